@@ -16,7 +16,7 @@ from common import arguments, progress, report, table, verdict
 
 from cnpgen.kernels.library import choose_backend
 from cnpgen.make.certify import CertifiedPlan, certified
-from cnpgen.make.load import load_dataset_recipe
+from cnpgen.make.recipe_file import load_dataset_recipe
 from cnpgen.pipelines.prepared import PreparedPipeline
 
 RECIPES = ("airhockey-hit", "airhockey-replan", "heavy-object")
@@ -42,7 +42,7 @@ def measure(name: str, rows: int, seed: int) -> dict[str, dict[str, float]]:
             block = each.block(seed, "train", index)
             found[way]["seconds"] += time.process_time() - begun
             found[way]["time"].append(block.columns["duration"][0])
-            found[way]["unplanned"] += block.fates.rejections.get("no plan found", 0)
+            found[way]["unplanned"] += block.sampling.rejections.get("no plan found", 0)
     made = size * -(-rows // size)
     return {
         way: {

@@ -25,10 +25,10 @@ STEPS = (  # what happens before the first row
     ("Python", "pass"),
     ("NumPy", "import numpy"),
     ("cnpgen.make.dataset", "import cnpgen.make.dataset"),
-    ("recipe", "from cnpgen.make.load import load_dataset_recipe; recipe = load_dataset_recipe({name!r})"),
+    ("recipe", "from cnpgen.make.recipe_file import load_dataset_recipe; recipe = load_dataset_recipe({name!r})"),
     ("Pinocchio, Coal", "import pinocchio, coal"),
     (
-        "kernels, blueprint",
+        "kernels, specification",
         "from pathlib import Path; place = cnpgen.make.dataset.find_workspace(Path({out!r}));"
         " cnpgen.make.dataset.draw_up(recipe, place)",
     ),

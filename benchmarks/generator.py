@@ -15,9 +15,9 @@ from typing import Any
 from common import arguments, at_hand, median, progress, report, table, verdict
 
 from cnpgen.kernels.library import choose_backend
-from cnpgen.pipelines.load import load_pipeline
+from cnpgen.pipelines.pipeline_file import load_pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline
-from cnpgen.pipelines.stages.stage import BLOCK_ROWS, Round, Stage, Work
+from cnpgen.pipelines.stages.stage import BLOCK_ROWS, CandidateBatch, Stage, StageFunction
 
 PIPELINES = ("airhockey-replan", "airhockey-hit", "heavy-object", "panda-cup", "ur5-wipe")
 BLOCKS = {"compiled": 16, "numpy": 4, "casadi": 1}  # per repetition
@@ -39,10 +39,10 @@ class StageTime:
     entered: int = 0
     left: int = 0
 
-    def timed(self, run: Work) -> Work:
+    def timed(self, run: StageFunction) -> StageFunction:
         """Wrap the stage's function."""
 
-        def timed(draws: Round, random: Any) -> None:
+        def timed(draws: CandidateBatch, random: Any) -> None:
             self.entered += len(draws.alive)
             start = time.process_time()
             run(draws, random)
@@ -83,7 +83,7 @@ class Case:
         """Make fresh blocks; return the CPU time [s] and the number of draws."""
         start, drawn = time.process_time(), 0
         for _ in range(blocks):
-            drawn += self.prepared.block(1, "benchmark", self.next_block).fates.tried
+            drawn += self.prepared.block(1, "benchmark", self.next_block).sampling.tried
             self.next_block += 1
         return time.process_time() - start, drawn
 

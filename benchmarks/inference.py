@@ -19,8 +19,8 @@ from common import arguments, at_hand, median, progress, report, table, verdict
 from cnpgen.machine.threads import one_thread
 from cnpgen.make.dataset import make_dataset
 from cnpgen.planner.model_file import shipped_models
+from cnpgen.planner.plan_requests import read_rows
 from cnpgen.planner.planner import Planner
-from cnpgen.planner.requests import read_rows
 
 BATCH = 1024
 DEFAULT = "default"
@@ -30,8 +30,8 @@ TARGETS = {1: 0.3, BATCH: 0.03}  # ms per plan
 def measure(model: str, folder: Path, repeat: int) -> list[dict[str, Any]]:
     """Milliseconds per plan, batch by batch, with and without the slow-down."""
     planners = {DEFAULT: Planner(model)}
-    if planners[DEFAULT].model.rests:
-        planners["without slow-down"] = Planner(model, slow_down=False)
+    if planners[DEFAULT].model.is_rest_to_rest:
+        planners["without slow-down"] = Planner(model, scale_time=False)
     asked = read_rows(folder, planners[DEFAULT].model, n=BATCH, split="train").boundary
     found = []
     with one_thread():

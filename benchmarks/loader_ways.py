@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.loader import kept
+from cnpgen.loader import in_memory_rows as kept
 from cnpgen.loader.batches import Batches
 from cnpgen.loader.dataset import Dataset
 
@@ -95,11 +95,11 @@ class Reader:
 
     def streamed(self, **options: Any) -> Tables:
         """Read batches with cnpgen as if the split were too large to be kept: its files in every epoch."""
-        limit, kept.KEEP_BYTES = kept.KEEP_BYTES, 0
+        limit, kept.MAX_IN_MEMORY_BYTES = kept.MAX_IN_MEMORY_BYTES, 0
         try:
             yield from (batch.table for batch in self.dataset.batches(self.batch_size, **options))
         finally:
-            kept.KEEP_BYTES = limit
+            kept.MAX_IN_MEMORY_BYTES = limit
 
     def torch_batches(self, workers: int) -> Tables:
         """Read cnpgen's batches through a torch DataLoader."""

@@ -19,8 +19,8 @@ from common import arguments, median, progress, report, table, verdict
 
 from cnpgen.losses import quadrature as rules
 from cnpgen.losses.plan_loss import PlanLoss
-from cnpgen.problems.load import load_problem
-from cnpgen.problems.robot import load_robot
+from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.problem_file import load_problem
 
 Array = np.ndarray[Any, np.dtype[Any]]
 PROBLEMS = ("airhockey", "heavy-object")
@@ -36,7 +36,7 @@ class Plans:
 
     path: Array
     rate: Array
-    tops: Array
+    obstacle_poses: Array
 
 
 def draw_plans(name: str, count: int) -> Plans:
@@ -72,7 +72,7 @@ class Case:
     def call(self, *, gradient: bool = True) -> None:
         """Evaluate the batch."""
         plans, weights = self.plans, np.ones(len(self.loss.terms) - 1)
-        self.loss(plans.path, plans.rate, weights=weights, tops=plans.tops, gradient=gradient)
+        self.loss(plans.path, plans.rate, weights=weights, obstacle_poses=plans.obstacle_poses, gradient=gradient)
 
     def measure(self) -> None:
         """Time a call with gradient, the kernel in it, and a call without gradient."""
@@ -147,16 +147,18 @@ def rule_errors(problem: str, plans: Plans) -> list[RuleError]:
     def evaluate(rule: str, nodes: int) -> tuple[Array, Array]:
         rules.basis_table.cache_clear()
         loss = PlanLoss(load_problem(problem), dtype="float64", nodes=nodes, rule=rule)
-        value = loss(plans.path, plans.rate, weights=np.ones(len(loss.terms) - 1), tops=plans.tops)
+        value = loss(plans.path, plans.rate, weights=np.ones(len(loss.terms) - 1), obstacle_poses=plans.obstacle_poses)
         rules.basis_table.cache_clear()
         return value.total, value.path_gradient.reshape(len(plans.path), -1)
 
-    total, slope = evaluate("cosine", FINE)
+    total, gradient = evaluate("cosine", FINE)
 
     def error(label: str, nodes: int, rule: str) -> RuleError:
-        found, found_slope = evaluate(rule, nodes)
-        of_slope = np.linalg.norm(found_slope - slope, axis=1) / np.linalg.norm(slope, axis=1)
-        return RuleError(problem, label, nodes, float(np.mean(np.abs(found - total) / total)), float(np.mean(of_slope)))
+        found, computed_gradient = evaluate(rule, nodes)
+        of_gradient = np.linalg.norm(computed_gradient - gradient, axis=1) / np.linalg.norm(gradient, axis=1)
+        return RuleError(
+            problem, label, nodes, float(np.mean(np.abs(found - total) / total)), float(np.mean(of_gradient))
+        )
 
     errors = [error(rule, nodes, rule) for nodes in (32, 64, 128) for rule in rules.RULES]
     with mock.patch.object(rules, "quadrature", uniform):

@@ -122,7 +122,7 @@ class Hit:
 
 
 def hitting_speed(arm: Arm, q: Array, direction: Array) -> tuple[Array, float] | None:
-    """Solve the linear programme of the hitting velocity by HiGHS; None if it fails."""
+    """Solve the linear program of the hitting velocity by HiGHS; None if it fails."""
     jacobian, limit = arm.jacobian(q)[:3], arm.robot.velocity_limit
     across = np.array([[-direction[1], direction[0], 0.0], [0.0, 0.0, 1.0]])
     bounds = np.column_stack([-limit, limit])
@@ -146,9 +146,9 @@ def table_acceleration(arm: Arm, q: Array, dq: Array, random: np.random.Generato
     direction -= limit**2 * row * (row @ direction) / (limit**2 @ row**2)
     torque = arm.torque(q, dq, particular)
     value = np.concatenate([particular, torque])
-    slope = np.concatenate([direction, arm.torque(q, dq, particular + direction) - torque])
+    gradient = np.concatenate([direction, arm.torque(q, dq, particular + direction) - torque])
     bound = np.concatenate([limit, arm.robot.torque_limit])
-    ends = np.sort(np.array([(bound - value) / slope, (-bound - value) / slope]), axis=0)
+    ends = np.sort(np.array([(bound - value) / gradient, (-bound - value) / gradient]), axis=0)
     low, high = ends[0].max(), ends[1].min()
     return particular + random.uniform(low, high) * direction if low <= 0 <= high else None
 
@@ -170,9 +170,9 @@ class Boxes:
         tip = self.arm.position(q)
         poses = self.arm.data.oMi
         points = [np.array(poses[i].translation) for i in range(1, self.arm.robot.n + 1)] + [tip]
-        return [(points[a], points[b]) for a, b in self.arm.robot.skeleton]
+        return [(points[a], points[b]) for a, b in self.arm.robot.capsule_axes]
 
-    def collide(self, q: Array, tops: Array) -> bool:
+    def collide(self, q: Array, obstacle_poses: Array) -> bool:
         """Ask Coal about every pair."""
         request = coal.CollisionRequest()
         moving = [
@@ -182,7 +182,7 @@ class Boxes:
         if self.held is not None:
             pose = self.arm.data.oMf[self.arm.tip]
             moving.append((self.held, coal.Transform3s(pose.rotation, pose.translation)))
-        for (x, y), box, top in zip(self.tables, self.boxes, tops, strict=True):
+        for (x, y), box, top in zip(self.tables, self.boxes, obstacle_poses, strict=True):
             middle = [(x.low + x.high) / 2, (y.low + y.high) / 2, top - 5.0]
             place = coal.Transform3s(np.eye(3), np.array(middle))
             if any(coal.collide(s, pose, box, place, request, coal.CollisionResult()) for s, pose in moving):

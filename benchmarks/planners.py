@@ -21,13 +21,13 @@ from generator import measure_rates, prepare
 from refiner_problems import PUCKS, make_each
 
 from cnpgen.machine.threads import one_thread
-from cnpgen.make.boundary_problems import draw_boundary_problems
+from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.planner.model_file import shipped_models
 from cnpgen.planner.planner import Planner, states_at
 from cnpgen.plans import Plans
 from cnpgen.plans.evaluate import evaluate_plans
-from cnpgen.refine.options import DEFAULT
-from cnpgen.refine.plans import refine_plans
+from cnpgen.refine.options import DEFAULT_OPTIONS
+from cnpgen.refine.refine_plans import refine_plans
 
 PLANNED, REFINED = 1000, {"airhockey-hit": 1000, "airhockey-replan": 1000}
 SOLVED, OTHERS = 200, 300  # plans from nothing; refined ones of the other planners
@@ -98,7 +98,7 @@ def draw_rate(name: str) -> float:
 def solve(problems: Plans) -> dict[str, float]:
     """Make plans from nothing one by one."""
     with one_thread():
-        made = make_each(problems, DEFAULT)
+        made = make_each(problems, DEFAULT_OPTIONS)
     return {
         "from nothing valid": float(np.mean([each.valid for each in made])),
         "from nothing, median ms": median(each.ms for each in made),
@@ -109,7 +109,7 @@ def solve(problems: Plans) -> dict[str, float]:
 def refine(plans: Plans) -> dict[str, float]:
     """Refine plans one by one; compare times where the result is valid."""
     with one_thread():
-        made = make_each(plans, DEFAULT)
+        made = make_each(plans, DEFAULT_OPTIONS)
     good = np.array([each.valid for each in made])
     after, ms = np.array([each.duration for each in made]), [each.ms for each in made]
     return {
@@ -126,7 +126,7 @@ def measure_grid(name: str) -> dict[str, float]:
     """The 81 pucks on a grid, hit from rest."""
     progress(f"{name}: 81 pucks on a grid")
     plans = Planner(name).plan_batch(draw_boundary_problems("airhockey-pucks", PUCKS).boundary)
-    made = make_each(plans, DEFAULT)
+    made = make_each(plans, DEFAULT_OPTIONS)
     strict = int(evaluate_plans(plans).valid.sum())
     return {"grid, strict of 81": strict, "grid, refined valid of 81": sum(each.valid for each in made)}
 
@@ -154,10 +154,10 @@ def curve(name: str, seed: int, count: int) -> dict[int, float]:
     plans = Planner(name).plan_batch(draw_boundary_problems(name, count, seed=seed).boundary)
     found = {}
     with one_thread():
-        full = make_each(plans, DEFAULT)
+        full = make_each(plans, DEFAULT_OPTIONS)
         for steps in STEPS:
             progress(f"{name}: {count} plans, at most {steps} steps")
-            made = make_each(plans, replace(DEFAULT, max_iterations=steps))
+            made = make_each(plans, replace(DEFAULT_OPTIONS, max_iterations=steps))
             both = [(a.duration, b.duration) for a, b in zip(made, full, strict=True) if a.valid and b.valid]
             few, all_ = np.array(both).T
             found[steps] = float(np.mean(few / all_))

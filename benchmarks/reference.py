@@ -3,7 +3,7 @@
 Both solve the same draws: the reference starts from the positions, guesses, angles and (for the goal) start
 configurations of rows that cnpgen accepted. So it pays for no rejected draw; cnpgen's time includes them. Prints the
 documentation's figures of speed-up and of optimality: CPU seconds per sample of both, and for every hit the objective
-of the hitting configuration against SLSQP's and the speed of the linear programme against HiGHS's.
+of the hitting configuration against SLSQP's and the speed of the linear program against HiGHS's.
 
     python benchmarks/reference.py
     python benchmarks/reference.py --samples 1000 --starts 4    SLSQP also from 3 random starts; the best one counts
@@ -31,9 +31,9 @@ from pinocchio_scipy import (
 )
 
 from cnpgen.kernels.library import choose_backend
-from cnpgen.pipelines.load import load_pipeline
+from cnpgen.pipelines.pipeline_file import load_pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
-from cnpgen.pipelines.stages.stage import BLOCK_ROWS, Round
+from cnpgen.pipelines.stages.stage import BLOCK_ROWS, CandidateBatch
 
 LOSS = 1e-6  # an objective this much below the reference's is a defeat
 
@@ -88,11 +88,11 @@ class Comparison:
             self.lost.append({"what": what, "ours": ours, "theirs": theirs, **plain})
 
 
-def our_rows(prepared: PreparedPipeline, samples: int, seed: int) -> Round:
+def our_rows(prepared: PreparedPipeline, samples: int, seed: int) -> CandidateBatch:
     """Run rounds of draws until one has enough rows; it also holds the columns that are not stored, such as guesses."""
     size = max(256, 3 * samples)
     while True:
-        draws = prepared._round(random_generator(seed, "reference", 0), size)
+        draws = prepared._sample_batch(random_generator(seed, "reference", 0), size)
         if len(draws.alive) >= samples:
             return draws
         size *= 2
@@ -168,10 +168,10 @@ def _reference_goal(
             best, ours = max(solved, key=hit.objective), sample["goal_q"]
             case = {"start_q": hit.home, "p": hit.target, "d": direction, "our_q": ours, "their_q": best}
             found.compare(what, hit.objective(ours), hit.objective(best), **case)
-    programme = hitting_speed(arm, sample["goal_q"], direction)
-    if programme is not None:
+    program = hitting_speed(arm, sample["goal_q"], direction)
+    if program is not None:
         speed = float(sample["hit_speed_max"][0])
-        found.compare("hitting velocity", speed, programme[1], goal_q=sample["goal_q"], d=direction)
+        found.compare("hitting velocity", speed, program[1], goal_q=sample["goal_q"], d=direction)
 
 
 def _nearby(arm: Arm, hit: Hit, random: np.random.Generator) -> Array:
@@ -190,7 +190,7 @@ def compare_heavy(prepared: PreparedPipeline, samples: int, seed: int) -> Compar
     found = Comparison("heavy-object", samples, our_seconds(prepared))
     for row in range(samples):
         sample = {name: np.ascontiguousarray(values[:, row]) for name, values in draws.columns.items()}
-        tops = np.array([sample[f"{box.below}_xyz"][2] - half for box in problem.obstacle])
+        obstacle_poses = np.array([sample[f"{box.below}_xyz"][2] - half for box in problem.obstacle])
         guess = sample["guess_q"]
         for end in ("start", "goal"):
             with watch.step(f"{end}: IK (SLSQP)"):
@@ -200,20 +200,20 @@ def compare_heavy(prepared: PreparedPipeline, samples: int, seed: int) -> Compar
                 break
             with watch.step(f"{end}: torque and collision (Coal)"):
                 fits = bool(np.all(np.abs(arm.torque(q, zero, zero)) <= arm.robot.torque_limit))
-                collides = boxes.collide(q, tops)
+                collides = boxes.collide(q, obstacle_poses)
             if collides or not fits:
                 found.fail(f"{end} in collision or too heavy")
                 break
             guess = q
-        _agree(found, boxes, sample, tops)
+        _agree(found, boxes, sample, obstacle_poses)
     return _finish(found, watch)
 
 
-def _agree(found: Comparison, boxes: Boxes, sample: dict[str, Array], tops: Array) -> None:
+def _agree(found: Comparison, boxes: Boxes, sample: dict[str, Array], obstacle_poses: Array) -> None:
     """Ask the reference about our configurations; an accepted row that it calls a collision is a defeat."""
     for end in ("start", "goal"):
-        ours = -1.0 if boxes.collide(sample[f"{end}_q"], tops) else 0.0
-        found.compare("free of collision", ours, 0.0, q=sample[f"{end}_q"], tops=tops)
+        ours = -1.0 if boxes.collide(sample[f"{end}_q"], obstacle_poses) else 0.0
+        found.compare("free of collision", ours, 0.0, q=sample[f"{end}_q"], obstacle_poses=obstacle_poses)
 
 
 def _finish(found: Comparison, watch: Watch) -> Comparison:

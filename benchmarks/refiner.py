@@ -1,12 +1,12 @@
-"""The refiner: how often its plans are valid, how long they take, how good they are, beside ipopt and SLSQP.
+"""Benchmark of the refiner: success rate, CPU time and quality of its plans, compared with Ipopt and SLSQP.
 
 CPU times are of one plan on one core; every part runs its variants in turn. Parts:
 
-    grid     81 hits from rest, puck on a 9 x 9 grid, from nothing and from a network-like start
-    fresh    fresh draws of every pipeline: valid share, CPU time, and of each failure what is proven about its problem
-    planned  fresh draws from the plans of the shipped planners, beside them with steps in NumPy and DAQP
-    ipopt    motion time and objective beside Ipopt's from the same start
-    height   what it costs to stay within 0.1 mm of the table's height
+    grid     81 hits from rest, puck on a 9 x 9 grid, without initial guess and from a network-like one
+    fresh    fresh problems of every pipeline: success rate, CPU time, and the explanation of each failure
+    planned  fresh problems from the plans of the shipped planners, with the compiled and the NumPy backend
+    ipopt    motion time and objective relative to Ipopt's from the same initial guess
+    height   motion time lost by staying within 0.1 mm of the table's height
     slsqp    SciPy's SLSQP on the same transcription (the paper's TrajOpt), with exact derivatives
     workers  plans per second (wall clock) of one process and of two
 
@@ -25,22 +25,22 @@ import numpy as np
 from common import arguments, median, progress, report, table, verdict
 from ipopt import with_ipopt
 from refiner_problems import PUCKS, Made, like_a_networks, make_each
-from slsqp import minimise_slsqp
+from slsqp import minimize_slsqp
 
 from cnpgen.machine.threads import one_thread
-from cnpgen.make.boundary_problems import draw_boundary_problems
+from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.planner.planner import Planner
 from cnpgen.plans.plans import Plans
-from cnpgen.problems.record import open_problem
-from cnpgen.refine.engine import load_refiner, prepare, tasks_of
-from cnpgen.refine.jury import Jury
+from cnpgen.problems.problem_record import open_problem
+from cnpgen.refine.grid_levels import GridLevels, default_grid_levels
 from cnpgen.refine.options import RefineOptions
-from cnpgen.refine.passes import Passes, default_passes
-from cnpgen.refine.plans import refine_plans
-from cnpgen.refine.proof.proof import explain_plans
+from cnpgen.refine.proof.explain import explain_plans
+from cnpgen.refine.refine_engine import load_refiner, prepare, tasks_of
+from cnpgen.refine.refine_plans import refine_plans
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.solver.sqp import Settings
-from cnpgen.trajectory.motion import Motion
+from cnpgen.refine.strategy import PlanChecker
+from cnpgen.trajectory.spline_motion import Motion
 
 PIPELINES = ("airhockey-hit", "airhockey-replan", "heavy-object")
 RUNS = 5  # of the grid
@@ -63,7 +63,7 @@ Result = tuple[dict[str, Any], list[str]]
 
 
 def grid(_: dict[str, Any], options: argparse.Namespace) -> Result:
-    """Solve the 81 hits several times: the middle run counts; beside it the least times, least disturbed by others."""
+    """Solve the 81 hits several times; report the median run and the minimum times of the plans."""
     problems = draw_boundary_problems("airhockey-pucks", PUCKS)
     starts = like_a_networks(problems, make_each(problems, RefineOptions()), options.seed)
     plans = {"from nothing": problems, "network-like start": starts}
@@ -82,7 +82,7 @@ def grid(_: dict[str, Any], options: argparse.Namespace) -> Result:
         times = f"{median(medians):.1f}", *met, *shown(found), f"{judging:.1f}"
         rows.append((start, str(valid), *verdict(valid, 81), *times))
     head = ("start", "valid", "target", "", "median", "target", "", *(f"{name} of least" for name in SHOWN), "verdicts")
-    title = f"81 hits from rest, CPU time per plan [ms]: median of the middle one of {RUNS} runs, least of each plan's"
+    title = f"81 hits from rest, CPU time per plan [ms]: median of the centre one of {RUNS} runs, least of each plan's"
     return {"grid": facts}, [table(title, head, rows)]
 
 
@@ -99,7 +99,7 @@ def fresh(sizes: dict[str, Any], options: argparse.Namespace) -> Result:
         rows.append((name, ms[0], *target, *ms[1:], f"{mean:.1f}", f"{share:.2%}", *verdict(share, VALID[name])))
         failed = [index for index, each in enumerate(found) if not each.valid]
         findings = explain_plans(problems, failed)
-        failures += [(name, str(index), found[index].refined.reason, str(findings[index])) for index in failed]
+        failures += [(name, str(index), str(found[index].refined.reason), str(findings[index])) for index in failed]
         facts[name] = {"valid": share, "mean_ms": mean, "failures": {i: str(findings[i]) for i in failed}}
     head = ("problems", SHOWN[0], "target", "", *SHOWN[1:], "mean", "valid", "target", "")
     tables = [table(f"fresh problems, seed {options.seed}, CPU time per plan from nothing [ms]", head, rows)]
@@ -109,17 +109,17 @@ def fresh(sizes: dict[str, Any], options: argparse.Namespace) -> Result:
 
 
 def planned(sizes: dict[str, Any], options: argparse.Namespace) -> Result:
-    """Refine the plans of the shipped planners, in compiled steps and in those of NumPy and DAQP."""
+    """Refine the plans of the shipped planners with the compiled and the NumPy backend."""
     facts, rows = {}, []
     for name, count in zip(PIPELINES, sizes["planned"], strict=True):
         progress(f"{count} of {name}, planned")
         plans = Planner(name).plan_batch(draw_boundary_problems(name, count, seed=options.seed + 5).boundary)
         found, plain = make_each(plans, RefineOptions()), make_each(plans, RefineOptions(), in_numpy(plans))
-        middle, late = (float(value) for value in np.percentile([each.ms for each in found], [50, 95]))
+        center, late = (float(value) for value in np.percentile([each.ms for each in found], [50, 95]))
         ratio = np.median([one.duration / other.duration for one, other in zip(found, plain, strict=True)])
-        goals = [verdict(value, goal, at_most=True) for value, goal in zip((middle, late), PLANNED[name], strict=True)]
+        goals = [verdict(value, goal, at_most=True) for value, goal in zip((center, late), PLANNED[name], strict=True)]
         valid = [f"{np.mean([each.valid for each in made]):.2%}" for made in (found, plain)]
-        ms = f"{middle:.1f}", *goals[0], f"{late:.1f}", *goals[1], f"{judged(found):.1f}", f"{cpu(plain):.1f}"
+        ms = f"{center:.1f}", *goals[0], f"{late:.1f}", *goals[1], f"{judged(found):.1f}", f"{cpu(plain):.1f}"
         rows.append((name, str(count), *ms, *valid, f"{ratio:.6f}"))
         facts[name] = {"ms": [each.ms for each in found], "plain_ms": [each.ms for each in plain], "valid": valid}
     head = (
@@ -141,14 +141,14 @@ def planned(sizes: dict[str, Any], options: argparse.Namespace) -> Result:
 
 
 def in_numpy(plans: Plans) -> Refiner:
-    """A refiner whose steps are not compiled, though its kernels are."""
+    """Return a refiner with compiled kernels and the NumPy backend."""
     tool = load_refiner(*open_problem(plans.problem))
-    tool.stage = replace(tool.stage, steps=None)
+    tool.residual_kernels = replace(tool.residual_kernels, step_library=None)
     return tool
 
 
 def ipopt(sizes: dict[str, Any], options: argparse.Namespace) -> Result:
-    """Compare with Ipopt from the same start, a straight line."""
+    """Compare with Ipopt from the same initial guess, a straight line."""
     facts, rows, worse = {}, [], []
     for name in PIPELINES:
         progress(f"{name} with ipopt")
@@ -210,11 +210,11 @@ def height(sizes: dict[str, Any], options: argparse.Namespace) -> Result:
         "target",
         "",
     )
-    return {"height": facts}, [table("height over the table, the worst of all plans and moments", head, rows)]
+    return {"height": facts}, [table("height over the table, the worst of all plans and times", head, rows)]
 
 
 def slsqp(sizes: dict[str, Any], options: argparse.Namespace) -> Result:
-    """Compare with SLSQP, from nothing and from network-like starts."""
+    """Compare with SLSQP, without initial guess and from network-like ones."""
     facts, rows = {}, []
     for name in ("airhockey-hit", "heavy-object"):
         problems = draw_boundary_problems(name, sizes["slsqp"], seed=options.seed + 3)
@@ -238,7 +238,7 @@ def slsqp(sizes: dict[str, Any], options: argparse.Namespace) -> Result:
 
 
 def workers(sizes: dict[str, Any], options: argparse.Namespace) -> Result:
-    """Measure plans per second, with the start of the processes, in turns: the middle one of the ratios counts."""
+    """Measure plans per second, with the start of the processes, in turns, and the median of the ratios."""
     problems = draw_boundary_problems("airhockey-hit", sizes["workers"], seed=options.seed + 4)
     speeds: dict[int, list[float]] = {1: [], 2: []}
     for turn in range(TURNS):
@@ -278,35 +278,35 @@ def spread(ratios: Any) -> str:
 
 
 def wide_band(problems: Plans) -> Refiner:
-    """A refiner that lets the tip use most of the tolerance of its height."""
+    """Return a refiner that lets the tip use most of the tolerance of its height."""
     problem, robot = open_problem(problems.problem)
-    usual = default_passes(problem, Settings())
-    wider = {name: replace(each, tightening=replace(each.tightening, band=0.9)) for name, each in vars(usual).items()}
-    tool = load_refiner(problem, robot, passes=Passes(**wider))
-    tool.check.equalities = set()  # plans that use the tolerance are not to be polished for it
+    usual = vars(default_grid_levels(problem, Settings()))
+    wider = {name: replace(level, tightening=replace(level.tightening, band=0.9)) for name, level in usual.items()}
+    tool = load_refiner(problem, robot, levels=GridLevels(**wider))
+    tool.check.equalities = set()  # plans that use the tolerance need no finer level
     return tool
 
 
 def off_height(problems: Plans, found: list[Made]) -> list[float]:
-    """How far the tips of valid plans are off the table's height at most, beyond the funnel of the start [m]."""
+    """Return the violations of the table's height by valid plans, outside the time-varying bound [m]."""
     problem, robot = open_problem(problems.problem)
-    jury = Jury(problem, robot, degree=problems.degree)
+    checker = PlanChecker(problem, robot, degree=problems.degree)
     pairs = zip(tasks_of(problems), found, strict=True)
-    verdicts = [jury.verdict(task, each.refined.path, each.refined.rate) for task, each in pairs if each.valid]
-    return [each.margins["table height"].excess for each in verdicts]
+    verdicts = [checker.verdict(task, each.refined.path, each.refined.rate) for task, each in pairs if each.valid]
+    return [each.margins["table height"].violation for each in verdicts]
 
 
 def run_slsqp(refiner: Refiner, plans: Plans, cap: float) -> tuple[list[bool], list[float]]:
     """Solve plans with SLSQP; return which are valid and the CPU times [s]."""
     problem, robot = open_problem(plans.problem)
-    jury, valid, seconds = Jury(problem, robot, degree=plans.degree), [], []
+    checker, valid, seconds = PlanChecker(problem, robot, degree=plans.degree), [], []
     for task in tasks_of(plans):
-        given = refiner.given(task)
-        x = refiner.straight(task) if given is None else given
-        end, took = minimise_slsqp(refiner, task, x, cap=cap)
+        variables = refiner.input_variables(task)
+        x = refiner.line_guess(task) if variables is None else variables
+        end, took = minimize_slsqp(refiner, task, x, cap=cap)
         path, rate = refiner.check.transcription(task).unpack(end)
         forward = bool(Motion(path[None], rate[None], plans.degree).runs_forward()[0])
-        valid.append(forward and jury.verdict(task, path, rate).valid)
+        valid.append(forward and checker.verdict(task, path, rate).valid)
         seconds.append(took)
     return valid, seconds
 

@@ -1,4 +1,4 @@
-"""Problems and starts of the refiner's benchmark, and what is measured of one plan."""
+"""Problems and initial guesses of the refiner's benchmark, and the measurements of one plan."""
 
 import time
 from dataclasses import dataclass, replace
@@ -8,51 +8,50 @@ from numpy.typing import NDArray
 
 from cnpgen.judges.plans.verdict import Verdict
 from cnpgen.plans.plans import Plans
-from cnpgen.problems.record import open_problem
-from cnpgen.refine.engine import prepare, tasks_of
-from cnpgen.refine.jury import Jury
+from cnpgen.problems.problem_record import open_problem
 from cnpgen.refine.options import RefineOptions
-from cnpgen.refine.polish import refine_task
-from cnpgen.refine.proof.tip_bound import Arm
+from cnpgen.refine.proof.tip_bound import ArmKinematics
+from cnpgen.refine.refine_engine import prepare, tasks_of
 from cnpgen.refine.refiner import Refiner
-from cnpgen.refine.task import Refined, Task
+from cnpgen.refine.strategy import PlanChecker, refine_task
+from cnpgen.refine.task import Attempt, RefinementTask
 from cnpgen.trajectory.boundary import assemble
-from cnpgen.trajectory.motion import Motion
+from cnpgen.trajectory.spline_motion import Motion
 
 Array = NDArray[np.float64]
 PUCKS = 81  # problems of the dataset airhockey-pucks
-LARGEST_Z, SMALLEST_Z, TOO_FAST = 0.010, 0.002, 1.05  # of a network-like start
+MAX_Z_ERROR_M, MIN_Z_ERROR_M, SPEED_FACTOR = 0.010, 0.002, 1.05  # of a network-like initial guess
 
 
 @dataclass(frozen=True)
 class Made:
-    """What came of one plan.
+    """Measurements of one plan.
 
     Attributes:
-        refined: The plan.
+        refined: Result of the refiner.
         ms: CPU time, verdicts included [ms].
         verdict_ms: CPU time of the verdicts [ms].
-        duration: Its motion time [s].
+        duration: Motion time [s].
     """
 
-    refined: Refined
+    refined: Attempt
     ms: float
     verdict_ms: float
     duration: float
 
     @property
     def valid(self) -> bool:
-        """Whether the verdict calls it valid."""
+        """Whether the verdict accepts the plan."""
         return self.refined.valid
 
 
-class WatchedJury(Jury):
-    """A jury that knows how long it took."""
+class WatchedChecker(PlanChecker):
+    """Plan checker that measures its CPU time."""
 
     seconds = 0.0
 
-    def verdict(self, task: Task, path: Array, rate: Array) -> Verdict:
-        """Judge, and add up the time."""
+    def verdict(self, task: RefinementTask, path: Array, rate: Array) -> Verdict:
+        """Judge a plan and add the time."""
         start = time.process_time()
         try:
             return super().verdict(task, path, rate)
@@ -61,44 +60,44 @@ class WatchedJury(Jury):
 
 
 def make_each(plans: Plans, options: RefineOptions, refiner: Refiner | None = None) -> list[Made]:
-    """Refine plans one by one in this process, and watch the clock."""
+    """Refine plans one by one in this process and measure the CPU time."""
     tool = prepare(plans, options) if refiner is None else refiner
     problem, robot = open_problem(plans.problem)
-    jury = WatchedJury(problem, robot, degree=plans.degree)
+    checker = WatchedChecker(problem, robot, degree=plans.degree)
     tasks = tasks_of(plans)
-    refine_task(tool, jury, tasks[0])  # warms up
-    return [_make(tool, jury, task) for task in tasks]
+    refine_task(tool, checker, tasks[0])  # warm-up
+    return [_make(tool, checker, task) for task in tasks]
 
 
-def _make(tool: Refiner, jury: WatchedJury, task: Task) -> Made:
-    jury.seconds, start = 0.0, time.process_time()
-    refined = refine_task(tool, jury, task)
+def _make(tool: Refiner, checker: WatchedChecker, task: RefinementTask) -> Made:
+    checker.seconds, start = 0.0, time.process_time()
+    refined = refine_task(tool, checker, task)
     ms = 1e3 * (time.process_time() - start)
     duration = float(Motion(refined.path[None], refined.rate[None], tool.spec.degree).duration()[0])
-    return Made(refined, ms, 1e3 * jury.seconds, duration)
+    return Made(refined, ms, 1e3 * checker.seconds, duration)
 
 
 def like_a_networks(plans: Plans, made: list[Made], seed: int) -> Plans:
-    """Disturb plans as a network errs: the tip is 2 to 10 mm too high or low somewhere, velocities are 5 % too high.
+    """Perturb plans like a network: the tip is 2 to 10 mm too high or low, velocities are 5 % too high.
 
-    Their ends are exact as those of a network's plans are, which are built from what the rate begins and ends with.
+    Their ends are exact, like those of a network's plans.
     """
     problem, robot = open_problem(plans.problem)
-    random, arm, s = np.random.default_rng(seed), Arm(robot), np.linspace(0, 1, 41)
+    random, arm, s = np.random.default_rng(seed), ArmKinematics(robot), np.linspace(0, 1, 41)
     paths, rates = [], []
     for index, each in enumerate(made):
         path, rate, boundary = each.refined.path, each.refined.rate, plans.boundary[index : index + 1]
         noise, end = np.zeros_like(path), len(path) - boundary.fixed_at_goal
         noise[3:end] = _smooth(random.normal(size=noise[3:end].shape))
-        wanted, size = random.uniform(SMALLEST_Z, LARGEST_Z), 4e-3
+        target, size = random.uniform(MIN_Z_ERROR_M, MAX_Z_ERROR_M), 4e-3
         for _ in range(4):
-            size *= wanted / _vertical(arm, path, path + size * noise, s)
-        bent = path + size * noise
+            size *= target / _vertical(arm, path, path + size * noise, s)
+        perturbed = path + size * noise
         for _ in range(4):
-            speed = np.abs(Motion(bent[None], rate[None], plans.degree).at(s).dq[0]) / robot.velocity_limit
-            rate = rate * TOO_FAST / speed.max()
-            bent = assemble(boundary, bent[None, 3:end], rate[None], problem.trajectory)[0]
-        paths.append(bent)
+            speed = np.abs(Motion(perturbed[None], rate[None], plans.degree).at(s).dq[0]) / robot.velocity_limit
+            rate = rate * SPEED_FACTOR / speed.max()
+            perturbed = assemble(boundary, perturbed[None, 3:end], rate[None], problem.trajectory)[0]
+        paths.append(perturbed)
         rates.append(rate)
     return replace(plans, path_control_points=np.array(paths), rate_control_points=np.array(rates))
 
@@ -109,7 +108,7 @@ def _smooth(values: Array) -> Array:
     return values
 
 
-def _vertical(arm: Arm, path: Array, bent: Array, s: Array) -> float:
-    """Largest vertical distance between the tips of two paths [m]."""
-    q = [Motion(each[None], np.ones((1, 20))).at(s).q[0] for each in (path, bent)]
+def _vertical(arm: ArmKinematics, path: Array, perturbed: Array, s: Array) -> float:
+    """Return the largest vertical distance between the tips of two paths [m]."""
+    q = [Motion(each[None], np.ones((1, 20))).at(s).q[0] for each in (path, perturbed)]
     return max(abs(float((arm.at(one).position - arm.at(other).position)[2])) for one, other in zip(*q, strict=True))

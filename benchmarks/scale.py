@@ -21,9 +21,9 @@ from common import arguments, progress, report, table
 import cnpgen
 from cnpgen.cli.dry_run import row_bytes
 from cnpgen.make.dataset import finish
-from cnpgen.store.blueprint import default_shard_size, load_blueprint, shards
+from cnpgen.make.repair import find_damaged
+from cnpgen.store.dataset_spec import default_shard_size, load_dataset_spec, shards
 from cnpgen.store.layout import DOCUMENTS
-from cnpgen.store.mending import find_damaged
 
 CERTIFIED_BLOCK = 64  # rows
 
@@ -84,14 +84,14 @@ def measure(name: str, rows: int, sample: int, **options: Any) -> Costs:
         cnpgen.make_dataset(name, folder, n=sample, begin=lambda *_: begun.append(time.process_time()), **settings)
         make = time.process_time() - begun[-1]
         deep = seconds(lambda: cnpgen.validate_dataset(folder, deep=True, workers=1))
-        blueprint = load_blueprint(folder)
-        tasks = shards(blueprint)
-        check = seconds(lambda: find_damaged(folder, blueprint, tasks))
-        summed = seconds(lambda: finish(folder, blueprint, "", made=1, alone=True))
+        spec = load_dataset_spec(folder)
+        tasks = shards(spec)
+        check = seconds(lambda: find_damaged(folder, spec, tasks))
+        summed = seconds(lambda: finish(folder, spec, "", made=1, exclusive=True))
         size = sum(path.stat().st_size for path in folder.glob("*/*"))
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     title = f"{name}, certified" if options.get("certify") else f"{name}, {options.get('dtype', 'float64')}"
-    per_row, width = (make / sample, check / sample, deep / sample), row_bytes(blueprint)
+    per_row, width = (make / sample, check / sample, deep / sample), row_bytes(spec)
     beside = (size - sample * width) / len(tasks)
     return Costs(title, rows, *per_row, summed / len(tasks), width, beside, shard_rows, memory)
 

@@ -1,4 +1,4 @@
-"""SciPy's SLSQP on the refiner's transcription of the first pass: the paper's TrajOpt, but with exact derivatives."""
+"""SciPy's SLSQP on the refiner's transcription of the coarse level: the paper's TrajOpt, but with exact derivatives."""
 
 import time
 from dataclasses import dataclass
@@ -8,15 +8,15 @@ from numpy.typing import NDArray
 
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.solver.bounds import Bounds
-from cnpgen.refine.solver.transcription import Linearisation, Transcription
-from cnpgen.refine.task import Task
+from cnpgen.refine.solver.transcription import Linearization, Transcription
+from cnpgen.refine.task import RefinementTask
 
 Array = NDArray[np.float64]
 MAX_ITERATIONS = 200
 
 
 class OutOfTimeError(Exception):
-    """The cap on the CPU time is reached."""
+    """The limit of the CPU time is reached."""
 
 
 @dataclass
@@ -26,24 +26,24 @@ class Function:
     Attributes:
         motion: The transcription.
         bounds: Bounds of its residuals.
-        until: ``time.process_time()`` at which it gives up.
-        at: The last evaluation.
+        until: Limit of ``time.process_time()`` [s].
+        at: Last evaluation.
     """
 
     motion: Transcription
     bounds: Bounds
     until: float
-    at: Linearisation | None = None
+    at: Linearization | None = None
 
     def __post_init__(self) -> None:
         self.above = np.nonzero(np.isfinite(self.bounds.upper))
         self.below = np.nonzero(np.isfinite(self.bounds.lower))
 
-    def evaluate(self, x: Array) -> Linearisation:
-        """Evaluate, or remember.
+    def evaluate(self, x: Array) -> Linearization:
+        """Evaluate at x, or return the last evaluation.
 
         Raises:
-            OutOfTimeError: It is too late.
+            OutOfTimeError: The limit of the CPU time is reached.
         """
         if time.process_time() > self.until:
             raise OutOfTimeError
@@ -51,43 +51,43 @@ class Function:
             self.at = self.motion.evaluate(x.copy())
         return self.at
 
-    def room(self, x: Array) -> Array:
-        """How far the residuals are inside their bounds."""
+    def margins(self, x: Array) -> Array:
+        """Return the margins of the residuals to their bounds."""
         g = self.evaluate(x).g
         return np.concatenate([(self.bounds.upper - g)[self.above], (g - self.bounds.lower)[self.below]])
 
-    def room_jacobian(self, x: Array) -> Array:
-        """Its Jacobian, shape (m, nx)."""
+    def margins_jacobian(self, x: Array) -> Array:
+        """Return the Jacobian of the margins, shape (m, nx)."""
         at = self.evaluate(x)
         return np.vstack([-self.motion.rows(at, *self.above), self.motion.rows(at, *self.below)])
 
 
-def minimise_slsqp(refiner: Refiner, task: Task, x: Array, *, cap: float) -> tuple[Array, float]:
-    """Minimise from x; return where it ended and the CPU time [s].
+def minimize_slsqp(refiner: Refiner, task: RefinementTask, x: Array, *, cap: float) -> tuple[Array, float]:
+    """Minimize from x; return the last iterate and the CPU time [s].
 
     Args:
-        refiner: Whose transcription and bounds of the first pass are used.
+        refiner: Refiner whose transcription and bounds of the coarse level are used.
         task: The boundary problem.
-        x: First variables.
-        cap: CPU time at which it is stopped [s]; what it last looked at comes back.
+        x: Initial variables.
+        cap: Limit of the CPU time [s], after which the last evaluated iterate is returned.
     """
     from scipy.optimize import minimize
 
-    which, start = refiner.passes.first, time.process_time()
-    motion = refiner.transcription(task, which)
-    bounds = refiner.bounds(task, which, motion.end_residuals())
+    level, start = refiner.levels.coarse, time.process_time()
+    motion = refiner.transcription(task, level)
+    bounds = refiner.bounds(task, level, motion.end_residuals())
     function = Function(motion, bounds, start + cap)
     try:
         with np.errstate(all="ignore"):
-            found = minimize(
+            solution = minimize(
                 lambda x: function.evaluate(x).cost,
                 x,
                 jac=lambda x: function.evaluate(x).gradient,
-                constraints={"type": "ineq", "fun": function.room, "jac": function.room_jacobian},
+                constraints={"type": "ineq", "fun": function.margins, "jac": function.margins_jacobian},
                 method="SLSQP",
-                options={"ftol": which.settings.cost_tolerance / 10, "maxiter": MAX_ITERATIONS},
+                options={"ftol": level.settings.cost_tolerance / 10, "maxiter": MAX_ITERATIONS},
             )
-        end = np.array(found.x)
+        end = np.array(solution.x)
     except OutOfTimeError:
         end = x if function.at is None else function.at.x
     return end, time.process_time() - start

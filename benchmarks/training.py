@@ -1,6 +1,6 @@
 """A training step, everything included, and what a run of some CPU time reaches.
 
-A step is: rows of the batch, network forwards, control points, landing on the manifold, loss and its gradient at 32
+A step is: rows of the batch, network forwards, control points, projection on the manifold, loss and its gradient at 32
 nodes, all of it backwards, clipping, Adam. The clock is the process's CPU time, one BLAS thread; medians over the
 steps, shares of the parts from the same steps.
 
@@ -24,11 +24,11 @@ from common import arguments, median, progress, report, table, verdict
 
 from cnpgen.machine.threads import one_thread
 from cnpgen.make.dataset import make_dataset
-from cnpgen.planner.kit import surroundings
+from cnpgen.planner.inference_pipeline import loaded_problem
+from cnpgen.planner.plan_requests import read_rows
 from cnpgen.planner.planner import Planner
-from cnpgen.planner.requests import read_rows
-from cnpgen.problems.record import as_record
-from cnpgen.refine.plans import refine_plans
+from cnpgen.problems.problem_record import as_record
+from cnpgen.refine.refine_plans import refine_plans
 from cnpgen.training import step as parts
 from cnpgen.training.data import open_training_data
 from cnpgen.training.prepare import begin_run, prepare_run
@@ -39,7 +39,7 @@ DATASETS = ("airhockey-hit", "heavy-object")
 NETWORKS = ((128, 64), (256, 128), (512, 128), (2048, 128))  # width and batch; all have a trunk of five layers
 TARGETS = {(256, 128): 12.0, (512, 128): 35.0, (2048, 128): 700.0}  # ms
 NAMES = {"forward": "forward", "control_points": "omega", "pull_back": "omega", "backward": "backward"}
-SHOWN = ("forward", "backward", "loss", "landing", "omega", "rest")
+SHOWN = ("forward", "backward", "loss", "projection", "omega", "rest")
 REACHED = {  # in this CPU time [s], from scratch: figure -> bound, and whether it is an upper one
     "airhockey-hit": (120.0, {
         "paper_valid": (0.999, False), "valid": (0.9, False), "z_error_mm_s": (0.2, True),
@@ -77,7 +77,7 @@ def time_steps(folder: Path, hidden: int, batch: int, *, steps: int, backend: st
     """Time steps of one network: milliseconds, and the share of every part."""
     settings = TrainingSettings(hidden=hidden, batch_size=batch)
     source, clock, times = open_training_data(folder), Clock({}), []
-    with one_thread(), surroundings(as_record(source.dataset.problem), backend) as given:
+    with one_thread(), loaded_problem(as_record(source.dataset.problem), backend) as given:
         run, _ = prepare_run(source, given, settings, check_rows=1)
         state = begin_run(run, Length(steps=10**6))
         gradient = np.empty_like(state.adam.parameters)
@@ -97,11 +97,11 @@ def time_steps(folder: Path, hidden: int, batch: int, *, steps: int, backend: st
 def patched(clock: Clock, run: Any) -> Iterator[None]:
     """Time the parts of a step."""
     before = {name: getattr(parts, name) for name in NAMES}
-    learner, landing = run.learner, run.learner.landing
+    learner, projection = run.learner, run.learner.projection
     timed = SimpleNamespace(
-        land=clock.timed("landing", landing.land), pull_back=clock.timed("landing", landing.pull_back)
+        project=clock.timed("projection", projection.project), vjp=clock.timed("projection", projection.vjp)
     )
-    run.learner = replace(learner, loss=clock.timed("loss", learner.loss), landing=timed)
+    run.learner = replace(learner, loss=clock.timed("loss", learner.loss), projection=timed)
     for name, function in before.items():
         setattr(parts, name, clock.timed(NAMES[name], function))
     yield

@@ -25,18 +25,18 @@ from typing import Any
 import numpy as np
 from common import arguments, progress, report, table
 from numpy.typing import NDArray
-from onthefly import Goals, figures, refine_each, rows_of
+from online_replanning import Goals, figures, refine_each, rows_of
 
 import cnpgen
-from cnpgen.make.boundary_problems import draw_boundary_problems
 from cnpgen.make.complete import complete
-from cnpgen.make.load import load_dataset_recipe
+from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.make.recipe import DatasetRecipe
+from cnpgen.make.recipe_file import load_dataset_recipe
 from cnpgen.pipelines.stages.ik import GoalIK, StartIK
 from cnpgen.pipelines.stages.stage import Stage
 from cnpgen.planner.planner import Planner
-from cnpgen.problems.robot import load_robot
-from cnpgen.refine.plans import Refinement, refine_plans, solve_plans
+from cnpgen.problems.load_robot import load_robot
+from cnpgen.refine.refine_plans import Refinement, refine_plans, solve_plans
 from cnpgen.trajectory.boundary import Boundary
 
 OLD, NEW = "heavy-object", "heavy-object-anywhere"
@@ -102,15 +102,15 @@ def refined_again(planner: Planner, boundary: Boundary) -> dict[str, dict[str, i
     plans = planner.plan_batch(boundary)
     first = {"refined": refine_plans(plans, workers=1), "solved": solve_plans(plans, workers=1)}
     later = {name: refine_plans(each.plans, workers=1) for name, each in first.items()}
-    shortest = np.min([valid_durations(each) for each in (*first.values(), *later.values())], axis=0)
+    min_duration = np.min([valid_durations(each) for each in (*first.values(), *later.values())], axis=0)
     found = {}
     for name, each in first.items():
         mine, then = valid_durations(each), valid_durations(later[name])
         found[name] = {
             "valid": int(each.valid.sum()),
-            "later": int((~each.valid & np.isfinite(shortest)).sum()),
+            "later": int((~each.valid & np.isfinite(min_duration)).sum()),
             "refining again": int((each.valid & (mine > SHORTER * then)).sum()),
-            "than any other": int((each.valid & (mine > SHORTER * shortest)).sum()),
+            "than any other": int((each.valid & (mine > SHORTER * min_duration)).sum()),
         }
     return found
 

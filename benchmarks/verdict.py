@@ -1,10 +1,10 @@
 """CPU time of the verdict per plan, beside the same check with one state of Pinocchio and Coal at a time.
 
-The second measures every constraint at every moment of the time grid, and looks at nothing between them. The verdict's
+The second measures every constraint at all times of the time grid, and looks at nothing between them. The verdict's
 time is the median over repetitions of the mean over all plans; both ways take turns on the plans that they share.
 
 With ``--always N``, N plans of each file are made to lie at a tolerance, a hundred-thousandth of it on either side, and
-judged at ever finer steps, and as briefly as the refiner does: whether they are valid must not depend on that.
+judged at ever finer steps, and as with early exit as the refiner does: whether they are valid must not depend on that.
 
     cnpgen solve airhockey-hit --n 100 -o hits.h5
     python benchmarks/verdict.py hits.h5 --always 100
@@ -19,14 +19,14 @@ import numpy as np
 from common import arguments, median, report, table, verdict
 
 from cnpgen.judges.plans import Margin, Reason, Verdict, judge
-from cnpgen.judges.plans.course import course
+from cnpgen.judges.plans.evaluated_trajectory import evaluate_trajectory
 from cnpgen.judges.plans.judge import Judge
 from cnpgen.judges.plans.sampling import sample, time_table
 from cnpgen.plans import Plans, load_plans, open_problem
-from cnpgen.problems.obstacles import obstacle_tops
+from cnpgen.problems.obstacles import obstacle_poses_of
 from cnpgen.problems.problem import Problem
-from cnpgen.trajectory.motion import Motion
-from cnpgen.world.state import World
+from cnpgen.trajectory.spline_motion import Motion
+from cnpgen.world.world import World
 
 STEP = 1e-3  # s
 STEPS = (1e-3, 1e-4, 1e-5)  # s
@@ -42,16 +42,16 @@ class Timing:
     Attributes:
         problem: Name of the problem.
         plans: Number of plans.
-        moments: Moments per plan that were looked at, on average.
+        times: Moments per plan that were looked at, on average.
         ms: CPU time of the verdict per plan [ms].
         times_faster: CPU time of the check state by state, in times the verdict's.
         missed: How much more than the verdict the check state by state saw at most, in what is allowed.
-        between: How much more the verdict saw between moments.
+        between: How much more the verdict saw between times.
     """
 
     problem: str
     plans: int
-    moments: float
+    times: float
     ms: float
     times_faster: float
     missed: float
@@ -68,22 +68,22 @@ def judged(plans: Plans) -> tuple[list[Verdict], float]:
 
 
 def state_by_state(plans: Plans) -> tuple[list[dict[str, float]], float]:
-    """Measure every constraint at every moment; return condition -> severity of each plan, and the CPU time [s]."""
+    """Measure every constraint at all times; return condition -> severity of each plan, and the CPU time [s]."""
     problem, robot = open_problem(plans.problem)
     world = World(robot, problem.obstacle, problem.object_size)
-    tops = obstacle_tops(problem, plans.columns["start_xyz"], plans.columns["goal_xyz"])
+    obstacle_poses = obstacle_poses_of(problem, plans.columns["start_xyz"], plans.columns["goal_xyz"])
     start, found = time.process_time(), []
     for index, motion in enumerate(plans.motion[[i]] for i in range(len(plans))):
-        moments = sample(time_table(motion.rate[0], motion.degree), STEP, 13)
-        assert moments is not None
-        states = course(motion, moments.s)
+        times = sample(time_table(motion.rate[0], motion.degree), STEP, 13)
+        assert times is not None
+        states = evaluate_trajectory(motion, times.s)
         severity: dict[str, float] = {}
-        for k, phase in enumerate(moments.s):
+        for k, phase in enumerate(times.s):
             q, dq, ddq = (values[:, k].copy() for values in (states.q, states.dq, states.ddq))
-            world.set_state(q, dq, ddq, tops[index])
+            world.set_state(q, dq, ddq, obstacle_poses[index])
             for constraint in problem.constraint:
                 for condition in constraint.measured(world):
-                    wider = constraint.funnel(condition, np.array([phase]), plans.columns["start_xyz"][index])
+                    wider = constraint.bound_relaxation(condition, np.array([phase]), plans.columns["start_xyz"][index])
                     g = np.array(condition.g, float)
                     excess = np.maximum(condition.lower - g, g - condition.upper) - wider
                     worst = float(np.max(excess / constraint.allowed(condition)))
@@ -105,8 +105,8 @@ def measure(plans: Plans, *, repeat: int, slow: int) -> Timing:
             for name, severity in expected.items():
                 missed = max(missed, severity - found.margins[name].severity)
                 between = max(between, found.margins[name].severity - severity)
-    moments = float(np.mean([found.samples for found in verdicts]))
-    return Timing(plans.problem.name, len(plans), moments, 1e3 * median(times), median(ratios), missed, between)
+    samples = float(np.mean([found.samples for found in verdicts]))
+    return Timing(plans.problem.name, len(plans), samples, 1e3 * median(times), median(ratios), missed, between)
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ class Always:
     Attributes:
         problem: Name of the problem.
         plans: Number of plans.
-        differ: How many of them are valid at one step, or as briefly as the refiner looks, and not at another.
+        differ: How many of them are valid at one step, or as with early exit as the refiner looks, and not at another.
     """
 
     problem: str
@@ -126,7 +126,7 @@ class Always:
 
 def at_the_tolerance(problem: Problem, margin: Margin, by: float) -> Problem:
     """Return the problem with one of its constraints alone, which allows the share ``by`` more than is exceeded."""
-    share = margin.excess / margin.allowed * (1 + by)
+    share = margin.violation / margin.tolerance * (1 + by)
     found = [each for each in problem.constraint if each.reason == margin.reason]
     only = [replace(each, tolerance=each.tolerance * share) for each in found]
     return replace(problem, constraint=tuple(only))
@@ -144,14 +144,16 @@ def always(plans: Plans, count: int, seed: int) -> Always:
         motion = Motion(path, given.rate_control_points)
         rest = motion, given.boundary, given.columns["start_xyz"], given.columns["goal_xyz"]
         margins = judge(problem, robot, *rest, step=STEP)[0].margins
-        exceeded = [name for name, each in margins.items() if each.reason != Reason.BOUNDARY and each.excess > EXCEEDED]
+        exceeded = [
+            name for name, each in margins.items() if each.reason != Reason.BOUNDARY and each.violation > EXCEEDED
+        ]
         name, near = exceeded[random.integers(len(exceeded))], problem
         for _ in range(4):  # each time more exactly, since it decides
             near = at_the_tolerance(near, judge(near, robot, *rest, step=STEP)[0].margins[name], 0.0)
         by = NEAR if k % 2 else -NEAR
         last = at_the_tolerance(near, judge(near, robot, *rest, step=STEP)[0].margins[name], by)
         said = {judge(last, robot, *rest, step=step)[0].valid for step in STEPS}
-        differ += len(said | {Judge(last, robot)(*rest, brief=True)[0].valid}) > 1
+        differ += len(said | {Judge(last, robot)(*rest, early_exit=True)[0].valid}) > 1
     return Always(plans.problem.name, count, differ)
 
 
@@ -173,7 +175,7 @@ def main() -> None:
         (
             item.problem,
             str(item.plans),
-            f"{item.moments:.0f}",
+            f"{item.times:.0f}",
             f"{item.ms:.2f}",
             *verdict(item.ms, TARGETS.get(item.problem), at_most=True),
             f"{item.times_faster:.1f}",

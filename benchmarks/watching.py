@@ -7,14 +7,14 @@ from pathlib import Path
 
 from common import progress
 
-from cnpgen.store.blueprint import default_shard_size
+from cnpgen.store.dataset_spec import default_shard_size
 
 MARKS = (0.1, 0.5, 1.0)  # of the rows
 
 
 @dataclass
 class Sample:
-    """Memory of the processes of a run at one moment.
+    """Memory of the processes of a run at one time.
 
     Attributes:
         done: Share of the rows that are there.
@@ -28,7 +28,7 @@ class Sample:
 
 
 def watch(process: "subprocess.Popen[bytes]", out: Path, rows: int) -> list[Sample]:
-    """Sample a run until it ends; return the moments when ``MARKS`` were reached, the last one just before the end."""
+    """Sample a run until it ends; return the times when ``MARKS`` were reached, the last one just before the end."""
     start, latest = time.perf_counter(), Sample(0.0, 0.0, {})
     found: list[Sample] = []
     while process.poll() is None:

@@ -1,33 +1,76 @@
-"""cnpgen: proven datasets of boundary problems for kinodynamic motion planning on constraint manifolds.
+"""Datasets, planners and trajectory optimization for kinodynamic motion planning on constraint manifolds (CNP-B).
 
-Names are loaded on first use, so that importing the package costs nothing. They are listed once, in ``__init__.pyi``,
-which type checkers and editors read as well (Scientific Python's SPEC 1).
+Example:
+    >>> import cnpgen
+    >>> made = cnpgen.make_dataset("airhockey-hit", "hits", n=2000)  # a folder with train/*.h5 and validation/*.h5
+    >>> dataset = cnpgen.load_dataset("hits")
+    >>> for batch in dataset.batches(64, seed=0):
+    ...     inputs = batch.table  # float32, normalized, shape (64, D)
+    >>> problems = cnpgen.load_boundary_problems("hits", n=8)
+    >>> plans = cnpgen.Planner("airhockey-hit").plan_batch(problems.boundary)
+    >>> refined = cnpgen.refine_plans(plans).plans  # optimize
+    >>> cnpgen.evaluate_plans(refined).valid  # judge with Pinocchio and Coal
+    >>> cnpgen.save_plans("plans.h5", refined)
+
+Functions:
+    Datasets: ``make_dataset``, ``extend_dataset``, ``merge_datasets``, ``load_dataset``, ``inspect_dataset``,
+    ``validate_dataset``.
+    Problems: ``load_problem``, ``load_boundary_problems``, ``draw_boundary_problems``, ``complete``.
+    Plans: ``make_plans``, ``load_plans``, ``save_plans``, ``join_plans``, ``fit_motion``, ``solve_plans``,
+    ``refine_plans``, ``explain_plans``, ``evaluate_plans``, ``export_plans``, ``simulate_plans``, ``run_benchmark``.
+    Models: ``train_model``, ``load_model``, ``save_model``.
+
+Classes:
+    ``Dataset``, ``Problem``, ``Scene``, ``RobotModel``, ``Boundary``, ``Motion``, ``Plans``, ``Planner``, ``Model``,
+    ``BoundaryLayer``, ``PlanLoss``, ``TrainingSettings``, ``RefineOptions``, ``CnpgenError``.
+
+``help(cnpgen.Plans)`` documents one name. Other public names are in these modules:
+
+* ``cnpgen.recipes``: recipes of problems, pipelines and datasets, and their parts.
+* ``cnpgen.losses``: the loss of a plan, its metric and its margins.
+* ``cnpgen.results``: classes that functions return.
+* ``cnpgen.errors``: the exceptions.
+* ``cnpgen.plugins``: contracts of stages, constraints, planners and exporters.
+* ``cnpgen.benchmark``: suites, planners and the simulator.
+
+Names load on first use, so that importing the package is cheap. ``__init__.pyi`` lists them for type checkers (SPEC 1).
 """
 
 import ast
+import sys
+from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+_MODULES = ("benchmark", "errors", "losses", "plugins", "recipes", "results")
 
-def _homes() -> dict[str, str]:
-    """Return the module of every public name: where the stub imports it from."""
-    stub = ast.parse(Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8"))
+
+def _lazy_exports(package: str, file: str) -> tuple[list[str], Callable[[str], Any], Callable[[], list[str]]]:
+    """Return ``__all__``, ``__getattr__`` and ``__dir__`` of a package whose stub beside ``file`` lists its names."""
+    stub = ast.parse(Path(file).with_suffix(".pyi").read_text(encoding="utf-8"))
     imports = [node for node in stub.body if isinstance(node, ast.ImportFrom)]
-    return {alias.name: str(node.module) for node in imports for alias in node.names}
+    modules = {alias.name: str(node.module) for node in imports for alias in node.names}
+
+    def load(name: str) -> Any:
+        if package == "cnpgen" and name in _MODULES:
+            return import_module(f"cnpgen.{name}")
+        if name not in modules:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        value = getattr(import_module(modules[name]), name)
+        setattr(sys.modules[package], name, value)
+        return value
+
+    def names() -> list[str]:
+        return sorted(modules)
+
+    return list(modules), load, names
 
 
-_HOME = _homes()
-__all__ = list(_HOME)
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module 'cnpgen' has no attribute {name!r}")
-    value = getattr(import_module(_HOME[name]), name)
-    globals()[name] = value
-    return value
+__all__, __getattr__, _names = _lazy_exports(__name__, __file__)
 
 
 def __dir__() -> list[str]:
-    return sorted(__all__)
+    """List the public names; none for ``help(cnpgen)``, which would print every class in full."""
+    caller = sys._getframe(1).f_globals.get("__name__")
+    return [] if caller == "inspect" else _names()

@@ -1,75 +1,115 @@
-"""The exceptions that users may want to catch, and the exit codes they turn into."""
+"""Exceptions of the public interface, their exit codes, and parts of their messages."""
 
 import difflib
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+Spelling = Callable[[str, object], str]
+"""Writes an argument with the value that a message proposes for it, None for any value."""
+
+
+def python_spelling(name: str, value: object) -> str:
+    """Write an argument as in a Python call: ``force=True``, ``out=``."""
+    return f"{name}={'' if value is None else repr(value)}"
 
 
 class CnpgenError(Exception):
-    """Base of everything cnpgen raises on purpose.
+    """Base class of all exceptions that cnpgen raises intentionally.
+
+    Args:
+        message: The error. With ``argument`` it is a predicate: "must be positive, got 0". ``{name}`` stands for an
+            argument of ``remedies``.
+        argument: Name of the invalid argument, which begins the text.
+        remedies: Arguments that the message proposes, name -> value; None for any value.
 
     Attributes:
-        exit_code: What the command line exits with.
+        exit_code: Exit code of the command line.
+        argument: Name of the invalid argument, or None.
+        remedies: Arguments that the message proposes.
     """
 
     exit_code = 2
+    argument: str | None = None
+    remedies: Mapping[str, object] = {}
+
+    def __init__(
+        self, message: str = "", *, argument: str | None = None, remedies: Mapping[str, object] | None = None
+    ) -> None:
+        super().__init__(message)
+        self.argument, self.remedies = argument, remedies or {}
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the keyword arguments, too, for worker processes."""
+        return type(self), self.args, {"argument": self.argument, "remedies": self.remedies}
+
+    def text(self, spelling: Spelling = python_spelling) -> str:
+        """Return the message with all arguments in one spelling, by default as in a Python call."""
+        text = " ".join(str(part) for part in self.args)
+        for name, value in self.remedies.items():
+            text = text.replace(f"{{{name}}}", spelling(name, value))
+        named = "" if self.argument is None else spelling(self.argument, None).removesuffix("=") + " "
+        return named + text
+
+    def __str__(self) -> str:
+        return self.text()
 
 
 class UsageError(CnpgenError):
-    """An argument or a combination of arguments that cannot be meant."""
+    """An invalid argument or combination of arguments."""
 
 
 class RecipeError(CnpgenError):
-    """One or more mistakes in a problem, pipeline or dataset file.
+    """One or more errors in a problem, pipeline or dataset file.
 
     Args:
-        mistakes: One line each, with file and key.
+        mistakes: One line per error, with file and key.
     """
 
     def __init__(self, mistakes: Sequence[str]) -> None:
         self.mistakes = tuple(mistakes)
-        super().__init__(self.mistakes)  # so that it can be pickled by worker processes
+        Exception.__init__(self, self.mistakes)  # required for pickling in worker processes
 
     def __str__(self) -> str:
         return "\n".join(self.mistakes)
 
 
 class PluginError(RecipeError):
-    """A recipe needs stages, constraints or robots of packages that are not installed here."""
+    """A recipe needs stages, constraints or robots of packages that are not installed."""
 
     exit_code = 3
 
 
 class DatasetError(CnpgenError):
-    """A dataset on disk that is damaged, unfinished or not what was asked for."""
+    """A dataset on disk that is damaged, unfinished or of another kind than requested."""
 
     exit_code = 1
 
 
 class MachineError(CnpgenError):
-    """The machine cannot do what is asked: no compiler, full disk, unwritable folder, a dead worker."""
+    """A failure of the machine: no compiler, a full disk, a folder without write permission, a dead worker."""
 
     exit_code = 3
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Return ``" (did you mean 'x'?)"`` for the known name nearest to ``name``, or an empty string."""
+    """Return ``" (did you mean 'x'?)"`` for the known name most similar to ``name``, or an empty string."""
     names = list(known)
-    begun = [each for each in names if len(name) > 2 and each.startswith(name)]
-    close = difflib.get_close_matches(name, names, n=1, cutoff=0.5) or begun
+    completions = [candidate for candidate in names if len(name) > 2 and candidate.startswith(name)]
+    close = difflib.get_close_matches(name, names, n=1, cutoff=0.5) or completions
     return f" (did you mean {close[0]!r}?)" if close else ""
 
 
 def lacks(noun: str, name: str, known: Iterable[str]) -> str:
-    """Say that something is not among what there is: ``"has no split 'x', only train, test"``."""
+    """Return the message for an unknown name: ``"has no split 'x', only train, test"``."""
     names = list(known)
     return f"has no {noun} {name!r}{nearest(name, names)}, only {', '.join(names) or 'none'}"
 
 
 def either(choices: Sequence[str]) -> str:
-    """Join what there is a choice of: ``"problem, pipeline or dataset"``."""
+    """Join alternatives: ``"problem, pipeline or dataset"``."""
     return " or ".join(filter(None, (", ".join(choices[:-1]), choices[-1])))
 
 
 def counted(number: int, noun: str) -> str:
-    """Write a number of things: ``"1 row"``, ``"120,000 rows"``."""
+    """Format a number with its noun: ``"1 row"``, ``"120,000 rows"``."""
     return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"

@@ -1,12 +1,12 @@
 """What packages with stages and constraints of their own import: these names stay here, wherever their modules are."""
 
-from cnpgen.kernels.symbolic.state import SymbolicState
+from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
 from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.stages.stage import Round, Stage
+from cnpgen.pipelines.stages.stage import CandidateBatch, Stage
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.schema.keys import PerJoint, Range, field
 from cnpgen.store.field import Field
-from cnpgen.world.state import World
+from cnpgen.world.world import World
 
 __all__ = [
     "Condition",
@@ -15,7 +15,7 @@ __all__ = [
     "Field",
     "PerJoint",
     "Range",
-    "Round",
+    "CandidateBatch",
     "Stage",
     "SymbolicState",
     "World",

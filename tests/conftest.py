@@ -19,16 +19,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cnpgen.kernels.cache import make_private, one_at_a_time
+from cnpgen.kernels.cache import exclusive_lock, make_private_folder
 from cnpgen.kernels.compiler import find_compiler
 from cnpgen.kernels.library import Backend, KernelLibrary, default_cache_folder
 from cnpgen.make.dataset import make_dataset
-from cnpgen.make.load import load_dataset_recipe
 from cnpgen.make.recipe import DatasetRecipe
-from cnpgen.pipelines.load import load_pipeline
+from cnpgen.make.recipe_file import load_dataset_recipe
 from cnpgen.pipelines.pipeline import Pipeline
+from cnpgen.pipelines.pipeline_file import load_pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
-from cnpgen.pipelines.stages.stage import Round
+from cnpgen.pipelines.stages.stage import CandidateBatch
 from cnpgen.robots.robot import Robot
 from cnpgen.store.layout import MANIFEST
 
@@ -107,9 +107,9 @@ def kernels_of(cache_folder: Path) -> Callable[..., KernelLibrary]:
     return library
 
 
-def run_stages(prepared: PreparedPipeline, size: int, *, seed: int = 0, until: str = "") -> Round:
+def run_stages(prepared: PreparedPipeline, size: int, *, seed: int = 0, until: str = "") -> CandidateBatch:
     """Run one round of draws through the stages, up to and including the first one of class ``until``."""
-    draws, random = Round(size), random_generator(seed, "train", 0)
+    draws, random = CandidateBatch(size), random_generator(seed, "train", 0)
     for stage in prepared.pipeline.stage:
         stage.prepare(prepared.context)(draws, random)
         if type(stage).__name__ == until:
@@ -169,12 +169,12 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     """Make a small dataset of a shipped recipe, once for all processes that the tests run in; not to be changed."""
     own = tmp_path_factory.getbasetemp()
     shared = (own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / "tiny"
-    make_private(shared)
+    make_private_folder(shared)
 
     @cache
     def made(name: str) -> Path:
         folder = shared / name
-        with one_at_a_time(shared / f"{name}.lock"):
+        with exclusive_lock(shared / f"{name}.lock"):
             if not (folder / MANIFEST).exists():
                 make_dataset(tiny_recipe(name), folder, shard_size=TINY_SHARD, workers=1)
         return folder

@@ -1,4 +1,4 @@
-"""Rooms import rooms of lower floors only, judges stand apart, nothing heavy is imported before it is needed."""
+"""Import rules: packages import lower layers only, judges are independent, heavy libraries are imported on use."""
 
 import ast
 import subprocess
@@ -13,8 +13,8 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "cnpgen"
 
-# Floors of rooms, the ground first, as docs/architecture.md has them: a room imports rooms of the floors below only.
-FLOORS = (
+# Layers of packages, lowest first, as in docs/architecture.md: a package imports packages of lower layers only.
+LAYERS = (
     ("errors",),
     ("schema", "store"),
     ("machine", "robots", "trajectory", "loader"),
@@ -25,35 +25,35 @@ FLOORS = (
     ("refine", "planner"),
     ("make", "training", "interop"),
     ("validate", "benchmark"),
-    ("cli", "__init__"),
+    ("cli", "recipes", "results", "__init__"),
     ("__main__",),
 )
-MOST_ROOMS = 25  # more than anybody keeps in mind need a reason
-# What a room must not import although it stands on a floor below: judges share no code with what they judge.
+MAX_PACKAGES = 26
+# Packages of lower layers that must not be imported: the judge shares no code with the solvers that it checks.
 SOLVERS = ("kernels", "pipelines", "losses", "refine", "planner")
-APART = {"judges": SOLVERS, "world": SOLVERS, "benchmark.simulator": SOLVERS}
+INDEPENDENT = {"judges": SOLVERS, "world": SOLVERS, "benchmark.simulator": SOLVERS}
 HEAVY = ("casadi", "pinocchio", "coal", "h5py", "joblib", "scipy", "matplotlib", "daqp", "mujoco", "imageio", "ompl")
 FRAMEWORKS = ("torch", "jax", "tensorflow")
-BRIDGES = ("interop.tensorflow",)  # those of one file; users import them
+BRIDGES = ("interop.tensorflow",)  # bridges of one file; users import them
 MODULES = sorted(
     path.relative_to(PACKAGE).with_suffix("") for path in PACKAGE.rglob("*.py") if "_recipes" not in path.parts
 )
 
 
 def name(module: Path) -> str:
-    """Dotted name of a module, without the package's: "store.files.atomic", "store" for its __init__."""
+    """Return the dotted name of a module without "cnpgen.": "store.files.atomic", "store" for its __init__."""
     parts = module.parts[:-1] if module.name == "__init__" and len(module.parts) > 1 else module.parts
     return ".".join(parts)
 
 
-def room(module: str) -> str:
+def package(module: str) -> str:
     return module.partition(".")[0]
 
 
-def floor(module: str) -> int:
-    found = [index for index, rooms in enumerate(FLOORS) if room(module) in rooms]
-    assert len(found) == 1, f"the room {room(module)!r} is on {len(found)} floors of docs/architecture.md, expected one"
-    return found[0]
+def layer(module: str) -> int:
+    layers = [index for index, packages in enumerate(LAYERS) if package(module) in packages]
+    assert len(layers) == 1, f"the package {package(module)!r} is in {len(layers)} layers, expected one"
+    return layers[0]
 
 
 @cache
@@ -63,91 +63,91 @@ def source(module: Path) -> ast.Module:
 
 @cache
 def imports(module: Path, *, everywhere: bool = True) -> frozenset[str]:
-    """Names that a module imports: at its top, which is not for type checkers only, or everywhere."""
+    """Return the names that a module imports, at module level or everywhere."""
     nodes = ast.walk(source(module)) if everywhere else iter(source(module).body)
-    found: set[str] = set()
+    names: set[str] = set()
     for node in nodes:
         if isinstance(node, ast.Import):
-            found.update(alias.name for alias in node.names)
+            names.update(alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module:
-            found.add(node.module)
+            names.add(node.module)
             if node.module.partition(".")[0] == "cnpgen":
-                found.update(f"{node.module}.{alias.name}" for alias in node.names)
-    return frozenset(found)
+                names.update(f"{node.module}.{alias.name}" for alias in node.names)
+    return frozenset(names)
 
 
 NAMES = {name(module): module for module in MODULES}
 
 
 def modules_of(imported: Collection[str]) -> set[str]:
-    """The package's own modules among imported names."""
+    """Return the package's own modules among imported names."""
     return {target for target in (item.removeprefix("cnpgen.") for item in imported) if target in NAMES}
 
 
-def test_a_module_imports_its_own_room_and_those_of_lower_floors() -> None:
+def test_a_module_imports_its_own_package_and_lower_layers_only() -> None:
     for own, module in NAMES.items():
         for target in modules_of(imports(module)):
-            assert room(target) == room(own) or floor(target) < floor(own), (
-                f"cnpgen.{own} imports cnpgen.{target}, which is not on a lower floor"
+            assert package(target) == package(own) or layer(target) < layer(own), (
+                f"cnpgen.{own} imports cnpgen.{target}, which is not in a lower layer"
             )
 
 
-def test_every_room_is_named_in_the_docs_on_its_floor() -> None:
+def test_the_docs_list_every_package_in_its_layer() -> None:
     page = (PACKAGE.parent / "docs" / "architecture.md").read_text(encoding="utf-8")
-    block = page.split("## Who may import whom")[1].split("```")[1]
-    floors = tuple(tuple(line.split("  ")[0].split(", ")) for line in block.splitlines() if line.strip())
-    assert floors == FLOORS
-    assert sum(map(len, floors)) <= MOST_ROOMS
-    assert {each for row in FLOORS for each in row} == {room(module) for module in NAMES}
+    block = page.split("## Import rules")[1].split("```")[1]
+    layers = tuple(tuple(line.split("  ")[0].split(", ")) for line in block.splitlines() if line.strip())
+    assert layers == LAYERS
+    assert len([name for row in layers for name in row if not name.startswith("__")]) <= MAX_PACKAGES
+    assert {name for row in LAYERS for name in row} == {package(module) for module in NAMES}
 
 
-def test_the_picture_shows_every_room_above_those_that_it_may_import() -> None:
-    picture = ElementTree.parse(PACKAGE.parent / "docs" / "images" / "house.svg")
+def test_the_picture_shows_every_package_above_the_layers_that_it_may_import() -> None:
+    picture = ElementTree.parse(PACKAGE.parent / "docs" / "images" / "packages.svg")
     texts = [text for text in picture.iter("{http://www.w3.org/2000/svg}text") if text.get("class") == "n"]
     heights = {str(text.text): float(text.get("y", "nan")) for text in texts}
-    assert heights.pop("cnpgen") < min(heights.values())  # the roof
-    drawn = [{each for each, y in heights.items() if y == height} for height in sorted(set(heights.values()))]
-    assert drawn == [set(row) for row in reversed(FLOORS)]
+    assert heights.pop("cnpgen") < min(heights.values())  # the title
+    drawn = [{name for name, y in heights.items() if y == height} for height in sorted(set(heights.values()))]
+    assert drawn == [set(row) for row in reversed(LAYERS)]
 
 
-def test_no_module_imports_itself_in_a_circle_not_even_for_types() -> None:
+def test_no_import_cycle_exists_not_even_for_types() -> None:
     graph = {own: modules_of(imports(module)) - {own} for own, module in NAMES.items()}
     order = list(TopologicalSorter(graph).static_order())  # raises CycleError
     assert set(order) == set(graph)
 
 
-@pytest.mark.parametrize("part", APART)
-def test_a_judge_shares_no_code_with_what_it_judges(part: str) -> None:
+@pytest.mark.parametrize("part", INDEPENDENT)
+def test_judges_do_not_import_the_solvers_that_they_check(part: str) -> None:
     for own, module in NAMES.items():
         if own == part or own.startswith(f"{part}."):
-            shared = {target for target in modules_of(imports(module)) if room(target) in APART[part]}
+            shared = {target for target in modules_of(imports(module)) if package(target) in INDEPENDENT[part]}
             assert not shared, f"cnpgen.{own} imports {shared}"
 
 
-def test_the_simulator_imports_nothing_of_the_benchmark_around_it() -> None:
+def test_the_simulator_does_not_import_the_rest_of_the_benchmark() -> None:
     for own, module in NAMES.items():
         if own.startswith("benchmark.simulator"):
-            around = {target for target in modules_of(imports(module)) if room(target) == "benchmark"}
+            around = {target for target in modules_of(imports(module)) if package(target) == "benchmark"}
             assert all(target.startswith("benchmark.simulator") for target in around - {"benchmark"}), (own, around)
 
 
-def test_the_symbolic_form_of_a_constraint_is_built_only_where_it_is_asked_for() -> None:
+def test_problems_import_kernels_and_world_on_use_only() -> None:
     for own, module in NAMES.items():
-        if room(own) == "problems":
+        if package(own) == "problems":
             loaded = modules_of(imports(module, everywhere=False))
-            assert not {target for target in loaded if room(target) in {"kernels", "world"}}, own
+            assert not {target for target in loaded if package(target) in {"kernels", "world"}}, own
 
 
-def test_every_file_has_a_reader() -> None:
-    """What nothing imports is left over; kinds are found by their names, and faces and bridges are for users."""
+def test_every_module_is_imported_or_registered() -> None:
+    """Registered kinds are loaded by name; plug-in contracts, facades and bridges are for users."""
     used = {target for module in MODULES for target in modules_of(imports(module))} | modules_of(public_modules())
     by_name = {value.partition(":")[0].removeprefix("cnpgen.") for value in kinds_by_name()}
-    left = {own for own, module in NAMES.items() if own not in used | by_name and module.name != "__init__"}
-    assert left <= {"__main__", "plugins", *BRIDGES}
+    unused = {own for own, module in NAMES.items() if own not in used | by_name and module.name != "__init__"}
+    assert unused <= {"__main__", "plugins", "recipes", "results", "training.select_via_points", *BRIDGES}
 
 
 def public_modules() -> set[str]:
-    """The modules of the names that users type, as the package's stub lists them."""
+    """Return the modules of the public names in the package's stub."""
     stub = ast.parse((PACKAGE / "__init__.pyi").read_text(encoding="utf-8"))
     return {str(node.module) for node in stub.body if isinstance(node, ast.ImportFrom)}
 
@@ -158,17 +158,17 @@ def kinds_by_name() -> set[str]:
     return {spec for group in registry.BUILT_IN.values() for spec in group.values()}
 
 
-def test_no_module_imports_a_heavy_library_at_its_top() -> None:
+def test_no_module_imports_a_heavy_library_at_module_level() -> None:
     for own, module in NAMES.items():
-        found = {imported.split(".")[0] for imported in imports(module, everywhere=False)}
-        assert not found & set(HEAVY), f"cnpgen.{own} imports {found & set(HEAVY)}"
+        heavy = {imported.split(".")[0] for imported in imports(module, everywhere=False)} & set(HEAVY)
+        assert not heavy, f"cnpgen.{own} imports {heavy}"
 
 
 def test_only_the_bridge_of_a_framework_imports_it() -> None:
     for module in MODULES:
-        found = {imported.split(".")[0] for imported in imports(module)} & set(FRAMEWORKS)
-        own = set(name(module).split(".")[1:2]) if room(name(module)) == "interop" else set()
-        assert found <= own, f"{name(module)} imports {found}"
+        frameworks = {imported.split(".")[0] for imported in imports(module)} & set(FRAMEWORKS)
+        own = set(name(module).split(".")[1:2]) if package(name(module)) == "interop" else set()
+        assert frameworks <= own, f"{name(module)} imports {frameworks}"
 
 
 def python(code: str) -> str:
@@ -181,45 +181,45 @@ MAKING = ("make-dataset", "validate", "inspect", "list", "show", "doctor")
 PLANNING = ("complete", "evaluate", "simulate", "benchmark", "export")
 
 
-def test_importing_recipes_or_listing_them_or_asking_for_help_loads_nothing_heavy() -> None:
-    """One process does one after the other, and names the first that loads it."""
+def test_imports_and_help_texts_load_no_heavy_library() -> None:
+    """One process runs all steps and reports the first step that loads a heavy library."""
     code = f"""
 import sys
 from contextlib import suppress
 loaded = {{}}
-def look(what):
+def check(step):
     for heavy in set({(*HEAVY, *FRAMEWORKS, "numpy.testing")!r}) & set(sys.modules):
-        loaded.setdefault(heavy, what)
+        loaded.setdefault(heavy, step)
 import cnpgen
-look("import cnpgen")
-import cnpgen.make.load
-look("import cnpgen.make.load")
+check("import cnpgen")
+import cnpgen.make.recipe_file
+check("import cnpgen.make.recipe_file")
 from cnpgen.cli.main import main
 main(["list"])
-look("list")
+check("list")
 for command in {("", *MAKING, *PLANNING)!r}:
     with suppress(SystemExit):
         main([*command.split(), "--help"])
-    look(command + " --help")
+    check(command + " --help")
 print("LOADED", loaded)
 """
     assert python(code) == "LOADED {}"
 
 
-def test_the_verifier_runs_without_a_module_of_what_it_verifies() -> None:
-    """Not only by what the source says: rows are verified and then there is no kernel or stage in the process."""
+def test_the_verifier_loads_no_solver_module() -> None:
+    """Verify rows in a process and check that it has loaded no kernel and no stage."""
     code = """
 import sys
 import numpy as np
-from cnpgen.problems.load import load_problem
-from cnpgen.problems.robot import load_robot
+from cnpgen.problems.problem_file import load_problem
+from cnpgen.problems.load_robot import load_robot
 from cnpgen.judges.rows.verify import verify_rows
 problem = load_problem("heavy-object")
 robot = load_robot(problem)
 zero = np.zeros((1, robot.n))
 fields = {"start_q": zero, "start_dq": zero, "start_ddq": zero, "goal_q": zero, "goal_dq": zero}
 verify_rows(problem, robot, {**fields, "start_xyz": np.ones((1, 3)), "goal_xyz": np.ones((1, 3))})
-apart = ("cnpgen.kernels", "cnpgen.pipelines", "cnpgen.refine", "casadi")
-print("LOADED", *sorted(m for m in sys.modules if m.startswith(apart)))
+solvers = ("cnpgen.kernels", "cnpgen.pipelines", "cnpgen.refine", "casadi")
+print("LOADED", *sorted(m for m in sys.modules if m.startswith(solvers)))
 """
     assert python(code) == "LOADED"

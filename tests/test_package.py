@@ -48,8 +48,8 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
 
 
 def test_the_wheel_installs_cnpgen_and_nothing_else(wheel: zipfile.ZipFile) -> None:
-    tops = {name.split("/")[0] for name in wheel.namelist()}
-    assert tops == {"cnpgen", f"cnpgen-{cnpgen.__version__}.dist-info"}
+    obstacle_poses = {name.split("/")[0] for name in wheel.namelist()}
+    assert obstacle_poses == {"cnpgen", f"cnpgen-{cnpgen.__version__}.dist-info"}
 
 
 def test_the_wheel_carries_every_recipe_and_robot(wheel: zipfile.ZipFile) -> None:
@@ -81,13 +81,13 @@ assert cnpgen.__file__.startswith(sys.argv[1]), cnpgen.__file__
 assert recipes_root().is_relative_to(sys.argv[1]), recipes_root()
 for name in cnpgen.__all__:
     getattr(cnpgen, name)
-for name in cnpgen.list_recipes("dataset"):
-    recipe = cnpgen.load_dataset_recipe(name)
+for name in cnpgen.recipes.list_recipes("dataset"):
+    recipe = cnpgen.recipes.load_dataset_recipe(name)
     if name not in ("panda-cup", "ur5-wipe"):  # whose robots an extra installs
         assert recipe.pipeline.problem.urdf_path.is_relative_to(sys.argv[1])
 (script,) = entry_points(group="console_scripts", name="cnpgen")
 assert callable(script.load())
-print(version("cnpgen"), len(cnpgen.list_recipes("dataset")))
+print(version("cnpgen"), len(cnpgen.recipes.list_recipes("dataset")))
 """
 
 

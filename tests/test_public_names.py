@@ -4,6 +4,7 @@ import ast
 import functools
 import importlib
 import inspect
+import pydoc
 import subprocess
 import sys
 import typing
@@ -11,6 +12,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import FunctionType
 from typing import Any
+
+import pytest
 
 import cnpgen
 import cnpgen.plugins
@@ -20,14 +23,14 @@ INNER = {  # classes that public signatures name, but that nobody is meant to ma
     "Run": "train_model hands it to its hook `begin`, for the progress that the command line shows",
     "State": "likewise",
     "Columns": "how a Batch finds its fields, which are asked for by name",
-    "Cut": "made by Dataset.batches",
-    "Form": "made by Dataset.batches",
+    "BatchPartition": "made by Dataset.batches",
+    "RowFormat": "made by Dataset.batches",
     "Position": "made by Dataset.batches",
     "Scaling": "what Boundary.from_batch needs of a Normalization",
     "Shard": "what Dataset reads rows from",
     "ShardReader": "likewise",
     "SplitShards": "likewise",
-    "Unsaid": "stands for an argument that was not given",
+    "Missing": "stands for an argument that was not given",
 }
 
 
@@ -77,35 +80,63 @@ def annotated(public: Any) -> Iterator[tuple[str, Any]]:
                     yield f"{function.__name__}: {name}", hint
 
 
+MODULES = ("benchmark", "errors", "losses", "plugins", "recipes", "results")
+MAX_NAMES, MAX_HELP_LINES = 40, 400
+
+
+def public_names() -> dict[str, Any]:
+    """Return all public names: those of the package and of its public modules."""
+    names = {name: getattr(cnpgen, name) for name in cnpgen.__all__ if name != "__version__"}
+    for module in map(importlib.import_module, (f"cnpgen.{name}" for name in MODULES)):
+        listed = getattr(module, "__all__", [name for name in vars(module) if name.endswith("Error")])
+        names |= {f"{module.__name__}.{name}": getattr(module, name) for name in listed}
+    return names
+
+
 def test_every_class_in_a_public_signature_is_public() -> None:
-    public = [getattr(cnpgen, name) for name in cnpgen.__all__]
-    known = {*public, *(getattr(cnpgen.plugins, name) for name in cnpgen.plugins.__all__)} - {cnpgen.__version__}
-    found = {
+    known = list(public_names().values())
+    inner = {
         (kind, f"{owner.__name__}({where})")
-        for owner in public
-        if owner is not cnpgen.__version__
+        for owner in known
         for where, hint in annotated(owner)
         for kind in classes_in(hint)
         if kind not in known
     }
-    assert [f"{kind.__name__} in {where}" for kind, where in found if kind.__name__ not in INNER] == []
-    assert {kind.__name__ for kind, _ in found} == set(INNER), "what is listed here and found nowhere"
+    assert [f"{kind.__name__} in {where}" for kind, where in inner if kind.__name__ not in INNER] == []
+    assert {kind.__name__ for kind, _ in inner} == set(INNER), "listed here, but in no public signature"
 
 
 def test_the_walk_sees_functions_fields_methods_and_properties() -> None:
-    found = {
+    classes = {
         kind
-        for owner in (cnpgen.load_plans, cnpgen.Plans, cnpgen.Motion, cnpgen.obstacle_tops)
+        for owner in (cnpgen.load_plans, cnpgen.Plans, cnpgen.Motion, cnpgen.RobotModel)
         for _, hint in annotated(owner)
         for kind in classes_in(hint)
     }
-    assert {cnpgen.Problem, cnpgen.ProblemRecord, cnpgen.Boundary, cnpgen.States, cnpgen.TrajectorySpec} <= found
+    assert {cnpgen.Problem, cnpgen.Boundary, cnpgen.Scene, cnpgen.recipes.TrajectorySpec} <= classes
 
 
-def test_the_stub_lists_every_name_once_and_nothing_else() -> None:
-    stub = Path(cnpgen.__file__).with_suffix(".pyi").read_text(encoding="utf-8")
+@pytest.mark.parametrize("package", ["cnpgen", "cnpgen.losses", "cnpgen.benchmark"])
+def test_a_stub_lists_every_name_once_and_nothing_else(package: str) -> None:
+    module = importlib.import_module(package)
+    stub = Path(str(module.__file__)).with_suffix(".pyi").read_text(encoding="utf-8")
     names = [line.split(" as ")[1] for line in stub.splitlines()]
-    assert sorted(names) == sorted(set(names)) == sorted(cnpgen.__all__)
+    assert sorted(names) == sorted(set(names)) == sorted(module.__all__) == dir(module)
+
+
+def test_the_package_has_few_names_and_help_is_short() -> None:
+    assert len(cnpgen.__all__) <= MAX_NAMES
+    lines = pydoc.plain(pydoc.render_doc(cnpgen)).splitlines()
+    assert len(lines) <= MAX_HELP_LINES
+    assert any("cnpgen.make_dataset(" in line for line in lines[:15])
+    text = "\n".join(lines)
+    assert all(f"``{name}``" in text for name in cnpgen.__all__ if name != "__version__")
+
+
+def test_public_modules_begin_with_one_sentence() -> None:
+    for name in MODULES:
+        summary = str(importlib.import_module(f"cnpgen.{name}").__doc__).splitlines()[0]
+        assert summary.endswith("."), name
 
 
 def test_importing_the_package_loads_none_of_its_rooms() -> None:

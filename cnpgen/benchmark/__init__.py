@@ -1,1 +1,5 @@
-"""Planners compared: the same problems, the same judge, the same simulator."""
+"""Benchmarks: suites, planners, the simulator and the report."""
+
+from cnpgen import _lazy_exports
+
+__all__, __getattr__, __dir__ = _lazy_exports(__name__, __file__)

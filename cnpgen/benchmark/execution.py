@@ -5,15 +5,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.benchmark.replanning_scenario import Lead
 from cnpgen.benchmark.results import answer_from_dict
 from cnpgen.benchmark.simulator.execute import Execution
 from cnpgen.benchmark.simulator.executed import Executed
 from cnpgen.benchmark.simulator.plant import Plant
 from cnpgen.benchmark.simulator.reference import Reference, StatesAt, states_of
-from cnpgen.benchmark.simulator.scene import Scene
 from cnpgen.benchmark.simulator.simulate import execute_states
+from cnpgen.benchmark.simulator.simulator_scene import Scene
 from cnpgen.benchmark.trajectory import Trajectory
-from cnpgen.benchmark.turns import Lead
 from cnpgen.errors import UsageError
 from cnpgen.plans.plans import Plans
 

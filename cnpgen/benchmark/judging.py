@@ -11,17 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.benchmark.trajectory import Trajectory
-from cnpgen.judges.plans.course import Course
+from cnpgen.judges.plans.evaluated_trajectory import EvaluatedTrajectory
 from cnpgen.judges.plans.judge import reason_of
 from cnpgen.judges.plans.measure import boundary_margins, by_name, measure
-from cnpgen.judges.plans.metrics import metrics_of
-from cnpgen.judges.plans.paper import paper_rule
+from cnpgen.judges.plans.paper import metrics_of, paper_rule
 from cnpgen.judges.plans.sampling import Samples
 from cnpgen.judges.plans.verdict import Reason, Verdict
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.plans import Plans
-from cnpgen.problems.obstacles import obstacle_tops
-from cnpgen.problems.record import ProblemRecord, open_problem
+from cnpgen.problems.obstacles import obstacle_poses_of
+from cnpgen.problems.problem_record import ProblemRecord, open_problem
 from cnpgen.world.path import PathWorld
 
 Array = NDArray[np.float64]
@@ -47,23 +46,23 @@ def judge_answer(problem: Plans, answer: Plans | Trajectory) -> Verdict:
 
 
 def _judge(problem: Plans, samples: Samples, answer: Trajectory) -> Verdict:
-    meaning, robot = open_problem(problem.problem)
-    states = _course(answer, samples.t, jerk=meaning.uses_jerk)
+    loaded, robot = open_problem(problem.problem)
+    states = _trajectory(answer, samples.t, jerk=loaded.uses_jerk)
     goal_xyz = problem.columns["goal_xyz"][0]
-    tops = obstacle_tops(meaning, problem.columns["start_xyz"][0], goal_xyz)
+    obstacle_poses = obstacle_poses_of(loaded, problem.columns["start_xyz"][0], goal_xyz)
     world = _world(problem.problem)
-    world.set_path(states.q, states.dq, states.ddq, tops, states.jerk)
+    world.set_path(states.q, states.dq, states.ddq, obstacle_poses, states.jerk)
     start_tip = world.tip_position[:, 0]
     margins = boundary_margins(states, problem.boundary, samples, robot)
-    for constraint in meaning.constraint:
-        margins += [each.margin(meaning, samples) for each in measure(constraint, world, samples.s, start_tip)]
+    for constraint in loaded.constraint:
+        margins += [each.margin(loaded, samples) for each in measure(constraint, world, samples.s, start_tip)]
     unknown = np.full_like(states.q, np.nan)
-    metrics = metrics_of(meaning, world, samples, unknown if states.jerk is None else states.jerk)
-    paper = paper_rule(meaning, world, tops, goal_xyz)
+    metrics = metrics_of(loaded, world, samples, unknown if states.jerk is None else states.jerk)
+    paper = paper_rule(loaded, world, obstacle_poses, goal_xyz)
     return Verdict(reason_of(margins), by_name(margins), metrics, paper, len(samples.t))
 
 
-def _course(answer: Trajectory, t: Array, *, jerk: bool) -> Course:
+def _trajectory(answer: Trajectory, t: Array, *, jerk: bool) -> EvaluatedTrajectory:
     """Evaluate a trajectory at times, joint by joint."""
     q, dq, ddq = answer.states(t)
     if answer.dq is None:
@@ -71,7 +70,7 @@ def _course(answer: Trajectory, t: Array, *, jerk: bool) -> Course:
     found = [q, dq, ddq]
     if jerk:
         found.append(np.gradient(ddq, t, axis=0) if answer.ddq is None else answer.jerks(t))
-    return Course(*(np.ascontiguousarray(values.T) for values in found))
+    return EvaluatedTrajectory(*(np.ascontiguousarray(values.T) for values in found))
 
 
 @lru_cache(maxsize=2)

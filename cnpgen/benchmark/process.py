@@ -11,7 +11,7 @@ from enum import StrEnum
 from multiprocessing.connection import Connection
 from typing import Any
 
-from cnpgen.benchmark.planner import Plan, Setting
+from cnpgen.benchmark.benchmark_planner import Plan, Setting
 from cnpgen.benchmark.results import answer_from_dict, answer_to_dict
 from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.errors import CnpgenError, MachineError, UsageError

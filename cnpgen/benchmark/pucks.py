@@ -11,15 +11,15 @@ from cnpgen.errors import RecipeError
 from cnpgen.make.complete import complete
 from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.stages.behind_puck import behind
-from cnpgen.pipelines.stages.given_positions import MOST_TASKS, GivenPositions
+from cnpgen.pipelines.stages.boundary_motion import TableAcceleration, TableVelocity
+from cnpgen.pipelines.stages.given_positions import MAX_TASKS, GivenPositions
 from cnpgen.pipelines.stages.hit_angle import HitAngleToGoal
 from cnpgen.pipelines.stages.hitting_configuration import HittingConfiguration
 from cnpgen.pipelines.stages.hitting_velocity import HittingVelocity
-from cnpgen.pipelines.stages.motion import TableAcceleration, TableVelocity
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.constraints.table import Table
+from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.robot import load_robot
 from cnpgen.schema.keys import Range, field
 
 Array = NDArray[np.float64]
@@ -31,18 +31,18 @@ State = tuple[Array, Array, Array]
 class Pucks:
     """A grid of pucks, each hit as fast as the arm can."""
 
-    problem: Problem = field("the problem, which has a table", form="name or path of a problem")
-    x: Range = field("where the pucks lie along world x, both ends included", unit="m")
-    y: Range = field("where they lie along world y, both ends included", unit="m")
-    columns: int = field("how many columns of pucks, evenly spaced along x", low=1)
-    rows: int = field("how many rows of pucks, evenly spaced along y", low=1)
-    goal: tuple[float, float] = field("where they are sent: x, y", unit="m")
-    behind: float = field("where the tip is when it hits: so far behind the puck's centre", unit="m", low=0.0)
+    problem: Problem = field("problem with a table", form="name or path of a problem")
+    x: Range = field("range of the pucks along world x, both ends included", unit="m")
+    y: Range = field("range of the pucks along world y, both ends included", unit="m")
+    columns: int = field("number of columns of pucks, evenly spaced along x", low=1)
+    rows: int = field("number of rows of pucks, evenly spaced along y", low=1)
+    goal: tuple[float, float] = field("target of the pucks: x, y", unit="m")
+    behind: float = field("distance of the tip behind the puck's centre at the hit", unit="m", low=0.0)
 
     def find_mistakes(self) -> Iterator[tuple[str, str]]:
         """Yield (key, what is wrong with it)."""
-        if (count := self.columns * self.rows) > MOST_TASKS:
-            yield "columns", f"a grid of {count:,} pucks is too large, expected at most {MOST_TASKS:,}"
+        if (count := self.columns * self.rows) > MAX_TASKS:
+            yield "columns", f"a grid of {count:,} pucks is too large, expected at most {MAX_TASKS:,}"
 
     def positions(self) -> Array:
         """Place the pucks [m], shape (2, columns x rows), y fastest."""

@@ -13,18 +13,27 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.benchmark.statistics import FIGURES
+from cnpgen.benchmark.hypothesis_tests import FIGURES
 from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.store.files.atomic import machine_error, write_file
+from cnpgen.store.files.document_structure import (
+    ANY_KEY,
+    ANYTHING,
+    FINITE,
+    TEXT,
+    WHOLE,
+    Nullable,
+    Structure,
+    check_structure,
+)
 from cnpgen.store.files.documents import parse_json
-from cnpgen.store.files.forms import ANYTHING, EVERY, FINITE, TEXT, WHOLE, Form, Maybe, check_form
 from cnpgen.store.paths import require_file
 
 FORMAT = "cnpgen-benchmark"
-FORMAT_VERSION = 1
-_POINTS = [Maybe(FINITE)]
+RESULTS_VERSION = 1
+_POINTS = [Nullable(FINITE)]
 _PLAN = {"degree": WHOLE, "path_control_points": [_POINTS], "rate_control_points": _POINTS}
 _NEEDED = {"t": _POINTS, "q": [_POINTS]}
 _SAMPLES = {**_NEEDED, "dq": [_POINTS], "ddq": [_POINTS]}
@@ -32,8 +41,8 @@ _PLANNED = {"ending": TEXT, "planning_s": FINITE, "planning_cpu_s": FINITE, "err
 _VERDICT = {
     "valid": ANYTHING,
     "paper": {"valid": ANYTHING, "finished": ANYTHING},
-    "metrics": {EVERY: Maybe(FINITE)},
-    "value_over_bound": {EVERY: FINITE},
+    "metrics": {ANY_KEY: Nullable(FINITE)},
+    "value_over_bound": {ANY_KEY: FINITE},
 }
 
 
@@ -97,7 +106,7 @@ def open_results(path: Path, identity: dict[str, Any], *, discard: bool = False)
         DatasetError: It holds something else.
         MachineError: It cannot be read or written.
     """
-    head = json.dumps({"format": FORMAT, "format_version": FORMAT_VERSION, **identity})
+    head = json.dumps({"format": FORMAT, "format_version": RESULTS_VERSION, **identity})
     results = Results(path)
     lines: list[str] = []
     if path.exists():
@@ -105,8 +114,9 @@ def open_results(path: Path, identity: dict[str, Any], *, discard: bool = False)
         lines = _whole_lines(path)
         if lines and lines[0] != head and not discard:
             raise UsageError(
-                f"{path} holds results of another run (suite, version or time limit differ): force=True throws them"
-                " away, another folder keeps them"
+                f"{path} holds results of another run (suite, version or time limit differ);"
+                " {force} discards them, another folder keeps them",
+                remedies={"force": True},
             )
         lines = lines[1:] if lines and lines[0] == head else []
     for number, line in enumerate(lines, start=2):
@@ -122,22 +132,22 @@ def open_results(path: Path, identity: dict[str, Any], *, discard: bool = False)
 
 def _check_row(row: Any) -> None:
     """Refuse with a ``ValueError`` what is no line of results; they may come from other people."""
-    check_form(row, {"problem": WHOLE})
+    check_structure(row, {"problem": WHOLE})
     if "ending" in row:
-        check_form(row, {**_PLANNED, "answer": Maybe({EVERY: ANYTHING})})
+        check_structure(row, {**_PLANNED, "answer": Nullable({ANY_KEY: ANYTHING})})
         if (answer := row["answer"]) is not None:
             form = _PLAN if "degree" in answer else {**_NEEDED, **_present(_SAMPLES, answer)}
-            check_form(answer, form)
-            check_form(row, {"verdict": _VERDICT})
+            check_structure(answer, form)
+            check_structure(row, {"verdict": _VERDICT})
             for name in form.keys() - {"degree"}:
                 np.array(answer[name], float)  # of rows of one length
     if "executed" in row:
-        check_form(row, {"executed": {EVERY: {EVERY: ANYTHING}}})
+        check_structure(row, {"executed": {ANY_KEY: {ANY_KEY: ANYTHING}}})
         for executed in row["executed"].values():
-            check_form(executed, _present(dict.fromkeys(FIGURES, Maybe(FINITE)), executed))
+            check_structure(executed, _present(dict.fromkeys(FIGURES, Nullable(FINITE)), executed))
 
 
-def _present(forms: dict[str, Form], table: dict[str, Any]) -> dict[str, Form]:
+def _present(forms: dict[str, Structure], table: dict[str, Any]) -> dict[str, Structure]:
     return {name: form for name, form in forms.items() if name in table}
 
 

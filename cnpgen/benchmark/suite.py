@@ -5,15 +5,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from cnpgen.benchmark.pucks import Pucks, hits_of
-from cnpgen.benchmark.turns import Lead, Turns, turns_of
-from cnpgen.make.boundary_problems import draw_boundary_problems
-from cnpgen.make.load import load_dataset_recipe
-from cnpgen.pipelines.stages.given_positions import MOST_TASKS
+from cnpgen.benchmark.replanning_scenario import Lead, Turns, turns_of
+from cnpgen.make.draw_boundary_problems import draw_boundary_problems
+from cnpgen.make.recipe_file import load_dataset_recipe
+from cnpgen.pipelines.stages.given_positions import MAX_TASKS
 from cnpgen.plans.plans import Plans
-from cnpgen.problems.load import read_problem
 from cnpgen.problems.problem import Problem
+from cnpgen.problems.problem_file import read_problem
 from cnpgen.schema.catalogue import list_recipes, load_recipe, reference
-from cnpgen.schema.keys import NAME, Place, field
+from cnpgen.schema.keys import NAME, RecipeLocation, field
 from cnpgen.schema.parsing import Reader, parse
 from cnpgen.schema.toml import is_kind, read_table
 
@@ -25,8 +25,8 @@ class Draws:
     """Fresh draws of a dataset's recipe: none of its rows is among them."""
 
     recipe: str = field("name or path of a dataset or a pipeline")
-    n: int = field("how many problems", default=RANDOM, low=1, high=MOST_TASKS)
-    seed: int = field("root seed of the draws", default=987_654_321, low=0)
+    n: int = field("number of problems", default=RANDOM, low=1, high=MAX_TASKS)
+    seed: int = field("root seed of the problems", default=987_654_321, low=0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,11 +34,11 @@ class Suite:
     """Boundary problems to compare planners on: pucks on a grid, or draws of a dataset."""
 
     name: str = field("name of the suite: lower-case letters, digits and hyphens", pattern=NAME)
-    version: str = field("semantic version; other problems need another", pattern=r"^\d+\.\d+\.\d+$")
-    title: str = field("one line about it", default="")
-    model: str = field("the shipped model that plans for such problems", default="")
-    pucks: Pucks | None = field("a grid of pucks to hit from rest", default=None)
-    turns: Turns | None = field("pucks to hit on the way to others", default=None)
+    version: str = field("semantic version; other problems need another version", pattern=r"^\d+\.\d+\.\d+$")
+    title: str = field("title in one line", default="")
+    model: str = field("shipped model for these problems", default="")
+    pucks: Pucks | None = field("grid of pucks to hit from rest", default=None)
+    turns: Turns | None = field("pucks to hit by online replanning", default=None)
     draws: Draws | None = field("random problems of a dataset", default=None)
 
     def find_mistakes(self) -> Iterator[tuple[str, str]]:
@@ -99,7 +99,7 @@ def _read(path: Path, mistakes: list[str]) -> Suite | None:
             draws=Draws(recipe=str(path)),
         )
     readers: dict[type, Reader] = {Problem: reference("problem", read_problem, path.parent)}
-    suite = parse(Suite, table, where=Place(str(path)), mistakes=mistakes, readers=readers)
+    suite = parse(Suite, table, where=RecipeLocation(str(path)), mistakes=mistakes, readers=readers)
     if suite is None or suite.draws is None:
         return suite
     beside = path.parent / suite.draws.recipe

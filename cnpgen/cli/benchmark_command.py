@@ -1,4 +1,4 @@
-"""``cnpgen benchmark``: planners compared on the problems of a suite."""
+"""``cnpgen benchmark``: compare planners on the problems of a suite."""
 
 import argparse
 import json
@@ -11,15 +11,15 @@ from cnpgen.cli.parser import Commands, Parser, add_command, add_engine, add_jso
 from cnpgen.cli.progress import Meter
 
 if TYPE_CHECKING:
-    from cnpgen.benchmark.run import Benchmark
+    from cnpgen.benchmark.run_suite import Benchmark
 
 _TEXT = """\
-Every planner plans for one problem after the other, in a process of its own and on one thread; Pinocchio and Coal judge
-what it returns, and with --simulate MuJoCo executes it. What is finished is written to DIR at once, a file per planner:
-after Ctrl-C, kill -9 or a full disk the same command goes on, and with more --planners or --plant it adds to what is
-there. A planner that crashes, runs out of time or returns garbage costs its own row. With --engine the workers of this
-machine or of a cluster plan at once: their times are those of shared machines. docs/benchmark.md says what the
-suites and the planners are. The exit code is 0 if the benchmark is complete, whatever the planners did.
+Each planner solves one problem after the other, in its own process and on one thread. Pinocchio and Coal judge the
+answers, and with --simulate MuJoCo executes them. Every finished problem is written to DIR at once, one file per
+planner. After an interruption the same command resumes; more --planners or --plant extend the results. If a planner
+crashes, times out or returns an invalid result, only that problem is marked as failed. With --engine several workers
+plan at once, so compare CPU times only. docs/benchmark.md describes suites and planners. The exit code is 0 if the
+benchmark is complete, also if planners failed.
 """
 
 
@@ -27,43 +27,43 @@ def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
     parser = add_command(commands, "benchmark", run, title="compare planners on the problems of a suite", text=_TEXT)
     option = parser.add_argument
-    option("suite", metavar="SUITE", nargs="?", help="a suite, see --list, or a dataset for random problems of it")
+    option("suite", metavar="SUITE", nargs="?", help="a suite (see --list), or a dataset for random problems")
     option("--list", action="store_true", help="list suites, planners and plants")
-    option("-o", "--out", metavar="DIR", type=Path, help="the folder of the results (default: SUITE-results)")
-    option("--planners", metavar="NAME", nargs="+", help="which planners (default: cnp-b cnp-b+refine solve)")
-    option("--n", metavar="N", type=values.positive, help="only the first N problems; of a random suite also more")
-    option("--simulate", action="store_true", help="execute the plans, too")
-    option("--plant", metavar="NAME", nargs="+", help="the robots that execute them (default: nominal)")
+    option("-o", "--out", metavar="DIR", type=Path, help="folder of the results (default: SUITE-results)")
+    option("--planners", metavar="NAME", nargs="+", help="planners to compare (default: cnp-b cnp-b+refine solve)")
+    option("--n", metavar="N", type=values.positive, help="number of problems; a random suite has any number")
+    option("--simulate", action="store_true", help="also execute the plans")
+    option("--plant", metavar="NAME", nargs="+", help="simulated robots that execute them (default: nominal)")
     option(
         "--environment",
         metavar="PATH",
         type=Path,
-        help="execute them in this clone of the Air Hockey Challenge, too",
+        help="also execute them in this clone of the Air Hockey Challenge",
     )
     option("--video", action="store_true", help="film the first plan of every planner for the report")
-    option("--time-limit", metavar="S", type=values.seconds, default=60.0, help="for each problem (default: 60s)")
-    text = "processes that execute, and with --engine plan; default one per available core"
+    option("--time-limit", metavar="S", type=values.seconds, default=60.0, help="time limit per problem (default: 60s)")
+    text = "processes for execution, and with --engine for planning; default one per available core"
     option("--workers", metavar="W", type=values.positive, help=text)
     add_engine(parser)
-    option("--force", action="store_true", help="throw away results of another suite, version or time limit in DIR")
+    option("--force", action="store_true", help="discard results of another suite, version or time limit in DIR")
     add_json(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
-    from cnpgen.benchmark.report import save_benchmark_report
+    from cnpgen.benchmark.html_report import save_benchmark_report
     from cnpgen.errors import UsageError
 
     if arguments.list:
         print(_listing(as_json=arguments.json))
         return 0
     if arguments.suite is None:
-        raise UsageError("which suite? 'cnpgen benchmark --list' names them")
+        raise UsageError("the argument SUITE is missing; 'cnpgen benchmark --list' lists suites")
     if (arguments.plant or arguments.environment) and not arguments.simulate:
         option = "--plant" if arguments.plant else "--environment"
-        raise UsageError(f"{option} says where plans are executed: it goes with --simulate only")
+        raise UsageError(f"{option} needs --simulate")
     if arguments.video and not arguments.simulate:
-        raise UsageError("--video films plans as they are executed: it goes with --simulate only")
+        raise UsageError("--video needs --simulate")
     folder = arguments.out or Path(f"{Path(arguments.suite).stem}-results")
     found = _run(arguments, folder)
     report = save_benchmark_report(found, folder / "report.html", video=arguments.video)
@@ -73,7 +73,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _run(arguments: argparse.Namespace, folder: Path) -> "Benchmark":
-    from cnpgen.benchmark.run import FASTEST, run_benchmark
+    from cnpgen.benchmark.run_suite import FASTEST, run_benchmark
 
     meter, doing = Meter(noun="problem"), [""]
 
@@ -99,19 +99,19 @@ def _run(arguments: argparse.Namespace, folder: Path) -> "Benchmark":
             progress=progress,
         )
     except KeyboardInterrupt as interruption:
-        kept = f"{folder} keeps what is finished, run the same command again to go on"
+        kept = f"{folder} keeps all finished problems; run the same command again to resume"
         raise type(interruption)(kept) from interruption
     finally:
         meter.close()
 
 
 def _facts(found: "Benchmark", folder: Path) -> dict[str, Any]:
-    """Return for JSON what is said of all planners."""
-    from cnpgen.benchmark.results import FORMAT, FORMAT_VERSION
+    """Return the results of all planners for JSON."""
+    from cnpgen.benchmark.results import FORMAT, RESULTS_VERSION
 
     return {
         "format": FORMAT,
-        "format_version": FORMAT_VERSION,
+        "format_version": RESULTS_VERSION,
         "suite": found.suite.name,
         "suite_version": found.suite.version,
         "problems": len(found.problems),
@@ -121,8 +121,8 @@ def _facts(found: "Benchmark", folder: Path) -> dict[str, Any]:
 
 
 def _text(found: "Benchmark") -> str:
-    """Lay out a table per plant, a column per planner."""
-    from cnpgen.benchmark.report import table_rows, troubles
+    """Format one table per plant with a column per planner."""
+    from cnpgen.benchmark.html_report import table_rows, troubles
     from cnpgen.cli.describe import table
 
     head = f"{found.suite.name} {found.suite.version}: {len(found.problems)} problems"
@@ -131,7 +131,7 @@ def _text(found: "Benchmark") -> str:
 
 
 def _listing(*, as_json: bool) -> str:
-    """List what there is to compare, and on what."""
+    """List suites, planners and plants."""
     from cnpgen.benchmark.simulator.plant import PLANTS
     from cnpgen.benchmark.suite import list_suites, load_suite
     from cnpgen.cli.describe import table
@@ -148,7 +148,7 @@ def _listing(*, as_json: bool) -> str:
 
 
 def _summary(planner: str) -> str:
-    """Say in a line what a planner does, or why it cannot be used: it may be anybody's."""
+    """Describe a planner in one line, or report why it cannot be used."""
     from cnpgen.cli.describe_keys import kind_summary
     from cnpgen.errors import CnpgenError
     from cnpgen.schema import registry

@@ -1,4 +1,4 @@
-"""``cnpgen complete``: boundary problems from tasks in the workspace."""
+"""``cnpgen complete``: compute boundary problems for tasks in the workspace."""
 
 import argparse
 import json
@@ -13,28 +13,28 @@ from cnpgen.cli.plan_files import check_suffix
 if TYPE_CHECKING:
     from cnpgen.make.complete import Completed
 
-NAMED = 10  # tasks without an answer, by number
+MAX_LISTED_TASKS = 10  # tasks without an answer that are listed by number
 
 _TEXT = """\
-The stages of the pipeline find, in their order, what tasks do not give: 'goal_xyz.x,goal_xyz.y,hit_angle' is enough to
-hit a puck. Columns are those of datasets, components after a dot, numbers in SI. The start is given by joints
-(start_q.*, start_dq.*, start_ddq.*) or by position (start_xyz.*); if nothing of it is given it is the problem's base at
-rest. A hit is as fast as possible unless hit_speed [m/s] or hit_speed_share says otherwise. docs/tasks.md has examples.
-What 'cnpgen solve', 'refine' and 'plan' make plans for is written to OUT, which is printed on stdout; sample_id says
-which task each problem is. Tasks that have no answer are left out, with the reason on stderr; the exit code is 1 if no
-task has one.
+The stages of the pipeline compute everything that the tasks do not give: 'goal_xyz.x,goal_xyz.y,hit_angle' is enough
+to hit a puck. Columns have the names of dataset fields, with components after a dot, in SI units. The start is given by
+joints (start_q.*, start_dq.*, start_ddq.*) or by position (start_xyz.*); the default is the problem's base at rest. The
+speed of a hit is the maximum unless hit_speed [m/s] or hit_speed_share is given. docs/tasks.md has examples.
+The boundary problems are written to OUT, which is printed on stdout; 'cnpgen solve', 'refine' and 'plan' read it. Its
+sample_id is the index of the task. Tasks without an answer are left out, with the reason on stderr. The exit code is 1
+if no task has an answer.
 """
 
 
 def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
     parser = add_command(
-        commands, "complete", run, title="make boundary problems of tasks in the workspace", text=_TEXT
+        commands, "complete", run, title="compute boundary problems for tasks in the workspace", text=_TEXT
     )
     option = parser.add_argument
     option("pipeline", metavar="NAME|FILE", help="a pipeline or dataset by name, or a recipe file")
     option("tasks", metavar="TASKS", type=Path, help="a table of tasks: CSV, or HDF5")
-    option("-o", "--out", metavar="OUT", type=Path, required=True, help="where the boundary problems go, .h5")
+    option("-o", "--out", metavar="OUT", type=Path, required=True, help="file of boundary problems to write, .h5")
     option("--force", action="store_true", help="replace OUT")
     option("--quiet", action="store_true", help="no summary")
     add_json(parser)
@@ -70,13 +70,13 @@ def _facts(found: "Completed", out: Path) -> dict[str, object]:
 
 
 def _summary(found: "Completed") -> list[str]:
-    """Say in a few lines how many tasks have an answer, and why the others have none."""
+    """Summarize how many tasks have an answer, and the reasons of the others."""
     from cnpgen.errors import counted
 
     lines = [f"{len(found.plans):,} of {counted(len(found.reasons), 'task')} completed"]
     for reason, count in found.rejections.items():
-        which = [task for task, why in enumerate(found.reasons) if why == reason][:NAMED]
-        more = f" and {count - NAMED:,} more" if count > NAMED else ""
-        named = f"task{'s' * (count > 1)} {', '.join(map(str, which))}{more}"
+        indices = [task for task, why in enumerate(found.reasons) if why == reason][:MAX_LISTED_TASKS]
+        more = f" and {count - MAX_LISTED_TASKS:,} more" if count > MAX_LISTED_TASKS else ""
+        named = f"task{'s' * (count > 1)} {', '.join(map(str, indices))}{more}"
         lines += textwrap.wrap(f"  {count:,} {reason}: {named}", 110, subsequent_indent="    ")
     return lines

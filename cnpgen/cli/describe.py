@@ -1,4 +1,4 @@
-"""Recipes in words and numbers: what ``cnpgen show`` prints."""
+"""Output of ``cnpgen show``: recipes in words and numbers."""
 
 import textwrap
 from collections.abc import Sequence
@@ -10,8 +10,8 @@ from cnpgen.make.recipe import DatasetRecipe, recipe_digest
 from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.stages.stage import Stage
 from cnpgen.problems.constraints.constraint import Constraint
+from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem, resolved
-from cnpgen.problems.robot import load_robot
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.inline import corners_of
@@ -83,7 +83,7 @@ def describe_problem(problem: Problem) -> str:
     facts += [("obstacle", f"{each.name}: {_obstacle(each)}") for each in problem.obstacle]
     facts += [("motion", numbers(problem.trajectory))]
     objective = numbers(problem.objective)
-    facts += [("objective", f"shortest time, and {objective}" if objective else "shortest time")]
+    facts += [("objective", f"minimum time, and {objective}" if objective else "minimum time")]
     constraints = [(kind_name(item), numbers(item)) for item in problem.constraint]
     robot = load_robot(problem)
     return "\n".join(
@@ -103,7 +103,7 @@ def describe_problem(problem: Problem) -> str:
 
 
 def _obstacle(obstacle: Obstacle) -> str:
-    """List what an obstacle is; of a mesh, which is in it, the number of its corners."""
+    """Describe an obstacle; a mesh by the number of its corners."""
     same = [key.name for key in keys(Obstacle) if getattr(obstacle, key.name) == key.default]
     text = numbers(obstacle, leave_out=("name", "mesh", *same))
     if not obstacle.mesh:
@@ -119,7 +119,7 @@ def _shape(robot: Robot) -> list[str]:
     numbers_of_links, numbers_of_pairs = range(1, 6), (2, 3)
     return [
         "",
-        "  shape: what the collision geometry of the URDF says, and capsules that cover it",
+        "  link geometry: collision geometry of the URDF, and capsules that enclose it",
         *table(links, indent="    ", right=numbers_of_links),
         "",
         "  pairs of links, by random states",
@@ -128,7 +128,7 @@ def _shape(robot: Robot) -> list[str]:
 
 
 def _limit_rows(problem: Problem, robot: Robot) -> list[tuple[str, ...]]:
-    """List what limits every joint; its jerk where the problem has something to say about jerks."""
+    """List the limits of every joint; the jerk limit if the problem limits jerks."""
     ends = zip(robot.position_lower, robot.position_upper, strict=True)
     columns = [
         ("position", "rad", [f"{low:.4g} to {high:.4g}" for low, high in ends]),
@@ -154,7 +154,7 @@ def with_units(units: str, cells: Sequence[str]) -> tuple[str, ...]:
 
 
 def title_lines(title: str) -> list[str]:
-    """Wrap what a recipe or a kind is, as lines below its name."""
+    """Wrap a title as lines below a name."""
     return textwrap.wrap(title, WIDTH - 2, initial_indent="  ", subsequent_indent="  ")
 
 
@@ -197,7 +197,7 @@ def kind_name(item: Stage | Constraint) -> str:
 
 
 def recipe_to_dict(recipe: Recipe) -> dict[str, Any]:
-    """Describe a recipe for JSON: everything it refers to resolved, in SI units, and what follows from it.
+    """Describe a recipe for JSON: everything it refers to resolved, in SI units, with derived values.
 
     Raises:
         RecipeError: The robot's URDF does not fit the problem.
@@ -238,18 +238,18 @@ def table(
     """
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]) - 1)]
     hanging = indent + " " * (sum(widths) + 2 * len(widths))
-    room = max(WIDTH - len(hanging), 30)
+    width = max(WIDTH - len(hanging), 30)
     lines = []
     for *cells, last in rows:
         pairs = enumerate(zip(cells, widths, strict=True))
         head = indent + "".join(f"{text.rjust(w) if i in right else text.ljust(w)}  " for i, (text, w) in pairs)
-        parts = [str(last)] if isinstance(last, Path) else _wrapped(last, room, one_line=one_line)
+        parts = [str(last)] if isinstance(last, Path) else _wrapped(last, width, one_line=one_line)
         lines += [(head + (parts[0] if parts else "")).rstrip(), *(hanging + part for part in parts[1:])]
     return lines
 
 
-def _wrapped(text: str, room: int, *, one_line: bool) -> list[str]:
+def _wrapped(text: str, width: int, *, one_line: bool) -> list[str]:
     lines = 1 if one_line else None
     return textwrap.wrap(
-        text, room, break_on_hyphens=False, break_long_words=one_line, max_lines=lines, placeholder=" ..."
+        text, width, break_on_hyphens=False, break_long_words=one_line, max_lines=lines, placeholder=" ..."
     )

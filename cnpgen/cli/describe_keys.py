@@ -1,4 +1,4 @@
-"""The keys of recipe files, as the schema knows them: those of one kind of stage or constraint, or all of them."""
+"""The keys of recipe files: those of one kind of stage or constraint, or all of them."""
 
 import dataclasses
 import re
@@ -20,7 +20,7 @@ FILES: dict[Kind, type] = {"problem": Problem, "pipeline": Pipeline, "dataset": 
 """What the files of a kind are read as."""
 
 GROUPS = {Stage: registry.STAGES, Constraint: registry.CONSTRAINTS}
-"""Tables whose key ``use`` says of which kind they are -> where the kinds are registered."""
+"""Tables with a key ``use`` that names their kind -> registry of the kinds."""
 
 _INTRODUCTION = """\
 # Keys of recipe files
@@ -43,7 +43,7 @@ def _first_line(kind: type) -> str:
 
 
 def describe_kind(group: str, name: str) -> str:
-    """Describe a kind of stage or constraint: what it does, and the keys of its table.
+    """Describe a kind of stage or constraint: its purpose, and the keys of its table.
 
     Args:
         group: ``registry.STAGES`` or ``registry.CONSTRAINTS``.
@@ -53,7 +53,7 @@ def describe_kind(group: str, name: str) -> str:
         RecipeError: There is no such kind.
     """
     kind = registry.load(group, name)
-    head = ("key", "default", "meaning (value)")
+    head = ("key", "default", "description (value)")
     rows = [(key.name, _default(key), f"{key.doc} ({_expected(key)})") for key in keys(kind)]
     text = table([head, *rows], indent="  ") if rows else ["  it has no keys"]
     return "\n".join([f"{registry.noun_of(group)} {name}", *title_lines(kind_summary(kind)), "", *text])
@@ -89,7 +89,7 @@ def _sections(cls: type, path: str) -> Iterator[str]:
         name = f"{path}.{key.name}" if path else key.name
         if part in GROUPS:
             yield f"### `[[{name}]]`"
-            yield "The key `use` of each says of which kind it is; the other keys are those of the kind."
+            yield "The key `use` names the kind; the other keys are those of the kind."
             for use in registry.names(GROUPS[part]):
                 kind = registry.load(GROUPS[part], use)
                 yield f"#### `{use}`"
@@ -110,7 +110,7 @@ def part_of(key: Key) -> type | None:
 
 
 def is_array(key: Key) -> bool:
-    """Whether a key holds tables, one after the other."""
+    """Return whether a key holds a list of tables."""
     args = get_args(key.hint)
     return bool(args) and dataclasses.is_dataclass(args[0]) and args[0] is not Range
 
@@ -119,7 +119,7 @@ def _markdown_table(cls: type) -> str:
     rows = [
         (f"`{key.name}`", _escaped(_expected(key)), _escaped(_default(key)), _escaped(key.doc)) for key in keys(cls)
     ]
-    lines = [("key", "value", "default", "meaning"), ("---",) * 4, *rows]
+    lines = [("key", "value", "default", "description"), ("---",) * 4, *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
@@ -135,7 +135,7 @@ def _default(key: Key) -> str:
 
 
 def _expected(key: Key) -> str:
-    """Say what may be written: ``"a length [m], at least 0"``."""
+    """Describe the accepted values: ``"a length [m], at least 0"``."""
     bounds = {"at least": key.low, "at most": key.high}
     said = [f"{which} {_exactly(bound)}" for which, bound in bounds.items() if bound is not None]
     return ", ".join([key.expected, *said])
@@ -151,7 +151,7 @@ def _table_to_dict(cls: type) -> dict[str, Any]:
 
 def _key_to_dict(key: Key) -> dict[str, Any]:
     """Describe a key, and the table or the tables that it holds."""
-    left_out, part = ("hint", "default", "late"), part_of(key)
+    left_out, part = ("hint", "default", "since_version"), part_of(key)
     content = {spec.name: getattr(key, spec.name) for spec in dataclasses.fields(key) if spec.name not in left_out}
     content |= {"expected": key.expected, "required": key.required}
     if part in GROUPS:

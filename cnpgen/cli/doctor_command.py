@@ -1,11 +1,10 @@
-"""``cnpgen doctor``: whether this machine has what cnpgen needs."""
+"""``cnpgen doctor``: check this machine."""
 
 import argparse
 import sys
 from typing import TYPE_CHECKING
 
 from cnpgen.cli.parser import Commands, Parser, add_command, add_json
-from cnpgen.cli.shell import in_shell
 from cnpgen.errors import MachineError, counted
 
 if TYPE_CHECKING:
@@ -13,14 +12,14 @@ if TYPE_CHECKING:
 
 
 _TEXT = """\
-What was found is on stdout, warnings and problems on stderr, each with what to do about it. The exit code is 3 if
-something that cnpgen needs does not work; without a C compiler it works, 10 to 20 times slower.
+Results are printed on stdout, warnings and problems with their remedies on stderr. The exit code is 3 if a required
+library does not work. Without a C compiler cnpgen works 10 to 20 times slower.
 """
 
 
 def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
-    title = "check that this machine has what cnpgen needs"
+    title = "check this machine"
     add_json(add_command(commands, "doctor", run, title=title, text=_TEXT))
 
 
@@ -33,7 +32,7 @@ def run(arguments: argparse.Namespace) -> int:
     report = check_machine()
     print(json.dumps(report.to_dict(), indent=2) if arguments.json else machine_text(report))
     for note in report.notes:
-        print(f"cnpgen: warning: {in_shell(note, ('out', 'workers'))}", file=sys.stderr)
+        print(f"cnpgen: warning: {note}", file=sys.stderr)
     for problem in report.problems:
         print(f"cnpgen: error: {problem}", file=sys.stderr)
     return 0 if report.ok else MachineError.exit_code
@@ -70,7 +69,7 @@ def _cache(report: "MachineReport") -> str:
 def _verdict(report: "MachineReport") -> str:
     if not report.ok:
         return f"cnpgen does not work here: {counted(len(report.problems), 'problem')}, below"
-    text = "everything that cnpgen needs works"
+    text = "all requirements are met"
     return f"{text}; {counted(len(report.notes), 'warning')}, below" if report.notes else text
 
 

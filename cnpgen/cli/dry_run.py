@@ -1,27 +1,27 @@
-"""What ``make-dataset --dry-run`` prints: the blueprint of a dataset and the state of its folder."""
+"""Output of ``make-dataset --dry-run``: the specification of a dataset and the state of its folder."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cnpgen.cli.describe import table
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.make.blueprint import dataset_folder, draw_up
-from cnpgen.make.load import load_notes
-from cnpgen.store.blueprint import Blueprint, shards
+from cnpgen.make.recipe_file import load_notes
+from cnpgen.make.resolve_spec import dataset_folder, draw_up
+from cnpgen.store.dataset_spec import DatasetSpec, shards
 from cnpgen.store.layout import MANIFEST
-from cnpgen.store.record import pending
 from cnpgen.store.shard import storage_dtype
-from cnpgen.store.workspace import Workspace, begun_blueprint, check_clearable, find_workspace
+from cnpgen.store.shard_record import pending
+from cnpgen.store.workspace import Workspace, check_clearable, find_workspace, started_spec
 
 if TYPE_CHECKING:
     from cnpgen.make.recipe import DatasetRecipe
 
 SHARD_OVERHEAD = 41_000  # bytes: what the HDF5 file and the sidecar of a shard take beside the rows
-DOCUMENTS = 90_000  # bytes: plan.json, manifest, card and statistics
+DOCUMENTS = 90_000  # bytes: specification.json, manifest, card and statistics
 
 
-def blueprint_text(recipe: "DatasetRecipe", out: str | None, *, force: bool, **settings: Any) -> str:
-    """Draw up the blueprint of a dataset without making anything, and describe it.
+def spec_text(recipe: "DatasetRecipe", out: str | None, *, force: bool, **settings: Any) -> str:
+    """Resolve the specification of a dataset without making anything, and describe it.
 
     Args:
         recipe: The recipe.
@@ -34,26 +34,26 @@ def blueprint_text(recipe: "DatasetRecipe", out: str | None, *, force: bool, **s
     """
     load_notes(recipe)
     workspace = find_workspace(dataset_folder(recipe, out))
-    blueprint = draw_up(recipe, workspace, **settings, force=force).blueprint
-    files = shards(blueprint)
-    splits = [f"{split} {rows:,}" for split, rows in blueprint.splits.items()]
-    counts = [f"{split} {sum(task.split == split for task in files)}" for split in blueprint.splits]
+    spec = draw_up(recipe, workspace, **settings, force=force).spec
+    files = shards(spec)
+    splits = [f"{split} {rows:,}" for split, rows in spec.splits.items()]
+    counts = [f"{split} {sum(task.split == split for task in files)}" for split in spec.splits]
     facts = [
         ("folder", workspace.folder),
-        ("state", folder_state(workspace, blueprint, force=force)),
-        ("rows", f"{sum(blueprint.splits.values()):,}: {', '.join(splits)}"),
-        ("shards", f"{len(files)} of at most {blueprint.shard_size:,} rows: {', '.join(counts)}"),
-        ("size", f"about {size_text(estimate_bytes(blueprint))}, {row_bytes(blueprint)} bytes per row"),
-        ("seed", str(blueprint.seed)),
-        ("backend", blueprint.backend),
-        ("dtype", blueprint.dtype),
-        ("recipe", f"sha256 {blueprint.recipe_sha256}"),
+        ("state", folder_state(workspace, spec, force=force)),
+        ("rows", f"{sum(spec.splits.values()):,}: {', '.join(splits)}"),
+        ("shards", f"{len(files)} of at most {spec.shard_size:,} rows: {', '.join(counts)}"),
+        ("size", f"about {size_text(estimate_bytes(spec))}, {row_bytes(spec)} bytes per row"),
+        ("seed", str(spec.seed)),
+        ("backend", spec.backend),
+        ("dtype", spec.dtype),
+        ("recipe", f"sha256 {spec.recipe_sha256}"),
     ]
     fields = [("field", "columns", "unit", "what")]
-    fields += [(item.name, str(item.width or "-"), item.unit, item.long_name) for item in blueprint.fields]
+    fields += [(item.name, str(item.width or "-"), item.unit, item.long_name) for item in spec.fields]
     return "\n".join(
         [
-            f"{blueprint.name} {blueprint.version}",
+            f"{spec.name} {spec.version}",
             *table(facts, indent="  "),
             "",
             *table(fields, indent="  ", right=(1,)),
@@ -61,29 +61,29 @@ def blueprint_text(recipe: "DatasetRecipe", out: str | None, *, force: bool, **s
     )
 
 
-def row_bytes(blueprint: Blueprint) -> int:
-    """Return what a row takes."""
-    return sum(max(field.width, 1) * storage_dtype(field, blueprint.dtype).itemsize for field in blueprint.fields)
+def row_bytes(spec: DatasetSpec) -> int:
+    """Return the size of a row in bytes."""
+    return sum(max(field.width, 1) * storage_dtype(field, spec.dtype).itemsize for field in spec.fields)
 
 
-def estimate_bytes(blueprint: Blueprint) -> int:
-    """Estimate what the finished dataset takes."""
-    return sum(blueprint.splits.values()) * row_bytes(blueprint) + len(shards(blueprint)) * SHARD_OVERHEAD + DOCUMENTS
+def estimate_bytes(spec: DatasetSpec) -> int:
+    """Estimate the size of the finished dataset in bytes."""
+    return sum(spec.splits.values()) * row_bytes(spec) + len(shards(spec)) * SHARD_OVERHEAD + DOCUMENTS
 
 
-def folder_state(workspace: Workspace, blueprint: Blueprint, *, force: bool) -> str:
-    """Say what is in the folder and what making the dataset would do to it."""
-    if workspace.holds == "nothing":
+def folder_state(workspace: Workspace, spec: DatasetSpec, *, force: bool) -> str:
+    """Describe the content of the folder and the effect of making the dataset."""
+    if workspace.content == "nothing":
         return "new"
-    if workspace.holds != "a dataset":
+    if workspace.content != "a dataset":
         return "holds something else: would be refused"
     if force:
         return _replacement(workspace)
-    return _refusal(workspace, blueprint) or _progress(workspace.folder, blueprint)
+    return _refusal(workspace, spec) or _progress(workspace.folder, spec)
 
 
 def _replacement(workspace: Workspace) -> str:
-    """Say whether --force would replace the dataset in a folder."""
+    """Describe whether --force would replace the dataset in a folder."""
     try:
         check_clearable(workspace)
     except UsageError as error:
@@ -91,23 +91,23 @@ def _replacement(workspace: Workspace) -> str:
     return "holds a dataset, which would be replaced"
 
 
-def _refusal(workspace: Workspace, blueprint: Blueprint) -> str:
-    """Say what becomes of a dataset that is not the one that would be made; nothing if it is."""
+def _refusal(workspace: Workspace, spec: DatasetSpec) -> str:
+    """Describe why another dataset in the folder would be refused; empty if it is the same one."""
     try:
-        begun = begun_blueprint(workspace, blueprint)
+        begun = started_spec(workspace, spec)
     except UsageError:
         return "holds another dataset: would be refused without --force"
     except DatasetError:
-        return "holds a dataset with a damaged plan.json: would be refused without --force"
-    return "" if begun is not None else "holds a plan.json of which nothing was made: would be replaced"
+        return "holds a dataset with a damaged specification.json: would be refused without --force"
+    return "" if begun is not None else "holds a specification.json without shards: would be replaced"
 
 
-def _progress(folder: Path, blueprint: Blueprint) -> str:
-    """Say how far a dataset is."""
-    todo, count = len(pending(folder, blueprint)), len(shards(blueprint))
+def _progress(folder: Path, spec: DatasetSpec) -> str:
+    """Describe the progress of a dataset."""
+    todo, count = len(pending(folder, spec)), len(shards(spec))
     if todo == 0 and (folder / MANIFEST).is_file():
-        return "complete already"
-    return f"{count - todo} of {count} shards are there: would go on"
+        return "already complete"
+    return f"{count - todo} of {count} shards exist: would resume"
 
 
 def size_text(number: int) -> str:

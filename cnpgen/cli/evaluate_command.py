@@ -15,9 +15,8 @@ if TYPE_CHECKING:
     from cnpgen.plans.evaluate import Evaluation
 
 _TEXT = """\
-Every plan is looked at on a fine time grid and between its moments; docs/verdict.md says how. The exit code is 0 if
-every plan is valid, and 1 if any is not, if there are none, or if the file is damaged. --workers changes nothing but
-the time that it takes.
+Every plan is checked on a fine time grid and between its samples (docs/verdict.md). The exit code is 0 if every plan
+is valid, and 1 if a plan is invalid, if the file holds no plans, or if it is damaged. --workers changes only the time.
 """
 
 
@@ -25,23 +24,23 @@ def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
     parser = add_command(commands, "evaluate", run, title="judge the plans of a file", text=_TEXT)
     option = parser.add_argument
-    option("file", metavar="FILE", type=Path, help="a file of plans, .h5")
-    option("--problem", metavar="NAME|FILE", help="the problem that they must be for; its tolerances count")
+    option("file", metavar="FILE", type=Path, help="plan file, .h5")
+    option("--problem", metavar="NAME|FILE", help="the problem of the plans; its tolerances are used")
     option(
         "--step",
         metavar="S",
         type=values.seconds,
         default=1e-3,
-        help="time between two looks (default: 1ms, at most 10ms)",
+        help="time between two samples (default: 1ms, at most 10ms)",
     )
     option("--workers", metavar="W", type=values.positive, help="processes; default one per available core")
-    option("--list", action="store_true", help="list the plans, too: a line each, those that are not valid first")
+    option("--list", action="store_true", help="also list the plans, one per line, invalid ones first")
     option("--plot", metavar="PICTURE", type=values.plot_file, help="draw one plan: .png, .pdf or .svg")
     option(
         "--plan",
         metavar="I",
         type=values.natural,
-        help="the plan to draw; default the first that is not valid, or plan 0 if all are",
+        help="plan to draw; default the first invalid one, or plan 0",
     )
     add_json(parser)
 
@@ -51,7 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
     from cnpgen.errors import UsageError
 
     if arguments.plan is not None and not arguments.plot:
-        raise UsageError("--plan says which plan is drawn: it goes with --plot only")
+        raise UsageError("--plan needs --plot")
     found = _evaluate(arguments)
     if arguments.json:
         _write_json(arguments.file, found)
@@ -82,7 +81,7 @@ def _evaluate(arguments: argparse.Namespace) -> "Evaluation":
 
 
 def _write_json(file: Path, found: "Evaluation") -> None:
-    """Write one document, plan by plan: all of them at once need much memory."""
+    """Write one document, plan by plan, to limit memory."""
     from cnpgen.store.files.documents import render
 
     head = render({"file": str(file), **found.summary()})
@@ -93,20 +92,20 @@ def _write_json(file: Path, found: "Evaluation") -> None:
 
 
 def _draw(found: "Evaluation", picture: str, index: int | None) -> None:
-    from cnpgen.judges.plans.plot import plot_plan
+    from cnpgen.judges.plans.plan_plot import plot_plan
     from cnpgen.plans import open_problem
-    from cnpgen.problems.obstacles import obstacle_tops
+    from cnpgen.problems.obstacles import obstacle_poses_of
 
     plans, chosen = found.plans, _chosen(found) if index is None else index
     problem, robot = open_problem(plans.problem)
-    tops = obstacle_tops(problem, plans.columns["start_xyz"][chosen], plans.columns["goal_xyz"][chosen])
+    obstacle_poses = obstacle_poses_of(problem, plans.columns["start_xyz"][chosen], plans.columns["goal_xyz"][chosen])
     note = f"sample {plans.sample_id[chosen]}: {found.verdicts[chosen]}"
-    plot_plan(problem, robot, plans.motion, chosen, picture, tops=tops, note=note)
+    plot_plan(problem, robot, plans.motion, chosen, picture, obstacle_poses=obstacle_poses, note=note)
     print(f"drawn: plan {chosen} in {picture}", file=sys.stderr)
 
 
 def _chosen(found: "Evaluation") -> int:
-    """Choose the plan that is drawn: the first that is not valid and can be drawn, else the first that can be."""
+    """Choose the plan to draw: the first invalid one that can be drawn, else the first that can be drawn."""
     from cnpgen.errors import DatasetError
 
     able = [index for index, verdict in enumerate(found.verdicts) if verdict.margins]

@@ -15,13 +15,13 @@ if TYPE_CHECKING:
     from cnpgen.plans.join import JoinedPlans
 
 FORMS = ("npz", "csv", "joint-trajectory")  # those of cnpgen.plans.export, which takes a while to import
-NAMED = 10  # plans that are not valid, by number
+MAX_LISTED_PLANS = 10  # invalid plans that are listed by number
 
 _TEXT = """\
 npz is one NumPy archive; csv and joint-trajectory (a message of ROS 2, as JSON) are a folder with one file per plan.
-docs/plan-format.md shows how to read them. What was written is printed on stdout. Plans that cannot be sampled are
-named on stderr and left out; the exit code is then 1. With --join what is exported is executed as it is: positions,
-velocities and accelerations go on from plan to plan without a jump (1e-9 in SI), or nothing is written.
+docs/plan-format.md shows how to read them. The path of the output is printed on stdout. Plans that cannot be sampled
+are left out and listed on stderr; the exit code is then 1. With --join, positions, velocities and accelerations must be
+continuous from plan to plan (1e-9 in SI); otherwise nothing is written.
 """
 
 
@@ -29,7 +29,7 @@ def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
     parser = add_command(commands, "export", run, title="write plans as sampled trajectories", text=_TEXT)
     option = parser.add_argument
-    option("file", metavar="FILE", type=Path, help="a file of plans, .h5")
+    option("file", metavar="FILE", type=Path, help="plan file, .h5")
     option("--to", metavar="FORM", required=True, choices=FORMS, help="the form: npz, csv or joint-trajectory")
     option("--rate", metavar="HZ", type=values.hertz, default=1000.0, help="samples per second (default: 1000)")
     option(
@@ -46,16 +46,16 @@ def add(commands: "Commands[Parser]") -> None:
         metavar="NEXT",
         type=Path,
         action="append",
-        help="cut every plan of FILE and go on with the plan of the same number of this file of plans; may be repeated",
+        help="cut every plan of FILE and continue with the plan of the same number of this file; may be repeated",
     )
     option(
         "--at",
         metavar="S",
         type=values.seconds,
         action="append",
-        help="when NEXT takes over, since the start: 330ms; once for each --join (default: at the end)",
+        help="time at which NEXT takes over: 330ms; once per --join (default: at the end)",
     )
-    option("--force", action="store_true", help="replace files that are there")
+    option("--force", action="store_true", help="replace existing files")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -75,7 +75,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _plans(arguments: argparse.Namespace) -> "Plans | JoinedPlans":
-    """Read the plans, and join them with those that follow."""
+    """Read the plans, and join them with the following ones."""
     from cnpgen.errors import UsageError, counted
     from cnpgen.plans.join import join_plans
 
@@ -97,14 +97,14 @@ def _counted(exported: "Exported") -> str:
 
 
 def _invalid(exported: "Exported") -> str:
-    """Name the exported plans that are known not to be valid."""
-    first, left = exported.invalid[:NAMED], len(exported.invalid[NAMED:])
+    """List the exported plans that are known to be invalid."""
+    first, left = exported.invalid[:MAX_LISTED_PLANS], len(exported.invalid[MAX_LISTED_PLANS:])
     which = ", ".join(map(str, first)) + (f" and {left:,} more" if left else "")
-    return f"not valid by their status ('cnpgen evaluate' says why): plan{'s' * (len(first) > 1)} {which}"
+    return f"not valid by their status ('cnpgen evaluate' reports why): plan{'s' * (len(first) > 1)} {which}"
 
 
 def _place(arguments: argparse.Namespace) -> Path:
-    """Return where to write to, which must be free without ``--force``."""
+    """Return the output path, which must not exist without ``--force``."""
     from cnpgen.errors import UsageError
 
     file: Path = arguments.file
@@ -113,12 +113,12 @@ def _place(arguments: argparse.Namespace) -> Path:
         raise UsageError(f"{out} must be in a folder that exists")
     target = out / "plans.npz" if arguments.to == "npz" and out.is_dir() else out
     if target.exists() and not arguments.force and not (target.is_dir() and not any(target.iterdir())):
-        raise UsageError(f"{target} is there already; --force replaces what has the same name")
+        raise UsageError(f"{target} exists; --force replaces files of the same name")
     return out
 
 
 def _chosen(plans: "Plans | JoinedPlans", arguments: argparse.Namespace) -> list[int] | None:
-    """Return the indices of the plans that are wanted, or None for all of them."""
+    """Return the indices of the selected plans, or None for all of them."""
     import numpy as np
 
     from cnpgen.errors import UsageError

@@ -1,4 +1,4 @@
-"""``cnpgen extend``: add rows to a dataset."""
+"""``cnpgen extend``: add samples to a dataset."""
 
 import argparse
 from functools import partial
@@ -8,18 +8,18 @@ from cnpgen.cli.make_command import make_metered
 from cnpgen.cli.parser import Commands, Parser, add_command, add_engine
 
 _TEXT = """\
-The rows are those that a dataset made at once would have, every split in the proportion of the recipe. Shards that are
-there stay as they are, to the bit; statistics, card and manifest are of all rows afterwards. Until it is finished the
-dataset has no manifest: after an interruption the same command goes on. docs/dataset-format.md says more.
+The samples are those of a dataset that is made at once, every split in the proportion of the recipe. Existing shards
+do not change; statistics, card and manifest are written again. Until it is finished the dataset has no manifest; after
+an interruption the same command resumes (docs/dataset-format.md).
 """
 
 
 def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
-    parser = add_command(commands, "extend", run, title="add rows to a dataset", text=_TEXT)
+    parser = add_command(commands, "extend", run, title="add samples to a dataset", text=_TEXT)
     option = parser.add_argument
     option("folder", metavar="DIR", help="the dataset")
-    option("--n", metavar="N", type=values.rows, required=True, help="rows of all splits together afterwards")
+    option("--n", metavar="N", type=values.rows, required=True, help="total number of samples afterwards")
     option("--workers", metavar="W", type=values.positive, help="processes; default one per available core")
     add_engine(parser)
     option("--quiet", action="store_true", help="no progress and no summary")

@@ -1,4 +1,4 @@
-"""``cnpgen init``: a problem, a pipeline and a dataset for anybody's arm, from its URDF."""
+"""``cnpgen init``: write a problem, a pipeline and a dataset for an arm, from its URDF."""
 
 import argparse
 from pathlib import Path
@@ -6,28 +6,26 @@ from pathlib import Path
 from cnpgen.cli.parser import Commands, Parser, add_command
 
 _TEXT = """\
-Writes NAME/problem.toml, NAME/pipeline.toml and NAME/dataset.toml: motions from rest to rest between two boxes of
-positions in front of the robot, within its limits and clear of itself. They work as they are, every key is explained in
-them, and what was found out about the robot is said at the top: joints, masses, frames, links and their pairs, limits
-that the URDF does not have and what was put in. docs/your-arm.md goes on from there.
+The command writes NAME/problem.toml, NAME/pipeline.toml and NAME/dataset.toml: motions from rest to rest between two
+boxes of positions in front of the robot, within its limits and without self-collision. Comments explain every key. The
+head of problem.toml lists findings about the robot: joints, masses, frames, link pairs, and placeholders for limits
+that the URDF lacks. docs/your-arm.md continues from there.
 """
 
 
 def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
-    parser = add_command(commands, "init", run, title="write recipes for an arm of your own", text=_TEXT)
+    parser = add_command(commands, "init", run, title="write recipes for your own arm", text=_TEXT)
     option = parser.add_argument
-    option("name", metavar="NAME", help="what the recipes are called, and the folder that they are written to")
-    option("--urdf", metavar="FILE", type=Path, required=True, help="the robot; the recipes refer to it where it is")
-    option(
-        "--tip", metavar="FRAME", help="link or joint that the task is about; default the only link that carries none"
-    )
-    text = "a folder in which package:// in the URDF is looked up; can be given more than once. By default those of"
+    option("name", metavar="NAME", help="name of the recipes and of their folder")
+    option("--urdf", metavar="FILE", type=Path, required=True, help="URDF file; the recipes refer to its path")
+    option("--tip", metavar="FRAME", help="tip frame, a link or joint; default the only link without a child")
+    text = "a folder that is searched for package:// of the URDF; may be repeated. By default those of"
     text += (
         " ROS_PACKAGE_PATH and AMENT_PREFIX_PATH, and those above the URDF; what is used of the former is written down"
     )
     option("--packages", metavar="DIR", type=Path, action="append", default=[], help=text)
-    option("--force", action="store_true", help="write over files that are there")
+    option("--force", action="store_true", help="overwrite existing files")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -35,7 +33,7 @@ def run(arguments: argparse.Namespace) -> int:
     from cnpgen.cli.init.arm import read_arm
     from cnpgen.cli.init.recipes import dataset_of
     from cnpgen.cli.init.write import FILES, texts_of
-    from cnpgen.robots.shape.files import packages_of_environment
+    from cnpgen.robots.shape.mesh_files import packages_of_environment
     from cnpgen.store.files.atomic import write_file
 
     folder = _folder(arguments.name)

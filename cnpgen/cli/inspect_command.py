@@ -1,4 +1,4 @@
-"""``cnpgen inspect``: what a dataset holds and how it came about."""
+"""``cnpgen inspect``: summarize a dataset and its sampling."""
 
 import argparse
 import sys
@@ -9,27 +9,26 @@ from cnpgen.cli import values
 from cnpgen.cli.parser import Commands, Parser, add_command, add_json
 
 if TYPE_CHECKING:
-    from cnpgen.store.fates import Fates
     from cnpgen.store.field import Field
     from cnpgen.store.inspection import Inspection
+    from cnpgen.store.sampling_statistics import SamplingStatistics
     from cnpgen.store.statistics import FieldStatistics
 
 
 _TEXT = """\
-It reads the documents and the records of the shards, not the rows, so that it is as quick for large datasets, and works
-for unfinished ones; whether the rows are what the records say is for 'cnpgen validate' to tell. Of the draws, "accepts"
-is the share that passes a condition of those that got there, "left" the share of all that is still alive after it. The
-exit code is 1 if the dataset is damaged, 0 if it is unfinished.
+The command reads documents and shard records, not samples, so it is fast for large datasets and works for unfinished
+ones; 'cnpgen validate' verifies the samples. "accepts" is the share of candidates that pass a condition, "left" the
+share of all candidates that remain after it. The exit code is 1 if the dataset is damaged, 0 if it is unfinished.
 """
 _UNREAD = "checksums of the shards were not looked at, 'cnpgen validate' does"
 
 
 def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
-    title = "show what a dataset holds and how it came about"
+    title = "summarize a dataset and its sampling"
     parser = add_command(commands, "inspect", run, title=title, text=_TEXT)
     parser.add_argument("folder", metavar="DIR", type=Path, help="folder of a dataset, finished or not")
-    parser.add_argument("--plot", metavar="FILE", type=values.plot_file, help="draw it, too: .png, .pdf or .svg")
+    parser.add_argument("--plot", metavar="FILE", type=values.plot_file, help="also draw it: .png, .pdf or .svg")
     add_json(parser)
 
 
@@ -41,7 +40,7 @@ def run(arguments: argparse.Namespace) -> int:
     found = inspect_dataset(arguments.folder)
     print(render(found.to_dict()) if arguments.json else inspection_text(found))
     if arguments.plot:
-        from cnpgen.store.plot import plot_dataset
+        from cnpgen.store.dataset_plot import plot_dataset
 
         plot_dataset(found, arguments.plot)
         print(f"drawn: {arguments.plot}", file=sys.stderr)
@@ -52,14 +51,12 @@ def inspection_text(found: "Inspection") -> str:
     """Lay out an inspection for people."""
     from cnpgen.cli.describe import table
 
-    blueprint = found.blueprint
-    sections = [
-        [f"{blueprint.name} {blueprint.version}  {blueprint.title}".rstrip(), *table(_facts(found), indent="  ")]
-    ]
-    if found.fates.tried:
-        sections.append(_yield_lines(found.fates))
+    spec = found.spec
+    sections = [[f"{spec.name} {spec.version}  {spec.title}".rstrip(), *table(_facts(found), indent="  ")]]
+    if found.sampling.tried:
+        sections.append(_yield_lines(found.sampling))
     head = ("field", "column", "unit", "min", "mean", "max")
-    rows = [row for field in blueprint.fields for row in _field_rows(field, found.statistics.get(field.name))]
+    rows = [row for field in spec.fields for row in _field_rows(field, found.statistics.get(field.name))]
     sections.append(table([(*row, "") for row in (head, *rows)], indent="  ", right=(3, 4, 5)))
     return "\n\n".join("\n".join(lines) for lines in sections)
 
@@ -67,40 +64,40 @@ def inspection_text(found: "Inspection") -> str:
 def _facts(found: "Inspection") -> list[tuple[str, str]]:
     from cnpgen.cli.dry_run import size_text
 
-    blueprint = found.blueprint
+    spec = found.spec
     splits = [
-        f"{split} {n:,}" + ("" if n == blueprint.splits[split] else f" of {blueprint.splits[split]:,}")
+        f"{split} {n:,}" + ("" if n == spec.splits[split] else f" of {spec.splits[split]:,}")
         for split, n in found.rows.items()
     ]
     versions = [", ".join(f"{name} {version}" for name, version in made.items()) for made in found.environments]
     return [
         ("state", f"complete; {_UNREAD}" if found.complete else found.state),
         ("rows", f"{sum(found.rows.values()):,}: {', '.join(splits)}"),
-        ("shards", f"{len(found.summary.records)} of at most {blueprint.shard_size:,} rows"),
-        ("size", f"{size_text(found.bytes)}, {blueprint.dtype}"),
-        ("seed", str(blueprint.seed)),
-        ("backend", f"{blueprint.backend}, {found.seconds:,.1f} s of work"),
-        ("recipe", f"sha256 {blueprint.recipe_sha256}"),
+        ("shards", f"{len(found.summary.records)} of at most {spec.shard_size:,} rows"),
+        ("size", f"{size_text(found.bytes)}, {spec.dtype}"),
+        ("seed", str(spec.seed)),
+        ("backend", f"{spec.backend}, {found.seconds:,.1f} s of work"),
+        ("recipe", f"sha256 {spec.recipe_sha256}"),
         *(("made with", text) for text in versions),
     ]
 
 
-def _yield_lines(fates: "Fates") -> list[str]:
-    """Lay out the fates of the draws, in pipeline order."""
+def _yield_lines(sampling: "SamplingStatistics") -> list[str]:
+    """Lay out the sampling statistics of the draws, in pipeline order."""
     from cnpgen.cli.describe import table
 
-    rows = [("stage", "rejects because", "draws", "accepts", "left"), ("", "", f"{fates.tried:,}", "", "100.00 %")]
-    left, before = fates.tried, ""
-    for reason, count in fates.rejections.items():
-        stage = fates.stages.get(reason, "")
+    rows = [("stage", "rejects because", "draws", "accepts", "left"), ("", "", f"{sampling.tried:,}", "", "100.00 %")]
+    left, before = sampling.tried, ""
+    for reason, count in sampling.rejections.items():
+        stage = sampling.stages.get(reason, "")
         accepts = 100 * (1 - count / left) if left else 100.0
         left -= count
         label = stage if stage != before else ""
-        rows.append((label, reason, f"{count:,}", f"{accepts:.2f} %", f"{100 * left / fates.tried:.2f} %"))
+        rows.append((label, reason, f"{count:,}", f"{accepts:.2f} %", f"{100 * left / sampling.tried:.2f} %"))
         before = stage
-    share = f"{100 * fates.accepted / fates.tried:.2f} %"
+    share = f"{100 * sampling.accepted / sampling.tried:.2f} %"
     lines = table([(*row, "") for row in rows], indent="  ", right=(2, 3, 4))
-    return [f"  {fates.accepted:,} of {fates.tried:,} draws accepted, {share}", *lines]
+    return [f"  {sampling.accepted:,} of {sampling.tried:,} draws accepted, {share}", *lines]
 
 
 def _field_rows(field: "Field", found: "FieldStatistics | None") -> list[tuple[str, ...]]:

@@ -1,4 +1,4 @@
-"""Being interrupted: by Ctrl-C, or by SIGTERM, which is what SLURM, Docker and ``timeout`` send."""
+"""Interruption by Ctrl-C or by SIGTERM, as SLURM, Docker and ``timeout`` send it."""
 
 import os
 import signal
@@ -6,7 +6,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from cnpgen.machine.signals import signals_taken
+from cnpgen.machine.signals import signals_handled
 
 INTERRUPTED, TERMINATED = 130, 143  # exit codes: 128 + SIGINT, 128 + SIGTERM, as shells have it
 
@@ -18,12 +18,12 @@ class Terminated(KeyboardInterrupt):
 
 
 def exit_code(interruption: KeyboardInterrupt) -> int:
-    """Return what the process exits with after an interruption."""
+    """Return the exit code after an interruption."""
     return TERMINATED if isinstance(interruption, Terminated) else INTERRUPTED
 
 
 def raise_if_interrupted() -> None:
-    """Raise again what was raised when the signal came: libraries that call Python back may have dropped it.
+    """Raise the interruption again, because libraries that call back into Python may have dropped it.
 
     Raises:
         KeyboardInterrupt: The process was interrupted.
@@ -51,7 +51,7 @@ def interruptible() -> Iterator[None]:
     """
     if threading.current_thread() is threading.main_thread():
         _interruptions.clear()
-    with signals_taken(_interrupt, _end, stay=True):
+    with signals_handled(_interrupt, _end, stay=True):
         try:
             yield
         except Exception:

@@ -48,7 +48,7 @@ def list_all(what: str) -> list[dict[str, Any]]:
 
 
 def _datasets() -> list[dict[str, Any]]:
-    from cnpgen.make.load import load_dataset_recipe
+    from cnpgen.make.recipe_file import load_dataset_recipe
     from cnpgen.schema.catalogue import list_recipes
 
     entries = []
@@ -73,7 +73,7 @@ def _models() -> list[dict[str, Any]]:
 
 
 def _pipelines() -> list[dict[str, Any]]:
-    from cnpgen.pipelines.load import load_pipeline
+    from cnpgen.pipelines.pipeline_file import load_pipeline
     from cnpgen.schema.catalogue import list_recipes
 
     entries = []
@@ -85,7 +85,7 @@ def _pipelines() -> list[dict[str, Any]]:
 
 
 def _problems() -> list[dict[str, Any]]:
-    from cnpgen.problems.load import load_problem
+    from cnpgen.problems.problem_file import load_problem
     from cnpgen.schema.catalogue import list_recipes
 
     entries = []

@@ -1,4 +1,4 @@
-"""The entry of the command line: parse, run one command, turn what goes wrong into a line and an exit code."""
+"""The command line: parse, run one command, turn errors into one line and an exit code."""
 
 import argparse
 import io
@@ -34,7 +34,7 @@ from cnpgen.cli import (
 )
 from cnpgen.cli.interruption import Terminated, exit_code, interruptible
 from cnpgen.cli.parser import Parser, add_debug
-from cnpgen.cli.shell import in_shell
+from cnpgen.cli.shell import shell_spelling
 from cnpgen.cli.terminal import printing_safely
 from cnpgen.errors import CnpgenError, MachineError, RecipeError
 from cnpgen.machine.threads import prefer_one_thread
@@ -61,38 +61,38 @@ _COMMANDS = (
     doctor_command,
 )
 
-_DESCRIPTION = "Make, inspect and prove datasets of boundary problems for kinodynamic motion planning."
+_DESCRIPTION = "Generate and verify datasets for kinodynamic motion planning, train planners and optimize plans."
 
 _EPILOG = """\
 examples:
-  cnpgen list                                        what there is
-  cnpgen init my-arm --urdf arm.urdf                 recipes for an arm of your own
-  cnpgen make-dataset airhockey-hit --n 1000         make 1000 rows; run it again to go on after an interruption
-  cnpgen inspect airhockey-hit-v1 --plot hits.png    look at them
-  cnpgen validate airhockey-hit-v1 --deep            prove that they are right
-  cnpgen train airhockey-hit-v1 -o hits.h5           train a planner: two minutes
+  cnpgen list                                        list recipes
+  cnpgen init my-arm --urdf arm.urdf                 recipes for your own arm
+  cnpgen make-dataset airhockey-hit --n 1000         make 1000 samples; the same command resumes
+  cnpgen inspect airhockey-hit-v1 --plot hits.png    summarize them
+  cnpgen validate airhockey-hit-v1 --deep            verify them
+  cnpgen train airhockey-hit-v1 -o hits.h5           train a planner in two minutes
   cnpgen plan airhockey-hit-v1 --model hits.h5 -o plans.h5; a shipped one: --model airhockey-hit
-  cnpgen solve airhockey-hit --n 100 -o plans.h5     plan 100 fresh problems from nothing
-  cnpgen complete airhockey-replan pucks.csv -o problems.h5; what is solved, refined or planned for
-  cnpgen refine plans.h5 -o better.h5                polish anyone's plans
-  cnpgen evaluate plans.h5 --plot plan.png           judge them with Pinocchio and Coal
-  cnpgen view plans.h5 --row 3 -o plan.html          look at one in a browser
-  cnpgen simulate plans.h5 --video plan.mp4          execute them in MuJoCo
+  cnpgen solve airhockey-hit --n 100 -o plans.h5     plan 100 fresh problems
+  cnpgen complete airhockey-replan pucks.csv -o problems.h5
+  cnpgen refine plans.h5 -o better.h5                optimize plans of any source
+  cnpgen evaluate plans.h5 --plot plan.png           judge plans with Pinocchio and Coal
+  cnpgen view plans.h5 --row 3 -o plan.html          show a plan in a browser
+  cnpgen simulate plans.h5 --video plan.mp4          execute plans in MuJoCo
   cnpgen benchmark hits-81 --simulate                compare planners
-  cnpgen export plans.h5 --to joint-trajectory       hand plans to robots and simulators
+  cnpgen export plans.h5 --to joint-trajectory       export plans for robots and simulators
 
 stdout is data, stderr everything else. Exit codes:
   0    done
-  1    the answer is no: a dataset or a file is damaged, unfinished, of another kind or of another problem than what
-       it is used for; rows or plans are not valid
-  2    a wrong argument, such as a path that is not there, or a mistake in a recipe
+  1    the answer is no: a dataset or a file is damaged, unfinished or of another kind or problem; samples or plans
+       are invalid
+  2    a wrong argument, such as a missing path, or a mistake in a recipe
   3    the machine: no compiler, a full disk, a broken library; also an internal error of cnpgen
-  130  interrupted (Ctrl-C); finished shards and plans are kept, the same command goes on
-  141  whoever read stdout went away
-  143  terminated (SIGTERM, as SLURM and Docker send it); likewise resumable
+  130  interrupted (Ctrl-C); finished shards and plans are kept, the same command resumes
+  141  the reader of stdout closed it
+  143  terminated (SIGTERM, as SLURM and Docker send it); resumable
 """
 
-NOBODY_READS = 141  # 128 + SIGPIPE, as shells have it
+BROKEN_PIPE = 141  # 128 + SIGPIPE, as shells have it
 
 
 class _Version(argparse.Action):
@@ -130,16 +130,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - the boundary of the process
             if "--debug" in words:
                 traceback.print_exc()
-            return _report(error, vars(given), words)
+            return _report(error, vars(given))
     return code
 
 
 def _run(words: list[str], given: argparse.Namespace) -> int:
-    """Run what the words ask for, and leave in ``given`` what they give."""
+    """Parse the words into ``given`` and run the command."""
     parser = build_parser()
     try:
         arguments, extras = parser.parse_known_args(words, given)
-    except SystemExit:  # --help and --version have printed what they have to say
+    except SystemExit:  # --help and --version have printed their text
         return 0
     chosen: Parser = getattr(arguments, "parser", parser)
     if extras:
@@ -165,27 +165,27 @@ def build_parser() -> Parser:
     return parser
 
 
-def _report(error: BaseException, options: Container[str], words: Sequence[str]) -> int:
-    """Print an error as one line per mistake, in the words of the command's options; return its exit code."""
+def _report(error: BaseException, options: Container[str]) -> int:
+    """Print an error as one line per mistake, with the options of the command; return its exit code."""
     if isinstance(error, KeyboardInterrupt):
         what = "terminated" if isinstance(error, Terminated) else "interrupted"
         print(f"cnpgen: {what}: {error}" if str(error) else f"cnpgen: {what}", file=sys.stderr)
         return exit_code(error)
-    lines, code = _explain(error)
+    lines, code = _explain(error, options)
     for line in lines:
-        print(f"cnpgen: error: {in_shell(line, options, words)}", file=sys.stderr)
+        print(f"cnpgen: error: {line}", file=sys.stderr)
     return code
 
 
-def _explain(error: BaseException) -> tuple[Sequence[str], int]:
-    """Return the lines that tell an error to a user, and the exit code."""
+def _explain(error: BaseException, options: Container[str]) -> tuple[Sequence[str], int]:
+    """Return the lines that describe an error, and the exit code."""
     if isinstance(error, RecipeError):
         return error.mistakes, error.exit_code
     if isinstance(error, CnpgenError):
-        return [" ".join(str(error).split())], error.exit_code
+        return [" ".join(error.text(shell_spelling(options)).split())], error.exit_code
     code = MachineError.exit_code
     if isinstance(error, ImportError):
-        return [f"{error}; 'cnpgen doctor' says what is wrong with this installation"], code
+        return [f"{error}; 'cnpgen doctor' checks this installation"], code
     if isinstance(error, MemoryError):
         return ["out of memory; fewer --workers need less"], code
     if isinstance(error, OSError) and error.strerror:
@@ -197,7 +197,7 @@ def _explain(error: BaseException) -> tuple[Sequence[str], int]:
 
 
 def _prepare_streams() -> None:
-    """Make sure that printing does not fail: Python has no stdout or stderr where the shell has closed them."""
+    """Replace closed streams, so that printing does not fail."""
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, Path(os.devnull).open("w", encoding="utf-8"))  # noqa: SIM115 - open until the end
@@ -206,10 +206,10 @@ def _prepare_streams() -> None:
 
 
 def _leave_pipe() -> int:
-    """Give stdout somewhere to go, so that Python does not complain when it flushes it at exit."""
+    """Redirect stdout to null, so that flushing at exit does not fail."""
     with suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    return NOBODY_READS
+    return BROKEN_PIPE
 
 
 @contextmanager

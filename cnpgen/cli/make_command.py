@@ -1,4 +1,4 @@
-"""``cnpgen make-dataset``: make a dataset, or go on with one that was interrupted."""
+"""``cnpgen make-dataset``: make a dataset, or resume one."""
 
 import argparse
 import sys
@@ -17,31 +17,29 @@ if TYPE_CHECKING:
 
     from cnpgen.make.dataset import MadeDataset
     from cnpgen.make.recipe import DatasetRecipe
-    from cnpgen.store.fates import Fates
+    from cnpgen.store.sampling_statistics import SamplingStatistics
 
-KEPT = "finished shards are kept, run the same command again to go on"
+INTERRUPTED_TEXT = "finished shards are kept; run the same command again to resume"
 
 _TEXT = """\
-The same recipe, seed and backend give the same rows, however the work is shared out: --workers, --shard-size and
---part decide which process makes which rows, never what is in them; a smaller --n gives the first rows of each split.
-With --certify every sample is planned from nothing (about 30 ms each): those without a valid plan are left out and
-counted under "no plan found", and the plan's control points are stored beside the others. With --model it begins
-with a planner's plans, in half the time; the same judges decide.
+The same recipe, seed and backend give the same samples. --workers, --shard-size and --part decide which process makes
+which samples, never their content; a smaller --n gives the first samples of each split. With --certify every sample is
+planned (about 30 ms each). Samples without a valid plan are rejected as "no plan found", and the control points of the
+plans are stored. With --model certification starts from a planner's plans, in half the time, with the same judge.
 The folder of the dataset is printed on stdout.
 
-What is in the folder already is kept if it is of the same dataset: its shards are read and compared with their
-recorded sha256 (at 0.3 to 1 GB/s per core), and damaged ones are made again. Another dataset is replaced only with
---force, or if it has no rows yet. After Ctrl-C (exit code 130), SIGTERM (143), kill -9 or a full disk the same command
-goes on.
+Shards of the same dataset in the folder are kept: they are compared with their recorded sha256 (at 0.3 to 1 GB/s per
+core), and damaged ones are made again. Another dataset is replaced only with --force, or if it has no shards. After
+Ctrl-C (exit code 130), SIGTERM (143), kill -9 or a full disk the same command resumes.
 """
 
 
 def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
-    parser = add_command(commands, "make-dataset", run, title="make a dataset, or go on with it", text=_TEXT)
+    parser = add_command(commands, "make-dataset", run, title="make a dataset, or resume one", text=_TEXT)
     option = parser.add_argument
     option("recipe", metavar="NAME|FILE", help="a shipped dataset or pipeline (see 'cnpgen list'), or a recipe file")
-    option("--n", metavar="N", type=values.rows, help="rows of all splits together; default the recipe's")
+    option("--n", metavar="N", type=values.rows, help="total number of samples; default the recipe's")
     option("--seed", metavar="S", type=values.seed, help="root seed; default the recipe's")
     option("-o", "--out", metavar="DIR", help="folder of the dataset; default NAME-vMAJOR here")
     option("--workers", metavar="W", type=values.positive, help="processes; default one per available core")
@@ -52,19 +50,17 @@ def add(commands: "Commands[Parser]") -> None:
         type=values.positive,
         help="rows per file; default 8192 to 65536, with --certify 64 to 1024",
     )
-    option("--dtype", choices=("float64", "float32"), default="float64", help="what numbers are stored as")
-    option("--backend", choices=("compiled", "numpy", "casadi"), help="what computes; default the fastest that works")
-    option(
-        "--part", metavar="K/M", type=values.part, help="make the K-th of M parts only (0/M to M-1/M), for job arrays"
-    )
-    option("--certify", action="store_true", help="plan every sample, and keep those with a valid plan, with the plan")
+    option("--dtype", choices=("float64", "float32"), default="float64", help="stored number type")
+    option("--backend", choices=("compiled", "numpy", "casadi"), help="kernel backend; default the fastest available")
+    option("--part", metavar="K/M", type=values.part, help="make only part K of M (0/M to M-1/M), for job arrays")
+    option("--certify", action="store_true", help="plan every sample, and store those with a valid plan")
     option(
         "--model",
         metavar="NAME|FILE",
-        help="with --certify: begin with the plans of this planner, a shipped one or a file (default: from nothing)",
+        help="with --certify: start from the plans of this planner, a shipped one or a file",
     )
-    option("--force", action="store_true", help="replace another dataset that is in the folder")
-    option("--dry-run", action="store_true", help="print what would be made, and write nothing")
+    option("--force", action="store_true", help="overwrite another dataset in the folder")
+    option("--dry-run", action="store_true", help="print the specification and write nothing")
     option("--quiet", action="store_true", help="no progress and no summary")
 
 
@@ -72,12 +68,12 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     from cnpgen.cli.recipe_names import check_recipe
     from cnpgen.errors import UsageError
-    from cnpgen.make.load import load_dataset_recipe
+    from cnpgen.make.recipe_file import load_dataset_recipe
 
-    check_recipe(arguments.recipe, of_dataset="'cnpgen make-dataset NAME --out {0}' goes on with it")
+    check_recipe(arguments.recipe, of_dataset="'cnpgen make-dataset NAME --out {0}' resumes it")
     recipe = load_dataset_recipe(arguments.recipe)
     if arguments.model is not None and not arguments.certify:
-        raise UsageError("--model says where certifying begins: it needs --certify")
+        raise UsageError("--model needs --certify")
     if arguments.certify:
         from cnpgen.make.certify import certified
 
@@ -85,16 +81,16 @@ def run(arguments: argparse.Namespace) -> int:
             raise UsageError("--certify stores plans, which are exact in float64 only: leave out --dtype float32")
         recipe = certified(recipe, model=arguments.model)
     if arguments.dry_run:
-        from cnpgen.cli.dry_run import blueprint_text
+        from cnpgen.cli.dry_run import spec_text
 
-        print(blueprint_text(recipe, **_settings(arguments), force=arguments.force))
+        print(spec_text(recipe, **_settings(arguments), force=arguments.force))
         return 0
     _make(recipe, arguments)
     return 0
 
 
 def _settings(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return the arguments that decide what the dataset is."""
+    """Return the arguments that determine the dataset."""
     return {name: getattr(arguments, name) for name in ("out", "n", "seed", "shard_size", "dtype", "backend")}
 
 
@@ -126,9 +122,9 @@ def make_metered(
 
     Args:
         make: Takes ``begin`` and ``progress``, as ``make_dataset`` does.
-        quiet: Whether to show neither.
+        quiet: Whether to print nothing on stderr.
         part: Which part of the dataset is made.
-        verb: What was done to the rows.
+        verb: Past participle of the action.
     """
     meter = Meter(quiet=quiet)
 
@@ -136,17 +132,17 @@ def make_metered(
         raise_if_interrupted()
         meter.begin(f"{step} {folder}", rows, there)
 
-    def count(rows: int, fates: "Fates | None") -> None:
+    def count(rows: int, sampling: "SamplingStatistics | None") -> None:
         raise_if_interrupted()
-        meter(rows, fates)
+        meter(rows, sampling)
 
     try:
         made = make(begin=begin, progress=count)
     except Exception:
-        raise_if_interrupted()  # what the same Ctrl-C did to a compiler is not the news
+        raise_if_interrupted()  # the interruption also ended a compiler
         raise
     except KeyboardInterrupt as interruption:
-        raise type(interruption)(KEPT) from interruption
+        raise type(interruption)(INTERRUPTED_TEXT) from interruption
     finally:
         meter.close()
     if not quiet:
@@ -155,13 +151,13 @@ def make_metered(
 
 
 def _summary(made: "MadeDataset", meter: Meter, part: tuple[int, int] | None, verb: str) -> list[str]:
-    """Say in a few lines what was done."""
+    """Summarize the run."""
     import textwrap
 
     wanted = sum(made.rows.values())
     text, rest = _rows_text(made.rows), "" if made.complete else "; other parts are still to be made"
     if part is not None:
-        all_rows = counted(sum(made.blueprint.splits.values()), "row")
+        all_rows = counted(sum(made.spec.splits.values()), "row")
         text, rest = f"{text}, part {part[0]}/{part[1]} of {all_rows},", rest or "; all parts are made"
     if not made.made:
         return [f"{_unmade(made, part)}: {text.rstrip(',')}{rest}"]
@@ -169,27 +165,27 @@ def _summary(made: "MadeDataset", meter: Meter, part: tuple[int, int] | None, ve
     whole, making = meter.seconds, max(meter.running, 1e-9)
     times = f"in {whole:.1f} s: {whole - making:.1f} s to get ready, then {made.made / making:,.0f} rows/s"
     lines = [f"{verb} {share}{text} {times}{rest}"]
-    lines += [_yield(meter.fates)] if meter.fates else []
+    lines += [_yield(meter.sampling)] if meter.sampling else []
     return [row for line in lines for row in textwrap.wrap(line, 100, subsequent_indent="  ")]
 
 
 def _unmade(made: "MadeDataset", part: tuple[int, int] | None) -> str:
-    """Say in what state a dataset was of which no row had to be made."""
-    if made.mended:
-        return f"every row was there already, {', '.join(made.mended)} written now"
+    """Describe a dataset of which no sample had to be made."""
+    if made.repaired:
+        return f"all samples existed, {', '.join(made.repaired)} written again"
     return f"already {'made' if part else 'complete'}"
 
 
 def _rows_text(rows: "Mapping[str, int]") -> str:
-    """Write rows in all and by split, without empty splits."""
+    """Format the number of samples in total and by split, without empty splits."""
     splits = ", ".join(f"{split} {number:,}" for split, number in rows.items() if number)
     return counted(sum(rows.values()), "row") + (f" ({splits})" if splits else "")
 
 
-def _yield(fates: "Fates") -> str:
-    """Say how many draws were accepted and why most of the others were not."""
-    tried = max(fates.tried, 1)
-    worst = sorted(fates.rejections.items(), key=lambda item: -item[1])[:3]
+def _yield(sampling: "SamplingStatistics") -> str:
+    """Summarize accepted candidates and the most frequent rejection reasons."""
+    tried = max(sampling.tried, 1)
+    worst = sorted(sampling.rejections.items(), key=lambda item: -item[1])[:3]
     reasons = ", ".join(f"{reason} {count / tried:.1%}" for reason, count in worst if count >= 5e-4 * tried)
-    text = f"accepted {fates.accepted / tried:.1%} of {fates.tried:,} draws"
+    text = f"accepted {sampling.accepted / tried:.1%} of {sampling.tried:,} draws"
     return f"{text}; rejected: {reasons}" if reasons else text

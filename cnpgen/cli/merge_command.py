@@ -1,4 +1,4 @@
-"""``cnpgen merge``: make one dataset of parts that were made in separate folders."""
+"""``cnpgen merge``: combine parts of a dataset from separate folders."""
 
 import argparse
 from functools import partial
@@ -7,16 +7,15 @@ from cnpgen.cli.make_command import make_metered
 from cnpgen.cli.parser import Commands, Parser, add_command
 
 _TEXT = """\
-The parts are what 'cnpgen make-dataset --part K/M' made of one dataset on machines that share no disk. They must be of
-the same recipe, seed, size and type; shards that none has, and shards that two have, are refused by name. Every shard
-is compared with its recorded sha256 and copied: the dataset has the same shards as one that was made at once. After
-an interruption the same command goes on.
+The parts are the output of 'cnpgen make-dataset --part K/M' on machines without a shared disk. They must have the same
+recipe, seed, size and type; missing and duplicate shards are refused. Every shard is compared with its recorded sha256
+and copied. The result equals a dataset that is made at once. After an interruption the same command resumes.
 """
 
 
 def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
-    parser = add_command(commands, "merge", run, title="make one dataset of its parts", text=_TEXT)
+    parser = add_command(commands, "merge", run, title="combine parts of a dataset", text=_TEXT)
     option = parser.add_argument
     option("parts", metavar="PART", nargs="+", help="folders of parts")
     option("-o", "--out", metavar="DIR", required=True, help="folder of the dataset; may be one of the parts")

@@ -1,4 +1,4 @@
-"""What the library logs while it works, as lines on stderr."""
+"""Log messages of the library as lines on stderr."""
 
 import logging
 import sys

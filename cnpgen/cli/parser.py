@@ -1,8 +1,8 @@
-"""argparse with errors of one line that name what was probably meant.
+"""argparse with errors of one line that suggest the nearest known name.
 
-argparse lets nobody say by public names what a choice is refused with, how wide the column of the commands is, which
-options a parser knows, or of which types what it returns is. This module alone uses the private ones; others take
-``Commands`` and ``Options`` from here. The tests of the errors show it where they have changed.
+argparse has no public names for the error of a choice, the width of the command column, the known options and some
+types. Only this module uses the private ones; others import ``Commands`` and ``Options`` from here. Tests of the errors
+detect changes of argparse.
 """
 
 import argparse
@@ -20,7 +20,7 @@ _NEGATIVE = re.compile(r"-\.?[0-9]")  # how values begin: -5ms; before Python 3.
 
 
 class _Help(argparse.RawDescriptionHelpFormatter):
-    """Help with enough room for the longest command; argparse forgets that commands are indented."""
+    """Help with a column wide enough for all commands; argparse ignores their indentation."""
 
     def __init__(self, prog: str, **options: Any) -> None:
         super().__init__(prog, **options)
@@ -39,7 +39,7 @@ class Parser(argparse.ArgumentParser):
         self._negative_number_matcher = _NEGATIVE
 
     def error(self, message: str) -> NoReturn:
-        """Raise UsageError: what is wrong and where to read more, on one line."""
+        """Raise UsageError with the mistake and the help command on one line."""
         raise UsageError(f"{message.removeprefix('argument ')}; see '{self.prog} --help'")
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
@@ -52,7 +52,7 @@ class Parser(argparse.ArgumentParser):
         raise argparse.ArgumentError(action, f"expected one of {', '.join(known)}, got {value!r}{hint}")
 
     def refuse(self, extras: Sequence[str]) -> NoReturn:
-        """Raise UsageError for arguments that nobody asked for."""
+        """Raise UsageError for unknown arguments."""
         option = next((text.partition("=")[0] for text in extras if text.startswith("-")), None)
         if option is None:
             self.error(f"unexpected argument {extras[0]!r}")
@@ -67,17 +67,17 @@ def add_command(commands: "Commands[Parser]", name: str, run: Command, *, title:
     """Add a command.
 
     Args:
-        commands: Where to.
-        name: What users type.
-        run: What it does.
-        title: What it does, in a few words, for the list of commands.
-        text: More about it, for its own help.
+        commands: The commands of the parser.
+        name: Name of the command.
+        run: Function that runs it.
+        title: Summary for the list of commands.
+        text: Details for its own help.
 
     Returns:
-        Its parser, for its own arguments.
+        The parser of its own arguments.
     """
     parser = commands.add_parser(name, help=title, description=f"{title[0].upper()}{title[1:]}.", epilog=text or None)
-    add_debug(parser, default=argparse.SUPPRESS)  # what was said before the command stays
+    add_debug(parser, default=argparse.SUPPRESS)  # keep an option before the command
     parser.set_defaults(run=run, parser=parser)
     return parser
 
@@ -88,10 +88,10 @@ def add_debug(parser: Parser, *, default: Any = False) -> None:
 
 
 def add_engine(parser: Options) -> None:
-    """Add ``--engine`` and ``--address``: where the workers run."""
-    text = "where the workers run: processes of this machine (loky, default), or a cluster (docs/scale.md)"
+    """Add ``--engine`` and ``--address``."""
+    text = "engine of the workers: local processes (loky, default), or a cluster (docs/scale.md)"
     parser.add_argument("--engine", choices=("loky", "dask", "ray"), help=text)
-    text = "of the cluster's scheduler or head, such as tcp://host:8786; without it one is started on this machine"
+    text = "address of the cluster, such as tcp://host:8786; without it a local cluster is started"
     parser.add_argument("--address", metavar="A", help=text)
 
 

@@ -13,16 +13,16 @@ from cnpgen.errors import counted
 
 if TYPE_CHECKING:
     from cnpgen.planner.model import Model
-    from cnpgen.planner.requests import Requests
+    from cnpgen.planner.plan_requests import Requests
     from cnpgen.plans import Plans
 
 _TEXT = """\
-The problems are rows of a dataset, or boundary conditions in an HDF5 file (a shard, a file of plans, or any other):
-start_q and goal_q of shape (N, joints), and start_dq, start_ddq and goal_dq where they are not zero; goal_ddq for
-models that hold the goal's acceleration. Plans meet them to rounding; whether they meet the constraints 'cnpgen
-evaluate' says. With --refine they are polished as by 'cnpgen refine', and the exit code is 1 if any is not valid in
-the end; what is finished is in PLANS.part, from where the same command goes on. The file of plans is printed on
-stdout; an existing one is replaced only with --force.
+The problems are samples of a dataset, or boundary conditions in an HDF5 file (a shard, a plan file, or any other):
+start_q and goal_q of shape (N, joints), optionally start_dq, start_ddq and goal_dq, and goal_ddq for models that hold
+the goal's acceleration. Plans meet the boundary conditions to rounding; 'cnpgen evaluate' checks the constraints. With
+--refine the plans are optimized as by 'cnpgen refine', and the exit code is 1 if a plan is invalid in the end. Finished
+plans are kept in PLANS.part, and the same command resumes. The plan file is printed on stdout; an existing one is
+replaced only with --force.
 """
 
 
@@ -31,19 +31,17 @@ def add(commands: "Commands[Parser]") -> None:
     parser = add_command(commands, "plan", run, title="plan with a trained model", text=_TEXT)
     option = parser.add_argument
     option("problems", metavar="DIR|FILE", type=Path, help="a dataset, or an HDF5 file of boundary conditions")
-    option("--model", metavar="NAME|FILE", required=True, help="a model that cnpgen ships, or a model file")
-    option("-o", "--out", metavar="PLANS", type=Path, required=True, help="where the plans go, .h5")
-    option("--split", metavar="NAME", help="which split of the dataset (default: validation)")
-    option("--first", metavar="I", type=values.natural, help="the first row of the split (default: 0)")
-    option("--n", metavar="K", type=values.rows, help="how many rows; by default all that follow")
-    option(
-        "--other-rows", action="store_true", help="plan for rows that are drawn in another way than the trained ones"
-    )
-    option("--no-slowing", action="store_true", help="leave rates as the network has them")
-    option("--force", action="store_true", help="replace PLANS, and throw away another run's PLANS.part")
+    option("--model", metavar="NAME|FILE", required=True, help="a shipped model, or a model file")
+    option("-o", "--out", metavar="PLANS", type=Path, required=True, help="plan file to write, .h5")
+    option("--split", metavar="NAME", help="split of the dataset (default: validation)")
+    option("--first", metavar="I", type=values.natural, help="first sample of the split (default: 0)")
+    option("--n", metavar="K", type=values.rows, help="number of samples; by default all that follow")
+    option("--other-rows", action="store_true", help="accept samples of another pipeline than the training data")
+    option("--no-time-scaling", action="store_true", help="keep the rates of the network")
+    option("--force", action="store_true", help="replace PLANS, and discard another run's PLANS.part")
     option("--quiet", action="store_true", help="no progress and no summary")
     add_json(parser)
-    option("--refine", action="store_true", help="polish the plans")
+    option("--refine", action="store_true", help="optimize the plans")
     refining = parser.add_argument_group("with --refine")
     refining.add_argument("--workers", metavar="W", type=values.positive, help=WORKERS)
     add_engine(refining)
@@ -60,7 +58,7 @@ def run(arguments: argparse.Namespace) -> int:
     _check(arguments)
     model = load_model(arguments.model)
     requests = _requests(arguments, model)
-    planner = Planner(model, slow_down=not arguments.no_slowing)
+    planner = Planner(model, scale_time=not arguments.no_time_scaling)
     begun = time.perf_counter()
     plans = planner.plan_batch(requests.boundary, sample_id=requests.sample_id, columns=requests.columns)
     seconds = time.perf_counter() - begun
@@ -75,7 +73,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _check(arguments: argparse.Namespace) -> None:
-    """Refuse before any work what cannot be meant, or would destroy something."""
+    """Refuse contradictory arguments and existing output before any work."""
     from cnpgen.errors import UsageError
 
     default = arguments.parser.get_default
@@ -85,7 +83,7 @@ def _check(arguments: argparse.Namespace) -> None:
         if getattr(arguments, name) != default(name)
     ]
     if lost and not arguments.refine:
-        raise UsageError(f"--{lost[0].replace('_', '-')} is for --refine, which is missing")
+        raise UsageError(f"--{lost[0].replace('_', '-')} needs --refine")
     check_suffix(arguments.out)
     check_place(arguments.out, force=arguments.force)
 
@@ -104,8 +102,7 @@ def _save(arguments: argparse.Namespace, plans: "Plans", seconds: float) -> int:
 
 def _requests(arguments: argparse.Namespace, model: "Model") -> "Requests":
     from cnpgen.errors import UsageError
-    from cnpgen.planner.request_files import read_file
-    from cnpgen.planner.requests import read_rows
+    from cnpgen.planner.plan_requests import read_file, read_rows
 
     if arguments.problems.is_dir():
         return read_rows(
@@ -117,5 +114,5 @@ def _requests(arguments: argparse.Namespace, model: "Model") -> "Requests":
             other=arguments.other_rows,
         )
     if arguments.split is not None or arguments.first is not None or arguments.n is not None:
-        raise UsageError("--split, --first and --n are for the folder of a dataset, got a file")
+        raise UsageError("--split, --first and --n need the folder of a dataset, got a file")
     return read_file(arguments.problems, model, other=arguments.other_rows)

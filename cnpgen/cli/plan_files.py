@@ -1,4 +1,4 @@
-"""Files of plans as commands read them, and what those that they write are called."""
+"""Plan files that commands read and write."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -8,10 +8,10 @@ if TYPE_CHECKING:
 
 
 def read_plans(path: Path, *, problem: str | None = None) -> "Plans":
-    """Read the plans of a file; see ``cnpgen.load_plans``.
+    """Read the plans of a file, as ``cnpgen.load_plans`` does.
 
     Raises:
-        DatasetError: It has none, too.
+        DatasetError: The file has no plans, or as ``load_plans``.
     """
     from cnpgen.errors import DatasetError
     from cnpgen.plans import load_plans
@@ -23,12 +23,12 @@ def read_plans(path: Path, *, problem: str | None = None) -> "Plans":
 
 
 def checksum_text(plans: "Plans") -> str:
-    """Say whether the file that plans were read from has a checksum."""
-    return "the file's checksum is right" if plans.sealed else "the file has no checksum"
+    """Return whether the source of the plans has a checksum, as text."""
+    return "the file's checksum is right" if plans.has_checksum else "the file has no checksum"
 
 
 def check_suffix(out: Path) -> None:
-    """Refuse a file for plans that does not end as they do."""
+    """Refuse an output file that does not end in .h5."""
     from cnpgen.errors import UsageError
 
     if out.suffix != ".h5":

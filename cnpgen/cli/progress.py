@@ -1,4 +1,4 @@
-"""Progress on stderr: a bar where somebody watches, a line at the start and one at the end where nobody does."""
+"""Progress on stderr: a bar on a terminal, otherwise one line at the start and one at the end."""
 
 import sys
 import time
@@ -8,38 +8,38 @@ from typing import TYPE_CHECKING, Any
 from cnpgen.errors import counted
 
 if TYPE_CHECKING:
-    from cnpgen.store.fates import Fates
+    from cnpgen.store.sampling_statistics import SamplingStatistics
 
 
 class Meter:
-    """Counts rows, and what became of their draws.
+    """Counts samples and sampling statistics.
 
     Args:
-        quiet: Whether to show nothing.
-        noun: What is counted.
+        quiet: Whether to print nothing.
+        noun: Name of the counted items.
 
     Attributes:
-        rows: Rows counted since the last beginning, without ``initial``.
-        fates: The fates of their draws.
+        rows: Samples counted since the last ``begin``, without ``initial``.
+        sampling: Sampling statistics of these samples.
     """
 
     def __init__(self, *, quiet: bool = False, noun: str = "row") -> None:
         self.rows = 0
-        self.fates: Fates | None = None
+        self.sampling: SamplingStatistics | None = None
         self._quiet, self._noun = quiet, noun
         self._start = self._begun = time.perf_counter()
         self._bar: Any = None
 
     def begin(self, title: str, total: int, initial: int = 0) -> None:
-        """Show that something begins; what began before is over.
+        """Show the start of a step; the previous step is over.
 
         Args:
-            title: What is going on.
-            total: Rows at the end.
-            initial: Rows that are there already.
+            title: Name of the step.
+            total: Samples at the end.
+            initial: Samples that exist already.
         """
         self.close()
-        self.rows, self.fates, self._begun = 0, None, time.perf_counter()
+        self.rows, self.sampling, self._begun = 0, None, time.perf_counter()
         if not self._quiet and sys.stderr.isatty():
             from tqdm import tqdm
 
@@ -54,7 +54,7 @@ class Meter:
                 dynamic_ncols=True,
             )
         elif not self._quiet:
-            there = f", {initial:,} there already" if initial else ""
+            there = f", {initial:,} exist already" if initial else ""
             print(f"{title}: {counted(total, self._noun)}{there}", file=sys.stderr, flush=True)
 
     @property
@@ -64,23 +64,23 @@ class Meter:
 
     @property
     def running(self) -> float:
-        """Time since the last beginning [s]."""
+        """Time since the last ``begin`` [s]."""
         return time.perf_counter() - self._begun
 
-    def __call__(self, rows: int, fates: "Fates | None" = None) -> None:
+    def __call__(self, rows: int, sampling: "SamplingStatistics | None" = None) -> None:
         """Count the rows of a shard."""
         self.rows += rows
-        if fates is not None:
-            self.fates = fates if self.fates is None else self.fates.merge(fates)
+        if sampling is not None:
+            self.sampling = sampling if self.sampling is None else self.sampling.merge(sampling)
         if self._bar is not None:
-            if self.fates is not None:
-                tried = self._bar.format_sizeof(self.fates.tried)
-                share = self.fates.accepted / max(self.fates.tried, 1)
+            if self.sampling is not None:
+                tried = self._bar.format_sizeof(self.sampling.tried)
+                share = self.sampling.accepted / max(self.sampling.tried, 1)
                 self._bar.set_postfix_str(f"{tried} tried, {share:.1%} accepted", refresh=False)
             self._bar.update(rows)
 
     def note(self, text: str) -> None:
-        """Show a word beside the bar."""
+        """Show a text beside the bar."""
         if self._bar is not None:
             self._bar.set_postfix_str(text, refresh=False)
 

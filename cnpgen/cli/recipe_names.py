@@ -1,4 +1,4 @@
-"""What users write where a recipe is expected: what is there but is something else is said to be that."""
+"""Arguments that name a recipe; an existing path of another kind is refused with its kind."""
 
 from contextlib import suppress
 from pathlib import Path
@@ -41,7 +41,7 @@ def check_recipe(recipe: str, *, of_dataset: str = DATASET) -> None:
 
 
 def check_there(what: str) -> None:
-    """Refuse what is neither a path nor the name of a recipe that gives problems.
+    """Refuse an argument that is neither a path nor the name of a recipe.
 
     Args:
         what: Name or path of a recipe, or the folder of a dataset.

@@ -10,7 +10,7 @@ from cnpgen.cli.refine_options import TEXT, add_options, refine_and_save
 
 _TEXT = (
     """\
-The plans may come from any planner; docs/plan-format.md says how ten lines write a file of them, and how trajectories
+The plans may come from any planner; docs/plan-format.md shows how to write a plan file, and how trajectories
 that are sampled in time become plans. No plan comes back worse than it was given: violations count first, then the
 objective. Plans whose control points are no numbers, or that take longer than a minute, are made from nothing.
 """
@@ -20,12 +20,12 @@ objective. Plans whose control points are no numbers, or that take longer than a
 
 def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
-    parser = add_command(commands, "refine", run, title="polish the plans of a file", text=_TEXT)
-    parser.add_argument("file", metavar="FILE", type=Path, help="a file of plans, .h5")
-    parser.add_argument("-o", "--out", metavar="OUT", type=Path, help="where to (default: FILE-refined.h5 beside it)")
+    parser = add_command(commands, "refine", run, title="optimize the plans of a file", text=_TEXT)
+    parser.add_argument("file", metavar="FILE", type=Path, help="plan file, .h5")
     parser.add_argument(
-        "--problem", metavar="NAME|FILE", help="the problem that they must be for; its tolerances count"
+        "-o", "--out", metavar="OUT", type=Path, help="output file (default: FILE-refined.h5 beside it)"
     )
+    parser.add_argument("--problem", metavar="NAME|FILE", help="the problem of the plans; its tolerances are used")
     add_options(parser)
 
 

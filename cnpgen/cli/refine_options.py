@@ -1,4 +1,4 @@
-"""What ``refine`` and ``solve`` have in common: options, progress, what they print."""
+"""Common parts of ``refine`` and ``solve``: options, progress, output."""
 
 import argparse
 import json
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from cnpgen.machine.times import Times
     from cnpgen.plans import Plans
-    from cnpgen.refine.plans import Refinement
+    from cnpgen.refine.refine_plans import Refinement
 
 REFINING = ("objective", "weight", "max_iterations", "tolerance", "deadline")  # what add_refining adds
 WORKERS = "processes; default one per available core, or one for up to 60 plans"
@@ -38,9 +38,7 @@ def add_options(parser: Parser) -> None:
     add_refining(parser)
     parser.add_argument("--workers", metavar="W", type=values.positive, help=WORKERS)
     add_engine(parser)
-    parser.add_argument(
-        "--force", action="store_true", help="replace OUT, and throw away what another run has left in OUT.part"
-    )
+    parser.add_argument("--force", action="store_true", help="replace OUT, and discard another run's OUT.part")
     parser.add_argument("--quiet", action="store_true", help="no progress and no summary")
     add_json(parser)
 
@@ -52,24 +50,26 @@ def add_refining(parser: Options) -> None:
         "--objective",
         choices=("time", "effort", "jerk"),
         default="time",
-        help="what is minimised: time and what the problem file adds to it (default), or effort or jerk beside time",
+        help="cost term in addition to the duration: that of the problem file (default), effort or jerk",
     )
-    option("--weight", metavar="X", type=float, help="of what is beside the time; default the problem's, 1 for others")
-    option("--max-iterations", metavar="I", type=values.natural, help="steps of the first pass (default: 40)")
+    option("--weight", metavar="X", type=float, help="weight of the cost term; default the problem's, 1 for others")
+    option("--max-iterations", metavar="I", type=values.natural, help="steps of the coarse level (default: 40)")
     option(
         "--tolerance",
         metavar="X",
         type=float,
-        help="relative change of the objective below which it has settled (default: 1e-3; from nothing a tenth of it,"
-        " among obstacles a twentieth)",
+        help="relative change of the objective at which the iteration converges (default: 1e-3; without an initial"
+        " guess a tenth of it, among obstacles a twentieth)",
     )
     option(
         "--deadline",
         metavar="S",
         type=values.seconds,
-        help="how long each plan may take, 10ms for example: the best valid one until then, never worse than the given",
+        help="time per plan, such as 10ms: returns the best plan until then, never worse than the input",
     )
-    option("--explain", action="store_true", help="say of every plan that is not valid what is proven of its problem")
+    option(
+        "--explain", action="store_true", help="report for every invalid plan whether its problem is proven infeasible"
+    )
 
 
 def refine_and_save(
@@ -80,7 +80,7 @@ def refine_and_save(
     title: str,
     make: "Callable[..., Refinement] | None" = None,
 ) -> int:
-    """Refine plans, save them, say what came of them; return the exit code.
+    """Refine plans, save them, print a summary; return the exit code.
 
     Args:
         arguments: What ``add_options`` added.
@@ -91,7 +91,7 @@ def refine_and_save(
     """
     from cnpgen.plans import save_plans
     from cnpgen.refine.options import RefineOptions
-    from cnpgen.refine.plans import refine_plans
+    from cnpgen.refine.refine_plans import refine_plans
 
     given = {name: getattr(arguments, name) for name in REFINING}
     options = RefineOptions(**{name: value for name, value in given.items() if value is not None})
@@ -132,7 +132,7 @@ def refine_and_save(
 
 
 def check_place(out: Path, *, force: bool) -> None:
-    """Refuse before any work what would fail, or destroy something, after it."""
+    """Refuse an output path before any work if it cannot be written or exists."""
     from cnpgen.errors import UsageError
     from cnpgen.plans.save import check_replaceable
 
@@ -151,8 +151,8 @@ def _tell(arguments: argparse.Namespace, facts: dict[str, Any], out: Path, times
 
 
 def _explain(facts: dict[str, Any], found: "Refinement", meter: Meter) -> None:
-    """Add to the facts about plans that are not valid what is proven about their problems."""
-    from cnpgen.refine.proof.proof import explain_plans
+    """Add proofs of infeasibility to the results of invalid plans."""
+    from cnpgen.refine.proof.explain import explain_plans
 
     if facts["not_valid"]:
         meter.begin("explaining", len(facts["not_valid"]))
@@ -163,8 +163,8 @@ def _explain(facts: dict[str, Any], found: "Refinement", meter: Meter) -> None:
 
 
 def _summary(facts: dict[str, Any], times: "Times", *, listed: int) -> list[str]:
-    """Say in a few lines what came of the plans."""
-    from cnpgen.refine.plans import outcome_text
+    """Summarize the refined plans."""
+    from cnpgen.refine.refine_plans import outcome_text
 
     mean = facts["mean_duration_s"]
     lines = [
@@ -180,6 +180,6 @@ def _summary(facts: dict[str, Any], times: "Times", *, listed: int) -> list[str]
 
 
 def _failure_text(failure: dict[str, Any]) -> str:
-    """Say of one plan why it is not valid, and of its problem what is proven, if that was asked for."""
+    """Describe why one plan is invalid, with the proof of its problem if requested."""
     why = f"{failure['finding']}: {failure['explanation']}" if "finding" in failure else failure["outcome"]
     return f"plan {failure['plan']} (sample {failure['sample_id']}): {failure['reason']}; {why}"

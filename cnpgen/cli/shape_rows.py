@@ -3,7 +3,7 @@
 import math
 from typing import Any
 
-from cnpgen.robots.shape.pairs import LinkPair
+from cnpgen.robots.shape.link_pairs import LinkPair
 from cnpgen.robots.shape.shape import Shape
 
 _LEFT_OUT = {
@@ -18,7 +18,7 @@ def link_rows(shape: Shape) -> list[tuple[str, ...]]:
     head = ("link", "pieces", "corners", "capsule length [mm]", "radius [mm]", "overhang [mm]", "joint")
     rows: list[tuple[str, ...]] = [head]
     for capsule in shape.capsules:
-        pieces = [piece for piece in shape.pieces if piece.link == capsule.link]
+        pieces = [piece for piece in shape.convex_parts if piece.link == capsule.link]
         corners, length = sum(len(piece.vertices) for piece in pieces), math.dist(capsule.first, capsule.second)
         lengths = (f"{1e3 * value:.1f}" for value in (length, capsule.radius, capsule.overhang))
         joint = shape.joints[capsule.link]
@@ -28,7 +28,7 @@ def link_rows(shape: Shape) -> list[tuple[str, ...]]:
 
 def pair_rows(shape: Shape) -> list[tuple[str, ...]]:
     """List the pairs of links: in how many random states they collide, and who looks at them."""
-    head = ("links", "", "colliding", "capsules mistaken", "kept apart by")
+    head = ("links", "", "colliding", "false capsule contacts", "checked by")
     return [head, *((pair.first, pair.second, *_shares(pair), _use(pair)) for pair in shape.pairs)]
 
 
@@ -48,7 +48,7 @@ def shape_to_dict(shape: Shape) -> dict[str, Any]:
         {
             "link": each.link,
             "joint": shape.joints[each.link],
-            "pieces": sum(piece.link == each.link for piece in shape.pieces),
+            "pieces": sum(piece.link == each.link for piece in shape.convex_parts),
             "capsule": {"first": each.first.tolist(), "second": each.second.tolist(), "radius": each.radius},
             "overhang": each.overhang,
         }

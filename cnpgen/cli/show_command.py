@@ -18,8 +18,8 @@ KINDS: tuple["Kind", ...] = ("dataset", "pipeline", "problem")  # a dataset incl
 
 
 _TEXT = """\
-A dataset is shown with its pipeline and its problem, a pipeline with its problem. A file that has mistakes is not
-shown: every mistake is a line on stderr, with file and key, and the exit code is 2.
+A dataset is shown with its pipeline and its problem, a pipeline with its problem. Mistakes in a file are
+reported on stderr with file and key, one per line, and the exit code is 2.
 """
 
 
@@ -38,7 +38,7 @@ def add(commands: "Commands[Parser]") -> None:
     what.add_argument("--constraint", metavar="KIND", help="describe a kind of constraint and its keys")
     text = "all keys of problem, pipeline, dataset and suite files, in Markdown (docs/keys.md); WHAT is one of these"
     what.add_argument("--keys", metavar="WHAT", nargs="?", choices=("all", *MARKS), const="all", help=text)
-    parser.add_argument("--kind", choices=KINDS, help="which one, where several recipes have the same name")
+    parser.add_argument("--kind", choices=KINDS, help="kind of the recipe, if several have the same name")
     add_json(parser)
 
 
@@ -49,7 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     if arguments.recipe is None:
         if arguments.kind:
-            raise UsageError("--kind says which recipe is meant: it goes with NAME or FILE only")
+            raise UsageError("--kind needs NAME or FILE")
         print(_about_kinds(arguments))
         return 0
     check_recipe(arguments.recipe)
@@ -80,9 +80,9 @@ def load_any(name_or_path: str, kind: "Kind | None" = None) -> "Recipe":
     Raises:
         RecipeError: There is none, or it has mistakes.
     """
-    from cnpgen.make.load import load_dataset_recipe
-    from cnpgen.pipelines.load import load_pipeline
-    from cnpgen.problems.load import load_problem
+    from cnpgen.make.recipe_file import load_dataset_recipe
+    from cnpgen.pipelines.pipeline_file import load_pipeline
+    from cnpgen.problems.problem_file import load_problem
 
     kind = kind or _kind(name_or_path)
     if kind == "dataset":
@@ -91,7 +91,7 @@ def load_any(name_or_path: str, kind: "Kind | None" = None) -> "Recipe":
 
 
 def _kind(name_or_path: str) -> "Kind":
-    """Find out what kind of recipe is meant."""
+    """Determine the kind of a recipe."""
     from cnpgen.schema.catalogue import list_recipes
     from cnpgen.schema.toml import kind_of_file
 

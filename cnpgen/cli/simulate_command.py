@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 PLANTS = ("nominal", "heavier", "delayed")
 
 _TEXT = """\
-Every plan is executed for itself, by computed torque at 1 kHz, on a robot with friction that its controller does not
-know. On a table, a plan that ends in motion is a hit: the puck lies 7 cm ahead of where it ends. docs/benchmark.md says
-what is simulated and what is counted. The exit code is 0 if every plan does its task (scores without touching the puck
-early, or reaches its goal without collision), and 1 if any does not.
+Every plan is executed separately by computed torque at 1 kHz on a robot with friction that its controller does not
+model. On a table, a plan that ends with a velocity is a hit: the puck lies 7 cm ahead of its end. docs/benchmark.md
+describes the simulation and its results. The exit code is 0 if every plan succeeds (it scores without touching the puck
+early, or reaches its goal without collision), and 1 otherwise.
 """
 _NAMES = {
     "success": "success",
@@ -46,14 +46,14 @@ def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
     parser = add_command(commands, "simulate", run, title="execute the plans of a file in MuJoCo", text=_TEXT)
     option = parser.add_argument
-    option("file", metavar="FILE", type=Path, help="a file of plans, .h5")
-    option("--problem", metavar="NAME|FILE", help="the problem that they must be for")
+    option("file", metavar="FILE", type=Path, help="plan file, .h5")
+    option("--problem", metavar="NAME|FILE", help="the problem of the plans")
     where = parser.add_mutually_exclusive_group().add_argument
     where("--plant", choices=PLANTS, default="nominal", help=f"the robot: {', '.join(PLANTS)} (default: nominal)")
-    where("--environment", metavar="PATH", type=Path, help="a clone of the Air Hockey Challenge, to execute them there")
+    where("--environment", metavar="PATH", type=Path, help="clone of the Air Hockey Challenge that executes them")
     option("--workers", metavar="W", type=values.positive, help="processes; default one per available core")
-    option("--list", action="store_true", help="list the plans, too: a line each")
-    option("--plan", metavar="I", type=values.natural, default=0, help="the plan to draw (default: 0)")
+    option("--list", action="store_true", help="also list the plans, one per line")
+    option("--plan", metavar="I", type=values.natural, default=0, help="plan to draw (default: 0)")
     option("--image", metavar="PICTURE", type=_picture, help="draw the world at the end of one plan: .png")
     option("--video", metavar="FILM", type=_film, help="film one plan: .mp4 or .gif")
     add_json(parser)
@@ -120,7 +120,7 @@ def _lines(found: "Simulation") -> list[str]:
 
 
 def _draw(arguments: argparse.Namespace, plan: "Plans", plant: "Plant") -> None:
-    from cnpgen.benchmark.simulator.picture import save_film, save_picture
+    from cnpgen.benchmark.simulator.rendering import save_film, save_picture
     from cnpgen.benchmark.simulator.simulate import execute_plan
 
     if not (arguments.image or arguments.video):

@@ -18,7 +18,7 @@ _TEXT = (
 A folder of a dataset gives its rows, a recipe gives fresh draws, which no split of the dataset holds. Rows of a
 certified dataset have plans already: these are refined. An HDF5 file gives boundary conditions: a shard, a file of
 plans, whose plans are not looked at, or any other with start_q and goal_q of shape (N, joints), and start_dq,
-start_ddq and goal_dq where they are not zero. --problem says which problem it is of where the file does not.
+start_ddq and goal_dq where they are not zero. --problem names the problem if the file does not.
 """
     + TEXT
 )
@@ -26,29 +26,29 @@ start_ddq and goal_dq where they are not zero. --problem says which problem it i
 
 def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
-    parser = add_command(commands, "solve", run, title="make plans from nothing", text=_TEXT)
+    parser = add_command(commands, "solve", run, title="plan without an initial guess", text=_TEXT)
     option = parser.add_argument
     option(
         "what",
         metavar="DIR|NAME|FILE",
         help="a dataset's folder; a dataset or pipeline by name, or a recipe file; or boundary conditions in HDF5",
     )
-    option("--n", metavar="K", type=values.rows, help="how many problems; of a folder by default all of the split")
-    option("--split", metavar="NAME", help="which split of the folder (default: validation)")
-    option("--first", metavar="I", type=values.natural, help="the first row of the split (default: 0)")
-    option("--seed", metavar="S", type=values.seed, help="root seed of fresh draws; default the recipe's")
+    option("--n", metavar="K", type=values.rows, help="number of problems; for a folder all of the split by default")
+    option("--split", metavar="NAME", help="split of the folder (default: validation)")
+    option("--first", metavar="I", type=values.natural, help="first sample of the split (default: 0)")
+    option("--seed", metavar="S", type=values.seed, help="root seed of fresh problems; default the recipe's")
     option(
         "--problem",
         metavar="NAME|FILE",
-        help="the problem that boundary conditions in HDF5 must be of; its tolerances count",
+        help="the problem of boundary conditions in HDF5; its tolerances are used",
     )
-    option("-o", "--out", metavar="OUT", type=Path, help="where to (default: DIR-plans.h5 or NAME-plans.h5 here)")
+    option("-o", "--out", metavar="OUT", type=Path, help="output file (default: DIR-plans.h5 or NAME-plans.h5)")
     add_options(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
-    from cnpgen.refine.plans import refine_plans, solve_plans
+    from cnpgen.refine.refine_plans import refine_plans, solve_plans
 
     problems = _problems(arguments)
     out = arguments.out or Path(f"{_name(Path(arguments.what))}-plans.h5")
@@ -57,7 +57,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _name(what: Path) -> str:
-    """Return what plans are called after: a folder, whatever dots are in its name, or a recipe."""
+    """Return the stem of the output: the name of the folder or of the recipe."""
     return what.resolve().name if what.is_dir() else what.stem
 
 
@@ -78,7 +78,7 @@ def _rows(arguments: argparse.Namespace) -> "Plans":
     from cnpgen.plans.boundary_problems import load_boundary_problems
 
     _refuse(arguments, ["seed"], "--seed is for fresh draws of a recipe; rows of a folder have --split and --first")
-    _refuse(arguments, ["problem"], "--problem is for boundary conditions in HDF5; a dataset says its problem itself")
+    _refuse(arguments, ["problem"], "--problem is for boundary conditions in HDF5; a dataset contains its problem")
     split = arguments.split or "validation"
     return load_boundary_problems(arguments.what, split=split, start=arguments.first, n=arguments.n)
 
@@ -98,15 +98,15 @@ def _conditions(arguments: argparse.Namespace) -> "Plans":
 def _draws(arguments: argparse.Namespace) -> "Plans":
     from cnpgen.cli.recipe_names import check_recipe, check_there
     from cnpgen.errors import UsageError
-    from cnpgen.make.boundary_problems import draw_boundary_problems
+    from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 
     check_there(arguments.what)
     check_recipe(arguments.what)
     of_rows = "--split and --first are for the folder of a dataset; fresh draws of a recipe have --seed"
     _refuse(arguments, ["split", "first"], of_rows)
-    _refuse(arguments, ["problem"], "--problem is for boundary conditions in HDF5; a recipe says its problem itself")
+    _refuse(arguments, ["problem"], "--problem is for boundary conditions in HDF5; a recipe contains its problem")
     if arguments.n is None:
-        raise UsageError(f"--n says how many fresh problems of the recipe {arguments.what} are drawn: it is missing")
+        raise UsageError(f"--n is required: the number of fresh problems of the recipe {arguments.what}")
     return draw_boundary_problems(arguments.what, arguments.n, seed=arguments.seed)
 
 

@@ -1,4 +1,4 @@
-r"""The one place through which a command prints: what strangers wrote must not steer the terminal that shows it.
+r"""The output stream of every command: untrusted text must not control the terminal that shows it.
 
 Titles of recipes, names of fields and joints, texts in files of plans: any of them may hold the control characters by
 which a terminal is told to move, to colour, to rename its window, or the marks that turn the direction of writing. They

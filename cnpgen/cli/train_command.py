@@ -16,16 +16,15 @@ if TYPE_CHECKING:
     from cnpgen.training.train import Trained
 
 _TEXT = """\
-The loss is the problem's objective and its constraints along every motion; no demonstrations are needed. Beside the
-model there are a log, .jsonl, a picture of it, .png (if matplotlib is installed), and until it is finished a
-checkpoint: after Ctrl-C (exit code 130) or SIGTERM (143) the same command goes on where it was, after kill -9 or a
-full disk at most a minute before, and gives the parameters that it would have given. The model that is kept is the
-best of ten, compared on validation rows as 'cnpgen evaluate' judges them; its score is that on others. Its file is
-printed on stdout. docs/training.md says how to choose.
+The loss is the problem's objective and constraints along every motion; no demonstrations are needed. The command also
+writes a log (.jsonl), a picture of it (.png, if matplotlib is installed) and, until the end, a checkpoint. After Ctrl-C
+(exit code 130), SIGTERM (143), kill -9 or a full disk the same command resumes from the checkpoint and gives the same
+parameters. The best of ten models on validation samples is kept; its score is measured on other samples. The model file
+is printed on stdout. docs/training.md explains the options.
 """
 
 _CHECK = "validation rows to compare models by, half of all at most (default: 200)"
-_STEPS, _FLAGS = ("bending_steps", "landing_steps"), ("within_limits", "paced")
+_STEPS, _FLAGS = ("line_projection_steps", "projection_steps"), ("within_limits", "time_parametrized")
 _SECONDS = "how long to train: CPU time of the steps; compiling and validations come on top (default: 2 min)"
 
 
@@ -34,20 +33,20 @@ def add(commands: "Commands[Parser]") -> None:
     parser = add_command(commands, "train", run, title="train a planner on a dataset", text=_TEXT)
     option = parser.add_argument
     option("folder", metavar="DIR", type=Path, help="the dataset")
-    option("-o", "--out", metavar="MODEL", type=Path, required=True, help="where the model goes, .h5")
+    option("-o", "--out", metavar="MODEL", type=Path, required=True, help="model file to write, .h5")
     _add_length(parser)
     _add_how(parser)
     option("--check", metavar="N", type=values.positive, default=200, help=_CHECK)
     option("--workers", metavar="W", type=values.positive, help="processes of the last validation, on up to 2,000 rows")
-    option("--force", action="store_true", help="replace MODEL and the files beside it, another run's checkpoint too")
+    option("--force", action="store_true", help="replace MODEL, its log and another run's checkpoint")
     option("--quiet", action="store_true", help="no progress and no summary")
 
 
 def _add_length(parser: Parser) -> None:
     option = parser.add_mutually_exclusive_group().add_argument
     option("--cpu-seconds", metavar="S", type=values.seconds, help=_SECONDS)
-    option("--steps", metavar="N", type=values.positive, help="likewise, in steps")
-    option("--epochs", metavar="E", type=values.positive, help="likewise, in passes over all rows")
+    option("--steps", metavar="N", type=values.positive, help="length of the run in steps")
+    option("--epochs", metavar="E", type=values.positive, help="length of the run in passes over all samples")
 
 
 def _add_how(parser: Parser) -> None:
@@ -57,7 +56,7 @@ def _add_how(parser: Parser) -> None:
     option("--batch-size", metavar="B", type=values.positive, help="rows per step, or all there are (default: 64)")
     option("--learning-rate", metavar="X", type=float, help="largest learning rate of Adam (default: 1e-3)")
     option("--metric", choices=metrics, help="weights of the constraints (default: ramped)")
-    option("--growth", metavar="X", type=float, help="by which factor ramped weights grow in the run (default: 30)")
+    option("--growth", metavar="X", type=float, help="factor by which ramped weights grow (default: 30)")
     option(
         "--margin",
         metavar="TERM=X",
@@ -69,31 +68,43 @@ def _add_how(parser: Parser) -> None:
     option(
         "--expected-time",
         choices=("distance", "reach"),
-        help="what motion times are a multiple of: the time of the distance at the velocity limits, or that in which"
-        " joints could reach their goal states (default: distance)",
+        help="unit of the network's durations: the distance over the velocity limits, or the time in which joints"
+        " reach their goal states (default: distance)",
     )
-    option("--rate-bias", metavar="X", type=float, help="logarithm of the first guess of that factor (default: -0.5)")
     option(
-        "--bending-steps", metavar="N", type=values.positive, help="steps that bend the line to the goal (default: 1)"
+        "--rate-bias",
+        metavar="X",
+        type=float,
+        help="logarithm of the first guess of the duration factor (default: -0.5)",
     )
-    option("--landing-steps", metavar="N", type=values.positive, help="likewise of what the network gives (default: 1)")
+    option(
+        "--line-projection-steps",
+        metavar="N",
+        type=values.positive,
+        help="Gauss-Newton steps that project the line onto the manifold (default: 1)",
+    )
+    option("--projection-steps", metavar="N", type=values.positive, help="the same for the network's path (default: 1)")
     option("--within-limits", action="store_true", help="keep control points within the joint limits in these steps")
-    option("--paced", action="store_true", help="let the planner fit rates to the limits behind the network")
+    option("--time-parametrized", action="store_true", help="fit the rates to the limits after the network")
     option(
         "--imitate",
         metavar="X",
         type=float,
-        help="begin with so large a fraction of the steps, such as 0.1, that imitate the plans of a dataset made with"
-        " --certify (default: 0)",
+        help="fraction of the steps, such as 0.1, that imitate the plans of a dataset made with --certify (default: 0)",
     )
     option(
         "--from",
         dest="start_from",
         metavar="MODEL",
-        help="begin with the parameters of a model, by name or file, instead of random ones; --hidden, --layers and"
-        " --expected-time must be as it was trained with",
+        help="start from the parameters of a model, by name or file; --hidden, --layers and --expected-time"
+        " must be those of the model",
     )
-    option("--seed", metavar="S", type=values.seed, help="of the first parameters and the order of rows (default: 0)")
+    option(
+        "--seed",
+        metavar="S",
+        type=values.seed,
+        help="seed of the initial parameters and of the order of samples (default: 0)",
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:

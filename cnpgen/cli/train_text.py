@@ -1,4 +1,4 @@
-"""What ``cnpgen train`` says: a bar, a line per validation, a summary."""
+"""Output of ``cnpgen train``: a bar, a line per validation, a summary."""
 
 import sys
 import textwrap
@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 from cnpgen.cli.progress import Meter
 
 if TYPE_CHECKING:
-    from cnpgen.training.run import Run
-    from cnpgen.training.state import State
     from cnpgen.training.train import Trained
+    from cnpgen.training.training_run import Run
+    from cnpgen.training.training_state import State
 
 
 WIDTH = 100  # of a line

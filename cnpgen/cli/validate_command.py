@@ -1,4 +1,4 @@
-"""``cnpgen validate``: prove that a dataset is what it says it is."""
+"""``cnpgen validate``: verify a dataset."""
 
 import argparse
 from pathlib import Path
@@ -9,27 +9,26 @@ from cnpgen.cli.parser import Commands, Parser, add_command, add_engine, add_jso
 from cnpgen.cli.progress import Meter
 
 if TYPE_CHECKING:
-    from cnpgen.validate.dataset import ValidationReport
+    from cnpgen.validate.validate_dataset import ValidationReport
 
 _TEXT = """\
-Always checked: that every file is there, whole (sha256) and what plan.json and the manifest say. --deep reads every
-row: constraints, positions, hits and their highest speeds, torque ratios, clearances, stored ranges, statistics,
-counts, and rows that stand there twice; of "attempts" only the sum per shard. Every row's attempts, the columns of
-plug-ins, and which draws became rows are for --regenerate to prove. It draws and solves blocks of 4096 rows again from
-the seed: with the backend, the kind of machine and the versions that made the dataset every bit is the same; elsewhere
-rows that agree to rounding (1e-9) are no finding.
+The command always checks that every file exists and matches its sha256, the specification and the manifest. --deep
+checks every sample: constraints, positions, hits and their maximum speeds, torque ratios, clearances, ranges,
+statistics, counts and duplicates; of "attempts" only the sum per shard. It judges the plans of a certified dataset as
+'cnpgen evaluate' does. --regenerate makes blocks of 4096 samples again from the seed and checks everything else: the
+attempts of each sample, columns of plug-ins, and which candidates were accepted. With the same backend, kind of machine
+and versions every bit is equal; elsewhere samples must agree to 1e-9.
 
-On stdout are the findings, one per line, as FILE: PROBLEM, and what was checked; with --quiet the findings only. A line
-that begins with "note:" is worth knowing and no finding. Of a certified dataset --deep judges the plans, too, as
-'cnpgen evaluate' does. Exit codes: 0 nothing was found, 1 there are findings, 2 a wrong argument, 3 this machine cannot
-check it: --regenerate of what compiled kernels have made needs a C compiler, and what plug-ins are part of needs them
-for --deep and --regenerate; without these options nothing but the files is needed.
+Findings are printed on stdout, one per line, as FILE: PROBLEM, followed by a summary of the checks; --quiet prints the
+findings only. A line that begins with "note:" is no finding. Exit codes: 0 no findings, 1 findings, 2 a wrong argument,
+3 this machine cannot check it: --regenerate of a compiled dataset needs a C compiler, and --deep and --regenerate need
+the plug-ins of the dataset.
 """
 
 
 def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
-    parser = add_command(commands, "validate", run, title="prove that a dataset is what it says it is", text=_TEXT)
+    parser = add_command(commands, "validate", run, title="verify a dataset", text=_TEXT)
     option = parser.add_argument
     option("folder", metavar="DIR", type=Path, help="folder of a dataset")
     option("--deep", action="store_true", help="check every row, its constraints with Pinocchio and Coal")
@@ -38,11 +37,11 @@ def add(commands: "Commands[Parser]") -> None:
         metavar="K",
         type=values.natural,
         default=0,
-        help="make K random blocks, or all if there are fewer, again from the seed and compare them",
+        help="make K random blocks again from the seed and compare them",
     )
     option("--workers", metavar="W", type=values.positive, help="processes for --deep; default one per available core")
     add_engine(parser)
-    option("--quiet", action="store_true", help="no progress and no summary: nothing at all if nothing is wrong")
+    option("--quiet", action="store_true", help="print findings only")
     add_json(parser)
 
 
@@ -64,7 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _validate(arguments: argparse.Namespace) -> "ValidationReport":
-    from cnpgen.validate.dataset import validate_dataset
+    from cnpgen.validate.validate_dataset import validate_dataset
 
     names = ("deep", "regenerate", "workers", "engine", "address")
     options = {name: getattr(arguments, name) for name in names}
@@ -80,13 +79,13 @@ def _validate(arguments: argparse.Namespace) -> "ValidationReport":
 
 
 def _rows(folder: Path) -> int:
-    """Return how many rows there are to compute again; 0 if plan.json cannot say, which validation will report."""
+    """Return the number of samples to check; 0 if the specification is damaged, which validation reports."""
     from cnpgen.errors import DatasetError
-    from cnpgen.store.blueprint import load_blueprint, shards
-    from cnpgen.store.record import is_committed
+    from cnpgen.store.dataset_spec import load_dataset_spec, shards
+    from cnpgen.store.shard_record import is_committed
 
     try:
-        blueprint = load_blueprint(folder)
+        spec = load_dataset_spec(folder)
     except DatasetError:
         return 0
-    return sum(task.rows for task in shards(blueprint) if is_committed(folder, blueprint, task))
+    return sum(task.rows for task in shards(spec) if is_committed(folder, spec, task))

@@ -9,9 +9,9 @@ from cnpgen.errors import either
 
 _PLAIN = re.compile(r"[+-]?[0-9]+(_[0-9]+)*")
 _SCIENTIFIC = re.compile(r"[+-]?[0-9]+(\.[0-9]+)?[eE]\+?[0-9]{1,2}")
-MOST_ROWS = 10**12  # make.MAX_ROWS, and
-_LONGEST = 30  # digits; no number here has more, and very long ones take long to read
-MOST_CHOSEN = 10**7  # of the numbers in a range
+MAX_ROWS_ARGUMENT = 10**12  # make.MAX_ROWS, and
+_MAX_DIGITS = 30  # digits; no number here has more, and very long ones take long to read
+MAX_SELECTED = 10**7  # of the numbers in a range
 
 
 def whole(text: str) -> int:
@@ -20,13 +20,13 @@ def whole(text: str) -> int:
     Raises:
         ValueError: It is none.
     """
-    if len(text) <= _LONGEST and _PLAIN.fullmatch(text):
+    if len(text) <= _MAX_DIGITS and _PLAIN.fullmatch(text):
         return int(text)
-    if len(text) <= _LONGEST and _SCIENTIFIC.fullmatch(text):
+    if len(text) <= _MAX_DIGITS and _SCIENTIFIC.fullmatch(text):
         number = Decimal(text)
         if number == number.to_integral_value():
             return int(number)
-    raise ValueError(f"no whole number: {text[:_LONGEST]!r}")
+    raise ValueError(f"no whole number: {text[:_MAX_DIGITS]!r}")
 
 
 def _at_least(low: int, text: str, example: str) -> int:
@@ -42,8 +42,8 @@ def _at_least(low: int, text: str, example: str) -> int:
 def rows(text: str) -> int:
     """Read a number of rows, 1 to 10^12."""
     number = _at_least(1, text, "120000, 120_000 or 1e6")
-    if number > MOST_ROWS:
-        raise ArgumentTypeError(f"expected at most {MOST_ROWS:.0e} rows, got {text!r}")
+    if number > MAX_ROWS_ARGUMENT:
+        raise ArgumentTypeError(f"expected at most {MAX_ROWS_ARGUMENT:.0e} rows, got {text!r}")
     return number
 
 
@@ -85,7 +85,7 @@ def part(text: str) -> tuple[int, int]:
 
 
 def plot_file(text: str) -> str:
-    """Read the name of a picture file that can be written, as far as its folder tells before it is drawn."""
+    """Read the name of a picture file in an existing folder."""
     return picture_file(text, ".png", ".pdf", ".svg")
 
 
@@ -125,9 +125,9 @@ def numbers(text: str) -> tuple[int, ...]:
     """Read whole numbers and ranges of them, ends included: ``0,3,10-12``."""
     found: list[int] = []
     for item in text.split(","):
-        ends = re.fullmatch(r"\s*(-?[0-9]+)\s*(?:-\s*([0-9]+))?\s*", item[:_LONGEST])
+        ends = re.fullmatch(r"\s*(-?[0-9]+)\s*(?:-\s*([0-9]+))?\s*", item[:_MAX_DIGITS])
         low, high = (int(ends[1]), int(ends[2] or ends[1])) if ends else (1, 0)
-        if not low <= high < low + MOST_CHOSEN:
+        if not low <= high < low + MAX_SELECTED:
             raise ArgumentTypeError(f"expected whole numbers such as 0,3,10-12; got {text[:60]!r}")
         found += range(low, high + 1)
     return tuple(found)

@@ -1,4 +1,4 @@
-"""What ``cnpgen evaluate`` prints: counts, reasons, figures, margins; and the plans one by one."""
+"""Output of ``cnpgen evaluate``: counts, reasons, statistics, margins; and the plans one by one."""
 
 import math
 from pathlib import Path
@@ -30,12 +30,12 @@ _TALLIES = {
 
 def summary_text(file: Path, found: "Evaluation") -> str:
     """Lay out what is said of all plans together."""
-    from cnpgen.judges.plans.sampling import MOST
+    from cnpgen.judges.plans.sampling import MAX_TIME_SAMPLES
 
     summary, count = found.summary(), len(found.verdicts)
     step = f"{1e3 * found.step:g} ms"
-    if (found.plans.duration > MOST * found.step).any():
-        step += f" or of {MOST:,} in all"
+    if (found.plans.duration > MAX_TIME_SAMPLES * found.step).any():
+        step += f" or of {MAX_TIME_SAMPLES:,} in all"
     head = f"{file}: {counted(count, 'plan')} of {found.plans.problem.name}, judged at steps of {step} and between them"
     tallies = [
         (text, f"{summary[name]:,} of {count:,}", f"{summary[f'{name}_ratio']:.2%}", "")
@@ -66,11 +66,11 @@ def _figure(form: str, value: float) -> str:
 
 def _why(verdict: "Verdict") -> str:
     """Say what decided, as far as there is more to say than the reason."""
-    from cnpgen.judges.plans.sampling import LONGEST
+    from cnpgen.judges.plans.sampling import MAX_DURATION_S
     from cnpgen.judges.plans.verdict import Reason
 
     if verdict.reason == Reason.TOO_LONG:
-        return f"{verdict.metrics.duration:.3g} s are more than {LONGEST:,.0f} s"
+        return f"{verdict.metrics.duration:.3g} s are more than {MAX_DURATION_S:,.0f} s"
     return str(verdict.worst or "")
 
 
@@ -91,16 +91,15 @@ def _figures(summary: dict[str, Any]) -> list[tuple[str, ...]]:
 
 
 def _margins(summary: dict[str, Any]) -> list[tuple[str, ...]]:
-    """Lay out how many plans break each condition, and which comes closest to its bound or is furthest beyond."""
+    """Format per condition the number of violating plans and the plan with the smallest margin."""
     rows: list[tuple[str, ...]] = [
-        ("condition", "broken by", "worst excess", "allowed", "unit", "plan", "t [s]", "where")
+        ("condition", "violated by", "worst violation", "tolerance", "unit", "plan", "t [s]", "where")
     ]
     for name, worst in summary["conditions"].items():
-        excess = "-" if worst["excess"] is None else f"{worst['excess']:.2e}"
+        violation = "-" if worst["violation"] is None else f"{worst['violation']:.2e}"
         at = "-" if worst["time"] is None else f"{worst['time']:.4f}"
-        allowed = f"{worst['allowed']:.1e}"
-        cells = (f"{worst['plans_out']:,}", excess, allowed, worst["unit"], str(worst["worst_plan"]), at, worst["part"])
-        rows.append((name, *cells))
+        count, tolerance = f"{worst['violating_plans']:,}", f"{worst['tolerance']:.1e}"
+        rows.append((name, count, violation, tolerance, worst["unit"], str(worst["worst_plan"]), at, worst["part"]))
     return rows
 
 
@@ -110,7 +109,7 @@ def listing_text(found: "Evaluation") -> str:
     metrics = {index: found.verdicts[index].metrics.to_dict() for index in order}
     shown = [name for name in METRICS if any(name in values for values in metrics.values())]
     rows = [
-        ("plan", "sample", "verdict", *(METRICS[name][1] for name in shown), "nearest to a bound, or furthest beyond")
+        ("plan", "sample", "verdict", *(METRICS[name][1] for name in shown), "smallest margin, or largest violation")
     ]
     for index in order:
         values = [(METRICS[name][2], metrics[index].get(name)) for name in shown]

@@ -1,4 +1,4 @@
-"""``cnpgen view``: a robot, a plan or a row as a page that any browser opens."""
+"""``cnpgen view``: show a robot, a plan or a sample in a browser."""
 
 import argparse
 from pathlib import Path
@@ -8,29 +8,31 @@ from cnpgen.cli import values
 from cnpgen.cli.parser import Commands, Parser, add_command
 
 if TYPE_CHECKING:
-    from cnpgen.cli.view.scene import Scene
+    from cnpgen.cli.view.view_scene import ViewScene
     from cnpgen.plans import Plans
 
 _TEXT = """\
-One file that needs no network: the arm with its meshes, its obstacles, the path of its tip, a slider of time, and its
-joints against their limits. A plan moves; a row without a plan is shown at its start and its goal, a problem in its
-base configuration. Plans and datasets hold the shape that judges see, and no meshes: --problem names the file that
-leads to them. --serve shows the page at an address of this machine instead, until Ctrl-C, and again when a file
-behind it changes; ?row=I at its end shows another row. Needs MeshCat's viewer: pip install 'cnpgen[view]'.
+The page is one file that needs no network: the arm with its meshes, its obstacles, the path of its tip, a time slider,
+and its joints relative to their limits. A plan moves; a sample without a plan is shown at its start and goal, a problem
+in its base configuration. Plans and datasets contain collision geometry only; --problem locates the visual meshes.
+--serve serves the page locally until Ctrl-C and reloads it when a file changes; ?row=I shows another sample. Needs
+MeshCat's viewer: pip install 'cnpgen[view]'.
 """
 
 
 def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
-    parser = add_command(commands, "view", run, title="look at a robot, a plan or a row in a browser", text=_TEXT)
+    parser = add_command(commands, "view", run, title="show a robot, a plan or a sample in a browser", text=_TEXT)
     option = parser.add_argument
-    option("what", metavar="PROBLEM|DIR|FILE", help="a problem, by name or file; the folder of a dataset; or plans")
-    option("--row", metavar="I", type=values.natural, help="which plan of the file, or row of the split (default: 0)")
-    option("--split", metavar="NAME", help="which split of the folder (default: validation)")
+    option(
+        "what", metavar="PROBLEM|DIR|FILE", help="a problem by name or file, the folder of a dataset, or a plan file"
+    )
+    option("--row", metavar="I", type=values.natural, help="plan of the file, or sample of the split (default: 0)")
+    option("--split", metavar="NAME", help="split of the folder (default: validation)")
     text = "the problem of plans or rows, whose URDF leads to its visual meshes"
     option("--problem", metavar="NAME|FILE", help=text)
     where = parser.add_mutually_exclusive_group()
-    where.add_argument("-o", "--out", metavar="OUT", type=_page, help="where to (default: NAME.html here)")
+    where.add_argument("-o", "--out", metavar="OUT", type=_page, help="output file (default: NAME.html)")
     text = "serve the page on this machine, and show every change of its files (default port: 8000)"
     where.add_argument("--serve", metavar="PORT", type=values.port, nargs="?", const=8000, help=text)
 
@@ -54,28 +56,28 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _serve(arguments: argparse.Namespace) -> int:
-    """Serve the page until somebody interrupts."""
+    """Serve the page until an interruption."""
     from cnpgen.cli.view.page import page_of
     from cnpgen.cli.view.serve import serve
-    from cnpgen.store.layout import PLAN
+    from cnpgen.store.layout import SPECIFICATION
 
     def page(row: int | None, stamp: str) -> str:
         shown = arguments if row is None else argparse.Namespace(**(vars(arguments) | {"row": row}))
         return page_of(_scene(shown), stamp=stamp)
 
-    _scene(arguments)  # what is wrong is said before there is an address
+    _scene(arguments)  # report errors before serving
     files = [Path(given) for given in (arguments.what, arguments.problem) if given and Path(given).exists()]
-    watched = [path / PLAN if path.is_dir() else path for path in files]
+    watched = [path / SPECIFICATION if path.is_dir() else path for path in files]
     serve(page, watched, port=arguments.serve, ready=lambda address: print(address, flush=True))
     return 0
 
 
-def _scene(arguments: argparse.Namespace) -> "Scene":
-    """Show what was given, by what it is."""
-    from cnpgen.cli.view.scene import scene_of_plan, scene_of_problem
+def _scene(arguments: argparse.Namespace) -> "ViewScene":
+    """Build the scene of a problem, a sample or a plan."""
+    from cnpgen.cli.view.view_scene import scene_of_plan, scene_of_problem
     from cnpgen.plans import open_problem
-    from cnpgen.problems.load import load_problem_behind
-    from cnpgen.problems.robot import load_robot
+    from cnpgen.problems.load_robot import load_robot
+    from cnpgen.problems.problem_file import load_problem_behind
     from cnpgen.store.paths import file_kind
 
     what, row = Path(arguments.what), arguments.row or 0
@@ -94,20 +96,20 @@ def _scene(arguments: argparse.Namespace) -> "Scene":
 
 
 def _refuse_for_problem(arguments: argparse.Namespace) -> None:
-    """Refuse options that mean nothing for a problem."""
+    """Refuse options that do not apply to a problem."""
     from cnpgen.errors import UsageError
 
     given = [name for name in ("row", "split", "problem") if getattr(arguments, name) is not None]
     if given:
-        raise UsageError(f"--{given[0]} is for plans and for the folder of a dataset, got {arguments.what}")
+        raise UsageError(f"--{given[0]} needs plans or the folder of a dataset, got {arguments.what}")
 
 
 def _row(arguments: argparse.Namespace, row: int) -> "Plans":
     """Read a row of a dataset."""
     from cnpgen.errors import DatasetError
     from cnpgen.plans.boundary_problems import load_boundary_problems
-    from cnpgen.problems.load import load_problem_behind
-    from cnpgen.problems.record import record_problem
+    from cnpgen.problems.problem_file import load_problem_behind
+    from cnpgen.problems.problem_record import record_problem
 
     plans = load_boundary_problems(arguments.what, split=arguments.split or "validation", start=row, n=1)
     if arguments.problem:

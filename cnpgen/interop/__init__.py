@@ -1,1 +1,1 @@
-"""Bridges to other people's frameworks, each imported only where that framework is; what they share needs none."""
+"""Bridges to torch, JAX and TensorFlow, each imported only if its framework is installed."""

@@ -12,12 +12,12 @@ except ImportError as error:
 
 
 def to_tensorflow(batches: Batches) -> Any:
-    """Give batches as a ``tf.data.Dataset`` of dicts: every pass gives the rest of an epoch.
+    """Return batches as a ``tf.data.Dataset`` of dicts; every pass yields the remaining batches of an epoch.
 
-    TensorFlow may take batches ahead of their use: the position is ``batches.state(epoch=..., batch=...)``.
+    TensorFlow may prefetch batches: the position is ``batches.state(epoch=..., batch=...)``.
 
     Args:
-        batches: What ``dataset.batches(...)`` returned.
+        batches: Batches from ``dataset.batches(...)``.
     """
 
     def generate() -> Iterator[dict[str, Any]]:

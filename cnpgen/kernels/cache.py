@@ -1,7 +1,7 @@
-"""The folder where tapes and compiled libraries are kept from run to run.
+"""The cache folder of tapes and compiled libraries.
 
-What is in it is loaded and run, so that nobody else may be able to change it: a folder that others own or may write to
-is refused, a single file likewise is as if it were not there.
+Its files are loaded and executed, so other users must not be able to change them. A folder that other users own or may
+write to is refused; such a file is ignored.
 """
 
 import atexit
@@ -20,195 +20,203 @@ from typing import IO
 from cnpgen.errors import MachineError
 
 LIBRARIES, TAPES = "lib", "tape"
-_WARM = "warm"  # in a temporary folder: a link to the cache that can be read but not written
-_OTHERS = stat.S_IWGRP | stat.S_IWOTH
-PATIENCE = 600  # [s] a process that needs longer may have been stopped: it is no longer waited for
+_READ_ONLY_LINK = "warm"  # in a temporary folder: a link to a cache that is readable but not writable
+_WRITABLE_FOR_OTHERS = stat.S_IWGRP | stat.S_IWOTH
+MAX_LOCK_WAIT_S = 600  # a process that holds a lock longer may have been stopped
 
 
 def default_cache_folder() -> Path:
-    """``$CNPGEN_CACHE``, else ``cnpgen`` in ``$XDG_CACHE_HOME`` or ``~/.cache``.
+    """Return ``$CNPGEN_CACHE``, else ``cnpgen`` in ``$XDG_CACHE_HOME`` or ``~/.cache``.
 
     Raises:
-        MachineError: None of them is known.
+        MachineError: Neither variable is set, and the user has no home folder.
     """
     if os.environ.get("CNPGEN_CACHE"):
         return Path(os.environ["CNPGEN_CACHE"])
     try:
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "cnpgen"
     except RuntimeError as error:
-        raise MachineError("this user has no home folder to keep kernels in: set CNPGEN_CACHE to a folder") from error
+        raise MachineError("this user has no home folder for the kernel cache: set CNPGEN_CACHE to a folder") from error
 
 
-def usable_folder(folder: Path) -> Path:
-    """Return the folder, made for this user alone if it is missing, or a temporary one.
+def usable_cache_folder(folder: Path) -> Path:
+    """Return the folder, created with private permissions if missing, or a temporary folder.
 
-    A folder that can only be read is still read: the temporary one refers to it. One that cannot be made, or that
-    others may change, is left alone after a warning.
+    The temporary folder links to a cache that is readable but not writable. A cache that cannot be created, or that
+    other users may change, is not used; a warning names the reason.
     """
     try:
-        make_private(folder)
+        make_private_folder(folder)
     except OSError as error:
-        return _instead(f"cannot write the kernel cache {folder} ({error.strerror or error})", "that can be written")
-    if why := distrusted(folder):
-        return _instead(f"the kernel cache {folder} is not used, {why}", "that nobody else may write to")
+        return _temporary_cache(
+            f"cannot write the kernel cache {folder} ({error.strerror or error})", "that is writable"
+        )
+    if problem := trust_problem(folder):
+        return _temporary_cache(
+            f"the kernel cache {folder} is not used, {problem}", "that is not writable for other users"
+        )
     try:
         with tempfile.TemporaryFile(dir=folder):
             return folder
     except OSError:
         temporary = temporary_folder()
-        (temporary / _WARM).symlink_to(folder.absolute())
+        (temporary / _READ_ONLY_LINK).symlink_to(folder.absolute())
         return temporary
 
 
-def _instead(problem: str, wanted: str) -> Path:
+def _temporary_cache(problem: str, expected: str) -> Path:
     warnings.warn(
-        f"{problem}: kernels are built for this run only, in a temporary folder; set CNPGEN_CACHE to a folder {wanted}",
+        f"{problem}: kernels are built for this run only, in a temporary folder;"
+        f" set CNPGEN_CACHE to a folder {expected}",
         RuntimeWarning,
         stacklevel=4,
     )
     return temporary_folder()
 
 
-def make_private(folder: Path) -> None:
-    """Make a folder, and those on the way to it, for this user alone, whatever the umask is; those there stay.
+def make_private_folder(folder: Path) -> None:
+    """Create a folder and its missing parents with permissions for this user only, independent of the umask.
 
     Raises:
-        OSError: It cannot be made.
+        OSError: It cannot be created.
     """
-    for each in (*reversed(folder.absolute().parents), folder.absolute()):
-        if not each.is_dir():
+    for path in (*reversed(folder.absolute().parents), folder.absolute()):
+        if not path.is_dir():
             try:
-                each.mkdir()
-            except FileExistsError as error:  # made by another process meanwhile, or a file
-                if each.is_dir():
+                path.mkdir()
+            except FileExistsError as error:  # created by another process meanwhile, or a file
+                if path.is_dir():
                     continue
-                raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(each)) from error
-            each.chmod(stat.S_IRWXU)
+                raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(path)) from error
+            path.chmod(stat.S_IRWXU)
 
 
-def keep_from_others(path: Path) -> None:
-    """Let nobody else write to a file, whatever the umask is; who may read it stays as it is."""
-    path.chmod(path.stat().st_mode & ~_OTHERS)
+def make_read_only_for_others(path: Path) -> None:
+    """Remove the write permission of other users from a file; its read permissions stay."""
+    path.chmod(path.stat().st_mode & ~_WRITABLE_FOR_OTHERS)
 
 
 @contextmanager
-def one_at_a_time(lock: Path) -> Iterator[None]:
-    """Let one process after the other do what is inside, where the system has locks; they end with their process.
+def exclusive_lock(lock: Path) -> Iterator[None]:
+    """Run the context in one process at a time, if the system has file locks; a lock ends with its process.
 
     Raises:
-        OSError: The lock's file cannot be made.
+        OSError: The lock file cannot be created.
     """
     with os.fdopen(os.open(lock, os.O_CREAT | os.O_RDWR, stat.S_IRUSR | stat.S_IWUSR), "r+b") as file:
-        with suppress(FileNotFoundError):  # another process is done and has removed it
-            lock.chmod(stat.S_IRUSR | stat.S_IWUSR)  # whatever the umask is
-        end = time.monotonic() + PATIENCE
-        while _is_held(file) and time.monotonic() < end:
+        with suppress(FileNotFoundError):  # another process has finished and removed it
+            lock.chmod(stat.S_IRUSR | stat.S_IWUSR)  # independent of the umask
+        end = time.monotonic() + MAX_LOCK_WAIT_S
+        while not _acquire(file) and time.monotonic() < end:
             time.sleep(0.02)
         try:
             yield
         finally:
             lock.unlink(missing_ok=True)
-            _let_go(file)
+            _release(file)
 
 
-def _is_held(file: IO[bytes]) -> bool:
-    """Take the lock on a file; whether another process holds it."""
+def _acquire(file: IO[bytes]) -> bool:
+    """Lock a file; return False if another process holds the lock, True where there are no locks."""
     try:
         import fcntl
 
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
-        return True
-    except (ImportError, OSError):  # Windows, and file systems without locks
         return False
-    return False
+    except (ImportError, OSError):  # Windows, and file systems without locks
+        return True
+    return True
 
 
-def _let_go(file: IO[bytes]) -> None:
-    """Give up the lock on a file, also where processes that were forked meanwhile have it open."""
+def _release(file: IO[bytes]) -> None:
+    """Release the lock on a file, even if processes that were forked meanwhile have it open."""
     with suppress(ImportError, OSError):
         import fcntl
 
         fcntl.flock(file, fcntl.LOCK_UN)
 
 
-def warm_folder(folder: Path) -> Path | None:
-    """Return the cache that can only be read and that a temporary folder stands in for, or None."""
-    return (folder / _WARM).resolve() if (folder / _WARM).is_symlink() else None
+def read_only_cache(folder: Path) -> Path | None:
+    """Return the read-only cache that a temporary folder links to, or None."""
+    return (folder / _READ_ONLY_LINK).resolve() if (folder / _READ_ONLY_LINK).is_symlink() else None
 
 
 def require_trusted(folder: Path) -> list[Path]:
-    """Return the folders to look for kernels in: this one and the one that it stands in for, if it does.
+    """Return the folders with cached kernels: this one and the read-only cache that it links to, if any.
 
     Raises:
-        MachineError: Others may change what is in one of them.
+        MachineError: Other users may change files in one of them.
     """
-    warm = warm_folder(folder)
-    folders = [folder] if warm is None else [folder, warm]
-    for each in folders:
-        if why := distrusted(each):
-            raise MachineError(f"the kernel cache {each} is not used, {why}: choose another folder")
+    linked = read_only_cache(folder)
+    folders = [folder] if linked is None else [folder, linked]
+    for cache in folders:
+        if problem := trust_problem(cache):
+            raise MachineError(f"the kernel cache {cache} is not used, {problem}: choose another folder")
     return folders
 
 
-def distrusted(folder: Path) -> str:
-    """Say who else may change what is in a cache folder: "as others may write to /a"; nothing if nobody may.
+def trust_problem(folder: Path) -> str:
+    """Return why other users may change files in a cache folder, or an empty text if they cannot.
 
-    Its folders and those on the way to it count, and what symbolic links on the way lead to.
+    The folder, its subfolders, its parents and the targets of symbolic links among them are checked.
     """
-    for each in filter(os.path.lexists, _way(folder.absolute())):
-        sticky = each != folder.absolute() and bool(each.stat().st_mode & stat.S_ISVTX)  # others' entries stay theirs
-        if why := _others(each, writable=sticky or each.is_symlink()):
-            return why
-    inside = (folder / name for name in (LIBRARIES, TAPES))
-    return next((why for each in inside if os.path.lexists(each) and (why := _planted(each))), "")
+    for path in filter(os.path.lexists, _path_components(folder.absolute())):
+        sticky = path != folder.absolute() and bool(path.stat().st_mode & stat.S_ISVTX)  # protects entries of others
+        if problem := _permission_problem(path, writable=sticky or path.is_symlink()):
+            return problem
+    subfolders = (folder / name for name in (LIBRARIES, TAPES))
+    return next(
+        (problem for path in subfolders if os.path.lexists(path) and (problem := _entry_problem(path))),
+        "",
+    )
 
 
 def is_trusted(path: Path) -> bool:
-    """Whether a file in a cache folder is this user's or root's, no link, and nobody else may write to it."""
-    return not _planted(path)
+    """Return whether a cache file is no link, belongs to this user or root, and is not writable for others."""
+    return not _entry_problem(path)
 
 
-def distrusted_files(folder: Path) -> list[Path]:
-    """List the tapes and libraries in a cache folder that others may have put there or changed."""
-    found = (path for name in (LIBRARIES, TAPES) for path in sorted((folder / name).glob("*.*")))
-    return [path for path in found if not is_trusted(path)]
+def untrusted_files(folder: Path) -> list[Path]:
+    """List the tapes and libraries in a cache folder that other users may have created or changed."""
+    paths = (path for name in (LIBRARIES, TAPES) for path in sorted((folder / name).glob("*.*")))
+    return [path for path in paths if not is_trusted(path)]
 
 
-def _planted(path: Path) -> str:
-    return f"as {path} is a symbolic link" if path.is_symlink() else _others(path)
+def _entry_problem(path: Path) -> str:
+    return f"as {path} is a symbolic link" if path.is_symlink() else _permission_problem(path)
 
 
-def _others(path: Path, *, writable: bool = False) -> str:
-    """Say who else owns a path or may write to it, unless it may be ``writable``."""
+def _permission_problem(path: Path, *, writable: bool = False) -> str:
+    """Return why other users own or may write a path, or an empty text; ``writable`` permits writing."""
     if not hasattr(os, "geteuid"):  # Windows
         return ""
     try:
-        found = path.lstat()
-    except FileNotFoundError:  # it was moved to its place since it was listed
+        status = path.lstat()
+    except FileNotFoundError:  # moved since it was listed
         return ""
-    if found.st_uid not in {0, os.geteuid()}:
-        return f"as {path} belongs to another user (uid {found.st_uid})"
-    if found.st_mode & _OTHERS and not writable:
+    if status.st_uid not in {0, os.geteuid()}:
+        return f"as {path} belongs to another user (uid {status.st_uid})"
+    if status.st_mode & _WRITABLE_FOR_OTHERS and not writable:
         return f"as others may write to {path} ('chmod go-w' ends that)"
     return ""
 
 
-def _way(path: Path) -> Iterator[Path]:
-    """List a path that is there, the folders above it, and likewise what symbolic links among them lead to."""
-    for each in (path, *path.parents):
-        yield each
-        if each.is_symlink():
-            yield from _way(Path(os.path.normpath(each.parent / each.readlink())))
+def _path_components(path: Path) -> Iterator[Path]:
+    """Yield an existing path, its parents, and the components of the targets of symbolic links among them."""
+    for component in (path, *path.parents):
+        yield component
+        if component.is_symlink():
+            yield from _path_components(Path(os.path.normpath(component.parent / component.readlink())))
 
 
 def temporary_folder() -> Path:
-    """Make a folder that is removed when this process ends; its workers may use it until then."""
+    """Create a folder that is removed when this process ends; its workers may use it until then."""
     folder = Path(tempfile.mkdtemp(prefix="cnpgen-cache-"))
     atexit.register(_remove, folder, os.getpid())
     return folder
 
 
 def _remove(folder: Path, owner: int) -> None:
-    if os.getpid() == owner:  # a forked worker inherits what is registered
+    if os.getpid() == owner:  # a forked worker inherits the exit handler
         shutil.rmtree(folder, ignore_errors=True)

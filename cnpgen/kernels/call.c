@@ -1,6 +1,5 @@
-/* Calls a kernel with NumPy's arrays: whether they fit, and where their numbers are, it finds out through Python's buffer
-protocol, in a quarter of the time that Python takes for it. vectors.h comes first; what is declared here of Python is in
-its stable ABI. */
+/* Calls a kernel with NumPy arrays. Shapes, strides and addresses come from Python's buffer protocol, in a quarter of
+the time that Python code takes. vectors.h is included before; the declarations of Python are those of its stable ABI. */
 
 typedef struct {
   void *numbers, *owner;
@@ -20,20 +19,20 @@ void *PyEval_SaveThread(void), PyEval_RestoreThread(void *);
 #define STRIDES_AND_FORMAT 0x1c /* PyBUF_STRIDES | PyBUF_FORMAT */
 
 typedef struct {
-  void (*kernel)(long n, const real *const *in, const long *distances, real *const *out);
+  void (*kernel)(long n, const real *const *in, const long *strides, real *const *out);
   long inputs, outputs;
   const long *widths; /* of inputs and outputs */
 } callee;
 
-/* Whether an array is float64 of shape (width, n) with contiguous rows. */
+/* Returns whether an array is float64 of shape (width, n) with contiguous rows. */
 static int fits(const array *a, long width, long n) {
   return a->dimensions == 2 && a->shape[0] == width && a->shape[1] == n && a->format[strspn(a->format, "=")] == 'd' &&
          (n < 2 || a->strides[1] == sizeof(real));
 }
 
-/* Runs a kernel on a tuple of arguments and a list of results, unless one of them does not fit; says whether it ran. */
+/* Runs a kernel on a tuple of arguments and a list of results; returns 0 without running it if one does not match. */
 int call(const callee *k, void *arguments, void *results) {
-  long count = k->inputs + k->outputs, open = 0, n = 0, distances[count];
+  long count = k->inputs + k->outputs, open = 0, n = 0, strides[count];
   array arrays[count];
   real *numbers[count];
   int fit = PyTuple_Size(arguments) == k->inputs;
@@ -48,11 +47,11 @@ int call(const callee *k, void *arguments, void *results) {
     open++;
     if (i == 0) n = a->dimensions == 2 ? a->shape[1] : 0;
     fit = fits(a, k->widths[i], n);
-    if (fit) numbers[i] = a->numbers, distances[i] = a->strides[0] / (long)sizeof(real);
+    if (fit) numbers[i] = a->numbers, strides[i] = a->strides[0] / (long)sizeof(real);
   }
   if (fit && n) {
     void *thread = PyEval_SaveThread();
-    k->kernel(n, (const real *const *)numbers, distances, numbers + k->inputs);
+    k->kernel(n, (const real *const *)numbers, strides, numbers + k->inputs);
     PyEval_RestoreThread(thread);
   }
   while (open) PyBuffer_Release(arrays + --open);

@@ -1,4 +1,4 @@
-"""The machine's C compiler: which one it is, what it compiles for, and running it."""
+"""The C compiler of the machine: its command, version, target and flags."""
 
 import hashlib
 import os
@@ -13,20 +13,23 @@ from pathlib import Path
 
 from cnpgen.errors import MachineError
 
-_OPEN = ("-Wl,-undefined,dynamic_lookup",) if platform.system() == "Darwin" else ()  # call.c calls Python's functions
-FLAGS = ("-std=gnu11", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-shared", "-w", *_OPEN)
-COMPILE_SECONDS = 3600  # what takes longer hangs; the largest kernels take minutes on a busy machine
-VERSION_SECONDS = 10
+_LINKER_FLAGS = ("-Wl,-undefined,dynamic_lookup",) if platform.system() == "Darwin" else ()  # for Python's C API
+COMPILER_FLAGS = (
+    "-std=gnu11", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-shared", "-w",
+    *_LINKER_FLAGS,
+)  # fmt: skip
+MAX_COMPILE_TIME_S = 3600  # the largest kernels take minutes on a busy machine; longer runs hang
+MAX_VERSION_TIME_S = 10
 
 
 @cache
 def find_compiler() -> str | None:
-    """Return the command of the C compiler: ``$CC``, then cc, gcc, clang; None where there is none.
+    """Return the command of the C compiler: ``$CC``, else cc, gcc or clang; None if there is none.
 
-    It is quoted as a shell would want it: CC may be a path with spaces, or a program with options ("ccache gcc").
+    It is quoted for a shell: CC may be a path with spaces, or a program with options ("ccache gcc").
     """
-    if wanted := os.environ.get("CC"):
-        return _command([wanted]) or _command(_words(wanted))
+    if configured := os.environ.get("CC"):
+        return _command([configured]) or _command(_words(configured))
     return next((path for path in map(shutil.which, ["cc", "gcc", "clang"]) if path), None)
 
 
@@ -38,7 +41,7 @@ def _words(command: str) -> list[str]:
 
 
 def _command(words: list[str]) -> str | None:
-    """Return a command with the path of its program, or None if there is no such program."""
+    """Return a command with the full path of its program, or None if the program does not exist."""
     path = shutil.which(words[0]) if words else None
     return shlex.join([path, *words[1:]]) if path else None
 
@@ -51,8 +54,8 @@ def require_compiler() -> str:
     """
     if compiler := find_compiler():
         return compiler
-    if wanted := os.environ.get("CC"):
-        raise MachineError(f"no C compiler found: CC is {wanted!r}, which names no program here (set or unset it)")
+    if configured := os.environ.get("CC"):
+        raise MachineError(f"no C compiler found: CC is {configured!r}, which names no program here (set or unset it)")
     raise MachineError("no C compiler found (looked for cc, gcc, clang): install gcc or clang")
 
 
@@ -63,17 +66,19 @@ def compiler_version(compiler: str) -> str:
     Raises:
         MachineError: The compiler does not run.
     """
-    done = _run([*shlex.split(compiler), "--version"], VERSION_SECONDS, "to say its version")
-    if done.returncode != 0:
-        raise MachineError(f"the C compiler {compiler} does not run: --version ends with exit code {done.returncode}")
-    return done.stdout.splitlines()[0].strip() if done.stdout else "unknown"
+    completed = _run([*shlex.split(compiler), "--version"], MAX_VERSION_TIME_S, "to print its version")
+    if completed.returncode != 0:
+        raise MachineError(
+            f"the C compiler {compiler} does not run: --version ends with exit code {completed.returncode}"
+        )
+    return completed.stdout.splitlines()[0].strip() if completed.stdout else "unknown"
 
 
-def _run(command: list[str], seconds: float, what: str) -> "subprocess.CompletedProcess[str]":
-    """Run a compiler; where it takes too long, or this process is interrupted, end it with all that it has started.
+def _run(command: list[str], seconds: float, purpose: str) -> "subprocess.CompletedProcess[str]":
+    """Run a compiler; at the time limit, or if this process is interrupted, kill it and its child processes.
 
     Raises:
-        MachineError: It does not run, or takes longer.
+        MachineError: It does not run, or exceeds the time limit.
     """
     pipe = subprocess.PIPE
     try:
@@ -87,14 +92,14 @@ def _run(command: list[str], seconds: float, what: str) -> "subprocess.Completed
             with suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
             if isinstance(error, subprocess.TimeoutExpired):
-                raise MachineError(f"the C compiler {command[0]} took more than {seconds:g} s {what}") from error
+                raise MachineError(f"the C compiler {command[0]} took more than {seconds:g} s {purpose}") from error
             raise
     return subprocess.CompletedProcess(command, process.returncode, out, errors)
 
 
 @cache
 def target() -> str:
-    """Name the instruction set that kernels are compiled for; machines that share a cache must not share libraries."""
+    """Return a name of the instruction set that kernels are compiled for, so that a cache may be shared by machines."""
     flags = ""
     if Path("/proc/cpuinfo").exists():
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
@@ -103,15 +108,15 @@ def target() -> str:
 
 
 def vector_flags() -> tuple[str, ...]:
-    """Flags that let the compiler use this machine's vector instructions."""
+    """Return the flags for the vector instructions of this machine."""
     if platform.machine() in ("arm64", "aarch64"):
         return ("-mcpu=native",)
     return ("-march=native",)
 
 
 def flags_of(level: str) -> tuple[str, ...]:
-    """Return what kernels are compiled with, at a level of optimisation."""
-    return (*FLAGS, level, *vector_flags())
+    """Return all compiler flags at an optimization level."""
+    return (*COMPILER_FLAGS, level, *vector_flags())
 
 
 def run_compiler(compiler: str, level: str, source: Path, built: Path) -> None:
@@ -121,7 +126,8 @@ def run_compiler(compiler: str, level: str, source: Path, built: Path) -> None:
         MachineError: The compiler fails, or takes more than an hour.
     """
     command = [*shlex.split(compiler), *flags_of(level), str(source), "-o", str(built), "-lm"]
-    done = _run(command, COMPILE_SECONDS, f"for {source.name}")
-    if done.returncode != 0 or not built.exists():
-        first = next((line for line in done.stderr.splitlines() if "error" in line), done.stderr.strip()[:200])
-        raise MachineError(f"{compiler} failed with exit code {done.returncode}: {first or 'no message'}")
+    completed = _run(command, MAX_COMPILE_TIME_S, f"for {source.name}")
+    if completed.returncode != 0 or not built.exists():
+        errors = completed.stderr
+        first = next((line for line in errors.splitlines() if "error" in line), errors.strip()[:200])
+        raise MachineError(f"{compiler} failed with exit code {completed.returncode}: {first or 'no message'}")

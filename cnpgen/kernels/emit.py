@@ -1,4 +1,4 @@
-"""C source of a tape, over vector types: one lane per sample, any target that GCC or Clang knows."""
+"""C source of a tape over vector types: one lane per sample, for any target of GCC or Clang."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -18,22 +18,21 @@ _BINARY = {
     "LT": "vlt({},{})", "LE": "vle({},{})", "EQ": "veq({},{})", "NE": "vne({},{})", "AND": "vand({},{})",
     "OR": "vor({},{})", "IF_ELSE_ZERO": "vsel({},{})",
 }  # fmt: skip
-_BESIDE_A_NUMBER = {"FMIN": "lesser({},{})", "FMAX": "larger({},{})"}  # one instruction where the second is no nan
+_BINARY_WITHOUT_NAN = {"FMIN": "lesser({},{})", "FMAX": "larger({},{})"}  # one instruction if the second is not nan
 
 
 def prelude(dtype: str) -> str:
-    """Return the C source that defines vectors of ``dtype`` and the functions of them."""
+    """Return the C source that defines vectors of ``dtype`` and their functions."""
     return ("#define SINGLE\n" if dtype == "float32" else "") + VECTORS.read_text(encoding="utf-8")
 
 
 def emit(tape: Tape) -> str:
-    """Write the C source of a kernel.
+    """Return the C source of a kernel.
 
     Without a grid the function is ``void kernel(long n, const real *const *in, const long *ld, real *const *out)``: n
-    lanes, one pointer per argument and the distance between its rows, one pointer per result of contiguous rows. With a
-    grid it is ``void kernel(long nodes, long n, const real *const *in, const long *ld, real *const *out, const long
-    *lo)``: two distances per argument and per result, from component to component and from node to node; what is summed
-    is added to what is there.
+    lanes, one pointer and one row stride per argument, one pointer per result of contiguous rows. With a grid it is
+    ``void kernel(long nodes, long n, const real *const *in, const long *ld, real *const *out, const long *lo)``: two
+    strides per argument and result, between components and between nodes. Sums are added to the values in ``out``.
     """
     body = _emit_loop(tape) if tape.loop else _emit_grid(tape, tape.grid) if tape.grid else _emit_once(tape)
     return prelude(tape.dtype) + body
@@ -54,7 +53,7 @@ for(long k=0;k<n;k+=W){{
 
 
 def _emit_loop(tape: Tape) -> str:
-    """The iterated form: state and parameters live in local arrays; converged lanes keep their values."""
+    """Return the source of an iteration: state and parameters are local arrays; converged lanes keep their values."""
     assert tape.loop is not None
     first = [sum(tape.inputs[:index]) for index in range(len(tape.inputs))]
     width, total = tape.inputs[0], sum(tape.inputs)
@@ -88,7 +87,7 @@ store(out[1],k,n,error);
 
 
 def _emit_grid(tape: Tape, grid: GridSpec) -> str:
-    """The form with nodes: all lanes of a node, then the next one, so that rows are read from end to end."""
+    """Return the source of a grid: lanes are the inner loop, so that rows are read contiguously."""
 
     def read(argument: int, component: int) -> str:
         axes = grid.arguments[argument]
@@ -119,24 +118,24 @@ def statements(
     write: Callable[[int, int, str], str],
     numbers: frozenset[int] | set[int] = frozenset(),
 ) -> str:
-    """Turn instructions into C statements in single-assignment form; sin and cos of one angle are computed together.
+    """Return C statements in single-assignment form; sine and cosine of one angle are computed together.
 
     Args:
         tape: The tape.
-        read: Writes how a component of an argument is read.
-        write: Writes the statement that stores a component of a result.
-        numbers: The arguments that are never nan.
+        read: Returns the expression that reads a component of an argument.
+        write: Returns the statement that stores a component of a result.
+        numbers: Arguments that are never nan.
     """
     lines: list[str] = []
     names: dict[int, str] = {}
     angles: set[int] = set()
-    sure: set[int] = set()  # values that are no nan
+    never_nan: set[int] = set()
     columns = (tape.operation.tolist(), tape.a.tolist(), tape.b.tolist(), tape.constant.tolist())
     for k, (code, a, b, constant) in enumerate(zip(*columns, strict=True)):
         name = NAMES[code]
         if name == "CONST":
             names[k] = f"K({_literal(constant)})"
-            sure |= set() if np.isnan(constant) else {k}
+            never_nan |= set() if np.isnan(constant) else {k}
             continue
         if name == "OUTPUT":
             lines.append(write(b, int(constant), names[a]))
@@ -149,20 +148,20 @@ def statements(
             continue
         if name == "INPUT":
             expression = read(a, b)
-            sure |= {k} if a in numbers else set()
+            never_nan |= {k} if a in numbers else set()
         elif name in _UNARY:
             expression = _UNARY[name].format(names[a])
         else:
-            form = _BESIDE_A_NUMBER if name in _BESIDE_A_NUMBER and b in sure else _BINARY
-            expression = form[name].format(names[a], names[b])
-            sure |= {k} if name in _BESIDE_A_NUMBER and sure & {a, b} else set()
+            templates = _BINARY_WITHOUT_NAN if name in _BINARY_WITHOUT_NAN and b in never_nan else _BINARY
+            expression = templates[name].format(names[a], names[b])
+            never_nan |= {k} if name in _BINARY_WITHOUT_NAN and never_nan & {a, b} else set()
         names[k] = f"t{k}"
         lines.append(f"v t{k}={expression};")
     return "\n".join(lines)
 
 
 def _literal(constant: float) -> str:
-    """Write a number in C."""
+    """Return a number as a C literal."""
     if np.isnan(constant):
         return "NAN"
     return repr(constant) if np.isfinite(constant) else f"{'-' if constant < 0 else ''}INFINITY"

@@ -1,4 +1,4 @@
-"""The contract of a kernel: one SX function on a batch, structure of arrays in and out."""
+"""The contract of a kernel: one SX function on a batch, with arrays of shape (width, N)."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ class Kernel(ABC):
 
     @property
     def address(self) -> int | None:
-        """Where its machine code begins, for other compiled code; None where there is none."""
+        """Address of the machine code, for other compiled code; None if there is none."""
         return None
 
     @abstractmethod
@@ -38,14 +38,14 @@ class Kernel(ABC):
             state before the last step, shape (1, N).
 
         Raises:
-            ValueError: Shapes or types do not fit the tape.
+            ValueError: A shape or type does not match the tape.
         """
 
 
 def check_arguments(tape: Tape, arguments: Sequence[Array]) -> int:
-    """Return the number of lanes N, or raise ValueError where arguments do not fit the tape."""
+    """Return the number of lanes N; raise ValueError if arguments do not match the tape."""
     if len(arguments) != len(tape.inputs):
-        raise ValueError(f"kernel {tape.name}: needs {len(tape.inputs)} arguments, got {len(arguments)}")
+        raise ValueError(f"kernel {tape.name}: expected {len(tape.inputs)} arguments, got {len(arguments)}")
     n = int(arguments[0].shape[-1])
     for index, (argument, width) in enumerate(zip(arguments, tape.inputs, strict=True)):
         if (

@@ -1,4 +1,4 @@
-"""Where kernels come from: SX builders, a cache of tapes and compiled libraries, and the backend that runs them."""
+"""The library of kernels: SX builders, a cache of tapes and compiled libraries, and the choice of the backend."""
 
 import ctypes
 import hashlib
@@ -19,128 +19,128 @@ from cnpgen.kernels.cache import (
     TAPES,
     default_cache_folder,
     is_trusted,
-    keep_from_others,
-    make_private,
+    make_private_folder,
+    make_read_only_for_others,
     require_trusted,
-    usable_folder,
+    usable_cache_folder,
 )
-from cnpgen.kernels.compiled import (
+from cnpgen.kernels.compiled_kernel import (
     CompiledGridKernel,
     CompiledKernel,
     compile_source,
     compile_tape,
 )
 from cnpgen.kernels.compiler import require_compiler
-from cnpgen.kernels.grid import GridKernel
-from cnpgen.kernels.interpreted import InterpretedGridKernel, InterpretedKernel
+from cnpgen.kernels.grid_kernel import GridKernel
+from cnpgen.kernels.interpreted_kernel import InterpretedGridKernel, InterpretedKernel
 from cnpgen.kernels.kernel import Kernel
-from cnpgen.kernels.mapped import MappedGridKernel, MappedKernel
+from cnpgen.kernels.mapped_kernel import MappedGridKernel, MappedKernel
+from cnpgen.kernels.parallel_compilation import CompilerPool
 from cnpgen.kernels.tape import CODES, Dtype, GridSpec, Loop, Tape, tape_from_function
-from cnpgen.kernels.together import Compilers
 from cnpgen.schema.registry import package_digest
 from cnpgen.store.files.atomic import write_file
 
 Backend = Literal["compiled", "numpy", "casadi"]
 BACKENDS: tuple[Backend, ...] = ("compiled", "numpy", "casadi")
-PACKAGE = Path(__file__).parents[1]
-ROOMS = ("robots", "kernels", "problems", "trajectory")  # what builders of any room import
-SLOWER = "10 to 20 times slower than compiled code"  # benchmarks/generator.py measures it: 9 to 24
+PACKAGE_FOLDER = Path(__file__).parents[1]
+BUILDER_PACKAGES = ("robots", "kernels", "problems", "trajectory")  # imported by builders of any package
+NUMPY_SLOWDOWN = "10 to 20 times slower than compiled code"  # benchmarks/generator.py: 9 to 24
 
 
 @dataclass
 class KernelLibrary:
-    """Loads kernels for one robot and problem, building only what is not cached.
+    """Loader of kernels for one robot and problem, which builds those that are not cached.
 
     Attributes:
-        backend: "compiled", "numpy" (the tape interpreted) or "casadi" (its own map; slow, for reference).
-        cache_folder: Where tapes and libraries are kept.
-        identity: Digest of what builders read besides their parameters: of all ``arguments``.
-        arguments: Named objects handed to builders that ask for them by parameter name (robot, problem).
+        backend: "compiled", "numpy" (interpreted tape) or "casadi" (CasADi's map; slow, for reference).
+        cache_folder: Folder of cached tapes and libraries.
+        identity: Digest of all ``arguments``.
+        arguments: Objects passed to builders that have a parameter of that name (robot, problem).
     """
 
     backend: Backend
     cache_folder: Path
     identity: str
     arguments: Mapping[str, Any] = field(default_factory=dict)
-    _compilers: Compilers | None = field(default=None, init=False, repr=False)
+    _compiler_pool: CompilerPool | None = field(default=None, init=False, repr=False)
 
     def load(self, builder: Callable[..., Any], loop: Loop | None = None, **parameters: Any) -> Kernel:
-        """Return the kernel of the SX function that ``builder`` builds.
+        """Return the kernel of an SX function.
 
         Args:
             builder: A module-level function that returns a ``casadi.Function``. Parameters named like entries of
                 ``arguments`` are filled from there.
-            loop: How to iterate it, or None.
+            loop: The iteration of the function, or None.
             parameters: Further JSON-able keyword arguments of the builder; part of the cache key.
         """
-        given = self._given(builder)
+        objects = self._builder_arguments(builder)
         if self.backend == "casadi":
-            function = builder(**given, **parameters)
+            function = builder(**objects, **parameters)
             return MappedKernel(tape_from_function(function, loop), function)
-        tape = self._tape(builder, given, parameters, loop=loop)
+        tape = self._tape(builder, objects, parameters, loop=loop)
         if self.backend == "numpy":
             return InterpretedKernel(tape)
-        if self._compilers is not None:
-            return self._compilers.kernel(tape)
+        if self._compiler_pool is not None:
+            return self._compiler_pool.kernel(tape)
         return CompiledKernel(tape, compile_tape(tape, self.cache_folder), self.cache_folder)
 
     @contextmanager
-    def compiling_together(self) -> Iterator[None]:
-        """Compile what is loaded inside side by side; afterwards all of it is there.
+    def compile_in_parallel(self) -> Iterator[None]:
+        """Compile the kernels that are loaded in the context in parallel; all are compiled when it ends.
 
         Raises:
             MachineError: A compiler failed.
         """
-        with Compilers(self.cache_folder) as compilers:
-            self._compilers = compilers
+        with CompilerPool(self.cache_folder) as pool:
+            self._compiler_pool = pool
             try:
                 yield
             finally:
-                self._compilers = None
+                self._compiler_pool = None
 
     def load_grid(self, builder: Callable[..., Any], grid: GridSpec, *, dtype: Dtype, **parameters: Any) -> GridKernel:
         """Return the kernel that evaluates an SX function on a grid of nodes and lanes.
 
         Args:
-            builder: As for ``load``.
-            grid: What its arguments and results vary over.
-            dtype: What it computes with.
+            builder: See ``load``.
+            grid: Axes of its arguments and results.
+            dtype: Precision of the arithmetic.
             parameters: Further JSON-able keyword arguments of the builder; part of the cache key.
         """
-        given = self._given(builder)
+        objects = self._builder_arguments(builder)
         if self.backend == "casadi":
-            function = builder(**given, **parameters)
+            function = builder(**objects, **parameters)
             return MappedGridKernel(tape_from_function(function, grid=grid, dtype=dtype), function)
-        tape = self._tape(builder, given, parameters, grid=grid, dtype=dtype)
+        tape = self._tape(builder, objects, parameters, grid=grid, dtype=dtype)
         if self.backend == "numpy":
             return InterpretedGridKernel(tape)
         return CompiledGridKernel(tape, compile_tape(tape, self.cache_folder))
 
     def load_source(self, *paths: Path) -> ctypes.CDLL | None:
-        """Return the library of C source that was written by hand, or None where kernels are not compiled.
+        """Return the library of handwritten C source, or None if the backend is not "compiled".
 
         Args:
-            paths: Its files, as of ``compile_source``.
+            paths: Source files; see ``compile_source``.
         """
         return ctypes.CDLL(str(compile_source(paths, self.cache_folder))) if self.backend == "compiled" else None
 
     def tape(self, builder: Callable[..., Any], **parameters: Any) -> Tape:
-        """Return the operations of the SX function that ``builder`` builds; nothing is compiled.
+        """Return the tape of an SX function without compiling it.
 
         Args:
-            builder: As for ``load``.
-            parameters: Likewise.
+            builder: See ``load``.
+            parameters: See ``load``.
         """
-        return self._tape(builder, self._given(builder), parameters)
+        return self._tape(builder, self._builder_arguments(builder), parameters)
 
-    def _given(self, builder: Callable[..., Any]) -> dict[str, Any]:
-        wanted = inspect.signature(builder).parameters
-        return {name: value for name, value in self.arguments.items() if name in wanted}
+    def _builder_arguments(self, builder: Callable[..., Any]) -> dict[str, Any]:
+        expected = inspect.signature(builder).parameters
+        return {name: value for name, value in self.arguments.items() if name in expected}
 
     def _tape(
         self,
         builder: Callable[..., Any],
-        given: Mapping[str, Any],
+        objects: Mapping[str, Any],
         parameters: Mapping[str, Any],
         *,
         loop: Loop | None = None,
@@ -160,12 +160,12 @@ class KernelLibrary:
         digest = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
         name = f"{builder.__name__}-{digest[:24]}.npy"
         if (tape := self._cached(name)) is None:
-            tape = tape_from_function(builder(**given, **parameters), loop, grid=grid, dtype=dtype)
-            self._keep(name, tape)
+            tape = tape_from_function(builder(**objects, **parameters), loop, grid=grid, dtype=dtype)
+            self._store(name, tape)
         return tape
 
     def _cached(self, name: str) -> Tape | None:
-        """Return a tape that is in the cache; damaged ones, and those that others may have changed, do not count."""
+        """Return a tape from the cache, or None; damaged and untrusted files are ignored."""
         for folder in require_trusted(self.cache_folder):
             path = folder / TAPES / name
             with suppress(OSError, ValueError):
@@ -173,13 +173,13 @@ class KernelLibrary:
                     return Tape.from_bytes(path.read_bytes())
         return None
 
-    def _keep(self, name: str, tape: Tape) -> None:
-        """Write a tape to the cache; one that cannot be written only costs time."""
+    def _store(self, name: str, tape: Tape) -> None:
+        """Write a tape to the cache; a failure is ignored, because it only costs time."""
         path = self.cache_folder / TAPES / name
         with suppress(MachineError, OSError):
-            make_private(path.parent)
+            make_private_folder(path.parent)
             write_file(path, tape.to_bytes())
-            keep_from_others(path)
+            make_read_only_for_others(path)
 
 
 @cache
@@ -190,71 +190,72 @@ def _versions() -> list[str]:
 
 
 def _source_digests(builder: Callable[..., Any]) -> list[str]:
-    """Digests of what a builder may be made of: kernels are rebuilt when one of them changes.
+    """Return digests of the sources that a builder may use; kernels are rebuilt when one of them changes.
 
-    In this package these are ``ROOMS`` and the builder's own room. A plug-in's builder may import anything, so that all
-    of this package counts, and all of its own.
+    In this package these are ``BUILDER_PACKAGES`` and the builder's own subpackage. A plug-in's builder may import
+    anything: the digests cover this package and the plug-in's.
     """
     package, _, module = builder.__module__.partition(".")
     if package != "cnpgen":
-        return [_digest_of(PACKAGE), package_digest(package)]
-    return [_digest_of(*(PACKAGE / room for room in ROOMS)), _digest_of(PACKAGE / module.partition(".")[0])]
+        return [_digest_of(PACKAGE_FOLDER), package_digest(package)]
+    shared = (PACKAGE_FOLDER / name for name in BUILDER_PACKAGES)
+    return [_digest_of(*shared), _digest_of(PACKAGE_FOLDER / module.partition(".")[0])]
 
 
 @cache
 def _digest_of(*folders: Path) -> str:
-    """Digest of all Python files of folders and of the folders in them; 40 files take 2 ms."""
+    """Return the digest of all Python files below the folders; 40 files take 2 ms."""
     digest = hashlib.sha256()
     for path in (path for folder in folders for path in sorted(folder.rglob("*.py"))):
-        digest.update(path.relative_to(PACKAGE).as_posix().encode() + b"\0" + path.read_bytes())
+        digest.update(path.relative_to(PACKAGE_FOLDER).as_posix().encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()
 
 
 class Identified(Protocol):
-    """What kernels are built for: a problem."""
+    """A problem that kernels are built for."""
 
     @property
     def identity(self) -> str:
-        """The sha256 over all that they depend on."""
+        """SHA-256 digest of everything that its kernels depend on."""
 
 
 def problem_kernels(problem: Identified, robot: object, backend: Backend, cache_folder: Path) -> KernelLibrary:
-    """Return the library of a problem: what is built of it and its robot is cached under the problem's identity."""
+    """Return the kernel library of a problem and its robot, cached under the problem's identity."""
     return KernelLibrary(backend, cache_folder, problem.identity, {"robot": robot, "problem": problem})
 
 
-def choose_backend(wanted: str | None = None) -> tuple[Backend, Path]:
-    """Decide which backend runs and where its cache is; warn once where it is not the fastest.
+def choose_backend(requested: str | None = None) -> tuple[Backend, Path]:
+    """Choose the backend and the cache folder; warn once if the backend is not the fastest.
 
     Args:
-        wanted: A backend, or None for the fastest that works on this machine.
+        requested: A backend, or None for the fastest that works on this machine.
 
     Returns:
         ``(backend, cache folder)``.
 
     Raises:
         UsageError: There is no such backend.
-        MachineError: The backend was asked for and does not work here.
+        MachineError: The requested backend does not work on this machine.
     """
-    if wanted is not None and wanted not in BACKENDS:
-        raise UsageError(f"backend {wanted!r} does not exist: expected one of {', '.join(BACKENDS)}")
-    folder = usable_folder(default_cache_folder())
-    if wanted == "numpy":
+    if requested is not None and requested not in BACKENDS:
+        raise UsageError(f"backend {requested!r} does not exist: expected one of {', '.join(BACKENDS)}")
+    folder = usable_cache_folder(default_cache_folder())
+    if requested == "numpy":
         return "numpy", folder
-    if wanted == "casadi":
+    if requested == "casadi":
         return "casadi", folder
     try:
         _try_compiler(folder)
     except MachineError as error:
-        if wanted == "compiled":
+        if requested == "compiled":
             raise
-        warnings.warn(f"{error}; running on the NumPy backend, {SLOWER}", RuntimeWarning, stacklevel=2)
+        warnings.warn(f"{error}; running on the NumPy backend, {NUMPY_SLOWDOWN}", RuntimeWarning, stacklevel=2)
         return "numpy", folder
     return "compiled", folder
 
 
 def _try_compiler(folder: Path) -> None:
-    """Compile, load and run the smallest kernel; raise MachineError where that does not work."""
+    """Compile, load and run the smallest kernel; raise MachineError if that fails."""
     require_compiler()
     codes = np.array([CODES["INPUT"], CODES["TWICE"], CODES["OUTPUT"]], np.int16)
     operands = np.array([0, 0, 1], np.int32)
@@ -262,4 +263,4 @@ def _try_compiler(folder: Path) -> None:
     kernel = CompiledKernel(tape, compile_tape(tape, folder), folder)
     (result,) = kernel(np.arange(5.0)[None])
     if not np.array_equal(result[0], 2 * np.arange(5.0)):
-        raise MachineError("the C compiler makes wrong code: 2 x differs from x + x")
+        raise MachineError("the C compiler generates wrong code: 2 x differs from x + x")

@@ -1,4 +1,4 @@
-"""A tape: an SX function as a flat list of scalar operations, and the description of the loop or grid that runs it."""
+"""Tapes: SX functions as flat lists of scalar operations, with the loop or grid that runs them."""
 
 import hashlib
 import json
@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-# Operations that a tape may hold: name -> number of operands. Names follow CasADi's OP_* constants.
+# Operations of a tape: name -> number of operands. The names are those of CasADi's OP_* constants.
 OPERATIONS = {
     "CONST": 0, "INPUT": 0, "OUTPUT": 1,
     "ADD": 2, "SUB": 2, "MUL": 2, "DIV": 2, "NEG": 1, "SQ": 1, "TWICE": 1, "INV": 1, "SQRT": 1, "FABS": 1, "SIGN": 1,
@@ -21,14 +21,14 @@ CODES = {name: code for code, name in enumerate(NAMES)}
 
 @dataclass(frozen=True)
 class Loop:
-    """Repeat the tape on each lane until its error is small: ``x, error = tape(x, parameters...)``.
+    """A fixed-point iteration of the tape on each lane: ``x, error = tape(x, parameters...)``.
 
-    The first input of the tape is the state, its first output the next state and its second output the error of the
-    state that it was given. A lane whose error is below ``tolerance`` takes that last step and is then frozen.
+    The first input of the tape is the state. Its outputs are the next state and the error of the input state. A lane
+    whose error is below ``tolerance`` takes that last step and then stays constant.
 
     Attributes:
-        tolerance: A lane has converged when its error is below this.
-        limit: Largest number of steps.
+        tolerance: Error below which a lane has converged.
+        limit: Maximum number of steps.
     """
 
     tolerance: float
@@ -38,17 +38,17 @@ class Loop:
 Axes = Literal["point", "lane", "node", "fixed"]
 Dtype = Literal["float64", "float32"]
 DTYPES: tuple[Dtype, ...] = ("float64", "float32")
-COLUMNS = {"constant": "<f8", "a": "<i4", "b": "<i4", "operation": "<i2"}  # how they are stored, the widest first
+STORED_TYPES = {"constant": "<f8", "a": "<i4", "b": "<i4", "operation": "<i2"}  # widest first, so that all are aligned
 
 
 @dataclass(frozen=True)
 class GridSpec:
-    """Evaluate the tape at K nodes of every lane, and keep results per point or sum them over the nodes of a lane.
+    """Evaluation of the tape at K nodes of every lane, with results per point or summed over the nodes of a lane.
 
     Attributes:
-        arguments: What each argument varies over: "point" (nodes and lanes), "lane", "node" or "fixed" (neither). What
-            is the same in all lanes ("node", "fixed") must not be nan.
-        results: "point" or "lane" per result; "lane" is the sum over the nodes.
+        arguments: Axes of each argument: "point" (nodes and lanes), "lane", "node" or "fixed" (neither). Arguments
+            without a lane axis ("node", "fixed") must not be nan.
+        results: Axes of each result: "point" or "lane"; "lane" is the sum over the nodes.
     """
 
     arguments: tuple[Axes, ...]
@@ -70,9 +70,9 @@ class Tape:
         a: First operands, shape (K,), int32.
         b: Second operands, shape (K,), int32.
         constant: Constants, shape (K,), float64.
-        loop: How to iterate, or None to evaluate once.
-        grid: The points to evaluate it at, or None for one point per lane.
-        dtype: What it computes with.
+        loop: The iteration, or None to evaluate once.
+        grid: The grid of evaluation points, or None for one point per lane.
+        dtype: Precision of the arithmetic.
     """
 
     name: str
@@ -90,7 +90,7 @@ class Tape:
         return len(self.operation)
 
     def to_bytes(self) -> bytes:
-        """Serialize, with a checksum; equal tapes give equal bytes."""
+        """Serialize with a checksum; equal tapes have equal bytes."""
         header = {
             "name": self.name,
             "inputs": self.inputs,
@@ -99,25 +99,25 @@ class Tape:
             "grid": (self.grid.arguments, self.grid.results) if self.grid else None,
             "dtype": self.dtype,
         }
-        columns = [getattr(self, name).astype(kind).tobytes() for name, kind in COLUMNS.items()]
+        columns = [getattr(self, name).astype(kind).tobytes() for name, kind in STORED_TYPES.items()]
         content = b"".join([json.dumps(header).encode(), b"\n", *columns])
         return hashlib.sha256(content).digest() + content
 
     @classmethod
     def from_bytes(cls, data: bytes) -> "Tape":
-        """Restore what ``to_bytes`` wrote.
+        """Deserialize the result of ``to_bytes``.
 
         Raises:
-            ValueError: The bytes are damaged.
+            ValueError: The checksum is wrong.
         """
         checksum, content = data[:32], data[32:]
         if hashlib.sha256(content).digest() != checksum:
             raise ValueError("damaged tape: its checksum is wrong")
         head, _, body = content.partition(b"\n")
         header = json.loads(head)
-        sizes = {name: np.dtype(kind).itemsize for name, kind in COLUMNS.items()}
+        sizes = {name: np.dtype(kind).itemsize for name, kind in STORED_TYPES.items()}
         count, first, columns = len(body) // sum(sizes.values()), 0, {}
-        for name, kind in COLUMNS.items():
+        for name, kind in STORED_TYPES.items():
             columns[name] = np.frombuffer(body, kind, count, first)
             first += count * sizes[name]
         return cls(
@@ -138,12 +138,12 @@ def tape_from_function(
 
     Args:
         function: A ``casadi.Function`` of SX expressions; arguments and results are columns.
-        loop: How to iterate it, or None.
-        grid: The points to evaluate it at, or None for one point per lane.
-        dtype: What it computes with.
+        loop: The iteration, or None.
+        grid: The grid of evaluation points, or None for one point per lane.
+        dtype: Precision of the arithmetic.
 
     Raises:
-        ValueError: It uses an operation that tapes do not have, or the grid does not fit it.
+        ValueError: The function uses an unsupported operation, or the grid does not match it.
     """
     import casadi as ca
 
@@ -151,7 +151,7 @@ def tape_from_function(
     count = function.n_instructions()
     operation, a, b = np.zeros(count, np.int16), np.zeros(count, np.int32), np.zeros(count, np.int32)
     constant = np.zeros(count)
-    holds: dict[int, int] = {}  # work vector slot -> value that it holds now
+    contents: dict[int, int] = {}  # slot of the work vector -> index of its present value
     for k in range(count):
         code, out, operands = function.instruction_id(k), function.instruction_output(k), function.instruction_input(k)
         name = known.get(code)
@@ -163,12 +163,12 @@ def tape_from_function(
         elif name == "INPUT":
             a[k], b[k] = operands
         elif name == "OUTPUT":
-            a[k], b[k], constant[k] = holds[operands[0]], out[0], out[1]
+            a[k], b[k], constant[k] = contents[operands[0]], out[0], out[1]
         else:
-            a[k] = holds[operands[0]]
-            b[k] = holds[operands[1]] if OPERATIONS[name] == 2 else 0
+            a[k] = contents[operands[0]]
+            b[k] = contents[operands[1]] if OPERATIONS[name] == 2 else 0
         if name != "OUTPUT":
-            holds[out[0]] = k
+            contents[out[0]] = k
     widths_in = tuple(function.nnz_in(i) for i in range(function.n_in()))
     widths_out = tuple(function.nnz_out(i) for i in range(function.n_out()))
     _check_dense(function)
@@ -177,18 +177,18 @@ def tape_from_function(
 
 
 def _check_dense(function: Any) -> None:
-    """Raise for sparse arguments: their components could not be told apart by position."""
-    for count, nnz, numel, what in (
+    """Raise ValueError for sparse arguments and results, whose components have no fixed position."""
+    for count, nnz, numel, label in (
         (function.n_in(), function.nnz_in, function.numel_in, "argument"),
         (function.n_out(), function.nnz_out, function.numel_out, "result"),
     ):
         for index in range(count):
             if nnz(index) != numel(index):
-                raise ValueError(f"{function.name()}: {what} {index} is sparse; densify it")
+                raise ValueError(f"{function.name()}: {label} {index} is sparse; densify it")
 
 
 def _check_grid(function: Any, grid: GridSpec | None) -> None:
-    """Raise for a grid that is not about this function."""
+    """Raise ValueError if the grid does not match the function."""
     if grid is None:
         return
     if (len(grid.arguments), len(grid.results)) != (function.n_in(), function.n_out()):

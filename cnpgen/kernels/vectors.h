@@ -1,11 +1,10 @@
-/* What every compiled kernel begins with: vectors of double, or of float where SINGLE is defined, one lane per sample, and
-functions of them.
+/* Prelude of every compiled kernel: vectors of double, or of float if SINGLE is defined, with one lane per sample.
 
-Comparisons are 1 or 0, as in CasADi; minima and maxima ignore a nan, as C's fmin and CasADi's do (the instructions, here
-lesser and larger, return their second operand if either is nan). Sine and cosine reduce their argument by pi/2 in parts
-(Cody and Waite; of 33, 33 and 53 bits as in fdlibm, or of 8, 11, 11 and 24 bits), the exponential by ln 2 in two; the
-polynomials are those of the Cephes mathematical library. Errors are at most 2 ulp: of the exponential everywhere, of sine
-and cosine, also beside their zeros, for |x| up to 2^20 (float: up to 2^8, and 3 ulp up to 2^13). */
+Comparisons are 1 or 0, as in CasADi. Minima and maxima ignore a nan, as fmin of C and CasADi does; the instructions
+(lesser and larger) return their second operand if either is nan. Sine and cosine use Cody-Waite reduction by pi/2 (parts
+of 33, 33 and 53 bits as in fdlibm, or of 8, 11, 11 and 24 bits), the exponential by ln 2 in two parts. The polynomials are
+those of the Cephes library. Errors are at most 2 ulp: of the exponential everywhere, of sine and cosine for |x| up to
+2^20, also next to their zeros (float: up to 2^8, and 3 ulp up to 2^13). */
 
 #include <math.h>
 #include <string.h>
@@ -13,50 +12,50 @@ and cosine, also beside their zeros, for |x| up to 2^20 (float: up to 2^8, and 3
 #ifdef SINGLE
 typedef float real;
 typedef int integer;
-#define HIGHEST 0x7fffffff
-#define MAGIC 12582912.0f /* 1.5 * 2^23: x + MAGIC has the nearest integer in its last bits */
+#define ABS_MASK 0x7fffffff
+#define ROUNDING_SHIFT 12582912.0f /* 1.5 * 2^23: x + ROUNDING_SHIFT has the nearest integer in its last bits */
 #define TWO_OVER_PI 0.636619772f
 #define PI_2_HIGH 1.5703125f
-#define PI_2_MIDDLE 4.837512969970703125e-4f
+#define PI_2_MEDIUM 4.837512969970703125e-4f
 #define PI_2_LOW 7.549533620476723e-8f
 #define PI_2_LOWEST 2.5633440682570896e-12f
 #define LOG2E 1.44269504f
 #define LN2_HIGH 0.693359375f
 #define LN2_LOW (-2.12194440e-4f)
-#define EXTREME 110.0f /* exp(-x) is 0 and exp(x) infinite */
+#define MAX_EXPONENT 110.0f /* exp(-x) is 0 and exp(x) infinite */
 #define BIAS 127
 #define MANTISSA 23
 #else
 typedef double real;
 typedef long long integer;
-#define HIGHEST 0x7fffffffffffffffLL
-#define MAGIC 6755399441055744.0
+#define ABS_MASK 0x7fffffffffffffffLL
+#define ROUNDING_SHIFT 6755399441055744.0
 #define TWO_OVER_PI 0.63661977236758134308
 #define PI_2_HIGH 1.57079632673412561417
-#define PI_2_MIDDLE 6.07710050630396597660e-11
+#define PI_2_MEDIUM 6.07710050630396597660e-11
 #define PI_2_LOW 2.02226624879595063154e-21
 #define LOG2E 1.4426950408889634073599
 #define LN2_HIGH 6.93145751953125e-1
 #define LN2_LOW 1.42860682030941723212e-6
-#define EXTREME 800.0
+#define MAX_EXPONENT 800.0
 #define BIAS 1023
 #define MANTISSA 52
 #endif
 
-/* GCC's own names, where it has them: reading immintrin.h takes longer than compiling a small kernel. */
+/* GCC's builtin functions, if available: reading immintrin.h takes longer than compiling a small kernel. */
 #if defined(__has_builtin) && !defined(__clang__)
 #ifdef __AVX512F__
 #if __has_builtin(__builtin_ia32_sqrtpd512_mask) && __has_builtin(__builtin_ia32_maxpd512_mask)
-#define OWN_NAMES
+#define HAVE_BUILTINS
 #endif
 #elif defined(__AVX__)
 #if __has_builtin(__builtin_ia32_sqrtpd256) && __has_builtin(__builtin_ia32_maxpd256)
-#define OWN_NAMES
+#define HAVE_BUILTINS
 #endif
 #endif
 #endif
 
-#ifdef OWN_NAMES
+#ifdef HAVE_BUILTINS
 #ifdef __AVX512F__
 #define BYTES 64
 #ifdef SINGLE
@@ -108,7 +107,7 @@ typedef integer vi __attribute__((vector_size(BYTES)));
 #define I static inline __attribute__((always_inline))
 I v K(real x) { v y = {0}; return y + x; }
 I v pick(vi m, v a, v b) { return (v)((m & (vi)a) | (~m & (vi)b)); }
-I v vabs(v x) { return (v)((vi)x & HIGHEST); }
+I v vabs(v x) { return (v)((vi)x & ABS_MASK); }
 
 #ifdef WIDE
 I v vsqrt(v x) { return WIDE(sqrt, (wide)x); }
@@ -168,17 +167,17 @@ I v reduced_exp(v r) {
 
 I v power_of_two(vi n) { return (v)((n + BIAS) << MANTISSA); }
 I v vexp(v x) {
-  v clipped = larger(lesser(x, K(EXTREME)), K(-EXTREME)), n = clipped * K(LOG2E) + K(MAGIC);
-  vi whole = (vi)n - (vi)K(MAGIC), half = whole >> 1;
-  n -= K(MAGIC);
+  v clipped = larger(lesser(x, K(MAX_EXPONENT)), K(-MAX_EXPONENT)), n = clipped * K(LOG2E) + K(ROUNDING_SHIFT);
+  vi whole = (vi)n - (vi)K(ROUNDING_SHIFT), half = whole >> 1;
+  n -= K(ROUNDING_SHIFT);
   v y = reduced_exp((clipped - n * K(LN2_HIGH)) - n * K(LN2_LOW));
   return pick(x != x, x, y * power_of_two(half) * power_of_two(whole - half));
 }
 I void vsincos(v x, v *s, v *c) {
-  v n = x * K(TWO_OVER_PI) + K(MAGIC);
+  v n = x * K(TWO_OVER_PI) + K(ROUNDING_SHIFT);
   vi quadrant = (vi)n;
-  n -= K(MAGIC);
-  v r = ((x - n * K(PI_2_HIGH)) - n * K(PI_2_MIDDLE)) - n * K(PI_2_LOW);
+  n -= K(ROUNDING_SHIFT);
+  v r = ((x - n * K(PI_2_HIGH)) - n * K(PI_2_MEDIUM)) - n * K(PI_2_LOW);
 #ifdef SINGLE
   r -= n * K(PI_2_LOWEST);
 #endif
@@ -190,7 +189,7 @@ I void vsincos(v x, v *s, v *c) {
   *c = (v)((vi)b ^ (((quadrant + 1) & 2) << sign));
 }
 
-/* The last lanes, fewer than W of them. They are not inlined: a kernel may have a thousand loads and stores. */
+/* The remaining lanes, fewer than W. They are not inlined, because a kernel may have a thousand loads and stores. */
 static __attribute__((noinline, cold)) v load_last(const real *p, long k, long n) {
   v x;
   for (int i = 0; i < W; i++) x[i] = p[k + i < n ? k + i : n - 1];

@@ -1,1 +1,1 @@
-"""From shards to batches: a dataset opened for training, in an order that is arithmetic and a form that is NumPy."""
+"""Loading a dataset for training: batches of NumPy arrays in a reproducible random order."""

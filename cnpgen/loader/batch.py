@@ -1,4 +1,4 @@
-"""One batch of rows: a mapping from field names to arrays, which are views of one packed table."""
+"""A batch of rows: a mapping from field names to arrays, which are views of one packed table."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -12,16 +12,16 @@ from cnpgen.loader.normalization import Normalization
 
 @dataclass(frozen=True, eq=False)
 class Batch(Mapping[str, NDArray[Any]]):
-    """B rows. The arrays are the batch's own: nobody writes to them later, and they may be changed or kept.
+    """B rows. The arrays belong to the batch alone and may be changed.
 
-    ``batch["start_q"]`` has shape (B, width), or (B,) for a scalar field. Fields of numbers are views of ``table``,
-    so that taking one costs nothing; ``dict(batch)`` is a plain dict of them.
+    ``batch["start_q"]`` has shape (B, width), or (B,) for a scalar field. Float fields are views of ``table``.
+    ``dict(batch)`` is a plain dict of all fields.
 
     Attributes:
-        table: The fields of numbers side by side, C-contiguous, shape (B, D).
-        layout: Which fields there are and where.
-        integers: The fields of integers, int64, shape (B, width) or (B,).
-        normalization: What the fields of numbers were normalised with; None if they are in their units.
+        table: Float fields side by side, C-contiguous, shape (B, D).
+        layout: Fields and their columns in the table.
+        integers: Integer fields, int64, shape (B, width) or (B,).
+        normalization: Normalization of the float fields; None if they are in their units.
     """
 
     table: NDArray[Any]
@@ -34,7 +34,7 @@ class Batch(Mapping[str, NDArray[Any]]):
 
     @property
     def columns(self) -> dict[str, slice]:
-        """Field name -> its columns of the table."""
+        """Field name -> columns of the table."""
         return self.layout.slices
 
     @property

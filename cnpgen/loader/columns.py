@@ -1,42 +1,42 @@
-"""Which fields are loaded, and where they are in the packed table."""
+"""The fields to load and their columns in the packed table."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 from cnpgen.errors import UsageError
-from cnpgen.store.blueprint import Blueprint
+from cnpgen.store.dataset_spec import DatasetSpec
 from cnpgen.store.field import Field
 
 
 @dataclass(frozen=True)
 class Columns:
-    """The fields that are loaded, in order. Fields of numbers share a table; integers are kept as they are.
+    """The fields to load. Float fields share a table; integer fields are separate arrays.
 
     Attributes:
-        fields: The fields.
+        fields: The fields, in order.
     """
 
     fields: tuple[Field, ...]
 
     @cached_property
     def floats(self) -> tuple[Field, ...]:
-        """The fields in the table."""
+        """The float fields, which are in the table."""
         return tuple(field for field in self.fields if field.dtype == "float")
 
     @cached_property
     def integers(self) -> tuple[Field, ...]:
-        """The fields beside the table: counters and identities, which are neither converted nor normalised."""
+        """The integer fields, which are neither in the table nor normalized."""
         return tuple(field for field in self.fields if field.dtype != "float")
 
     @cached_property
     def slices(self) -> dict[str, slice]:
-        """Field name -> its columns of the table."""
-        found, start = {}, 0
+        """Field name -> columns of the table."""
+        slices, start = {}, 0
         for field in self.floats:
-            found[field.name] = slice(start, start + max(field.width, 1))
+            slices[field.name] = slice(start, start + max(field.width, 1))
             start += max(field.width, 1)
-        return found
+        return slices
 
     @cached_property
     def scalars(self) -> frozenset[str]:
@@ -45,7 +45,7 @@ class Columns:
 
     @property
     def summary(self) -> str:
-        """The fields in a few words, with their widths: ``"start_q[6], hit_speed"``."""
+        """The fields with their widths: ``"start_q[6], hit_speed"``."""
         return ", ".join(f"{field.name}[{field.width}]" if field.width else field.name for field in self.fields)
 
     @property
@@ -55,29 +55,27 @@ class Columns:
 
 
 def tail(field: Field) -> tuple[int, ...]:
-    """Return the shape of a field's value in one row: (width,), or () for a scalar."""
+    """Return the shape of a field in one row: (width,), or () for a scalar."""
     return (field.width,) if field.width else ()
 
 
-def select_columns(blueprint: Blueprint, names: Iterable[str] | None) -> Columns:
-    """Look fields up by name.
+def select_columns(spec: DatasetSpec, names: Iterable[str] | None) -> Columns:
+    """Select fields by name.
 
     Args:
-        blueprint: The dataset's blueprint.
-        names: Names in the order they are wanted in; by default all fields of numbers that are not diagnostics, in
-            the blueprint's order.
+        spec: Specification of the dataset.
+        names: Names in the requested order; by default all float fields except for diagnostics, in the order of the
+            specification.
 
     Raises:
         DatasetError: There is no such field.
-        UsageError: The names are a single text, none, or not different.
+        UsageError: The names are a single text, empty or not unique.
     """
     if names is None:
-        return Columns(
-            tuple(field for field in blueprint.fields if field.dtype == "float" and field.role != "diagnostic")
-        )
+        return Columns(tuple(field for field in spec.fields if field.dtype == "float" and field.role != "diagnostic"))
     if isinstance(names, str):
-        raise UsageError(f"fields must be a list of names, got the text {names!r}: write [{names!r}]")
-    wanted: Sequence[str] = tuple(names)
-    if not wanted or len(set(wanted)) != len(wanted):
-        raise UsageError(f"fields must be one or more different names, got {list(wanted)}")
-    return Columns(tuple(blueprint.field_named(name) for name in wanted))
+        raise UsageError(f"must be a list of names, got the text {names!r}: write [{names!r}]", argument="fields")
+    selected: Sequence[str] = tuple(names)
+    if not selected or len(set(selected)) != len(selected):
+        raise UsageError(f"must be one or more different names, got {list(selected)}", argument="fields")
+    return Columns(tuple(spec.field_named(name) for name in selected))

@@ -15,19 +15,19 @@ LIBRARIES = ("polars", "pandas")
 
 
 def make_frame(rows: Mapping[str, NDArray[Any]], fields: Sequence[Field], *, library: str | None) -> Any:
-    """Lay rows out as a table.
+    """Convert rows to a table.
 
     Args:
         rows: Field name -> values, shape (rows, width) or (rows,).
         fields: The fields, in the order of the table's columns.
-        library: "polars" or "pandas"; None for the one that is installed, polars if both are.
+        library: "polars" or "pandas"; None for the installed one, polars if both are.
 
     Returns:
-        A ``DataFrame``; that of pandas has the units of its columns in ``attrs["units"]``.
+        A ``DataFrame``; with pandas, ``attrs["units"]`` contains the units of the columns.
 
     Raises:
-        UsageError: There is no such library.
-        MachineError: It is not installed.
+        UsageError: The library is not supported.
+        MachineError: The library is not installed.
     """
     name = _installed(library)
     columns = {
@@ -42,11 +42,11 @@ def make_frame(rows: Mapping[str, NDArray[Any]], fields: Sequence[Field], *, lib
 
 
 def _installed(library: str | None) -> str:
-    """Return the library that is meant."""
+    """Return the requested library, or the installed one."""
     if library is not None and library not in LIBRARIES:
-        raise UsageError(f"library must be one of {', '.join(LIBRARIES)}, got {library!r}")
-    wanted = LIBRARIES if library is None else (library,)
-    found = next((name for name in wanted if find_spec(name) is not None), None)
-    if found is None:
-        raise MachineError(f"a frame needs {' or '.join(wanted)}, not installed here: pip install {wanted[0]}")
-    return found
+        raise UsageError(f"must be one of {', '.join(LIBRARIES)}, got {library!r}", argument="library")
+    candidates = LIBRARIES if library is None else (library,)
+    installed = next((name for name in candidates if find_spec(name) is not None), None)
+    if installed is None:
+        raise MachineError(f"a frame needs {' or '.join(candidates)}, not installed here: pip install {candidates[0]}")
+    return installed

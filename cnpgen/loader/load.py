@@ -1,4 +1,4 @@
-"""Opening a dataset: what is not whole is refused."""
+"""Opening a dataset for training; incomplete and damaged datasets are refused."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -6,116 +6,121 @@ from typing import Any
 
 from cnpgen.errors import DatasetError
 from cnpgen.loader.dataset import Dataset
-from cnpgen.loader.shards import Shard, ShardReader
+from cnpgen.loader.shard_reader import Shard, ShardReader
 from cnpgen.schema.arguments import flag
-from cnpgen.store.blueprint import Blueprint, ShardTask, shards
+from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, shards
+from cnpgen.store.dataset_summary import (
+    STATS_FORMAT,
+    STATS_STRUCTURE,
+    STATS_VERSION,
+    DatasetSummary,
+    summarize_dataset,
+)
 from cnpgen.store.files.documents import load_document
-from cnpgen.store.files.limits import ALWAYS, EXPANSION
-from cnpgen.store.intact import AGAIN
-from cnpgen.store.layout import PLAN, STATS
+from cnpgen.store.files.size_limits import MAX_EXPANSION, MIN_EXPANSION_LIMIT_BYTES
+from cnpgen.store.intact import RERUN_HINT
+from cnpgen.store.layout import SPECIFICATION, STATS
 from cnpgen.store.manifest import data_fingerprint
 from cnpgen.store.reader import open_dataset
 from cnpgen.store.shard import storage_dtype
 from cnpgen.store.statistics import FieldStatistics, are_of, statistics_from_json
-from cnpgen.store.summary import STATS_FORM, STATS_FORMAT, STATS_FORMAT_VERSION, Summary, summarise
 
 Statistics = dict[str, dict[str, FieldStatistics]]
 
 
 def load_dataset(folder: str | Path, *, allow_incomplete: bool = False, verify: bool = True) -> Dataset:
-    """Open a dataset: its rows in batches for training, as arrays or a table, one by one.
+    """Open a dataset: its rows as batches for training, arrays, tables or one by one.
 
-    That the shards are there and have their sizes is checked now; header and sha256 of each when it is first read.
+    Existence and sizes of all shards are checked now, header and sha256 of each when it is read for the first time.
 
     Args:
-        folder: Its folder.
-        allow_incomplete: Take the shards that are there, if the dataset is unfinished or has lost some.
-        verify: Compare the sha256 of every shard, once, when it is first read.
+        folder: Folder of the dataset.
+        allow_incomplete: Whether to open the existing shards of a dataset that is unfinished or has missing shards.
+        verify: Whether to verify the sha256 of every shard when it is read for the first time.
 
     Raises:
-        UsageError: There is no such folder, or an option is neither True nor False.
-        DatasetError: It holds no dataset, it is unfinished, or a part of it is missing or damaged.
-        MachineError: The system would not let us read something.
+        UsageError: The folder does not exist, or an option is not a bool.
+        DatasetError: The folder contains no dataset, the dataset is unfinished, or a part is missing or damaged.
+        MachineError: A file cannot be read.
     """
     folder, verify = Path(folder), flag("verify", verify)
     stored = open_dataset(folder, allow_incomplete=flag("allow_incomplete", allow_incomplete))
     if stored.manifest is None:
-        summary = summarise(folder, stored.blueprint, allow_incomplete=True)
+        summary = summarize_dataset(folder, stored.spec, allow_incomplete=True)
         listed, statistics = _recorded(folder, summary), summary.statistics
     else:
         listed, statistics = (
-            _listed(folder, stored.blueprint, stored.manifest),
-            _load_statistics(folder, stored.blueprint),
+            _listed(folder, stored.spec, stored.manifest),
+            _load_statistics(folder, stored.spec),
         )
-    _check_rows(stored.blueprint, listed)
+    _check_rows(stored.spec, listed)
     present = _present(folder, listed, allow_incomplete=allow_incomplete)
     fingerprint = data_fingerprint(
         (shard.path.relative_to(folder).as_posix(), shard.sha256) for part in present.values() for shard in part
     )
-    return Dataset(folder, stored.blueprint, fingerprint, present, statistics, ShardReader(verify=verify))
+    return Dataset(folder, stored.spec, fingerprint, present, statistics, ShardReader(verify=verify))
 
 
-def _recorded(folder: Path, summary: Summary) -> dict[str, list[Shard]]:
-    """List the shards of an unfinished dataset by their sidecars."""
-    blueprint = summary.blueprint
+def _recorded(folder: Path, summary: DatasetSummary) -> dict[str, list[Shard]]:
+    """Return the shards of an unfinished dataset, from their sidecars."""
+    spec = summary.spec
     return {
-        split: [
-            _shard(folder, blueprint, task, record.bytes, record.sha256) for task, record in summary.of_split(split)
-        ]
-        for split in blueprint.splits
+        split: [_shard(folder, spec, task, record.bytes, record.sha256) for task, record in summary.of_split(split)]
+        for split in spec.splits
     }
 
 
-def _listed(folder: Path, blueprint: Blueprint, manifest: Mapping[str, Any]) -> dict[str, list[Shard]]:
-    """List the shards of a finished dataset by its manifest."""
-    tasks = {task.file: task for task in shards(blueprint)}
+def _listed(folder: Path, spec: DatasetSpec, manifest: Mapping[str, Any]) -> dict[str, list[Shard]]:
+    """Return the shards of a finished dataset, from its manifest."""
+    tasks = {task.file: task for task in shards(spec)}
     return {
         split: [
-            _shard(folder, blueprint, tasks[entry["file"]], entry["bytes"], entry["sha256"])
-            for entry in content["shards"]
+            _shard(folder, spec, tasks[entry["file"]], entry["bytes"], entry["sha256"]) for entry in content["shards"]
         ]
         for split, content in manifest["splits"].items()
     }
 
 
-def _shard(folder: Path, blueprint: Blueprint, task: ShardTask, size: int, sha256: str) -> Shard:
-    return Shard(folder / task.file, task.rows, task.first_row, size, sha256, blueprint.of(task).key)
+def _shard(folder: Path, spec: DatasetSpec, task: ShardTask, size: int, sha256: str) -> Shard:
+    return Shard(folder / task.file, task.rows, task.first_row, size, sha256, spec.version_with(task).key)
 
 
-def _load_statistics(folder: Path, blueprint: Blueprint) -> Statistics:
+def _load_statistics(folder: Path, spec: DatasetSpec) -> Statistics:
     """Read the statistics of a finished dataset."""
     path = folder / STATS
-    document = load_document(path, STATS_FORMAT, version=STATS_FORMAT_VERSION, form=STATS_FORM)
-    if document["plan_fingerprint"] != blueprint.fingerprint:
-        raise DatasetError(f"{path} is of another blueprint than {PLAN}; {AGAIN}")
+    document = load_document(path, STATS_FORMAT, version=STATS_VERSION, structure=STATS_STRUCTURE)
+    if document["specification_fingerprint"] != spec.fingerprint:
+        raise DatasetError(f"{path} is of another specification than {SPECIFICATION}; {RERUN_HINT}")
     try:
-        found = {
+        statistics = {
             split: {name: statistics_from_json(content) for name, content in fields.items()}
             for split, fields in document["splits"].items()
         }
     except ValueError as error:
-        raise DatasetError(f"{path} is damaged: {error}; {AGAIN}") from error
-    if not all(are_of(statistics, blueprint.fields) for statistics in found.values()):
-        raise DatasetError(f"{path} is of other fields than {PLAN}; {AGAIN}")
-    return found
+        raise DatasetError(f"{path} is damaged: {error}; {RERUN_HINT}") from error
+    if not all(are_of(items, spec.fields) for items in statistics.values()):
+        raise DatasetError(f"{path} is of other fields than {SPECIFICATION}; {RERUN_HINT}")
+    return statistics
 
 
-def _check_rows(blueprint: Blueprint, shards: Mapping[str, list[Shard]]) -> None:
-    """Refuse shards that cannot have as many rows as is recorded, before room is made for them."""
-    width = sum(max(field.width, 1) * storage_dtype(field, blueprint.dtype).itemsize for field in blueprint.fields)
-    for shard in (each for part in shards.values() for each in part):
-        if shard.rows * width > max(EXPANSION * shard.size, ALWAYS):
-            raise DatasetError(f"{shard.path} has {shard.size:,} bytes, too few for the {shard.rows:,} rows of {PLAN}")
+def _check_rows(spec: DatasetSpec, shards: Mapping[str, list[Shard]]) -> None:
+    """Raise an error, before memory is allocated, if shards are too small for their recorded number of rows."""
+    width = sum(max(field.width, 1) * storage_dtype(field, spec.dtype).itemsize for field in spec.fields)
+    for shard in (shard for part in shards.values() for shard in part):
+        if shard.rows * width > max(MAX_EXPANSION * shard.size, MIN_EXPANSION_LIMIT_BYTES):
+            raise DatasetError(
+                f"{shard.path} has {shard.size:,} bytes, too few for the {shard.rows:,} rows of {SPECIFICATION}"
+            )
 
 
 def _present(
     folder: Path, shards: Mapping[str, list[Shard]], *, allow_incomplete: bool
 ) -> dict[str, tuple[Shard, ...]]:
-    """Return the shards that are there; refuse, unless it is allowed, to do without the others."""
+    """Return the existing shards; raise an error if others are missing, unless this is allowed."""
     problems = [problem for part in shards.values() for shard in part if (problem := shard.problem())]
     if problems and not allow_incomplete:
         more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
         raise DatasetError(
-            f"{folder} is damaged: {problems[0]}{more}; {AGAIN}, or pass allow_incomplete=True to do without"
+            f"{folder} is damaged: {problems[0]}{more}; {RERUN_HINT}, or omit the shard with allow_incomplete=True"
         )
     return {split: tuple(shard for shard in part if not shard.problem()) for split, part in shards.items()}

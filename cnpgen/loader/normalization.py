@@ -1,4 +1,4 @@
-"""Normalisation: every column with mean 0 and deviation 1 over the training rows, by their stored statistics."""
+"""Normalization of every column to mean 0 and standard deviation 1 over the training rows."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,11 +17,12 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Normalization:
-    """Means and deviations of the columns of fields.
+    """Means and standard deviations of the columns of fields.
 
     Attributes:
-        mean: Field name -> mean of its c columns, in the field's unit, shape (c,); c is 1 for a scalar field.
-        std: Field name -> standard deviation, likewise; 0 for a constant column, which normalisation maps to 0.
+        mean: Field name -> mean of its c columns, in the unit of the field, shape (c,); c is 1 for a scalar field.
+        std: Field name -> standard deviation of its c columns, in the unit of the field, shape (c,). It is 0 for a
+            constant column, which is normalized to 0.
     """
 
     mean: Mapping[str, Floats]
@@ -36,31 +37,35 @@ class Normalization:
         return {name: np.divide(1.0, std, out=np.zeros_like(std), where=std > 0) for name, std in self.std.items()}
 
     def normalize(self, rows: Mapping[str, Any]) -> dict[str, Any]:
-        """Return (x - mean) / std of the fields that have statistics, and others as they are.
+        """Return (x - mean) / std of the fields with statistics; other fields are unchanged.
 
         Args:
-            rows: Field name -> values in the field's unit, shape (..., width), or (...) of a scalar field; arrays of
-                NumPy or JAX or tensors of torch, which stay what they are, and gradients go through.
+            rows: Field name -> values in the unit of the field, shape (..., width), or (...) for a scalar field. They
+                may be arrays of NumPy or JAX or tensors of torch; gradients are propagated.
         """
         return {name: self._scaled(name, values) for name, values in rows.items()}
 
     def denormalize(self, rows: Mapping[str, Any]) -> dict[str, Any]:
-        """Return mean + std x, which undoes :meth:`normalize`; a constant column gets its one value back.
+        """Return mean + std x, the inverse of :meth:`normalize`; a constant column returns to its value.
 
         Args:
-            rows: Field name -> normalised values, otherwise as for :meth:`normalize`.
+            rows: Field name -> normalized values, otherwise as for :meth:`normalize`.
         """
         return {name: self._unscaled(name, values) for name, values in rows.items()}
 
     def _scaled(self, name: str, values: Any) -> Any:
         if name not in self.mean:
             return values
-        return _keeping(values, (values - _beside(values, self.mean[name])) * _beside(values, self.scale[name]))
+        return _with_type_of(
+            values, (values - _as_type_of(values, self.mean[name])) * _as_type_of(values, self.scale[name])
+        )
 
     def _unscaled(self, name: str, values: Any) -> Any:
         if name not in self.mean:
             return values
-        return _keeping(values, values * _beside(values, self.std[name]) + _beside(values, self.mean[name]))
+        return _with_type_of(
+            values, values * _as_type_of(values, self.std[name]) + _as_type_of(values, self.mean[name])
+        )
 
     def side_by_side(self, fields: Sequence[Field]) -> tuple[Floats, Floats]:
         """Return mean and scale of the columns of fields in the packed table, shape (columns,) each.
@@ -71,38 +76,38 @@ class Normalization:
         missing = [field.name for field in fields if field.name not in self.mean]
         if missing:
             raise DatasetError(
-                f"there are no statistics to normalise {', '.join(missing)} with, only those of {', '.join(self.mean)}"
+                f"there are no statistics to normalize {', '.join(missing)} with, only those of {', '.join(self.mean)}"
             )
-        nothing = np.empty(0)
-        mean = np.concatenate([nothing, *(self.mean[field.name] for field in fields)])
-        return mean, np.concatenate([nothing, *(self.scale[field.name] for field in fields)])
+        empty = np.empty(0)
+        mean = np.concatenate([empty, *(self.mean[field.name] for field in fields)])
+        return mean, np.concatenate([empty, *(self.scale[field.name] for field in fields)])
 
 
-def _beside(values: Any, numbers: Floats) -> Any:
-    """Return numbers as what can be computed with beside values: tensors of torch take only their like."""
+def _as_type_of(values: Any, numbers: Floats) -> Any:
+    """Return numbers in the array type of ``values``, since torch does not mix its tensors with arrays."""
     return values.new_tensor(numbers) if hasattr(values, "new_tensor") else numbers
 
 
-def _keeping(values: Any, result: Any) -> Any:
-    """Give a result the shape and type of the values that it was made of."""
+def _with_type_of(values: Any, result: Any) -> Any:
+    """Return a result with the shape and dtype of ``values``."""
     return (result if result.dtype == values.dtype else result.astype(values.dtype)).reshape(values.shape)
 
 
 def make_normalization(statistics: Mapping[str, FieldStatistics], fields: Sequence[Field]) -> Normalization:
-    """Take the means and deviations of the fields of numbers out of statistics.
+    """Make the normalization of the float fields from statistics.
 
-    A column whose deviation is below the resolution of float32 at its largest value counts as constant: normalised, it
-    would be nothing but rounding errors of size 1 (the height of a tip that stays on a table).
+    A column counts as constant if its standard deviation is below the float32 resolution of its largest value.
+    Otherwise its rounding errors would be scaled to size 1, such as those of the height of a tip on a table.
 
     Args:
         statistics: Field name -> statistics of the training rows.
-        fields: The dataset's fields.
+        fields: Fields of the dataset.
     """
     mean, std = {}, {}
     for field in fields:
         if field.dtype == "float" and field.name in statistics:
-            found = statistics[field.name]
-            largest = np.maximum(np.abs(found.minimum), np.abs(found.maximum))
-            mean[field.name] = found.mean
-            std[field.name] = np.where(found.std > np.finfo(np.float32).eps * largest, found.std, 0.0)
+            item = statistics[field.name]
+            largest = np.maximum(np.abs(item.minimum), np.abs(item.maximum))
+            mean[field.name] = item.mean
+            std[field.name] = np.where(item.std > np.finfo(np.float32).eps * largest, item.std, 0.0)
     return Normalization(mean, std)

@@ -1,8 +1,8 @@
-"""The order of a split's rows in one epoch: arithmetic in seed, epoch and the shards' sizes; nothing is stored.
+"""The order of the rows of a split in one epoch, computed from seed, epoch and shard sizes; nothing is stored.
 
-The shards are permuted and dealt out to windows of about 2^18 rows; within a window the rows of all its shards are
-permuted together. A split of less than a window and a half is therefore shuffled uniformly as a whole; in larger ones
-rows of one shard stay within one window of their epoch. Every epoch deals the shards out anew.
+In every epoch, the shards are permuted and distributed over windows of about 2^18 rows. Within a window, the rows of
+all its shards are permuted together. A split of less than 1.5 windows is therefore shuffled uniformly. In larger
+splits, the rows of a shard stay within one window per epoch.
 """
 
 import hashlib
@@ -22,7 +22,7 @@ class Window:
     Attributes:
         first: Position of its first row in the epoch.
         rows: Number of rows.
-        shards: Numbers of its shards within the split, in the order in which they are laid out.
+        shards: Indices of its shards within the split, in the order of their rows.
     """
 
     first: int
@@ -38,8 +38,8 @@ class Order:
         split: Name of the split; splits are shuffled independently.
         shard_rows: Rows of every shard of the split.
         seed: Seed of all epochs, not negative.
-        epoch: Number of the epoch, not negative.
-        shuffle: Whether to shuffle at all; else rows come as they are stored.
+        epoch: Epoch, not negative.
+        shuffle: Whether to shuffle; otherwise rows are in their stored order.
     """
 
     split: str
@@ -54,14 +54,14 @@ class Order:
         shards = self._permuted(len(self.shard_rows), stage=0)
         count = min(max(round(sum(self.shard_rows) / WINDOW_ROWS), 1), max(len(shards), 1))
         windows, first = [], 0
-        for dealt in np.array_split(shards, count):
-            rows = sum(self.shard_rows[shard] for shard in dealt)
-            windows.append(Window(first, rows, tuple(dealt.tolist())))
+        for members in np.array_split(shards, count):
+            rows = sum(self.shard_rows[shard] for shard in members)
+            windows.append(Window(first, rows, tuple(members.tolist())))
             first += rows
         return tuple(windows)
 
     def rows_of(self, window: int) -> NDArray[np.int64]:
-        """Return the order of a window's rows: numbers of rows in its shards laid end to end, shape (rows,)."""
+        """Return the order of the rows of a window: indices into the concatenated rows of its shards, shape (rows,)."""
         return self._permuted(self.windows[window].rows, stage=1 + window)
 
     def _permuted(self, size: int, *, stage: int) -> NDArray[np.int64]:
@@ -72,19 +72,19 @@ class Order:
 
 
 def permutation(size: int, *, seed: int, key: tuple[int, ...]) -> NDArray[np.int64]:
-    """Return a uniformly random permutation that no later NumPy changes.
+    """Return a uniformly random permutation that does not depend on the version of NumPy.
 
-    NumPy keeps the raw numbers of a bit generator for ever, but not what ``Generator.permutation`` makes of them. Here
-    the rows are sorted by raw numbers whose last bits are replaced by the number of the row; up to 2^20 rows, 44 bits
-    stay random, so that ties, which go to the lower number, do not matter.
+    NumPy guarantees the raw output of bit generators, but not that of ``Generator.permutation``. The rows are sorted by
+    raw random numbers, the last bits of which are replaced by the row index. For up to 2^20 rows, 44 bits remain
+    random, so ties are negligible.
 
     Args:
         size: Number of rows.
         seed: Seed, not negative.
-        key: Which of the seed's permutations; integers that are not negative.
+        key: Key of the permutation of this seed; integers that are not negative.
 
     Returns:
-        The numbers from 0 to ``size - 1``, shape (size,).
+        Permutation of 0 to ``size - 1``, shape (size,).
     """
     raw = np.random.SFC64(np.random.SeedSequence(seed, spawn_key=key)).random_raw(size)
     mask = np.uint64((1 << max(size - 1, 1).bit_length()) - 1)

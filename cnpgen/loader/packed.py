@@ -1,4 +1,4 @@
-"""Rows of whole shards packed into one table, converted and normalised as they are copied."""
+"""Packing the rows of whole shards into one table, with conversion and normalization."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -9,18 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.loader.columns import tail
-from cnpgen.loader.form import Form
-from cnpgen.loader.shards import Shard, ShardReader
+from cnpgen.loader.row_format import RowFormat
+from cnpgen.loader.shard_reader import Shard, ShardReader
 
-_CHUNK = 1 << 15  # numbers in float64 that fit into a processor's second cache
+_CHUNK_VALUES = 1 << 15  # float64 numbers that fit into the L2 cache of a processor
 
 
 @dataclass(frozen=True, eq=False)
 class Packed:
-    """The rows of some shards, end to end.
+    """The concatenated rows of some shards.
 
     Attributes:
-        table: The fields of numbers side by side, shape (rows, D).
+        table: The float fields side by side, shape (rows, D).
         integers: Field name -> values, shape (rows, width) or (rows,).
     """
 
@@ -32,26 +32,28 @@ class Packed:
         return Packed(self.table[first:last], {name: values[first:last] for name, values in self.integers.items()})
 
 
-def row_bytes(form: Form) -> int:
-    """Return how much memory a packed row takes [bytes]."""
-    return form.layout.width * form.dtype.itemsize + sum(8 * max(field.width, 1) for field in form.layout.integers)
+def row_bytes(row_format: RowFormat) -> int:
+    """Return the size of a packed row [bytes]."""
+    layout = row_format.layout
+    return layout.width * row_format.dtype.itemsize + sum(8 * max(field.width, 1) for field in layout.integers)
 
 
-def empty_packed(rows: int, form: Form) -> Packed:
-    """Make room for rows."""
-    integers = {field.name: np.empty((rows, *tail(field)), np.int64) for field in form.layout.integers}
-    return Packed(np.empty((rows, form.layout.width), form.dtype), integers)
+def empty_packed(rows: int, row_format: RowFormat) -> Packed:
+    """Allocate memory for rows."""
+    layout = row_format.layout
+    integers = {field.name: np.empty((rows, *tail(field)), np.int64) for field in layout.integers}
+    return Packed(np.empty((rows, layout.width), row_format.dtype), integers)
 
 
-def pack(shards: Sequence[Shard], form: Form, reader: ShardReader, *, out: Packed) -> None:
-    """Read whole shards into ``out``, end to end.
+def pack(shards: Sequence[Shard], row_format: RowFormat, reader: ShardReader, *, out: Packed) -> None:
+    """Read whole shards into ``out``, one after the other.
 
     Raises:
-        DatasetError: A shard is missing or damaged, or the normalisation lacks a field.
-        MachineError: The system would not let us read a shard.
+        DatasetError: A shard is missing or damaged, or the normalization has no statistics of a field.
+        MachineError: A shard cannot be read.
     """
-    layout, first = form.layout, 0
-    scaling = None if form.normalization is None else form.normalization.side_by_side(layout.floats)
+    layout, first, normalization = row_format.layout, 0, row_format.normalization
+    scaling = None if normalization is None else normalization.side_by_side(layout.floats)
     for shard in shards:
         columns, part = reader.read(shard, layout.fields), out.part(first, first + shard.rows)
         if layout.floats:
@@ -66,27 +68,27 @@ def _fill(
     columns: Mapping[str, NDArray[Any]],
     scaling: tuple[NDArray[np.float64], NDArray[np.float64]] | None,
 ) -> None:
-    """Put columns side by side, chunk by chunk: the arithmetic is in float64 and stays in the cache."""
+    """Copy columns side by side in chunks, so that the float64 arithmetic stays in the cache."""
     rows, width = table.shape
-    step = min(max(_CHUNK // width, 1), rows)
+    step = min(max(_CHUNK_VALUES // width, 1), rows)
     buffer = np.empty((step, width))
     scales: Sequence[NDArray[np.float64]] = () if scaling is None else [np.tile(part, (step, 1)) for part in scaling]
-    moves = [(place, _whole_rows(columns[name])) for name, place in _places(buffer, columns).items()]
+    copies = [(target, _opaque_rows(columns[name])) for name, target in _targets(buffer, columns).items()]
     for first in range(0, rows, step):
         last = min(first + step, rows)
         if last - first < step:
             buffer, *scales = (part[: last - first] for part in (buffer, *scales))
-            moves = [(place[: last - first], values) for place, values in moves]
-        for place, values in moves:
-            np.copyto(place, values[first:last])
+            copies = [(target[: last - first], values) for target, values in copies]
+        for target, values in copies:
+            np.copyto(target, values[first:last])
         if scales:
             np.subtract(buffer, scales[0], out=buffer)
             np.multiply(buffer, scales[1], out=buffer)
         table[first:last] = buffer
 
 
-def _whole_rows(values: NDArray[Any]) -> NDArray[Any]:
-    """View float64 values as one opaque item per row: NumPy copies those twice as fast as rows of six numbers.
+def _opaque_rows(values: NDArray[Any]) -> NDArray[Any]:
+    """View float64 values as one opaque item per row, which NumPy copies twice as fast as rows of six numbers.
 
     Args:
         values: Values of a field, shape (rows, width) or (rows,).
@@ -95,11 +97,11 @@ def _whole_rows(values: NDArray[Any]) -> NDArray[Any]:
     return rows.view(f"V{8 * rows.shape[1]}")[:, 0]
 
 
-def _places(buffer: NDArray[np.float64], columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """View the parts of a buffer that columns go to, side by side, as one opaque item per row."""
-    places, start = {}, 0
+def _targets(buffer: NDArray[np.float64], columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """View the part of the buffer for every column as one opaque item per row."""
+    targets, start = {}, 0
     for name, values in columns.items():
         size = 8 * math.prod(values.shape[1:])
-        places[name] = np.ndarray(len(buffer), f"V{size}", buffer, start, buffer.strides[:1])
+        targets[name] = np.ndarray(len(buffer), f"V{size}", buffer, start, buffer.strides[:1])
         start += size
-    return places
+    return targets

@@ -1,15 +1,15 @@
-"""Where in which order a loader is: all that is needed to go on exactly there."""
+"""The position of a loader in the order of its rows, which allows to continue exactly there."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.loader.shards import SplitShards
+from cnpgen.loader.shard_reader import SplitShards
 from cnpgen.schema.arguments import flag, integer
 
-FORMAT = "cnpgen-loader-state"
-FORMAT_VERSION = 1  # raised also when the arithmetic of the order changes
+LOADER_STATE_FORMAT = "cnpgen-loader-state"
+LOADER_STATE_VERSION = 1  # also raised if the computation of the order changes
 
 
 @dataclass(frozen=True)
@@ -19,8 +19,8 @@ class Position:
     Attributes:
         seed: Seed of the order.
         shuffle: Whether rows are shuffled.
-        epoch: Number of the epoch.
-        row: Rows of the epoch that were delivered, to all ranks together.
+        epoch: Epoch.
+        row: Rows of the epoch that were read by all ranks together.
     """
 
     seed: int
@@ -30,10 +30,10 @@ class Position:
 
 
 def checked_position(*, seed: Any, shuffle: Any, epoch: Any, row: Any = 0) -> Position:
-    """Make a position of what somebody gave.
+    """Make a position of unchecked arguments.
 
     Raises:
-        UsageError: Seed, epoch or row is no integer from 0 on, or shuffle neither True nor False.
+        UsageError: Seed, epoch or row is not a non-negative integer, or shuffle is not a bool.
     """
     numbers = {"seed": seed, "epoch": epoch, "row": row}
     return Position(
@@ -42,8 +42,8 @@ def checked_position(*, seed: Any, shuffle: Any, epoch: Any, row: Any = 0) -> Po
 
 
 def position_to_json(position: Position, source: SplitShards) -> dict[str, Any]:
-    """Return a position and what it is a position in as a small JSON-able dict."""
-    head = {"format": FORMAT, "format_version": FORMAT_VERSION}
+    """Return a position with the fingerprint and split of its rows as a small JSON-able dict."""
+    head = {"format": LOADER_STATE_FORMAT, "format_version": LOADER_STATE_VERSION}
     return head | {"fingerprint": source.fingerprint, "split": source.split, **asdict(position)}
 
 
@@ -51,17 +51,19 @@ def position_from_json(state: Mapping[str, Any], source: SplitShards) -> Positio
     """Rebuild a position.
 
     Raises:
-        UsageError: This is not the state of a loader.
-        DatasetError: It is of other rows: another dataset or split, or a newer cnpgen.
+        UsageError: The argument is not the state of a loader.
+        DatasetError: The state is of another dataset, split or format version.
     """
-    if not isinstance(state, Mapping) or state.get("format") != FORMAT:
+    if not isinstance(state, Mapping) or state.get("format") != LOADER_STATE_FORMAT:
         raise UsageError(f"a loader's state must be what state() returned, got {state!r:.100}")
-    if state.get("format_version") != FORMAT_VERSION:
-        found = state.get("format_version")
-        raise DatasetError(f"the loader's state has format version {found!r}, this cnpgen reads {FORMAT_VERSION}")
-    for name, has in (("fingerprint", source.fingerprint), ("split", source.split)):
-        if state.get(name) != has:
-            raise DatasetError(f"the loader's state is of another dataset: {name} {state.get(name)!r}, here {has!r}")
+    if state.get("format_version") != LOADER_STATE_VERSION:
+        version = state.get("format_version")
+        raise DatasetError(
+            f"the loader's state has format version {version!r}, this cnpgen reads {LOADER_STATE_VERSION}"
+        )
+    for name, value in (("fingerprint", source.fingerprint), ("split", source.split)):
+        if state.get(name) != value:
+            raise DatasetError(f"the loader's state is of another dataset: {name} {state.get(name)!r}, here {value!r}")
     try:
         position = checked_position(**{name: state[name] for name in Position.__dataclass_fields__})
     except KeyError as error:

@@ -1,4 +1,4 @@
-"""The windows of an epoch, packed one after the other, the next one in a thread of its own."""
+"""The windows of an epoch: groups of shards that are packed and shuffled together, one ahead in a thread."""
 
 import os
 from bisect import bisect_right
@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.loader.batch import Batch
-from cnpgen.loader.form import Form
-from cnpgen.loader.kept import Kept
+from cnpgen.loader.in_memory_rows import InMemoryRows
 from cnpgen.loader.order import Order
 from cnpgen.loader.packed import Packed, empty_packed, pack
-from cnpgen.loader.shards import SplitShards
+from cnpgen.loader.row_format import RowFormat
+from cnpgen.loader.shard_reader import SplitShards
 
 Loaded = tuple[Packed, NDArray[np.int64]]
 
@@ -24,17 +24,17 @@ T = TypeVar("T")
 
 
 def start(task: Callable[[], T]) -> "Future[T]":
-    """Run a task in a new thread, which ends with it: no pool is left for a fork or an exit to stumble over.
+    """Run a task in a new thread. Unlike a pool, the thread ends with its task and does not disturb forks or exits.
 
     Returns:
-        Its future; what the task raises, ``result()`` raises.
+        The future of the task; ``result()`` raises the exception of the task.
     """
     future: Future[T] = Future()
 
     def run() -> None:
         try:
             future.set_result(task())
-        except BaseException as error:  # noqa: BLE001 - not swallowed: handed over to whoever asks for the result
+        except BaseException as error:  # noqa: BLE001 - raised again by result()
             future.set_exception(error)
 
     Thread(target=run, name="cnpgen-loader").start()
@@ -42,51 +42,55 @@ def start(task: Callable[[], T]) -> "Future[T]":
 
 
 class Windows:
-    """Rows of an epoch by their positions; at most two windows are in memory, but for what is kept.
+    """Access to the rows of an epoch by position. At most two windows are in memory, unless the whole split is.
 
     Args:
-        source: Where rows come from.
-        form: What is wanted of them.
-        order: Their order.
-        kept: The split's rows that are in memory already; None to keep none.
+        source: Shards of the split.
+        row_format: Format of the rows.
+        order: Order of the rows.
+        in_memory: Rows of the split that stay in memory; None for a large split.
     """
 
-    def __init__(self, source: SplitShards, form: Form, order: Order, kept: Kept | None) -> None:
-        self._source, self._form, self._order, self._kept = source, form, order, kept
+    def __init__(
+        self, source: SplitShards, row_format: RowFormat, order: Order, in_memory: InMemoryRows | None
+    ) -> None:
+        self._source, self._row_format, self._order, self._in_memory = source, row_format, order, in_memory
         self._firsts = [window.first for window in order.windows]
         self._futures: dict[int, Future[Loaded]] = {}
-        self._memory: dict[int, Packed] = {}  # of two windows, used in turn: fresh memory costs as much as packing
+        self._memory: dict[
+            int, Packed
+        ] = {}  # of two windows, reused in turn, because allocating it takes as long as packing
         self._process = os.getpid()
 
     def batch(self, first: int, last: int, *, rank: int = 0, world: int = 1) -> Batch:
-        """Return the rows at the positions ``range(first + rank, last, world)``, in fresh arrays.
+        """Return the rows at the positions ``range(first + rank, last, world)``, in new arrays.
 
         Raises:
-            DatasetError: A shard is missing or damaged, or the normalisation lacks a field.
-            MachineError: The system would not let us read a shard.
+            DatasetError: A shard is missing or damaged, or the normalization has no statistics of a field.
+            MachineError: A shard cannot be read.
         """
         tables, integers = [], []
-        for packed, rows in self._pieces(first + rank, last, world):
+        for packed, rows in self._rows_by_window(first + rank, last, world):
             tables.append(packed.table.take(rows, axis=0))
             integers.append({name: values.take(rows, axis=0) for name, values in packed.integers.items()})
         if len(tables) == 1:
-            return Batch(tables[0], self._form.layout, integers[0], self._form.normalization)
+            return Batch(tables[0], self._row_format.layout, integers[0], self._row_format.normalization)
         joined = {name: np.concatenate([part[name] for part in integers]) for name in integers[0]}
-        return Batch(np.concatenate(tables), self._form.layout, joined, self._form.normalization)
+        return Batch(np.concatenate(tables), self._row_format.layout, joined, self._row_format.normalization)
 
-    def _pieces(self, first: int, last: int, step: int) -> Iterator[Loaded]:
-        """Give the positions ``range(first, last, step)`` window by window: the window and numbers of rows in it."""
+    def _rows_by_window(self, first: int, last: int, step: int) -> Iterator[Loaded]:
+        """Yield every window of the positions ``range(first, last, step)`` with the indices of the rows in it."""
         index = bisect_right(self._firsts, min(first, last - 1)) - 1
         while index < len(self._firsts) and self._firsts[index] < last:
             window = self._order.windows[index]
             packed, rows = self._load(index)
-            skipped = max(-((first - window.first) // step), 0) * step  # of the positions, those in earlier windows
+            skipped = max(-((first - window.first) // step), 0) * step  # positions in previous windows
             yield packed, rows[first - window.first + skipped : last - window.first : step]
             index += 1
 
     def _load(self, index: int) -> Loaded:
-        """Wait for a window, start on the one after it, forget those before it."""
-        if self._process != os.getpid():  # a fork has no threads: what was being loaded would never be there
+        """Wait for a window, start loading the next one and release the previous ones."""
+        if self._process != os.getpid():  # threads do not survive a fork, so their results would never arrive
             self._process, self._futures, self._memory = os.getpid(), {}, {}
         if index + 1 not in self._futures:
             self._futures = {other: future for other, future in self._futures.items() if other == index}
@@ -102,10 +106,10 @@ class Windows:
 
     def _pack(self, index: int) -> Loaded:
         window, rows = self._order.windows[index], self._order.rows_of(index)
-        if self._kept is not None:
-            return self._kept.packed, self._kept.load(window.shards)[rows]
+        if self._in_memory is not None:
+            return self._in_memory.packed, self._in_memory.load(window.shards)[rows]
         if index % 2 not in self._memory:
-            self._memory[index % 2] = empty_packed(max(other.rows for other in self._order.windows), self._form)
+            self._memory[index % 2] = empty_packed(max(other.rows for other in self._order.windows), self._row_format)
         packed = self._memory[index % 2]
-        pack([self._source.shards[shard] for shard in window.shards], self._form, self._source.reader, out=packed)
+        pack([self._source.shards[shard] for shard in window.shards], self._row_format, self._source.reader, out=packed)
         return packed, rows

@@ -1,1 +1,5 @@
-"""The loss of a plan, integrals over the phase of time and constraint manifold, its gradient and its metric."""
+"""Losses: the loss of plans, its gradient, its metric and its margins."""
+
+from cnpgen import _lazy_exports
+
+__all__, __getattr__, __dir__ = _lazy_exports(__name__, __file__)

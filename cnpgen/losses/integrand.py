@@ -1,4 +1,4 @@
-"""What is integrated: the step losses of one phase of one plan and their gradient, as SX.
+"""The integrand: the step losses of one phase of one plan and their gradient, as SX.
 
 Terms are the task loss and one per constraint of the problem, all times ``dt/ds = 1 / r`` (paper, section on loss
 functions) and the quadrature weight of the node.
@@ -8,98 +8,100 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from cnpgen.kernels.symbolic.state import HeldState, SymbolicState, jerk_along
+from cnpgen.kernels.symbolic.symbolic_state import FrozenState, SymbolicState, jerk_along
 from cnpgen.kernels.tape import Axes, GridSpec
-from cnpgen.losses.published import published
+from cnpgen.losses.published_conditions import published_conditions
 from cnpgen.losses.terms import Term, constraint_term, task_term
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.problem import Problem
-from cnpgen.robots.solid import count_numbers
+from cnpgen.robots.solid import pose_width
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
 
 
 def grid_specs(problem: Problem) -> tuple[GridSpec, GridSpec]:
-    """Say what the arguments and results of ``loss_values`` and ``loss_gradient`` vary over."""
+    """Return the axes of the arguments and results of ``loss_values`` and ``loss_gradient``."""
     point: Axes = "point"
     splines = (point,) * (problem.path_orders + 1)
     arguments: tuple[Axes, ...] = (*splines, "lane", "point", "node", "fixed", "fixed")
     return GridSpec(arguments, ("lane",)), GridSpec(arguments, ("lane", *splines))
 
 
-def wider_argument(problem: Problem) -> int:
-    """Say which argument of the kernels is the funnel."""
+def relaxation_argument(problem: Problem) -> int:
+    """Return the index of the kernel argument with the relaxation of time-varying bounds."""
     return problem.path_orders + 2
 
 
 @dataclass(frozen=True)
 class Inputs:
-    """The arguments of the kernels as SX columns, in order; ``grid_specs`` says what they vary over.
+    """The arguments of the kernels as SX columns, in order, with the axes of ``grid_specs``.
 
     Attributes:
-        path: p, p' and p'' [rad], n each; p''', too, where the jerk is constrained.
-        rate: r and r' [1/s], and r'' where the jerk is constrained.
-        tops: The numbers of the obstacles.
-        wider: How much wider than their bounds the conditions of constraints with a funnel are, in their units.
-        node: The quadrature weight.
-        tightening: For every constraint the factor of its limits, then for every one the inset of its other bounds.
-        weights: The weight of every constraint (the paper's e^alpha).
+        path: p, p' and p'' [rad], n each, and p''' if the jerk is constrained.
+        rate: r and r' [1/s], and r'' if the jerk is constrained.
+        obstacle_poses: Poses and sizes of the obstacles.
+        relaxation: Relaxation of the conditions with time-varying bounds, in their units.
+        node: Quadrature weight.
+        tightening: Factors of the limits of all constraints, then insets of the other bounds of all constraints.
+        weights: Weight of every constraint (the paper's e^alpha).
     """
 
     path: tuple[Any, ...]
     rate: Any
-    tops: Any
-    wider: Any
+    obstacle_poses: Any
+    relaxation: Any
     node: Any
     tightening: Any
     weights: Any
 
     @property
     def columns(self) -> list[Any]:
-        """All of them."""
+        """All arguments."""
         return [*self.path, *(column for name, column in vars(self).items() if name != "path")]
 
 
 def loss_values(robot: "Robot", problem: Problem, *, form: str) -> Any:
-    """Build ``inputs -> terms``: what is summed over the nodes, without weights."""
+    """Build ``inputs -> terms``: the summands of the quadrature, without the weights of constraints."""
     import casadi as ca
 
     inputs, state, terms = _stage(robot, problem, form)
-    return ca.Function("loss_values", inputs.columns, ca.cse(state.released([_stacked(inputs, terms)])))
+    return ca.Function("loss_values", inputs.columns, ca.cse(state.unfrozen([_stacked(inputs, terms)])))
 
 
 def loss_gradient(robot: "Robot", problem: Problem, *, form: str) -> Any:
-    """Build ``inputs -> (terms, d/dp, d/dp', ..., d/d(r, r', ...))`` of the weighted sum, by the reverse mode."""
+    """Build ``inputs -> (terms, d/dp, d/dp', ..., d/d(r, r', ...))`` of the weighted sum by reverse-mode AD."""
     import casadi as ca
 
     inputs, state, terms = _stage(robot, problem, form)
     n, step, weights = robot.n, inputs.node / inputs.rate[0], [1.0, *ca.vertsplit(inputs.weights)]
     g = [part for term in terms for part, _ in term.parts]
-    seeds = [step * weight * slope for weight, term in zip(weights, terms, strict=True) for _, slope in term.parts]
+    seeds = [step * weight * partial for weight, term in zip(weights, terms, strict=True) for _, partial in term.parts]
     states, width = ca.vertcat(*inputs.path, inputs.rate), len(inputs.path) * n
-    back = ca.densify(ca.jtimes(ca.vertcat(*g), states, ca.vertcat(*seeds), True))
+    gradient = ca.densify(ca.jtimes(ca.vertcat(*g), states, ca.vertcat(*seeds), True))
     total = sum(weight * term.value for weight, term in zip(weights, terms, strict=True))
-    back[width] -= step / inputs.rate[0] * total  # the factor 1 / r
-    parts = [back[first : first + n] for first in range(0, width, n)]
-    results = state.released([_stacked(inputs, terms), *parts, back[width:]])
+    gradient[width] -= step / inputs.rate[0] * total  # the factor 1 / r
+    parts = [gradient[first : first + n] for first in range(0, width, n)]
+    results = state.unfrozen([_stacked(inputs, terms), *parts, gradient[width:]])
     return ca.Function("loss_gradient", inputs.columns, ca.cse(results))
 
 
-def stated(
+def penalized_conditions(
     constraints: Iterable[Constraint], state: SymbolicState, form: str
 ) -> list[tuple[Constraint, tuple[Condition, ...]]]:
-    """State what is penalised, constraint by constraint."""
-    return [(each, published(each, state) if form == "paper" else each.penalised(state)) for each in constraints]
+    """Return every constraint with the conditions that the loss penalizes."""
+    if form == "paper":
+        return [(constraint, published_conditions(constraint, state)) for constraint in constraints]
+    return [(constraint, constraint.penalized(state)) for constraint in constraints]
 
 
-def has_funnel(constraint: Constraint) -> bool:
-    """Whether motions may begin outside of a constraint."""
-    return type(constraint).funnel is not Constraint.funnel
+def has_time_varying_bound(constraint: Constraint) -> bool:
+    """Return whether the bounds of a constraint depend on the phase."""
+    return type(constraint).bound_relaxation is not Constraint.bound_relaxation
 
 
-def _stage(robot: "Robot", problem: Problem, form: str) -> tuple[Inputs, HeldState, list[Term]]:
-    """Return the inputs, the state at them, and the terms: task and constraints."""
+def _stage(robot: "Robot", problem: Problem, form: str) -> tuple[Inputs, FrozenState, list[Term]]:
+    """Return the inputs, the state as a function of them, and the terms of the task and the constraints."""
     import casadi as ca
 
     sym, n, m = ca.SX.sym, robot.n, len(problem.constraint)
@@ -107,19 +109,21 @@ def _stage(robot: "Robot", problem: Problem, form: str) -> tuple[Inputs, HeldSta
     p, dp, ddp, *_ = path = tuple(sym("d" * order + "p", n) for order in range(orders))
     rate = sym("rate", orders - 1)
     dq, ddq = dp * rate[0], ddp * (rate[0] * rate[0]) + dp * (rate[0] * rate[1])
-    tops, size = sym("tops", count_numbers(problem.obstacle)), problem.object_size
-    q_sx, dq_sx, ddq_sx, tops_sx = (ca.vertsplit(column) for column in (p, dq, ddq, tops))
+    obstacle_poses, size = sym("obstacle_poses", pose_width(problem.obstacle)), problem.object_size
+    q_sx, dq_sx, ddq_sx, poses_sx = (ca.vertsplit(column) for column in (p, dq, ddq, obstacle_poses))
     jerk = jerk_along([ca.vertsplit(column) for column in path[1:]], ca.vertsplit(rate))
-    state = HeldState(robot, q_sx, dq_sx, ddq_sx, tops_sx, problem.obstacle, size, jerk)
-    pairs = stated(problem.constraint, state, form)
-    count = sum(len(condition.g) for each, conditions in pairs if has_funnel(each) for condition in conditions)
-    wider, tightening = sym("wider", count), sym("tightening", 2 * m)
-    inputs = Inputs(path, rate, tops, wider, sym("node"), tightening, sym("weights", m))
-    free = iter(ca.vertsplit(wider))
+    state = FrozenState(robot, q_sx, dq_sx, ddq_sx, poses_sx, problem.obstacle, size, jerk)
+    pairs = penalized_conditions(problem.constraint, state, form)
+    sizes = [sum(len(condition.g) for condition in conditions) for _, conditions in pairs]
+    varying = [has_time_varying_bound(constraint) for constraint, _ in pairs]
+    relaxation = sym("relaxation", sum(size for size, varies in zip(sizes, varying, strict=True) if varies))
+    tightening = sym("tightening", 2 * m)
+    inputs = Inputs(path, rate, obstacle_poses, relaxation, sym("node"), tightening, sym("weights", m))
+    unused = iter(ca.vertsplit(relaxation))
     terms = [task_term(state, problem.objective.centrifugal)]
-    for index, (each, conditions) in enumerate(pairs):
-        funnel = [next(free) if has_funnel(each) else None for condition in conditions for _ in condition.g]
-        terms.append(constraint_term(conditions, tightening[index], tightening[m + index], funnel))
+    for index, (_, conditions) in enumerate(pairs):
+        values = [next(unused) if varying[index] else None for _ in range(sizes[index])]
+        terms.append(constraint_term(conditions, tightening[index], tightening[m + index], values))
     return inputs, state, terms
 
 

@@ -1,6 +1,5 @@
-"""How much tighter than the problem's the bounds are while training, so that what is learned has room to spare."""
+"""Margins: tightened bounds during training, so that the true bounds hold afterwards."""
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -8,28 +7,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError, nearest
+from cnpgen.problems.problem import Problem
+from cnpgen.schema import registry
 
 
 @dataclass(frozen=True)
 class Margins:
-    """Tightened bounds, term by term; equalities are never tightened.
+    """Tightened bounds of terms; equalities are never tightened.
 
-    A penalty leaves a violation of the order of 1 / weight: with limits a few tenths of a percent smaller, plans meet
-    the true ones.
+    A penalty leaves a violation of the order of 1 / weight, and a network errs by a percent. With limits that are a
+    few tenths of a percent smaller, plans meet the true limits.
 
     Attributes:
-        factors: Term -> what its limits (of joints) are multiplied by, in (0, 1].
-        insets: Term -> by how much its other bounds are moved inwards, in their SI unit, e.g. the table's edges [m].
+        factors: Term -> factor of its limits (of joints), in (0, 1].
+        insets: Term -> distance by which its other bounds are moved inwards, in SI units, e.g. the table's edges [m].
     """
 
     factors: Mapping[str, float] = field(default_factory=dict)
     insets: Mapping[str, float] = field(default_factory=dict)
 
     def tightening(self, terms: Sequence[str]) -> NDArray[np.float64]:
-        """Return the factor of every term, then the inset of every term, shape (2 m,).
+        """Return the factors of all terms, then the insets of all terms, shape (2 m,).
 
         Args:
-            terms: The names of the m constraint terms.
+            terms: Names of the m constraint terms.
 
         Raises:
             UsageError: A name is not a term, a factor is not in (0, 1] or an inset is not a number.
@@ -52,26 +53,22 @@ class Margins:
                 yield f"margin of {name!r}: an inset must be a finite number, got {inset}"
 
 
-# A penalty leaves violations of the order of 1 / weight, and a network errs by a percent here and there.
-FACTORS = {
-    "joint-position": 0.999,
-    "joint-velocity": 0.99,
-    "joint-acceleration": 0.985,
-    "joint-jerk": 0.97,
-    "joint-torque": 0.97,
-}
-INSETS = {"table": 1e-3, "object-contact": 5e-4}  # m
+def suggested_margins(problem: Problem) -> Margins:
+    """Return the margins that the constraint classes suggest: ``training_factor`` and ``training_inset``."""
+    constraints = dict(zip(constraint_terms(problem), problem.constraint, strict=True))
+    factors = {name: constraint.training_factor for name, constraint in constraints.items()}
+    insets = {name: constraint.training_inset for name, constraint in constraints.items()}
+    return Margins(
+        {name: factor for name, factor in factors.items() if factor != 1},
+        {name: inset for name, inset in insets.items() if inset != 0},
+    )
 
 
-def suggested_margins(terms: Sequence[str]) -> Margins:
-    """Return the margins of the terms whose kinds are known; none of others.
-
-    Args:
-        terms: ``PlanLoss.terms``; the second of a kind is called ``kind-2``.
-    """
-    return Margins(_known(terms, FACTORS), _known(terms, INSETS))
-
-
-def _known(terms: Sequence[str], by_kind: Mapping[str, float]) -> dict[str, float]:
-    kinds = {name: re.sub(r"-\d+$", "", name) for name in terms}
-    return {name: by_kind[kind] for name, kind in kinds.items() if kind in by_kind}
+def constraint_terms(problem: Problem) -> list[str]:
+    """Return the names of the constraint terms: their kinds, with a number from the second of a kind on (kind-2)."""
+    names: list[str] = []
+    for constraint in problem.constraint:
+        kind = registry.name_of(registry.CONSTRAINTS, type(constraint))
+        count = 1 + sum(type(other) is type(constraint) for other in problem.constraint[: len(names)])
+        names.append(kind if count == 1 else f"{kind}-{count}")
+    return names

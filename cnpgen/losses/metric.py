@@ -1,8 +1,8 @@
 """The metric of the constraint manifold: the weight e^alpha of every term (paper, section on loss function learning).
 
-Published is a learned metric: after every epoch each alpha takes a step towards the value at which its term would be as
-large as its budget, ``alpha += gamma log(mean L_i / C_i)``. On short runs that is slow, and budgets that cannot be met
-wind it up; weights that only grow with the progress of a run are the default.
+The published metric is learned: after every epoch each alpha takes a step toward the value at which its term equals its
+budget, ``alpha += gamma log(mean L_i / C_i)``. This is slow in short runs, and it winds up if budgets cannot be met.
+The default is therefore a metric whose weights grow with the progress of a run.
 """
 
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ from cnpgen.errors import UsageError
 from cnpgen.losses.metric_settings import Average, MetricSettings
 
 Array = NDArray[np.float64]
-TRIMMED = 0.1  # fraction of the plans, those with the largest losses, that a trimmed mean leaves out
+TRIMMED_FRACTION = 0.1  # of the plans, those with the largest losses, excluded from a trimmed mean
 
 
 def alpha_step(
@@ -25,9 +25,9 @@ def alpha_step(
 
     Args:
         alpha: Logarithms of the weights, shape (m,).
-        losses: Mean of every term, shape (m,). One that is not finite changes nothing.
-        budgets: Acceptable value of every term (the paper's C-bar^2), shape (m,). Without one (0) a weight stays.
-        gamma: Step.
+        losses: Mean of every term, shape (m,). A value that is not finite leaves its weight unchanged.
+        budgets: Acceptable value of every term (the paper's C-bar^2), shape (m,). 0 leaves its weight unchanged.
+        gamma: Step size.
         largest_log: Bound on the absolute value of the logarithm.
     """
     before, mean, budget = (np.asarray(x, float) for x in (alpha, losses, budgets))
@@ -40,11 +40,11 @@ def alpha_step(
 
 
 def average_loss(terms: ArrayLike, average: Average) -> Array:
-    """Average every term over plans, those that are none left out; nan if there is no other.
+    """Average every term over valid plans; nan if there are none.
 
     Args:
         terms: Losses of N plans, shape (N, m).
-        average: How.
+        average: Kind of average.
 
     Returns:
         Shape (m,).
@@ -56,7 +56,7 @@ def average_loss(terms: ArrayLike, average: Average) -> Array:
     if average == "median":
         return np.asarray(np.median(values, axis=0))
     if average == "trimmed":
-        values = np.sort(values, axis=0)[: len(values) - int(TRIMMED * len(values))]
+        values = np.sort(values, axis=0)[: len(values) - int(TRIMMED_FRACTION * len(values))]
     return np.asarray(values.mean(axis=0))
 
 
@@ -66,10 +66,10 @@ class Metric:
     Args:
         weights: First weights (e^alpha), shape (m,), positive.
         budgets: Acceptable value of every term (the paper's C-bar^2), shape (m,); 0 where there is none.
-        settings: How weights change.
+        settings: Settings of the metric.
 
     Attributes:
-        alpha: Logarithms of the weights as learned so far, shape (m,).
+        alpha: Logarithms of the present weights, shape (m,).
     """
 
     def __init__(self, weights: ArrayLike, budgets: ArrayLike, settings: MetricSettings | None = None) -> None:
@@ -81,7 +81,7 @@ class Metric:
         if not (np.isfinite(first).all() and (first > 0).all()):
             raise UsageError(f"first weights must be positive and finite, got {first.tolist()}")
         if not (np.isfinite(self._budgets).all() and (self._budgets >= 0).all()):
-            raise UsageError(f"budgets must be finite and not negative, got {self._budgets.tolist()}")
+            raise UsageError(f"must be finite and not negative, got {self._budgets.tolist()}", argument="budgets")
         self.settings = settings or MetricSettings()
         self.alpha: Array = np.log(first)
         self._sum, self._count = np.zeros(len(first)), 0
@@ -90,17 +90,17 @@ class Metric:
         """Return the weights for the next batch, shape (m,).
 
         Args:
-            progress: How much of the run is done, in [0, 1].
+            progress: Completed fraction of the run, in [0, 1].
         """
         growth = self.settings.grown(progress) if self.settings.kind == "ramped" else 1.0
         return np.asarray(np.exp(self.alpha) * growth)
 
     def observe(self, terms: ArrayLike, progress: float) -> None:
-        """Take note of what the plans of a batch cost.
+        """Record the losses of the plans of a batch.
 
         Args:
-            terms: As ``LossValue.terms``, shape (N, 1 + m).
-            progress: How much of the run is done, in [0, 1].
+            terms: ``LossValue.terms``, shape (N, 1 + m).
+            progress: Completed fraction of the run, in [0, 1].
         """
         if self.settings.kind != "learned":
             return
@@ -111,27 +111,27 @@ class Metric:
             self._learn(progress)
 
     def end_epoch(self, progress: float) -> None:
-        """Take the step of an epoch, where steps are taken after epochs."""
+        """Take the step of an epoch, if the settings have steps per epoch."""
         if self.settings.kind == "learned" and self.settings.every == "epoch":
             self._learn(progress)
 
     def _learn(self, progress: float) -> None:
-        chosen, count = self.settings, self._count
-        if count and progress < chosen.frozen:
-            budgets = self._budgets / chosen.grown(progress)
+        settings, count = self.settings, self._count
+        if count and progress < settings.frozen:
+            budgets = self._budgets / settings.grown(progress)
             alpha = alpha_step(
-                self.alpha, self._sum / count, budgets, gamma=chosen.gamma, largest_log=chosen.largest_log
+                self.alpha, self._sum / count, budgets, gamma=settings.gamma, largest_log=settings.largest_log
             )
             with np.errstate(divide="ignore"):
-                self.alpha = np.clip(alpha, np.log(chosen.lowest), np.log(chosen.highest))
+                self.alpha = np.clip(alpha, np.log(settings.lowest), np.log(settings.highest))
         self._sum, self._count = np.zeros(len(self.alpha)), 0
 
     def state(self) -> dict[str, Any]:
-        """Return all that has been learned, as what JSON can hold."""
+        """Return the learned state, JSON-able."""
         return {"alpha": self.alpha.tolist(), "sum": self._sum.tolist(), "count": self._count}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Go on from a state of the same run.
+        """Restore a state of the same run.
 
         Raises:
             UsageError: It is the state of another metric.

@@ -1,8 +1,6 @@
-"""How the weights of a metric change in the course of a run, and which ones to begin with."""
+"""The settings of a metric and the suggested first weights."""
 
 import math
-import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -10,39 +8,31 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError, nearest
+from cnpgen.problems.problem import Problem
 
 Kind = Literal["fixed", "ramped", "learned"]
-KINDS: tuple[Kind, ...] = ("fixed", "ramped", "learned")
+METRIC_KINDS: tuple[Kind, ...] = ("fixed", "ramped", "learned")
 Average = Literal["mean", "median", "trimmed"]
 AVERAGES: tuple[Average, ...] = ("mean", "median", "trimmed")
 
-# Weights that made planners of the shipped problems valid within minutes; the base of the fixed and ramped metrics.
-# Other manifolds of the tip have those of the shipped ones: of its place the table's, of an axis that of 'vertical'. A
-# pose has one weight for both, the larger: its one tolerance is for millimetres, too.
-SUGGESTED = {
-    "joint-position": 4000.0, "joint-velocity": 100.0, "joint-acceleration": 5.0, "joint-torque": 1.5,
-    "joint-jerk": 0.01,
-    "table": 1e4, "plane": 1e4, "line": 1e4, "pose": 1e4, "vertical": 300.0, "axis": 300.0,
-    "robot-clearance": 3000.0, "object-contact": 3e4,
-}  # fmt: skip
-PLUGGED_IN = 100.0  # of other kinds, times the weight in the problem file
+WEIGHT_FACTOR = 100.0  # of the weight in the problem file, for constraint classes without ``training_weight``
 
 
 @dataclass(frozen=True, kw_only=True)
 class MetricSettings:
-    """How weights follow from the progress of a run (0 at its start, 1 at its end) and from what plans cost.
+    """The dependence of weights on the progress of a run (0 at its start, 1 at its end) and on the losses of plans.
 
     Attributes:
-        kind: "fixed": the first weights; "ramped": they grow; "learned": the published rule.
-        growth: By which factor ramped weights grow, and budgets of the learned metric shrink, during the ramp.
-        ramp: Progress at which the ramp begins and ends; it is geometric.
-        gamma: Step of the learned metric.
-        every: Whether it takes its step after every "epoch", as published, or "batch".
+        kind: "fixed": the first weights; "ramped": growing weights; "learned": the published rule.
+        growth: Factor by which ramped weights grow, and budgets of the learned metric shrink, during the ramp.
+        ramp: Progress at the start and the end of the ramp, which is geometric.
+        gamma: Step size of the learned metric.
+        every: Interval of its steps: "epoch", as published, or "batch".
         largest_log: Bound on ``|log(mean L_i / C_i)|`` in a step, from the authors' implementation.
-        lowest: Lower bound of a learned weight; a term that is never violated falls without end otherwise.
+        lowest: Lower bound of a learned weight; without it the weight of a term without violations decreases forever.
         highest: Upper bound of a learned weight.
-        average: How the plans of a batch are averaged: "mean" as published, "median" or "trimmed".
-        frozen: Progress from which a learned metric stays as it is.
+        average: Average over the plans of a batch: "mean" as published, "median" or "trimmed".
+        frozen: Progress after which a learned metric is constant.
     """
 
     kind: Kind = "ramped"
@@ -57,7 +47,7 @@ class MetricSettings:
     frozen: float = math.inf
 
     def __post_init__(self) -> None:
-        for name, known in (("kind", KINDS), ("every", ("epoch", "batch")), ("average", AVERAGES)):
+        for name, known in (("kind", METRIC_KINDS), ("every", ("epoch", "batch")), ("average", AVERAGES)):
             value = getattr(self, name)
             if value not in known:
                 raise UsageError(
@@ -67,19 +57,19 @@ class MetricSettings:
             if not getattr(self, name) > 0:
                 raise UsageError(f"{name} of a metric must be above 0, got {getattr(self, name)}")
         if not self.lowest <= self.highest:
-            raise UsageError(f"lowest must be at most highest = {self.highest}, got {self.lowest}")
+            raise UsageError(f"must be at most highest = {self.highest}, got {self.lowest}", argument="lowest")
         if not 0 <= self.ramp[0] < self.ramp[1]:
             raise UsageError(f"the ramp of a metric must begin at 0 or later and before it ends, got {self.ramp}")
 
     def grown(self, progress: float) -> float:
-        """Return by which factor the ramp has grown."""
+        """Return the factor of the ramp."""
         begin, end = self.ramp
         return float(self.growth ** min(max((progress - begin) / (end - begin), 0.0), 1.0))
 
 
-# The paper's rule with the authors' clip; the paper's budgets are those of PlanLoss(..., form="paper").
+# The paper's rule with the authors' bound of the logarithm; the paper's budgets belong to PlanLoss(..., form="paper").
 PUBLISHED = MetricSettings(kind="learned", growth=1.0)
-# The same rule for short runs: steps per batch, budgets that shrink, bounds, a mean that a few plans cannot hold up.
+# The same rule for short runs: steps per batch, decreasing budgets, bounds, and a mean that is robust to outliers.
 BOUNDED = MetricSettings(
     kind="learned",
     growth=400.0,
@@ -93,13 +83,19 @@ BOUNDED = MetricSettings(
 )
 
 
-def suggested_weights(names: Sequence[str], weights0: ArrayLike) -> NDArray[np.float64]:
-    """Return weights to begin with: those that work for the known kinds, 100 times the problem file's for others.
+def suggested_weights(problem: Problem, weights0: ArrayLike) -> NDArray[np.float64]:
+    """Return first weights: ``training_weight`` of the constraint classes, else 100 times those of the problem file.
+
+    With the weights of the shipped classes, planners of the shipped problems became valid within minutes. They are the
+    base of the fixed and ramped metrics.
 
     Args:
-        names: ``PlanLoss.terms``.
-        weights0: ``PlanLoss.weights0``.
+        problem: The problem.
+        weights0: Weights from the problem file, ``PlanLoss.weights0``, shape (m,).
     """
-    given = np.asarray(weights0, float).tolist()
-    kinds = [re.sub(r"-\d+$", "", name) for name in names[1:]]
-    return np.array([SUGGESTED.get(kind, PLUGGED_IN * first) for kind, first in zip(kinds, given, strict=True)])
+    pairs = zip(problem.constraint, np.asarray(weights0, float).tolist(), strict=True)
+    suggested = [
+        WEIGHT_FACTOR * weight if constraint.training_weight is None else constraint.training_weight
+        for constraint, weight in pairs
+    ]
+    return np.array(suggested)

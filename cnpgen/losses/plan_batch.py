@@ -1,4 +1,4 @@
-"""Plans on their way into and out of the loss kernels: checked, cast, samples last, padded to whole vectors."""
+"""Batches of plans for the loss kernels: checked, cast, samples last, padded to whole vectors."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,54 +9,54 @@ from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.problems.problem import Problem
-from cnpgen.robots.solid import count_numbers
+from cnpgen.robots.solid import pose_width
 from cnpgen.schema.arguments import numbers
 
 Array = NDArray[Any]
-BLOCK = 128  # plans at a time: their points stay in the cache
-LANES = 16  # of the widest vectors
+PLANS_PER_BLOCK = 128  # their points fit into the cache
+MAX_VECTOR_LANES = 16
 
 
 @dataclass(frozen=True)
 class PlanBatch:
-    """N plans and what the loss must know of their problems.
+    """N plans with their obstacle poses and start positions.
 
     Attributes:
         path: Path control points [rad], shape (N, C, n).
         rate: Rate control points [1/s], shape (N, R).
-        tops: Where the obstacles are, as ``obstacle_tops`` says, shape (N, numbers).
+        obstacle_poses: Poses and sizes of the obstacles, shape (N, width).
         start_tip: Positions of the tip at the start [m], shape (N, 3), float64, or None.
-        good: Whether a plan is one: finite, with positive rate control points; shape (N,).
+        valid: Mask of the plans that are finite with positive rate control points, shape (N,).
     """
 
     path: Array
     rate: Array
-    tops: Array
+    obstacle_poses: Array
     start_tip: Array | None
-    good: NDArray[np.bool_]
+    valid: NDArray[np.bool_]
 
     def __len__(self) -> int:
         return len(self.rate)
 
     def __getitem__(self, rows: slice) -> "PlanBatch":
         start_tip = None if self.start_tip is None else self.start_tip[rows]
-        return PlanBatch(self.path[rows], self.rate[rows], self.tops[rows], start_tip, self.good[rows])
+        return PlanBatch(self.path[rows], self.rate[rows], self.obstacle_poses[rows], start_tip, self.valid[rows])
 
     def lanes(self, values: Array) -> Array:
-        """Return values of shape (N, ...) as (..., lanes): samples last, ones for what is no plan or none at all."""
+        """Return values of shape (N, ...) as (..., lanes), with ones for invalid plans and padding."""
         n = len(values)
-        out = np.empty((*values.shape[1:], -(-n // LANES) * LANES), values.dtype)
+        out = np.empty((*values.shape[1:], -(-n // MAX_VECTOR_LANES) * MAX_VECTOR_LANES), values.dtype)
         out[..., :n] = np.moveaxis(values, 0, -1)
         out[..., n:] = 1
-        if not self.good.all():
-            out[..., :n][..., ~self.good] = 1
+        if not self.valid.all():
+            out[..., :n][..., ~self.valid] = 1
         return out
 
-    def back(self, lanes: Array) -> Array:
-        """Return values of shape (..., lanes) as (N, ...), nan for what is no plan."""
+    def samples(self, lanes: Array) -> Array:
+        """Return values of shape (..., lanes) as (N, ...), with nan for invalid plans."""
         values = np.moveaxis(lanes[..., : len(self)], -1, 0)
-        if not self.good.all():
-            values[~self.good] = np.nan
+        if not self.valid.all():
+            values[~self.valid] = np.nan
         return values
 
 
@@ -64,52 +64,57 @@ def check_batch(
     problem: Problem,
     path: ArrayLike,
     rate: ArrayLike,
-    tops: ArrayLike | None,
+    obstacle_poses: ArrayLike | None,
     start_tip: ArrayLike | None,
     *,
     dtype: str,
 ) -> PlanBatch:
-    """Make a batch of what a caller gives.
+    """Check the caller's arguments and make a batch of them.
 
     Raises:
-        UsageError: A shape is wrong, what says where the obstacles are is missing, or something is no real number.
+        UsageError: A shape is wrong, the obstacle poses are missing, or a value is not a real number.
     """
-    given = {"path": (path, dtype), "rate": (rate, dtype), "tops": (tops, dtype), "start_tip": (start_tip, "float64")}
-    found = {
+    arguments = {
+        "path": (path, dtype),
+        "rate": (rate, dtype),
+        "obstacle_poses": (obstacle_poses, dtype),
+        "start_tip": (start_tip, "float64"),
+    }
+    arrays = {
         name: numbers(name, values, kind, differentiable=True)
-        for name, (values, kind) in given.items()
+        for name, (values, kind) in arguments.items()
         if values is not None
     }
-    check_shapes(problem, {name: array.shape for name, array in found.items()})
-    good = np.asarray((found["rate"] > 0).all(axis=1))
-    for array in found.values():
-        good &= np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
-    heights = found.get("tops", np.zeros((len(good), 0), dtype))
-    return PlanBatch(found["path"], found["rate"], heights, found.get("start_tip"), good)
+    check_shapes(problem, {name: array.shape for name, array in arrays.items()})
+    valid = np.asarray((arrays["rate"] > 0).all(axis=1))
+    for array in arrays.values():
+        valid &= np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
+    poses = arrays.get("obstacle_poses", np.zeros((len(valid), 0), dtype))
+    return PlanBatch(arrays["path"], arrays["rate"], poses, arrays.get("start_tip"), valid)
 
 
 def check_shapes(problem: Problem, shapes: Mapping[str, tuple[int, ...]]) -> None:
-    """Refuse what cannot be plans of a problem by its shapes alone.
+    """Check the shapes of the arrays of plans.
 
     Args:
         problem: The problem.
-        shapes: Those of ``path``, ``rate`` and, where they are given, ``tops`` and ``start_tip``.
+        shapes: Shapes of ``path``, ``rate`` and, if present, ``obstacle_poses`` and ``start_tip``.
 
     Raises:
-        UsageError: A shape is wrong, or what says where the obstacles are is missing.
+        UsageError: A shape is wrong, or the obstacle poses are missing.
     """
-    spec, numbers = problem.trajectory, count_numbers(problem.obstacle)
-    if numbers and "tops" not in shapes:
+    spec, width = problem.trajectory, pose_width(problem.obstacle)
+    if width and "obstacle_poses" not in shapes:
         names = ", ".join(box.name for box in problem.obstacle)
         raise UsageError(
-            f"tops is missing: the problem {problem.name!r} has obstacles ({names}), and it says where they are:"
-            " cnpgen.obstacle_tops"
+            f"obstacle_poses is missing: the problem {problem.name!r} has obstacles ({names});"
+            " cnpgen.problems.obstacles.obstacle_poses_of returns their poses and sizes"
         )
     count = next(iter(shapes["path"]), 0)
     tails = {
         "path": (spec.path_control_points, len(problem.robot.joints)),
         "rate": (spec.rate_control_points,),
-        "tops": (numbers,),
+        "obstacle_poses": (width,),
         "start_tip": (3,),
     }
     for name, tail in tails.items():

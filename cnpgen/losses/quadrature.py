@@ -1,8 +1,8 @@
-"""Where the integrals over the phase are sampled: rules that see what clamped splines do at the ends.
+"""Quadrature rules over the phase with nodes that are dense at both ends.
 
-The first and last basis functions of r are about 0.01 wide. Between uniform nodes a plan can hide an acceleration of a
-hundred times the limit there, and training finds it. The nodes of Gauss, and those of the midpoint rule in the angle of
-``s = (1 - cos theta) / 2``, are dense at the ends: 64 of them are as accurate as 1024 uniform ones.
+The first and last basis functions of r are about 0.01 wide. Between uniform nodes a plan can have an acceleration of a
+hundred times the limit there, and training finds such plans. The nodes of Gauss and those of the midpoint rule in the
+angle of ``s = (1 - cos theta) / 2`` are dense at the ends: 64 of them are as accurate as 1024 uniform ones.
 """
 
 from dataclasses import dataclass
@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError, nearest
 from cnpgen.schema.arguments import integer
-from cnpgen.trajectory.spec import TrajectorySpec
 from cnpgen.trajectory.spline import basis
+from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
 Array = NDArray[np.float64]
 RULES = ("cosine", "gauss")
@@ -27,14 +27,14 @@ def quadrature(rule: str, nodes: int, shift: float = 0.0) -> tuple[Array, Array]
     Args:
         rule: "cosine": the midpoint rule in theta; "gauss": Gauss-Legendre.
         nodes: Number of nodes K.
-        shift: By which fraction of their distance the nodes of the cosine rule are moved on, in [0, 1). Averaged over
-            shifts there is nothing between nodes.
+        shift: Offset of the nodes of the cosine rule, as a fraction of their spacing in theta, in [0, 1). The average
+            over shifts covers the intervals between nodes.
 
     Returns:
         ``(s, weights)``, shape (K,) each; the weights sum to 1.
 
     Raises:
-        UsageError: There is no such rule, no whole number of nodes, or the shift is not in [0, 1).
+        UsageError: The rule does not exist, the number of nodes is no positive integer, or the shift is not in [0, 1).
     """
     check_quadrature(rule, nodes, shift)
     if rule == "gauss":
@@ -46,7 +46,7 @@ def quadrature(rule: str, nodes: int, shift: float = 0.0) -> tuple[Array, Array]
 
 
 def check_quadrature(rule: str, nodes: int, shift: float = 0.0) -> None:
-    """Refuse what :func:`quadrature` knows nothing of."""
+    """Raise UsageError for arguments that :func:`quadrature` does not accept."""
     if rule not in RULES:
         uniform = rule == "uniform"
         reason = "; between uniform nodes the ends of r hide violations" if uniform else nearest(str(rule), RULES)
@@ -58,11 +58,11 @@ def check_quadrature(rule: str, nodes: int, shift: float = 0.0) -> None:
 
 
 def rotating_shift(step: int, count: int = 8) -> float:
-    """Return the shift of a training step: ``count`` equally spaced ones in turn, none of which puts a node on an end.
+    """Return the shift of a training step: ``count`` equally spaced shifts in rotation, none with a node on an end.
 
     Args:
-        step: Which step.
-        count: How many shifts; 1 leaves the nodes where they are.
+        step: Index of the step.
+        count: Number of shifts; 1 for constant nodes.
     """
     return ((step % count + 0.5) / count + 0.5) % 1
 
@@ -74,8 +74,8 @@ class BasisTable:
     Attributes:
         s: Phases, shape (K,), float64.
         weights: Quadrature weights, shape (1, K).
-        path: Those of p and its derivatives, shape (orders K, C).
-        rate: Those of r and its derivatives, shape ((orders - 1) K, R).
+        path: Basis functions of p and its derivatives, shape (orders K, C).
+        rate: Basis functions of r and its derivatives, shape ((orders - 1) K, R).
     """
 
     s: Array
@@ -88,7 +88,7 @@ class BasisTable:
 def basis_table(
     spec: TrajectorySpec, rule: str, nodes: int, shift: float, dtype: str, *, orders: int = 3
 ) -> BasisTable:
-    """Tabulate the basis of both splines at the nodes of ``quadrature``, with so many orders of p."""
+    """Tabulate the basis of both splines at the nodes of ``quadrature``, with ``orders`` orders of p."""
     s, weights = quadrature(rule, nodes, shift)
     path = [basis(s, spec.path_control_points, spec.degree, order) for order in range(orders)]
     rate = [basis(s, spec.rate_control_points, spec.degree, order) for order in range(orders - 1)]

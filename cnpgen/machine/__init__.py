@@ -1,1 +1,1 @@
-"""The machine under the process: threads, signals, worker processes, versions."""
+"""Interface to the machine: threads, signals, worker processes, versions."""

@@ -1,4 +1,4 @@
-"""Clusters of dask and of ray, by their own interfaces: joblib's cannot say whether anybody is there to work."""
+"""Clusters of dask and ray through their own interfaces; joblib's interface cannot report missing workers."""
 
 import importlib
 import logging
@@ -11,10 +11,10 @@ from itertools import islice
 from typing import Any, TypeVar
 
 from cnpgen.errors import MachineError
-from cnpgen.machine.workers import DIED, signals_held
+from cnpgen.machine.workers import DIED, signals_blocked
 
-LOOK_SECONDS = 1.0  # between two looks at who is there
-SILENT_SECONDS = 10.0  # without any worker until it is said for the first time; then after twice as long
+POLL_INTERVAL_S = 1.0  # between two checks for finished tasks and workers
+FIRST_WARNING_S = 10.0  # time without workers before the first warning; doubled for each further warning
 _LOG = logging.getLogger(__name__)
 
 T = TypeVar("T")
@@ -22,25 +22,25 @@ R = TypeVar("R")
 
 
 class Cluster(ABC):
-    """Workers of a cluster, which may come and go; what one of them did not finish is given to another."""
+    """Workers of a cluster, which may join and leave; unfinished tasks of a lost worker run again on another."""
 
-    is_far = True
+    is_remote = True
 
-    def __init__(self, what: str, workers: int | None) -> None:
-        self._what, self._workers = what, workers
+    def __init__(self, name: str, workers: int | None) -> None:
+        self._name, self._workers = name, workers
 
     @property
     def size(self) -> int:
-        """Tasks that run at once."""
+        """Number of tasks that run at once."""
         return self._workers or max(self.present(), 1)
 
-    def share_out(
-        self, function: Callable[[T], R], tasks: Iterable[T], *, ordered: bool = False, advice: str = ""
+    def distribute(
+        self, function: Callable[[T], R], tasks: Iterable[T], *, ordered: bool = False, hint: str = ""
     ) -> Generator[R, None, None]:
         """Run a function on every task and yield the results.
 
         Raises:
-            MachineError: A task has ended several workers, or the cluster is gone.
+            MachineError: A task has crashed several workers, or the connection to the cluster is lost.
         """
         submit, left = self.prepared(function), enumerate(tasks)
         under_way: dict[Any, int] = {}
@@ -58,49 +58,49 @@ class Cluster(ABC):
                     yield results.pop(following if ordered else next(iter(results)))
                     following += 1
         except MachineError as error:
-            raise MachineError(f"{error}{advice}") from error
+            raise MachineError(f"{error}{hint}") from error
         finally:
             self.cancel(list(under_way))
 
     def _wait(self, tickets: Sequence[Any]) -> Sequence[Any]:
-        """Wait until some are finished; say so where nobody works on them."""
-        alone, said = time.monotonic(), SILENT_SECONDS
-        while not (finished := self.finished(tickets, LOOK_SECONDS)):
+        """Wait until some tasks are finished; log a warning if there is no worker."""
+        idle_since, warn_after = time.monotonic(), FIRST_WARNING_S
+        while not (finished := self.finished(tickets, POLL_INTERVAL_S)):
             if self.present():
-                alone, said = time.monotonic(), SILENT_SECONDS
-            elif time.monotonic() - alone >= said:
-                _LOG.warning("nobody is working: %s has had no worker for %.0f s; waiting for one", self._what, said)
-                said *= 2
+                idle_since, warn_after = time.monotonic(), FIRST_WARNING_S
+            elif time.monotonic() - idle_since >= warn_after:
+                _LOG.warning("%s has had no worker for %.0f s; waiting for one", self._name, warn_after)
+                warn_after *= 2
         return finished
 
     @abstractmethod
     def present(self) -> int:
-        """Count the tasks that the workers that are there could run at once."""
+        """Return the number of tasks that the present workers can run at once."""
 
     @abstractmethod
     def prepared(self, function: Callable[[T], R]) -> Callable[[T], Any]:
-        """Return what submits a task of a function and returns a ticket for its result."""
+        """Return a callable that submits a task of a function and returns a ticket for its result."""
 
     @abstractmethod
     def finished(self, tickets: Sequence[Any], seconds: float) -> Sequence[Any]:
-        """Return those that are finished, after so long at most [s]."""
+        """Return the finished tickets; wait at most ``seconds`` for the first one."""
 
     @abstractmethod
     def result(self, ticket: Any) -> Any:
-        """Return the result of a finished task, or raise what it raised."""
+        """Return the result of a finished task, or raise its exception."""
 
     @abstractmethod
     def cancel(self, tickets: Sequence[Any]) -> None:
-        """Give up what is not finished."""
+        """Cancel unfinished tasks."""
 
 
 class _Dask(Cluster):
-    def __init__(self, client: Any, what: str, workers: int | None) -> None:
-        super().__init__(what, workers)
+    def __init__(self, client: Any, name: str, workers: int | None) -> None:
+        super().__init__(name, workers)
         self._client = client
 
     def present(self) -> int:
-        with _gone(self._what):
+        with _connection_errors(self._name):
             return sum(self._client.nthreads().values())
 
     def prepared(self, function: Callable[[T], R]) -> Callable[[T], Any]:
@@ -121,10 +121,10 @@ class _Dask(Cluster):
         except KilledWorker as error:
             raise MachineError(DIED) from error
         except _lost_of_dask() as error:
-            raise MachineError(f"{self._what} is gone") from error
+            raise MachineError(f"the connection to {self._name} is lost") from error
 
     def cancel(self, tickets: Sequence[Any]) -> None:
-        with suppress(Exception):  # whatever the cluster says: it is of no interest any more
+        with suppress(Exception):  # errors of a cancellation are irrelevant
             self._client.cancel(tickets)
 
 
@@ -137,11 +137,11 @@ def _lost_of_dask() -> tuple[type[BaseException], ...]:
 
 
 @contextmanager
-def _gone(what: str) -> Iterator[None]:
+def _connection_errors(name: str) -> Iterator[None]:
     try:
         yield
-    except OSError as error:  # as are time-outs and closed connections
-        raise MachineError(f"{what} is gone: {error}") from error
+    except OSError as error:  # includes time-outs and closed connections
+        raise MachineError(f"the connection to {name} is lost: {error}") from error
 
 
 class _Ray(Cluster):
@@ -177,26 +177,26 @@ class _Ray(Cluster):
         import ray
 
         for ticket in tickets:
-            with suppress(Exception):  # whatever the cluster says: it is of no interest any more
+            with suppress(Exception):  # errors of a cancellation are irrelevant
                 ray.cancel(ticket)
 
 
 def _call(function: Callable[[T], R], task: T) -> R:
-    """Run a function on a task; ray hands over the function itself once."""
+    """Run a function on a task; ray transfers the function only once."""
     return function(task)
 
 
 @contextmanager
 def joined(name: str, address: str | None, workers: int | None) -> Iterator[Cluster]:
-    """Join a cluster, or start one on this machine; it is left, or ended, after the block.
+    """Connect to a cluster, or start one on this machine, for the duration of the block.
 
     Args:
         name: "dask" or "ray".
-        address: Of its scheduler or head; None: one on this machine, for this block.
-        workers: Tasks that run at once; None: as many as its workers can.
+        address: Address of the scheduler or head; None for a temporary cluster on this machine.
+        workers: Number of tasks that run at once; None for all workers of the cluster.
 
     Raises:
-        MachineError: Its package is not installed, or it cannot be reached.
+        MachineError: The package is not installed, or the cluster cannot be reached.
     """
     module, join = {"dask": ("distributed", _dask), "ray": ("ray", _ray)}[name]
     try:
@@ -212,11 +212,11 @@ def joined(name: str, address: str | None, workers: int | None) -> Iterator[Clus
 def _dask(address: str | None, workers: int | None, what: str) -> Iterator[Cluster]:
     from distributed import Client
 
-    quiet = logging.CRITICAL  # what workers say that are ended while they work is no news
+    quiet = logging.CRITICAL  # terminated workers log irrelevant errors
     here: dict[str, Any] = {"n_workers": workers, "threads_per_worker": 1, "silence_logs": quiet}
     here["dashboard_address"] = None
     try:
-        with nullcontext() if address else signals_held():  # no worker of ours sees the Ctrl-C of a terminal
+        with nullcontext() if address else signals_blocked():  # local workers do not receive the Ctrl-C of a terminal
             client = Client(address, set_as_default=False, **({} if address else here))
     except (OSError, ValueError, TypeError) as error:
         raise MachineError(f"cannot reach {what}: {error}") from error

@@ -1,4 +1,4 @@
-"""Where work is shared out to: processes of this machine, or a cluster of dask or ray."""
+"""Engines that run distributed work: processes of this machine, or a cluster of dask or ray."""
 
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
 from cnpgen.errors import UsageError, nearest
-from cnpgen.machine.workers import share_out, worker_count
+from cnpgen.machine.workers import distribute, worker_count
 from cnpgen.schema.arguments import integer
 
 CLUSTERS = ("dask", "ray")
@@ -18,17 +18,17 @@ R = TypeVar("R")
 
 @dataclass(frozen=True)
 class Engine:
-    """What users choose about where work runs.
+    """User's choice of the engine.
 
     Attributes:
-        name: "loky": processes of this machine, which end with this one; "dask" or "ray": a cluster. None: loky, or
-            whatever backend ``joblib.parallel_config`` names.
-        address: Of the cluster: of dask's scheduler ("tcp://host:8786"), of ray's head ("host:6379", "auto"). None: a
-            cluster on this machine, for this run.
-        workers: Tasks that run at once; None: one per core that there is.
+        name: "loky" for processes of this machine, which end with this one; "dask" or "ray" for a cluster. None for
+            loky, or the backend of ``joblib.parallel_config``.
+        address: Address of dask's scheduler ("tcp://host:8786") or ray's head ("host:6379", "auto"). None for a
+            temporary cluster on this machine.
+        workers: Number of tasks that run at once; None for one per available core.
 
     Raises:
-        UsageError: There is no such engine, it has no address, or there are fewer than one worker.
+        UsageError: The engine does not exist or has no address, or there is less than one worker.
     """
 
     name: str | None = None
@@ -43,49 +43,50 @@ class Engine:
             raise UsageError(f"engine {self.name!r} does not exist: {expected}")
         if self.address is not None and self.name not in CLUSTERS:
             raise UsageError(
-                f"the address {self.address!r} is that of a cluster: say of which with engine= (dask, ray)"
+                f"the address {self.address!r} is that of a cluster: choose {{engine}} dask or ray",
+                remedies={"engine": None},
             )
 
 
-class Team(Protocol):
-    """Those who share the work."""
+class WorkerPool(Protocol):
+    """Workers that share the tasks."""
 
     @property
     def size(self) -> int:
-        """Tasks that run at once."""
+        """Number of tasks that run at once."""
 
     @property
-    def is_far(self) -> bool:
-        """Whether they may be on other machines, with another working directory and other caches."""
+    def is_remote(self) -> bool:
+        """Whether workers may be on other machines, with other working directories and caches."""
 
-    def share_out(
-        self, function: Callable[[T], R], tasks: Iterable[T], *, ordered: bool = False, advice: str = ""
+    def distribute(
+        self, function: Callable[[T], R], tasks: Iterable[T], *, ordered: bool = False, hint: str = ""
     ) -> Generator[R, None, None]:
-        """Run a function on every task and yield the results; see ``cnpgen.machine.workers.share_out``."""
+        """Run a function on every task and yield the results; see ``cnpgen.machine.workers.distribute``."""
 
 
 @dataclass(frozen=True)
-class _Near:
+class _LocalPool:
     """Processes of this machine, or a backend of joblib."""
 
     size: int
-    is_far: bool = False
+    is_remote: bool = False
 
-    def share_out(
-        self, function: Callable[[T], R], tasks: Iterable[T], *, ordered: bool = False, advice: str = ""
+    def distribute(
+        self, function: Callable[[T], R], tasks: Iterable[T], *, ordered: bool = False, hint: str = ""
     ) -> Generator[R, None, None]:
-        return share_out(function, tasks, self.size, ordered=ordered, advice=advice)
+        return distribute(function, tasks, self.size, ordered=ordered, hint=hint)
 
 
 @contextmanager
-def assembled(engine: Engine, tasks: int, *, quick: bool = False) -> Iterator[Team]:
-    """Assemble those who share the work of the block: start processes, or join a cluster, which is left at its end.
+def assembled(engine: Engine, tasks: int, *, quick: bool = False) -> Iterator[WorkerPool]:
+    """Provide a worker pool for the block: start processes or connect to a cluster.
 
     Args:
-        engine: Where to.
-        tasks: How many tasks there are; more workers are of no use.
-        quick: Whether one process is faster than the start of a second one; not asked if somebody said how many, or
-            which cluster.
+        engine: Choice of the engine.
+        tasks: Number of tasks, the maximum number of local workers.
+        quick: Whether one process finishes before a second one has started; ignored if the user chose a number of
+            workers or a cluster.
 
     Raises:
         UsageError: The engine's package is not installed.
@@ -98,7 +99,7 @@ def assembled(engine: Engine, tasks: int, *, quick: bool = False) -> Iterator[Te
             yield cluster
         return
     with _on_loky() if engine.name == "loky" else nullcontext():
-        yield _Near(worker_count(1 if quick and engine.workers is None else engine.workers, tasks))
+        yield _LocalPool(worker_count(1 if quick and engine.workers is None else engine.workers, tasks))
 
 
 def _on_loky() -> AbstractContextManager[object]:

@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM while something runs: who is told of the first one, and of one that comes again."""
+"""Handling of SIGINT and SIGTERM: separate handlers for the first signal and for repeated ones."""
 
 import signal
 import threading
@@ -10,18 +10,18 @@ from types import FrameType
 from typing import Any
 
 NUMBERS = (signal.SIGINT, signal.SIGTERM)
-ECHO_SECONDS = 1.0  # a terminal and a wrapper such as ``uv run`` both pass on the same Ctrl-C
+MIN_REPEAT_INTERVAL_S = 1.0  # a terminal and a wrapper such as ``uv run`` forward the same Ctrl-C twice
 
-Told = Callable[[int], object]
+SignalHandler = Callable[[int], object]
 
 
 @dataclass
 class Received:
-    """What has come so far.
+    """State of the received signals.
 
     Attributes:
-        number: The first signal; None before.
-        since: When it came [s].
+        number: Number of the first signal; None before.
+        since: Monotonic time of its receipt [s].
     """
 
     number: int | None = None
@@ -29,20 +29,21 @@ class Received:
 
     @property
     def came(self) -> bool:
-        """Whether one has come."""
+        """Whether a signal was received."""
         return self.number is not None
 
 
 @contextmanager
-def signals_taken(first: Told, again: Told, *, stay: bool = False) -> Iterator[Received]:
-    """Tell ``first`` of the first signal in this block, and ``again`` of those more than ``ECHO_SECONDS`` after it.
+def signals_handled(first: SignalHandler, again: SignalHandler, *, stay: bool = False) -> Iterator[Received]:
+    """Call ``first`` for the first signal in the block, and ``again`` after ``MIN_REPEAT_INTERVAL_S`` or more.
 
-    Signals that are ignored stay so, and so do all of them outside of the main thread, which alone may set handlers.
+    Ignored signals stay ignored. Outside the main thread, which alone may set handlers, nothing changes.
 
     Args:
         first: Called with the number of the first signal.
-        again: Called with the number of a later one.
-        stay: Whether the handlers stay after the block once a signal has come; else those from before are back.
+        again: Called with the number of a later signal.
+        stay: Whether the handlers stay after the block once a signal was received; otherwise the previous ones are
+            restored.
     """
     received, before = Received(), _handlers()
 
@@ -50,7 +51,7 @@ def signals_taken(first: Told, again: Told, *, stay: bool = False) -> Iterator[R
         if not received.came:
             received.number, received.since = number, time.monotonic()
             first(number)
-        elif time.monotonic() - received.since > ECHO_SECONDS:
+        elif time.monotonic() - received.since > MIN_REPEAT_INTERVAL_S:
             again(number)
 
     try:
@@ -64,8 +65,8 @@ def signals_taken(first: Told, again: Told, *, stay: bool = False) -> Iterator[R
 
 
 @contextmanager
-def signals_wait() -> Iterator[Received]:
-    """Let a signal wait until the end of the block, where it takes its effect; one that comes again does not wait."""
+def signals_deferred() -> Iterator[Received]:
+    """Defer the first signal to the end of the block; a repeated signal takes effect at once."""
     before, waiting = _handlers(), Received()
 
     def effect(number: int) -> None:
@@ -74,7 +75,7 @@ def signals_wait() -> Iterator[Received]:
         signal.raise_signal(number)
 
     try:
-        with signals_taken(lambda _: None, effect) as waiting:
+        with signals_handled(lambda _: None, effect) as waiting:
             yield waiting
     finally:
         if waiting.number is not None:
@@ -82,7 +83,7 @@ def signals_wait() -> Iterator[Received]:
 
 
 def _handlers() -> dict[int, Any]:
-    """Return the handlers that may be replaced, by the number of their signal."""
+    """Return the replaceable handlers: signal number -> handler."""
     if threading.current_thread() is not threading.main_thread():
         return {}
     found = {int(number): signal.getsignal(number) for number in NUMBERS}

@@ -1,4 +1,4 @@
-"""One BLAS thread: for matrices as small as ours more only wait for each other, and take several times the CPU."""
+"""Limit of BLAS to one thread: for small matrices, more threads cost several times the CPU time without speedup."""
 
 import os
 import threading
@@ -10,30 +10,30 @@ from typing import Any
 VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 
 
-_preferred: dict[str, str] = {}  # what this process has added to its environment
+_preferred: dict[str, str] = {}  # variables that this process has added to its environment
 
 
 def prefer_one_thread() -> None:
-    """Let BLAS libraries that are loaded from now on start with one thread, unless the environment says otherwise."""
+    """Let BLAS libraries loaded from now on start with one thread, unless the environment sets another number."""
     for variable in VARIABLES:
         if variable not in os.environ:
             os.environ[variable] = _preferred[variable] = "1"
 
 
 def users_environment() -> dict[str, str]:
-    """Return the environment without what ``prefer_one_thread`` has added to it."""
+    """Return the environment without the variables that ``prefer_one_thread`` has added."""
     return {name: value for name, value in os.environ.items() if _preferred.get(name) != value}
 
 
 class _Limit:
-    """The limit of some libraries: whoever enters first sets it, whoever leaves last takes it back."""
+    """Reference-counted thread limit of some libraries."""
 
     def __init__(self) -> None:
         self._inside = 0
         self._before: list[tuple[Any, int]] = []
 
     def enter(self, libraries: Sequence[Any]) -> None:
-        """Set the limit, or only count that somebody is inside."""
+        """Increment the count; set the limit on the first entry."""
         if self._inside == 0:
             found = ((library, library.get_num_threads()) for library in libraries)
             self._before = [(library, count) for library, count in found if count != 1]
@@ -42,7 +42,7 @@ class _Limit:
         self._inside += 1
 
     def leave(self) -> None:
-        """Take the limit back, unless somebody is still inside."""
+        """Decrement the count; restore the thread numbers on the last exit."""
         self._inside -= 1
         if self._inside == 0:
             for library, count in self._before:
@@ -50,14 +50,14 @@ class _Limit:
 
 
 class _OwnLimit(threading.local):
-    """A limit that every Python thread has for itself."""
+    """Limit per Python thread."""
 
     def __init__(self) -> None:
         self.limit = _Limit()
 
 
 class OneThread(ContextDecorator):
-    """One BLAS thread for the process as long as any Python thread is inside; entering again only counts."""
+    """Context of one BLAS thread for the process while any Python thread is inside; it is reentrant."""
 
     def __init__(self) -> None:
         self._lock, self._limit, self._own = threading.Lock(), _Limit(), _OwnLimit()
@@ -80,7 +80,7 @@ _ONE_THREAD = OneThread()
 def one_thread() -> OneThread:
     """Compute with one BLAS thread, in a ``with`` block or, as a decorator, in a function.
 
-    It takes 2 microseconds where there is one thread already, and 20 to 30 where there are more.
+    It takes 2 microseconds if there is one thread already, otherwise 20 to 30.
     """
     return _ONE_THREAD
 
@@ -88,7 +88,7 @@ def one_thread() -> OneThread:
 @cache
 def _libraries() -> tuple[list[Any], list[Any]]:
     """Find the BLAS libraries: those with one setting for the process, and those with one for every Python thread."""
-    import numpy as np  # noqa: F401 - its BLAS must be there to be found
+    import numpy as np  # noqa: F401 - loads its BLAS
     import scipy.linalg  # noqa: F401
     from threadpoolctl import ThreadpoolController
 
@@ -98,7 +98,7 @@ def _libraries() -> tuple[list[Any], list[Any]]:
 
 
 def _set_threads(library: Any, count: int) -> None:
-    """Set the threads of a library from any Python thread: newer threadpoolctl listens to only one of them."""
+    """Set the threads of a library from any Python thread; newer threadpoolctl accepts only one controlling thread."""
     release = getattr(library, "clear_controlling_thread", None)
     if release is not None:
         release(force=True)

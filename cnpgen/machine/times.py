@@ -1,4 +1,4 @@
-"""Where the time of a run went: into preparing (compiling kernels, if they are not cached), computing and waiting."""
+"""Times of a run: preparation (including the compilation of kernels that are not cached), computation, waiting."""
 
 import time
 from dataclasses import asdict, dataclass, field
@@ -6,12 +6,12 @@ from dataclasses import asdict, dataclass, field
 
 @dataclass(frozen=True)
 class Times:
-    """The time that has passed in a run, in parts [s].
+    """Elapsed time of a run, in parts [s].
 
     Attributes:
-        preparing: Until everything was prepared: above all kernels are compiled, unless they are in the cache.
-        computing: CPU time after that, of each of the processes that share the work.
-        waiting: The rest: for the processor where other jobs use it, for the disk, or for the last process.
+        preparing: Time of the preparation, mainly of kernels that are not cached.
+        computing: CPU time after the preparation, per process.
+        waiting: Remaining time: waiting for the processor, the disk or the last process.
     """
 
     preparing: float = 0.0
@@ -20,7 +20,7 @@ class Times:
 
     @property
     def passed(self) -> float:
-        """All of it [s]."""
+        """Total elapsed time [s]."""
         return self.preparing + self.computing + self.waiting
 
     def __str__(self) -> str:
@@ -39,12 +39,12 @@ NO_TIME = Times()
 
 @dataclass
 class Stopwatch:
-    """Measures a run from when it is made.
+    """Stopwatch of a run, started at construction.
 
     Attributes:
-        begun: When that was [s].
-        preparing: How long everything took to prepare [s].
-        computing: CPU time of each process since then [s]; whoever computes in other processes adds to it.
+        begun: Start time [s].
+        preparing: Duration of the preparation [s].
+        computing: CPU time per process after the preparation [s]; callers add the time of other processes.
     """
 
     begun: float = field(default_factory=time.perf_counter)
@@ -53,14 +53,14 @@ class Stopwatch:
     _cpu: float = 0.0
 
     def prepared(self) -> None:
-        """Note that everything is prepared."""
+        """Record the end of the preparation."""
         self.preparing, self._cpu = time.perf_counter() - self.begun, time.process_time()
 
     def computed_here(self) -> None:
-        """Note that this process has computed since all was prepared, and no other one."""
+        """Record the CPU time of this process as the computing time."""
         self.computing = time.process_time() - self._cpu
 
     def times(self) -> Times:
-        """Say where the time went until now."""
+        """Return the times until now."""
         left = time.perf_counter() - self.begun - self.preparing
         return Times(self.preparing, self.computing, max(left - self.computing, 0.0))

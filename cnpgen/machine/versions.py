@@ -1,4 +1,4 @@
-"""The version of cnpgen, and of what it computes with."""
+"""Versions of cnpgen and of its numerical libraries."""
 
 from functools import cache
 
@@ -7,7 +7,7 @@ __version__ = "0.1.0"
 
 @cache
 def versions() -> dict[str, str]:
-    """Versions of cnpgen, Python and the libraries that make rows."""
+    """Return the versions of cnpgen, Python and the numerical libraries."""
     import platform
     from importlib.metadata import PackageNotFoundError, version
 

@@ -1,4 +1,4 @@
-"""Sharing work out: to processes that end with this one, or to whatever backend ``joblib.parallel_config`` names."""
+"""Distribution of tasks over processes that end with this one, or over the backend of ``joblib.parallel_config``."""
 
 import os
 import pickle
@@ -20,44 +20,44 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from cnpgen.errors import MachineError
-from cnpgen.machine.signals import NUMBERS, signals_wait
+from cnpgen.machine.signals import NUMBERS, signals_deferred
 from cnpgen.schema.arguments import integer
 from cnpgen.store.files.atomic import machine_error
 
-_TIDIED = "ignore:resource_tracker:UserWarning"  # as the option -W takes it: the beginning of the message
+_IGNORED_WARNING = "ignore:resource_tracker:UserWarning"  # in the format of the option -W
 DIED = "a worker died (killed, or out of memory)"
-SHORT = 2048  # bytes of a message through the pipe, to which joblib adds some: up to 4096 are written as a whole
-WAVE = 4  # tasks for each worker of those that are given at a time to what knows only lists
-WATCH_SECONDS = 0.5  # how often a worker looks whether the process that started it is still there
+MAX_PIPE_BYTES = 2048  # plus the overhead of joblib; writes of up to 4096 bytes to a pipe are atomic
+TASKS_PER_WORKER = 4  # per batch, for backends that accept only lists of tasks
+PARENT_POLL_INTERVAL_S = 0.5  # of the check of a worker for its parent process
 
 T = TypeVar("T")
 R = TypeVar("R")
 
 
 def worker_count(workers: int | None, tasks: int) -> int:
-    """Decide how many processes share the tasks: what was asked for, else one per available core.
+    """Return the number of processes for the tasks: the requested number, by default one per available core.
 
     Raises:
-        UsageError: Fewer than one was asked for, or no whole number.
+        UsageError: The requested number is not a positive integer.
     """
     if workers is None:
         from joblib import effective_n_jobs
 
-        return max(1, min(int(effective_n_jobs(-1)), tasks))  # of the backend that parallel_config names, if any
+        return max(1, min(int(effective_n_jobs(-1)), tasks))  # of the backend of parallel_config, if any
     return max(1, min(integer("workers", workers, least=1), tasks))
 
 
-def share_out(
-    function: Callable[[T], R], tasks: Iterable[T], workers: int, *, ordered: bool = False, advice: str = ""
+def distribute(
+    function: Callable[[T], R], tasks: Iterable[T], workers: int, *, ordered: bool = False, hint: str = ""
 ) -> Generator[R, None, None]:
     """Run a function on every task in other processes and yield the results.
 
     Args:
-        function: What to run; it and the tasks can be pickled.
-        tasks: What to run it on.
-        workers: Processes; with one, everything runs here.
-        ordered: Whether results come in the order of the tasks instead of as they are ready.
-        advice: What to do after a worker has died; part of the message.
+        function: Function to run, picklable.
+        tasks: Arguments of the function, picklable.
+        workers: Number of processes; one for this process.
+        ordered: Whether results keep the order of the tasks; otherwise they are yielded when ready.
+        hint: Text that is appended to the error message.
 
     Raises:
         MachineError: A worker died.
@@ -75,47 +75,47 @@ def share_out(
         elif backend.supports_return_generator or name == "SequentialBackend":
             yield from _generated(function, tasks, workers, ordered=ordered)
         else:
-            yield from _in_waves(function, tasks, workers)
+            yield from _in_batches(function, tasks, workers)
     except BrokenExecutor as error:
-        raise MachineError(f"{DIED}{advice}") from error
+        raise MachineError(f"{DIED}{hint}") from error
 
 
 def _generated(
     function: Callable[[T], R], tasks: Iterable[T], workers: int, *, ordered: bool, **options: Any
 ) -> Generator[R, None, None]:
-    """Let joblib yield the results, on the backend that ``parallel_config`` names."""
+    """Yield the results of joblib with the backend of ``parallel_config``."""
     from joblib import Parallel, delayed
 
     order, results = "generator" if ordered else "generator_unordered", None
     run = Parallel(n_jobs=workers, return_as=order, pre_dispatch="2*n_jobs", batch_size=1, **options)
     try:
-        with signals_held():
+        with signals_blocked():
             results = run(delayed(function)(task) for task in tasks)
         for result in results:  # noqa: UP028 - closing this generator must not close that one noisily
             yield result
     finally:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # that tasks under way are cancelled is the point
+            warnings.simplefilter("ignore", UserWarning)  # about cancelled tasks
             if results is not None:
                 results.close()
 
 
-def _in_waves(function: Callable[[T], R], tasks: Iterable[T], workers: int) -> Iterator[R]:
-    """Yield the results of a few tasks at a time: backends such as ray and multiprocessing know only lists of them."""
+def _in_batches(function: Callable[[T], R], tasks: Iterable[T], workers: int) -> Iterator[R]:
+    """Yield the results in batches, for backends such as ray and multiprocessing that accept only lists of tasks."""
     from joblib import Parallel, delayed
 
     left = iter(tasks)
     with Parallel(n_jobs=workers, batch_size=1) as run:
-        while wave := list(islice(left, WAVE * workers)):
-            yield from run(delayed(function)(task) for task in wave)
+        while batch := list(islice(left, TASKS_PER_WORKER * workers)):
+            yield from run(delayed(function)(task) for task in batch)
 
 
 def _on_processes(function: Callable[[T], R], tasks: Iterable[T], workers: int, *, ordered: bool) -> Iterator[R]:
-    """Yield the results of processes of ours, which end with this one.
+    """Yield the results of loky processes that end with this one.
 
-    All of them write to one pipe. A message of more than 4096 bytes is written in steps: a process that is killed
-    between two of them would leave this one waiting for the rest for ever, as the others hold the pipe open. So what
-    is longer goes through a file, and only its name through the pipe.
+    All processes write to one pipe, and messages of more than 4096 bytes are not atomic. If a process is killed during
+    such a write, this process waits forever for the rest, since the others keep the pipe open. Longer messages are
+    therefore written to a file, and only the file name goes through the pipe.
     """
     _start_helpers()
     ours: dict[str, Any] = {"initializer": _end_with, "initargs": (os.getpid(),)}
@@ -126,17 +126,17 @@ def _on_processes(function: Callable[[T], R], tasks: Iterable[T], workers: int, 
 
 
 def _packed(function: Callable[[T], R], folder: str, task: T) -> bytes | str:
-    """Run a function and return its result, or what it raised, as a short message or as the name of a file."""
+    """Run a function and return its result or exception, as a short message or as a file name."""
     from joblib.externals.loky.backend.reduction import dumps
 
     outcome: tuple[bool, R | Exception]
     try:
         outcome = True, function(task)
-    except Exception as error:  # noqa: BLE001 - the boundary of the worker: it is raised again in the parent
+    except Exception as error:  # noqa: BLE001 - raised again in the parent process
         error.add_note(traceback.format_exc())
         outcome = False, error
     message = bytes(dumps(outcome))
-    if len(message) <= SHORT:
+    if len(message) <= MAX_PIPE_BYTES:
         return message
     path = Path(folder) / uuid.uuid4().hex
     try:
@@ -147,12 +147,12 @@ def _packed(function: Callable[[T], R], folder: str, task: T) -> bytes | str:
 
 
 def _unpacked(message: bytes | str) -> Any:
-    """Return the result that a worker has packed, or raise what it raised."""
+    """Return a packed result of a worker, or raise its exception."""
     if isinstance(message, str):
         path = Path(message)
         message = path.read_bytes()
         path.unlink()
-    done, outcome = pickle.loads(message)  # noqa: S301 - of a process of ours
+    done, outcome = pickle.loads(message)  # noqa: S301 - from our own process
     if not done:
         raise outcome
     return outcome
@@ -160,7 +160,7 @@ def _unpacked(message: bytes | str) -> Any:
 
 @contextmanager
 def _shared_folder() -> Iterator[str]:
-    """Make a folder for results that is gone after the block, or, where this process is killed, soon after it."""
+    """Create a folder for results that is deleted after the block, or soon after this process is killed."""
     from joblib.externals.loky.backend import resource_tracker
 
     folder = tempfile.mkdtemp(prefix="cnpgen-results-")
@@ -173,17 +173,17 @@ def _shared_folder() -> Iterator[str]:
 
 
 @contextmanager
-def signals_held() -> Iterator[None]:
-    """Let processes be started that never see Ctrl-C, which a terminal sends to all of them.
+def signals_blocked() -> Iterator[None]:
+    """Block signals, so that processes started in the block ignore the Ctrl-C that a terminal sends to all.
 
-    A process inherits the signals that are blocked when it is started. Only this process acts on them, at the end of
-    the block, and ends the others. A thread of this process that blocks nothing may get a signal: it waits, too.
+    A process inherits the blocked signals of its parent. Only this process handles them, at the end of the block, and
+    ends the others. Signals that reach another thread of this process are deferred, too.
     """
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
     _start_helpers()
-    with signals_wait():
+    with signals_deferred():
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, NUMBERS)
         try:
             yield
@@ -192,12 +192,11 @@ def signals_held() -> Iterator[None]:
 
 
 def _start_helpers() -> None:
-    """Start the helper processes that joblib would start otherwise later, unblocking the signals.
+    """Start joblib's helper processes, which would otherwise start later and unblock the signals.
 
-    They tidy up after processes that were killed; they say so on stderr unless their interpreter, which inherits this
-    one's options, ignores it.
+    They clean up after killed processes. Their warnings on stderr are suppressed by the inherited interpreter options.
     """
-    sys.warnoptions.append(_TIDIED)
+    sys.warnoptions.append(_IGNORED_WARNING)
     try:
         with suppress(ImportError):
             from multiprocessing import resource_tracker
@@ -207,18 +206,18 @@ def _start_helpers() -> None:
             loky_tracker.ensure_running()
             resource_tracker.ensure_running()
     finally:
-        sys.warnoptions.remove(_TIDIED)
+        sys.warnoptions.remove(_IGNORED_WARNING)
 
 
 def _end_with(parent: int) -> None:
-    """Let this process, a worker, end soon after its parent: joblib's own would wait for minutes for more work.
+    """Let this worker end soon after its parent; by default, joblib's workers wait minutes for more tasks.
 
-    It may end at any moment: files get their names when they are whole.
+    It may end at any time: files are renamed to their final names when complete.
     """
 
     def watch() -> None:
         while os.getppid() == parent:
-            time.sleep(WATCH_SECONDS)
+            time.sleep(PARENT_POLL_INTERVAL_S)
         os._exit(1)
 
     threading.Thread(target=watch, name="cnpgen-watch", daemon=True).start()

@@ -1,1 +1,1 @@
-"""Datasets made: their recipe, the blueprint, shards, certified plans, problems to solve."""
+"""Generation of datasets: recipes, specifications, shards, certified plans and fresh boundary problems."""

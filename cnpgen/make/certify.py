@@ -1,4 +1,4 @@
-"""Stage: certified samples, each with a plan that Pinocchio and Coal call valid."""
+"""Stage: certified samples, each with a plan that Pinocchio and Coal verify as valid."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,9 +9,9 @@ import numpy as np
 from cnpgen.errors import RecipeError
 from cnpgen.machine.threads import one_thread
 from cnpgen.make.recipe import DatasetRecipe
-from cnpgen.make.stage_planner import SHA256, asked, load_stage_planner, model_sha256
+from cnpgen.make.stage_planner import SHA256, load_stage_planner, model_sha256, planner_boundary
 from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.stages.stage import Round, Stage, Work
+from cnpgen.pipelines.stages.stage import CandidateBatch, Stage, StageFunction
 from cnpgen.plans.format import BOUNDARY
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
@@ -21,29 +21,29 @@ NO_PLAN = "no plan found"
 
 @dataclass(frozen=True, kw_only=True)
 class CertifiedPlan(Stage):
-    """Solves every sample, with the problem's own objective, and keeps those with a valid plan."""
+    """Stage: solve every sample with the problem's objective and keep those with a valid plan."""
 
-    block_rows: ClassVar[int] = 64  # a sample takes some 30 ms: blocks of this stage must be small
-    needs = (*BOUNDARY, "start_xyz", "goal_xyz")
+    block_rows: ClassVar[int] = 64  # small blocks, since a sample takes about 30 ms
+    inputs = (*BOUNDARY, "start_xyz", "goal_xyz")
     model: str = field(
-        "the planner whose plans solving begins with, a shipped one or a file; none: from nothing",
+        "planner whose plans are the initial guesses, a shipped one or a file; none: no initial guess",
         default="",
-        late=True,
+        since_version=2,
     )
     sha256: str = field(
-        "sha256 of the model's file: from another one come other plans", default="", pattern=SHA256, late=True
+        "sha256 of the model file; another file gives other plans", default="", pattern=SHA256, since_version=2
     )
 
     def describe(self) -> str:
-        """Say what is kept."""
+        """Describe the stage in one sentence."""
         origin = f"from the plan of {self.model!r}" if self.model else "from nothing"
         return (
             f"plan every sample {origin} (sequential quadratic programming, several starts) and keep those whose"
             " plan Pinocchio and Coal call valid on a time grid of 1 ms, with the plan"
         )
 
-    def provides(self, context: Context) -> tuple[Field, ...]:
-        """The control points, flattened point by point, and the duration."""
+    def outputs(self, context: Context) -> tuple[Field, ...]:
+        """List the fields of the control points, flattened point by point, and of the duration."""
         spec, joints = context.problem.trajectory, context.robot.joint_names
         points, rates = spec.path_control_points, spec.rate_control_points
         path_names = tuple(f"C{point}.{joint}" for point in range(points) for joint in joints)
@@ -63,40 +63,40 @@ class CertifiedPlan(Stage):
             Field("duration", "s", "its motion time", role="target"),
         )
 
-    def takes(self, context: Context) -> tuple[Field, ...]:
-        """Nothing: tasks bring no plans."""
+    def task_inputs(self, context: Context) -> tuple[Field, ...]:
+        """Return no fields: tasks have no plans."""
         del context
         return ()
 
-    def prepare(self, context: Context) -> Work:
+    def prepare(self, context: Context) -> StageFunction:
         """Load the refiner."""
         if context.dtype != "float64":
             raise RecipeError([f"plans meet their boundary conditions in float64 only: needs it, got {context.dtype}"])
-        from cnpgen.refine.engine import load_solver
+        from cnpgen.refine.refine_engine import load_solver
 
         solve = load_solver(context.problem, context.robot, context.kernels)
         planner = load_stage_planner(self.model, self.sha256, context) if self.model else None
 
-        def work(draws: Round, _random: np.random.Generator) -> None:
-            columns = {name: np.ascontiguousarray(values.T) for name, values in draws.columns.items()}
-            given = None if planner is None else planner.plan_batch(asked(columns, planner)).motion
+        def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
+            columns = {name: np.ascontiguousarray(values.T) for name, values in candidates.columns.items()}
+            guess = None if planner is None else planner.plan_batch(planner_boundary(columns, planner)).motion
             with one_thread():
-                motion, valid = solve(columns, given)
+                motion, valid = solve(columns, guess)
             count, points, joints = motion.path.shape
-            draws["path_control_points"] = np.ascontiguousarray(motion.path.reshape(count, points * joints).T)
-            draws["rate_control_points"] = np.ascontiguousarray(motion.rate.T)
-            draws["duration"] = motion.duration()[None]
-            draws.reject(valid, NO_PLAN)
+            candidates["path_control_points"] = np.ascontiguousarray(motion.path.reshape(count, points * joints).T)
+            candidates["rate_control_points"] = np.ascontiguousarray(motion.rate.T)
+            candidates["duration"] = motion.duration()[None]
+            candidates.reject(valid, NO_PLAN)
 
         return work
 
 
 def certified(recipe: DatasetRecipe, *, model: str | Path | None = None) -> DatasetRecipe:
-    """Return the recipe of the certified dataset: one more stage, and a name that says so.
+    """Return the recipe of the certified dataset, with one more stage and the name ``NAME-certified``.
 
     Args:
-        recipe: The recipe; one that is of a certified dataset already stays as it is.
-        model: The planner whose plans solving begins with; by default it begins from nothing.
+        recipe: Recipe of the samples; the recipe of a certified dataset is returned unchanged.
+        model: Planner of the initial guesses; by default there is none.
 
     Raises:
         UsageError: There is no such model.

@@ -1,4 +1,4 @@
-"""Completing tasks that users give: positions to reach and directions to hit in, for boundary problems to solve."""
+"""Completion of user tasks, positions to reach and hit directions, into boundary problems."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import DatasetError, UsageError, counted
 from cnpgen.kernels.library import choose_backend
-from cnpgen.make.load import as_dataset_recipe
 from cnpgen.make.recipe import DatasetRecipe
+from cnpgen.make.recipe_file import as_dataset_recipe
 from cnpgen.make.task_table import read_tasks
 from cnpgen.pipelines.completion import Completion, given_fields, table_height
 from cnpgen.pipelines.context import Context, load_context
@@ -19,7 +19,7 @@ from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.steps import steps_of
 from cnpgen.plans.boundary_problems import plans_of_rows
 from cnpgen.plans.plans import Plans
-from cnpgen.problems.record import record_problem
+from cnpgen.problems.problem_record import record_problem
 from cnpgen.schema.arguments import numbers
 from cnpgen.store.field import Field
 
@@ -28,13 +28,12 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Completed:
-    """What came of N tasks.
+    """Result of the completion of N tasks.
 
     Attributes:
-        plans: The boundary problems of those that have an answer, as plans that are still to be made: ``solve_plans``
-            and ``refine_plans`` make them, a planner plans for ``plans.boundary``. ``plans.sample_id`` says which task
-            each is.
-        reasons: Why each task has no answer; empty where it has one.
+        plans: Boundary problems of the solved tasks, as plans without motions; ``plans.sample_id`` is the index of the
+            task. ``solve_plans`` and ``refine_plans`` compute the motions; a planner plans for ``plans.boundary``.
+        reasons: Rejection reason of each task; empty for solved tasks.
     """
 
     plans: Plans
@@ -45,27 +44,27 @@ class Completed:
 
     @property
     def rejections(self) -> dict[str, int]:
-        """How many tasks have no answer for each reason, the most frequent one first."""
+        """Number of rejected tasks per reason, the most frequent reason first."""
         return dict(Counter(reason for reason in self.reasons if reason).most_common())
 
 
 def complete(recipe: str | Path | Pipeline | DatasetRecipe, /, **columns: ArrayLike) -> Completed:
-    """Complete tasks: find by the stages of a pipeline, in their order, what is not given, instead of drawing it.
+    """Complete tasks: compute their missing columns with the stages of a pipeline, without random sampling.
 
-    A start is given by ``start_q``, with ``start_dq`` and ``start_ddq`` where it moves, or by the tip's position
-    ``start_xyz``; else it is the problem's base at rest. A goal is given by ``goal_xyz``, for hits with ``hit_angle``
-    and, unless the hit is to be as fast as possible, with ``hit_speed`` [m/s] or ``hit_speed_share``, from 0 to 1. On a
-    table positions need no z. What a stage would draw and no task gives is the middle of what it could be: a hit goes
-    towards the pipeline's target or along the line from start to goal. What restricts draws only, such as the least
-    distance of start and goal, restricts no task. Every task is completed for itself.
+    A start is given by ``start_q``, for moving starts with ``start_dq`` and ``start_ddq``, or by the tip position
+    ``start_xyz``. The default start is the problem's base at rest. A goal is given by ``goal_xyz``, for hits with
+    ``hit_angle``. Hits have the maximum speed unless ``hit_speed`` [m/s] or ``hit_speed_share``, from 0 to 1, is given.
+    Positions on a table need no z. Missing random values are replaced by their mean: a hit goes towards the pipeline's
+    target or along the line from start to goal. Restrictions of sampling only, such as the minimum distance of start
+    and goal, do not apply to tasks. Tasks are completed independently of each other.
 
     Args:
         recipe: Name of a shipped pipeline or dataset, path of a recipe file, or a loaded recipe.
-        columns: Name -> values in SI units, as datasets name them: shape (w,) for one task or (N, w), scalars one
-            number or shape (N,). One task's value holds for all.
+        columns: Name of a dataset column -> values in SI units, shape (w,) for one task or (N, w); scalars have shape
+            () or (N,). The value of one task applies to all.
 
     Raises:
-        UsageError: There is no such column, something has the wrong shape or is not finite, or a goal is missing.
+        UsageError: A column is unknown, has the wrong shape or is not finite, or a goal is missing.
         RecipeError: The recipe has mistakes.
         MachineError: No backend works.
     """
@@ -91,12 +90,12 @@ def complete_table(recipe: str | Path | Pipeline | DatasetRecipe, path: str | Pa
     """Complete the tasks of a table, CSV or HDF5; see ``complete`` and docs/tasks.md.
 
     Args:
-        recipe: As of ``complete``.
-        path: The table.
+        recipe: Recipe of the tasks, as for ``complete``.
+        path: Path of the table.
 
     Raises:
         UsageError: There is no such file.
-        DatasetError: The table is damaged, lacks a goal, or has columns that tasks cannot give, or not together.
+        DatasetError: The table is damaged, lacks a goal, or has unknown or contradictory columns.
         RecipeError: The recipe has mistakes.
         MachineError: No backend works, or the file cannot be read.
     """
@@ -115,7 +114,7 @@ def _pipeline(recipe: str | Path | Pipeline | DatasetRecipe) -> Pipeline:
 
 
 def _rows(field: Field, values: ArrayLike, *, flat: bool) -> Array:
-    """Return the values of a field as rows, shape (N, w); on a table (``flat``) a position may have no z."""
+    """Return the values of a field as rows, shape (N, w); on a table (``flat``) the z of a position is optional."""
     array, width = numbers(field.name, values), max(field.width, 1)
     widths = {width, 2} if flat and field.name.endswith("_xyz") else {width}
     if not field.width:
@@ -128,5 +127,5 @@ def _rows(field: Field, values: ArrayLike, *, flat: bool) -> Array:
         row = int(np.argmin(np.isfinite(rows).all(axis=1)))
         raise UsageError(f"{field.name} must be finite, got {rows[row]} in task {row}")
     if not len(rows):
-        raise UsageError(f"{field.name} is of no task")
+        raise UsageError(f"{field.name} has no rows, expected at least one task")
     return rows

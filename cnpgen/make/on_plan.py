@@ -1,4 +1,4 @@
-"""Stages: starts on motions that are being executed, as a planner gives them or refined, and goals that stay theirs."""
+"""Stages for replanning: starts on planned or refined motions, and goals of these motions."""
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
@@ -8,104 +8,108 @@ from numpy.typing import NDArray
 
 from cnpgen.kernels.symbolic.kinematics import tip_position
 from cnpgen.machine.threads import one_thread
-from cnpgen.make.stage_planner import SHA256, asked, load_stage_planner
+from cnpgen.make.stage_planner import SHA256, load_stage_planner, planner_boundary
 from cnpgen.pipelines.context import Context
+from cnpgen.pipelines.stages.boundary_motion import onto_table, velocity_of_tip
 from cnpgen.pipelines.stages.draw import position_field
-from cnpgen.pipelines.stages.motion import onto_table, velocity_of_tip
-from cnpgen.pipelines.stages.stage import Round, Stage, Work, leave
+from cnpgen.pipelines.stages.stage import CandidateBatch, Stage, StageFunction, leave
 from cnpgen.plans.format import BOUNDARY
 from cnpgen.problems.constraints.table import Table
 from cnpgen.schema.keys import Range, field
 from cnpgen.store.field import Field
-from cnpgen.trajectory.moment import states_at_times
-from cnpgen.trajectory.motion import Motion
+from cnpgen.trajectory.spline_motion import Motion, states_at_times
 
-MOMENTS = 40  # on every refined plan: one takes some 20 ms, a moment on it nothing
+STATES_PER_REFINED_PLAN = 40  # a refined plan takes about 20 ms, a state on it is cheap
 START = ("start_q", "start_dq", "start_ddq")
 GOAL = ("goal_q", "goal_dq", "goal_xyz", "hit_angle", "hit_speed", "hit_speed_max", "home_q")
 
 
 @dataclass(frozen=True, kw_only=True)
 class StartOnPlan(Stage):
-    """Plans the draws so far and moves their starts to random moments of the motions, put back on the table exactly."""
+    """Stage: plan the candidates and move their starts to random times of the motions, projected onto the table."""
 
-    needs = (*BOUNDARY, "start_xyz", *GOAL[2:-1])
-    renews = ("goal_q", "goal_dq")
-    model: str = field("the planner: name of a shipped one, or path of a model file")
-    sha256: str = field("sha256 of the model's file: from another one come other rows", pattern=SHA256)
-    moved: float = field("fraction of the starts that are moved; the others stay where they are", low=0.0, high=1.0)
+    inputs = (*BOUNDARY, "start_xyz", *GOAL[2:-1])
+    replaces = ("goal_q", "goal_dq")
+    model: str = field("planner: name of a shipped model, or path of a model file")
+    sha256: str = field("sha256 of the model file; another file gives other samples", pattern=SHA256)
+    moved: float = field("fraction of the starts that are moved onto plans", low=0.0, high=1.0)
     refined: float = field(
-        f"fraction of the moved ones that are on refined plans, up to {MOMENTS} on each", low=0.0, high=1.0, default=0.0
+        f"fraction of the moved ones that are on refined plans, up to {STATES_PER_REFINED_PLAN} on each",
+        low=0.0,
+        high=1.0,
+        default=0.0,
     )
-    moments: Range = field("when, as a fraction of the motion time")
+    times: Range = field("time on the plan as a fraction of its duration")
 
     def describe(self) -> str:
-        """Say where starts go."""
+        """Describe the stage in one sentence."""
         return (
-            f"plan with {self.model!r} and move {100 * self.moved:.4g} % of the starts to a moment between"
-            f" {self.moments.low:g} and {self.moments.high:g} of the motion time, {100 * self.refined:.4g} % of them"
+            f"plan with {self.model!r} and move {100 * self.moved:.4g} % of the starts to a time between"
+            f" {self.times.low:g} and {self.times.high:g} of the motion time, {100 * self.refined:.4g} % of them"
             " on refined plans"
         )
 
-    def provides(self, context: Context) -> tuple[Field, ...]:
-        """The state at the start, anywhere on the table."""
-        meaning = (("rad", "positions"), ("rad/s", "velocities"), ("rad/s^2", "accelerations"))
+    def outputs(self, context: Context) -> tuple[Field, ...]:
+        """List the fields of the state and the tip position at the start."""
+        quantities = (("rad", "positions"), ("rad/s", "velocities"), ("rad/s^2", "accelerations"))
         states = (
-            context.joint_field(name, unit, f"joint {what} at the start")
-            for name, (unit, what) in zip(START, meaning, strict=True)
+            context.joint_field(name, unit, f"joint {quantity} at the start")
+            for name, (unit, quantity) in zip(START, quantities, strict=True)
         )
         table = context.constraint(Table)
         low, high = ([getattr(axis, end) for axis in (table.x, table.y)] for end in ("low", "high"))
         return (*states, position_field("start", [*low, table.z], [*high, table.z]))
 
     def writes(self, context: Context) -> tuple[str, ...]:
-        """Also where the tip is and how it moves, and the goals of the plans."""
-        return (*(field.name for field in self.provides(context)), "start_tip_velocity", *map(of_plan, GOAL))
+        """List the outputs, the tip velocity, and the goals of the plans."""
+        return (*(field.name for field in self.outputs(context)), "start_tip_velocity", *map(of_plan, GOAL))
 
-    def prepare(self, context: Context) -> Work:
+    def prepare(self, context: Context) -> StageFunction:
         """Load the planner, the refiner and the kernels."""
         height = context.constraint(Table).z
         load = context.kernels.load
         exact, tip, speed = load(onto_table, height=height), load(tip_position), load(velocity_of_tip)
         make = self._maker(context)
 
-        def work(draws: Round, random: np.random.Generator) -> None:
-            moves, refines, when = (draws.draw(random, 1)[0] for _ in range(3))
+        def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
+            moves, refines, times = (candidates.draw(random, 1)[0] for _ in range(3))
             moved = moves < self.moved
-            owner, motion = make(draws, moved & (refines < self.refined))
+            owner, motion = make(candidates, moved & (refines < self.refined))
             for name in GOAL:
-                draws[of_plan(name)] = np.take(draws["start_q" if name == "home_q" else name], owner, axis=1)
-            phase = self.moments.low + (self.moments.high - self.moments.low) * when
+                candidates[of_plan(name)] = np.take(candidates["start_q" if name == "home_q" else name], owner, axis=1)
+            phase = self.times.low + (self.times.high - self.times.low) * times
             states = states_at_times(motion, phase * motion.duration())
-            found = exact(*(np.ascontiguousarray(each.T) for each in states))
-            for name, values in zip(START, found, strict=True):
-                draws[name] = np.where(moved, values, draws[name])
-            (draws["start_xyz"],) = tip(draws["start_q"])
-            (draws["start_tip_velocity"],) = speed(draws["start_q"], draws["start_dq"])
+            projected = exact(*(np.ascontiguousarray(state.T) for state in states))
+            for name, values in zip(START, projected, strict=True):
+                candidates[name] = np.where(moved, values, candidates[name])
+            (candidates["start_xyz"],) = tip(candidates["start_q"])
+            (candidates["start_tip_velocity"],) = speed(candidates["start_q"], candidates["start_dq"])
 
         return work
 
-    def complete(self, context: Context, given: Collection[str]) -> Work:
-        """Leave a start where it is."""
+    def complete(self, context: Context, given: Collection[str]) -> StageFunction:
+        """Keep the start of tasks."""
         del context, given
         return leave
 
-    def _maker(self, context: Context) -> Callable[[Round, NDArray[np.bool_]], tuple[NDArray[np.intp], Motion]]:
-        """Return what makes a motion for every draw, and says whose of the draws it is."""
-        from cnpgen.refine.engine import load_solver
+    def _maker(
+        self, context: Context
+    ) -> Callable[[CandidateBatch, NDArray[np.bool_]], tuple[NDArray[np.intp], Motion]]:
+        """Return a function that computes a motion for every candidate and the index of its owner."""
+        from cnpgen.refine.refine_engine import load_solver
 
         planner = load_stage_planner(self.model, self.sha256, context)
         solve = load_solver(context.problem, context.robot, context.kernels)
 
-        def make(draws: Round, refined: NDArray[np.bool_]) -> tuple[NDArray[np.intp], Motion]:
-            columns = {name: np.ascontiguousarray(values.T) for name, values in draws.columns.items()}
-            motion = planner.plan_batch(asked(columns, planner)).motion
+        def make(candidates: CandidateBatch, refined: NDArray[np.bool_]) -> tuple[NDArray[np.intp], Motion]:
+            columns = {name: np.ascontiguousarray(values.T) for name, values in candidates.columns.items()}
+            motion = planner.plan_batch(planner_boundary(columns, planner)).motion
             owner, some = np.arange(len(motion)), np.flatnonzero(refined)
-            few = some[::MOMENTS]
-            owner[some] = np.repeat(few, MOMENTS)[: len(some)]
+            few = some[::STATES_PER_REFINED_PLAN]
+            owner[some] = np.repeat(few, STATES_PER_REFINED_PLAN)[: len(some)]
             path, rate = motion.path.copy(), motion.rate.copy()
             with one_thread():
-                better, _ = solve({name: values[few] for name, values in columns.items()}, given=motion[few])
+                better, _ = solve({name: values[few] for name, values in columns.items()}, initial_guess=motion[few])
             path[few], rate[few] = better.path, better.rate
             return owner, Motion(path[owner], rate[owner], motion.degree)
 
@@ -114,37 +118,37 @@ class StartOnPlan(Stage):
 
 @dataclass(frozen=True, kw_only=True)
 class GoalOfPlan(Stage):
-    """In some cases the goal stays that of the motion which the start is on: only the way to it is planned anew."""
+    """Stage: keep the goal of the motion that contains the start, in a fraction of the cases."""
 
-    needs = tuple(f"planned_{name}" for name in GOAL)
-    share: float = field("fraction of the cases", low=0.0, high=1.0)
+    inputs = tuple(f"planned_{name}" for name in GOAL)
+    share: float = field("fraction of the plans that are refined", low=0.0, high=1.0)
 
     def describe(self) -> str:
-        """Say how often."""
+        """Describe the stage in one sentence."""
         return f"in {100 * self.share:.4g} % of the cases take the goal of the motion that the start is on"
 
-    def provides(self, context: Context) -> tuple[Field, ...]:
-        """Nothing that is not there already."""
+    def outputs(self, context: Context) -> tuple[Field, ...]:
+        """Return no new fields."""
         del context
         return ()
 
-    def prepare(self, context: Context) -> Work:
-        """Nothing to load."""
+    def prepare(self, context: Context) -> StageFunction:
+        """Return the stage function."""
         del context
 
-        def work(draws: Round, random: np.random.Generator) -> None:
-            same = draws.draw(random, 1)[0] < self.share
+        def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
+            same = candidates.draw(random, 1)[0] < self.share
             for name in GOAL:
-                draws[name] = np.where(same, draws[of_plan(name)], draws[name])
+                candidates[name] = np.where(same, candidates[of_plan(name)], candidates[name])
 
         return work
 
-    def complete(self, context: Context, given: Collection[str]) -> Work:
-        """Leave the goal, which is what tasks are about."""
+    def complete(self, context: Context, given: Collection[str]) -> StageFunction:
+        """Keep the goal of tasks."""
         del context, given
         return leave
 
 
 def of_plan(name: str) -> str:
-    """Return what a column of the goal is called while it is that of the plan."""
+    """Return the column name of a goal column of the plan."""
     return f"planned_{name}"

@@ -1,4 +1,4 @@
-"""DatasetRecipe: how many rows of which pipeline, from which seed, split how."""
+"""DatasetRecipe: pipeline, seed and rows per split of a dataset."""
 
 import hashlib
 import json
@@ -20,39 +20,38 @@ VERSION = r"^(0|[1-9][0-9]{0,8})\.(0|[1-9][0-9]{0,8})\.(0|[1-9][0-9]{0,8})$"
 
 @dataclass(frozen=True, kw_only=True)
 class DatasetRecipe:
-    """How many rows of which pipeline, from which seed, split how.
+    """Pipeline, seed and rows per split of a dataset.
 
     Attributes:
-        splits: Split name -> rows; the first split takes what rounding leaves when the sizes are scaled by ``n``.
+        splits: Split name -> rows; see ``split_rows`` for scaling to ``n`` rows.
     """
 
     name: str = field("name of the dataset: lower-case letters, digits and hyphens", pattern=NAME)
     version: str = field("version of the dataset, MAJOR.MINOR.PATCH", default="1.0.0", pattern=VERSION)
-    title: str = field("one line about it", default="")
+    title: str = field("title in one line", default="")
     pipeline: Pipeline = field(
         "name of a shipped pipeline, or path of a pipeline file relative to this one", form="a name or a path"
     )
     seed: int = field("root seed", default=0, low=0, high=MAX_SEED)
-    splits: dict[str, int] = field("rows per split", low=1, pattern=SPLIT_NAME)
-    license: str = field("licence of the rows", default="CC-BY-4.0")
+    splits: dict[str, int] = field("samples per split", low=1, pattern=SPLIT_NAME)
+    license: str = field("license of the samples", default="CC-BY-4.0")
     path: Path = Path()
 
 
 def split_rows(recipe: DatasetRecipe, n: int) -> dict[str, int]:
     """Scale the splits of a recipe to ``n`` rows in total.
 
-    Every split gets its proportional share rounded down; the few rows that are left go one by one to the split that has
-    the most rows in the recipe per row it would then have, the first one on a tie. This is D'Hondt's rule: no split
-    shrinks when ``n`` grows, so a longer run of a recipe extends a shorter one. (Giving all of the rest to the first
-    split would not do: of 80 + 10 + 10, n = 9 would give it 9 rows and n = 10 only 8.)
+    Every split gets its proportional share rounded down. Each remaining row goes to the split with the most recipe rows
+    per row after the addition, the first one on a tie. This is D'Hondt's rule: no split shrinks when ``n`` grows, so a
+    longer run of a recipe extends a shorter one. (Adding the remainder to the first split violates this: of
+    80 + 10 + 10, it would get 9 rows for n = 9 but 8 for n = 10.)
 
     Args:
-        recipe: The recipe.
-        n: Rows of all splits together, at least 1.
+        recipe: Recipe to scale.
+        n: Number of rows over all splits, at least 1.
 
     Returns:
-        Split name -> rows, in the recipe's order, without splits that would be empty; the recipe's own numbers if ``n``
-        is their sum.
+        Split name -> rows, in the recipe's order, without empty splits; the recipe's own rows if ``n`` is their sum.
 
     Raises:
         UsageError: ``n`` is less than 1.
@@ -67,11 +66,11 @@ def split_rows(recipe: DatasetRecipe, n: int) -> dict[str, int]:
 
 
 def recipe_digest(recipe: Pipeline | DatasetRecipe) -> str:
-    """Hash all that decides which rows a seed gives.
+    """Hash everything that determines the rows of a seed.
 
-    That is the resolved pipeline and problem, the code of plug-ins and the content of the URDF: not titles, comments,
-    paths, the seed or the splits. Writing "5 mm" for 0.005 or a default explicitly does not change it; another name, or
-    what is read only where motions are planned (trajectory, objective), does, although the rows stay the same.
+    The hash covers the resolved pipeline and problem, the code of plug-ins and the content of the URDF. It does not
+    cover titles, comments, paths, the seed or the splits. Writing "5 mm" for 0.005, or a default explicitly, does not
+    change it. Another name, trajectory or objective changes it, although the rows stay the same.
 
     Returns:
         sha256, as 64 hexadecimal digits.
@@ -81,10 +80,10 @@ def recipe_digest(recipe: Pipeline | DatasetRecipe) -> str:
 
 
 def resolved_digest(pipeline: Mapping[str, Any], urdf: bytes) -> str:
-    """Hash a pipeline that was resolved, here or, as blueprints of datasets keep it, elsewhere; see ``recipe_digest``.
+    """Hash a resolved pipeline, for example from the specification of a dataset; see ``recipe_digest``.
 
     Args:
-        pipeline: What ``resolved`` made of it.
+        pipeline: Result of ``resolved``.
         urdf: Content of the robot's URDF file.
     """
     content = {key: value for key, value in pipeline.items() if key != "title"}

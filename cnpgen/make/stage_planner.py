@@ -1,4 +1,4 @@
-"""The planner that a stage plans with: rows depend on its numbers, so that recipes say which file it must be."""
+"""Planner of a stage: rows depend on its weights, so recipes name the sha256 of its file."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from cnpgen.errors import RecipeError
 from cnpgen.pipelines.context import Context
 from cnpgen.plans.format import BOUNDARY, CONDITIONS
-from cnpgen.problems.record import record_problem
+from cnpgen.problems.problem_record import record_problem
 from cnpgen.trajectory.boundary import Boundary
 
 if TYPE_CHECKING:
@@ -44,15 +44,15 @@ def load_stage_planner(model: str, sha256: str, context: Context) -> "Planner":
         context: Problem and kernels of the stage.
 
     Raises:
-        RecipeError: It is another one, or for another problem.
+        RecipeError: The file has another sha256, or the model is for another problem.
         UsageError: There is no such model.
     """
     from cnpgen.planner.model_file import load_model
     from cnpgen.planner.planner import Planner
 
-    found = model_sha256(model)
-    if found != sha256:
-        raise RecipeError([f"sha256: the file of model {model!r} has {found}, expected {sha256}"])
+    digest = model_sha256(model)
+    if digest != sha256:
+        raise RecipeError([f"sha256: the file of model {model!r} has {digest}, expected {sha256}"])
     loaded, problem = load_model(model), record_problem(context.problem)
     if loaded.problem.comparable_sha256 != problem.comparable_sha256:
         differs = ", ".join(problem.differences(loaded.problem)[:4])
@@ -60,10 +60,10 @@ def load_stage_planner(model: str, sha256: str, context: Context) -> "Planner":
     return Planner(loaded, backend=context.kernels.backend)
 
 
-def asked(columns: Mapping[str, Array], planner: "Planner") -> Boundary:
-    """Return what a planner is asked for N rows with columns of shape (N, width).
+def planner_boundary(columns: Mapping[str, Array], planner: "Planner") -> Boundary:
+    """Return the boundary conditions of N rows for a planner, from columns of shape (N, width).
 
-    Goal accelerations that it leaves free are left out.
+    Goal accelerations are omitted if the planner leaves them free.
     """
     names = BOUNDARY if planner.model.fixed_at_goal == 2 else CONDITIONS
     return Boundary(**{name: columns[name] for name in names if name in columns})

@@ -1,4 +1,4 @@
-"""Tables of tasks: CSV or HDF5 with the columns of datasets, components after a dot: ``goal_xyz.x``, ``hit_angle``."""
+"""Task tables: CSV or HDF5 files with dataset columns such as ``goal_xyz.x`` and ``hit_angle``."""
 
 import csv
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ from cnpgen.store.field import Field
 from cnpgen.store.files.atomic import machine_error
 from cnpgen.store.files.hdf5 import opened_hdf5
 from cnpgen.store.files.kind import is_hdf5
-from cnpgen.store.files.limits import TABLE_BYTES, TABLE_COLUMNS
+from cnpgen.store.files.size_limits import MAX_TABLE_BYTES, MAX_TABLE_COLUMNS
 from cnpgen.store.paths import require_file
 
 Array = NDArray[np.float64]
@@ -23,18 +23,18 @@ def read_tasks(path: Path, fields: Mapping[str, Field], *, flat: bool) -> dict[s
     """Read tasks from a table.
 
     Args:
-        path: A table of CSV, whose first line names the columns, or a file of HDF5, whose datasets are columns, or
-            whole fields of shape (N, width). Numbers are in SI.
-        fields: What tasks may give: name -> field.
-        flat: Whether positions are on a table: they may be without z.
+        path: CSV file with column names in the first line, or HDF5 file whose datasets are columns or whole fields of
+            shape (N, width); values in SI units.
+        fields: Columns that tasks may have: name -> field.
+        flat: Whether positions are on a table and need no z.
 
     Returns:
-        Name -> values, shape (N,) or (N, width); of a position without its z, shape (N, 2).
+        Name -> values, shape (N,) or (N, width); (N, 2) for positions without z.
 
     Raises:
-        UsageError: There is no such file.
-        DatasetError: It is damaged or has no task, or a column that no task can give, or something that is no number.
-        MachineError: The system would not let us read it.
+        UsageError: The file does not exist.
+        DatasetError: The file is damaged, has no tasks, an unknown column, or a value that is not a finite number.
+        MachineError: The file cannot be read.
     """
     require_file(path, "a table of tasks, CSV or HDF5")
     try:
@@ -64,7 +64,7 @@ def _unknown(path: Path, name: str, fields: Mapping[str, Field]) -> str:
 
 
 def _joined(path: Path, field: Field, parts: list[str], columns: Mapping[str, Array], *, flat: bool) -> Array:
-    """Join the components of a field; a position on a table needs no height."""
+    """Stack the components of a field; the height of a position on a table is optional."""
     without = {f"{field.name}.z"} if flat and field.name.endswith("_xyz") else set()
     missing = [column for column in field.columns if column not in {*parts, *without}]
     if missing:
@@ -86,20 +86,20 @@ def _hdf5_columns(path: Path) -> dict[str, Array]:
 
 
 def _csv_columns(path: Path) -> dict[str, Array]:
-    if (size := path.stat().st_size) > TABLE_BYTES:
-        raise DatasetError(f"{path} has {size:,} bytes, expected a table of at most {TABLE_BYTES:,}")
+    if (size := path.stat().st_size) > MAX_TABLE_BYTES:
+        raise DatasetError(f"{path} has {size:,} bytes, expected a table of at most {MAX_TABLE_BYTES:,}")
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             lines = [(number, row) for number, row in enumerate(csv.reader(file), 1) if any(map(str.strip, row))]
     except (UnicodeDecodeError, csv.Error) as error:
-        raise DatasetError(f"{path} is no table of CSV in UTF-8: {error}") from error
+        raise DatasetError(f"{path} is not a CSV table in UTF-8: {error}") from error
     if not lines:
         raise DatasetError(f"{path} is empty: its first line must name columns, such as goal_xyz.x,goal_xyz.y")
     names = [cell.strip() for cell in lines[0][1]]
     if other := next((mark for mark in ";\t" if mark in "".join(names)), None):
         raise DatasetError(f"{path}: line 1: columns are separated by ',', got {other!r}; numbers have '.', as in 0.5")
-    if len(names) > TABLE_COLUMNS:
-        raise DatasetError(f"{path}: line 1 names {len(names):,} columns, expected at most {TABLE_COLUMNS:,}")
+    if len(names) > MAX_TABLE_COLUMNS:
+        raise DatasetError(f"{path}: line 1 names {len(names):,} columns, expected at most {MAX_TABLE_COLUMNS:,}")
     if twice := [name for name in names if names.count(name) > 1]:
         raise DatasetError(f"{path}: the column {twice[0]!r} is there more than once")
     table = np.array([_numbers_of(path, number, row, names) for number, row in lines[1:]])

@@ -1,1 +1,1 @@
-"""Pipelines: ordered stages that draw boundary problems and reject the impossible ones, one file per stage."""
+"""Pipelines: ordered stages that sample boundary problems and reject infeasible ones."""

@@ -1,4 +1,4 @@
-"""What a stage is prepared with: the problem, its robot and the kernels."""
+"""Context of a stage: the problem, its robot and the kernels."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,8 +7,8 @@ from typing import TypeVar
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.library import Backend, KernelLibrary, problem_kernels
 from cnpgen.problems.constraints.constraint import Constraint
+from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.robot import load_robot
 from cnpgen.robots.robot import Robot
 from cnpgen.schema import registry
 from cnpgen.store.field import Field
@@ -18,13 +18,13 @@ Kind = TypeVar("Kind", bound=Constraint)
 
 @dataclass(frozen=True)
 class Context:
-    """The surroundings of a stage.
+    """Loaded problem of a stage.
 
     Attributes:
-        problem: What a valid motion is.
-        robot: The robot with its planning limits.
-        kernels: Where kernels are loaded from.
-        dtype: The float type that rows are stored in.
+        problem: Definition of a valid motion.
+        robot: Robot with its planning limits.
+        kernels: Library of compiled kernels.
+        dtype: Float type of stored rows.
     """
 
     problem: Problem
@@ -36,7 +36,7 @@ class Context:
         """Return the problem's constraint of a kind.
 
         Raises:
-            RecipeError: The problem has none, so that a stage that asks for it has no meaning there.
+            RecipeError: The problem has no constraint of this kind.
         """
         if (constraint := self.problem.first(kind)) is not None:
             return constraint
@@ -47,10 +47,10 @@ class Context:
         """Describe a field with one column per planned joint, bounded by the planning limits of its unit.
 
         Args:
-            name: Its name.
-            unit: Its unit at joints that turn: "rad", "rad/s" or "rad/s^2".
-            long_name: What it is, in a few words.
-            role: As of ``Field``.
+            name: Name of the field.
+            unit: Unit for revolute joints: "rad", "rad/s" or "rad/s^2".
+            long_name: Short description of the field.
+            role: Role of the field, see ``Field``.
         """
         robot = self.robot
         bounds = {
@@ -65,6 +65,6 @@ class Context:
 
 
 def load_context(problem: Problem, backend: Backend, cache_folder: Path, dtype: str = "float64") -> Context:
-    """Load the robot of a problem, and say where its kernels are loaded from."""
+    """Load the robot of a problem and open its kernel library."""
     robot = load_robot(problem)
     return Context(problem, robot, problem_kernels(problem, robot, backend, cache_folder), dtype)

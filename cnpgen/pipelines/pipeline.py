@@ -1,4 +1,4 @@
-"""Pipeline: how the boundary conditions of a problem are drawn."""
+"""Pipeline: the stages that sample the boundary conditions of a problem."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -9,32 +9,32 @@ from cnpgen.pipelines.stages.stage import Stage
 from cnpgen.problems.problem import Problem
 from cnpgen.schema.keys import NAME, field
 
-MOST_STAGES = 100
+MAX_STAGES = 100
 
 
 @dataclass(frozen=True, kw_only=True)
 class Pipeline:
-    """How the boundary conditions of a problem are drawn."""
+    """Stages that sample the boundary conditions of a problem."""
 
     name: str = field("name of the pipeline: lower-case letters, digits and hyphens", pattern=NAME)
-    title: str = field("one line about it", default="")
+    title: str = field("title in one line", default="")
     problem: Problem = field(
         "name of a shipped problem, or path of a problem file relative to this one", form="a name or a path"
     )
-    stage: tuple[Stage, ...] = field("the steps, in order", form="[[stage]] tables")
+    stage: tuple[Stage, ...] = field("stages, in order", form="[[stage]] tables")
     path: Path = Path()
 
     def find_mistakes(self) -> Iterator[tuple[str, str]]:
-        """Yield (key, what is wrong with it)."""
-        if (count := len(self.stage)) > MOST_STAGES:
-            yield "stage", f"there are {count:,} stages, expected at most {MOST_STAGES}"
+        """Yield (key, mistake) pairs."""
+        if (count := len(self.stage)) > MAX_STAGES:
+            yield "stage", f"there are {count:,} stages, expected at most {MAX_STAGES}"
 
 
 def listed_tasks(pipeline: Pipeline) -> int | None:
-    """Return how many draws there are where a stage lists them; None where none does.
+    """Return the number of listed tasks of a pipeline; None if no stage lists tasks.
 
     Raises:
-        RecipeError: More than one stage lists them.
+        RecipeError: More than one stage lists tasks.
     """
     listed = [stage.tasks for stage in pipeline.stage if stage.tasks is not None]
     if len(listed) > 1:

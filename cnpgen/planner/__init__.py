@@ -1,1 +1,1 @@
-"""The planner: a trained model asked for plans, and what it needs of kinematics and limits around the network."""
+"""Plan with a trained model: kinematics and limits evaluated before and after the network."""

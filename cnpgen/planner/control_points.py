@@ -1,8 +1,8 @@
-"""The paper's Omega block: control points from what the network gives, and its gradient from theirs.
+"""The paper's Omega block: control points from network outputs, and the vector-Jacobian product back.
 
 ``C_{3+i} = line_i + correction_i + scale phi_i`` with the line from C_2 to C_{C-N_d}, and ``rate = e^o / T_expected``.
-The boundary control points follow from the rates, so that boundary conditions hold by construction, and so does the
-line that hangs on two of them: gradients of the path reach the rates on both ways.
+The boundary control points follow from the rates, so that boundary conditions hold by construction. The line depends
+on two of them, so gradients of the path reach the rates both directly and through the line.
 """
 
 import math
@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from cnpgen.planner.tasks import Tasks
 from cnpgen.trajectory.boundary import goal_points, start_points
-from cnpgen.trajectory.slopes import boundary_slopes
-from cnpgen.trajectory.spec import TrajectorySpec
+from cnpgen.trajectory.boundary_derivatives import boundary_derivatives
+from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
 Array = NDArray[Any]
 
@@ -26,8 +26,8 @@ class ControlPoints:
     """Control points of N motions.
 
     Attributes:
-        path: Of p [rad], shape (N, C, n).
-        rate: Of r [1/s], shape (N, R).
+        path: Control points of p [rad], shape (N, C, n).
+        rate: Control points of r [1/s], shape (N, R).
     """
 
     path: Array
@@ -38,13 +38,13 @@ class ControlPoints:
 
 
 def control_points(tasks: Tasks, phi: Array, log_rate: Array, *, scale: float, spec: TrajectorySpec) -> ControlPoints:
-    """Compute control points; in the type of the arguments, so in float64 where they are.
+    """Compute control points in the dtype of the arguments.
 
     Args:
         tasks: N tasks.
         phi: Output of the configuration head, in (-1, 1), shape (N, m n).
         log_rate: Output of the time head, shape (N, R).
-        scale: What phi is a multiple of [rad] (the paper's pi).
+        scale: Factor of phi [rad] (the paper's pi).
         spec: Degree and numbers of control points.
     """
     boundary = tasks.boundary
@@ -60,7 +60,7 @@ def control_points(tasks: Tasks, phi: Array, log_rate: Array, *, scale: float, s
     return ControlPoints(np.concatenate([first, interior, last], axis=1), rate)
 
 
-def pull_back(
+def vjp(
     tasks: Tasks,
     points: ControlPoints,
     *,
@@ -69,14 +69,14 @@ def pull_back(
     scale: float,
     spec: TrajectorySpec,
 ) -> tuple[Array, Array]:
-    """Turn gradients with respect to the control points into those with respect to the network's outputs.
+    """Convert gradients with respect to the control points to gradients with respect to the network's outputs.
 
     Args:
         tasks: N tasks.
-        points: What ``control_points`` gave.
+        points: Result of ``control_points``.
         path_gradient: Gradient with respect to ``points.path``, shape (N, C, n).
-        rate_gradient: Likewise to ``points.rate``, shape (N, R).
-        scale: As in ``control_points``.
+        rate_gradient: Gradient with respect to ``points.rate``, shape (N, R).
+        scale: Factor of phi [rad], as in ``control_points``.
         spec: Degree and numbers of control points.
 
     Returns:
@@ -88,13 +88,13 @@ def pull_back(
     total[:, 2] += (1 - along) @ interior
     total[:, spec.path_control_points - tasks.boundary.fixed_at_goal] += along @ interior
     rates = rate_gradient.copy()
-    for each in boundary_slopes(tasks.boundary, points.rate, spec):
-        rates[:, each.variable] += np.einsum("ij,ij->i", total[:, each.point], each.slope)
+    for partial in boundary_derivatives(tasks.boundary, points.rate, spec):
+        rates[:, partial.variable] += np.einsum("ij,ij->i", total[:, partial.point], partial.derivative)
     rates *= points.rate
     return scale * interior.reshape(len(interior), math.prod(interior.shape[1:])), rates
 
 
 @lru_cache(maxsize=16)
 def along_line(count: int, dtype: str = "float64") -> Array:
-    """How far along the line from C_2 to C_{C-N_d} the interior control points are, shape (m, 1)."""
+    """Return the interior control points' fractions of the line from C_2 to C_{C-N_d}, shape (m, 1)."""
     return np.linspace(0, 1, count, dtype=dtype)[:, None]

@@ -1,4 +1,4 @@
-"""A trained model: the network's numbers, what its inputs and outputs mean, and where it comes from."""
+"""A trained model: network parameters, definition of its inputs and outputs, and training metadata."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -12,42 +12,41 @@ from cnpgen.planner.network.architecture import Architecture, Weights
 from cnpgen.planner.network.features import Features
 from cnpgen.planner.network.forward import forward
 from cnpgen.planner.tasks import Tasks
-from cnpgen.problems.record import ProblemRecord
+from cnpgen.problems.problem_record import ProblemRecord
 
 Array = NDArray[Any]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Meaning:
-    """What the network's outputs stand for.
+class ModelConfig:
+    """Definition of the network's outputs.
 
     Attributes:
-        path_scale: What the configuration head's output is a multiple of [rad]; pi in the paper.
-        bending_steps: Gauss-Newton steps that bend the line onto the manifold's equalities; none in the paper.
-        landing_steps: Likewise of what the network gave.
-        expected_time: What its rates are multiples of the inverse of: the time of the "distance" at the velocity
-            limits, as in the paper, or the least time in which joints could "reach" their goal states.
-        within_limits: Whether control points are put back within the joint limits after every one of these steps.
-        paced: Whether rates are then made as large, or as small, as limits allow or ask for (``pacing``).
-        middles: Where the corners are of the other lines that are tried where a plan breaks something [rad], n numbers
-            each (``detours``).
+        path_scale: Factor of the configuration head's output [rad]; pi in the paper.
+        line_projection_steps: Gauss-Newton steps that project the line onto the equalities; 0 in the paper.
+        projection_steps: Gauss-Newton steps that project the path onto the equalities.
+        expected_time: Unit of durations: "distance", the time of the distance at the velocity limits, as in the paper,
+            or "reach", the minimum time in which every joint could reach its goal state.
+        within_limits: Whether control points are clipped to the joint limits after each of these steps.
+        time_parametrized: Whether rates are fitted to the limits after the network (``time_parametrization``).
+        via_points: Via points of alternative lines for plans with violations [rad], n numbers each (``via_points``).
     """
 
     path_scale: float
-    bending_steps: int
-    landing_steps: int
+    line_projection_steps: int
+    projection_steps: int
     expected_time: str = "distance"
     within_limits: bool = False
-    paced: bool = False
-    middles: tuple[tuple[float, ...], ...] = ()
+    time_parametrized: bool = False
+    via_points: tuple[tuple[float, ...], ...] = ()
 
 
 @dataclass(frozen=True)
 class Outputs:
-    """What a network says of N tasks.
+    """Network outputs of N tasks.
 
     Attributes:
-        offsets: What interior path control points are off the line by [rad], shape (N, interior points x n).
+        offsets: Offsets of interior path control points from the line [rad], shape (N, interior points x n).
         rate: Rate control points [1/s], shape (N, R).
     """
 
@@ -62,11 +61,11 @@ class Model:
     Attributes:
         problem: The problem that it plans for, with its URDF.
         architecture: The network's architecture.
-        parameters: All of its numbers, float32, shape (architecture.n_parameters,).
-        features: Its inputs.
-        meaning: Its outputs.
-        rest: Names of the boundary conditions that were zero in every training row.
-        training: How it was made: command, seed, dataset, steps, seconds, score; JSON-able.
+        parameters: All parameters, float32, shape (architecture.n_parameters,).
+        features: Definition of its inputs.
+        config: Definition of its outputs.
+        zero_conditions: Names of the boundary conditions that were zero in all training rows.
+        training: Training metadata: command, seed, dataset, steps, seconds, score; JSON-able.
         log: Its training log, one JSON object per line.
     """
 
@@ -74,8 +73,8 @@ class Model:
     architecture: Architecture
     parameters: NDArray[np.float32]
     features: Features
-    meaning: Meaning
-    rest: tuple[str, ...] = ()
+    config: ModelConfig
+    zero_conditions: tuple[str, ...] = ()
     training: Mapping[str, Any] = field(default_factory=dict)
     log: str = ""
 
@@ -83,12 +82,12 @@ class Model:
         return f"<Model of {self.problem.name!r}: a network of {self.architecture}>"
 
     def outputs(self, tasks: Tasks) -> Outputs:
-        """Ask the network for N tasks: in float32 itself, sums and the exponential in float64."""
-        given = forward(self._weights, self.features.of(tasks))
-        offsets = self.meaning.path_scale * given.path.astype(np.float64)
+        """Evaluate the network for N tasks, in float32; sums and the exponential are in float64."""
+        activations = forward(self._weights, self.features.of(tasks))
+        offsets = self.config.path_scale * activations.path.astype(np.float64)
         if tasks.correction is not None:
             offsets += tasks.correction.reshape(offsets.shape)
-        return Outputs(offsets, np.exp(given.log_rate.astype(np.float64)) / tasks.expected_time[:, None])
+        return Outputs(offsets, np.exp(activations.log_rate.astype(np.float64)) / tasks.expected_time[:, None])
 
     @cached_property
     def _weights(self) -> Weights:
@@ -96,17 +95,17 @@ class Model:
 
     @cached_property
     def fixed_at_goal(self) -> int:
-        """Number of path control points that the goal fixes: 2, or 3 where motions end with a given acceleration."""
+        """Number of path control points that the goal fixes: 2, or 3 if goal accelerations are given."""
         interior = self.architecture.path_outputs // len(self.problem.joint_names)
         return self.problem.trajectory.path_control_points - 3 - interior
 
     @property
-    def rests(self) -> bool:
-        """Whether all of its motions begin and end at rest, so that they may be slowed down."""
-        return begins_and_ends_at_rest(self.rest, self.fixed_at_goal)
+    def is_rest_to_rest(self) -> bool:
+        """Whether all of its motions begin and end at rest, so that they may be scaled in time."""
+        return is_rest_to_rest(self.zero_conditions, self.fixed_at_goal)
 
 
-def begins_and_ends_at_rest(rest: Iterable[str], fixed_at_goal: int) -> bool:
-    """Whether motions may be slowed down of which the named boundary conditions are zero; a free one need not be."""
+def is_rest_to_rest(zero_conditions: Iterable[str], fixed_at_goal: int) -> bool:
+    """Return whether motions with these zero conditions begin and end at rest; a free condition need not be zero."""
     moving = {"start_dq", "start_ddq", "goal_dq"} | ({"goal_ddq"} if fixed_at_goal == 3 else set())
-    return moving <= set(rest)
+    return moving <= set(zero_conditions)

@@ -1,4 +1,4 @@
-"""Writing and reading models, and finding those that cnpgen ships."""
+"""Write and read model files, and find the shipped ones."""
 
 import json
 import math
@@ -12,48 +12,51 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, RecipeError, UsageError, nearest
-from cnpgen.planner.model import Meaning, Model
+from cnpgen.planner.model import Model, ModelConfig
 from cnpgen.planner.network.architecture import Architecture
 from cnpgen.planner.network.features import ARRIVAL, BLOCKS, Features, count_features
 from cnpgen.planner.tasks import EXPECTED_TIMES
 from cnpgen.plans.format import CONDITIONS
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.record import ProblemRecord, as_record
+from cnpgen.problems.problem_record import ProblemRecord, as_record
 from cnpgen.schema.catalogue import recipes_root
-from cnpgen.store.blueprint import StoredProblem
+from cnpgen.store.dataset_spec import StoredProblem
+from cnpgen.store.files.checksum_file import Content, read_with_checksum, write_with_checksum
+from cnpgen.store.files.document_structure import ANY_KEY, ANYTHING, NUMBER, TEXT, WHOLE, check_structure
 from cnpgen.store.files.documents import parse_json
-from cnpgen.store.files.forms import ANYTHING, EVERY, NUMBER, TEXT, WHOLE, check_form
-from cnpgen.store.files.sealed import Content, read_sealed, write_sealed
 from cnpgen.store.paths import require_file
 
-KIND, VERSION = "cnpgen-model", 1
-MOST_STEPS = 20  # of Gauss-Newton, each of which makes a kernel larger
-_UNSAID = {
+MODEL_KIND, MODEL_VERSION = "cnpgen-model", 2
+MAX_PROJECTION_STEPS = 20  # Gauss-Newton steps; each makes a kernel larger
+_DEFAULTS = {
     "expected_time": "distance",
     "within_limits": False,
-    "paced": False,
-    "middles": (),
-}  # what files need not say
-_FORM = {
+    "time_parametrized": False,
+    "via_points": (),
+}  # values that files omit
+_STRUCTURE = {
     "architecture": dict.fromkeys(("inputs", "hidden", "layers", "path_outputs", "rate_outputs"), WHOLE),
     "features": [TEXT],
-    "meaning": {"path_scale": NUMBER, "bending_steps": WHOLE, "landing_steps": WHOLE},
-    "rest": [TEXT],
+    "config": {"path_scale": NUMBER, "line_projection_steps": WHOLE, "projection_steps": WHOLE},
+    "zero_conditions": [TEXT],
 }
-_TRAINING = {"dataset": {EVERY: ANYTHING}, "stages": [{EVERY: ANYTHING}]}  # what is read of it, where it is there
+_TRAINING_STRUCTURE = {
+    "dataset": {ANY_KEY: ANYTHING},
+    "stages": [{ANY_KEY: ANYTHING}],
+}  # of the keys that are read; both are optional
 
 
 def save_model(path: str | Path, model: Model) -> None:
     """Write a model to a file, atomically; equal models give equal bytes.
 
     Args:
-        path: Where to; a file that is there is replaced.
+        path: Output file; replaced if it exists.
         model: The model.
 
     Raises:
-        MachineError: The disk is full, read-only or otherwise unwilling.
+        MachineError: The disk is full or read-only.
     """
-    write_sealed(Path(path), model_content(model), kind=KIND, version=VERSION)
+    write_with_checksum(Path(path), model_content(model), kind=MODEL_KIND, version=MODEL_VERSION)
 
 
 def load_model(name_or_path: str | Path) -> Model:
@@ -64,46 +67,46 @@ def load_model(name_or_path: str | Path) -> Model:
 
     Raises:
         UsageError: There is no such file, or no shipped model of this name.
-        DatasetError: The file is damaged, cut off, or no model.
-        MachineError: The system would not let us read it.
+        DatasetError: The file is damaged, of another format version, or no model.
+        MachineError: The operating system denies reading it.
     """
     path = find_model(name_or_path)
     require_file(path, "a model")
-    return model_from_content(path, read_sealed(path, kind=KIND, version=VERSION))
+    return model_from_content(path, read_with_checksum(path, kind=MODEL_KIND, version=MODEL_VERSION))
 
 
 def model_for(problem: Problem | StoredProblem) -> Model:
-    """Read the shipped model that plans for a problem, where there is one and no other.
+    """Read the only shipped model of a problem.
 
     Args:
         problem: The problem, or its record: ``plans.problem``, ``dataset.problem``.
 
     Raises:
-        UsageError: No shipped model plans for it, or several, which are named.
+        UsageError: There is no shipped model for it, or several.
     """
     record = as_record(problem)
     models = {name: load_model(path) for name, path in shipped_models().items()}
-    found = [name for name, each in models.items() if each.problem.comparable_sha256 == record.comparable_sha256]
-    if len(found) != 1:
-        which = f"several shipped models ({', '.join(found)})" if found else "no shipped model"
-        raise UsageError(f"{which} for the problem {record.name!r}: say the name or the file of a model")
-    return models[found[0]]
+    matches = [name for name, model in models.items() if model.problem.comparable_sha256 == record.comparable_sha256]
+    if len(matches) != 1:
+        subject = f"several shipped models ({', '.join(matches)})" if matches else "no shipped model"
+        raise UsageError(f"{subject} for the problem {record.name!r}: pass the name or the file of a model")
+    return models[matches[0]]
 
 
 def shipped_models() -> dict[str, Path]:
-    """List the models that cnpgen ships: name -> file, by name."""
-    found = (recipes_root() / "datasets" / "models").glob("*.h5")
-    return {path.stem: path for path in sorted(found, key=lambda path: path.stem)}
+    """Return the shipped models: name -> file, sorted by name."""
+    files = (recipes_root() / "datasets" / "models").glob("*.h5")
+    return {path.stem: path for path in sorted(files, key=lambda path: path.stem)}
 
 
 def find_model(name_or_path: str | Path) -> Path:
-    """Find the file of a model: a path if it ends in ``.h5``, has a path separator or is a file; else a shipped one.
+    """Return the file of a model: a path if it ends in ``.h5``, has a separator or is a file; else a shipped model.
 
     Raises:
         UsageError: There is no shipped model of this name.
     """
     if not isinstance(name_or_path, str | Path):
-        raise UsageError(f"a model is a name or a path, got {name_or_path!r}")
+        raise UsageError(f"a model must be a name or a path, got {name_or_path!r}")
     text, known = os.fspath(name_or_path), shipped_models()
     if isinstance(name_or_path, Path) or text.endswith(".h5") or os.sep in text or Path(text).is_file():
         return Path(text)
@@ -113,7 +116,7 @@ def find_model(name_or_path: str | Path) -> Path:
 
 
 def model_content(model: Model) -> Content:
-    """Lay a model out as arrays and texts; the arrays of a layer are called after it."""
+    """Convert a model to arrays and texts; arrays are named after their layer."""
     arrays: dict[str, NDArray[Any]] = {}
     for layer in model.architecture.all_layers:
         arrays[f"{layer.name}_weight"] = layer.weight(model.parameters)
@@ -122,8 +125,8 @@ def model_content(model: Model) -> Content:
     description = {
         "architecture": asdict(model.architecture),
         "features": list(model.features.blocks),
-        "meaning": {name: value for name, value in asdict(model.meaning).items() if value != _UNSAID.get(name)},
-        "rest": list(model.rest),
+        "config": {name: value for name, value in asdict(model.config).items() if value != _DEFAULTS.get(name)},
+        "zero_conditions": list(model.zero_conditions),
         "problem_sha256": model.problem.comparable_sha256,
     }
     texts = {
@@ -137,14 +140,14 @@ def model_content(model: Model) -> Content:
 
 
 def model_from_content(path: Path, content: Content) -> Model:
-    """Put a model together again.
+    """Make a model from arrays and texts.
 
     Args:
-        path: Where it comes from, for messages.
-        content: What ``model_content`` made.
+        path: Source file, for messages.
+        content: Result of ``model_content``.
 
     Raises:
-        DatasetError: It needs another version of cnpgen.
+        DatasetError: The content does not fit this version of cnpgen.
     """
     try:
         return _assembled(content)
@@ -155,57 +158,63 @@ def model_from_content(path: Path, content: Content) -> Model:
 
 
 def _assembled(content: Content) -> Model:
-    """Put a model together; what it says of itself is compared with its arrays before anything is made of it."""
+    """Make a model; check its description against its arrays first."""
     description, training = (parse_json(content.texts[name]) for name in ("description", "training"))
-    check_form(description, _FORM)
-    check_form(training, {EVERY: ANYTHING})
-    check_form(training, {key: form for key, form in _TRAINING.items() if key in training})
+    check_structure(description, _STRUCTURE)
+    check_structure(training, {ANY_KEY: ANYTHING})
+    check_structure(training, {key: form for key, form in _TRAINING_STRUCTURE.items() if key in training})
     problem = ProblemRecord(content.texts["problem_recipe"], content.texts["problem_urdf"])
     architecture = Architecture(**description["architecture"])
     features = Features(tuple(description["features"]), content.arrays["feature_mean"], content.arrays["feature_scale"])
-    said = description["meaning"]
-    meaning = Meaning(**{**said, "middles": tuple(tuple(map(float, each)) for each in said.get("middles", ()))})
+    stored = description["config"]
+    config = ModelConfig(
+        **{**stored, "via_points": tuple(tuple(map(float, each)) for each in stored.get("via_points", ()))}
+    )
     _check_sizes(problem, architecture, features)
     joints = len(problem.joint_names)
-    if not all(len(each) == joints and np.isfinite(each).all() for each in meaning.middles):
-        raise ValueError(f"middles must be {joints} numbers each, got {meaning.middles}")
-    if unknown := set(description["rest"]) - set(CONDITIONS):
+    if not all(len(each) == joints and np.isfinite(each).all() for each in config.via_points):
+        raise ValueError(f"via points must be {joints} numbers each, got {config.via_points}")
+    if unknown := set(description["zero_conditions"]) - set(CONDITIONS):
         raise ValueError(f"unknown boundary conditions {', '.join(sorted(unknown))}")
-    if positions := {"start_q", "goal_q"} & set(description["rest"]):
+    if positions := {"start_q", "goal_q"} & set(description["zero_conditions"]):
         raise ValueError(f"{', '.join(sorted(positions))}: only velocities and accelerations are zero in every row")
-    if max(meaning.bending_steps, meaning.landing_steps) > MOST_STEPS or not math.isfinite(float(meaning.path_scale)):
-        raise ValueError(f"{meaning} cannot be meant: there are at most {MOST_STEPS} steps")
-    if meaning.expected_time not in EXPECTED_TIMES:
-        raise ValueError(f"expected_time must be one of {', '.join(EXPECTED_TIMES)}, got {meaning.expected_time!r}")
-    for name in ("within_limits", "paced"):
-        if getattr(meaning, name) not in {True, False}:
-            raise ValueError(f"{name} must be true or false, got {getattr(meaning, name)!r}")
+    if max(config.line_projection_steps, config.projection_steps) > MAX_PROJECTION_STEPS or not math.isfinite(
+        float(config.path_scale)
+    ):
+        raise ValueError(
+            f"{config} is invalid: there are at most {MAX_PROJECTION_STEPS} steps, and path_scale is finite"
+        )
+    if config.expected_time not in EXPECTED_TIMES:
+        raise ValueError(f"expected_time must be one of {', '.join(EXPECTED_TIMES)}, got {config.expected_time!r}")
+    for name in ("within_limits", "time_parametrized"):
+        if getattr(config, name) not in {True, False}:
+            raise ValueError(f"{name} must be true or false, got {getattr(config, name)!r}")
     return Model(
         problem=problem,
         architecture=architecture,
         parameters=_parameters(architecture, content.arrays),
         features=features,
-        meaning=meaning,
-        rest=tuple(description["rest"]),
+        config=config,
+        zero_conditions=tuple(description["zero_conditions"]),
         training=training,
         log=content.texts["log"],
     )
 
 
 def _check_sizes(problem: ProblemRecord, architecture: Architecture, features: Features) -> None:
-    """Refuse a network whose inputs and outputs are not those of its features and its problem."""
+    """Check that the network's inputs and outputs fit its features and its problem."""
     unknown = set(features.blocks) - set(BLOCKS)
     if unknown:
         raise ValueError(f"unknown features {', '.join(sorted(unknown))}")
     joints, spec = len(problem.joint_names), problem.trajectory
     inputs, rates = count_features(features.blocks, joints), spec.rate_control_points
     interior = [(spec.path_control_points - 3 - fixed) * joints for fixed in (2, 3)]
-    found = (architecture.inputs, architecture.path_outputs, architecture.rate_outputs)
-    if found not in [(inputs, outputs, rates) for outputs in interior]:
-        expected = f"{(inputs, interior[0], rates)}, or {interior[1]} path outputs where goal accelerations are given"
-        raise ValueError(f"the network has {found} inputs, path outputs and rate outputs, expected {expected}")
+    widths = (architecture.inputs, architecture.path_outputs, architecture.rate_outputs)
+    if widths not in [(inputs, outputs, rates) for outputs in interior]:
+        expected = f"{(inputs, interior[0], rates)}, or {interior[1]} path outputs if goal accelerations are given"
+        raise ValueError(f"the network has {widths} inputs, path outputs and rate outputs, expected {expected}")
     if ARRIVAL in features.blocks and architecture.path_outputs == interior[0]:
-        raise ValueError(f"{ARRIVAL} is among its features, and its outputs leave goal accelerations free")
+        raise ValueError(f"its features include {ARRIVAL}, but its outputs leave goal accelerations free")
     for name in ("mean", "scale"):
         shape = getattr(features, name).shape
         if shape != (architecture.inputs,):
@@ -213,7 +222,7 @@ def _check_sizes(problem: ProblemRecord, architecture: Architecture, features: F
 
 
 def _parameters(architecture: Architecture, arrays: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
-    """Join the arrays of all layers, each of which must be there in its shape."""
+    """Concatenate the arrays of all layers; check their shapes."""
     if architecture.layers > len(arrays):
         raise ValueError(f"{architecture.layers} layers cannot be in {len(arrays)} arrays")
     parts = []

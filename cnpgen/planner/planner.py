@@ -1,4 +1,4 @@
-"""The planner: boundary conditions in, plans out, in a fraction of a millisecond; replanning on the fly."""
+"""Plan motions from boundary conditions with a trained model, in a fraction of a millisecond; online replanning."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -11,77 +11,75 @@ from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.machine.threads import one_thread
-from cnpgen.pipelines.completion import Completion
-from cnpgen.planner.keeping import keep_what_is_faster
-from cnpgen.planner.kit import make_kit, surroundings
+from cnpgen.planner.inference_pipeline import loaded_problem, make_inference_pipeline
 from cnpgen.planner.model import Model
 from cnpgen.planner.model_file import load_model, model_for
-from cnpgen.planner.strike import MEETING, State, Strikes, boundary_of_tasks, load_completion, strike_tasks
-from cnpgen.plans.boundary_file import CONTEXT
+from cnpgen.planner.plan_reuse import reuse_previous_plan
 from cnpgen.plans.plans import Plans, check_made, check_plans_type
 from cnpgen.plans.plausible import warn_of_far_joints
 from cnpgen.problems.problem import Problem
 from cnpgen.schema.arguments import numbers
-from cnpgen.store.blueprint import StoredProblem
+from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.boundary_arguments import boundary_of
-from cnpgen.trajectory.moment import states_at_times
+from cnpgen.trajectory.spline_motion import states_at_times
 
 Array = NDArray[np.float64]
 
-AT_REST = 1e-9  # of a limit: what rounding leaves of a velocity or an acceleration that was zero
+REST_TOLERANCE = 1e-9  # fraction of a limit: rounding error of a velocity or an acceleration that was zero
 
 
 class Planner:
-    """Plans with a trained model.
+    """Plan motions with a trained model.
 
     Args:
-        model: A model, the path of a model file, or the name of a model that cnpgen ships; or a problem
-            (``plans.problem``, ``dataset.problem``) for which it ships just one.
-        slow_down: Whether motions from rest to rest are slowed down uniformly as far as the limits need it. It is done
-            only by models whose training rows all begin and end at rest: then it is exact. False also leaves the rates
-            of models that are paced, such as airhockey-onthefly, as the network has them.
-        backend: What computes kinematics and limits; by default the fastest that works.
+        model: A model, the path of a model file, the name of a shipped model, or a problem (``plans.problem``,
+            ``dataset.problem``) with exactly one shipped model.
+        scale_time: Whether motions from rest to rest are scaled uniformly in time to meet the limits. This is exact,
+            and done only for models whose training rows all begin and end at rest. False also disables the time
+            parametrization of models such as airhockey-online.
+        backend: Backend of the kernels; by default the fastest available.
 
     Attributes:
         model: The model.
         robot: The robot of its problem.
+        backend: Backend of the kernels, as passed.
 
     Raises:
-        UsageError: ``model`` is none, there is no such file or shipped model, or several are for the problem.
-        CnpgenError: The model cannot be read, or the machine lacks what it needs.
+        UsageError: ``model`` is invalid, there is no such file or shipped model, or several are for the problem.
+        CnpgenError: The model cannot be read, or a dependency is missing.
     """
 
     def __init__(
         self,
         model: Model | Problem | StoredProblem | str | Path,
         *,
-        slow_down: bool = True,
+        scale_time: bool = True,
         backend: str | None = None,
     ) -> None:
         if isinstance(model, Problem | StoredProblem):
             model = model_for(model)
         self.model = model if isinstance(model, Model) else load_model(model)
-        self._options: dict[str, Any] = {"slow_down": slow_down, "backend": backend}
-        meaning = self.model.meaning if slow_down else replace(self.model.meaning, paced=False)
-        with surroundings(self.model.problem, backend) as given:
-            self.robot = given.robot
-            self._kit = make_kit(
-                given,
-                meaning,
-                slow_down=slow_down and self.model.rests,
+        self.backend, self._scale_time = backend, scale_time
+        config = self.model.config if scale_time else replace(self.model.config, time_parametrized=False)
+        with loaded_problem(self.model.problem, backend) as loaded:
+            self.robot = loaded.robot
+            self._inference = make_inference_pipeline(
+                loaded,
+                config,
+                scale_time=scale_time and self.model.is_rest_to_rest,
                 fixed_at_goal=self.model.fixed_at_goal,
             )
-            limits = {"dq": given.robot.velocity_limit, "ddq": given.robot.acceleration_limit}
-            self._still = {f"{end}_{what}": AT_REST * limits[what] for end in ("start", "goal") for what in limits}
-        self._completion: Completion | None = None
+            limits = {"dq": loaded.robot.velocity_limit, "ddq": loaded.robot.acceleration_limit}
+            ends = ("start", "goal")
+            self._rest_tolerance = {f"{end}_{name}": REST_TOLERANCE * limits[name] for end in ends for name in limits}
 
     def __repr__(self) -> str:
         return f"<Planner for {self.model.problem.name!r}: a network of {self.model.architecture}>"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle without kernels: they are loaded anew where the planner goes."""
-        return partial(type(self), **self._options), (self.model,)
+        """Pickle without kernels; they are loaded again when the planner is unpickled."""
+        return partial(type(self), scale_time=self._scale_time, backend=self.backend), (self.model,)
 
     def plan(
         self,
@@ -93,27 +91,27 @@ class Planner:
         goal_dq: ArrayLike | None = None,
         goal_ddq: ArrayLike | None = None,
     ) -> Plans:
-        """Plan motions; boundary conditions hold to rounding, whatever the network gives.
+        """Plan motions; boundary conditions hold to rounding for any network output.
 
-        Boundary conditions are not judged: of a start or goal outside of the limits or off the table comes a plan that
-        goes there, and ``evaluate_plans`` says that it is not valid. Only where a joint is so far outside that its
-        position is probably in degrees, or normalised, there is a warning.
+        Boundary conditions are not checked against the limits. A plan from or to an invalid state is returned, and
+        ``evaluate_plans`` reports that it is not valid. A warning is issued if a joint position is so far outside its
+        limits that it is probably in degrees or normalized.
 
         Args:
             start_q: Start positions [rad], shape (n,) for one motion or (N, n).
-            goal_q: Goal positions [rad], likewise, as all that follow.
-            start_dq: Start velocities [rad/s]; at rest by default.
-            start_ddq: Start accelerations [rad/s^2]; none by default.
-            goal_dq: Goal velocities [rad/s]; at rest by default.
-            goal_ddq: Goal accelerations [rad/s^2], of models that were trained on rows that give them; none by default.
-                Other models leave them free.
+            goal_q: Goal positions [rad], shape (n,) or (N, n).
+            start_dq: Start velocities [rad/s], shape (n,) or (N, n); zero by default.
+            start_ddq: Start accelerations [rad/s^2], shape (n,) or (N, n); zero by default.
+            goal_dq: Goal velocities [rad/s], shape (n,) or (N, n); zero by default.
+            goal_ddq: Goal accelerations [rad/s^2], shape (n,) or (N, n), for models trained on rows with goal
+                accelerations; zero by default. Other models leave them free.
 
         Returns:
             One plan or N, not checked yet (status UNKNOWN).
 
         Raises:
-            UsageError: A shape is wrong, something is not finite, something moves that was at rest in every row that
-                the model was trained on, or goal accelerations are given that the model leaves free.
+            UsageError: A shape is wrong, a value is not finite, a condition is not zero that was zero in all training
+                rows, or goal accelerations are given that the model leaves free.
         """
         return self.plan_batch(boundary_of(self.robot.n, start_q, start_dq, start_ddq, goal_q, goal_dq, goal_ddq))
 
@@ -129,50 +127,14 @@ class Planner:
 
         Args:
             boundary: Boundary conditions, shape (N, n) each, float64 and finite.
-            sample_id: Which samples of a dataset these are, shape (N,); 0, 1, ... by default.
-            columns: What else is known of the tasks, as ``Plans.columns``.
+            sample_id: Dataset samples of the tasks, shape (N,); 0, 1, ... by default.
+            columns: Further columns of the tasks, as ``Plans.columns``.
 
         Raises:
-            UsageError: As for ``plan``.
+            UsageError: See ``plan``.
         """
         warn_of_far_joints(self.robot, boundary)
-        return self._kit.plan(self.model, self._accepted(boundary), sample_id=sample_id, columns=columns)
-
-    @one_thread()
-    def strike(
-        self,
-        state: State,
-        puck: ArrayLike,
-        towards: ArrayLike,
-        *,
-        meeting: float = MEETING,
-        speed_share: ArrayLike = 1.0,
-    ) -> Strikes:
-        """Plan hits: from where the arm is, to the puck, so that it goes where it is to go.
-
-        The stages that completed the rows which the model was trained on find the goal configuration and velocity
-        (``cnpgen.complete`` does the same in files). They are loaded at the first strike.
-
-        Args:
-            state: Where the arm is: positions [rad], velocities [rad/s] and accelerations [rad/s^2], shape (n,) or
-                (N, n) each, as ``states_at`` gives them; off the table by no more than motions may be.
-            puck: Where the puck's centre is, x and y [m], shape (2,) or (N, 2); with its z [m] where there is no table.
-            towards: Where it is to go, x and y [m], shape (2,) or (N, 2).
-            meeting: From the puck's centre to the mallet's when they meet [m].
-            speed_share: Speed of the hit as a fraction of the highest possible one, a number or shape (N,).
-
-        Returns:
-            Plans for the strikes that have an answer, not checked yet, and why the others have none.
-
-        Raises:
-            UsageError: A shape is wrong, something is not finite, or the model was not trained on hits.
-        """
-        if self._completion is None:
-            self._completion = load_completion(self.model, self._options["backend"])
-        tasks = strike_tasks(self._completion, state, puck, towards, meeting=meeting, share=speed_share)
-        columns = {name: tasks[name][0] for name in CONTEXT}
-        boundary = self._accepted(boundary_of_tasks(tasks, self.model.fixed_at_goal))
-        return Strikes(self._kit.plan(self.model, boundary, sample_id=tasks.alive, columns=columns), tasks.why())
+        return self._inference.plan(self.model, self._checked(boundary), sample_id=sample_id, columns=columns)
 
     def replan(
         self,
@@ -183,26 +145,27 @@ class Planner:
         goal_dq: ArrayLike | None = None,
         goal_ddq: ArrayLike | None = None,
     ) -> Plans:
-        """Plan on from points on plans that are being executed: q, dq and ddq go on without a jump.
+        """Replan from states on plans that are being executed: q, dq and ddq are continuous.
 
-        At its very end a plan may still accelerate where goal accelerations are free. What follows a motion that
-        ends at rest begins at rest: ``plan`` from its goal.
+        If goal accelerations are free, a plan may still accelerate at its very end. To continue after a motion that
+        ends at rest, call ``plan`` from its goal.
 
-        To a goal that has not moved no plan takes longer than what was left: where the network's is not faster by 2 %,
-        it is the rest of the old plan, with exact ends and the same duration, written anew. Where accelerations would
-        differ by more than 0.1 % of the limits, all plans that are returned have two or three spans for each of theirs.
+        If the goal is unchanged, the new plan never takes longer than the remaining trajectory: unless the network's
+        plan is faster by 2 %, the remaining trajectory is returned, with exact ends and the same duration. If its
+        accelerations would differ by more than 0.1 % of the limits, all returned plans have two or three spans for
+        each original one.
 
         Args:
-            plans: One plan or N, by any planner of the same robot; one may be left for several goals.
-            time: When the new plans take over, since the start of the old ones [s], one number or shape (N,). Planning
-                itself takes time: choose a moment that is still to come.
+            plans: One plan or N, by any planner of the same robot; one plan may be replanned to several goals.
+            time: Time at which the new plans take over, since the start of the old ones [s], one number or shape (N,).
+                Planning itself takes time: choose a time in the future.
             goal_q: New goal positions [rad], shape (n,) or (N, n).
-            goal_dq: New goal velocities [rad/s]; at rest by default.
+            goal_dq: New goal velocities [rad/s], shape (n,) or (N, n); zero by default.
             goal_ddq: New goal accelerations [rad/s^2], as for ``plan``.
 
         Raises:
-            UsageError: There are not as many times as plans, one is not within its plan, they are of another robot, or
-                as for ``plan``.
+            UsageError: The number of times differs from that of plans, a time is outside its plan, the plans are of
+                another robot, or see ``plan``.
         """
         check_plans_type(plans)
         if plans.problem.joint_names != self.model.problem.joint_names:
@@ -212,27 +175,27 @@ class Planner:
         times = np.broadcast_to(numbers("time", time), (len(plans),))
         if len(plans) == 1:
             plans, times = plans[np.zeros(len(new), int)], np.repeat(times, len(new))
-        return keep_what_is_faster(plans, times, new, acceleration_limit=self.robot.acceleration_limit)
+        return reuse_previous_plan(plans, times, new, acceleration_limit=self.robot.acceleration_limit)
 
-    def _accepted(self, boundary: Boundary) -> Boundary:
-        """Set to zero what was zero in every training row and differs from it by rounding; refuse what moves."""
-        boundary, still = self._arriving(boundary), {}
-        for name in self.model.rest:
+    def _checked(self, boundary: Boundary) -> Boundary:
+        """Set conditions that were zero in all training rows to exactly zero; check that they are zero to rounding."""
+        boundary, zeroed = self._with_goal_acceleration(boundary), {}
+        for name in self.model.zero_conditions:
             values = getattr(boundary, name)
-            if not np.count_nonzero(values):  # a fifth of the time of any()
+            if not np.count_nonzero(values):  # takes a fifth of the time of any()
                 continue
-            moving = np.abs(values).max(axis=1)
-            row = int(moving.argmax())
-            if (np.abs(values) > self._still[name]).any():
+            largest = np.abs(values).max(axis=1)
+            row = int(largest.argmax())
+            if (np.abs(values) > self._rest_tolerance[name]).any():
                 raise UsageError(
-                    f"{name} was zero in every row that the model was trained on, got {moving[row]:g} in plan {row}:"
+                    f"{name} was zero in every row that the model was trained on, got {largest[row]:g} in plan {row}:"
                     " train on such rows, or use a model that was"
                 )
-            still[name] = np.zeros_like(values)
-        return replace(boundary, **still) if still else boundary
+            zeroed[name] = np.zeros_like(values)
+        return replace(boundary, **zeroed) if zeroed else boundary
 
-    def _arriving(self, boundary: Boundary) -> Boundary:
-        """Give the goal an acceleration, of zero where none is said, just where the model holds one."""
+    def _with_goal_acceleration(self, boundary: Boundary) -> Boundary:
+        """Add zero goal accelerations if the model fixes them and none are given."""
         if boundary.fixed_at_goal == self.model.fixed_at_goal:
             return boundary
         if boundary.goal_ddq is not None:
@@ -241,22 +204,24 @@ class Planner:
 
 
 def states_at(plans: Plans, time: ArrayLike) -> tuple[Array, Array, Array]:
-    """Evaluate each of N plans at one moment.
+    """Evaluate each of N plans at one time.
 
     Args:
         plans: N plans.
-        time: Since their start [s], one number or shape (N,).
+        time: Time since the start of each plan [s], one number or shape (N,).
 
     Returns:
         Positions [rad], velocities [rad/s] and accelerations [rad/s^2], shape (N, n) each.
 
     Raises:
-        UsageError: There are not as many times as plans, one is not within its plan, or a plan is still to be made.
+        UsageError: The number of times differs from that of plans, a time is outside its plan, or a plan is missing.
     """
     try:
         times = np.broadcast_to(numbers("time", time), (len(plans),))
     except (UsageError, ValueError) as error:
-        raise UsageError(f"time must be one number or one for each of {len(plans)} plans, got {time!r}") from error
+        raise UsageError(
+            f"must be one number or one for each of {len(plans)} plans, got {time!r}", argument="time"
+        ) from error
     outside = ~((times >= 0) & (times <= plans.duration))
     if outside.any():
         row = int(outside.argmax())

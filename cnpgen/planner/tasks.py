@@ -1,4 +1,4 @@
-"""What a planner is asked for: boundary conditions, and what follows from them before any network runs."""
+"""Planning tasks: boundary conditions and the values computed from them before the network runs."""
 
 from dataclasses import dataclass
 from functools import reduce
@@ -14,9 +14,9 @@ if TYPE_CHECKING:
 
 Array = NDArray[Any]
 
-SHORTEST_TIME = 0.2  # s: floor of the expected time; what lies close together is not reached in no time at all
-SHORTEST_REACH = 0.03  # s: likewise of the time that velocities and accelerations need
-EXPECTED_TIMES = ("distance", "reach")  # what a model may take for the expected time: the two functions here
+MIN_EXPECTED_TIME_S = 0.2  # lower bound of ``expected_time``
+MIN_REACH_TIME_S = 0.03  # lower bound of ``reaching_time``
+EXPECTED_TIMES = ("distance", "reach")  # by ``expected_time`` and ``reaching_time``
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,8 @@ class Tasks:
         boundary: Boundary conditions, shape (N, n) each.
         start_xyz: Tip positions at the start, world frame [m], shape (N, 3).
         goal_xyz: Tip positions at the goal, world frame [m], shape (N, 3).
-        expected_time: What the network's rates are multiples of the inverse of [s], shape (N,).
-        correction: What the bent line deviates from the straight one by [rad], shape (N, m, n); None if it is straight.
+        expected_time: Unit of durations [s], shape (N,): network outputs are rates times this.
+        correction: Offsets of the projected line from the straight one [rad], shape (N, m, n); None if it is straight.
     """
 
     boundary: Boundary
@@ -44,7 +44,7 @@ class Tasks:
         return len(self.expected_time)
 
     def take(self, rows: slice | NDArray[Any]) -> "Tasks":
-        """Return some of the tasks."""
+        """Return a subset of the tasks."""
         return Tasks(
             self.boundary[rows],
             self.start_xyz[rows],
@@ -54,7 +54,7 @@ class Tasks:
         )
 
     def astype(self, dtype: str) -> "Tasks":
-        """Return the same tasks in another float type."""
+        """Return the tasks in another float type."""
         parts = {name: None if part is None else np.asarray(part, dtype) for name, part in vars(self.boundary).items()}
         return Tasks(
             Boundary(**parts),  # type: ignore[arg-type]
@@ -66,39 +66,41 @@ class Tasks:
 
 
 def expected_time(boundary: Boundary, velocity_limit: Array) -> Array:
-    """Time that the slowest joint needs at its velocity limit, at least ``SHORTEST_TIME`` (paper, expected time) [s].
+    """Return the largest time that a joint needs at its velocity limit (paper, expected time) [s].
 
     Args:
         boundary: Boundary conditions.
         velocity_limit: Planning limits [rad/s], shape (n,).
 
     Returns:
-        Shape (N,).
+        Shape (N,), at least ``MIN_EXPECTED_TIME_S``.
     """
-    each: Array = np.abs(boundary.goal_q - boundary.start_q) / velocity_limit
-    time: Array = each.max(axis=1, initial=SHORTEST_TIME)
+    joint_times: Array = np.abs(boundary.goal_q - boundary.start_q) / velocity_limit
+    time: Array = joint_times.max(axis=1, initial=MIN_EXPECTED_TIME_S)
     return time
 
 
 def reaching_time(robot: "Robot", *, fixed_at_goal: int) -> Any:
-    """Build ``ends -> time``: the least time in which every joint could go from its start to its goal state [s].
+    """Build ``ends -> time``: the minimum time in which every joint alone could reach its goal state [s].
 
-    Each joint for itself, with what is bounded of it: to its goal at full acceleration either way, at its velocity
-    limit between the two where it would exceed that. No motion is shorter but for the floor, ``SHORTEST_REACH``.
-    Ends are those of ``curves``; as a kernel, it takes an eighth of what NumPy takes for one task.
+    Each joint accelerates at its limit in either direction, and cruises at its velocity limit if it would exceed it.
+    This is a lower bound of the motion time if it exceeds ``MIN_REACH_TIME_S``. Ends are those of
+    ``control_point_functions``. The kernel takes an eighth of the time of NumPy for one task.
     """
     import casadi as ca
 
     ends = ca.SX.sym("ends", (3 + fixed_at_goal) * robot.n)
     q, dq, _, goal_q, goal_dq, *_ = ca.vertsplit(ends, robot.n)
     velocity, acceleration = ca.SX(robot.velocity_limit), ca.SX(robot.acceleration_limit)
-    direct = (dq + goal_dq) * ca.fabs(goal_dq - dq) / (2 * acceleration)  # the way while it only changes speed
+    direct = (
+        (dq + goal_dq) * ca.fabs(goal_dq - dq) / (2 * acceleration)
+    )  # distance at constant acceleration from dq to goal_dq
     side = ca.if_else(goal_q - q >= direct, 1.0, -1.0)
-    first, last, way = side * dq, side * goal_dq, side * (goal_q - q)
+    first, last, distance = side * dq, side * goal_dq, side * (goal_q - q)
     squares = (first**2 + last**2) / 2
-    peak = ca.sqrt(ca.fmax(acceleration * way + squares, 0.0))
+    peak = ca.sqrt(ca.fmax(acceleration * distance + squares, 0.0))
     fastest = ca.fmax(velocity, ca.fmax(first, last))
-    cruise = ca.fmax(way - (fastest**2 - squares) / acceleration, 0.0) / fastest
-    each = (2 * ca.fmin(peak, fastest) - first - last) / acceleration + ca.if_else(peak > fastest, cruise, 0.0)
-    time = reduce(ca.fmax, ca.vertsplit(each), ca.SX(SHORTEST_REACH))
+    cruise = ca.fmax(distance - (fastest**2 - squares) / acceleration, 0.0) / fastest
+    joint_times = (2 * ca.fmin(peak, fastest) - first - last) / acceleration + ca.if_else(peak > fastest, cruise, 0.0)
+    time = reduce(ca.fmax, ca.vertsplit(joint_times), ca.SX(MIN_REACH_TIME_S))
     return ca.Function("reaching_time", [ends], [time])

@@ -1,11 +1,11 @@
-"""Plans: motions for boundary problems, and the file that they are kept in."""
+"""Plans: motions for boundary problems, and their file format."""
 
 from cnpgen.plans.concatenate import concatenate
-from cnpgen.plans.load import load_plans
+from cnpgen.plans.plan_file import load_plans
 from cnpgen.plans.plans import PlanIndexError, Plans, make_plans, screen
 from cnpgen.plans.save import save_plans
 from cnpgen.plans.status import PlanStatus
-from cnpgen.problems.record import ProblemRecord, open_problem, record_problem
+from cnpgen.problems.problem_record import ProblemRecord, open_problem, record_problem
 
 __all__ = [
     "PlanIndexError",

@@ -1,7 +1,4 @@
-"""Boundary problems to solve: rows of a dataset or boundary conditions in a file, as plans that are still to be made.
-
-Rows of a certified dataset have their plans already.
-"""
+"""Boundary problems of a dataset or file, as plans without motions; rows of a certified dataset have motions."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -12,12 +9,12 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, UsageError, lacks
 from cnpgen.plans.boundary_file import CONTEXT, read_boundary_file
-from cnpgen.plans.load import agreed_problem
+from cnpgen.plans.plan_file import agreed_problem
 from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.record import ProblemRecord, as_record
+from cnpgen.problems.problem_record import ProblemRecord, as_record
 from cnpgen.schema.arguments import integer
-from cnpgen.store.blueprint import StoredProblem
+from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.store.paths import require_folder
 from cnpgen.store.reader import open_dataset
 from cnpgen.trajectory.boundary import Boundary
@@ -25,7 +22,7 @@ from cnpgen.trajectory.boundary import Boundary
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from cnpgen.store.blueprint import Blueprint
+    from cnpgen.store.dataset_spec import DatasetSpec
 
 
 def load_boundary_problems(
@@ -36,24 +33,23 @@ def load_boundary_problems(
     n: int | None = None,
     problem: Problem | StoredProblem | str | Path | None = None,
 ) -> Plans:
-    """Read boundary problems as plans that ``solve_plans`` is still to make: their control points are nan.
+    """Read boundary problems as plans without motions for ``solve_plans``: their control points are nan.
 
-    Rows of a certified dataset have the stored plans. Of a file only the boundary conditions are read, also where it
-    has plans: ``load_plans`` reads these.
+    Rows of a certified dataset have the stored plans. From a file, only the boundary conditions are read;
+    ``load_plans`` reads its plans.
 
     Args:
-        path: The folder of a dataset, or an HDF5 file of boundary conditions: a shard, a file of plans, or any other
-            with ``start_q`` and ``goal_q`` of shape (N, joints), and ``start_dq``, ``start_ddq`` and ``goal_dq`` where
-            they are not zero, and ``goal_ddq`` where goal accelerations are not free.
-        split: Which split of the dataset; "train" by default.
-        start: The first row of the split; 0 by default.
-        n: How many rows; by default all that follow.
-        problem: The problem that a file must be of, by name, path or as loaded, or its record. Tolerances may differ
-            from those in the file; those given here count.
+        path: Folder of a dataset, or an HDF5 file of boundary conditions: a shard, a file of plans, or any other
+            with ``start_q`` and ``goal_q`` of shape (N, joints), and ``start_dq``, ``start_ddq`` and ``goal_dq`` unless
+            they are zero, and ``goal_ddq`` unless goal accelerations are free.
+        split: Split of the dataset; "train" by default.
+        start: First row of the split; 0 by default.
+        n: Number of rows; by default all that follow.
+        problem: Required problem of a file: name, path, problem or record. Its tolerances replace those in the file.
 
     Raises:
-        DatasetError: The dataset or the file cannot be read, lacks something or is of another problem.
-        UsageError: There is no such folder, file or split, the split has no such rows, or rows of a file are asked for.
+        DatasetError: The dataset or the file cannot be read, is incomplete or is of another problem.
+        UsageError: The folder, file, split or rows do not exist, or rows of a file are requested.
         RecipeError: ``problem`` has mistakes.
     """
     path = Path(path)
@@ -70,29 +66,29 @@ def load_boundary_problems(
 def _of_folder(folder: Path, split: str, start: int, n: int | None) -> Plans:
     """Return rows of a dataset."""
     dataset = open_dataset(folder)
-    rows = chosen_rows(folder, dataset.blueprint, split=split, start=start, n=n)
-    source = f"dataset {dataset.blueprint.name}, seed {dataset.blueprint.seed}, split {split}"
+    rows = chosen_rows(folder, dataset.spec, split=split, start=start, n=n)
+    source = f"dataset {dataset.spec.name}, seed {dataset.spec.seed}, split {split}"
     columns = dataset.read(split, start=rows.start, stop=rows.stop)
-    return plans_of_rows(as_record(dataset.blueprint.problem), columns, source=source)
+    return plans_of_rows(as_record(dataset.spec.problem), columns, source=source)
 
 
-def chosen_rows(folder: Path, blueprint: "Blueprint", *, split: str, start: int, n: int | None) -> range:
-    """Return which rows of a split are meant.
+def chosen_rows(folder: Path, spec: "DatasetSpec", *, split: str, start: int, n: int | None) -> range:
+    """Return the range of rows of a split.
 
     Args:
-        folder: The dataset, for messages.
-        blueprint: Its blueprint.
-        split: Which split.
-        start: The first row.
-        n: How many; by default all that follow.
+        folder: Folder of the dataset, for messages.
+        spec: Specification of the dataset.
+        split: Name of the split.
+        start: First row.
+        n: Number of rows; by default all that follow.
 
     Raises:
-        UsageError: There is no such split, or it has no such rows.
+        UsageError: The split or the rows do not exist.
     """
     start = integer("start", start, least=0)
-    if split not in blueprint.splits:
-        raise UsageError(f"{folder} {lacks('split', split, blueprint.splits)}")
-    rows = blueprint.splits[split]
+    if split not in spec.splits:
+        raise UsageError(f"{folder} {lacks('split', split, spec.splits)}")
+    rows = spec.splits[split]
     stop = rows if n is None else start + integer("n", n, least=1)
     if not start < stop <= rows:
         wanted = f"{max(stop - start, 1)} from row {start} on"
@@ -113,16 +109,16 @@ def _of_file(path: Path, wanted: ProblemRecord | None) -> Plans:
         plans = plans_of_rows(problem, columns, source=f"boundary conditions in {path.name}")
     except UsageError as error:
         raise DatasetError(f"{path}: {error}") from error
-    return replace(plans, sealed=file.sealed)
+    return replace(plans, has_checksum=file.has_checksum)
 
 
 def plans_of_rows(problem: ProblemRecord, columns: "Mapping[str, NDArray[Any]]", *, source: str = "") -> Plans:
-    """Return rows of a dataset as plans: with those of a certified dataset, else with control points of nan.
+    """Return rows of a dataset as plans, with the plans of a certified dataset or control points of nan.
 
     Args:
-        problem: Their problem.
-        columns: Field -> values, shape (N,) or (N, w), as shards hold them.
-        source: Where they are from.
+        problem: Problem of the rows.
+        columns: Field -> values, shape (N,) or (N, w), as in shards.
+        source: Source of the rows, a line of text.
     """
     spec = problem.trajectory
     rows, n = columns["start_q"].shape

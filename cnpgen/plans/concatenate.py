@@ -1,4 +1,4 @@
-"""Joining plans of several files or runs."""
+"""Concatenation of plans of several files or runs."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -13,10 +13,10 @@ from cnpgen.trajectory.boundary import Boundary
 
 
 def concatenate(parts: Sequence[Plans]) -> Plans:
-    """Join plans of the same problem that have the same control points and columns.
+    """Concatenate plans of the same problem with the same numbers of control points and columns.
 
     Raises:
-        UsageError: They do not fit together.
+        UsageError: The plans are not compatible.
     """
     if not parts:
         raise UsageError("there are no plans to join")
@@ -44,7 +44,7 @@ def concatenate(parts: Sequence[Plans]) -> Plans:
 
 
 def _kinds(first: Plans, other: Plans) -> Iterator[tuple[str, Any, Any]]:
-    """Yield what must be the same in plans that are joined."""
+    """Yield the properties that concatenated plans must share."""
     yield "the problem", first.problem.comparable_sha256, other.problem.comparable_sha256
     yield "the degree", first.degree, other.degree
     for name in ("path_control_points", "rate_control_points"):

@@ -1,4 +1,4 @@
-"""Judging whole sets of plans: every plan by the independent verdict, in as many processes as are wanted."""
+"""Evaluation of sets of plans by the independent verdict, in several processes."""
 
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -11,20 +11,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import counted
-from cnpgen.judges.plans import Reason, Verdict, judge, summarise
+from cnpgen.judges.plans import Reason, Verdict, judge, summarize_verdicts
 from cnpgen.judges.plans.judge import check_step
-from cnpgen.machine.workers import share_out, worker_count
+from cnpgen.machine.workers import distribute, worker_count
 from cnpgen.plans.plans import Plans, check_plans_type
 from cnpgen.plans.status import PlanStatus
-from cnpgen.plans.tips import settle_tips
-from cnpgen.problems.record import open_problem
+from cnpgen.plans.tips import correct_tips
+from cnpgen.problems.problem_record import open_problem
 from cnpgen.schema.arguments import number
 
 FORMAT = "cnpgen-evaluation"
-FORMAT_VERSION = 1
-STEP = 1e-3  # s
-ALONE = 1000  # plans up to which a second process is not worth its start
-PART = 50  # plans that a process judges before it is given others
+EVALUATION_VERSION = 2
+MAX_VERDICT_STEP_S = 1e-3  # s
+MAX_PLANS_OF_ONE_PROCESS = 1000  # a second process takes longer to start than it saves
+PLANS_PER_VERDICT_TASK = 50  # plans that a process judges at a time
 
 _STATUS: dict[str, PlanStatus] = {
     Reason.OK: PlanStatus.VALID,
@@ -35,12 +35,12 @@ _STATUS: dict[str, PlanStatus] = {
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """What the verdict says of N plans.
+    """Verdicts of N plans.
 
     Attributes:
-        plans: The plans, with tip positions where the joints put the tip.
-        verdicts: Their verdicts, in the same order.
-        step: Moments that were looked at are no further apart than this [s].
+        plans: Plans, with tip positions consistent with the joints.
+        verdicts: Verdicts, in the same order.
+        step: Maximum distance of checked times [s].
     """
 
     plans: Plans
@@ -58,55 +58,59 @@ class Evaluation:
 
     @property
     def status(self) -> NDArray[np.uint8]:
-        """What is known of each plan now, values of ``PlanStatus``, shape (N,)."""
+        """Status of each plan after the verdict, values of ``PlanStatus``, shape (N,)."""
         return np.array([_STATUS.get(verdict.reason, PlanStatus.INVALID) for verdict in self.verdicts], np.uint8)
 
     def summary(self) -> dict[str, Any]:
-        """Return for JSON what is said of all plans together (docs/verdict.md)."""
+        """Return the summary of all plans for JSON (docs/verdict.md)."""
         record = self.plans.problem
         return {
             "format": FORMAT,
-            "format_version": FORMAT_VERSION,
+            "format_version": EVALUATION_VERSION,
             "problem": record.name,
             "problem_sha256": record.comparable_sha256,
             "checksum": self.plans.checksum,
             "step_s": self.step,
-            **summarise(self.verdicts),
+            **summarize_verdicts(self.verdicts),
         }
 
     def rows(self) -> Iterator[dict[str, Any]]:
-        """Yield for JSON what is said of each plan (docs/verdict.md)."""
+        """Yield the result of each plan for JSON (docs/verdict.md)."""
         for index, (sample, verdict) in enumerate(zip(self.plans.sample_id.tolist(), self.verdicts, strict=True)):
             yield {"plan": index, "sample_id": sample, **verdict.to_dict()}
 
 
 def evaluate_plans(
-    plans: Plans, *, step: float = STEP, workers: int | None = None, progress: Callable[[int], None] | None = None
+    plans: Plans,
+    *,
+    step: float = MAX_VERDICT_STEP_S,
+    workers: int | None = None,
+    progress: Callable[[int], None] | None = None,
 ) -> Evaluation:
-    """Judge plans with Pinocchio and Coal, on a fine time grid and between its moments.
+    """Judge plans with Pinocchio and Coal, on a fine time grid and between its times.
 
-    Every plan is judged for itself: neither the others nor the number of processes change its verdict. Plans that
-    cannot be evaluated get a verdict that says so. Where a column ``start_xyz`` or ``goal_xyz`` is not where the joints
-    put the tip, the joints count, after a warning.
+    Every verdict is independent of the other plans and of the number of processes. Plans that cannot be evaluated get a
+    verdict with that status. If ``start_xyz`` or ``goal_xyz`` differ from the tip positions of the joints, the joints
+    are used, after a warning.
 
     Args:
-        plans: The plans.
-        step: Largest time between two moments that are looked at [s].
-        workers: Processes; default one per available core, or one where a second would not pay.
+        plans: Plans to judge.
+        step: Maximum distance of checked times [s].
+        workers: Number of processes; default one per available core, or one for few plans.
         progress: Called with the number of plans that were judged since the last call.
 
     Raises:
-        UsageError: There are no plans, the step is not positive, or there are fewer than one worker.
-        RecipeError: The problem needs a plug-in that is not installed.
+        UsageError: There are no plans, the step is not positive, or there is less than one worker.
+        RecipeError: A required plug-in is not installed.
         MachineError: A worker died.
     """
     check_plans_type(plans)
     check_step(step := number("step", step))
-    plans = settle_tips(plans)
-    parts = [plans[first : first + PART] for first in range(0, len(plans), PART)]
-    count = worker_count(1 if workers is None and len(plans) <= ALONE else workers, len(parts))
+    plans = correct_tips(plans)
+    parts = [plans[first : first + PLANS_PER_VERDICT_TASK] for first in range(0, len(plans), PLANS_PER_VERDICT_TASK)]
+    count = worker_count(1 if workers is None and len(plans) <= MAX_PLANS_OF_ONE_PROCESS else workers, len(parts))
     verdicts: list[list[Verdict]] = []
-    with closing(share_out(partial(_judge, step=step), parts, count, ordered=True)) as results:
+    with closing(distribute(partial(_judge, step=step), parts, count, ordered=True)) as results:
         for found in results:
             verdicts.append(found)
             if progress is not None:

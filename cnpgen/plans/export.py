@@ -1,4 +1,4 @@
-"""Sampling plans in time and writing them in one of several forms."""
+"""Export of plans: sampling in time, and writing in one of several formats."""
 
 import json
 from collections.abc import Iterator, Sequence
@@ -18,21 +18,21 @@ from cnpgen.store.files.atomic import write_file
 Form = Literal["npz", "csv", "joint-trajectory"]
 
 FORMS: tuple[Form, ...] = get_args(Form)
-MOST_SAMPLES = 1_000_000  # of one plan
-HIGHEST_RATE = 1e6  # Hz: steps of 1 us, of which ROS stamps can say a thousandth
+MAX_SAMPLES = 1_000_000  # per plan
+MAX_RATE_HZ = 1e6  # steps of 1 us; ROS stamps resolve 1 ns
 
 
 @dataclass(frozen=True)
 class Exported:
-    """What ``export_plans`` did.
+    """Result of ``export_plans``.
 
     Attributes:
-        files: The files that it wrote, in the order of the plans.
-        count: How many plans are in them.
-        refused: Index of each plan that could not be exported -> why, naming it.
-        invalid: Indices of the exported plans whose status says that they are not valid.
-        held_joints: The file that says where joints stay that move and are not planned: beside plans as csv and
-            joint-trajectory, if the robot has such joints.
+        files: Written files, in the order of the plans.
+        count: Number of exported plans.
+        refused: Index of each plan that could not be exported -> message.
+        invalid: Indices of exported plans with a status other than valid or unknown.
+        held_joints: File with the positions of unplanned movable joints, for csv and joint-trajectory, if the robot has
+            such joints.
     """
 
     files: tuple[Path, ...]
@@ -45,38 +45,38 @@ class Exported:
 def export_plans(
     plans: Plans | JoinedPlans, out: str | Path, *, to: Form, rate: float = 1000.0, only: Sequence[int] | None = None
 ) -> Exported:
-    """Sample plans in time and write them; files that are there are replaced.
+    """Sample plans in time and write them; existing files are replaced.
 
     * "npz": one file; ``plan_00000_t`` (K,), ``plan_00000_q``, ``_dq``, ``_ddq`` and ``_jerk`` (K, n) of every plan,
-      numbered by its place among ``plans``; ``plan`` and ``sample_id`` (the numbers of those that are there),
-      ``joint_names``; ``held_joint_names`` and ``held_joint_positions`` of the joints that move and are not planned.
+      numbered by its index in ``plans``; ``plan`` and ``sample_id`` of the exported plans,
+      ``joint_names``; ``held_joint_names`` and ``held_joint_positions`` of unplanned movable joints.
     * "csv": one file per plan, ``plan_00000.csv``, with a header of names and units.
     * "joint-trajectory": one JSON file per plan, ``plan_00000.json``, with the fields of ROS's
       ``trajectory_msgs/JointTrajectory``.
 
-    Neither a table nor a message has room for joints that are not planned: where the robot has any that move,
-    ``held_joints.yaml`` beside them says where these stay.
+    Tables and messages do not contain unplanned joints. If the robot has movable ones, ``held_joints.yaml`` contains
+    their positions.
 
-    Plans that cannot be sampled are left out, and said to be.
+    Plans that cannot be sampled are omitted and reported.
 
     Args:
-        plans: The plans, or what ``join_plans`` made of them.
-        out: The file to write for "npz" (in a folder that exists: ``plans.npz``), else a folder, which is made.
-        to: The form.
+        plans: Plans, or joined plans of ``join_plans``.
+        out: File for "npz" (in an existing folder: ``plans.npz``), otherwise a folder, which is created.
+        to: Format, see above.
         rate: Samples per second [Hz]; the last instant of a plan is always one of its samples.
         only: Indices of the plans to export; all by default.
 
     Raises:
-        UsageError: An argument makes no sense.
-        DatasetError: None of the plans can be exported.
-        MachineError: The disk is full, read-only or otherwise unwilling.
+        UsageError: An argument is invalid.
+        DatasetError: No plan can be exported.
+        MachineError: The disk is full or read-only, or a file operation failed.
     """
     if not isinstance(plans, JoinedPlans):
         check_plans_type(plans)
     if to not in FORMS:
         raise UsageError(f"plans can be exported to {', '.join(FORMS)}, got {to!r}")
-    if not 0 < rate <= HIGHEST_RATE:
-        raise UsageError(f"the rate must be above 0 and at most {HIGHEST_RATE:g} Hz, got {rate}")
+    if not 0 < rate <= MAX_RATE_HZ:
+        raise UsageError(f"the rate must be above 0 and at most {MAX_RATE_HZ:g} Hz, got {rate}")
     chosen = _chosen(plans, only)
     out, refused = Path(out), _refused(plans, rate, chosen)
     kept = [index for index in chosen if index not in refused]
@@ -90,7 +90,7 @@ def export_plans(
 
 
 def _chosen(plans: Plans | JoinedPlans, only: Sequence[int] | None) -> list[int]:
-    """Return the indices of the plans that are wanted, ascending."""
+    """Return the indices of the requested plans, ascending."""
     chosen = sorted(set(range(len(plans)) if only is None else only))
     for index in chosen:
         if not 0 <= index < len(plans):
@@ -99,8 +99,8 @@ def _chosen(plans: Plans | JoinedPlans, only: Sequence[int] | None) -> list[int]
 
 
 def _refused(plans: Plans | JoinedPlans, rate: float, chosen: list[int]) -> dict[int, str]:
-    """Find the plans that cannot be sampled: index -> why."""
-    unknown = np.full(len(plans), PlanStatus.UNKNOWN, np.uint8)  # parts that cannot be evaluated cannot be joined
+    """Return the plans that cannot be sampled: index -> message."""
+    unknown = np.full(len(plans), PlanStatus.UNKNOWN, np.uint8)  # joined plans have only plans that can be evaluated
     statuses, found = unknown if isinstance(plans, JoinedPlans) else screen(plans), {}
     for index in chosen:
         why = _why_not(plans, index, PlanStatus(statuses[index]), rate)
@@ -115,8 +115,8 @@ def _why_not(plans: Plans | JoinedPlans, index: int, status: PlanStatus, rate: f
         return status.text
     if duration < 1e-9:
         return f"it lasts {duration:.3g} s, less than a nanosecond"
-    if duration * rate > MOST_SAMPLES:
-        return f"it lasts {duration:.3g} s: more than {MOST_SAMPLES} samples at {rate:g} Hz"
+    if duration * rate > MAX_SAMPLES:
+        return f"it lasts {duration:.3g} s: more than {MAX_SAMPLES} samples at {rate:g} Hz"
     if not np.isfinite(plans.motion[[index]].at_times(np.linspace(0, duration, 101)[None]).jerk).all():
         return "its derivatives are too large to compute with"
     return ""
@@ -156,7 +156,7 @@ def _write_each(out: Path, plans: Plans | JoinedPlans, rate: float, kept: list[i
 
 
 def _write_held_joints(folder: Path, plans: Plans | JoinedPlans) -> Path | None:
-    """Say where the joints stay that move and are not planned."""
+    """Write the positions of unplanned movable joints."""
     held = plans.problem.held_joints
     if not held:
         return None

@@ -1,4 +1,4 @@
-"""What a plan file holds: names, units and meanings of its datasets (docs/plan-format.md)."""
+"""Plan file format: names, units and definitions of its datasets (docs/plan-format.md)."""
 
 import difflib
 from collections.abc import Collection
@@ -9,10 +9,10 @@ from cnpgen.store.field import Field
 from cnpgen.store.joint_units import units_of_joints
 
 FORMAT = "cnpgen-plans"
-FORMAT_VERSION = 1
+PLAN_FILE_VERSION = 1
 
 BOUNDARY = ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq")
-CONDITIONS = (*BOUNDARY, "goal_ddq")  # the last one only where goal accelerations are given
+CONDITIONS = (*BOUNDARY, "goal_ddq")  # the last one only for given goal accelerations
 REQUIRED = (*BOUNDARY, "path_control_points", "rate_control_points")
 
 FLOATS = (*REQUIRED, "goal_ddq", "duration")
@@ -20,9 +20,9 @@ INTEGERS = ("sample_id", "status")
 NOTES = ("source", "refined_with")
 ATTRIBUTES = ("format", "format_version", "degree", "problem", "problem_recipe", "problem_urdf", "problem_sha256")
 
-UNITS = {"q": "rad", "dq": "rad/s", "ddq": "rad/s^2", "jerk": "rad/s^3"}  # of joints that turn
-ALMOST = 0.8  # likeness of names, of 1, from which on one is taken for a slip of the other
-_MEANINGS = {"q": "joint positions", "dq": "joint velocities", "ddq": "joint accelerations", "xyz": "tip position"}
+UNITS = {"q": "rad", "dq": "rad/s", "ddq": "rad/s^2", "jerk": "rad/s^3"}  # for revolute joints
+MIN_SIMILARITY = 0.8  # similarity ratio of names from which one is treated as a misspelling of the other
+_DESCRIPTIONS = {"q": "joint positions", "dq": "joint velocities", "ddq": "joint accelerations", "xyz": "tip position"}
 _OTHERS = (
     Field("rate_control_points", "1/s", "control points of the rate r(s) = ds/dt"),
     Field("duration", "s", "integral of 1 / r(s)", role="diagnostic"),
@@ -37,40 +37,40 @@ _OTHERS = (
 
 
 def plan_fields(joints: tuple[str, ...], sliding: tuple[bool, ...]) -> dict[str, Field]:
-    """Describe the datasets that have a fixed meaning.
+    """Describe the datasets that have a fixed definition.
 
     Args:
         joints: Names of the planned joints.
-        sliding: Of each whether it slides.
+        sliding: Whether each joint is prismatic.
     """
     fields = {item.name: item for item in _OTHERS}
     for end, goal in (("start", "the start"), ("goal", "the goal")):
-        for what, meaning in _MEANINGS.items():
+        for what, text in _DESCRIPTIONS.items():
             axes, frame = (("x", "y", "z"), "world") if what == "xyz" else (joints, "")
             unit = "m" if what == "xyz" else units_of_joints(UNITS[what], sliding)
             name = f"{end}_{what}"
-            fields[name] = Field(name, unit, f"{meaning} at {goal}", len(axes), axes, frame=frame)
+            fields[name] = Field(name, unit, f"{text} at {goal}", len(axes), axes, frame=frame)
     name, unit = "path_control_points", units_of_joints(UNITS["q"], sliding)
     fields[name] = Field(name, unit, "control points of the path p(s)", names=joints)
     return fields
 
 
-KNOWN = frozenset(plan_fields((), ()))  # names that have a meaning of their own
+KNOWN = frozenset(plan_fields((), ()))  # names with a fixed definition
 
 
 def refuse_misspelt(path: Path, names: Collection[str], asked: Collection[str]) -> None:
-    """Refuse a file with a dataset that is called almost as one which may be left out, and is: it would be ignored.
+    """Raise DatasetError for a misspelled name of a missing optional dataset, which would be ignored.
 
     Args:
-        path: The file, for the message.
-        names: The datasets that it has.
-        asked: The names that are looked for.
+        path: Path of the file, for the message.
+        names: Names of the datasets in the file.
+        asked: Known names.
 
     Raises:
-        DatasetError: There is such a dataset.
+        DatasetError: A name is misspelled.
     """
     missing = [name for name in asked if name not in names]
     for name in names:
-        meant = difflib.get_close_matches(name.lower(), missing, n=1, cutoff=ALMOST)
+        meant = difflib.get_close_matches(name.lower(), missing, n=1, cutoff=MIN_SIMILARITY)
         if meant and name not in KNOWN:
             raise DatasetError(f"{path}: {name!r} is almost {meant[0]!r}, which the file lacks: rename or remove it")

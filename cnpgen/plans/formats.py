@@ -1,4 +1,4 @@
-"""The forms that plans are exported in: sampled at evenly spaced moments, as tables, messages or an archive."""
+"""Export formats of plans, sampled at evenly spaced times: tables, messages and archives."""
 
 import csv
 import io
@@ -18,19 +18,19 @@ from cnpgen.plans.format import UNITS
 from cnpgen.store.files.atomic import committing
 from cnpgen.store.joint_units import unit_of, units_of_joints
 from cnpgen.trajectory.joined import JoinedMotion
-from cnpgen.trajectory.motion import Motion
+from cnpgen.trajectory.spline_motion import Motion
 
 Array = NDArray[np.float64]
 
-LEAST_STEP = 0.01  # the last step may be this part of a step; what would be shorter is joined to the step before
+MIN_LAST_STEP_FRACTION = 0.01  # minimum length of the last step in steps; a shorter one is merged with the step before
 
-# YAML 1.1, which ROS's tools read, takes 1e-05 for a text: a number needs a point before its exponent.
+# YAML 1.1, which ROS's tools read, parses 1e-05 as text: a number needs a point before its exponent.
 _WITHOUT_POINT = re.compile(r"(?<![\d.])(\d+)(?=e[+-])")
 
 
 @dataclass(frozen=True)
 class Sampled:
-    """A plan sampled at K moments.
+    """Plan sampled at K times.
 
     Attributes:
         t: Times [s], shape (K,), strictly increasing from 0 to the duration.
@@ -50,19 +50,19 @@ class Sampled:
 def sample_plan(motion: Motion | JoinedMotion, rate: float) -> Sampled:
     """Sample one motion at ``rate`` [Hz], and at its last instant."""
     duration = float(motion.duration()[0])
-    count = max(math.ceil(duration * rate - LEAST_STEP), 1)
+    count = max(math.ceil(duration * rate - MIN_LAST_STEP_FRACTION), 1)
     t = np.append(np.arange(count) / rate, duration)
     states = motion.at_times(t[None])
     return Sampled(t, states.q[0], states.dq[0], states.ddq[0], states.jerk[0])
 
 
 def csv_table(sampled: Sampled, joints: tuple[str, ...], sliding: tuple[bool, ...]) -> str:
-    """Write a plan as a table of CSV; every number reads back as the same float64.
+    """Write a plan as a CSV table; every number reads back as the same float64.
 
     Args:
-        sampled: The plan.
+        sampled: Sampled plan.
         joints: Names of the joints.
-        sliding: Of each whether it slides.
+        sliding: Whether each joint is prismatic.
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -77,7 +77,7 @@ def csv_table(sampled: Sampled, joints: tuple[str, ...], sliding: tuple[bool, ..
 def joint_trajectory(sampled: Sampled, joints: tuple[str, ...]) -> str:
     """Write a plan as a message, ROS's ``trajectory_msgs/JointTrajectory`` as JSON, one point per line.
 
-    Positions, velocities and accelerations are given, efforts are not; the time of the header is 0: begin at once.
+    Positions, velocities and accelerations are included, efforts are not. The header time is 0: start immediately.
     """
     rows = zip(sampled.t, sampled.q.tolist(), sampled.dq.tolist(), sampled.ddq.tolist(), strict=True)
     points = ",\n    ".join(json.dumps(_point(*row)) for row in rows)
@@ -94,15 +94,15 @@ def _point(t: float, q: list[float], dq: list[float], ddq: list[float]) -> dict[
 
 
 def write_npz(path: Path, about: dict[str, NDArray[Any]], plans: Iterable[tuple[int, Sampled]]) -> None:
-    """Write plans as an archive of NumPy, plan by plan, atomically: ``numpy.savez`` would need all of them in memory.
+    """Write plans to a NumPy archive atomically, plan by plan, since ``numpy.savez`` requires all in memory.
 
     Args:
-        path: Where to.
-        about: Arrays about all plans: name -> values.
-        plans: (number, samples) of every plan.
+        path: Path of the archive.
+        about: Arrays for all plans: name -> values.
+        plans: (index, samples) of every plan.
 
     Raises:
-        MachineError: The disk is full, read-only or otherwise unwilling.
+        MachineError: The disk is full or read-only, or a file operation failed.
     """
     with committing(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
         for name, values in about.items():
@@ -113,6 +113,6 @@ def write_npz(path: Path, about: dict[str, NDArray[Any]], plans: Iterable[tuple[
 
 
 def _add(archive: zipfile.ZipFile, name: str, values: NDArray[Any]) -> None:
-    """Add an array under a fixed date, so that equal plans give equal bytes."""
+    """Add an array with a fixed date, so that equal plans give equal bytes."""
     with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
         np.lib.format.write_array(member, values, allow_pickle=False)

@@ -1,4 +1,4 @@
-"""Joining plans: what is executed when a plan is cut at a moment, and another goes on from there."""
+"""Joined plans: sequences in which a plan is cut at a time and continued by another plan."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from cnpgen.errors import UsageError
 from cnpgen.plans.plans import Plans, check_made, check_plans_type
 from cnpgen.plans.status import PlanStatus
-from cnpgen.problems.record import ProblemRecord
+from cnpgen.problems.problem_record import ProblemRecord
 from cnpgen.schema.arguments import numbers
 from cnpgen.trajectory.joined import JoinedMotion
 
@@ -18,11 +18,11 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class JoinedPlans:
-    """N sequences of plans, as they are executed; ``export_plans`` takes them as it takes plans.
+    """N sequences of plans in the order of execution; ``export_plans`` accepts them.
 
     Attributes:
-        parts: The plans, N each, in the order of their execution.
-        begins: When each of them takes over, since the start of the first [s], shape (parts, N).
+        parts: Plans, N each, in the order of execution.
+        begins: Start time of each part, since the start of the first [s], shape (parts, N).
     """
 
     parts: tuple[Plans, ...]
@@ -36,17 +36,17 @@ class JoinedPlans:
 
     @property
     def problem(self) -> ProblemRecord:
-        """The problem of all of them."""
+        """Problem of all plans."""
         return self.parts[0].problem
 
     @property
     def sample_id(self) -> NDArray[np.int64]:
-        """Which samples the first plans are for, shape (N,)."""
+        """Sample IDs of the first plans, shape (N,)."""
         return self.parts[0].sample_id
 
     @property
     def status(self) -> NDArray[np.uint8]:
-        """What is known of each sequence: valid where all of its plans are, not valid where one is not; shape (N,)."""
+        """Status of each sequence, shape (N,): valid if all plans are valid, not valid if one plan is not valid."""
         status = np.array([part.status for part in self.parts])
         known = np.where((status == PlanStatus.VALID).all(axis=0), PlanStatus.VALID, PlanStatus.UNKNOWN)
         return np.where((status == PlanStatus.INVALID).any(axis=0), PlanStatus.INVALID, known).astype(np.uint8)
@@ -63,20 +63,20 @@ class JoinedPlans:
 
 
 def join_plans(first: Plans | JoinedPlans, following: Plans, *, at: ArrayLike | None = None) -> JoinedPlans:
-    """Cut each of N plans at a moment and join it with the plan that follows it.
+    """Cut each of N plans at a time and join it with the plan that follows it.
 
-    Positions, velocities and accelerations go on without a jump, to 1e-9 in SI units: as they do where ``following``
-    was planned from the state at that moment (``Planner.replan``, ``Planner.strike``, ``refine_plans``). To that comes
-    what rounding of control points makes of plans of a few milliseconds.
+    Positions, velocities and accelerations must be continuous up to 1e-9 in SI units, as for plans from the state at
+    that time (``Planner.replan``, ``plan_hits``, ``refine_plans``). The tolerance includes rounding errors of control
+    points for plans of a few milliseconds.
 
     Args:
-        first: N plans, or what was joined before.
-        following: N plans, each of which begins where one is cut.
-        at: When they take over, since the start of the first [s], one number or shape (N,); by default at the end.
+        first: N plans, or joined plans.
+        following: N plans, each starting at the cut of a plan.
+        at: Times of the cuts, since the start of the first [s], one number or shape (N,); by default at the end.
 
     Raises:
-        UsageError: There are not as many plans or times, they are of different problems, a time is not within its plan,
-            one is still to be made, or there is a jump; the message says how large it is.
+        UsageError: The numbers of plans or times or the problems differ, a time is outside its plan, a plan has no
+            motion, or there is a discontinuity.
     """
     joined = first if isinstance(first, JoinedPlans) else _alone(first)
     check_plans_type(following)
@@ -89,9 +89,11 @@ def join_plans(first: Plans | JoinedPlans, following: Plans, *, at: ArrayLike | 
     try:
         begins = joined.duration if at is None else np.broadcast_to(numbers("at", at), (len(joined),))
     except ValueError as error:
-        raise UsageError(f"at must be one number or one for each of {len(joined)} plans, got {at!r:.60}") from error
+        raise UsageError(
+            f"must be one number or one for each of {len(joined)} plans, got {at!r:.60}", argument="at"
+        ) from error
     found = JoinedPlans((*joined.parts, following), np.concatenate([joined.begins, begins[None]]))
-    _ = found.motion  # refuses gaps
+    _ = found.motion  # raises an error for discontinuities
     return found
 
 

@@ -15,36 +15,36 @@ from cnpgen.plans.format import FLOATS, INTEGERS, NOTES
 from cnpgen.plans.plausible import warn_of_far_joints
 from cnpgen.plans.status import PlanStatus
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.record import ProblemRecord, as_record, open_problem
+from cnpgen.problems.problem_record import ProblemRecord, as_record, open_problem
 from cnpgen.schema.arguments import integer, numbers
-from cnpgen.store.blueprint import StoredProblem
+from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.trajectory.boundary import Boundary
-from cnpgen.trajectory.motion import Motion
-from cnpgen.trajectory.spec import MOST_DEGREE, MOST_POINTS
+from cnpgen.trajectory.spline_motion import Motion
+from cnpgen.trajectory.trajectory_spec import MAX_CONTROL_POINTS, MAX_DEGREE
 
 Array = NDArray[np.float64]
 
-_NO_COLUMNS = {*FLOATS, *INTEGERS, "", "."}  # what a column cannot be called
+_NO_COLUMNS = {*FLOATS, *INTEGERS, "", "."}  # invalid names of columns
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Plans:
-    """N plans of one problem with n planned joints. Values may be garbage (nan, rates below 0); shapes are right.
+    """N plans of one problem with n planned joints. Values may be invalid (nan, negative rates); shapes are valid.
 
     Attributes:
-        problem: The problem.
+        problem: Record of the problem.
         boundary: Boundary conditions, shape (N, n) each.
         path_control_points: Control points of p(s) [rad], shape (N, C, n).
         rate_control_points: Control points of r(s) = ds/dt [1/s], shape (N, R).
         degree: Degree of both splines.
-        columns: What else is known of the tasks: name -> values in SI units, shape (N,) or (N, w). ``start_xyz`` and
+        columns: Further columns of the tasks: name -> values in SI units, shape (N,) or (N, w). ``start_xyz`` and
             ``goal_xyz``, the tip's positions in the world frame [m], shape (N, 3), are always there after
             ``make_plans`` and ``load_plans``.
-        sample_id: Which sample of a dataset every plan is for, shape (N,).
-        status: What is known of every plan, values of ``PlanStatus``, shape (N,).
-        source: Where they are from, a line of text, or nothing.
-        refined_with: The options that they were refined with, as JSON, or nothing.
-        sealed: Whether they are from a file with a checksum, which was right.
+        sample_id: Sample ID of every plan in a dataset, shape (N,).
+        status: Status of every plan, values of ``PlanStatus``, shape (N,).
+        source: Source of the plans, a line of text, or empty.
+        refined_with: Options of the refinement, as JSON, or empty.
+        has_checksum: Whether they are from a file with a verified checksum.
     """
 
     problem: ProblemRecord
@@ -57,15 +57,15 @@ class Plans:
     status: NDArray[np.uint8]
     source: str = ""
     refined_with: str = ""
-    sealed: bool = False
+    has_checksum: bool = False
 
     @property
     def checksum(self) -> str:
-        """What is said of it in summaries: "right", or "none" if their file has none, or they are from no file."""
-        return "right" if self.sealed else "none"
+        """Text for summaries: "right", or "none" without a file or checksum."""
+        return "right" if self.has_checksum else "none"
 
     def __post_init__(self) -> None:
-        integer("degree", self.degree, least=3, most=MOST_DEGREE)
+        integer("degree", self.degree, least=3, most=MAX_DEGREE)
         if next(_mistakes(self), None):
             raise UsageError(next(_mistakes(self, _rows(self))))
 
@@ -85,17 +85,17 @@ class Plans:
 
     @cached_property
     def duration(self) -> Array:
-        """Duration of every plan [s], shape (N,); inf or nan where there is none."""
+        """Duration of every plan [s], shape (N,); inf or nan if undefined."""
         return self.motion.duration()
 
     def __getitem__(self, which: int | slice | Sequence[int] | NDArray[Any]) -> "Plans":
-        """Return some of the plans, with all that is known of them; one plan is Plans as well.
+        """Return a selection of the plans, as Plans also for a single plan.
 
         Args:
-            which: A number, several in any order, a mask of shape (N,), or a slice.
+            which: An index, several indices in any order, a mask of shape (N,), or a slice.
 
         Raises:
-            PlanIndexError: The mask has another length, or there are no such plans; it is an IndexError as well.
+            PlanIndexError: The mask has another length, or an index is out of range; a subclass of IndexError.
         """
         which = _checked(which, len(self))
         return replace(
@@ -113,7 +113,7 @@ class Plans:
 
 
 class PlanIndexError(UsageError, IndexError):
-    """A plan that is not among the plans."""
+    """Index of a plan that does not exist."""
 
 
 def make_plans(
@@ -128,27 +128,27 @@ def make_plans(
     status: ArrayLike | None = None,
     source: str = "",
 ) -> Plans:
-    """Put plans together; what is not given is computed.
+    """Build plans; missing data is computed.
 
-    Everything may be arrays of NumPy or JAX, or tensors of torch on the CPU, whose gradients are left behind.
+    Values may be arrays of NumPy or JAX, or tensors of torch on the CPU, which are detached.
 
     Args:
-        problem: The problem, its record, or the name or the file of a problem, a pipeline or a dataset.
+        problem: Problem, record, or name or path of a problem, pipeline or dataset.
         boundary: Boundary conditions, shape (N, n) each.
         path_control_points: Control points of p(s) [rad], shape (N, C, n).
         rate_control_points: Control points of r(s) [1/s], shape (N, R).
         degree: Degree of both splines; the problem's by default.
-        columns: Name -> values, shape (N,) or (N, w); ``start_xyz`` and ``goal_xyz`` [m] by forward kinematics unless
-            they are given, and then they must be that.
-        sample_id: Shape (N,); 0, 1, ... by default.
+        columns: Name -> values, shape (N,) or (N, w); ``start_xyz`` and ``goal_xyz`` [m] by forward kinematics by
+            default; given values must be consistent with it.
+        sample_id: Sample IDs, shape (N,); 0, 1, ... by default.
         status: Values of ``PlanStatus``, shape (N,); unknown by default.
-        source: Where they are from, a line of text.
+        source: Source of the plans, a line of text.
 
     Warns:
-        UserWarning: A joint position is so far outside of its limits that it is probably in degrees, or normalised.
+        UserWarning: A joint position is so far outside its limits that it is probably in degrees or normalized.
 
     Raises:
-        UsageError: Something has the wrong shape.
+        UsageError: An array has the wrong shape.
     """
     record = as_record(problem)
     path = numbers("path_control_points", path_control_points)
@@ -172,20 +172,20 @@ def make_plans(
 
 
 def check_plans_type(plans: Any) -> None:
-    """Refuse what is not ``Plans``: the name of a file, for example.
+    """Check that an argument is ``Plans``, and not a file name, for example.
 
     Raises:
-        UsageError: It is something else.
+        UsageError: The argument has another type.
     """
     if not isinstance(plans, Plans):
         raise UsageError(f"expected Plans, as load_plans and make_plans return them, got {type(plans).__name__}")
 
 
 def check_made(plans: Plans) -> None:
-    """Refuse plans that are still to be made.
+    """Check that plans have motions.
 
     Raises:
-        UsageError: One has no control points.
+        UsageError: A plan has no control points.
     """
     waiting = np.isnan(plans.path_control_points).all(axis=(1, 2))
     if waiting.any():
@@ -193,10 +193,10 @@ def check_made(plans: Plans) -> None:
 
 
 def screen(plans: Plans) -> NDArray[np.uint8]:
-    """Find the plans that cannot be evaluated at all.
+    """Find the plans that cannot be evaluated.
 
     Returns:
-        Shape (N,): NOT_FINITE, NOT_FORWARD, or UNKNOWN for the plans that can be.
+        Status, shape (N,): NOT_FINITE, NOT_FORWARD, or UNKNOWN for plans that can be evaluated.
     """
     parts = [part for part in _parts(plans.boundary) if part is not None] + [plans.rate_control_points]
     finite = np.isfinite(plans.path_control_points).all(axis=(1, 2))
@@ -206,7 +206,7 @@ def screen(plans: Plans) -> NDArray[np.uint8]:
 
 
 def _integers(name: str, values: ArrayLike, kind: type[np.integer[Any]]) -> NDArray[Any]:
-    """Return values as an array of integers of a kind, if they are such."""
+    """Return values as an integer array of a type; raise an error for other values."""
     try:
         found = np.asarray(values)
         whole = found.astype(kind)
@@ -219,7 +219,7 @@ def _integers(name: str, values: ArrayLike, kind: type[np.integer[Any]]) -> NDAr
 
 
 def _checked(which: Any, plans: int) -> slice | NDArray[Any]:
-    """Return what is selected as a slice or an array of shape (k,), if there are such plans."""
+    """Return a selection of plans as a slice or an index array of shape (k,)."""
     if isinstance(which, slice):
         return which
     found = np.asarray(which)
@@ -241,7 +241,7 @@ def _parts(boundary: Boundary) -> list[Array | None]:
 
 
 def _mistakes(plans: Plans, rows: int | None = None) -> Iterator[str]:
-    """Yield what is wrong with the shapes, of as many plans as there are paths by default."""
+    """Yield error messages about shapes; the default number of plans is that of the paths."""
     path, rate, degree = plans.path_control_points, plans.rate_control_points, plans.degree
     if path.ndim != 3:
         yield f"path_control_points must have shape (N, C, n), got {path.shape}"
@@ -253,12 +253,12 @@ def _mistakes(plans: Plans, rows: int | None = None) -> Iterator[str]:
     joints = len(plans.problem.joint_names)
     if n != joints:
         yield f"path_control_points has {n} joints, but {plans.problem.name!r} plans {joints}: got shape {path.shape}"
-    fewest = plans.boundary.fewest_points(degree)
-    if points < fewest:
-        yield f"path_control_points must have at least {fewest} of degree {degree}, got shape {path.shape}"
+    min_count = plans.boundary.min_control_points(degree)
+    if points < min_count:
+        yield f"path_control_points must have at least {min_count} of degree {degree}, got shape {path.shape}"
     most = max(points, rate.shape[-1] if rate.ndim else 0)
-    if most > MOST_POINTS:
-        yield f"splines have at most {MOST_POINTS} control points, got {most}"
+    if most > MAX_CONTROL_POINTS:
+        yield f"splines have at most {MAX_CONTROL_POINTS} control points, got {most}"
     if rate.ndim != 2 or len(rate) != rows or rate.shape[1] <= degree:
         yield f"rate_control_points must have shape ({rows}, R) with R > {degree}, the degree, got {rate.shape}"
     for name, values in vars(plans.boundary).items():
@@ -274,7 +274,7 @@ def _mistakes(plans: Plans, rows: int | None = None) -> Iterator[str]:
 
 
 def _rows(plans: Plans) -> int:
-    """Return how many plans most of the fields are about: the others are wrong."""
+    """Return the most frequent number of plans among the fields."""
     fields: list[NDArray[Any]] = [part for part in _parts(plans.boundary) if part is not None]
     fields += [plans.path_control_points, plans.rate_control_points, plans.sample_id, plans.status]
     fields += plans.columns.values()

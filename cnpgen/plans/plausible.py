@@ -1,4 +1,4 @@
-"""Joint positions that cannot be meant: in degrees, or normalised."""
+"""Detection of implausible joint positions, in degrees or normalized."""
 
 import inspect
 import warnings
@@ -9,17 +9,17 @@ from cnpgen.robots.robot import Robot
 from cnpgen.store.joint_units import unit_of
 from cnpgen.trajectory.boundary import Boundary
 
-FAR = 2.0  # from the middle of a joint's range, in halves of it: a whole half range beyond its limit
+MAX_RANGE_RATIO = 2.0  # distance from the center of a joint's range, in half ranges
 
 
 def warn_of_far_joints(robot: Robot, boundary: Boundary) -> None:
-    """Warn where a start or a goal is so far outside of the joints' limits that its unit is probably another one.
+    """Warn about a start or goal so far outside the joint limits that its unit is probably wrong.
 
-    It is no error: boundary conditions are not judged where they come in, files may hold anything, and the verdict says
-    what is wrong with a plan. Nothing is said of numbers that are not finite.
+    It is not an error: boundary conditions are not judged on input, and the verdict reports violations of a plan.
+    Values that are not finite are ignored.
 
     Args:
-        robot: The robot.
+        robot: Robot of the problem.
         boundary: Boundary conditions, shape (N, n) each.
     """
     low, high = robot.position_lower, robot.position_upper
@@ -27,7 +27,7 @@ def warn_of_far_joints(robot: Robot, boundary: Boundary) -> None:
         q = np.asarray(getattr(boundary, name))
         if np.count_nonzero((low <= q) & (q <= high)) == q.size:
             continue
-        far = np.abs(q - (low + high) / 2) > FAR * (high - low) / 2
+        far = np.abs(q - (low + high) / 2) > MAX_RANGE_RATIO * (high - low) / 2
         if far.any():
             plan, joint = np.argwhere(far)[0]
             unit = unit_of(robot.units("rad"), int(joint))
@@ -42,7 +42,7 @@ def warn_of_far_joints(robot: Robot, boundary: Boundary) -> None:
 
 
 def _users_level() -> int:
-    """Return the ``stacklevel`` of a warning of this module's that names the user's line, not one of this package."""
+    """Return the ``stacklevel`` with which a warning refers to the user's line, not to this package."""
     level, frame = 0, inspect.currentframe()
     while frame is not None and str(frame.f_globals.get("__name__")).partition(".")[0] in {"cnpgen", "contextlib"}:
         level, frame = level + 1, frame.f_back

@@ -1,4 +1,4 @@
-"""Writing plan files: HDF5 with one dataset per field, and the whole problem in its attributes."""
+"""Writer of plan files: HDF5 with one dataset per field, and the whole problem in its attributes."""
 
 import io
 from collections.abc import Mapping
@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
-from cnpgen.plans.format import FORMAT, FORMAT_VERSION, NOTES, plan_fields
+from cnpgen.plans.format import FORMAT, NOTES, PLAN_FILE_VERSION, plan_fields
 from cnpgen.plans.plans import Plans, check_plans_type
 from cnpgen.plans.status import PlanStatus
 from cnpgen.store.files.atomic import write_file
+from cnpgen.store.files.checksum_file import HEADER_BYTES, with_checksum
 from cnpgen.store.files.hdf5 import create_hdf5
 from cnpgen.store.files.kind import PLANS
-from cnpgen.store.files.sealed import BLOCK, under_seal
 from cnpgen.store.paths import file_kind
 from cnpgen.store.shard import field_attributes
 
@@ -24,13 +24,12 @@ def save_plans(path: str | Path, plans: Plans) -> None:
     """Write plans to a file with a checksum, atomically; equal plans give equal bytes.
 
     Args:
-        path: Where to; a file of plans that is there is replaced, and folders that are missing are made (which
-            commands do not).
-        plans: The plans.
+        path: Path of the file. An existing plan file is replaced, and missing folders are created (unlike by commands).
+        plans: Plans to write.
 
     Raises:
-        UsageError: Something else than a file of plans is there, or ``plans`` are none.
-        MachineError: The disk is full, read-only or otherwise unwilling.
+        UsageError: The path holds another file, or ``plans`` has another type.
+        MachineError: The disk is full or read-only, or a file operation failed.
     """
     import h5py
 
@@ -38,21 +37,21 @@ def save_plans(path: str | Path, plans: Plans) -> None:
     check_replaceable(Path(path))
     buffer = io.BytesIO()
     fields = plan_fields(plans.problem.joint_names, plans.problem.sliding_joints)
-    with h5py.File(create_hdf5(buffer, userblock=BLOCK)) as file:
+    with h5py.File(create_hdf5(buffer, userblock=HEADER_BYTES)) as file:
         for name, values in _datasets(plans).items():
             dataset = file.create_dataset(name, data=values, track_times=False)
             _write_attributes(dataset, field_attributes(fields[name]) if name in fields else {})
         file["status"].attrs["flag_values"] = np.array(list(PlanStatus), np.uint8)
         _write_attributes(file["status"], {"flag_meanings": " ".join(status.name.lower() for status in PlanStatus)})
         _write_attributes(file, _attributes(plans))
-    write_file(Path(path), under_seal(buffer.getvalue(), kind=FORMAT, version=FORMAT_VERSION))
+    write_file(Path(path), with_checksum(buffer.getvalue(), kind=FORMAT, version=PLAN_FILE_VERSION))
 
 
 def check_replaceable(path: Path) -> None:
-    """Refuse to put plans in the place of anything but an older file of plans, or of an empty one.
+    """Check that a path is free, or holds an older plan file or an empty file.
 
     Raises:
-        UsageError: Something else is there.
+        UsageError: The path holds another file.
     """
     if path.is_dir():
         raise UsageError(f"{path} is a folder, expected a file for plans")
@@ -65,8 +64,8 @@ def check_replaceable(path: Path) -> None:
 
 
 def _datasets(plans: Plans) -> dict[str, NDArray[Any]]:
-    """Return everything that is stored, in order and in its stored type."""
-    floats = plans.boundary.given() | dict(sorted(plans.columns.items()))
+    """Return the stored datasets, in order and in their stored types."""
+    floats = plans.boundary.conditions() | dict(sorted(plans.columns.items()))
     floats |= {"path_control_points": plans.path_control_points, "rate_control_points": plans.rate_control_points}
     floats["duration"] = plans.duration
     stored: dict[str, NDArray[Any]] = {name: np.ascontiguousarray(values, "<f8") for name, values in floats.items()}
@@ -77,7 +76,7 @@ def _attributes(plans: Plans) -> dict[str, str | int]:
     record = plans.problem
     return {
         "format": FORMAT,
-        "format_version": FORMAT_VERSION,
+        "format_version": PLAN_FILE_VERSION,
         "degree": plans.degree,
         "problem": record.name,
         "problem_recipe": record.recipe,
@@ -88,7 +87,7 @@ def _attributes(plans: Plans) -> dict[str, str | int]:
 
 
 def _write_attributes(item: Any, attributes: Mapping[str, Any]) -> None:
-    """Write attributes; texts with a fixed length: those of variable length can make HDF5 hang on damaged files."""
+    """Write attributes; use texts of fixed length, since variable length can make HDF5 hang on damaged files."""
     import h5py
 
     for name, value in attributes.items():

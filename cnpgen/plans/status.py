@@ -1,12 +1,12 @@
-"""What is known of a plan."""
+"""Status of a plan."""
 
 from enum import IntEnum
 
 
 class PlanStatus(IntEnum):
-    """What is known of a plan; the first that applies.
+    """Status of a plan; the first one that applies.
 
-    Files keep the names beside the numbers, so that members can be added, and numbers mean the same when they are read.
+    Files store the names with the values, so that members can be added later.
     """
 
     UNKNOWN = 0
@@ -17,11 +17,11 @@ class PlanStatus(IntEnum):
 
     @property
     def text(self) -> str:
-        """The status in words."""
+        """Text of the status."""
         return {
             PlanStatus.UNKNOWN: "not checked yet",
-            PlanStatus.VALID: "meets every constraint and its boundary conditions at every moment",
-            PlanStatus.INVALID: "breaks a constraint or a boundary condition",
+            PlanStatus.VALID: "satisfies every constraint and the boundary conditions at every time",
+            PlanStatus.INVALID: "violates a constraint or a boundary condition",
             PlanStatus.NOT_FINITE: "a boundary condition or a control point is not a finite number",
-            PlanStatus.NOT_FORWARD: "the rate ds/dt is not positive throughout: the motion never arrives",
+            PlanStatus.NOT_FORWARD: "the rate ds/dt is not positive throughout",
         }[self]

@@ -1,4 +1,4 @@
-"""Where the tip is at the ends of plans: what their columns say, put right where their joints say something else."""
+"""Correction of tip positions in the columns of plans that are inconsistent with the joints."""
 
 import warnings
 from dataclasses import replace
@@ -8,25 +8,25 @@ import numpy as np
 from cnpgen.errors import counted
 from cnpgen.plans.plans import Plans
 
-SAME_PLACE = 1e-5  # m: what a tip position may differ by from the one that the joints give, float32 included
+TIP_TOLERANCE_M = 1e-5  # maximum deviation of a tip position from forward kinematics, float32 included
 
 
-def settle_tips(plans: Plans, *, where: str = "") -> Plans:
-    """Put tip positions right that are not where the joints put the tip, with a warning.
+def correct_tips(plans: Plans, *, where: str = "") -> Plans:
+    """Replace tip positions that are inconsistent with the joints, with a warning.
 
-    Both say where the tip must begin and end, and tip positions say where obstacles stand that are below the object.
-    The joints are what a plan is executed with, and what its control points meet: they count.
+    Tip positions define the ends of the tip and the obstacles below the object. The joints have priority, since plans
+    are executed with them and control points match them.
 
     Args:
-        plans: The plans, with the columns ``start_xyz`` and ``goal_xyz``.
-        where: What the warning begins with: the file.
+        plans: Plans with the columns ``start_xyz`` and ``goal_xyz``.
+        where: Beginning of the warning: the file.
     """
     found = {}
     for end in ("start", "goal"):
         name, said = f"{end}_xyz", plans.columns[f"{end}_xyz"]
         tip = plans.problem.tip_positions(getattr(plans.boundary, f"{end}_q"))
         off = np.linalg.norm(said - tip, axis=1)
-        wrong = ~(off <= SAME_PLACE) & np.isfinite(tip).all(axis=1)
+        wrong = ~(off <= TIP_TOLERANCE_M) & np.isfinite(tip).all(axis=1)
         if wrong.any():
             first = int(np.argmax(wrong))
             text = f"{where}{name} of {counted(int(wrong.sum()), 'plan')} is not where {end}_q puts the tip"

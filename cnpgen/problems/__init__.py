@@ -1,1 +1,1 @@
-"""What a valid motion is: the problem, its constraints, its robot, and the problem as text."""
+"""Problems, which define valid motions: constraints, robot, obstacles, and records as text."""

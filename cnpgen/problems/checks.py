@@ -1,4 +1,4 @@
-"""What a problem file must say that is about several of its tables, or about the URDF beside it."""
+"""Checks of a problem file across several tables, or against its URDF."""
 
 import os
 from collections.abc import Iterable, Iterator
@@ -8,16 +8,16 @@ from typing import Any
 from xml.etree import ElementTree
 
 from cnpgen.errors import PluginError, RecipeError, nearest
-from cnpgen.robots.shape.files import find_urdf
+from cnpgen.robots.shape.mesh_files import find_urdf
 from cnpgen.robots.urdf import read_urdf, urdf_tree
-from cnpgen.schema.keys import Place
+from cnpgen.schema.keys import RecipeLocation
 from cnpgen.schema.units import show
 
 _XACRO = "{http://www.ros.org/wiki/xacro}"
 
 
-def problem_mistakes(table: dict[str, Any], where: Place, folder: Path) -> Iterator[str]:
-    """Check what is about several tables; on the raw ones, so that it is reported along with their own mistakes."""
+def problem_mistakes(table: dict[str, Any], where: RecipeLocation, folder: Path) -> Iterator[str]:
+    """Check conditions across tables, on the raw tables, so that all mistakes are reported together."""
     robot = table.get("robot")
     if isinstance(robot, dict):
         yield from _robot_mistakes(robot, where / "robot", folder)
@@ -25,49 +25,49 @@ def problem_mistakes(table: dict[str, Any], where: Place, folder: Path) -> Itera
     yield from _repeated(table, where, "obstacle", "name")
     for index, obstacle in tables(table, "obstacle"):
         if obstacle.get("below") and "object" not in table:
-            yield (where / "obstacle" / index / "below").says("nothing stands on the obstacle: there is no [object]")
+            yield (where / "obstacle" / index / "below").message("nothing stands on the obstacle: there is no [object]")
 
 
-def _robot_mistakes(robot: dict[str, Any], where: Place, folder: Path) -> Iterator[str]:
-    """Check that the URDF is there and has the joints and the tip; all else of it is for Pinocchio to read."""
+def _robot_mistakes(robot: dict[str, Any], where: RecipeLocation, folder: Path) -> Iterator[str]:
+    """Check that the URDF exists and has the joints and the tip; Pinocchio checks the rest."""
     urdf, joints, tip = robot.get("urdf"), robot.get("joints"), robot.get("tip")
     if not isinstance(urdf, str):
         return
     try:
         path = find_urdf(urdf, folder / "problem.toml", named_packages(robot, folder))
-    except PluginError:  # without its robot a problem can be listed; whoever loads the robot says what is missing
+    except PluginError:  # a problem can be listed without its robot; loading the robot raises the error
         return
     if not os.path.isfile(path):  # noqa: PTH113 - Path.is_file raises where a name is too long
         hint = nearest(urdf, [file.name for file in folder.glob("*.urdf")])
         there = os.path.exists(path)  # noqa: PTH110 - likewise
-        yield (where / "urdf").says(f"not a file: {path}" if there else f"no such file: {path}{hint}")
+        yield (where / "urdf").message(f"not a file: {path}" if there else f"no such file: {path}{hint}")
         return
     try:
         tree = urdf_tree(read_urdf(path))
-    except (RecipeError, ValueError):  # whoever loads the robot says so
+    except (RecipeError, ValueError):  # loading the robot raises the error
         return
     if text := unread_xacro(tree, path):
-        yield (where / "urdf").says(text)
+        yield (where / "urdf").message(text)
         return
     moving = [joint.get("name", "") for joint in tree.iter("joint") if joint.get("type", "fixed") != "fixed"]
     for name in joints if isinstance(joints, list) else ():
         if isinstance(name, str) and name not in moving:
-            yield (where / "joints").says(f"{path.name} has no joint {name!r} that moves{nearest(name, moving)}")
+            yield (where / "joints").message(f"{path.name} has no joint {name!r} that moves{nearest(name, moving)}")
     if isinstance(tip, str) and (text := missing_frame(tree, path, tip)):
-        yield (where / "tip").says(text)
+        yield (where / "tip").message(text)
     for name, low, high in _locked_outside(tree.iter("joint"), joints if isinstance(joints, list) else []):
         text = f"{name!r} is not planned and stays at zero, which is outside of its limits [{low:g}, {high:g}]"
-        yield (where / "joints").says(text)
+        yield (where / "joints").message(text)
 
 
 def named_packages(robot: dict[str, Any], folder: Path) -> list[Path]:
-    """List the folders that ``packages`` in the table [robot] of a problem in ``folder`` names."""
+    """Return the folders in ``packages`` of the table [robot] of a problem in ``folder``."""
     named = robot.get("packages", [])
     return [folder / each for each in named if isinstance(each, str)] if isinstance(named, list) else []
 
 
 def unread_xacro(tree: ElementTree.Element, path: Path) -> str:
-    """Say that a file is to be read by xacro first; nothing where it is a URDF."""
+    """Return an error message for a xacro file; empty for a URDF."""
     if not any(part.tag.startswith(_XACRO) for part in tree.iter()):
         return ""
     return f"{path.name} is to be read by xacro, expected a URDF: run 'xacro {path.name} > robot.urdf'"
@@ -79,7 +79,7 @@ def frames_of(tree: ElementTree.Element) -> list[str]:
 
 
 def missing_frame(tree: ElementTree.Element, path: Path, name: str) -> str:
-    """Say that a URDF has no frame of a name, and which it has; nothing where it has one."""
+    """Return an error message for a missing frame, with the known names; empty if the frame exists."""
     frames = frames_of(tree)
     return (
         ""
@@ -89,27 +89,27 @@ def missing_frame(tree: ElementTree.Element, path: Path, name: str) -> str:
 
 
 def _locked_outside(joints: Iterable[ElementTree.Element], planned: list[Any]) -> Iterator[tuple[str, float, float]]:
-    """List joints that are not planned and cannot stand at zero, with their limits; those that mimic are left out."""
+    """Return unplanned joints whose limits exclude zero, with the limits; mimic joints are omitted."""
     for joint in joints:
         limit, name = joint.find("limit"), joint.get("name", "")
         movable = joint.get("type") in ("revolute", "prismatic") and joint.find("mimic") is None
         if limit is None or not movable or name in planned:
             continue
-        with suppress(ValueError):  # numbers that are none are for Pinocchio to refuse
+        with suppress(ValueError):  # Pinocchio rejects invalid numbers
             low, high = (float(limit.get(key, "0")) for key in ("lower", "upper"))
             if not low <= 0 <= high and low <= high:
                 yield name, low, high
 
 
-def _repeated(table: dict[str, Any], where: Place, array: str, key: str) -> Iterator[str]:
+def _repeated(table: dict[str, Any], where: RecipeLocation, array: str, key: str) -> Iterator[str]:
     seen: list[Any] = []
     for index, entry in tables(table, array):
         if key in entry and entry[key] in seen:
-            yield (where / array / index / key).says(f"there is a {array} {show(entry[key])} already")
+            yield (where / array / index / key).message(f"there is a {array} {show(entry[key])} already")
         seen.append(entry.get(key))
 
 
 def tables(table: dict[str, Any], array: str) -> list[tuple[int, dict[str, Any]]]:
-    """List the entries of an array of tables that are tables, with their places in it."""
+    """Return the tables among the entries of an array, with their indices."""
     entries = table.get(array)
     return [(i, e) for i, e in enumerate(entries) if isinstance(e, dict)] if isinstance(entries, list) else []

@@ -1,4 +1,4 @@
-"""Which shape the robot of a problem has, and what in a problem file does not go with it; on the raw tables."""
+"""Choice of the robot geometry of a problem, and checks of the raw tables against it."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -7,19 +7,19 @@ from xml.etree import ElementTree
 
 from cnpgen.errors import RecipeError
 from cnpgen.problems.checks import named_packages, tables
-from cnpgen.robots.shape.files import find_named_file, find_urdf
+from cnpgen.robots.shape.mesh_files import find_named_file, find_urdf
 from cnpgen.robots.urdf import read_urdf, urdf_tree
-from cnpgen.schema.keys import Place
+from cnpgen.schema.keys import RecipeLocation
 
 _NAME_IT = 'name geometry = "paper-capsules" in [robot] for a robot that is a line through its joints\' origins'
 
 
 def chosen_geometry(table: dict[str, Any], folder: Path) -> str:
-    """Say which shape a problem's robot has: what it names, else that of the URDF if there is something to hit.
+    """Return the geometry of a problem's robot: the named one, or the URDF's if there is an obstacle.
 
     Args:
-        table: The problem file.
-        folder: The folder that it is in.
+        table: Table of the problem file.
+        folder: Folder of the problem file.
     """
     named = _robot(table).get("geometry")
     if isinstance(named, str):
@@ -28,8 +28,8 @@ def chosen_geometry(table: dict[str, Any], folder: Path) -> str:
     return "urdf" if something_to_hit and _collision_elements(table, folder) else "paper-capsules"
 
 
-def geometry_mistakes(table: dict[str, Any], where: Place, folder: Path) -> Iterator[str]:
-    """Say what in a problem file does not go with the shape of its robot."""
+def geometry_mistakes(table: dict[str, Any], where: RecipeLocation, folder: Path) -> Iterator[str]:
+    """Yield error messages for keys that are inconsistent with the robot geometry."""
     elements = _collision_elements(table, folder)
     if chosen_geometry(table, folder) != "urdf":
         yield from _paper_mistakes(table, where)
@@ -38,50 +38,50 @@ def geometry_mistakes(table: dict[str, Any], where: Place, folder: Path) -> Iter
 
 
 def _shape_mistakes(
-    table: dict[str, Any], where: Place, folder: Path, elements: list[ElementTree.Element]
+    table: dict[str, Any], where: RecipeLocation, folder: Path, elements: list[ElementTree.Element]
 ) -> Iterator[str]:
     if not elements:
         text = "its links have no <collision> elements, so that it has no shape"
-        yield (where / "robot" / "geometry").says(f"the URDF gives no shape: {text}; {_NAME_IT}")
+        yield (where / "robot" / "geometry").message(f"the URDF gives no shape: {text}; {_NAME_IT}")
     for place, constraint in _constraints(table, "robot-clearance"):
         if "radius" in constraint:
             text = f"the robot has the shape that its URDF gives it, and no radius: leave it out, or {_NAME_IT}"
-            yield (where / "constraint" / place / "radius").says(text)
+            yield (where / "constraint" / place / "radius").message(text)
     yield from _missing_files(table, where / "robot", folder, elements)
 
 
-def _paper_mistakes(table: dict[str, Any], where: Place) -> Iterator[str]:
+def _paper_mistakes(table: dict[str, Any], where: RecipeLocation) -> Iterator[str]:
     for place, constraint in _constraints(table, "robot-clearance"):
         if "radius" not in constraint:
             text = 'missing key, expected a length [m]: with geometry = "paper-capsules" the arm is so thick'
-            yield (where / "constraint" / place / "radius").says(text)
+            yield (where / "constraint" / place / "radius").message(text)
     for place, _ in _constraints(table, "self-clearance"):
         text = 'links are kept apart by their shapes: it needs geometry = "urdf" in [robot], and <collision> elements'
-        yield (where / "constraint" / place).says(text)
+        yield (where / "constraint" / place).message(text)
     if _robot(table).get("convex_parts", 1) != 1:
-        yield (where / "robot" / "convex_parts").says('meshes matter with geometry = "urdf" only')
+        yield (where / "robot" / "convex_parts").message('meshes matter with geometry = "urdf" only')
     if _robot(table).get("srdf"):
-        yield (where / "robot" / "srdf").says('pairs of links matter with geometry = "urdf" only')
+        yield (where / "robot" / "srdf").message('pairs of links matter with geometry = "urdf" only')
 
 
 def _missing_files(
-    table: dict[str, Any], where: Place, folder: Path, elements: list[ElementTree.Element]
+    table: dict[str, Any], where: RecipeLocation, folder: Path, elements: list[ElementTree.Element]
 ) -> Iterator[str]:
     robot = _robot(table)
     packages = named_packages(robot, folder)
     for package in packages:
         if not package.is_dir():
-            yield (where / "packages").says(f"no such folder: {package}")
+            yield (where / "packages").message(f"no such folder: {package}")
     urdf = find_urdf(str(robot.get("urdf")), folder / "problem.toml", packages) if elements else folder
     meshes = dict.fromkeys(mesh.get("filename", "") for each in elements for mesh in each.iter("mesh"))
     for name in (each for each in meshes if not each.startswith("data:")):
         try:
             find_named_file(name, urdf, packages)
         except RecipeError as error:
-            yield (where / "urdf").says(str(error))
+            yield (where / "urdf").message(str(error))
     srdf = robot.get("srdf")
     if isinstance(srdf, str) and srdf and not (folder / srdf).is_file():
-        yield (where / "srdf").says(f"no such file: {folder / srdf}")
+        yield (where / "srdf").message(f"no such file: {folder / srdf}")
 
 
 def _collision_elements(table: dict[str, Any], folder: Path) -> list[ElementTree.Element] | None:

@@ -1,4 +1,4 @@
-"""Problem: what a valid motion is, and what identifies it."""
+"""Problem: definition of a valid motion, and its identity."""
 
 import dataclasses
 import hashlib
@@ -13,26 +13,26 @@ from cnpgen.errors import MachineError
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.robots.obstacle import Obstacle
-from cnpgen.robots.shape.files import find_urdf
+from cnpgen.robots.robot_spec import HeldObject, LimitSpec, Payload, RobotSpec
 from cnpgen.robots.shape.inline import with_inline_meshes
+from cnpgen.robots.shape.mesh_files import find_urdf
 from cnpgen.robots.shape.srdf import with_disabled_pairs
-from cnpgen.robots.spec import HeldObject, LimitSpec, Payload, RobotSpec
 from cnpgen.robots.urdf import read_urdf
 from cnpgen.schema import registry
 from cnpgen.schema.keys import NAME, field, to_dict
-from cnpgen.trajectory.spec import TrajectorySpec
+from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
 Kind = TypeVar("Kind", bound=Constraint)
 
-MOST_TABLES = 100  # obstacles, and constraints
+MAX_TABLES = 100  # of obstacles or constraints
 
 
 @dataclass(frozen=True, kw_only=True)
 class Objective:
-    """What a good motion is: the integral over time of ``1 + centrifugal |kappa| v^2`` (paper, Appendix B, eta)."""
+    """Objective of a motion: the integral over time of ``1 + centrifugal |kappa| v^2`` (paper, Appendix B, eta)."""
 
     centrifugal: float = field(
-        "weight of the centrifugal acceleration |kappa| v^2 of the tip beside the time",
+        "weight of the centrifugal acceleration |kappa| v^2 of the tip relative to time",
         unit="s^2/m",
         default=0.0,
         low=0.0,
@@ -41,24 +41,24 @@ class Objective:
 
 @dataclass(frozen=True, kw_only=True)
 class Problem:
-    """What a valid motion is.
+    """Definition of a valid motion.
 
     Attributes:
-        path: The problem file; the URDF is looked up beside it.
+        path: Path of the problem file, the base of the URDF's relative path.
     """
 
     name: str = field("name of the problem: lower-case letters, digits and hyphens", pattern=NAME)
-    title: str = field("one line about it", default="")
-    robot: RobotSpec = field("which robot, and what of it is planned")
-    limits: LimitSpec = field("its planning limits, as fractions of the URDF's or in their place")
-    object: HeldObject | None = field("an upright cuboid that it holds", default=None)
-    payload: Payload | None = field("what else it carries at its tip", default=None, late=True)
-    obstacle: tuple[Obstacle, ...] = field("what stands around the robot", default=(), form="[[obstacle]] tables")
+    title: str = field("title in one line", default="")
+    robot: RobotSpec = field("robot and its planned joints")
+    limits: LimitSpec = field("planning limits, as fractions of the URDF's or in their place")
+    object: HeldObject | None = field("upright cuboid that the tip holds", default=None)
+    payload: Payload | None = field("additional load at the tip", default=None, since_version=2)
+    obstacle: tuple[Obstacle, ...] = field("obstacles around the robot", default=(), form="[[obstacle]] tables")
     constraint: tuple[Constraint, ...] = field(
-        "what every state of a valid motion meets", default=(), form="[[constraint]] tables"
+        "constraints on every state of a valid motion", default=(), form="[[constraint]] tables"
     )
-    trajectory: TrajectorySpec = field("how motions are parameterised", default=TrajectorySpec())
-    objective: Objective = field("what is minimised", default=Objective())
+    trajectory: TrajectorySpec = field("parametrization of motions", default=TrajectorySpec())
+    objective: Objective = field("objective of the optimization", default=Objective())
     path: Path = Path()
 
     def first(self, kind: type[Kind]) -> Kind | None:
@@ -67,15 +67,15 @@ class Problem:
 
     @property
     def arm_radius(self) -> float | None:
-        """How thick an arm that is a line is, as the first constraint of its clearance says [m]; None if none does."""
+        """Radius of the capsules of the paper's geometry, from the first clearance constraint [m], or None."""
         clearance = self.first(RobotClearance)
         return None if clearance is None else clearance.radius
 
     def find_mistakes(self) -> Iterator[tuple[str, str]]:
-        """Yield (key, what is wrong with it)."""
+        """Yield (key, mistake) pairs."""
         for key in ("obstacle", "constraint"):
-            if (count := len(getattr(self, key))) > MOST_TABLES:
-                yield key, f"there are {count:,} of them, expected at most {MOST_TABLES}: kernels grow with each"
+            if (count := len(getattr(self, key))) > MAX_TABLES:
+                yield key, f"there are {count:,} of them, expected at most {MAX_TABLES}: kernels grow with each"
         depth = max((item.depth for item in self.constraint if isinstance(item, ObjectContact)), default=0.0)
         if self.object is not None and min(self.object.size) <= 2 * depth:
             yield (
@@ -91,12 +91,12 @@ class Problem:
 
     @property
     def uses_jerk(self) -> bool:
-        """Whether a constraint is about jerks."""
+        """Whether a constraint limits jerks."""
         return any(constraint.uses_jerk for constraint in self.constraint)
 
     @property
     def path_orders(self) -> int:
-        """How many derivatives of p(s), itself included, its constraints depend on; of r(s) they are one less."""
+        """Number of derivatives of p(s), including p itself, in the constraints; for r(s) it is one less."""
         return 4 if self.uses_jerk else 3
 
     @property
@@ -104,7 +104,7 @@ class Problem:
         """The URDF file.
 
         Raises:
-            PluginError: It is one of a package that is not here.
+            PluginError: The URDF belongs to a package that is not installed.
         """
         return find_urdf(self.robot.urdf, self.path, self._packages)
 
@@ -114,12 +114,12 @@ class Problem:
 
     @cached_property
     def urdf_text(self) -> str:
-        """The URDF, read once: the robot, its kernels and the identity are of one text, whatever becomes of the file.
+        """Text of the URDF, read once, so that robot, kernels and identity use the same text.
 
-        Where the robot has its real shape, the hulls of its meshes and the pairs of an SRDF are part of the text.
+        For robots with the URDF's geometry, the text includes the hulls of meshes and the pairs of an SRDF.
 
         Raises:
-            RecipeError: The file cannot be read, or is not UTF-8; or a mesh or the SRDF.
+            RecipeError: The URDF, a mesh or the SRDF cannot be read, or is not UTF-8.
         """
         text, spec = read_urdf(self.urdf_path), self.robot
         if spec.geometry != "urdf":
@@ -130,35 +130,38 @@ class Problem:
 
     @cached_property
     def identity(self) -> str:
-        """The sha256 over all that kernels and plans of the problem depend on; what is cached for it has this key.
+        """Hash (sha256) of everything that kernels and plans of the problem depend on; the key of caches.
 
-        It is that of the object, however it was made, and not of a file: a copy with another value has another one.
-        Only the title and the places of the files are left out.
+        It depends on the values of the object and not on a file. Only the title and the file paths are excluded.
         """
         content = json.dumps(without_labels(to_dict(self, label=_all_of)), sort_keys=True)
         return hashlib.sha256(content.encode() + self.urdf_text.encode()).hexdigest()
 
 
-# Keys of [robot] that say where something is or how it is read: what came of it is in the URDF's text.
+# Keys of [robot] that only locate or read files; their results are in the text of the URDF.
 FILES = ("urdf", "packages", "srdf", "convex_parts")
 
 
 def kept_folder() -> Path | None:
-    """Return the folder where shapes are kept, beside the kernels; None where others may change it."""
-    from cnpgen.kernels.cache import default_cache_folder, distrusted, make_private  # only robots with a shape need it
+    """Return the cache folder of shapes; None if other users may write to it."""
+    from cnpgen.kernels.cache import (
+        default_cache_folder,
+        make_private_folder,
+        trust_problem,
+    )  # used only by robots with a shape
 
     try:
         folder = default_cache_folder()
-        make_private(folder)
+        make_private_folder(folder)
     except (OSError, MachineError):
         return None
-    return None if distrusted(folder) else folder
+    return None if trust_problem(folder) else folder
 
 
 def resolved(recipe: object) -> dict[str, Any]:
     """Return a problem, pipeline or dataset recipe as plain dicts and lists in SI units.
 
-    Everything that it refers to is in it, and every default.
+    The result includes referenced recipes and default values.
     """
     return to_dict(recipe, label=_use)
 
@@ -173,7 +176,7 @@ def _use(obj: object) -> dict[str, str]:
 
 
 def _all_of(obj: object) -> dict[str, str]:
-    """Label a kind with its name and code, and with its fields that are no keys: an object made in Python has them."""
+    """Label a kind with its name, code and fields that are not keys, as objects built in Python have them."""
     label = _use(obj)
     if not label:
         return {}
@@ -182,6 +185,6 @@ def _all_of(obj: object) -> dict[str, str]:
 
 
 def without_labels(problem: Mapping[str, Any]) -> dict[str, Any]:
-    """Leave out of a resolved problem what changes nothing but how it is shown or found: title and names of files."""
+    """Remove title and file names from a resolved problem, which do not affect its motions."""
     robot = {key: value for key, value in problem["robot"].items() if key not in FILES}
     return {key: value for key, value in problem.items() if key != "title"} | {"robot": robot}

@@ -1,1 +1,1 @@
-"""The refiner: B-spline trajectory optimisation by sequential quadratic programming, and what it falls back on."""
+"""The refiner: B-spline trajectory optimization by sequential quadratic programming."""

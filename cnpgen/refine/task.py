@@ -1,6 +1,6 @@
-"""One boundary problem for the refiner, and what comes of it."""
+"""Boundary problems of the refiner and the attempts at solving them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import numpy as np
@@ -14,52 +14,52 @@ Array = NDArray[np.float64]
 
 
 class Outcome(IntEnum):
-    """How refining a plan ended."""
+    """Result of refining a plan."""
 
     SOLVED = 0
-    SLOWED = 1
-    POLISHED = 2
+    TIME_SCALED = 1
+    SOLVED_FINE = 2
     RESTARTED = 3
-    KEPT = 4
+    UNCHANGED = 4
     UNSOLVED = 5
-    UNUSABLE = 6
+    INVALID_INPUT = 6
     ADJUSTED = 7
-    UNSETTLED = 8
+    NOT_CONVERGED = 8
     OUT_OF_TIME = 9
 
     @property
     def text(self) -> str:
-        """The outcome in words."""
+        """Description of the outcome."""
         return {
-            Outcome.SOLVED: "solved in the first pass",
-            Outcome.SLOWED: "valid after a uniform slow-down",
-            Outcome.POLISHED: "solved after a polish on a finer grid",
-            Outcome.RESTARTED: "solved from another start",
-            Outcome.KEPT: "kept as it was given: nothing better was found",
-            Outcome.UNSOLVED: "no valid plan was found; this is the best one",
-            Outcome.ADJUSTED: "kept as it was given but for its ends, made exact, and its rates, made positive",
-            Outcome.UNSETTLED: "valid, but the objective still fell when its steps were used up",
-            Outcome.OUT_OF_TIME: "the best until the deadline: with more time there may be a better one",
-            Outcome.UNUSABLE: "the boundary conditions are no numbers",
+            Outcome.SOLVED: "solved on the coarse level",
+            Outcome.TIME_SCALED: "valid after uniform time scaling",
+            Outcome.SOLVED_FINE: "solved on a finer level",
+            Outcome.RESTARTED: "solved from another initial guess",
+            Outcome.UNCHANGED: "input plan returned unchanged: no better plan was found",
+            Outcome.UNSOLVED: "no valid plan was found; this is the best attempt",
+            Outcome.ADJUSTED: "input plan returned with exact boundary conditions and positive rates",
+            Outcome.NOT_CONVERGED: "valid, but the objective still decreased at the iteration limit",
+            Outcome.OUT_OF_TIME: "the best plan until the deadline; more time may give a better one",
+            Outcome.INVALID_INPUT: "the boundary conditions are not finite",
         }[self]
 
 
 @dataclass(frozen=True)
-class Task:
-    """A boundary problem, with a plan to begin with or without.
+class RefinementTask:
+    """Boundary problem with an optional input plan.
 
     Attributes:
         boundary: Boundary conditions of one motion, shape (1, n) each.
-        tops: Where its obstacles are, as ``obstacle_tops`` says, shape (numbers,).
+        obstacle_poses: Poses and sizes of its obstacles, shape (width,).
         start_xyz: Position of the tip at the start [m], shape (3,).
         goal_xyz: Position of the tip at the goal [m], shape (3,).
-        path: Path control points of the given plan [rad], shape (C, n), or None.
-        rate: Its rate control points [1/s], shape (R,), or None.
-        deadline: When steps should be over, if that matters.
+        path: Path control points of the input plan [rad], shape (C, n), or None.
+        rate: Rate control points of the input plan [1/s], shape (R,), or None.
+        deadline: Deadline of the solver's iterations, or None.
     """
 
     boundary: Boundary
-    tops: Array
+    obstacle_poses: Array
     start_xyz: Array
     goal_xyz: Array
     path: Array | None = None
@@ -68,63 +68,77 @@ class Task:
 
     @property
     def at_rest(self) -> bool:
-        """Whether the motion begins and ends at rest, so that it may be slowed down without leaving its ends."""
+        """Whether the motion starts and ends at rest; time scaling then preserves its boundary conditions."""
         ends = (self.boundary.start_dq, self.boundary.start_ddq, self.boundary.goal_dq, self.boundary.goal_ddq)
         return all(values is None or not np.any(values) for values in ends)
 
     @property
     def is_finite(self) -> bool:
-        """Whether the boundary conditions are numbers."""
-        values = (self.tops, self.start_xyz, self.goal_xyz, *vars(self.boundary).values())
-        return all(each is None or bool(np.isfinite(each).all()) for each in values)
+        """Whether the boundary conditions are finite."""
+        conditions = (self.obstacle_poses, self.start_xyz, self.goal_xyz, *vars(self.boundary).values())
+        return all(values is None or bool(np.isfinite(values).all()) for values in conditions)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Attempt:
-    """A plan on the way to the best one.
+    """Trajectory for a boundary problem; after the independent check also its verdict.
 
-    Attributes:
-        x: Variables of the transcription.
-        excess: Worst violation on the fine grid, as a multiple of what is allowed; at most 1 is within the tolerances.
-            0 where nobody looked, since the iteration ended within its bounds.
-        cost: Objective [s].
-        outcome: What it would be called if it were the last.
-        iterations: Steps that led to it.
-    """
-
-    x: Array
-    excess: float
-    cost: float
-    outcome: Outcome
-    iterations: int = 0
-
-    def is_better(self, other: "Attempt") -> bool:
-        """Whether it breaks less than another, or breaks as little and costs less."""
-        mine, others = max(self.excess, 1.0), max(other.excess, 1.0)
-        return self.cost < other.cost if mine == others else mine < others
-
-
-@dataclass(frozen=True)
-class Refined:
-    """A refined plan.
+    ``violation``, ``severity``, ``is_precise`` and ``x`` are used by the search and not part of its result.
 
     Attributes:
         path: Path control points [rad], shape (C, n).
         rate: Rate control points [1/s], shape (R,).
-        outcome: How it ended.
-        reason: What the independent verdict says: "ok", or why the plan is not valid.
-        iterations: Steps of all passes together.
-        cost: The objective [s].
+        cost: Objective [s].
+        outcome: Outcome of the refinement if this attempt is its result.
+        iterations: Iterations of the solver.
+        reason: Reason of the independent verdict: "ok", or why the plan is not valid; None before it is judged.
+        violation: Largest violation on the 600-point grid, as a multiple of its tolerance; at most 1 is accepted. It is
+            0 where it was not evaluated because the solver converged within its bounds.
+        severity: 1 if the plan is valid; otherwise larger, inf if it cannot be evaluated.
+        is_precise: Whether equalities are met within a fraction of their tolerance.
+        x: Variables of the transcription, shape (nx,), or None.
     """
 
     path: Array
     rate: Array
-    outcome: Outcome
-    reason: str
-    iterations: int
     cost: float
+    outcome: Outcome
+    iterations: int = 0
+    reason: str | None = None
+    violation: float = np.nan
+    severity: float = np.nan
+    is_precise: bool = False
+    x: Array | None = None
 
     @property
     def valid(self) -> bool:
-        """Whether the independent verdict calls it valid."""
+        """Whether the independent verdict accepts the plan."""
         return self.reason == Reason.OK
+
+    @property
+    def rank(self) -> tuple[float, float]:
+        """Sort key of judged attempts: the severity first, then the objective."""
+        return self.severity, self.cost
+
+    @property
+    def variables(self) -> Array:
+        """Variables of the transcription, of an attempt that has them, shape (nx,)."""
+        assert self.x is not None
+        return self.x
+
+    def is_better(self, other: "Attempt") -> bool:
+        """Return whether the violation is smaller than another's, or as small at a lower cost."""
+        mine, others = max(self.violation, 1.0), max(other.violation, 1.0)
+        return self.cost < other.cost if mine == others else mine < others
+
+    def result(self, iterations: int, outcome: Outcome | None = None) -> "Attempt":
+        """Return the attempt as the result of a search with so many iterations in total."""
+        return replace(
+            self,
+            iterations=iterations,
+            outcome=self.outcome if outcome is None else outcome,
+            violation=np.nan,
+            severity=np.nan,
+            is_precise=False,
+            x=None,
+        )

@@ -1,1 +1,1 @@
-"""The numeric robot: its Pinocchio model and chain, its limits, and what a problem file says of it."""
+"""Numeric robot model: Pinocchio model, kinematic chain, limits and specification."""

@@ -1,4 +1,4 @@
-"""What a problem adds to the robot of a URDF: a tool's offset, a payload, ranges of joints."""
+"""Attachments of a problem to the robot of a URDF: tool offset, payload, joint ranges."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -18,13 +18,13 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Body:
-    """A rigid body.
+class PayloadBody:
+    """Rigid body of the payload.
 
     Attributes:
-        mass: Its mass [kg].
-        com: Its centre of mass in the tip frame [m], shape (3,).
-        inertia: Its inertia about the centre of mass, along the tip frame's axes [kg m^2], shape (3, 3).
+        mass: Mass [kg].
+        com: Center of mass in the tip frame [m], shape (3,).
+        inertia: Inertia about the center of mass, in the axes of the tip frame [kg m^2], shape (3, 3).
     """
 
     mass: float
@@ -34,20 +34,20 @@ class Body:
 
 @dataclass(frozen=True)
 class Attached:
-    """What is added to a URDF's robot.
+    """Attachments to the robot of a URDF.
 
     Attributes:
-        frame: The URDF's frame that the tip frame is fixed to.
+        frame: URDF frame to which the tip frame is fixed.
         rotation: Rotation of the tip frame in it, shape (3, 3).
-        translation: Its origin there [m], shape (3,).
-        payload: What the robot carries at the tip frame, or None.
-        ranges: Planned joint -> its position limits [rad], in the place of the URDF's.
+        translation: Origin of the tip frame in it [m], shape (3,).
+        payload: Body carried at the tip frame, or None.
+        ranges: Planned joint -> position limits [rad] that replace those of the URDF.
     """
 
     frame: str
     rotation: Array = field(default_factory=lambda: np.eye(3))
     translation: Array = field(default_factory=lambda: np.zeros(3))
-    payload: Body | None = None
+    payload: PayloadBody | None = None
     ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
@@ -58,7 +58,7 @@ class Attached:
 
 
 def attach(model: "pin.Model", attached: Attached) -> None:
-    """Add to a reduced model what a problem adds to it.
+    """Add the attachments of a problem to a reduced model.
 
     Raises:
         RecipeError: The model has no such frame.
@@ -82,12 +82,12 @@ def attach(model: "pin.Model", attached: Attached) -> None:
 
 
 def bounded(urdf: str, tree: ElementTree.Element, attached: Attached) -> str:
-    """Return a URDF whose continuous joints are revolute where they are given a range.
+    """Return a URDF in which continuous joints with a given range are revolute.
 
     Args:
-        urdf: The text of the URDF.
-        tree: The same, parsed; it is changed.
-        attached: The ranges.
+        urdf: Text of the URDF.
+        tree: Parsed URDF, modified in place.
+        attached: Attachments with the ranges.
     """
     turning = [joint for joint in tree.iter("joint") if joint.get("type") == "continuous"]
     given = [joint for joint in turning if joint.get("name") in attached.ranges]

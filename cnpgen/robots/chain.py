@@ -1,4 +1,4 @@
-"""The numbers of a serial chain: joint placements, axes and inertias of a reduced Pinocchio model."""
+"""Parameters of a serial chain: joint placements, axes and inertias of a reduced Pinocchio model."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -14,10 +14,10 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 
-NEARLY = 1e-12  # how far off a number that is meant to be -1, 0 or 1 may be
-LINK = " (link)"  # behind the name of a link that a joint has, too
+SNAP_TOLERANCE = 1e-12  # maximum deviation of entries that are rounded to -1, 0 or 1
+LINK_SUFFIX = " (link)"  # suffix of links with the name of a joint
 _PLANNED = "only revolute and prismatic joints can be planned"
-_KINDS = {  # how Pinocchio names the types of joints -> what URDF calls them
+_KINDS = {  # Pinocchio's name of a joint type -> URDF's name
     "JointModelRUB": "a continuous joint, which has no limits (give ranges to all joints: 'position' in [limits])",
     "JointModelFreeFlyer": "a floating joint",
     "JointModelPlanar": "a planar joint",
@@ -27,16 +27,16 @@ _KINDS = {  # how Pinocchio names the types of joints -> what URDF calls them
 
 @dataclass(frozen=True)
 class Joint:
-    """One planned joint and the rigid body that it moves.
+    """Planned joint and the rigid body that it moves.
 
     Attributes:
         rotation: Rotation of the joint frame in the previous joint frame at q = 0, shape (3, 3).
-        translation: Its origin there [m], shape (3,).
+        translation: Origin of the joint frame in the previous one [m], shape (3,).
         axis: Unit axis in the joint frame, shape (3,).
         prismatic: Whether q is a displacement [m] and not an angle [rad].
-        mass: Mass of the body with everything fixed to it [kg].
-        com: Centre of mass in the joint frame [m], shape (3,).
-        inertia: Inertia about the centre of mass, joint axes [kg m^2], shape (3, 3).
+        mass: Mass of the body with all fixed parts [kg].
+        com: Center of mass in the joint frame [m], shape (3,).
+        inertia: Inertia about the center of mass, joint axes [kg m^2], shape (3, 3).
     """
 
     rotation: Array
@@ -50,12 +50,12 @@ class Joint:
 
 @dataclass(frozen=True)
 class Chain:
-    """A serial chain from the world to a tip frame.
+    """Serial chain from the world to a tip frame.
 
     Attributes:
         joints: The planned joints, from the base outwards.
         tip_rotation: Rotation of the tip frame in the last joint frame, shape (3, 3).
-        tip_translation: Origin of the tip frame there [m], shape (3,).
+        tip_translation: Origin of the tip frame in the last joint frame [m], shape (3,).
         gravity: Gravity in the world frame [m/s^2], shape (3,).
     """
 
@@ -66,7 +66,7 @@ class Chain:
 
     @property
     def reach(self) -> float:
-        """Upper bound of the distance of the tip from the first joint's origin [m]; none where joints slide."""
+        """Upper bound of the distance of the tip from the first joint's origin [m]; infinite with prismatic joints."""
         if any(joint.prismatic for joint in self.joints):
             return np.inf
         lengths = [float(np.linalg.norm(joint.translation)) for joint in self.joints[1:]]
@@ -97,22 +97,22 @@ def chain_from_model(model: "pin.Model", tip: str) -> Chain:
 
 
 def tell_links_apart(model: "pin.Model") -> None:
-    """Rename the frames of links that have the name of a joint: Pinocchio looks for frames by name."""
+    """Rename link frames with the name of a joint, since Pinocchio finds frames by name."""
     import pinocchio as pin
 
     joints = {frame.name for frame in model.frames if frame.type != pin.FrameType.BODY}
     for frame in model.frames:
         if frame.type == pin.FrameType.BODY and frame.name in joints:
-            frame.name += LINK
+            frame.name += LINK_SUFFIX
 
 
 def frame_of(model: "pin.Model", name: str) -> int:
-    """Return the number of a frame; where a link and a joint have the same name, that of the link."""
-    return int(model.getFrameId(name + LINK if model.existFrame(name + LINK) else name))
+    """Return the index of a frame; a link has priority over a joint of the same name."""
+    return int(model.getFrameId(name + LINK_SUFFIX if model.existFrame(name + LINK_SUFFIX) else name))
 
 
 def _kind(name: str) -> str:
-    """Say what Pinocchio's type of a joint is."""
+    """Return the URDF name of a joint's Pinocchio type."""
     return next((text for start, text in _KINDS.items() if name.startswith(start)), "a joint of another kind")
 
 
@@ -132,9 +132,9 @@ def _joint(model: "pin.Model", data: "pin.Data", index: int) -> Joint:
 
 
 def _snap(values: Array) -> Array:
-    """Round entries that are nearly -1, 0 or 1: a URDF's pi/2 must not cost operations in every kernel."""
+    """Round entries close to -1, 0 or 1, so that a URDF's pi/2 adds no operations to kernels."""
     values = np.array(values, float)
     nearest = np.rint(values)
-    close = (np.abs(values - nearest) < NEARLY) & (np.abs(nearest) <= 1)
+    close = (np.abs(values - nearest) < SNAP_TOLERANCE) & (np.abs(nearest) <= 1)
     values[close] = nearest[close]
     return values

@@ -1,4 +1,4 @@
-"""Joints of a URDF that mimic others: Pinocchio reads them as joints of their own, so most of them are refused."""
+"""Mimic joints of a URDF: Pinocchio treats them as independent joints, so most of them raise an error."""
 
 from collections.abc import Iterator, Sequence
 from xml.etree.ElementTree import Element
@@ -8,11 +8,11 @@ from cnpgen.robots.urdf import number_in
 
 
 def check_mimic(tree: Element, joints: Sequence[str]) -> None:
-    """Raise RecipeError where a joint that mimics another would not stand where its robot has it.
+    """Raise RecipeError if a mimic joint would have a wrong position.
 
     Args:
-        tree: The URDF.
-        joints: The planned joints; all others stay at zero.
+        tree: Parsed URDF.
+        joints: Planned joints; all others stay at zero.
     """
     mistakes = [f"robot.joints: {text}" for joint in tree.iter("joint") for text in _mistakes(joint, joints)]
     if mistakes:
@@ -33,7 +33,7 @@ def _mistakes(joint: Element, planned: Sequence[str]) -> Iterator[str]:
 
 
 def _offset(mimic: Element) -> str:
-    """Say what is wrong with an offset; nothing where it is zero."""
+    """Return an error message for a non-zero offset, otherwise an empty text."""
     try:
         return "an offset" if number_in(mimic, "offset", 0.0) else ""
     except ValueError as error:

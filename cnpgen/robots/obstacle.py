@@ -1,4 +1,4 @@
-"""The obstacles of a problem, as its file says them."""
+"""Obstacles of a problem file."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -7,68 +7,70 @@ from cnpgen.robots.shape.hull import check_solid
 from cnpgen.robots.shape.inline import corners_of, is_inline
 from cnpgen.schema.keys import Range, field
 
-_KEYS = {  # kind -> the keys that say where and how large it is; those of _OPTIONAL may be left out
+_KEYS = {  # kind -> keys of pose and size; those of _OPTIONAL may be omitted
     "box": ("position", "size", "rotation"),
     "sphere": ("position", "radius"),
     "cylinder": ("position", "radius", "length", "rotation"),
     "capsule": ("position", "radius", "length", "rotation"),
     "mesh": ("position", "mesh", "rotation", "scale"),
 }
-_UPRIGHT = ("x", "y", "top", "height")  # those of an upright box
+_UPRIGHT = ("x", "y", "top", "height")  # keys of an upright box
 _OPTIONAL = {"rotation": (0.0, 0.0, 0.0), "scale": (1.0, 1.0, 1.0)}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Obstacle:
-    """A convex body that stands still: an upright box given by ranges, or one of several kinds with a pose.
+    """Convex static obstacle: an upright box given by ranges, or another kind with a pose.
 
     With ``below`` its highest point touches the bottom of the object at that end of the motion; the z of a
-    ``position`` then says how much higher it is.
+    ``position`` is then an additional offset.
     """
 
     name: str = field("name of the obstacle")
     x: Range | None = field("extent of an upright box along world x", unit="m", default=None)
     y: Range | None = field("extent of an upright box along world y", unit="m", default=None)
     height: float | None = field(
-        "height of the upright box, measured down from its top; none: it extends down without end",
+        "height of the upright box, measured down from its top; default: without lower end",
         unit="m",
         default=None,
         low=1e-6,
     )
-    top: float | None = field("height of its upper face", unit="m", default=None)
-    below: str = field("the end whose object stands on this obstacle", choices=("", "start", "goal"), default="")
-    kind: str = field("what it is", choices=tuple(_KEYS), default="box", late=True)
+    top: float | None = field("height of the upper face", unit="m", default=None)
+    below: str = field("end whose object stands on this obstacle", choices=("", "start", "goal"), default="")
+    kind: str = field("kind of the obstacle", choices=tuple(_KEYS), default="box", since_version=2)
     position: tuple[float, float, float] | None = field(
-        "where its centre is, of a mesh the origin of its file: x, y, z", unit="m", default=None, late=True
+        "position of the centre, for a mesh of the origin of its file: x, y, z", unit="m", default=None, since_version=2
     )
     rotation: tuple[float, float, float] = field(
-        "how it is turned: roll, pitch and yaw about the world's axes, as <origin rpy> of a URDF",
+        "rotation: roll, pitch and yaw about the world's axes, as <origin rpy> of a URDF",
         unit="rad",
         default=_OPTIONAL["rotation"],
-        late=True,
+        since_version=2,
     )
     size: tuple[float, float, float] | None = field(
-        "edge lengths of a box", unit="m", default=None, low=1e-6, late=True
+        "edge lengths of a box", unit="m", default=None, low=1e-6, since_version=2
     )
     radius: float | None = field(
-        "radius of a sphere, a cylinder, a capsule", unit="m", default=None, low=1e-6, late=True
+        "radius of a sphere, a cylinder, a capsule", unit="m", default=None, low=1e-6, since_version=2
     )
     length: float | None = field(
-        "length of a cylinder or, without its round ends, of a capsule; both lie along their z axis",
+        "length of a cylinder, or of a capsule without its round ends, along its z axis",
         unit="m",
         default=None,
         low=1e-6,
-        late=True,
+        since_version=2,
     )
     mesh: str = field(
-        "mesh file (STL, DAE, OBJ), relative to the problem file, of which the convex hull counts",
+        "mesh file (STL, DAE, OBJ), relative to the problem file; its convex hull is used",
         default="",
-        late=True,
+        since_version=2,
     )
-    scale: tuple[float, float, float] = field("factors of the mesh's x, y and z", default=_OPTIONAL["scale"], late=True)
+    scale: tuple[float, float, float] = field(
+        "scale factors of the mesh along x, y and z", default=_OPTIONAL["scale"], since_version=2
+    )
 
     def find_mistakes(self) -> Iterator[tuple[str, str]]:
-        """Yield (key, what is wrong with it)."""
+        """Yield (key, mistake) pairs."""
         if self.upright:
             yield from self._mistakes_upright()
         else:
@@ -81,7 +83,7 @@ class Obstacle:
 
     @property
     def is_turned(self) -> bool:
-        """Whether its axes are not the world's."""
+        """Whether its axes differ from the world's axes."""
         return self.rotation != _OPTIONAL["rotation"]
 
     def _mistakes_upright(self) -> Iterator[tuple[str, str]]:
@@ -114,7 +116,7 @@ class Obstacle:
                 yield "mesh", str(error)
 
     def _given(self, keys: Iterable[str]) -> list[str]:
-        """List those of some keys that are given."""
+        """Return the given keys among some keys."""
         return [key for key in sorted(keys) if getattr(self, key) not in (None, "", _OPTIONAL.get(key))]
 
 

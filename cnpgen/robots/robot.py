@@ -1,4 +1,4 @@
-"""A robot: its Pinocchio model reduced to the planned joints, and the planning limits that the problem sets."""
+"""Robot: Pinocchio model, reduced to the planned joints, and planning limits of the problem."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -25,24 +25,24 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Robot:
-    """What every stage, kernel and check needs to know about the robot of a problem.
+    """Robot of a problem, used by stages, kernels and checks.
 
     Attributes:
-        urdf: The URDF file, for messages: it may be gone.
-        urdf_text: What was in it.
+        urdf: Path of the URDF file, for messages only; the file may be deleted.
+        urdf_text: Text of the URDF.
         joint_names: The n planned joints; every other joint of the URDF stays at zero.
-        tip: Name of the frame that the task is about, as the model has it.
-        attached: What the problem adds to the URDF's robot.
-        position_lower: Planning limits of joint positions [rad], shape (n,).
-        position_upper: Likewise, shape (n,).
+        tip: Name of the tip frame in the model.
+        attached: Attachments of the problem.
+        position_lower: Lower planning limits of joint positions [rad], shape (n,).
+        position_upper: Upper planning limits of joint positions [rad], shape (n,).
         velocity_limit: Symmetric planning limit of joint velocities [rad/s], shape (n,).
         acceleration_limit: Symmetric planning limit of joint accelerations [rad/s^2], shape (n,).
         jerk_limit: Symmetric planning limit of joint jerks [rad/s^3], shape (n,); only ``joint-jerk`` constrains them.
         torque_limit: Symmetric planning limit of joint torques [N m], shape (n,).
         rated_velocity: The URDF's own velocity limit [rad/s], shape (n,).
         base: Base configuration [rad], shape (n,).
-        chain: The numbers of the kinematic chain from the world to the tip.
-        shape: Its collision geometry; None where it is the paper's, a line through the joints' origins.
+        chain: Parameters of the kinematic chain from the world to the tip.
+        shape: Collision geometry; None for the paper's, a line through the joint origins.
     """
 
     urdf: Path
@@ -68,21 +68,21 @@ class Robot:
 
     @cached_property
     def sliding(self) -> tuple[bool, ...]:
-        """Of every joint whether it slides: in m, where one that turns is in rad."""
+        """Whether each joint is prismatic [m] and not revolute [rad]."""
         return tuple(joint.prismatic for joint in self.chain.joints)
 
     def units(self, turning: str) -> str:
-        """Name the units of a quantity of the joints by its unit at those that turn: see ``units_of_joints``."""
+        """Return the units of a joint quantity from its unit for revolute joints; see ``units_of_joints``."""
         return units_of_joints(turning, self.sliding)
 
     @cached_property
-    def skeleton(self) -> tuple[tuple[int, int], ...]:
-        """Segments that stand for the moving links: index pairs into (joint origins..., tip).
+    def capsule_axes(self) -> tuple[tuple[int, int], ...]:
+        """Segments that represent the moving links: index pairs into (joint origins..., tip).
 
-        Origins of successive joints are joined; points that coincide are merged, collinear neighbours (links of one
-        straight piece) become one segment, and what joint 1 cannot move is left out.
+        Segments connect the origins of successive joints. Coincident points are merged, collinear neighbors become one
+        segment, and parts that joint 1 does not move are omitted.
         """
-        return _skeleton(self.model, self.tip)
+        return _capsule_axes(self.model, self.tip)
 
     @cached_property
     def model(self) -> "pin.Model":
@@ -91,21 +91,21 @@ class Robot:
 
     @cached_property
     def tip_frame(self) -> int:
-        """Number of the tip's frame in the model."""
+        """Index of the tip frame in the model."""
         return frame_of(self.model, self.tip)
 
 
 def reduced_model(urdf: Path, text: str, joints: tuple[str, ...], attached: Attached) -> "pin.Model":
-    """Build the Pinocchio model of a URDF, reduced to the planned joints, with what a problem adds to it.
+    """Build the Pinocchio model of a URDF, reduced to the planned joints, with the attachments of a problem.
 
     Args:
-        urdf: The URDF file, for messages.
-        text: What is in it.
-        joints: The planned joints; all others are locked at zero.
-        attached: What is added.
+        urdf: Path of the URDF file, for messages.
+        text: Text of the URDF.
+        joints: Planned joints; all others are locked at zero.
+        attached: Attachments of the problem.
 
     Raises:
-        RecipeError: It is no URDF, or the joints are not in it in this order.
+        RecipeError: The text is not a URDF, or it lacks the joints in this order.
     """
     import pinocchio as pin
 
@@ -128,8 +128,8 @@ def reduced_model(urdf: Path, text: str, joints: tuple[str, ...], attached: Atta
     return reduced
 
 
-def _skeleton(model: "pin.Model", tip: str) -> tuple[tuple[int, int], ...]:
-    """Merge the chain of joint origins into segments; what is straight at random configurations always is."""
+def _capsule_axes(model: "pin.Model", tip: str) -> tuple[tuple[int, int], ...]:
+    """Merge the chain of joint origins into segments; parts that are straight at random configurations always are."""
     import pinocchio as pin
 
     data, random = model.createData(), np.random.default_rng(0)
@@ -146,7 +146,7 @@ def _skeleton(model: "pin.Model", tip: str) -> tuple[tuple[int, int], ...]:
 
     def straight(a: int, b: int, c: int) -> bool:
         first, second = points[:, b] - points[:, a], points[:, c] - points[:, b]
-        onwards = bool((first * second).sum(axis=1).min() > 0)  # a link that folds back is one of its own
+        onwards = bool((first * second).sum(axis=1).min() > 0)  # a link that folds back is a separate segment
         return onwards and bool(np.abs(np.cross(first, second)).max() < 1e-9)
 
     kept = [0]

@@ -1,10 +1,10 @@
-"""Obstacles as bodies, and the numbers that say where they are and how large.
+"""Obstacles as convex bodies, and the vectors of their poses and sizes.
 
-The numbers are what kernels and judges are told of obstacles, sample by sample. Those of one obstacle are, all in m,
+Kernels and judges receive poses and sizes of obstacles per sample. The entries of one obstacle are, all in m,
 
 * of an upright box given by ``x`` and ``y``: the height of its upper face;
 * of any other: its position, then
-  box: half its edge lengths, and the rows of its rotation matrix if it is turned;
+  box: half its edge lengths, and the rows of its rotation matrix if it is rotated;
   sphere: its radius;
   capsule, cylinder: the vector from its centre to the end of its axis, and its radius (of a cylinder that of the
   corners of the prism round it);
@@ -20,27 +20,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.robots.obstacle import Obstacle
+from cnpgen.robots.shape.convex_part import PRISM_SIDES, prism, turned
 from cnpgen.robots.shape.hull import CUBE, frame_along
 from cnpgen.robots.shape.inline import corners_of
-from cnpgen.robots.shape.piece import SIDES, prism, turned
 from cnpgen.schema.keys import Range
 
 Array = NDArray[np.float64]
 
-ENDLESS = 10.0  # m: height of the box that stands for an obstacle without a lower end
+UNBOUNDED_OBSTACLE_HEIGHT_M = 10.0  # height of the box that represents an obstacle without a lower end
 _NOTHING = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
 class Solid:
-    """A convex body where it stands: all points within ``radius`` of the hull of ``corners`` moved by ``position``.
+    """Convex body in the world: all points within ``radius`` of the hull of ``corners``, translated by ``position``.
 
     Attributes:
-        position: Where it is [m], shape (3,).
-        corners: Corners of the hull from there, along the world's axes [m], shape (V, 3).
-        low: Its lowest coordinates [m], shape (3,).
-        high: Its highest coordinates [m], shape (3,).
-        radius: How thick the hull is wrapped [m].
+        position: Position [m], shape (3,).
+        corners: Corners of the hull relative to the position, in world axes [m], shape (V, 3).
+        low: Lower corner of the bounding box [m], shape (3,).
+        high: Upper corner of the bounding box [m], shape (3,).
+        radius: Radius around the hull [m].
     """
 
     position: Array
@@ -50,36 +50,36 @@ class Solid:
     radius: float = 0.0
 
     def furthest(self, direction: Array) -> float:
-        """How far it reaches along a unit vector of shape (3,), from the world's origin [m]."""
+        """Return its extent along a unit vector of shape (3,), from the world's origin [m]."""
         return float(self.position @ direction + (self.corners @ direction).max() + self.radius)
 
 
 class Box(Solid):
-    """A box along the world's axes."""
+    """Box aligned with the world axes."""
 
     def furthest(self, direction: Array) -> float:
-        """Likewise."""
+        """Return its extent along a unit vector; see ``Solid``."""
         return float(np.where(direction > 0, self.high, self.low) @ direction)
 
 
 def same_shape(a: Solid, b: Solid) -> bool:
-    """Whether two bodies differ at most in where they are."""
+    """Return whether two bodies differ at most in their position."""
     return type(a) is type(b) and a.radius == b.radius and np.array_equal(a.corners, b.corners)
 
 
-def count_numbers(obstacles: Sequence[Obstacle]) -> int:
-    """How many numbers say where obstacles are and how large."""
+def pose_width(obstacles: Sequence[Obstacle]) -> int:
+    """Return the number of entries of the poses and sizes of obstacles."""
     return sum(map(_count, obstacles))
 
 
 def number_slices(obstacles: Sequence[Obstacle]) -> list[slice]:
-    """Say which of the numbers are those of each obstacle."""
+    """Return the slice of entries of each obstacle."""
     ends = accumulate(map(_count, obstacles), initial=0)
     return [slice(*pair) for pair in pairwise(ends)]
 
 
 def height_places(obstacles: Sequence[Obstacle]) -> list[int]:
-    """Say which of the numbers is the height of each obstacle."""
+    """Return the index of the height entry of each obstacle."""
     parts = number_slices(obstacles)
     return [part.start + (0 if each.upright else 2) for each, part in zip(obstacles, parts, strict=True)]
 
@@ -92,14 +92,14 @@ def _count(obstacle: Obstacle) -> int:
 
 
 def place_obstacles(obstacles: Sequence[Obstacle], bottoms: Mapping[str, Array] | None = None) -> Array:
-    """Compute the numbers of obstacles, shape (..., count_numbers).
+    """Compute poses and sizes of obstacles, shape (..., pose_width).
 
     Args:
-        obstacles: The obstacles.
+        obstacles: Obstacles of the problem.
         bottoms: Height of the object's bottom [m] at "start" and "goal", arrays of shape (...); by default 0.
     """
     bottoms = bottoms or {"start": np.zeros(()), "goal": np.zeros(())}
-    numbers = np.empty((*bottoms["start"].shape, count_numbers(obstacles)))
+    numbers = np.empty((*bottoms["start"].shape, pose_width(obstacles)))
     for obstacle, part in zip(obstacles, number_slices(obstacles), strict=True):
         if obstacle.upright:
             numbers[..., part.start] = bottoms[obstacle.below] if obstacle.top is None else obstacle.top
@@ -112,31 +112,31 @@ def place_obstacles(obstacles: Sequence[Obstacle], bottoms: Mapping[str, Array] 
 
 
 def _posed_numbers(obstacle: Obstacle) -> Array:
-    """Return the numbers of an obstacle with a pose, as its keys say."""
+    """Return the pose and size entries of an obstacle with a pose."""
     turn, radius, half = turned(*obstacle.rotation), obstacle.radius or 0.0, (obstacle.length or 0.0) / 2
     edges = np.array(obstacle.size or _NOTHING) / 2
     by_kind: dict[str, Sequence[float]] = {
         "box": [*edges, *(turn.ravel() if obstacle.is_turned else ())],
         "sphere": [radius],
         "capsule": [*(half * turn[:, 2]), radius],
-        "cylinder": [*(half * turn[:, 2]), radius / math.cos(math.pi / SIDES)],
+        "cylinder": [*(half * turn[:, 2]), radius / math.cos(math.pi / PRISM_SIDES)],
         "mesh": [*turn.ravel()],
     }
     return np.array([*(obstacle.position or _NOTHING), *by_kind[obstacle.kind]])
 
 
 def solids_of(obstacles: Sequence[Obstacle], numbers: Array) -> list[Solid]:
-    """Return the bodies that obstacles are.
+    """Return the convex bodies of obstacles.
 
     Args:
-        obstacles: The obstacles.
-        numbers: Their numbers, shape (count_numbers,).
+        obstacles: Obstacles of the problem.
+        numbers: Poses and sizes of the obstacles, shape (pose_width,).
     """
     return [_solid(each, numbers[part]) for each, part in zip(obstacles, number_slices(obstacles), strict=True)]
 
 
 def _solid(obstacle: Obstacle, numbers: Array) -> Solid:
-    """Return the body that an obstacle is; a cylinder is the prism of ``SIDES`` sides round it."""
+    """Return the convex body of an obstacle; a cylinder becomes a prism of ``PRISM_SIDES`` sides that contains it."""
     if obstacle.upright:
         return _upright_box(obstacle, float(numbers[0]))
     position, rest = numbers[:3], numbers[3:]
@@ -160,7 +160,7 @@ def _wrapped(position: Array, corners: Array, radius: float = 0.0) -> Solid:
 
 def _upright_box(obstacle: Obstacle, top: float) -> Box:
     x, y = obstacle.x or Range(0, 0), obstacle.y or Range(0, 0)
-    height = obstacle.height or ENDLESS
+    height = obstacle.height or UNBOUNDED_OBSTACLE_HEIGHT_M
     middle = np.array([(x.low + x.high) / 2, (y.low + y.high) / 2, top - height / 2])
     corners = CUBE * np.array([x.high - x.low, y.high - y.low, height])
     return Box(middle, corners, np.array([x.low, y.low, top - height]), np.array([x.high, y.high, top]))

@@ -1,4 +1,4 @@
-"""URDF files: read as UTF-8 text, and looked at before Pinocchio, which trusts them, reads them."""
+"""URDF files: read as UTF-8 text and validated as untrusted input before Pinocchio parses them."""
 
 import math
 import re
@@ -8,14 +8,16 @@ from xml.etree import ElementTree
 from cnpgen.errors import RecipeError
 from cnpgen.schema.texts import read_at_most, utf8_text
 
-MOST_BYTES = 1 << 23
-MOST_PARTS = 1_000  # links, and joints: Pinocchio descends a chain by recursion, and of 5,000 does not come back
-MOST_DEPTH = 64  # elements in one another
-_CONTROL = re.compile("[\t\n\r\x7f-\x9f]")  # other ones are no XML; parsers make spaces of a file's own line ends
+MAX_URDF_BYTES = 1 << 23
+MAX_URDF_ELEMENTS = 1_000  # links or joints: Pinocchio recurses along a chain and crashes at 5,000
+MAX_DEPTH = 64  # of nested elements
+_CONTROL = re.compile(
+    "[\t\n\r\x7f-\x9f]"
+)  # others are invalid in XML; parsers replace line ends in attributes by spaces
 
 
 class _Builder(ElementTree.TreeBuilder):
-    """Builds a tree of bounded depth, without a document type, which could define entities."""
+    """Tree builder of bounded depth that rejects document types, which could define entities."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -23,10 +25,10 @@ class _Builder(ElementTree.TreeBuilder):
 
     def start(self, tag: str, attrs: dict[str, str], /) -> ElementTree.Element:
         self._depth += 1
-        if self._depth > MOST_DEPTH:
-            raise ValueError(f"it has more than {MOST_DEPTH} elements in one another")
+        if self._depth > MAX_DEPTH:
+            raise ValueError(f"it has more than {MAX_DEPTH} nested elements")
         for name, value in attrs.items():
-            if _CONTROL.search(value):  # names are printed, and written into recipes' comments
+            if _CONTROL.search(value):  # names appear in output and in comments of recipes
                 raise ValueError(f"its <{tag} {name}=...> has control characters")
         return super().start(tag, attrs)
 
@@ -42,10 +44,10 @@ def read_urdf(path: Path) -> str:
     """Read the text of a URDF file.
 
     Raises:
-        RecipeError: It cannot be read, is too large or is not UTF-8.
+        RecipeError: The file cannot be read, is too large or is not UTF-8.
     """
     try:
-        return utf8_text(read_at_most(path, MOST_BYTES, "a URDF"), "utf-8", advice="; save the URDF as UTF-8")
+        return utf8_text(read_at_most(path, MAX_URDF_BYTES, "a URDF"), "utf-8", hint="; save the URDF as UTF-8")
     except OSError as error:
         raise RecipeError([f"{path}: cannot be read: {error.strerror or error}"]) from error
     except ValueError as error:
@@ -56,10 +58,10 @@ def urdf_tree(text: str) -> ElementTree.Element:
     """Parse the text of a URDF.
 
     Raises:
-        ValueError: It is not XML, or not what any robot needs: too deep, too large, with entities of its own.
+        ValueError: The text is not XML, too deep or too large, or it defines entities.
     """
-    if len(text) > MOST_BYTES:
-        raise ValueError(f"it has {len(text):,} characters, expected at most {MOST_BYTES:,}")
+    if len(text) > MAX_URDF_BYTES:
+        raise ValueError(f"it has {len(text):,} characters, expected at most {MAX_URDF_BYTES:,}")
     parser = ElementTree.XMLParser(target=_Builder(), encoding="utf-8")  # noqa: S314 - the builder allows no entities
     try:
         parser.feed(text.encode())
@@ -67,16 +69,16 @@ def urdf_tree(text: str) -> ElementTree.Element:
     except ElementTree.ParseError as error:
         raise ValueError(f"it is not XML: {error}") from error
     for part in ("link", "joint"):
-        if (count := sum(1 for _ in tree.iter(part))) > MOST_PARTS:
-            raise ValueError(f"it has {count:,} {part}s, expected at most {MOST_PARTS:,}")
+        if (count := sum(1 for _ in tree.iter(part))) > MAX_URDF_ELEMENTS:
+            raise ValueError(f"it has {count:,} {part}s, expected at most {MAX_URDF_ELEMENTS:,}")
     return tree
 
 
 def number_in(element: ElementTree.Element | None, attribute: str, default: float) -> float:
-    """Return a number that an element may have.
+    """Return a numeric attribute of an element.
 
     Raises:
-        ValueError: It has something else.
+        ValueError: The attribute is not a number.
     """
     text = default if element is None else element.get(attribute, default)
     try:

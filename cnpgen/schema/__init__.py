@@ -1,1 +1,1 @@
-"""What may be written, in TOML and in Python: keys with units and bounds, kinds by name, recipe files."""
+"""Schema of recipes in TOML and Python: keys with units and bounds, registered kinds, recipe files."""

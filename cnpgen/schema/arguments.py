@@ -1,4 +1,4 @@
-"""What functions are given from Python: whole numbers within bounds, finite numbers, arrays of them, yes or no."""
+"""Validation of Python arguments: bounded integers, finite numbers, arrays and flags."""
 
 import math
 import operator
@@ -13,16 +13,16 @@ Array = NDArray[Any]
 
 
 def integer(name: str, value: Any, *, least: int, most: int | None = None) -> int:
-    """Return an argument as an integer; NumPy's integers are some, True is none.
+    """Return an argument as an integer; accept NumPy integers, reject bool.
 
     Args:
-        name: The argument's name.
-        value: What was given.
-        least: The smallest that makes sense.
-        most: The largest one.
+        name: Name of the argument.
+        value: Value of the argument.
+        least: Minimum value.
+        most: Maximum value, None for no maximum.
 
     Raises:
-        UsageError: It is none, or too small or large.
+        UsageError: The value is not an integer, or out of range.
     """
     try:
         found = operator.index(value)
@@ -30,15 +30,15 @@ def integer(name: str, value: Any, *, least: int, most: int | None = None) -> in
         found = least - 1
     if not least <= found or (most is not None and found > most) or isinstance(value, bool):
         bounds = f"from {least} on" if most is None else f"from {least} to {most}"
-        raise UsageError(f"{name} must be an integer {bounds}, got {value!r}")
+        raise UsageError(f"must be an integer {bounds}, got {value!r}", argument=name)
     return found
 
 
 def number(name: str, value: Any) -> float:
-    """Return an argument as a float; any library's real numbers are some, texts, True, arrays and nan are none.
+    """Return an argument as a float; accept real scalars of all libraries, reject texts, bool, arrays and nan.
 
     Raises:
-        UsageError: It is none, or not finite.
+        UsageError: The value is not a finite number.
     """
     try:
         real = not isinstance(value, str | bytes | bool | np.bool_ | np.complexfloating) and np.ndim(value) == 0
@@ -46,25 +46,25 @@ def number(name: str, value: Any) -> float:
     except (TypeError, ValueError):
         found = math.nan
     if not math.isfinite(found):
-        raise UsageError(f"{name} must be a finite number, got {value!r:.100}")
+        raise UsageError(f"must be a finite number, got {value!r:.100}", argument=name)
     return found
 
 
 def numbers(name: str, values: ArrayLike, dtype: str = "float64", *, differentiable: bool = False) -> Array:
-    """Return an argument as an array of floats, nan and inf included; texts, dates and complex numbers are none.
+    """Return an argument as an array of floats; accept nan and inf, reject texts, dates and complex numbers.
 
     Args:
-        name: The argument's name.
-        values: What was given: numbers, lists of them, arrays, or tensors on the CPU.
+        name: Name of the argument.
+        values: Numbers, lists of numbers, arrays, or tensors on the CPU.
         dtype: "float64" or "float32".
-        differentiable: Whether a gradient must not be lost: tensors that carry one are then refused, else detached.
+        differentiable: Whether tensors with gradients raise an error; otherwise they are detached.
 
     Raises:
-        UsageError: These are no real numbers, or rows of different lengths, or not in the memory of this process.
+        UsageError: The values are not real numbers, have rows of different lengths, or are not in CPU memory.
     """
-    if type(values) is np.ndarray and values.dtype == dtype:  # as most are
+    if type(values) is np.ndarray and values.dtype == dtype:  # the usual case
         return values
-    wrong = f"{name} must be an array of numbers, got {type(values).__name__}"
+    wrong = f"must be an array of numbers, got {type(values).__name__}"
     try:
         detached = values.detach() if hasattr(values, "detach") and not differentiable else values
         array = np.asarray(detached)
@@ -74,19 +74,19 @@ def numbers(name: str, values: ArrayLike, dtype: str = "float64", *, differentia
             real: Array = array.real.astype(dtype, copy=False)
     except (TypeError, ValueError, RuntimeError) as error:  # the last from torch
         uneven = "inhomogeneous" in str(error)
-        raise UsageError(f"{wrong}: {'its rows have different lengths' if uneven else error}") from error
+        raise UsageError(f"{wrong}: {'its rows have different lengths' if uneven else error}", argument=name) from error
     missing = array.dtype.kind == "O" and any(value is None for value in array.flat)
-    if array.dtype.kind in "cUSmM" or missing:  # NumPy would drop imaginary parts, and read texts and None
-        raise UsageError(f"{wrong}: {array.dtype} is no real type")
+    if array.dtype.kind in "cUSmM" or missing:  # NumPy would drop imaginary parts and convert texts and None
+        raise UsageError(f"{wrong}: {array.dtype} is no real type", argument=name)
     return real
 
 
 def flag(name: str, value: Any) -> bool:
-    """Return an argument that must be True or False; NumPy's are some, 1 and "no" are none.
+    """Return an argument as a bool; accept NumPy's bool, reject other types such as 1 and "no".
 
     Raises:
-        UsageError: It is neither.
+        UsageError: The value is not a bool.
     """
     if not isinstance(value, bool | np.bool_):
-        raise UsageError(f"{name} must be True or False, got {value!r:.100}")
+        raise UsageError(f"must be True or False, got {value!r:.100}", argument=name)
     return bool(value)

@@ -1,4 +1,4 @@
-"""Recipes by name or path: those that cnpgen ships, anybody's files, and what reads and builds them."""
+"""Recipes by name or path: shipped recipes, user files, and their readers."""
 
 import os
 from collections.abc import Callable, Iterable
@@ -7,16 +7,16 @@ from typing import Any, TypeVar
 
 from cnpgen.errors import RecipeError, either, nearest
 from cnpgen.schema import registry
-from cnpgen.schema.keys import Place
+from cnpgen.schema.keys import RecipeLocation
 from cnpgen.schema.parsing import Reader, parse
 from cnpgen.schema.toml import Kind
 from cnpgen.schema.units import show
 
 Recipe = TypeVar("Recipe")
 
-LONGEST = 200  # characters of a name that a message repeats
+MAX_NAME_LENGTH = 200  # of a name in messages
 
-_LAYOUT: dict[Kind, str] = {  # where the shipped files of a kind are
+_LAYOUT: dict[Kind, str] = {  # paths of the shipped files of a kind
     "problem": "problems/*/problem.toml",
     "pipeline": "pipelines/*.toml",
     "dataset": "datasets/*.toml",
@@ -39,17 +39,17 @@ def recipes_root() -> Path:
 
 
 def find_file(kinds: tuple[Kind, ...], name_or_path: str | Path, folder: Path | None) -> Path:
-    """Find a recipe of one of several kinds, the first one first; a ValueError says why there is none."""
+    """Find a recipe of one of several kinds, in this priority; raise ValueError if there is none."""
     text = os.fspath(name_or_path)
     path = (folder or Path()) / text
-    shown = text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
+    shown = text if len(text) <= MAX_NAME_LENGTH else f"{text[:MAX_NAME_LENGTH]}..."
     known = {name: file for kind in reversed(kinds) for name, file in list_recipes(kind).items()}
     is_path = isinstance(name_or_path, Path) or text.endswith(".toml") or "/" in text or os.sep in text
-    if os.path.isfile(path):  # noqa: PTH113 - Path.is_file raises where a name is too long
+    if os.path.isfile(path):  # noqa: PTH113 - Path.is_file raises for names that are too long
         return path
     if is_path:
         hint = nearest(Path(shown).stem, known)
-        if os.path.isdir(path):  # noqa: PTH112 - likewise
+        if os.path.isdir(path):  # noqa: PTH112 - as above
             raise ValueError(f"{path} is a folder, expected a .toml file")
         raise ValueError(f"no such file: {(folder or Path()) / shown}{hint}")
     if text not in known:
@@ -59,7 +59,7 @@ def find_file(kinds: tuple[Kind, ...], name_or_path: str | Path, folder: Path | 
 
 
 def _hint(text: str, kinds: tuple[Kind, ...], known: Iterable[str]) -> str:
-    """Say of which other kinds there is a recipe of this name, or which known name is near."""
+    """Return a hint: other kinds with a recipe of this name, or a similar known name."""
     others = " and ".join(f"a {kind}" for kind in _LAYOUT if kind not in kinds and text in list_recipes(kind))
     return f": it is the name of {others}" if others else nearest(text, known)
 
@@ -83,27 +83,27 @@ def load_recipe(
 
 
 def reference(kind: Kind, build: Callable[[Path, list[str]], Any], folder: Path) -> Reader:
-    """Return what reads a key that names another recipe."""
+    """Return a reader of keys that refer to another recipe."""
 
-    def read(value: Any, where: Place, mistakes: list[str]) -> Any:
+    def read(value: Any, where: RecipeLocation, mistakes: list[str]) -> Any:
         if isinstance(value, str):
             return build(find_file((kind,), value, folder), mistakes)
-        mistakes.append(where.says(f"expected a name or a path, got {show(value)}"))
+        mistakes.append(where.message(f"expected a name or a path, got {show(value)}"))
         return None
 
     return read
 
 
-def read_kind(group: str, value: Any, where: Place, mistakes: list[str]) -> Any:
+def read_kind(group: str, value: Any, where: RecipeLocation, mistakes: list[str]) -> Any:
     """Read a ``[[stage]]`` or ``[[constraint]]`` table, whose key ``use`` names the kind."""
     use = value.get("use") if isinstance(value, dict) else None
     if not isinstance(use, str):
-        mistakes.append((where / "use").says(f"missing key, expected one of {', '.join(registry.names(group))}"))
+        mistakes.append((where / "use").message(f"missing key, expected one of {', '.join(registry.names(group))}"))
         return None
     try:
         kind = registry.load(group, use)
     except RecipeError as error:
-        mistakes.extend((where / "use").says(text) for text in error.mistakes)
+        mistakes.extend((where / "use").message(text) for text in error.mistakes)
         return None
     rest = {key: entry for key, entry in value.items() if key != "use"}
     return parse(kind, rest, where=where, mistakes=mistakes)

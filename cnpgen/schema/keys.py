@@ -1,4 +1,4 @@
-"""Dataclasses whose fields are the keys of recipe tables: what each may be, in which unit, within which bounds."""
+"""Keys of recipe tables, declared as dataclass fields with units and bounds."""
 
 import dataclasses
 import json
@@ -13,7 +13,7 @@ from cnpgen.schema.units import dimension, show
 
 @dataclass(frozen=True)
 class Range:
-    """A closed interval; ``"0.16 m"`` reads as a single point.
+    """Closed interval; ``"0.16 m"`` is a single point.
 
     Attributes:
         low: Lower end, SI unit.
@@ -26,10 +26,10 @@ class Range:
 
 @dataclass(frozen=True)
 class PerJoint:
-    """One number for every planned joint: ``"2 rad/s"`` for all of them, or a list.
+    """One number per planned joint: ``"2 rad/s"`` for all joints, or a list.
 
     Attributes:
-        values: The numbers, SI unit; one, or one per joint.
+        values: Numbers in the SI unit; one, or one per joint.
     """
 
     values: tuple[float, ...]
@@ -45,37 +45,39 @@ def field(
     choices: tuple[str, ...] = (),
     pattern: str = "",
     form: str = "",
-    late: bool = False,
+    since_version: int = 1,
 ) -> Any:
     """Declare a key of a recipe table.
 
     Args:
-        doc: What the key means, in a few words.
-        unit: SI unit that the value is stored in; a quantity string in another unit of the same dimension is converted.
-        default: Value when the key is absent; without it the key is required.
-        low: Smallest allowed number.
-        high: Largest allowed number.
+        doc: Short description of the key.
+        unit: SI unit of the stored value; quantities in other units of the same dimension are converted.
+        default: Value of an absent key; without a default the key is required.
+        low: Minimum value.
+        high: Maximum value.
         choices: Allowed strings.
         pattern: Regular expression that a string, or the names in a table of integers, must match.
-        form: How the value is written, where the type does not say it.
-        late: Whether recipes were written down before there was this key: at its default it is left out, so that they
-            keep their digests.
+        form: Notation of the value, if the type does not determine it.
+        since_version: First version of the recipe schema with this key. Keys of versions later than 1 are omitted from
+            records at their default, so that digests of older recipes stay the same.
 
     Returns:
         A dataclass field with this as metadata.
     """
     bounds = {"low": low, "high": high, "choices": choices, "pattern": pattern}
-    return dataclasses.field(default=default, metadata={"doc": doc, "unit": unit, "form": form, "late": late, **bounds})
+    return dataclasses.field(
+        default=default, metadata={"doc": doc, "unit": unit, "form": form, "since_version": since_version, **bounds}
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Key:
-    """A key of a recipe table, as ``field`` declared it.
+    """Key of a recipe table, declared by ``field``.
 
     Attributes:
-        name: The key.
+        name: Name of the key.
         hint: Type of the dataclass field, without ``| None``.
-        default: Value when the key is absent, ``dataclasses.MISSING`` if it is required.
+        default: Value of an absent key, ``dataclasses.MISSING`` for required keys.
     """
 
     name: str
@@ -88,7 +90,7 @@ class Key:
     choices: tuple[str, ...]
     pattern: str
     form: str
-    late: bool
+    since_version: int
 
     @property
     def required(self) -> bool:
@@ -97,17 +99,17 @@ class Key:
 
     @property
     def expected(self) -> str:
-        """What to write, in a few words: ``"a range, each end a length [m]"``."""
+        """Short description of valid values: ``"a range, each end a length [m]"``."""
         if self.choices:
             return "one of " + ", ".join(show(choice) for choice in self.choices)
         return self.form or _expected(self.hint, self.unit)
 
 
 def keys(cls: type) -> tuple[Key, ...]:
-    """List the keys of the table that a dataclass is read from, in order.
+    """List the keys of a dataclass, in order.
 
     Args:
-        cls: A dataclass; its fields that ``field`` did not declare are no keys.
+        cls: Dataclass; fields that are not declared with ``field`` are not keys.
     """
     hints = get_type_hints(cls)
     return tuple(
@@ -118,22 +120,22 @@ def keys(cls: type) -> tuple[Key, ...]:
 
 
 @dataclass(frozen=True)
-class Place:
-    """Where in which file something is: ``place / "robot" / "base"``, ``place / "stage" / 3``.
+class RecipeLocation:
+    """Location in a recipe file: ``location / "robot" / "base"``, ``location / "stage" / 3``.
 
-    Entries of a list are shown as people count them: the first stage is "stage 1".
+    Messages count list entries from 1: the first stage is "stage 1".
     """
 
     file: str
     key: str = ""
 
-    def __truediv__(self, key: str | int) -> "Place":
+    def __truediv__(self, key: str | int) -> "RecipeLocation":
         if isinstance(key, int):
-            return Place(self.file, f"{self.key} {key + 1}")
+            return RecipeLocation(self.file, f"{self.key} {key + 1}")
         bare = key if re.fullmatch(r"[\w-]{1,60}", key) else json.dumps(key[:60])
-        return Place(self.file, f"{self.key}.{bare}" if self.key else bare)
+        return RecipeLocation(self.file, f"{self.key}.{bare}" if self.key else bare)
 
-    def says(self, text: str) -> str:
+    def message(self, text: str) -> str:
         """Return ``"FILE: key: text"``."""
         return ": ".join(part for part in (self.file, self.key, text) if part)
 
@@ -142,13 +144,13 @@ def to_dict(obj: Any, *, label: Callable[[Any], Mapping[str, Any]] = lambda _: {
     """Turn an object declared with ``field`` into plain dicts, lists, numbers and strings, all in SI.
 
     Args:
-        obj: The object; its fields that are no keys are left out.
-        label: What else to write for a nested object, such as its registered name.
+        obj: Object; fields that are not keys are omitted.
+        label: Function that returns further entries of an object, such as its registered name.
     """
     values = ((key, getattr(obj, key.name)) for key in keys(type(obj)))
     return {
         **label(obj),
-        **{k.name: _plain(value, label) for k, value in values if not (k.late and value == k.default)},
+        **{k.name: _plain(value, label) for k, value in values if not (k.since_version > 1 and value == k.default)},
     }
 
 
@@ -165,7 +167,7 @@ def _plain(value: Any, label: Callable[[Any], Mapping[str, Any]]) -> Any:
 
 
 def _present(hint: Any) -> Any:
-    """Return ``X`` for ``X | None``: TOML has no null, a key is there or not."""
+    """Return ``X`` for ``X | None``, since TOML has no null."""
     if get_origin(hint) not in (Union, UnionType):
         return hint
     options = [option for option in get_args(hint) if option is not type(None)]
@@ -173,7 +175,7 @@ def _present(hint: Any) -> Any:
 
 
 def _expected(hint: Any, unit: str) -> str:
-    """Say what a value of a type is, in a few words."""
+    """Return a short description of the values of a type."""
     args = get_args(hint)
     if get_origin(hint) is tuple:
         count = "a list" if args[-1] is Ellipsis else f"a list of {len(args)}"

@@ -1,4 +1,4 @@
-"""Dataclasses from TOML tables: types, units and bounds checked, every mistake reported with its file and key."""
+"""Parser of TOML tables to dataclasses: checks types, units and bounds, and reports mistakes with file and key."""
 
 import dataclasses
 import re
@@ -8,37 +8,37 @@ from dataclasses import MISSING, dataclass
 from typing import Any, NoReturn, TypeVar, get_args, get_origin
 
 from cnpgen.errors import nearest
-from cnpgen.schema.keys import Key, PerJoint, Place, Range, keys
+from cnpgen.schema.keys import Key, PerJoint, Range, RecipeLocation, keys
 from cnpgen.schema.units import parse_number, parse_numbers, parse_range, show
 
 T = TypeVar("T")
 
-MOST_UNKNOWN = 20  # unknown keys of a table that are named; the others are counted
+MAX_UNKNOWN_KEYS = 20  # unknown keys of a table that messages name
 
-Reader = Callable[[Any, Place, list[str]], Any]
-"""A function of (TOML value, where it is, mistakes) that returns an object, or None after adding to the mistakes."""
+Reader = Callable[[Any, RecipeLocation, list[str]], Any]
+"""Function of (TOML value, location, mistakes) that returns an object, or None after adding to the mistakes."""
 
 
 def parse(
     cls: type[T],
     table: object,
     *,
-    where: Place,
+    where: RecipeLocation,
     mistakes: list[str],
     readers: Mapping[type, Reader] | None = None,
 ) -> T | None:
     """Build a dataclass declared with ``field`` from a TOML table.
 
-    What types and bounds cannot say, a dataclass checks itself: with a ValueError in ``__post_init__``, or with a
-    method ``find_mistakes()`` that yields pairs (key, what is wrong). The latter is also asked where other keys have
-    mistakes, and then gets as far as it needs none of those.
+    Further conditions are checked by the dataclass, with a ValueError in ``__post_init__`` or a method
+    ``find_mistakes()`` that yields (key, mistake) pairs. The method also runs if other keys have mistakes, and then
+    stops at the first use of such a key.
 
     Args:
-        cls: The dataclass.
-        table: What the TOML parser returned.
-        where: Where the table is.
-        mistakes: Every mistake is appended to it, one line each.
-        readers: How to read fields of types that are not written as a table of their own keys.
+        cls: Dataclass to build.
+        table: Result of the TOML parser.
+        where: Location of the table.
+        mistakes: List to which mistakes are appended, one line each.
+        readers: Readers of field types that are not tables of their own keys.
 
     Returns:
         The object with all values in SI, or None if there was a mistake.
@@ -51,32 +51,32 @@ def parse(
 
 @dataclass(frozen=True)
 class _Parser:
-    """Reads values of any supported type; what comes after a mistake is None, which no TOML value is."""
+    """Parser of values of all supported types; None marks a mistake, since TOML has no null."""
 
     mistakes: list[str]
     readers: Mapping[type, Reader]
 
-    def attempt(self, read: Callable[[], Any], where: Place) -> Any:
+    def attempt(self, read: Callable[[], Any], where: RecipeLocation) -> Any:
         try:
             return read()
         except ValueError as error:
-            self.mistakes.append(where.says(str(error)))
+            self.mistakes.append(where.message(str(error)))
             return None
 
-    def table(self, cls: type[T], table: Any, where: Place) -> T | None:
+    def table(self, cls: type[T], table: Any, where: RecipeLocation) -> T | None:
         if not isinstance(table, dict):
             raise ValueError(f"expected a table, got {show(table)}")  # noqa: TRY004 - a user's mistake
         before = len(self.mistakes)
         known = {key.name: key for key in keys(cls)}
         unknown = [name for name in table if name not in known]
-        for name in unknown[:MOST_UNKNOWN]:
+        for name in unknown[:MAX_UNKNOWN_KEYS]:
             hint = nearest(name, known) or f", known: {', '.join(known)}"
-            self.mistakes.append((where / name).says(f"unknown key{hint}"))
-        if len(unknown) > MOST_UNKNOWN:
-            self.mistakes.append(where.says(f"and {len(unknown) - MOST_UNKNOWN:,} more unknown keys"))
+            self.mistakes.append((where / name).message(f"unknown key{hint}"))
+        if len(unknown) > MAX_UNKNOWN_KEYS:
+            self.mistakes.append(where.message(f"and {len(unknown) - MAX_UNKNOWN_KEYS:,} more unknown keys"))
         for name, key in known.items():
             if key.required and name not in table:
-                self.mistakes.append((where / name).says(f"missing key, expected {key.expected}: {key.doc}"))
+                self.mistakes.append((where / name).message(f"missing key, expected {key.expected}: {key.doc}"))
         given = [key for name, key in known.items() if name in table]
         values = {key.name: self.value(key.hint, table[key.name], key, where / key.name) for key in given}
         if len(self.mistakes) == before:
@@ -86,13 +86,13 @@ class _Parser:
         self.check(_first_mistakes_of(_partly(cls, known, values)), where)
         return None
 
-    def check(self, mistakes: Iterable[tuple[str, str]], where: Place) -> None:
-        self.mistakes.extend((where / name).says(text) for name, text in mistakes)
+    def check(self, mistakes: Iterable[tuple[str, str]], where: RecipeLocation) -> None:
+        self.mistakes.extend((where / name).message(text) for name, text in mistakes)
 
-    def value(self, hint: Any, value: Any, key: Key, where: Place) -> Any:
+    def value(self, hint: Any, value: Any, key: Key, where: RecipeLocation) -> Any:
         return self.attempt(lambda: self.read(hint, value, key, where), where)
 
-    def read(self, hint: Any, value: Any, key: Key, where: Place) -> Any:
+    def read(self, hint: Any, value: Any, key: Key, where: RecipeLocation) -> Any:
         args = get_args(hint)
         if hint in self.readers:
             return self.readers[hint](value, where, self.mistakes)
@@ -108,7 +108,7 @@ class _Parser:
             return self.array(args[0], None if args[1] is Ellipsis else len(args), value, key, where)
         raise ValueError(f"the type of this key, {hint}, is not one that a recipe can hold")
 
-    def array(self, hint: Any, count: int | None, values: Any, key: Key, where: Place) -> tuple[Any, ...]:
+    def array(self, hint: Any, count: int | None, values: Any, key: Key, where: RecipeLocation) -> tuple[Any, ...]:
         _check_filled(list, values, key)
         if hint is Range and any(isinstance(item, int | float) for item in values):
             raise ValueError(f"expected a list of ranges, got {show(values)}; write a point as [0.1, 0.1]")
@@ -116,26 +116,26 @@ class _Parser:
             raise ValueError(f"expected {count} entries, got {len(values)}: {show(values)}")
         return tuple(self.value(hint, item, key, where / index) for index, item in enumerate(values))
 
-    def entries(self, hint: Any, values: Any, key: Key, where: Place) -> dict[str, Any]:
+    def entries(self, hint: Any, values: Any, key: Key, where: RecipeLocation) -> dict[str, Any]:
         _check_filled(dict, values, key)
         for name in values:
             if key.pattern and not re.fullmatch(key.pattern, name):
-                self.mistakes.append((where / name).says(f"the name {show(name)} does not match {key.pattern}"))
+                self.mistakes.append((where / name).message(f"the name {show(name)} does not match {key.pattern}"))
         return {name: self.value(hint, item, key, where / name) for name, item in values.items()}
 
 
 class _Wrong:
-    """Stands for a value with a mistake: nothing that depends on it can be checked."""
+    """Placeholder of a value with a mistake; every use raises TypeError."""
 
     def _refuse(self, *_: Any) -> NoReturn:
-        raise TypeError("nothing is known of a value with a mistake")
+        raise TypeError("a value with a mistake cannot be used")
 
     __bool__ = __len__ = __iter__ = __eq__ = __ne__ = __lt__ = __le__ = __gt__ = __ge__ = _refuse
     __hash__ = None  # type: ignore[assignment]
 
 
 def _partly(cls: type[T], known: Mapping[str, Key], values: Mapping[str, Any]) -> T:
-    """Build an object of which some values have mistakes or are missing."""
+    """Build an object with placeholders for missing values and values with mistakes."""
     made = object.__new__(cls)
     for name, key in known.items():
         value = values.get(name, key.default)
@@ -149,11 +149,11 @@ def _mistakes_of(made: object) -> Iterable[tuple[str, str]]:
 
 
 def _first_mistakes_of(made: object) -> list[tuple[str, str]]:
-    """List the mistakes of an object up to the first check that needs a value which has one."""
+    """List the mistakes of an object up to the first check that uses a value with a mistake."""
     found: list[tuple[str, str]] = []
     with suppress(TypeError, AttributeError):
         for mistake in _mistakes_of(made):
-            found.append(mistake)  # noqa: PERF402 - what was found before an error is kept
+            found.append(mistake)  # noqa: PERF402 - keeps the mistakes before an error
     return found
 
 

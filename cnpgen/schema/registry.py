@@ -1,4 +1,4 @@
-"""The registry of stages, constraints and planners: built-in kinds by name, others from installed packages."""
+"""Registry of stages, constraints and planners: built-in kinds, and kinds of installed packages."""
 
 import contextlib
 import dataclasses
@@ -18,10 +18,10 @@ STAGES = "cnpgen.stages"
 CONSTRAINTS = "cnpgen.constraints"
 PLANNERS = "cnpgen.planners"
 
-CONTRACTS: dict[str, str] = {  # what a kind is a subclass of
+CONTRACTS: dict[str, str] = {  # base class of the kinds of a group
     STAGES: "cnpgen.pipelines.stages.stage:Stage",
     CONSTRAINTS: "cnpgen.problems.constraints.constraint:Constraint",
-    PLANNERS: "cnpgen.benchmark.planner:BenchmarkPlanner",
+    PLANNERS: "cnpgen.benchmark.benchmark_planner:BenchmarkPlanner",
 }
 
 BUILT_IN: dict[str, dict[str, str]] = {
@@ -37,9 +37,9 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "home": "cnpgen.pipelines.stages.home:Home",
         "hitting-configuration": "cnpgen.pipelines.stages.hitting_configuration:HittingConfiguration",
         "hitting-velocity": "cnpgen.pipelines.stages.hitting_velocity:HittingVelocity",
-        "at-rest": "cnpgen.pipelines.stages.motion:AtRest",
-        "table-velocity": "cnpgen.pipelines.stages.motion:TableVelocity",
-        "table-acceleration": "cnpgen.pipelines.stages.motion:TableAcceleration",
+        "at-rest": "cnpgen.pipelines.stages.boundary_motion:AtRest",
+        "table-velocity": "cnpgen.pipelines.stages.boundary_motion:TableVelocity",
+        "table-acceleration": "cnpgen.pipelines.stages.boundary_motion:TableAcceleration",
         "ballistic-reach": "cnpgen.pipelines.stages.reach:BallisticReach",
         "braking-reach": "cnpgen.pipelines.stages.braking:BrakingReach",
         "collision": "cnpgen.pipelines.stages.collision:Collision",
@@ -114,18 +114,18 @@ def load(group: str, name: str) -> type[Any]:
 
 
 def contract(group: str) -> type[Any]:
-    """Import the class that every kind of a group is a subclass of."""
+    """Import the base class of a group."""
     kind: type[Any] = _named(CONTRACTS[group])
     return kind
 
 
 def noun_of(group: str) -> str:
-    """Say what a kind of a group is: "stage", "constraint" or "planner"."""
+    """Return the noun of a group: "stage", "constraint" or "planner"."""
     return group.removeprefix("cnpgen.").removesuffix("s")
 
 
 def group_of(kind: type) -> str:
-    """Return the group that a class is a kind of; empty if it is none."""
+    """Return the group of a class; empty for other classes."""
     bases = {f"{base.__module__}:{base.__qualname__}" for base in kind.__mro__}
     return next((group for group, name in CONTRACTS.items() if name in bases), "")
 
@@ -142,7 +142,7 @@ def name_of(group: str, kind: type) -> str:
         if built_in == spec:
             return name
     for entry in installed(group):
-        with contextlib.suppress(RecipeError):  # a broken plug-in is no reason to fail here
+        with contextlib.suppress(RecipeError):  # ignores broken plug-ins
             if entry.value == spec or load(group, entry.name) is kind:
                 return entry.name
     return spec
@@ -160,7 +160,7 @@ def source_digest(kind: type) -> str:
 def package_digest(package: str) -> str:
     """Hash the source files of an imported top-level package or module; empty if it has none."""
     module = sys.modules.get(package)
-    folders = [Path(folder) for folder in getattr(module, "__path__", ())]  # more than one of a namespace package
+    folders = [Path(folder) for folder in getattr(module, "__path__", ())]  # a namespace package has several
     source = getattr(module, "__file__", None)
     files = [file for folder in folders for file in sorted(folder.rglob("*.py"))]
     if not folders and source:
@@ -178,7 +178,7 @@ def package_of(group: str, kind: type) -> str:
 
 
 def why_missing(group: str, use: str, package: str) -> str:
-    """Say which package to install for a kind that a recipe of somebody else names; empty if the kind is there.
+    """Return the missing package of a kind in a recipe; empty if the kind exists.
 
     Args:
         group: ``STAGES``, ``CONSTRAINTS`` or ``PLANNERS``.
@@ -198,12 +198,12 @@ def why_missing(group: str, use: str, package: str) -> str:
 
 @functools.cache
 def installed(group: str) -> tuple[importlib.metadata.EntryPoint, ...]:
-    """List the entry points of installed packages; reading their metadata takes milliseconds, so it is done once."""
+    """List the entry points of installed packages; cached, since reading their metadata takes milliseconds."""
     return tuple(importlib.metadata.entry_points(group=group))
 
 
 def _sources(group: str, name: str) -> dict[str, Callable[[], Any]]:
-    """List who defines a kind, and how to import it from there."""
+    """List the packages that define a kind, with import paths."""
     found: dict[str, Callable[[], Any]] = {}
     if name in BUILT_IN[group]:
         found["cnpgen"] = lambda: _named(BUILT_IN[group][name])
@@ -215,7 +215,7 @@ def _sources(group: str, name: str) -> dict[str, Callable[[], Any]]:
 
 
 def _named(spec: str) -> Any:
-    """Import what ``"module:name"`` says."""
+    """Import the object ``"module:name"``."""
     module, _, attribute = spec.partition(":")
     return getattr(importlib.import_module(module), attribute)
 
@@ -224,7 +224,7 @@ def _imported(importer: Callable[[], Any], what: str, *, base: type) -> type[Any
     """Import a class and check that it is a concrete kind of ``base``."""
     try:
         kind = importer()
-    except Exception as error:  # somebody else's module may raise anything while it is imported
+    except Exception as error:  # imported modules may raise any exception
         raise RecipeError([f"{what} cannot be imported: {type(error).__name__}: {error}"]) from error
     if not (inspect.isclass(kind) and issubclass(kind, base)):
         raise RecipeError([f"{what} is not a subclass of {base.__module__}.{base.__name__}, got {kind!r}"])
@@ -235,7 +235,7 @@ def _imported(importer: Callable[[], Any], what: str, *, base: type) -> type[Any
 
 
 def _faults(kind: type[Any]) -> Iterator[str]:
-    """Say what keeps a class from being read from a table."""
+    """Return the reason why a class cannot be read from a table."""
     if inspect.isabstract(kind):
         yield f"{kind.__name__} is abstract, it does not define {', '.join(sorted(kind.__abstractmethods__))}"
     if "__dataclass_params__" not in vars(kind):

@@ -1,4 +1,4 @@
-"""Recipe files as tables: TOML read, with the line of a mistake, and of which kind a table is."""
+"""Reader of recipe files: TOML tables, line numbers of mistakes, kinds of recipes."""
 
 import re
 import tomllib
@@ -15,19 +15,19 @@ MARKS: dict[Kind, set[str]] = {
     "dataset": {"splits", "pipeline"},
     "suite": {"pucks", "turns", "draws"},
 }
-"""Top-level keys that only files of a kind have."""
+"""Top-level keys that are specific to a kind."""
 
 
-# What strangers' files may be, looked at before they are parsed: tomllib takes the square of a key's parts as its time.
-MOST_BYTES = 1 << 18
-MOST_PARTS = 16  # of a key: a.b.c has three
+# Limits of untrusted files, checked before parsing: the time of tomllib is quadratic in the parts of a key.
+MAX_RECIPE_BYTES = 1 << 18
+MAX_KEY_PARTS = 16  # a.b.c has three
 _LONG_KEY = re.compile(
-    rf"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){{{MOST_PARTS}}}""", re.ASCII
+    rf"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){{{MAX_KEY_PARTS}}}""", re.ASCII
 )
 
 
 def kind_of_file(path: Path) -> Kind:
-    """Tell the kind of a recipe file by its keys; "dataset" where they do not tell or it cannot be read."""
+    """Return the kind of a recipe file from its keys; "dataset" if it is unknown or the file cannot be read."""
     try:
         table = _read(path)
     except (OSError, ValueError):
@@ -47,7 +47,7 @@ def read_table(path: Path, kinds: tuple[Kind, ...], mistakes: list[str]) -> dict
 
 
 def _expect(kinds: tuple[Kind, ...], table: dict[str, Any]) -> dict[str, Any]:
-    """Return the table unless it is clearly a recipe of another kind."""
+    """Return the table; raise ValueError if it is a recipe of another kind."""
     found = [kind for kind in MARKS if is_kind(kind, table)]
     if found and not set(found) & set(kinds):
         raise ValueError(f"is a {found[0]}, expected a {' or a '.join(kinds)}")
@@ -55,12 +55,12 @@ def _expect(kinds: tuple[Kind, ...], table: dict[str, Any]) -> dict[str, Any]:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """Read a file and parse it as TOML; a ValueError says that it is none, or in which line it is wrong."""
-    data = read_at_most(path, MOST_BYTES, "a recipe")
+    """Read a file and parse it as TOML; raise ValueError with the line of a mistake."""
+    data = read_at_most(path, MAX_RECIPE_BYTES, "a recipe")
     content = utf8_text(data)
     if key := _LONG_KEY.search(content):
         line = content.count("\n", 0, key.start()) + 1
-        raise ValueError(f"line {line}: a key has more than {MOST_PARTS} parts")
+        raise ValueError(f"line {line}: a key has more than {MAX_KEY_PARTS} parts")
     try:
         return tomllib.loads(content)
     except (ValueError, RecursionError) as error:
@@ -72,5 +72,5 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def is_kind(kind: Kind, table: dict[str, Any]) -> bool:
-    """Whether a top-level table has a key that only recipes of this kind have."""
+    """Return whether a top-level table has a key that is specific to a kind."""
     return not MARKS[kind].isdisjoint(table)

@@ -1,4 +1,4 @@
-"""Quantities as people write them, ``"50 ms"`` or ``"[0.6, 1.3] m"``, read as floats in SI units."""
+"""Quantities such as ``"50 ms"`` or ``"[0.6, 1.3] m"``, parsed to floats in SI units."""
 
 import math
 import re
@@ -27,7 +27,7 @@ _SCALES = {
 UNITS: dict[str, tuple[str, Decimal]] = {
     unit: (si, Decimal(factor)) for si, scale in _SCALES.items() for unit, factor in scale.items()
 }
-"""Unit -> its SI unit and what one of it is in that. Decimal, so that "9 mm" and 0.009 are the same float."""
+"""Unit -> SI unit and conversion factor. Decimal, so that "9 mm" and 0.009 are the same float."""
 
 _DIMENSIONS = {
     "1": "a number",
@@ -53,12 +53,12 @@ _SPELLINGS = (("**", "^"), ("*", " "), ("·", " "), ("²", "^2"), ("°", "deg"),
 
 
 def dimension(unit: str) -> str:
-    """Name what is measured in an SI unit: ``"a time [s]"``."""
+    """Return the name of the dimension of an SI unit: ``"a time [s]"``."""
     return _DIMENSIONS.get(unit, f"a quantity [{unit}]")
 
 
 def show(value: object) -> str:
-    """Write a TOML value as its file has it, cut to a length that fits into a message."""
+    """Format a TOML value as in its file, shortened for messages."""
     text = str(value).lower() if isinstance(value, bool) else repr(value)
     return text if len(text) <= 60 else text[:57] + "..."
 
@@ -74,7 +74,7 @@ def parse_number(value: Any, unit: str) -> float:
         The value [unit].
 
     Raises:
-        ValueError: The value is no finite number, or its unit is unknown or measures something else.
+        ValueError: The value is not a finite number, or its unit is unknown or of another dimension.
     """
     match = _QUANTITY.fullmatch(value) if isinstance(value, str) else None
     if match:
@@ -89,15 +89,15 @@ def parse_numbers(value: Any, unit: str, *, count: int | None = None) -> tuple[f
     """Read a list of numbers or quantities.
 
     Args:
-        value: A list of what ``parse_number`` reads, or a text such as ``"[0.6, 1.3] m"``.
+        value: A list of values for ``parse_number``, or a text such as ``"[0.6, 1.3] m"``.
         unit: SI unit of the result.
-        count: How many there must be; None for one or more.
+        count: Required number of values; None for one or more.
 
     Returns:
         The values [unit].
 
     Raises:
-        ValueError: It is no list, has the wrong length, or one of its entries is wrong.
+        ValueError: The value is not a list, has the wrong length, or an invalid entry.
     """
     match = _LIST.fullmatch(value) if isinstance(value, str) else None
     if match:
@@ -116,14 +116,14 @@ def parse_range(value: Any, unit: str) -> tuple[float, float]:
     """Read a closed interval.
 
     Args:
-        value: A list of two, ``"[0.6, 1.3] m"``, or what ``parse_number`` reads: a single point.
+        value: A list of two, ``"[0.6, 1.3] m"``, or a value for ``parse_number``, a single point.
         unit: SI unit of the result.
 
     Returns:
-        Its low and high end [unit].
+        Low and high end [unit].
 
     Raises:
-        ValueError: An end is wrong, or the low end is above the high end.
+        ValueError: An end is invalid, or the low end is above the high end.
     """
     if isinstance(value, list) or (isinstance(value, str) and value.lstrip().startswith("[")):
         low, high = parse_numbers(value, unit, count=2)
@@ -135,7 +135,7 @@ def parse_range(value: Any, unit: str) -> tuple[float, float]:
 
 
 def _check_commas(match: re.Match[str], value: object) -> None:
-    """Say what is missing in ``"[0.6 1.3] m"``."""
+    """Raise ValueError for missing commas, as in ``"[0.6 1.3] m"``."""
     items = [re.split(r"[;\s]+", item.strip()) for item in match[1].split(",")]
     if any(len(words) > 1 and all(map(_NUMBER.fullmatch, words)) for words in items):
         meant = ", ".join(word for words in items for word in words)
@@ -143,7 +143,7 @@ def _check_commas(match: re.Match[str], value: object) -> None:
 
 
 def _finite(number: Decimal | float, suffix: str, value: object, unit: str) -> float:
-    """Convert ``number suffix`` to ``unit``; ``value`` is what the user wrote."""
+    """Convert ``number suffix`` to ``unit``; ``value`` is the user's input."""
     factor = _factor(_spell(suffix), value, unit)
     try:
         result = float(number * factor if isinstance(number, Decimal) else number)
@@ -155,7 +155,7 @@ def _finite(number: Decimal | float, suffix: str, value: object, unit: str) -> f
 
 
 def _factor(written: str, value: object, unit: str) -> Decimal:
-    """Return what one ``written`` is in ``unit``."""
+    """Return the conversion factor from ``written`` to ``unit``."""
     if written in ("", unit):
         return Decimal(1)
     if written not in UNITS:
@@ -169,7 +169,7 @@ def _factor(written: str, value: object, unit: str) -> Decimal:
 
 
 def _spell(unit: str) -> str:
-    """Bring the spellings of a unit to one: ``"N·m"`` to ``"N m"``, ``"/s"`` to ``"1/s"``."""
+    """Normalize the spelling of a unit: ``"N·m"`` to ``"N m"``, ``"/s"`` to ``"1/s"``."""
     for old, new in _SPELLINGS:
         unit = unit.replace(old, new)
     unit = re.sub(r"\s*/\s*", "/", " ".join(unit.split()))

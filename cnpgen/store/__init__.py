@@ -1,1 +1,1 @@
-"""Datasets on disk: blueprint, shards, sidecars, manifest and card; the only place that knows their layout."""
+"""Datasets on disk: specification, shards, sidecars, manifest and card. Only this package defines their layout."""

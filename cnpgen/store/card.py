@@ -1,13 +1,13 @@
-"""The card of a dataset: the README.md that people and the Hugging Face hub read."""
+"""The card of a dataset: the README.md for users and the Hugging Face hub."""
 
 import json
 from collections.abc import Sequence
 
 import numpy as np
 
+from cnpgen.store.dataset_summary import DatasetSummary
 from cnpgen.store.field import Field
 from cnpgen.store.statistics import FieldStatistics
-from cnpgen.store.summary import Summary
 
 _SIZES = (
     (10**3, "n<1K"),
@@ -56,88 +56,86 @@ _VERIFY = """\
 cnpgen validate . --deep
 ```
 
-checks every file against `manifest.json` and computes every row's constraints again with Pinocchio and Coal, sharing no
-code with what made them.
+checks every file against `manifest.json` and evaluates all constraints of every row again with Pinocchio and Coal,
+independently of the code that made the dataset.
 """
 
 
-def card_text(summary: Summary, *, folder: str, notes: str = "") -> str:
-    """Write the card of a finished dataset; it depends on rows and blueprint only, not on when or where they were made.
+def card_text(summary: DatasetSummary, *, folder: str, notes: str = "") -> str:
+    """Return the card of a finished dataset; it depends on its rows and specification only, not on time or place.
 
     Args:
         summary: The finished shards.
-        folder: Name of the dataset's folder.
-        notes: Text about the dataset to include, Markdown.
+        folder: Name of the folder of the dataset.
+        notes: Text about the dataset to include, in Markdown.
     """
-    blueprint = summary.blueprint
+    spec = summary.spec
     split = next(iter(summary.statistics))
     sections = [
         _front_matter(summary),
-        f"# {blueprint.name} {blueprint.version}\n\n{blueprint.title or blueprint.name}\n\n{_contents(summary)}",
+        f"# {spec.name} {spec.version}\n\n{spec.title or spec.name}\n\n{_contents(summary)}",
         notes.strip(),
         f"{_AFTER_NOTES}\n\n{_making(summary)}",
         f"## How to load it\n\n{_LOAD.replace('SPLIT', split).replace('FOLDER', folder)}",
-        f"## Fields\n\n{_field_table(blueprint.fields)}",
+        f"## Fields\n\n{_field_table(spec.fields)}",
         f"## Yield\n\n{_yield_table(summary)}",
-        f"## Ranges ({split})\n\n{_range_table(blueprint.fields, summary.statistics[split])}",
+        f"## Ranges ({split})\n\n{_range_table(spec.fields, summary.statistics[split])}",
         f"## How to verify it\n\n{_VERIFY}",
     ]
     return "\n\n".join(section.strip() for section in sections if section) + "\n"
 
 
 def card_notes(card: str) -> str:
-    """Return the notes in a card that ``card_text`` wrote; nothing where there are none."""
+    """Return the notes in a card of ``card_text``; empty if there are none."""
     _, _, rest = card.partition(f"| {' | '.join(_BEFORE_NOTES)} |\n")
     _, _, rest = rest.partition("\n\n")  # the end of the table
     notes, _, _ = f"\n\n{rest}".rpartition(f"\n\n{_AFTER_NOTES}\n")
     return notes.strip()
 
 
-def _front_matter(summary: Summary) -> str:
-    """Write the YAML that makes the folder a dataset of Hugging Face; JSON strings are YAML strings."""
-    blueprint = summary.blueprint
-    rows = sum(blueprint.splits.values())
+def _front_matter(summary: DatasetSummary) -> str:
+    """Return the YAML header that makes the folder a Hugging Face dataset; JSON strings are valid YAML."""
+    spec = summary.spec
+    rows = sum(spec.splits.values())
     size = next((name for limit, name in _SIZES if rows < limit), "n>1B")
-    lines = [f"license: {json.dumps(blueprint.license.lower())}"] if blueprint.license else []
-    lines += [f"pretty_name: {json.dumps(blueprint.title or blueprint.name, ensure_ascii=False)}"]
+    lines = [f"license: {json.dumps(spec.license.lower())}"] if spec.license else []
+    lines += [f"pretty_name: {json.dumps(spec.title or spec.name, ensure_ascii=False)}"]
     lines += ["task_categories:", "- robotics", "tags:", "- robotics", "- motion-planning", "- trajectory-optimization"]
     lines += ["- cnpgen", "size_categories:", f'- "{size}"', "configs:", "- config_name: default", "  data_files:"]
-    for split, count in blueprint.splits.items():
+    for split, count in spec.splits.items():
         if count:
             lines += [f"  - split: {split}", f'    path: "{split}/*.h5"']
     return "\n".join(["---", *lines, "---"])
 
 
-def _contents(summary: Summary) -> str:
-    blueprint = summary.blueprint
-    rows = [(f"`{split}`", f"{count:,}", len(summary.of_split(split))) for split, count in blueprint.splits.items()]
-    proven = (
-        "Every row passed every stage of its pipeline; the problem's constraints were evaluated on the stored numbers."
-    )
-    return f"{proven}\n\n{_table(_BEFORE_NOTES, rows)}"
+def _contents(summary: DatasetSummary) -> str:
+    spec = summary.spec
+    rows = [(f"`{split}`", f"{count:,}", len(summary.of_split(split))) for split, count in spec.splits.items()]
+    checks = "Every row passed every stage of its pipeline. Constraints were evaluated on the stored values."
+    return f"{checks}\n\n{_table(_BEFORE_NOTES, rows)}"
 
 
-def _making(summary: Summary) -> str:
-    blueprint = summary.blueprint
+def _making(summary: DatasetSummary) -> str:
+    spec = summary.spec
     facts = {
-        "recipe": f"sha256 `{blueprint.recipe_sha256}`, in full in `manifest.json`",
-        "robot": str(blueprint.robot.get("name", "")),
-        "seed": str(blueprint.seed),
-        "random numbers": blueprint.generator,
-        "kernels": blueprint.backend,
-        "stored as": blueprint.dtype,
-        "blueprint": f"fingerprint `{blueprint.fingerprint}`",
-        "made with": ", ".join(f"{name} {version}" for name, version in blueprint.versions.items()),
+        "recipe": f"sha256 `{spec.recipe_sha256}`, in full in `manifest.json`",
+        "robot": str(spec.robot.get("name", "")),
+        "seed": str(spec.seed),
+        "random numbers": spec.generator,
+        "kernels": spec.backend,
+        "stored as": spec.dtype,
+        "specification": f"fingerprint `{spec.fingerprint}`",
+        "made with": ", ".join(f"{name} {version}" for name, version in spec.versions.items()),
     }
     lines = [f"- {name}: {value}" for name, value in facts.items() if value]
     return (
         "\n".join(lines)
-        + "\n\nThe same blueprint with the same versions gives the same bytes, however the work is shared out."
+        + "\n\nThe same specification with the same versions gives the same bytes, for any number of workers."
     )
 
 
 def _field_table(fields: Sequence[Field]) -> str:
-    head = ("field", "unit", "width", "what", "role", "frame", "columns")
+    head = ("field", "unit", "width", "description", "role", "frame", "columns")
     rows = [
         (f"`{f.name}`", f.unit, f.width or "-", f.long_name, f.role, f.frame or "-", ", ".join(f.names) or "-")
         for f in fields
@@ -145,13 +143,13 @@ def _field_table(fields: Sequence[Field]) -> str:
     return _table(head, rows)
 
 
-def _yield_table(summary: Summary) -> str:
-    fates = summary.fates
-    counts = {"**tried**": fates.tried, **fates.rejections, "**accepted**": fates.accepted}
-    rows = [(name, f"{count:,}", f"{100 * count / max(fates.tried, 1):.3f} %") for name, count in counts.items()]
-    text = _table(("fate", "draws", "share"), rows)
-    if fates.verification:
-        worst = [(f"`{name}`", f"{value:.3g}") for name, value in fates.verification.items()]
+def _yield_table(summary: DatasetSummary) -> str:
+    sampling = summary.sampling
+    counts = {"**tried**": sampling.tried, **sampling.rejections, "**accepted**": sampling.accepted}
+    rows = [(name, f"{count:,}", f"{100 * count / max(sampling.tried, 1):.3f} %") for name, count in counts.items()]
+    text = _table(("outcome", "candidates", "share"), rows)
+    if sampling.verification:
+        worst = [(f"`{name}`", f"{value:.3g}") for name, value in sampling.verification.items()]
         text += (
             "\n\nWorst violation in 32 rows of every shard, recomputed with Pinocchio and Coal, in SI units:\n\n"
             + _table(("constraint", "worst"), worst)
@@ -165,9 +163,9 @@ def _range_table(fields: Sequence[Field], statistics: dict[str, FieldStatistics]
     return _table(head, rows)
 
 
-def _range_rows(field: Field, found: FieldStatistics) -> list[tuple[str, ...]]:
-    """Return a row per column of a field."""
-    numbers = np.stack([found.minimum, found.maximum, found.mean, found.std], axis=1)
+def _range_rows(field: Field, statistics: FieldStatistics) -> list[tuple[str, ...]]:
+    """Return one row per column of a field."""
+    numbers = np.stack([statistics.minimum, statistics.maximum, statistics.mean, statistics.std], axis=1)
     rows = []
     for column, values in enumerate(numbers):
         name = f"{field.name}.{field.names[column] if field.names else column}" if field.width else field.name
@@ -178,6 +176,6 @@ def _range_rows(field: Field, found: FieldStatistics) -> list[tuple[str, ...]]:
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """Lay out a Markdown table."""
+    """Format a Markdown table."""
     lines = [head, ["---"] * len(head), *rows]
     return "\n".join("| " + " | ".join(str(cell).replace("|", "\\|") for cell in line) + " |" for line in lines)

@@ -1,14 +1,14 @@
-"""The Croissant description of a dataset: metadata, files and what is measured in which unit.
+"""The Croissant description of a dataset: metadata, files and measured variables with units.
 
-No record set is promised: no reader of Croissant opens HDF5 (mlcommons/croissant issue 697). Croissant's own fields are
-parts of record sets and have no unit; so the fields are listed as schema.org's ``variableMeasured``, which a Croissant
-document may have as any ``sc:Dataset`` may.
+It has no record sets, because no Croissant reader opens HDF5 (mlcommons/croissant issue 697). Fields of Croissant are
+parts of record sets and have no unit. The fields are therefore listed as ``variableMeasured`` of schema.org, which
+Croissant documents may contain.
 """
 
 from typing import Any
 
+from cnpgen.store.dataset_summary import DatasetSummary
 from cnpgen.store.field import Field
-from cnpgen.store.summary import Summary
 
 _CONTEXT: dict[str, Any] = {
     "@language": "en",
@@ -48,46 +48,46 @@ _CONTEXT: dict[str, Any] = {
 }
 
 
-def croissant_document(summary: Summary, *, created: str) -> dict[str, Any]:
+def croissant_document(summary: DatasetSummary, *, created: str) -> dict[str, Any]:
     """Return the content of ``croissant.json``.
 
     Args:
         summary: The finished shards.
-        created: When the dataset was finished, ISO 8601.
+        created: Creation time of the dataset, ISO 8601.
     """
-    blueprint = summary.blueprint
+    spec = summary.spec
     document: dict[str, Any] = {
         "@context": _CONTEXT,
         "@type": "sc:Dataset",
         "conformsTo": "http://mlcommons.org/croissant/1.0",
-        "name": blueprint.name,
+        "name": spec.name,
         "description": _description(summary),
-        "version": blueprint.version,
+        "version": spec.version,
         "datePublished": created,
     }
-    if blueprint.license:
-        document["license"] = f"https://spdx.org/licenses/{blueprint.license}"
+    if spec.license:
+        document["license"] = f"https://spdx.org/licenses/{spec.license}"
     return document | {
-        "variableMeasured": [_variable(field) for field in blueprint.fields],
+        "variableMeasured": [_variable(field) for field in spec.fields],
         "distribution": [_file(item.file, item.bytes, item.sha256) for _, item in summary.records],
     }
 
 
 def _variable(field: Field) -> dict[str, Any]:
-    """Describe a field; limits are those of all columns together."""
+    """Describe a field; the limits cover all columns."""
     columns = f" ({', '.join(field.names)})" if field.names else ""
     described = {"name": field.name, "description": f"{field.long_name}{columns}", "unitText": field.unit}
-    least = {} if field.valid_min is None else {"minValue": min(field.valid_min)}
-    most = {} if field.valid_max is None else {"maxValue": max(field.valid_max)}
-    return {"@type": "sc:PropertyValue", **described, **least, **most}
+    lower = {} if field.valid_min is None else {"minValue": min(field.valid_min)}
+    upper = {} if field.valid_max is None else {"maxValue": max(field.valid_max)}
+    return {"@type": "sc:PropertyValue", **described, **lower, **upper}
 
 
-def _description(summary: Summary) -> str:
-    """Say in prose what the record sets would have said."""
-    blueprint = summary.blueprint
-    rows = ", ".join(f"{count} {split}" for split, count in blueprint.splits.items())
-    fields = "; ".join(f"{item.name} ({item.long_name}) [{item.unit}]" for item in blueprint.fields)
-    title = blueprint.title.rstrip(".") or blueprint.name
+def _description(summary: DatasetSummary) -> str:
+    """Describe splits and fields in prose, in place of record sets."""
+    spec = summary.spec
+    rows = ", ".join(f"{count} {split}" for split, count in spec.splits.items())
+    fields = "; ".join(f"{item.name} ({item.long_name}) [{item.unit}]" for item in spec.fields)
+    title = spec.title.rstrip(".") or spec.name
     return f"{title}. Rows: {rows}. Every HDF5 file holds one dataset per field, one entry per row: {fields}."
 
 

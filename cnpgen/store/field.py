@@ -1,4 +1,4 @@
-"""A field of a dataset: the name, shape, unit and meaning of one HDF5 dataset."""
+"""A field of a dataset: the name, shape, unit and description of one HDF5 dataset."""
 
 from dataclasses import dataclass
 
@@ -11,13 +11,13 @@ class Field:
 
     Attributes:
         name: HDF5 dataset name at the root of the shard.
-        unit: SI unit as text: "rad", "rad/s", "rad/s^2", "m", "m/s", "N m", "1"; or, where some joints slide and others
-            turn, one per joint, separated by commas.
-        long_name: What it is, in a few words.
+        unit: SI unit as text: "rad", "rad/s", "rad/s^2", "m", "m/s", "N m", "1"; or
+            one per joint, separated by commas, if some joints are prismatic and others revolute.
+        long_name: Description in a few words.
         width: Number of columns; 0 for a scalar per row.
         names: Names of the columns (joints, axes), empty for scalars.
         role: "input", "target", "context" or "diagnostic".
-        frame: Reference frame of Cartesian fields, else "".
+        frame: Reference frame of Cartesian fields, otherwise "".
         valid_min: Lower limit of every column, shape (max(width, 1),), or None.
         valid_max: Upper limit of every column, or None.
         dtype: "float" (stored in the dataset's float type) or "int64".
@@ -35,7 +35,7 @@ class Field:
     dtype: str = "float"
 
     def __post_init__(self) -> None:
-        for name in ("valid_min", "valid_max"):  # floats, as they are read back: a blueprint's fingerprint has them
+        for name in ("valid_min", "valid_max"):  # floats, as read from JSON, because they are part of the fingerprint
             limits = getattr(self, name)
             if limits is not None:
                 object.__setattr__(self, name, tuple(map(float, limits)))

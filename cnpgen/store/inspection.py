@@ -1,4 +1,4 @@
-"""What a dataset holds and how it came about, from its documents and the sidecars of its shards; no row is read."""
+"""Inspection of a dataset: its content and origin, from its documents and sidecars; no sample is read."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -7,169 +7,166 @@ from pathlib import Path
 from typing import Any
 
 from cnpgen.errors import DatasetError
-from cnpgen.store.blueprint import Blueprint, load_blueprint, shards
 from cnpgen.store.check import check_documents
-from cnpgen.store.fates import Fates, densities_to_json
+from cnpgen.store.dataset_spec import DatasetSpec, load_dataset_spec, shards
+from cnpgen.store.dataset_summary import DatasetSummary, summarize_dataset, unfinished
 from cnpgen.store.field import Field
 from cnpgen.store.files.documents import plain
-from cnpgen.store.layout import DOCUMENTS, MANIFEST, PLAN
+from cnpgen.store.layout import DOCUMENTS, MANIFEST, SPECIFICATION
 from cnpgen.store.paths import require_folder
+from cnpgen.store.sampling_statistics import SamplingStatistics, densities_to_json
 from cnpgen.store.statistics import FieldStatistics, merge_statistics
-from cnpgen.store.summary import Summary, summarise, unfinished
 from cnpgen.store.workspace import is_dataset
 
 
 @dataclass(frozen=True, eq=False)
 class Inspection:
-    """What is known of a dataset, finished or not.
+    """Description of a dataset, which may be unfinished.
 
     Attributes:
-        folder: Its folder.
-        summary: Its blueprint and the records of its finished shards.
-        sealed: Whether its manifest is there.
-        bytes: Size of its files.
-        damage: What is wrong with the documents of a sealed dataset, a line each; shards are not read for it.
+        folder: Folder of the dataset.
+        summary: The specification and the records of the finished shards.
+        is_finalized: Whether the manifest exists.
+        bytes: Size of all files [bytes].
+        damage: Problems of the documents of a finalized dataset, one per line; shards are not read.
     """
 
     folder: Path
-    summary: Summary
-    sealed: bool
+    summary: DatasetSummary
+    is_finalized: bool
     bytes: int
     damage: tuple[str, ...] = ()
 
     @property
-    def blueprint(self) -> Blueprint:
-        """The blueprint of the dataset."""
-        return self.summary.blueprint
+    def spec(self) -> DatasetSpec:
+        """The specification of the dataset."""
+        return self.summary.spec
 
     @property
-    def fates(self) -> Fates:
-        """The fates of all draws that were made for the rows that are there."""
-        return self.summary.fates
+    def sampling(self) -> SamplingStatistics:
+        """Sampling statistics of the finished shards."""
+        return self.summary.sampling
 
     @property
     def complete(self) -> bool:
-        """Whether all of it is there."""
-        return self.sealed and not self.summary.problems and not self.damage
+        """Whether all files exist and no document is damaged."""
+        return self.is_finalized and not self.summary.problems and not self.damage
 
     @property
     def damaged(self) -> bool:
-        """Whether what was looked at is not as it was made."""
-        return self.sealed and not self.complete
+        """Whether the dataset is finalized and a document or a shard is missing or damaged."""
+        return self.is_finalized and not self.complete
 
     @property
     def state(self) -> str:
         """The state of the dataset in a few words."""
         if self.complete:
             return "complete"
-        if not self.sealed:
+        if not self.is_finalized:
             return unfinished(self.summary)
         if self.summary.problems:
-            what = f"{len(self.summary.records)} of {self.summary.n_shards} shards are as they were made"
+            problem = f"{len(self.summary.records)} of {self.summary.n_shards} shards are undamaged"
         else:
-            what = self.damage[0]
-        return f"damaged: {what}; 'cnpgen validate' says more"
+            problem = self.damage[0]
+        return f"damaged: {problem}; for details run 'cnpgen validate'"
 
     @cached_property
     def rows(self) -> dict[str, int]:
-        """Rows per split that are there."""
-        return {
-            split: sum(record.rows for _, record in self.summary.of_split(split)) for split in self.blueprint.splits
-        }
+        """Number of existing rows per split."""
+        return {split: sum(record.rows for _, record in self.summary.of_split(split)) for split in self.spec.splits}
 
     @cached_property
     def statistics(self) -> Mapping[str, FieldStatistics]:
-        """Statistics of every field over all splits; empty without rows."""
+        """Statistics of every field over all splits; empty if there are no rows."""
         parts = list(self.summary.statistics.values())
         return merge_statistics(parts) if parts else {}
 
     @property
     def seconds(self) -> float:
-        """Working time of all processes together [s]."""
+        """Computing time of all processes together [s]."""
         return sum(record.seconds for _, record in self.summary.records)
 
     @cached_property
     def environments(self) -> list[dict[str, str]]:
-        """The versions of cnpgen, Python and libraries that made the shards; more than one after an upgrade."""
-        found: list[dict[str, str]] = []
+        """Different combinations of versions of cnpgen, Python and libraries that made the shards."""
+        environments: list[dict[str, str]] = []
         for _, record in self.summary.records:
-            if (versions := dict(record.versions)) not in found:
-                found.append(versions)
-        return found
+            if (versions := dict(record.versions)) not in environments:
+                environments.append(versions)
+        return environments
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything for JSON."""
-        blueprint = self.blueprint
+        spec = self.spec
         content = {
             "folder": self.folder,
-            **{name: getattr(blueprint, name) for name in ("name", "version", "title", "license")},
+            **{name: getattr(spec, name) for name in ("name", "version", "title", "license")},
             **{name: getattr(self, name) for name in ("complete", "state", "bytes", "seconds")},
-            "damage": [*self.summary.problems, *self.damage] if self.sealed else [],
+            "damage": [*self.summary.problems, *self.damage] if self.is_finalized else [],
             "shards": {"planned": self.summary.n_shards, "finished": len(self.summary.records)},
-            "rows": {split: {"planned": blueprint.splits[split], "stored": rows} for split, rows in self.rows.items()},
-            "fields": [self._field(field) for field in blueprint.fields],
-            "yield": _yield(self.fates),
-            "yield_by_split": {split: _yield(fates) for split, fates in self.summary.fates_by_split.items()},
-            "densities": densities_to_json(self.fates.densities),
-            "verification": self.fates.verification,
-            "seed": str(blueprint.seed),
-            **{
-                name: getattr(blueprint, name)
-                for name in ("generator", "backend", "dtype", "shard_size", "recipe_sha256")
-            },
-            "plan_fingerprint": blueprint.fingerprint,
-            "versions": blueprint.versions,
+            "rows": {split: {"planned": spec.splits[split], "stored": rows} for split, rows in self.rows.items()},
+            "fields": [self._field(field) for field in spec.fields],
+            "yield": _yield(self.sampling),
+            "yield_by_split": {split: _yield(sampling) for split, sampling in self.summary.sampling_by_split.items()},
+            "densities": densities_to_json(self.sampling.densities),
+            "verification": self.sampling.verification,
+            "seed": str(spec.seed),
+            **{name: getattr(spec, name) for name in ("generator", "backend", "dtype", "shard_size", "recipe_sha256")},
+            "specification_fingerprint": spec.fingerprint,
+            "versions": spec.versions,
             "environments": self.environments,
         }
-        found: dict[str, Any] = plain(content)
-        return found
+        result: dict[str, Any] = plain(content)
+        return result
 
     def _field(self, field: Field) -> dict[str, Any]:
         names = ("name", "unit", "long_name", "width", "names", "role", "frame", "dtype", "valid_min", "valid_max")
         content = {name: getattr(field, name) for name in names}
-        found = self.statistics.get(field.name)
-        if found is None:
+        item = self.statistics.get(field.name)
+        if item is None:
             return content
-        return content | {"min": found.minimum, "mean": found.mean, "max": found.maximum, "std": found.std}
+        return content | {"min": item.minimum, "mean": item.mean, "max": item.maximum, "std": item.std}
 
 
-def _yield(fates: Fates) -> dict[str, Any]:
-    """Return tried, accepted and, in pipeline order, why draws were rejected and how many went on."""
-    tried, left, steps = max(fates.tried, 1), fates.tried, []
-    for reason, count in fates.rejections.items():
+def _yield(sampling: SamplingStatistics) -> dict[str, Any]:
+    """Return the numbers of candidates and, in pipeline order, of rejections with the fractions that remain."""
+    tried, left, steps = max(sampling.tried, 1), sampling.tried, []
+    for reason, count in sampling.rejections.items():
         left -= count
-        stage = fates.stages.get(reason, "")
-        steps.append({"stage": stage, "reason": reason, "draws": count, "share": count / tried, "left": left / tried})
-    share = fates.accepted / tried
-    return {"tried": fates.tried, "accepted": fates.accepted, "acceptance": share, "rejections": steps}
+        stage = sampling.stages.get(reason, "")
+        steps.append(
+            {"stage": stage, "reason": reason, "candidates": count, "share": count / tried, "left": left / tried}
+        )
+    share = sampling.accepted / tried
+    return {"tried": sampling.tried, "accepted": sampling.accepted, "acceptance": share, "rejections": steps}
 
 
 def inspect_dataset(folder: str | Path) -> Inspection:
-    """Look at a dataset, finished or not.
+    """Inspect a dataset, which may be unfinished.
 
     Args:
-        folder: Its folder.
+        folder: Folder of the dataset.
 
     Raises:
-        UsageError: There is no such folder.
-        DatasetError: It holds no dataset, or its plan.json is damaged.
-        MachineError: The system would not let us read something.
+        UsageError: The folder does not exist.
+        DatasetError: It contains no dataset, or its specification is damaged.
+        MachineError: A file cannot be read.
     """
     folder = Path(folder)
     require_folder(folder)
     if not is_dataset(folder):
-        raise DatasetError(f"{folder} is not a dataset of cnpgen: it has no {PLAN}")
+        raise DatasetError(f"{folder} is not a dataset of cnpgen: it has no {SPECIFICATION}")
     try:
-        blueprint = load_blueprint(folder)
+        spec = load_dataset_spec(folder)
     except DatasetError as error:
-        raise DatasetError(f"{error}; 'cnpgen validate' says what to do") from error
-    summary = summarise(folder, blueprint, allow_incomplete=True)
-    sealed = (folder / MANIFEST).is_file()
-    damage = tuple(str(finding) for finding in check_documents(folder, blueprint)) if sealed else ()
-    return Inspection(folder, summary, sealed, _size(folder, blueprint), damage)
+        raise DatasetError(f"{error}; for a remedy run 'cnpgen validate'") from error
+    summary = summarize_dataset(folder, spec, allow_incomplete=True)
+    is_finalized = (folder / MANIFEST).is_file()
+    damage = tuple(str(finding) for finding in check_documents(folder, spec)) if is_finalized else ()
+    return Inspection(folder, summary, is_finalized, _size(folder, spec), damage)
 
 
-def _size(folder: Path, blueprint: Blueprint) -> int:
-    """Add up the files of a dataset, without what else is in its folder [bytes]."""
-    names = [*DOCUMENTS, *(name for task in shards(blueprint) for name in (task.file, task.sidecar))]
+def _size(folder: Path, spec: DatasetSpec) -> int:
+    """Return the size of all files of the dataset [bytes], without other files in its folder."""
+    names = [*DOCUMENTS, *(name for task in shards(spec) for name in (task.file, task.sidecar))]
     return sum((folder / name).stat().st_size for name in names if (folder / name).is_file())

@@ -1,29 +1,29 @@
-"""Units of joints, one for all or one for each: what is in rad where a joint turns is in m where it slides."""
+"""Units of joint quantities: rad for revolute joints, m for prismatic joints."""
 
 from functools import cache
 
-_SLIDING = {"rad": "m", "rad/s": "m/s", "rad/s^2": "m/s^2", "rad/s^3": "m/s^3", "N m": "N"}
-_BETWEEN = ", "  # units of several values in one text
+_PRISMATIC = {"rad": "m", "rad/s": "m/s", "rad/s^2": "m/s^2", "rad/s^3": "m/s^3", "N m": "N"}
+_SEPARATOR = ", "
 
 
 @cache
-def units_of_joints(turning: str, sliding: tuple[bool, ...]) -> str:
-    """Name the units of a quantity of joints: one for all, or one per joint, separated by commas, where they differ.
+def units_of_joints(revolute_unit: str, is_prismatic: tuple[bool, ...]) -> str:
+    """Return the unit of a joint quantity: one for all joints, or one per joint, separated by commas, if they differ.
 
     Args:
-        turning: Its unit at joints that turn: "rad", "rad/s", "rad/s^2", "rad/s^3" or "N m".
-        sliding: Of every joint whether it slides.
+        revolute_unit: Unit of revolute joints: "rad", "rad/s", "rad/s^2", "rad/s^3" or "N m".
+        is_prismatic: For every joint, whether it is prismatic.
     """
-    units = [_SLIDING[turning] if slides else turning for slides in sliding]
-    return units[0] if len(set(units)) == 1 else _BETWEEN.join(units)
+    units = [_PRISMATIC[revolute_unit] if prismatic else revolute_unit for prismatic in is_prismatic]
+    return units[0] if len(set(units)) == 1 else _SEPARATOR.join(units)
 
 
 def unit_of(units: str, index: int) -> str:
-    """Return the unit of one of several values, or of one of several rounds of the joints.
+    """Return the unit of one column.
 
     Args:
-        units: What ``units_of_joints`` names, or one unit.
-        index: Which value.
+        units: Result of ``units_of_joints``, or one unit.
+        index: Index of the column; units repeat for several values per joint.
     """
-    each = units.split(_BETWEEN)
-    return each[index % len(each)]
+    names = units.split(_SEPARATOR)
+    return names[index % len(names)]

@@ -1,33 +1,34 @@
-"""What the files of a dataset folder are called.
+"""Names of the files in the folder of a dataset.
 
 ```
 airhockey-replan-v1/
-  plan.json                 what will be made: written first, changed by an extension only
-  train/shard-00000.h5      the rows
-  train/shard-00000.json    the sidecar: that shard's commit record, written after it
+  specification.json        the dataset specification: written first, replaced only by an extension
+  train/shard-00000.h5      the samples
+  train/shard-00000.json    the sidecar: the commit record of that shard, written after it
   validation/...
-  stats.json  README.md  croissant.json    written at the end
-  manifest.json             written last: its existence means that the dataset is complete
-  _work/                    temporary files, deletable at any time
+  stats.json  README.md  croissant.json    written when all shards are complete
+  manifest.json             written last: it exists only for a complete dataset
+  _work/                    temporary files; may be deleted at any time
 ```
 """
 
 import re
 
-PLAN = "plan.json"
+SPECIFICATION = "specification.json"
+OLD_SPECIFICATION = "plan.json"  # of the formats 1 and 2, which are refused
 MANIFEST = "manifest.json"
 STATS = "stats.json"
 CARD = "README.md"
 CROISSANT = "croissant.json"
 WORK = "_work"
 
-DOCUMENTS = (PLAN, MANIFEST, STATS, CARD, CROISSANT)
-"""The files of a dataset that are not of one shard."""
+DOCUMENTS = (SPECIFICATION, MANIFEST, STATS, CARD, CROISSANT)
+"""The files of a dataset that do not belong to one shard."""
 
 SPLIT_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,99}")
-"""Names that are folders everywhere and splits to Hugging Face."""
+"""Split names that are valid folder names on every system and valid splits of Hugging Face."""
 
 
 def shard_stem(split: str, index: int) -> str:
-    """Return the path of a shard without its ending, relative to the dataset's folder."""
+    """Return the path of a shard without its suffix, relative to the folder of the dataset."""
     return f"{split}/shard-{index:05d}"

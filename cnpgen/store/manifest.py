@@ -1,4 +1,4 @@
-"""The manifest of a dataset: written last, so that its existence means that the dataset is complete."""
+"""The manifest of a dataset. It is written last, so it exists only for a complete dataset."""
 
 import hashlib
 import os
@@ -10,51 +10,51 @@ from pathlib import Path
 from typing import Any, cast
 
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.store.blueprint import Blueprint, shards
 from cnpgen.store.card import card_text
 from cnpgen.store.croissant import croissant_document
+from cnpgen.store.dataset_spec import DatasetSpec, shards
+from cnpgen.store.dataset_summary import DatasetSummary, stats_document, summarize_dataset
 from cnpgen.store.field import Field
 from cnpgen.store.files.atomic import file_sha256, write_file
+from cnpgen.store.files.document_structure import ANY_KEY, TEXT, WHOLE
 from cnpgen.store.files.documents import load_document, plain, render, save_document
-from cnpgen.store.files.forms import EVERY, TEXT, WHOLE
-from cnpgen.store.files.leftovers import sweep_all
-from cnpgen.store.layout import CARD, CROISSANT, MANIFEST, PLAN, STATS, WORK
-from cnpgen.store.summary import Summary, stats_document, summarise
+from cnpgen.store.files.leftovers import remove_all_temporary
+from cnpgen.store.layout import CARD, CROISSANT, MANIFEST, SPECIFICATION, STATS, WORK
 
-FORMAT = "cnpgen-dataset"
-FORMAT_VERSION = 1
-_SHARD = {
+MANIFEST_FORMAT = "cnpgen-dataset"
+MANIFEST_VERSION = 2
+_SHARD_STRUCTURE = {
     **dict.fromkeys(("file", "sha256"), TEXT),
     **dict.fromkeys(("rows", "first_sample_id", "bytes"), WHOLE),
     "sidecar": {"file": TEXT, "sha256": TEXT},
 }
-FORM = {
+MANIFEST_STRUCTURE = {
     "fingerprint": TEXT,
-    "plan_fingerprint": TEXT,
-    "splits": {EVERY: {"rows": WHOLE, "shards": [_SHARD]}},
-    "files": {name: {"bytes": WHOLE, "sha256": TEXT} for name in (PLAN, STATS, CARD, CROISSANT)},
+    "specification_fingerprint": TEXT,
+    "splits": {ANY_KEY: {"rows": WHOLE, "shards": [_SHARD_STRUCTURE]}},
+    "files": {name: {"bytes": WHOLE, "sha256": TEXT} for name in (SPECIFICATION, STATS, CARD, CROISSANT)},
 }
 
 
-def finalize(folder: Path, blueprint: Blueprint, *, notes: str = "") -> dict[str, Any]:
-    """Sum up the shards of a dataset: statistics, card, Croissant and, last, the manifest.
+def finalize(folder: Path, spec: DatasetSpec, *, notes: str = "") -> dict[str, Any]:
+    """Summarize the shards of a dataset: write statistics, card, Croissant description and, last, the manifest.
 
-    The same shards give the same files; processes that find all shards made may do it at once.
+    The same shards give the same files, so several processes may do it at the same time.
 
     Args:
-        folder: The dataset's folder.
-        blueprint: Its blueprint.
-        notes: Text about the dataset to include in its card, Markdown.
+        folder: Folder of the dataset.
+        spec: Specification of the dataset.
+        notes: Text about the dataset for its card, in Markdown.
 
     Returns:
         The manifest.
 
     Raises:
-        DatasetError: Shards are missing, damaged or of another blueprint; the message says which.
-        UsageError: SOURCE_DATE_EPOCH is no time.
-        MachineError: The disk is full, read-only or otherwise unwilling.
+        DatasetError: Shards are missing, damaged or of another specification; the message names them.
+        UsageError: SOURCE_DATE_EPOCH is not a time.
+        MachineError: A file cannot be written.
     """
-    summary = summarise(folder, blueprint)
+    summary = summarize_dataset(folder, spec)
     created = _created(summary)
     (folder / MANIFEST).unlink(missing_ok=True)
     save_document(folder / STATS, stats_document(summary))
@@ -68,13 +68,13 @@ def finalize(folder: Path, blueprint: Blueprint, *, notes: str = "") -> dict[str
 
 
 def _name(folder: Path) -> str:
-    """Return the name of a folder as text; bytes in it that are not UTF-8 become question marks."""
+    """Return the name of a folder as text; bytes that are not UTF-8 are replaced by question marks."""
     return os.fsencode(folder.resolve().name).decode(errors="replace")
 
 
 def _remove_work(work: Path) -> None:
-    """Remove the folder for temporary files: every shard is committed, so nobody needs it; foreign files are kept."""
-    sweep_all(work)
+    """Remove the folder of temporary files after all shards are committed; other files in it are kept."""
+    remove_all_temporary(work)
     with suppress(OSError):
         work.rmdir()
 
@@ -83,33 +83,34 @@ def load_manifest(folder: Path) -> dict[str, Any]:
     """Read ``manifest.json``.
 
     Raises:
-        DatasetError: It is missing (the dataset is unfinished), damaged or written by a newer cnpgen.
-        MachineError: The system would not let us read it.
+        DatasetError: It is missing (the dataset is unfinished), damaged or of another format version.
+        MachineError: A file cannot be read.
     """
-    return load_document(folder / MANIFEST, FORMAT, version=FORMAT_VERSION, form=FORM)
+    return load_document(folder / MANIFEST, MANIFEST_FORMAT, version=MANIFEST_VERSION, structure=MANIFEST_STRUCTURE)
 
 
-def lists_shards_of(manifest: dict[str, Any], blueprint: Blueprint) -> bool:
-    """Whether a manifest lists the shards of a blueprint, in order, under their names, and nothing else.
+def lists_shards_of(manifest: dict[str, Any], spec: DatasetSpec) -> bool:
+    """Return whether a manifest lists exactly the shards of a specification, in order.
 
-    Only names that the blueprint gives are opened: no path in a manifest leads out of the dataset's folder.
+    Only these file names are opened: no path in a manifest can lead outside the folder of the dataset.
     """
-    found = {split: [_place(entry) for entry in content["shards"]] for split, content in manifest["splits"].items()}
-    wanted: dict[str, list[tuple[str, str, int, int]]] = {split: [] for split in blueprint.splits}
-    for task in shards(blueprint):
-        wanted[task.split].append((task.file, task.sidecar, task.first_row, task.rows))
-    return found == wanted
+    listed = {split: [_location(entry) for entry in content["shards"]] for split, content in manifest["splits"].items()}
+    expected: dict[str, list[tuple[str, str, int, int]]] = {split: [] for split in spec.splits}
+    for task in shards(spec):
+        expected[task.split].append((task.file, task.sidecar, task.first_row, task.rows))
+    return listed == expected
 
 
-def _place(entry: dict[str, Any]) -> tuple[str, str, int, int]:
+def _location(entry: dict[str, Any]) -> tuple[str, str, int, int]:
+    """Return file, sidecar, first row and number of rows of a shard."""
     return entry["file"], entry["sidecar"]["file"], entry["first_sample_id"], entry["rows"]
 
 
 def source_date() -> datetime | None:
-    """Return the time that the environment variable SOURCE_DATE_EPOCH wants datasets to be made at, if it is set.
+    """Return the time in the environment variable SOURCE_DATE_EPOCH, or None if it is not set.
 
     Raises:
-        UsageError: It is no time.
+        UsageError: It is not a time.
     """
     epoch = os.environ.get("SOURCE_DATE_EPOCH", "")
     try:
@@ -118,46 +119,48 @@ def source_date() -> datetime | None:
         raise UsageError(f"SOURCE_DATE_EPOCH must be whole seconds since 1970, got {epoch!r}: unset it") from error
 
 
-def _created(summary: Summary) -> str:
-    """Return when the work on the last shard began, or what SOURCE_DATE_EPOCH says, in UTC to the second.
+def _created(summary: DatasetSummary) -> str:
+    """Return the start time of the last shard, or SOURCE_DATE_EPOCH, in UTC to the second.
 
-    It does not depend on when the dataset is finished: doing that twice, even at the same time, gives the same files.
+    It does not depend on when the dataset is finished, so finishing it twice gives the same files.
     """
-    wanted = source_date()
+    fixed = source_date()
     try:
         started = [datetime.fromisoformat(record.started) for _, record in summary.records if record.started]
-        last = max((moment.timestamp() for moment in started), default=time.time())
-        moment = datetime.fromtimestamp(int(last), UTC) if wanted is None else wanted
-        return moment.strftime("%Y-%m-%dT%H:%M:%SZ")
+        last = max((instant.timestamp() for instant in started), default=time.time())
+        instant = datetime.fromtimestamp(int(last), UTC) if fixed is None else fixed
+        return instant.strftime("%Y-%m-%dT%H:%M:%SZ")
     except (ValueError, OverflowError, OSError) as error:
-        raise DatasetError(f"cannot tell when the dataset was made: a shard's record has no start ({error})") from error
+        raise DatasetError(
+            f"the creation time of the dataset is unknown: the record of a shard has no valid start time ({error})"
+        ) from error
 
 
-def _manifest(folder: Path, summary: Summary, *, created: str) -> dict[str, Any]:
-    """Build the manifest; the files that it lists must be on the disk."""
-    blueprint = summary.blueprint
+def _manifest(folder: Path, summary: DatasetSummary, *, created: str) -> dict[str, Any]:
+    """Build the manifest; the files that it lists must exist."""
+    spec = summary.spec
     return {
-        "format": FORMAT,
-        "format_version": FORMAT_VERSION,
-        "name": blueprint.name,
-        "version": blueprint.version,
-        "title": blueprint.title,
+        "format": MANIFEST_FORMAT,
+        "format_version": MANIFEST_VERSION,
+        "name": spec.name,
+        "version": spec.version,
+        "title": spec.title,
         "created": created,
-        "license": blueprint.license,
+        "license": spec.license,
         "fingerprint": data_fingerprint((item.file, item.sha256) for _, item in summary.records),
-        "plan_fingerprint": blueprint.fingerprint,
+        "specification_fingerprint": spec.fingerprint,
         **_origin(summary),
-        "features": {field.name: _feature(field, blueprint) for field in blueprint.fields},
-        "yield": summary.fates.yield_json(),
-        "verification": dict(summary.fates.verification),
-        "splits": {split: _split(folder, summary, split) for split in blueprint.splits},
+        "features": {field.name: _feature(field, spec) for field in spec.fields},
+        "yield": summary.sampling.yield_json(),
+        "verification": dict(summary.sampling.verification),
+        "splits": {split: _split(folder, summary, split) for split in spec.splits},
         "stats": STATS,
-        "files": {name: _listed(folder / name) for name in (PLAN, STATS, CARD, CROISSANT)},
+        "files": {name: _listed(folder / name) for name in (SPECIFICATION, STATS, CARD, CROISSANT)},
     }
 
 
 def data_fingerprint(files: Iterable[tuple[str, str]]) -> str:
-    """Compute the fingerprint of a dataset's rows, as ``sha256sum */shard-*.h5 | sha256sum`` in its folder does.
+    """Compute the fingerprint of the samples, as ``sha256sum */shard-*.h5 | sha256sum`` does in the dataset folder.
 
     Args:
         files: Path and sha256 of every shard.
@@ -166,35 +169,35 @@ def data_fingerprint(files: Iterable[tuple[str, str]]) -> str:
     return hashlib.sha256(lines.encode()).hexdigest()
 
 
-def _origin(summary: Summary) -> dict[str, Any]:
-    """Say where the rows come from; "environments" are the versions that made them, more than one after an upgrade."""
-    blueprint = summary.blueprint
+def _origin(summary: DatasetSummary) -> dict[str, Any]:
+    """Describe the origin of the samples; "environments" are all combinations of versions that made shards."""
+    spec = summary.spec
     environments: list[dict[str, str]] = []
     for _, record in summary.records:
         if (versions := dict(record.versions)) not in environments:
             environments.append(versions)
-    pipeline = blueprint.recipe.get("pipeline")
+    pipeline = spec.recipe.get("pipeline")
     return {
         "pipeline": pipeline.get("name", "") if isinstance(pipeline, dict) else pipeline,
-        "recipe_sha256": blueprint.recipe_sha256,
-        "recipe": blueprint.recipe,
-        "seed": str(blueprint.seed),
-        "generator": blueprint.generator,
-        "backend": blueprint.backend,
-        "dtype": blueprint.dtype,
-        "block_rows": blueprint.block_rows,
-        "shard_size": blueprint.shard_size,
-        "robot": blueprint.robot,
-        "versions": blueprint.versions,
+        "recipe_sha256": spec.recipe_sha256,
+        "recipe": spec.recipe,
+        "seed": str(spec.seed),
+        "generator": spec.generator,
+        "backend": spec.backend,
+        "dtype": spec.dtype,
+        "block_rows": spec.block_rows,
+        "shard_size": spec.shard_size,
+        "robot": spec.robot,
+        "versions": spec.versions,
         "environments": environments,
         "seconds": sum(record.seconds for _, record in summary.records),
     }
 
 
-def _feature(field: Field, blueprint: Blueprint) -> dict[str, Any]:
-    """Describe a field with the keys of LeRobot's ``info.json`` and the units that those lack."""
+def _feature(field: Field, spec: DatasetSpec) -> dict[str, Any]:
+    """Describe a field with the keys of LeRobot's ``info.json``, and its unit, which LeRobot does not have."""
     return {
-        "dtype": blueprint.dtype if field.dtype == "float" else field.dtype,
+        "dtype": spec.dtype if field.dtype == "float" else field.dtype,
         "shape": [field.width] if field.width else [],
         "names": field.names,
         "units": field.unit,
@@ -206,7 +209,7 @@ def _feature(field: Field, blueprint: Blueprint) -> dict[str, Any]:
     }
 
 
-def _split(folder: Path, summary: Summary, split: str) -> dict[str, Any]:
+def _split(folder: Path, summary: DatasetSummary, split: str) -> dict[str, Any]:
     """List the shards of a split."""
     entries = [
         {
@@ -219,8 +222,8 @@ def _split(folder: Path, summary: Summary, split: str) -> dict[str, Any]:
         }
         for task, record in summary.of_split(split)
     ]
-    fates = summary.fates_by_split[split]
-    return {"rows": summary.blueprint.splits[split], "yield": fates.yield_json(), "shards": entries}
+    sampling = summary.sampling_by_split[split]
+    return {"rows": summary.spec.splits[split], "yield": sampling.yield_json(), "shards": entries}
 
 
 def _listed(path: Path) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What users point at: the folder of a dataset, a file. What is not there is a mistake in an argument, not damage."""
+"""Checks of paths given by users: a missing file or folder is a usage error, not a damaged dataset."""
 
 from pathlib import Path
 
@@ -6,46 +6,46 @@ from cnpgen.errors import DatasetError, MachineError, UsageError
 from cnpgen.store.files.kind import PLANS, is_hdf5, own_kind
 from cnpgen.store.workspace import is_dataset
 
-_SAID = {"cnpgen-plans": PLANS, "cnpgen-shard": "a shard of a dataset"}
+_KIND_OF_FORMAT = {"cnpgen-plans": PLANS, "cnpgen-shard": "a shard of a dataset"}
 
 
 def require_folder(folder: Path) -> None:
-    """Refuse what is no folder.
+    """Raise an error if a folder does not exist.
 
     Args:
-        folder: What should be the folder of a dataset.
+        folder: Folder of a dataset.
 
     Raises:
-        UsageError: It is not there, or is a file.
+        UsageError: The folder is missing or is a file.
     """
     if not folder.is_dir():
-        what = "a file" if folder.exists() else "not there"
-        raise UsageError(f"{folder} is {what}, expected the folder of a dataset")
+        actual = "a file" if folder.exists() else "not there"
+        raise UsageError(f"{folder} is {actual}, expected the folder of a dataset")
 
 
-def require_file(path: Path, what: str, *, of_dataset: str = "") -> None:
-    """Refuse what is no file.
+def require_file(path: Path, expected: str, *, of_dataset: str = "") -> None:
+    """Raise an error if a path is not a file.
 
     Args:
-        path: What should be a file.
-        what: What it should hold: "a file of plans".
-        of_dataset: What to do if it is the folder of a dataset instead.
+        path: The path.
+        expected: Expected content: "a file of plans".
+        of_dataset: Hint in the case of the folder of a dataset.
 
     Raises:
-        UsageError: It is not there, or is a folder, a device or a pipe.
+        UsageError: The path does not exist, or is a folder, a device or a pipe.
     """
     if path.is_dir():
-        found, hint = ("the folder of a dataset", of_dataset) if is_dataset(path) else ("a folder", "")
-        raise UsageError(f"{path} is {found}, expected {what}{hint and f': {hint}'}")
+        actual, hint = ("the folder of a dataset", of_dataset) if is_dataset(path) else ("a folder", "")
+        raise UsageError(f"{path} is {actual}, expected {expected}{hint and f': {hint}'}")
     if not path.exists():
-        raise UsageError(f"{path} is not there, expected {what}")
+        raise UsageError(f"{path} is not there, expected {expected}")
     if not path.is_file():
-        raise UsageError(f"{path} is a device or a pipe, expected {what}")
+        raise UsageError(f"{path} is a device or a pipe, expected {expected}")
 
 
 def file_kind(path: Path) -> str:
-    """Say what a file is: "a model of cnpgen", "a file of plans"; nothing where that is not known."""
-    if not path.is_file():  # to open a pipe is to wait for somebody
+    """Return the kind of a file, "a model of cnpgen" or "a file of plans"; empty if it is not known."""
+    if not path.is_file():  # opening a pipe would block
         return ""
     try:
         with path.open("rb") as file:
@@ -60,10 +60,13 @@ def _hdf5_kind(path: Path) -> str:
 
     try:
         with opened_hdf5(path) as file:
-            said, names = file.attributes.some(["format"]).get("format"), set(file)
+            format_name, names = file.attributes.some(["format"]).get("format"), set(file)
     except (DatasetError, MachineError):
         return "an HDF5 file"
-    said = said.decode(errors="replace") if isinstance(said, bytes) else said
-    if said is None and {"path_control_points", "rate_control_points"} <= names:  # others' files need not say it
+    if isinstance(format_name, bytes):
+        format_name = format_name.decode(errors="replace")
+    if (
+        format_name is None and {"path_control_points", "rate_control_points"} <= names
+    ):  # files of other software may have no format
         return PLANS
-    return _SAID.get(str(said), "an HDF5 file")
+    return _KIND_OF_FORMAT.get(str(format_name), "an HDF5 file")

@@ -1,4 +1,4 @@
-"""Reading a dataset's rows back: for inspection, for planners, for whoever wants them as they are stored."""
+"""Reading the rows of a dataset as they are stored."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -10,44 +10,44 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, lacks
-from cnpgen.store.blueprint import Blueprint, ShardTask, load_blueprint, shards
+from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, load_dataset_spec, shards
+from cnpgen.store.dataset_summary import summarize_dataset, unfinished
 from cnpgen.store.intact import require_intact
-from cnpgen.store.layout import MANIFEST, PLAN
+from cnpgen.store.layout import MANIFEST, SPECIFICATION
 from cnpgen.store.manifest import lists_shards_of, load_manifest
 from cnpgen.store.paths import require_folder
-from cnpgen.store.record import is_committed, load_record
 from cnpgen.store.shard import read_shard, storage_dtype
-from cnpgen.store.summary import summarise, unfinished
+from cnpgen.store.shard_record import is_committed, load_record
 
 
 @dataclass(frozen=True, eq=False)
 class StoredDataset:
-    """A dataset on disk; holds no open files, so it can be pickled and used in any process.
+    """A dataset on disk. It has no open files, so it can be pickled and used in any process.
 
-    The sha256 of every shard is compared with the recorded one before its rows are first given.
+    The sha256 of every shard is verified before its rows are read for the first time.
 
     Attributes:
-        folder: Its folder.
-        blueprint: Its blueprint.
-        manifest: Its manifest; None while it is unfinished.
+        folder: Folder of the dataset.
+        spec: Specification of the dataset.
+        manifest: Manifest of the dataset; None if it is unfinished.
     """
 
     folder: Path
-    blueprint: Blueprint
+    spec: DatasetSpec
     manifest: dict[str, Any] | None
 
     def tasks(self, split: str) -> list[ShardTask]:
-        """List the shards of a split that are there, in order.
+        """List the existing shards of a split, in order.
 
         Raises:
             DatasetError: There is no such split.
         """
-        if split not in self.blueprint.splits:
-            raise DatasetError(f"{self.folder} {lacks('split', split, self.blueprint.splits)}")
-        found = [task for task in shards(self.blueprint) if task.split == split]
+        if split not in self.spec.splits:
+            raise DatasetError(f"{self.folder} {lacks('split', split, self.spec.splits)}")
+        tasks = [task for task in shards(self.spec) if task.split == split]
         if self.manifest is None:
-            return [task for task in found if is_committed(self.folder, self.blueprint, task)]
-        return found
+            return [task for task in tasks if is_committed(self.folder, self.spec, task)]
+        return tasks
 
     def iter_shards(
         self, split: str, *, fields: Sequence[str] | None = None
@@ -56,10 +56,10 @@ class StoredDataset:
 
         Args:
             split: Name of the split.
-            fields: Names of the fields; all by default, in the blueprint's order.
+            fields: Names of the fields; by default all, in the order of the specification.
 
         Yields:
-            The shard, and field name -> values, shape (rows, width) or (rows,).
+            The shard and field name -> values, shape (rows, width) or (rows,).
 
         Raises:
             DatasetError: There is no such split or field, or a shard is damaged.
@@ -71,13 +71,13 @@ class StoredDataset:
     def read(
         self, split: str, *, fields: Sequence[str] | None = None, start: int = 0, stop: int | None = None
     ) -> dict[str, NDArray[Any]]:
-        """Read rows ``start`` to ``stop`` of a split; of an unfinished dataset, those of them that are there.
+        """Read rows ``start`` to ``stop`` of a split; of an unfinished dataset, only the existing ones of them.
 
         Args:
             split: Name of the split.
-            fields: Names of the fields; all by default, in the blueprint's order.
+            fields: Names of the fields; by default all, in the order of the specification.
             start: First row.
-            stop: Row after the last one; all by default.
+            stop: Row after the last one; by default the end of the split.
 
         Returns:
             Field name -> values, shape (rows, width) or (rows,).
@@ -87,7 +87,7 @@ class StoredDataset:
         """
         names = self._names(fields)
         tasks = self.tasks(split)
-        rows = self.blueprint.splits[split]
+        rows = self.spec.splits[split]
         stop = rows if stop is None else stop
         if not 0 <= start <= stop <= rows:
             raise DatasetError(f"split {split!r} has rows 0 to {rows}, got {start} to {stop}")
@@ -101,34 +101,30 @@ class StoredDataset:
         return {name: np.concatenate(items) for name, items in parts.items()}
 
     def _read(self, task: ShardTask, names: Sequence[str]) -> dict[str, NDArray[Any]]:
-        """Read fields of a shard that is the recorded one."""
+        """Verify a shard and read fields of it."""
         path = self.folder / task.file
-        size, sha256 = self._recorded.get(task.file) or _of_sidecar(self.folder, task)
+        size, sha256 = self._recorded.get(task.file) or _size_and_sha256(self.folder, task)
         require_intact(path, size=size, sha256=sha256)
         return read_shard(path, names)
 
     @cached_property
     def _recorded(self) -> dict[str, tuple[int, str]]:
-        """Shard -> its size [bytes] and sha256, as the manifest lists them; empty while there is none."""
+        """Shard -> size [bytes] and sha256 in the manifest; empty without a manifest."""
         splits = {} if self.manifest is None else self.manifest["splits"]
         return {
             entry["file"]: (entry["bytes"], entry["sha256"]) for split in splits.values() for entry in split["shards"]
         }
 
     def _names(self, fields: Sequence[str] | None) -> list[str]:
-        return (
-            [self.blueprint.field_named(name).name for name in fields]
-            if fields
-            else [f.name for f in self.blueprint.fields]
-        )
+        return [self.spec.field_named(name).name for name in fields] if fields else [f.name for f in self.spec.fields]
 
     def _no_rows(self, name: str) -> NDArray[Any]:
-        field = self.blueprint.field_named(name)
-        return np.empty((0, field.width) if field.width else (0,), storage_dtype(field, self.blueprint.dtype))
+        field = self.spec.field_named(name)
+        return np.empty((0, field.width) if field.width else (0,), storage_dtype(field, self.spec.dtype))
 
 
-def _of_sidecar(folder: Path, task: ShardTask) -> tuple[int, str]:
-    """Return size [bytes] and sha256 of a shard as its sidecar has them."""
+def _size_and_sha256(folder: Path, task: ShardTask) -> tuple[int, str]:
+    """Return the size [bytes] and sha256 of a shard in its sidecar."""
     record = load_record(folder, task)
     return record.bytes, record.sha256
 
@@ -137,26 +133,26 @@ def open_dataset(folder: str | Path, *, allow_incomplete: bool = False) -> Store
     """Open a dataset for reading.
 
     Args:
-        folder: Its folder.
-        allow_incomplete: Open it even if it is unfinished.
+        folder: Folder of the dataset.
+        allow_incomplete: Whether to open an unfinished dataset, too.
 
     Raises:
-        UsageError: There is no such folder.
-        DatasetError: It holds no dataset, it is unfinished, or its plan.json or manifest is damaged.
-        MachineError: The system would not let us read something.
+        UsageError: The folder does not exist.
+        DatasetError: The folder contains no dataset, or the dataset is unfinished or its documents are damaged.
+        MachineError: A file cannot be read.
     """
     folder = Path(folder)
     require_folder(folder)
-    blueprint = load_blueprint(folder)
+    spec = load_dataset_spec(folder)
     if (folder / MANIFEST).exists():
         manifest = load_manifest(folder)
-        if manifest["plan_fingerprint"] != blueprint.fingerprint:
+        if manifest["specification_fingerprint"] != spec.fingerprint:
             raise DatasetError(
-                f"{folder / MANIFEST} is of another blueprint than {PLAN}: the folder mixes two datasets"
+                f"{folder / MANIFEST} is of another specification than {SPECIFICATION}: the folder mixes two datasets"
             )
-        if not lists_shards_of(manifest, blueprint):
-            raise DatasetError(f"{folder / MANIFEST} lists other shards than {PLAN}")
-        return StoredDataset(folder, blueprint, manifest)
+        if not lists_shards_of(manifest, spec):
+            raise DatasetError(f"{folder / MANIFEST} lists other shards than {SPECIFICATION}")
+        return StoredDataset(folder, spec, manifest)
     if not allow_incomplete:
-        raise DatasetError(f"{folder} is {unfinished(summarise(folder, blueprint, allow_incomplete=True))}")
-    return StoredDataset(folder, blueprint, None)
+        raise DatasetError(f"{folder} is {unfinished(summarize_dataset(folder, spec, allow_incomplete=True))}")
+    return StoredDataset(folder, spec, None)

@@ -1,6 +1,7 @@
-"""One shard: an HDF5 file with one contiguous dataset per field and attributes that say what the numbers are.
+"""A shard: an HDF5 file with one contiguous dataset per field and attributes that describe it.
 
-The bytes of a shard depend on its rows, fields and attributes only, within one version of HDF5: no time, host or path.
+The bytes of a shard depend only on its rows, fields and attributes and on the version of HDF5, not on time, host or
+path.
 """
 
 import io
@@ -18,8 +19,8 @@ from cnpgen.store.field import Field
 from cnpgen.store.files.atomic import committing
 from cnpgen.store.files.hdf5 import create_hdf5, opened_hdf5
 
-FORMAT = "cnpgen-shard"
-FORMAT_VERSION = 1
+SHARD_FORMAT = "cnpgen-shard"
+SHARD_VERSION = 2
 _STORAGE = {"float64": "<f8", "float32": "<f4", "int64": "<i8"}
 
 
@@ -28,10 +29,10 @@ def storage_dtype(field: Field, dtype: str) -> np.dtype[Any]:
 
     Args:
         field: The field.
-        dtype: The dataset's float type, "float64" or "float32".
+        dtype: Float type of the dataset, "float64" or "float32".
 
     Raises:
-        DatasetError: There is no such type.
+        DatasetError: The type is not supported.
     """
     name = dtype if field.dtype == "float" else field.dtype
     if name not in _STORAGE:
@@ -40,7 +41,7 @@ def storage_dtype(field: Field, dtype: str) -> np.dtype[Any]:
 
 
 def field_attributes(field: Field) -> dict[str, Any]:
-    """Say what the numbers of a field are; arrays have shape (max(width, 1),)."""
+    """Return the HDF5 attributes of a field; arrays have shape (max(width, 1),)."""
     attributes: dict[str, Any] = {
         "units": field.unit,
         "long_name": field.long_name,
@@ -61,22 +62,22 @@ def write_shard(
     dtype: str = "float64",
     work: Path | None = None,
 ) -> int:
-    """Write a shard atomically; it is read back before it gets its name.
+    """Write a shard atomically, and read it back before it is renamed.
 
     Args:
-        path: Where to.
-        columns: Field name -> finite values, shape (rows, width) or (rows,), already in the type they are stored in.
-        fields: The fields, in order; every one must have a column.
-        attributes: File attributes; "rows" must be the number of rows.
-        dtype: The dataset's float type, "float64" or "float32".
-        work: Folder for the temporary file.
+        path: The file.
+        columns: Field name -> finite values in their stored type, shape (rows, width) or (rows,).
+        fields: The fields, in order; each must have a column.
+        attributes: Attributes of the file; "rows" must be the number of rows.
+        dtype: Float type of the dataset, "float64" or "float32".
+        work: Folder of the temporary file.
 
     Returns:
-        Number of bytes written.
+        Size of the file [bytes].
 
     Raises:
-        DatasetError: The columns are not what the fields say, or not finite.
-        MachineError: The disk is full, read-only or otherwise unwilling.
+        DatasetError: The columns do not fit the fields, or are not finite.
+        MachineError: A file cannot be written.
     """
     rows = int(attributes["rows"])
     _check_columns(columns, fields, rows, dtype)
@@ -86,7 +87,7 @@ def write_shard(
         with opened_hdf5(temporary) as file:
             shapes = {name: item.shape for name, item in file.columns().items()}
         if shapes != {field.name: _shape(field, rows) for field in fields}:
-            raise DatasetError(f"{path} was not written as it was meant: found {shapes}")
+            raise DatasetError(f"{path} was not written correctly: it has the shapes {shapes}")
     return len(content)
 
 
@@ -95,7 +96,7 @@ def _shape(field: Field, rows: int) -> tuple[int, ...]:
 
 
 def _check_columns(columns: Mapping[str, NDArray[Any]], fields: Sequence[Field], rows: int, dtype: str) -> None:
-    """Refuse columns that do not fit the fields."""
+    """Raise an error if the columns do not fit the fields."""
     names = {field.name for field in fields}
     if columns.keys() != names or rows < 1:
         missing, extra = sorted(names - columns.keys()), sorted(columns.keys() - names)
@@ -103,8 +104,8 @@ def _check_columns(columns: Mapping[str, NDArray[Any]], fields: Sequence[Field],
     for field in fields:
         values, shape, stored = columns[field.name], _shape(field, rows), storage_dtype(field, dtype)
         if values.shape != shape or values.dtype != stored:
-            found = f"{values.dtype} of shape {values.shape}"
-            raise DatasetError(f"field {field.name!r} must be {stored} of shape {shape}, got {found}")
+            actual = f"{values.dtype} of shape {values.shape}"
+            raise DatasetError(f"field {field.name!r} must be {stored} of shape {shape}, got {actual}")
         finite = np.isfinite(values)
         if not finite.all():
             bad = ~finite.reshape(rows, -1).all(axis=1)
@@ -114,7 +115,7 @@ def _check_columns(columns: Mapping[str, NDArray[Any]], fields: Sequence[Field],
 def _encode(
     columns: Mapping[str, NDArray[Any]], fields: Sequence[Field], attributes: Mapping[str, str | int], dtype: str
 ) -> memoryview:
-    """Build the file in memory, where a full disk cannot leave half of it and errors are the system's own."""
+    """Build the file in memory: a full disk then causes a plain system error, and no partial file."""
     import h5py
 
     buffer = io.BytesIO()
@@ -123,7 +124,7 @@ def _encode(
             stored = storage_dtype(field, dtype)
             dataset = file.create_dataset(field.name, data=columns[field.name], dtype=stored, track_times=False)
             dataset.attrs.update(field_attributes(field))
-        file.attrs.update({"format": FORMAT, "format_version": FORMAT_VERSION, **attributes})
+        file.attrs.update({"format": SHARD_FORMAT, "format_version": SHARD_VERSION, **attributes})
     return buffer.getbuffer()
 
 
@@ -131,15 +132,15 @@ def read_shard(path: Path, fields: Sequence[str] | None = None) -> dict[str, NDA
     """Read whole fields of a shard.
 
     Args:
-        path: The shard.
-        fields: Names of the fields; all by default.
+        path: File of the shard.
+        fields: Names of the fields; all fields by default.
 
     Returns:
         Field name -> values, shape (rows, width) or (rows,).
 
     Raises:
         DatasetError: The file is missing, damaged or cut off, or has no such field.
-        MachineError: The system would not let us read it.
+        MachineError: A file cannot be read.
     """
     with opened_hdf5(path) as file:
         known = list(file)
@@ -150,18 +151,18 @@ def read_shard(path: Path, fields: Sequence[str] | None = None) -> dict[str, NDA
 
 
 def read_attributes(path: Path, names: Sequence[str] | None = None) -> dict[str, str | int]:
-    """Read a shard's file attributes.
+    """Read the attributes of a shard.
 
     Args:
-        path: The shard.
-        names: Names of the attributes; all by default.
+        path: File of the shard.
+        names: Names of the attributes; all attributes by default.
 
     Returns:
         Name -> value.
 
     Raises:
         DatasetError: The file is missing, damaged or cut off, or has no such attribute.
-        MachineError: The system would not let us read it.
+        MachineError: A file cannot be read.
     """
     with opened_hdf5(path) as file:
         values = {name: file.attributes[name] for name in (file.attributes if names is None else names)}
@@ -170,12 +171,12 @@ def read_attributes(path: Path, names: Sequence[str] | None = None) -> dict[str,
 
 @dataclass(frozen=True, eq=False)
 class StoredField:
-    """What a shard says about one of its datasets.
+    """Description of an HDF5 dataset in a shard.
 
     Attributes:
         shape: Shape of the dataset.
-        dtype: Its stored type.
-        attributes: Its attributes.
+        dtype: Stored type.
+        attributes: HDF5 attributes.
     """
 
     shape: tuple[int, ...]
@@ -184,11 +185,11 @@ class StoredField:
 
 
 def read_schema(path: Path) -> dict[str, StoredField]:
-    """Read what a shard says about its datasets, without their values.
+    """Read the descriptions of the datasets of a shard, without their values.
 
     Raises:
         DatasetError: The file is missing, damaged or cut off.
-        MachineError: The system would not let us read it.
+        MachineError: A file cannot be read.
     """
     with opened_hdf5(path) as file:
         columns = file.columns()
@@ -197,13 +198,13 @@ def read_schema(path: Path) -> dict[str, StoredField]:
 
 @dataclass(frozen=True)
 class Placement:
-    """Where a shard keeps the values of a field.
+    """Location of the values of a field in a shard.
 
     Attributes:
         shape: Shape of the values.
-        dtype: Their stored type.
-        offset: Where they begin in the file [bytes]; None if they are not there in one piece, as cnpgen writes them,
-            but in chunks, maybe compressed.
+        dtype: Stored type.
+        offset: Position of the first value in the file [bytes]; None if they are stored in chunks or compressed, which
+            cnpgen does not do.
     """
 
     shape: tuple[int, ...]
@@ -212,15 +213,17 @@ class Placement:
 
 
 def read_placements(path: Path) -> tuple[dict[str, Placement], dict[str, int]]:
-    """Read where a shard keeps its fields, so that they can be mapped into memory, and which shard it is.
+    """Read the locations of the fields of a shard, for memory mapping, and the identity of the shard.
 
     Returns:
-        Field name -> its place; and the file's attributes ``plan_key``, ``first_sample_id`` and ``rows``.
+        Field name -> location; and the attributes ``specification_key``, ``first_sample_id`` and ``rows`` of the file.
 
     Raises:
         DatasetError: The file is missing, damaged or cut off.
-        MachineError: The system would not let us read it.
+        MachineError: A file cannot be read.
     """
     with opened_hdf5(path) as file:
-        places = {name: Placement(item.shape, item.dtype, item.offset) for name, item in file.columns().items()}
-        return places, {name: int(file.attributes[name]) for name in ("plan_key", "first_sample_id", "rows")}
+        placements = {name: Placement(item.shape, item.dtype, item.offset) for name, item in file.columns().items()}
+        return placements, {
+            name: int(file.attributes[name]) for name in ("specification_key", "first_sample_id", "rows")
+        }

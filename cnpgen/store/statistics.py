@@ -1,4 +1,4 @@
-"""Statistics of a field that can be merged shard by shard, without ever averaging a quantile."""
+"""Statistics of a field: count, mean, variance, extrema and histogram, which can be merged exactly over shards."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError
 from cnpgen.store.field import Field
-from cnpgen.store.files.forms import NUMBER, WHOLE, check_form
+from cnpgen.store.files.document_structure import NUMBER, WHOLE, check_structure
 
 Floats = NDArray[np.float64]
 N_BINS = 64
@@ -19,7 +19,7 @@ N_BINS = 64
 class FieldStatistics:
     """Statistics of the c columns of one field, in the field's unit; c is 1 for a scalar field.
 
-    Counts, extremes and histograms do not depend on how the rows were sharded; mean and m2 only in their last digits.
+    Counts, extrema and histograms do not depend on the shard size; mean and m2 depend on it by rounding errors only.
 
     Attributes:
         count: Number of rows.
@@ -27,10 +27,10 @@ class FieldStatistics:
         m2: Sum of squared deviations from the mean, shape (c,).
         minimum: Smallest value, shape (c,).
         maximum: Largest value, shape (c,).
-        low: Lower ends of the histograms, the field's ``valid_min``, shape (c,); None without histograms.
-        high: Upper ends, the field's ``valid_max``, shape (c,).
-        histogram: Rows per bin, 64 equal bins from ``low`` to ``high``, shape (c, 64). What lies outside
-            (a value at its limit, but for rounding) counts in the first or last bin.
+        low: Lower bounds of the histograms, the ``valid_min`` of the field, shape (c,); None without histograms.
+        high: Upper bounds of the histograms, the ``valid_max`` of the field, shape (c,).
+        histogram: Rows per bin, 64 equal bins from ``low`` to ``high``, shape (c, 64). Values outside, by rounding
+            errors, are counted in the first or last bin.
     """
 
     count: int
@@ -44,21 +44,21 @@ class FieldStatistics:
 
     @property
     def constant(self) -> NDArray[np.bool_]:
-        """Columns with one value in all rows: dividing by their deviation would make NaN, shape (c,)."""
+        """Mask of the columns with one value in all rows, shape (c,); their standard deviation is 0."""
         return np.equal(self.minimum, self.maximum)
 
     @property
     def std(self) -> Floats:
-        """Standard deviation of these rows, m2 / count under the root, exactly 0 for constant columns, shape (c,)."""
+        """Standard deviation sqrt(m2 / count), exactly 0 for constant columns, shape (c,)."""
         return np.where(self.constant, 0.0, np.sqrt(self.m2 / self.count))
 
     def merge(self, other: "FieldStatistics") -> "FieldStatistics":
-        """Return the statistics of both sets of rows together (Chan, Golub, LeVeque 1979).
+        """Return the statistics of the union of both sets of rows (Chan, Golub and LeVeque 1979).
 
         Raises:
-            DatasetError: The two have different columns or histogram ranges.
+            DatasetError: The columns or the ranges of the histograms differ.
         """
-        if not _alike(self, other):
+        if not _have_equal_columns(self, other):
             raise DatasetError("statistics of different fields cannot be merged")
         count = self.count + other.count
         delta = other.mean - self.mean
@@ -77,7 +77,7 @@ class FieldStatistics:
         )
 
     def to_json(self) -> dict[str, Any]:
-        """Return a JSON-able dict, with the derived ``std`` and ``constant`` for readers."""
+        """Return a JSON-able dict, which also contains the derived ``std`` and ``constant``."""
         content: dict[str, Any] = {"count": self.count}
         for name in ("mean", "std", "m2", "minimum", "maximum", "constant"):
             content[{"minimum": "min", "maximum": "max"}.get(name, name)] = getattr(self, name).tolist()
@@ -87,8 +87,8 @@ class FieldStatistics:
         return content
 
 
-def _alike(a: FieldStatistics, b: FieldStatistics) -> bool:
-    """Whether two statistics are of the same columns."""
+def _have_equal_columns(a: FieldStatistics, b: FieldStatistics) -> bool:
+    """Return whether two statistics are of the same columns."""
     if a.mean.shape != b.mean.shape or (a.histogram is None) != (b.histogram is None):
         return False
     if a.low is None or b.low is None or a.high is None or b.high is None:
@@ -96,38 +96,38 @@ def _alike(a: FieldStatistics, b: FieldStatistics) -> bool:
     return np.array_equal(a.low, b.low) and np.array_equal(a.high, b.high)
 
 
-STATISTICS_FORM = {"count": WHOLE, "mean": [NUMBER], "m2": [NUMBER], "min": [NUMBER], "max": [NUMBER]}
-_HISTOGRAM_FORM = {"low": [NUMBER], "high": [NUMBER], "counts": [[WHOLE]]}
+STATISTICS_STRUCTURE = {"count": WHOLE, "mean": [NUMBER], "m2": [NUMBER], "min": [NUMBER], "max": [NUMBER]}
+_HISTOGRAM_STRUCTURE = {"low": [NUMBER], "high": [NUMBER], "counts": [[WHOLE]]}
 
 
 def statistics_from_json(content: Mapping[str, Any]) -> FieldStatistics:
-    """Rebuild statistics from their JSON form.
+    """Rebuild statistics from a dict.
 
     Args:
-        content: What has the form ``STATISTICS_FORM``.
+        content: Dict with the structure ``STATISTICS_STRUCTURE``.
 
     Raises:
-        ValueError: They cannot be those of any field.
+        ValueError: Shapes or counts are inconsistent.
     """
-    arrays = {name: np.array(content[name], np.float64) for name in ("mean", "m2")}
-    arrays |= {name + "imum": np.array(content[name], np.float64) for name in ("min", "max")}
+    keys = {"mean": "mean", "m2": "m2", "minimum": "min", "maximum": "max"}
+    arrays = {name: np.array(content[key], np.float64) for name, key in keys.items()}
     counts = None
     if (histogram := content.get("histogram")) is not None:
-        check_form(histogram, _HISTOGRAM_FORM)
+        check_structure(histogram, _HISTOGRAM_STRUCTURE)
         arrays |= {name: np.array(histogram[name], np.float64) for name in ("low", "high")}
         counts = np.array(histogram["counts"], np.int64)
-    found = FieldStatistics(count=int(content["count"]), histogram=counts, **arrays)
-    columns = len(found.mean)
-    if found.count < 1 or any(array.shape != (columns,) for array in arrays.values()):
-        raise ValueError(f"statistics must be of rows, and all of {columns} columns")
+    statistics = FieldStatistics(count=int(content["count"]), histogram=counts, **arrays)
+    columns = len(statistics.mean)
+    if statistics.count < 1 or any(array.shape != (columns,) for array in arrays.values()):
+        raise ValueError(f"statistics must be of at least 1 row, and all of {columns} columns")
     if counts is not None and counts.shape != (columns, N_BINS):
         raise ValueError(f"a histogram must have shape {(columns, N_BINS)}, got {counts.shape}")
-    return found
+    return statistics
 
 
 def are_of(statistics: Mapping[str, FieldStatistics], fields: Sequence[Field]) -> bool:
-    """Whether statistics are of these fields and of as many columns as they have."""
-    columns = {name: len(found.mean) for name, found in statistics.items()}
+    """Return whether statistics are of these fields and have their numbers of columns."""
+    columns = {name: len(item.mean) for name, item in statistics.items()}
     return columns == {field.name: max(field.width, 1) for field in fields}
 
 
@@ -135,13 +135,15 @@ def field_statistics(values: NDArray[Any], field: Field) -> FieldStatistics:
     """Compute the statistics of one field.
 
     Args:
-        values: Its values, shape (rows, width) or (rows,), at least one row.
-        field: What they are; histograms are made when it has both finite limits.
+        values: Values of the field, shape (rows, width) or (rows,), at least one row.
+        field: The field; histograms need two finite limits.
 
     Returns:
-        The statistics of its columns.
+        The statistics of the columns.
     """
-    columns = np.ascontiguousarray(np.asarray(values, np.float64).reshape(len(values), -1).T)  # NumPy likes long rows
+    columns = np.ascontiguousarray(
+        np.asarray(values, np.float64).reshape(len(values), -1).T
+    )  # sums over long contiguous rows are fast
     mean = columns.mean(axis=1)
     low, high = _limits(field, len(columns))
     return FieldStatistics(
@@ -157,7 +159,7 @@ def field_statistics(values: NDArray[Any], field: Field) -> FieldStatistics:
 
 
 def _limits(field: Field, columns: int) -> tuple[Floats, Floats] | tuple[None, None]:
-    """Return the limits of every column, shape (c,) each, or nothing if one of them is open."""
+    """Return the limits of every column, shape (c,) each, or (None, None) if a limit is missing or infinite."""
     if field.valid_min is None or field.valid_max is None:
         return None, None
     low, high = np.array(field.valid_min, np.float64), np.array(field.valid_max, np.float64)
@@ -169,20 +171,20 @@ def _limits(field: Field, columns: int) -> tuple[Floats, Floats] | tuple[None, N
 def _histogram(columns: Floats, low: Floats, high: Floats) -> NDArray[np.int64]:
     """Count the rows of every column, shape (c, rows), in its bins, shape (c, 64)."""
     width = np.where(high > low, high - low, 1.0)
-    places = (columns - low[:, None]) / width[:, None] * N_BINS
-    bins = np.clip(places, 0, N_BINS - 1).astype(np.int64)  # cut off, which is rounding down: none is negative
+    positions = (columns - low[:, None]) / width[:, None] * N_BINS
+    bins = np.clip(positions, 0, N_BINS - 1).astype(np.int64)  # rounds down, since no position is negative
     return np.array([np.bincount(row, minlength=N_BINS) for row in bins])
 
 
 def column_statistics(columns: Mapping[str, NDArray[Any]], fields: Sequence[Field]) -> dict[str, FieldStatistics]:
-    """Compute the statistics of every field, in the fields' order."""
+    """Compute the statistics of every field, in the order of the fields."""
     return {field.name: field_statistics(columns[field.name], field) for field in fields}
 
 
 def merge_statistics(
     parts: Sequence[Mapping[str, FieldStatistics]],
 ) -> dict[str, FieldStatistics]:
-    """Merge the statistics of shards, in the given order.
+    """Merge the statistics of shards, in order.
 
     Raises:
         DatasetError: There are no parts, or they are of different fields.

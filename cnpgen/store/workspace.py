@@ -1,4 +1,4 @@
-"""The folder in which a dataset is made: what is there, whose it is, and what may be done with it."""
+"""The folder in which a dataset is made: its current content, and whether it can be continued or replaced."""
 
 import errno
 import os
@@ -10,130 +10,137 @@ from pathlib import Path
 from typing import Literal
 
 from cnpgen.errors import DatasetError, MachineError, UsageError
-from cnpgen.store.blueprint import INFORMATIONAL, Blueprint, load_blueprint, to_json, write_blueprint
+from cnpgen.store.dataset_spec import INFORMATIONAL, DatasetSpec, load_dataset_spec, to_json, write_dataset_spec
 from cnpgen.store.files.atomic import machine_error, read_file
 from cnpgen.store.files.documents import Difference, differences
-from cnpgen.store.files.leftovers import sweep
-from cnpgen.store.layout import CARD, CROISSANT, MANIFEST, PLAN, STATS, WORK
+from cnpgen.store.files.leftovers import remove_leftovers
+from cnpgen.store.layout import CARD, CROISSANT, MANIFEST, OLD_SPECIFICATION, SPECIFICATION, STATS, WORK
 
 _SUMMARIES = (MANIFEST, STATS, CROISSANT, CARD)
 _SHARD = re.compile(r"shard-\d{5,}\.(h5|json)")
-_MARK = re.compile(rb'\{\s*"format": "cnpgen-')
+_FORMAT_KEY = re.compile(rb'\{\s*"format": "cnpgen-')
 
 
 @dataclass(frozen=True)
 class Workspace:
-    """A folder for a dataset as it was found; others may change it meanwhile.
+    """The content of a folder for a dataset; other processes may change it later.
 
     Attributes:
         folder: The folder.
-        there: The folder, or where it is missing the nearest one above it that is there.
-        holds: What is in it: "nothing", "a dataset", finished or not, damaged or not, "a file" in its place, or
+        existing: The folder, or its nearest existing parent.
+        content: "nothing"; "a dataset", possibly unfinished or damaged; "a file" in place of the folder; or
             "something else".
-        rows: Whether there are shards, or records of shards.
-        blueprint: The blueprint in it; None where there is none that can be read.
-        damage: Why the blueprint cannot be read; empty where it can.
+        has_shards: Whether there are shards or sidecars.
+        spec: The specification in it; None where there is none that can be read.
+        damage: Reason why the specification cannot be read; empty if it can.
     """
 
     folder: Path
-    there: Path
-    holds: Literal["nothing", "a dataset", "a file", "something else"]
-    rows: bool = False
-    blueprint: Blueprint | None = None
+    existing: Path
+    content: Literal["nothing", "a dataset", "a file", "something else"]
+    has_shards: bool = False
+    spec: DatasetSpec | None = None
     damage: str = ""
 
 
 def find_workspace(folder: Path) -> Workspace:
-    """Look at a folder in which a dataset is to be made.
+    """Inspect the folder for a new dataset.
 
     Raises:
-        MachineError: The system would not let us look.
+        MachineError: The folder cannot be read.
     """
     try:
         above = [folder.absolute(), *folder.absolute().parents]
-        there = next(path for path in above if path.exists())
-        if not there.is_dir():
-            return Workspace(folder, there, "a file")
-        if there != above[0] or all(item.name == WORK for item in folder.iterdir()):
-            return Workspace(folder, there, "nothing")
+        existing = next(path for path in above if path.exists())
+        if not existing.is_dir():
+            return Workspace(folder, existing, "a file")
+        if existing != above[0] or all(item.name == WORK for item in folder.iterdir()):
+            return Workspace(folder, existing, "nothing")
     except OSError as error:
         raise machine_error("write to", folder, error) from error
     if not is_dataset(folder):
-        return Workspace(folder, there, "something else")
-    rows = any(_shard_files(folder))
+        return Workspace(folder, existing, "something else")
+    has_shards = any(_shard_files(folder))
     try:
-        return Workspace(folder, there, "a dataset", rows, load_blueprint(folder))
+        return Workspace(folder, existing, "a dataset", has_shards, load_dataset_spec(folder))
     except DatasetError as error:
-        return Workspace(folder, there, "a dataset", rows, damage=str(error))
+        return Workspace(folder, existing, "a dataset", has_shards, damage=str(error))
 
 
 def check_place(workspace: Workspace) -> None:
-    """Refuse a folder in which no dataset can be made, before any work is done for it.
+    """Raise an error if no dataset can be made in a folder, before any computation.
 
-    A finished dataset need not be writable: it may turn out that there is nothing to do.
+    The folder of a finished dataset need not be writable.
 
     Raises:
-        UsageError: It is a file, lies below one, or holds something that is not a dataset of cnpgen.
+        UsageError: It is a file, or contains files that are not a dataset of cnpgen.
         MachineError: It cannot be written.
     """
-    if workspace.holds == "a file":
-        raise UsageError(f"{workspace.there} is a file, not a folder; choose another out=")
-    if workspace.holds == "something else":
-        raise UsageError(f"{workspace.folder} is not empty and not a dataset of cnpgen; choose another out=")
+    if workspace.content == "a file":
+        raise UsageError(
+            f"{workspace.existing} is a file, not a folder; choose another {{out}}", remedies={"out": None}
+        )
+    if workspace.content == "something else":
+        raise UsageError(
+            f"{workspace.folder} is not empty and not a dataset of cnpgen; choose another {{out}}",
+            remedies={"out": None},
+        )
     if (workspace.folder / MANIFEST).is_file():
         return
-    if not os.access(workspace.there, os.W_OK | os.X_OK):
-        number = errno.EROFS if _is_read_only(workspace.there) else errno.EACCES
+    if not os.access(workspace.existing, os.W_OK | os.X_OK):
+        number = errno.EROFS if _is_read_only(workspace.existing) else errno.EACCES
         raise machine_error("write to", workspace.folder, OSError(number, os.strerror(number)))
 
 
 def _is_read_only(path: Path) -> bool:
-    """Whether a path is on a file system that nobody can write to."""
+    """Return whether a path is on a read-only file system."""
     return hasattr(os, "statvfs") and bool(os.statvfs(path).f_flag & os.ST_RDONLY)
 
 
-def begun_blueprint(workspace: Workspace, wanted: Blueprint) -> Blueprint | None:
-    """Return the blueprint in a folder if it is the one that is wanted; if there is none, it may be written.
+def started_spec(workspace: Workspace, wanted: DatasetSpec) -> DatasetSpec | None:
+    """Return the specification in a folder if it equals the wanted one, or None if the folder has no shards.
 
-    It is the same, but perhaps written by another version of cnpgen, as its shards say.
+    The returned specification may have been written by another version of cnpgen.
 
     Raises:
-        UsageError: It has rows of another blueprint.
-        DatasetError: It has rows, and its blueprint is damaged.
+        UsageError: The folder has shards of another specification.
+        DatasetError: The folder has shards and a damaged specification.
     """
-    found = workspace.blueprint
-    if found is not None and found.fingerprint == wanted.fingerprint:
-        return found
-    if not workspace.rows:
+    existing = workspace.spec
+    if existing is not None and existing.fingerprint == wanted.fingerprint:
+        return existing
+    if not workspace.has_shards:
         return None
-    if found is None:
-        raise DatasetError(f"{workspace.damage}; force=True replaces the whole dataset")
-    raise UsageError(f"{workspace.folder} {_refusal(found, wanted)}")
+    if existing is None:
+        raise DatasetError(f"{workspace.damage}; {{force}} replaces the whole dataset", remedies={"force": True})
+    raise UsageError(
+        f"{workspace.folder} {_describe_conflict(existing, wanted)}", remedies={"out": None, "force": True}
+    )
 
 
-def open_workspace(folder: Path, blueprint: Blueprint, *, force: bool = False) -> Blueprint:
-    """Create the folder with its blueprint, or make sure that it holds the same blueprint already.
+def open_workspace(folder: Path, spec: DatasetSpec, *, force: bool = False) -> DatasetSpec:
+    """Create the folder with its specification, or check that it already contains the same specification.
 
-    The folder is looked at anew: while kernels were built another process may have begun the dataset in it. A blueprint
-    of which nothing was made yet gives way to the new one: it costs nothing.
+    The folder is inspected again, because another process may have started the dataset while kernels were compiled. A
+    specification without shards is replaced.
 
     Args:
         folder: The folder.
-        blueprint: What is to be made.
-        force: Whether to delete the dataset that is in the folder.
+        spec: Specification of the new dataset.
+        force: Whether to delete an existing dataset in the folder.
 
     Returns:
-        The blueprint in the folder (see ``begun_blueprint``).
+        The specification in the folder (see ``started_spec``).
 
     Raises:
-        UsageError: The folder holds something else.
+        UsageError: The folder contains another dataset or other files.
         MachineError: The folder cannot be written.
-        DatasetError: The blueprint in the folder is damaged.
+        DatasetError: The specification in the folder is damaged.
     """
     workspace = find_workspace(folder)
     check_place(workspace)
     workspace = _cleared(workspace) if force else workspace
-    begun = begun_blueprint(workspace, blueprint)
+    begun = started_spec(workspace, spec)
     if begun is None:
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -141,120 +148,128 @@ def open_workspace(folder: Path, blueprint: Blueprint, *, force: bool = False) -
                 (folder / name).unlink(missing_ok=True)
         except OSError as error:
             raise machine_error("write to", folder, error) from error
-        write_blueprint(folder, blueprint)
-    sweep(folder / WORK)
-    return begun or blueprint
+        write_dataset_spec(folder, spec)
+    remove_leftovers(folder / WORK)
+    return begun or spec
 
 
-def require_blueprint(folder: Path, blueprint: Blueprint) -> None:
-    """Make sure that the folder still belongs to a blueprint: another process may have replaced the dataset meanwhile.
+def require_dataset_spec(folder: Path, spec: DatasetSpec) -> None:
+    """Check that the folder still has a specification, since another process may have replaced the dataset.
 
     Raises:
-        UsageError: It has another blueprint now.
-        MachineError: It has none, or is gone.
+        UsageError: It now has another specification.
+        MachineError: The specification or the folder is missing.
     """
     try:
-        mine = blueprint.fingerprint.encode() in read_file(folder / PLAN)
+        is_unchanged = spec.fingerprint.encode() in read_file(folder / SPECIFICATION)
     except DatasetError as error:
-        what = f"the {PLAN} in it" if folder.is_dir() else "it"
+        missing = f"its {SPECIFICATION}" if folder.is_dir() else "it"
         raise MachineError(
-            f"{folder}: {what} was deleted or moved while the dataset was made; make it again"
+            f"{folder}: {missing} was deleted or moved while the dataset was made; make it again"
         ) from error
-    if not mine:
-        raise UsageError(f"{folder} was given to another dataset while this one was made; choose another out=")
+    if not is_unchanged:
+        raise UsageError(
+            f"{folder} was replaced by another dataset while this one was made; choose another {{out}}",
+            remedies={"out": None},
+        )
 
 
 def is_dataset(folder: Path) -> bool:
-    """Whether a folder holds a dataset of cnpgen, finished or not, damaged or not: one of its documents says so."""
+    """Return whether a folder contains a dataset of cnpgen, possibly unfinished or damaged."""
     sidecars = (path for path in _shard_files(folder) if path.suffix == ".json")
-    return any(_is_ours(path) for path in (folder / PLAN, folder / MANIFEST, folder / STATS, *sidecars))
+    documents = (folder / name for name in (SPECIFICATION, OLD_SPECIFICATION, MANIFEST, STATS))
+    return any(_is_cnpgen_document(path) for path in (*documents, *sidecars))
 
 
-def _is_ours(path: Path) -> bool:
+def _is_cnpgen_document(path: Path) -> bool:
     try:
-        if not path.is_file():  # to open a pipe is to wait for somebody
+        if not path.is_file():  # opening a pipe would block
             return False
         with path.open("rb") as file:
-            return _MARK.match(file.read(64)) is not None
+            return _FORMAT_KEY.match(file.read(64)) is not None
     except OSError:
         return False
 
 
 def _shard_files(folder: Path) -> Iterator[Path]:
-    """List the shards and sidecars in a folder, of whatever splits."""
+    """Yield the shards and sidecars in a folder, of all splits."""
     return (path for path in folder.glob("*/shard-*.*") if _SHARD.fullmatch(path.name))
 
 
-def _refusal(found: Blueprint, wanted: Blueprint) -> str:
-    """Say why a dataset cannot become another one, and what to do."""
-    if changed := changed_settings(found, wanted):
-        return f"holds another dataset ({changed}); choose another out=, or replace it with force=True"
-    larger = all(rows <= wanted.splits.get(split, 0) for split, rows in found.splits.items())
+def _describe_conflict(existing: DatasetSpec, wanted: DatasetSpec) -> str:
+    """Explain why a dataset cannot become another one, with a hint."""
+    if changed := changed_settings(existing, wanted):
+        return f"holds another dataset ({changed}); choose another {{out}}, or replace it with {{force}}"
+    larger = all(rows <= wanted.splits.get(split, 0) for split, rows in existing.splits.items())
     extend = "extend_dataset or 'cnpgen extend' adds the rows, or " if larger else ""
     return (
-        f"holds this dataset with {_sizes(found)}, not with {_sizes(wanted)}; the rows that both sizes have are the"
-        f" same: {extend}choose another out=, or replace it with force=True"
+        f"holds this dataset with {_sizes(existing)}, not with {_sizes(wanted)}; the common rows are the"
+        f" same: {extend}choose another {{out}}, or replace it with {{force}}"
     )
 
 
-def changed_settings(found: Blueprint, wanted: Blueprint) -> str:
-    """Name up to three settings in which two blueprints differ, except for their sizes; nothing if there are none."""
-    same = (*INFORMATIONAL, "splits", "earlier")
-    old, new = ({key: value for key, value in to_json(item).items() if key not in same} for item in (found, wanted))
+def changed_settings(existing: DatasetSpec, wanted: DatasetSpec) -> str:
+    """Describe up to three differences of two specifications, except for their sizes; empty if they are equal."""
+    same = (*INFORMATIONAL, "splits", "previous_splits")
+    old, new = ({key: value for key, value in to_json(item).items() if key not in same} for item in (existing, wanted))
     return "; ".join([*dict.fromkeys(_setting(difference) for difference in differences(old, new))][:3])
 
 
 def _setting(difference: Difference) -> str:
-    """Name a setting in which two blueprints differ, with its values where they say something."""
+    """Name a setting that differs, with its values if they are short."""
     key, _, rest = difference.key.partition(".")
     if key == "recipe_sha256":
         return "another recipe"
-    if rest or isinstance(difference.found, list):
+    if rest or isinstance(difference.old, list):
         return f"another {key}"
-    return f"{key.replace('_', ' ')} {difference.found} instead of {difference.wanted}"
+    return f"{key.replace('_', ' ')} {difference.old} instead of {difference.new}"
 
 
-def _sizes(blueprint: Blueprint) -> str:
-    splits = ", ".join(f"{split} {rows:,}" for split, rows in blueprint.splits.items())
-    return f"{sum(blueprint.splits.values()):,} rows ({splits})"
+def _sizes(spec: DatasetSpec) -> str:
+    splits = ", ".join(f"{split} {rows:,}" for split, rows in spec.splits.items())
+    return f"{sum(spec.splits.values()):,} rows ({splits})"
 
 
 def _cleared(workspace: Workspace) -> Workspace:
-    """Delete the dataset in a folder, and nothing that is not part of one.
+    """Delete the dataset in a folder, and no other files.
 
     Raises:
-        UsageError: The folder holds something that is not part of the dataset.
+        UsageError: The folder contains files that are not part of the dataset.
         MachineError: A file cannot be deleted.
     """
-    if workspace.holds != "a dataset":
+    if workspace.content != "a dataset":
         return workspace
     folder, splits = workspace.folder, check_clearable(workspace)
     try:
-        (folder / MANIFEST).unlink(missing_ok=True)  # first: what is half deleted must not look complete
+        (folder / MANIFEST).unlink(missing_ok=True)  # first: a partially deleted dataset must not appear complete
         for split in splits:
             for path in split.iterdir():
                 path.unlink()
             split.rmdir()
         shutil.rmtree(folder / WORK, ignore_errors=True)
-        for name in (*_SUMMARIES, PLAN):  # last: what is half deleted must still look like a dataset
+        for name in (
+            *_SUMMARIES,
+            OLD_SPECIFICATION,
+            SPECIFICATION,
+        ):  # last: a partially deleted dataset must still be recognized
             (folder / name).unlink(missing_ok=True)
     except OSError as error:
         raise machine_error("delete from", folder, error) from error
-    return Workspace(folder, workspace.there, "nothing")
+    return Workspace(folder, workspace.existing, "nothing")
 
 
 def check_clearable(workspace: Workspace) -> list[Path]:
-    """Refuse a folder that holds anything else than a dataset; return the folders of its splits.
+    """Raise an error if a folder contains other files than a dataset; return the folders of its splits.
 
-    Those are the splits that the blueprint names, or, where it cannot be read, the folders with shards.
+    These are the splits of the specification, or all folders with shards if the specification cannot be read.
 
     Raises:
-        UsageError: It does.
+        UsageError: The folder contains files that are not part of the dataset.
     """
-    folder, blueprint = workspace.folder, workspace.blueprint
+    folder, spec = workspace.folder, workspace.spec
     named = sorted({path.parent for path in _shard_files(folder)})
-    if blueprint is not None:
-        named = [folder / split for split in blueprint.splits]
+    if spec is not None:
+        named = [folder / split for split in spec.splits]
     splits = [split for split in named if split.is_dir()]
     if foreign := _foreign(folder, splits):
         raise UsageError(
@@ -264,8 +279,8 @@ def check_clearable(workspace: Workspace) -> list[Path]:
 
 
 def _foreign(folder: Path, splits: list[Path]) -> Path | None:
-    """Return a file that force=True must not delete and that would be in the way, if there is one."""
-    known = {*_SUMMARIES, PLAN, WORK, *(split.name for split in splits)}
+    """Return the first file that is not part of the dataset, or None."""
+    known = {*_SUMMARIES, OLD_SPECIFICATION, SPECIFICATION, WORK, *(split.name for split in splits)}
     candidates = [path for path in folder.iterdir() if path.name not in known]
     for split in splits:
         candidates += [path for path in split.iterdir() if not _SHARD.fullmatch(path.name)]

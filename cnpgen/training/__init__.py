@@ -1,1 +1,1 @@
-"""Training: from a dataset to a planner, with the loss that needs no demonstrations."""
+"""Train planners: loss, network, optimizer, checkpoints and validation."""

@@ -1,4 +1,4 @@
-"""Adam (Kingma and Ba, 2015) on one flat vector, in place, with an average of the parameters beside them."""
+"""Adam (Kingma and Ba, 2015) on one flat vector, in place, with an exponential average of the parameters."""
 
 import math
 from dataclasses import dataclass
@@ -9,20 +9,20 @@ from numpy.typing import NDArray
 
 Array = NDArray[Any]
 
-FIRST, SECOND, TINY = 0.9, 0.999, 1e-8
-BLOCK = 1 << 17  # numbers at once: the five arrays of a block stay in the cache
+BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-8
+PARAMETERS_PER_BLOCK = 1 << 17  # small enough for the five arrays of a block to stay in the CPU cache
 
 
 @dataclass
 class Adam:
-    """The optimiser's state; everything has shape (n_parameters,).
+    """State of the optimizer; all arrays have shape (n_parameters,).
 
     Attributes:
         parameters: The parameters.
-        average: Their exponential average, which is what is validated and kept.
+        average: Their exponential average, which is validated and kept.
         first: Average of the gradient.
-        second: Average of its square.
-        step: Steps taken.
+        second: Average of the squared gradient.
+        step: Number of steps taken.
     """
 
     parameters: Array
@@ -37,30 +37,30 @@ class Adam:
         Args:
             gradient: Gradient of the loss.
             rate: Learning rate.
-            memory: How much of the average stays; less at the beginning.
+            memory: Decay of the average; smaller during the first steps.
         """
         self.step += 1
         new = 1 - min(memory, (1 + self.step) / (10 + self.step))
-        scratch = np.empty(min(BLOCK, len(gradient)), gradient.dtype)
-        bias = np.sqrt(1 - SECOND**self.step)
-        factor = rate * bias / (1 - FIRST**self.step)
-        for start in range(0, len(gradient), BLOCK):
-            part = slice(start, start + BLOCK)
-            self._update_block(part, gradient[part], scratch, factor=factor, tiny=TINY * bias, new=new)
+        scratch = np.empty(min(PARAMETERS_PER_BLOCK, len(gradient)), gradient.dtype)
+        bias = np.sqrt(1 - BETA_2**self.step)
+        factor = rate * bias / (1 - BETA_1**self.step)
+        for start in range(0, len(gradient), PARAMETERS_PER_BLOCK):
+            part = slice(start, start + PARAMETERS_PER_BLOCK)
+            self._update_block(part, gradient[part], scratch, factor=factor, epsilon=EPSILON * bias, new=new)
 
     def _update_block(
-        self, part: slice, gradient: Array, scratch: Array, *, factor: float, tiny: float, new: float
+        self, part: slice, gradient: Array, scratch: Array, *, factor: float, epsilon: float, new: float
     ) -> None:
         first, second, parameters = self.first[part], self.second[part], self.parameters[part]
         average, work = self.average[part], scratch[: len(gradient)]
-        first *= FIRST
-        first += np.multiply(gradient, 1 - FIRST, out=work)
-        second *= SECOND
+        first *= BETA_1
+        first += np.multiply(gradient, 1 - BETA_1, out=work)
+        second *= BETA_2
         np.multiply(gradient, gradient, out=work)
-        work *= 1 - SECOND
+        work *= 1 - BETA_2
         second += work
         np.sqrt(second, out=work)
-        work += tiny
+        work += epsilon
         np.divide(first, work, out=work)
         work *= factor
         parameters -= work
@@ -70,19 +70,19 @@ class Adam:
 
 
 def start_adam(parameters: Array) -> Adam:
-    """Begin with given parameters, shape (n_parameters,)."""
+    """Return the initial state for parameters of shape (n_parameters,)."""
     return Adam(parameters, parameters.copy(), np.zeros_like(parameters), np.zeros_like(parameters))
 
 
 def learning_rate(step: int, steps: int, *, peak: float, final: float, warm_up: int) -> float:
-    """Cosine from ``peak`` to ``final * peak``, after a linear warm-up.
+    """Return the learning rate: a cosine from ``peak`` to ``final * peak``, after a linear warm-up.
 
     Args:
-        step: Steps taken.
-        steps: Steps of the whole run.
+        step: Number of steps taken.
+        steps: Number of steps of the run.
         peak: Largest learning rate.
-        final: The last one, as a fraction of it.
-        warm_up: Steps of the warm-up.
+        final: Last learning rate, as a fraction of the peak.
+        warm_up: Number of steps of the warm-up.
     """
     falling = 0.5 * (1 + math.cos(math.pi * min(step / steps, 1.0)))
     return peak * (final + (1 - final) * falling) * min(1.0, (step + 1) / max(warm_up, 1))

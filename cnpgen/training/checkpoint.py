@@ -1,4 +1,4 @@
-"""Checkpoints: the state of a run and which run it is of, so that another run is not taken for this one."""
+"""Checkpoints: the state of a run and its identity, so that no other run resumes from it."""
 
 import json
 import time
@@ -8,36 +8,36 @@ from pathlib import Path
 from typing import Any
 
 from cnpgen.errors import DatasetError, UsageError
+from cnpgen.store.files.checksum_file import read_with_checksum, write_with_checksum
 from cnpgen.store.files.documents import differences, parse_json
-from cnpgen.store.files.sealed import read_sealed, write_sealed
-from cnpgen.training.state import State, from_content, to_content
+from cnpgen.training.training_state import State, from_content, to_content
 
-KIND, VERSION = "cnpgen-checkpoint", 1
-EVERY, LATEST = 20.0, 50.0  # s of wall time between two checkpoints, and where writing one takes long
-SHARE = 20.0  # so many times longer than writing one takes
+CHECKPOINT_KIND, CHECKPOINT_VERSION = "cnpgen-checkpoint", 2
+MIN_INTERVAL_S, MAX_INTERVAL_S = 20.0, 50.0  # wall time between two checkpoints
+INTERVAL_PER_WRITING_TIME = 20.0
 
 
 class Checkpoints:
-    """Writes checkpoints of one run, now and then.
+    """Checkpoints of one run, written at intervals.
 
     Args:
         path: The file.
-        identity: What the run is: settings, dataset, steps; JSON-able.
+        identity: Settings, dataset and steps of the run; JSON-able.
 
     Attributes:
-        identity: As JSON has it.
+        identity: The identity after a round trip through JSON.
     """
 
     def __init__(self, path: Path, identity: Mapping[str, Any]) -> None:
         self.path = path
         self.identity: dict[str, Any] = json.loads(json.dumps(identity))
-        self._next = time.monotonic() + EVERY
+        self._next = time.monotonic() + MIN_INTERVAL_S
 
     def load(self, *, discard: bool = False) -> State | None:
-        """Return the state that the run was left in; None if it has none.
+        """Return the state of an interrupted run; None if there is none.
 
         Args:
-            discard: Whether what is damaged or of another run is as if it were not there.
+            discard: Whether to ignore a checkpoint that is damaged or of another run.
 
         Raises:
             DatasetError: The file is damaged.
@@ -53,21 +53,22 @@ class Checkpoints:
             raise
 
     def _load(self) -> State:
-        content = read_sealed(self.path, kind=KIND, version=VERSION)
+        content = read_with_checksum(self.path, kind=CHECKPOINT_KIND, version=CHECKPOINT_VERSION)
         try:
-            found, state = parse_json(content.texts["identity"]), from_content(content)
+            identity, state = parse_json(content.texts["identity"]), from_content(content)
         except (KeyError, TypeError, ValueError) as error:
             raise DatasetError(f"{self.path} does not fit this version of cnpgen: {error!r}") from error
-        changed = list(map(str, differences(found, self.identity)))
+        changed = list(map(str, differences(identity, self.identity)))
         if changed:
             raise UsageError(
-                f"{self.path} is of another run, it differs in {', '.join(changed[:4])}: give the same arguments to go"
-                " on with it, or force=True to throw it away"
+                f"{self.path} is of another run, it differs in {', '.join(changed[:4])}: give the same arguments to"
+                " resume it, or {force} to replace it",
+                remedies={"force": True},
             )
         return state
 
-    def save_now_and_then(self, state: State) -> None:
-        """Save the state if the last time was long ago."""
+    def save_if_due(self, state: State) -> None:
+        """Save the state if the interval has passed."""
         if time.monotonic() > self._next:
             self.save(state)
 
@@ -75,13 +76,13 @@ class Checkpoints:
         """Save the state.
 
         Raises:
-            MachineError: The disk is full, read-only or otherwise unwilling.
+            MachineError: The disk is full or read-only.
         """
-        begun, content = time.monotonic(), to_content(state)
+        started, content = time.monotonic(), to_content(state)
         content = replace(content, texts={**content.texts, "identity": json.dumps(self.identity)})
-        write_sealed(self.path, content, kind=KIND, version=VERSION)
-        took = time.monotonic() - begun
-        self._next = time.monotonic() + min(max(EVERY, SHARE * took), LATEST)
+        write_with_checksum(self.path, content, kind=CHECKPOINT_KIND, version=CHECKPOINT_VERSION)
+        interval = INTERVAL_PER_WRITING_TIME * (time.monotonic() - started)
+        self._next = time.monotonic() + min(max(MIN_INTERVAL_S, interval), MAX_INTERVAL_S)
 
     def remove(self) -> None:
         """Remove the file."""

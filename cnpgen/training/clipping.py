@@ -1,7 +1,7 @@
-"""Clipping of gradients against their own running size: of every sample, and of the whole batch.
+"""Clip the gradients of samples and of the batch relative to their running norms.
 
-A few samples in a hundred break a constraint by far; unclipped, one of them weighs as much as hundreds of others, and
-Adam's second moment remembers it for a thousand steps.
+A few percent of the samples violate a constraint by far. Without clipping one of them weighs as much as hundreds of
+others, and Adam's average of squared gradients contains it for a thousand steps.
 """
 
 from dataclasses import dataclass
@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 Array = NDArray[Any]
 
 SAMPLE_MEMORY, BATCH_MEMORY = 0.98, 0.99
-JUMP = 3.0  # the running norm follows no single batch further than this
+MAX_NORM_RATIO = 3.0  # of a batch's norm to the running norm, in the update of the latter
 
 
 @dataclass
 class Clipping:
-    """Running sizes of gradients; 0 before the first batch.
+    """Running norms of gradients; 0 before the first batch.
 
     Attributes:
-        sample: Running median over the samples of a batch of their gradients' norms.
+        sample: Running median of the norms of the samples' gradients.
         batch: Running norm of the batch's gradient.
     """
 
@@ -29,29 +29,29 @@ class Clipping:
     batch: float = 0.0
 
     def sample_factors(self, norms: Array, *, limit: float) -> Array:
-        """Return what the gradient of every sample is to be multiplied by.
+        """Return the factors of the samples' gradients.
 
         Args:
             norms: Norms of the samples' gradients, finite, shape (N,).
             limit: Largest norm, in running medians; inf for no clipping.
 
         Returns:
-            Shape (N,), in (0, 1]; 1 as long as half of the gradients of every batch are zero: there is no measure yet.
+            Shape (N,), in (0, 1]; 1 while half of the gradients of every batch are zero.
         """
-        middle = float(np.median(norms))
-        self.sample = SAMPLE_MEMORY * self.sample + (1 - SAMPLE_MEMORY) * middle if self.sample else middle
+        median = float(np.median(norms))
+        self.sample = SAMPLE_MEMORY * self.sample + (1 - SAMPLE_MEMORY) * median if self.sample else median
         if not self.sample or np.isinf(limit):
             return np.ones_like(norms)
         return np.minimum(1.0, limit * self.sample / np.maximum(norms, 1e-30)).astype(norms.dtype)
 
     def batch_factor(self, norm: float, *, limit: float) -> float:
-        """Return what the gradient of the batch is to be multiplied by.
+        """Return the factor of the batch's gradient.
 
         Args:
-            norm: Its norm.
+            norm: Norm of the gradient.
             limit: Largest norm, in running norms; inf for no clipping.
         """
-        self.batch = BATCH_MEMORY * self.batch + (1 - BATCH_MEMORY) * min(norm, JUMP * self.batch) or norm
+        self.batch = BATCH_MEMORY * self.batch + (1 - BATCH_MEMORY) * min(norm, MAX_NORM_RATIO * self.batch) or norm
         if not self.batch or np.isinf(limit):
             return 1.0
         return min(1.0, limit * self.batch / max(norm, 1e-30))

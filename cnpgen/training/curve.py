@@ -1,4 +1,4 @@
-"""The learning curve: loss, terms, validity and motion time against CPU time, as a picture."""
+"""Draw the learning curve: loss, terms, validity and motion time against CPU time."""
 
 import json
 from pathlib import Path
@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING, Any
 
 from cnpgen.errors import UsageError
 from cnpgen.store.files.atomic import committing
-from cnpgen.store.files.picture import new_figure
+from cnpgen.store.files.figure_file import new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-SMALLEST = 1e-12  # terms that are zero are drawn here
+MIN_DRAWN_TERM = 1e-12  # smaller terms are drawn here
 
 
 def plot_curve(log: str, path: str | Path) -> None:
@@ -19,16 +19,16 @@ def plot_curve(log: str, path: str | Path) -> None:
 
     Args:
         log: The log, one JSON object per line.
-        path: Picture file, ``.png``, ``.pdf`` or ``.svg``; replaced if it exists.
+        path: Output file, ``.png``, ``.pdf`` or ``.svg``; replaced if it exists.
 
     Raises:
-        UsageError: The log holds no step.
+        UsageError: The log contains no step.
         MachineError: matplotlib is missing, or the file cannot be written.
     """
     records = [json.loads(line) for line in log.splitlines()]
     steps = [record for record in records if "loss" in record]
     if not steps:
-        raise UsageError("the log holds no step: nothing to draw")
+        raise UsageError("the log contains no step: nothing to draw")
     figure = new_figure(12, 7)
     axes = figure.subplots(2, 2, sharex=True).ravel()
     _draw_loss(axes[0], steps)
@@ -54,10 +54,10 @@ def _draw_loss(axis: "Axes", steps: list[dict[str, Any]]) -> None:
 
 
 def _draw_terms(axis: "Axes", steps: list[dict[str, Any]]) -> None:
-    """Draw every constraint term; dashed, its budget in the problem file."""
+    """Draw every constraint term, and its budget in the problem file as a dashed line."""
     seconds, budgets = _column(steps, "seconds"), steps[0].get("budgets", {})
     for name in steps[0]["weights"]:
-        (line,) = axis.plot(seconds, [max(record["terms"][name], SMALLEST) for record in steps], label=name)
+        (line,) = axis.plot(seconds, [max(record["terms"][name], MIN_DRAWN_TERM) for record in steps], label=name)
         if budgets.get(name):
             axis.axhline(budgets[name], color=line.get_color(), linestyle="--", linewidth=0.8)
     axis.set_ylabel("terms (dashed: budgets)")
@@ -75,7 +75,7 @@ def _draw_validity(axis: "Axes", checks: list[dict[str, Any]]) -> None:
 
 
 def _name_lines(axis: "Axes") -> None:
-    """Draw a legend above the curves, where it covers none of them."""
+    """Draw a legend above the axes, so that it covers no curve."""
     axis.legend(fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, frameon=False)
 
 

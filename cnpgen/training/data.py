@@ -1,4 +1,4 @@
-"""Where training rows come from: a dataset on disk, its problem, its splits."""
+"""Training data: a dataset on disk, its problem and its splits."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +9,7 @@ from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.load import load_dataset
 from cnpgen.planner.control_points import ControlPoints
 from cnpgen.plans.format import CONDITIONS
-from cnpgen.training.rows import boundary_columns
+from cnpgen.training.training_rows import boundary_columns
 from cnpgen.trajectory.boundary import Boundary
 
 DEMONSTRATION = ("path_control_points", "rate_control_points")  # columns of a certified dataset
@@ -17,12 +17,12 @@ DEMONSTRATION = ("path_control_points", "rate_control_points")  # columns of a c
 
 @dataclass(frozen=True)
 class TrainingData:
-    """A dataset that is trained on.
+    """A dataset to train on.
 
     Attributes:
         dataset: The dataset.
-        train: Name of the split that is trained on.
-        validation: Name of the split that is only looked at.
+        train: Name of the split to train on.
+        validation: Name of the split to validate on.
     """
 
     dataset: Dataset
@@ -30,15 +30,15 @@ class TrainingData:
     validation: str
 
     def training(self) -> Boundary:
-        """Read the boundary conditions of all rows that are trained on."""
+        """Read the boundary conditions of all training rows."""
         return boundary_columns(self.dataset.arrays(self.train, fields=self._names, dtype="float64"))
 
     def checked(self, rows: int) -> Boundary:
-        """Read the validation rows that models are compared by: the first ones, half of all at most."""
+        """Read the validation rows that compare models: the first ones, at most half of all."""
         return self._validation(0, self._checks(rows))
 
     def judged(self, rows: int, *, after: int) -> Boundary:
-        """Read the validation rows that the last model is judged on: those that follow the compared ``after``."""
+        """Read the validation rows for the final score: those that follow the ones of ``checked(after)``."""
         first = self._checks(after)
         return self._validation(first, first + rows)
 
@@ -57,18 +57,18 @@ class TrainingData:
         """Read the plans of a certified dataset's training rows; None if it has none."""
         if not set(DEMONSTRATION) <= set(self.dataset.fields):
             return None
-        found = self.dataset.arrays(self.train, fields=DEMONSTRATION, dtype="float32")
-        path, rate = (found[name] for name in DEMONSTRATION)
+        columns = self.dataset.arrays(self.train, fields=DEMONSTRATION, dtype="float32")
+        path, rate = (columns[name] for name in DEMONSTRATION)
         return ControlPoints(path.reshape(len(path), -1, joints), rate)
 
     def describe(self) -> dict[str, Any]:
-        """Say which rows these are, for the model's file."""
-        blueprint = self.dataset.blueprint
+        """Return the identity of the rows, for the model's file."""
+        spec = self.dataset.spec
         return {
-            "name": blueprint.name,
-            "version": blueprint.version,
-            "seed": blueprint.seed,
-            "recipe_sha256": blueprint.recipe_sha256,
+            "name": spec.name,
+            "version": spec.version,
+            "seed": spec.seed,
+            "recipe_sha256": spec.recipe_sha256,
             "fingerprint": self.dataset.fingerprint,
             "rows": dict(self.dataset.splits),
         }
@@ -78,7 +78,7 @@ def open_training_data(folder: str | Path) -> TrainingData:
     """Open a dataset for training.
 
     Raises:
-        DatasetError: It is missing, unfinished or damaged, or has no rows to train on or to validate with.
+        DatasetError: It is missing, unfinished or damaged, or has no rows for training or validation.
     """
     dataset = load_dataset(folder)
     names = [name for name, rows in dataset.splits.items() if rows]
@@ -88,5 +88,7 @@ def open_training_data(folder: str | Path) -> TrainingData:
     others = [name for name in names if name != train]
     validation = "validation" if "validation" in others else others[0]
     if dataset.splits[validation] < 2:
-        raise DatasetError(f"{folder} has 1 row in {validation!r}: models are compared by some and judged on others")
+        raise DatasetError(
+            f"{folder} has 1 row in {validation!r}: models are compared on some rows and scored on others"
+        )
     return TrainingData(dataset, train, validation)

@@ -1,4 +1,4 @@
-"""The training log: one JSON object per line, in a file for who watches; what counts is in the checkpoint."""
+"""The training log: one JSON object per line, in a file to follow the run; the checkpoint has a copy."""
 
 import json
 from collections.abc import Mapping
@@ -8,18 +8,18 @@ from typing import Any
 from cnpgen.store.files.atomic import machine_error, write_file
 from cnpgen.store.files.documents import parse_json
 
-OURS = {"step", "epoch", "learning_rate", "seconds", "lost"}  # keys of the first line of every log
+FIRST_LINE_KEYS = {"step", "epoch", "learning_rate", "seconds", "lost"}
 
 
 class TrainingLog:
-    """Appends to a log.
+    """A log that records are appended to.
 
     Args:
-        path: The file; what is in it is replaced by ``lines``.
-        lines: The log so far; new lines are appended to this very list, too.
+        path: The file; its content is replaced by ``lines``.
+        lines: Previous lines of the log; new lines are appended to this list, too.
 
     Raises:
-        MachineError: The disk is full, read-only or otherwise unwilling.
+        MachineError: The disk is full or read-only.
     """
 
     def __init__(self, path: Path, lines: list[str]) -> None:
@@ -30,7 +30,7 @@ class TrainingLog:
         """Append a record.
 
         Raises:
-            MachineError: The disk is full, read-only or otherwise unwilling.
+            MachineError: The disk is full or read-only.
         """
         line = json.dumps(record, allow_nan=False)
         self.lines.append(line)
@@ -42,16 +42,16 @@ class TrainingLog:
 
     @property
     def text(self) -> str:
-        """The whole log."""
+        """Text of the whole log."""
         return "".join(f"{line}\n" for line in self.lines)
 
 
 def is_log(path: Path) -> bool:
-    """Whether a file is a training log, by its first line, or holds nothing yet."""
+    """Return whether a file is a training log, by its first line, or empty."""
     try:
         with path.open("rb") as file:
             first = file.readline(1 << 16)
         record = parse_json(first.decode() or "null")
     except (OSError, ValueError):
         return False
-    return not first or (isinstance(record, dict) and record.keys() >= OURS)
+    return not first or (isinstance(record, dict) and record.keys() >= FIRST_LINE_KEYS)

@@ -1,4 +1,4 @@
-"""Setting a run up: rows, kernels, loss and network; how many steps it has."""
+"""Set up a run: rows, kernels, loss and network; determine its number of steps."""
 
 import time
 from dataclasses import asdict, replace
@@ -12,118 +12,120 @@ from cnpgen.losses.metric import Metric
 from cnpgen.losses.metric_settings import suggested_weights
 from cnpgen.losses.plan_loss import PlanLoss
 from cnpgen.machine.versions import __version__
-from cnpgen.planner.kit import Kit, Surroundings, make_kit
-from cnpgen.planner.landing import make_landing
-from cnpgen.planner.model import Meaning, Model, begins_and_ends_at_rest
+from cnpgen.planner.inference_pipeline import InferencePipeline, LoadedProblem, make_inference_pipeline
+from cnpgen.planner.model import Model, ModelConfig, is_rest_to_rest
 from cnpgen.planner.network.architecture import Architecture, initial_parameters
 from cnpgen.planner.network.features import Features, count_features, usual_blocks
+from cnpgen.planner.projection import make_projection
 from cnpgen.store.files.documents import plain
 from cnpgen.training.data import TrainingData
-from cnpgen.training.rows import Rows, prepare_rows, resting
-from cnpgen.training.run import Run
 from cnpgen.training.score import validate
 from cnpgen.training.settings import Length, TrainingSettings
-from cnpgen.training.state import State, start_state
 from cnpgen.training.step import Learner
+from cnpgen.training.training_rows import Rows, prepare_rows, zero_conditions
+from cnpgen.training.training_run import Run
+from cnpgen.training.training_state import State, start_state
 from cnpgen.trajectory.boundary import Boundary
 
-WARMING, TIMED = 10, 50  # steps taken to find out how long one takes
+WARM_UP_STEPS, TIMED_STEPS = 10, 50  # to measure the time of a step
 
 
 def prepare_run(
     source: TrainingData,
-    given: Surroundings,
+    loaded: LoadedProblem,
     settings: TrainingSettings,
     *,
-    first: Model | None = None,
+    initial_model: Model | None = None,
     check_rows: int = 200,
     command: str = "",
-) -> tuple[Run, Kit]:
+) -> tuple[Run, InferencePipeline]:
     """Load rows, kernels and loss; set up the network.
 
     Args:
         source: The dataset.
-        given: Its problem.
-        settings: How to train.
-        first: The model to start from; None for random parameters and features standardised by the rows.
-        check_rows: Validation rows that models are compared by.
-        command: What the model says that it was made by.
+        loaded: Its problem.
+        settings: Training settings.
+        initial_model: Model to start from; None for random parameters and features standardized by the rows.
+        check_rows: Number of validation rows that models are compared on.
+        command: Command recorded in the model.
 
     Returns:
-        The run, and the kit that plans are made with.
+        The run, and the inference pipeline of its plans.
 
     Raises:
-        UsageError: Plans are to be imitated, and the dataset has none; or the first model is for something else.
+        UsageError: The dataset has no plans to imitate, or the initial model does not fit.
     """
     boundary = source.training()
-    rest, spec = resting(boundary), given.problem.trajectory
+    zero, spec = zero_conditions(boundary), loaded.problem.trajectory
     fixed = boundary.fixed_at_goal
-    meaning = settings.meaning if first is None else replace(settings.meaning, middles=first.meaning.middles)
-    kit = make_kit(given, meaning, slow_down=begins_and_ends_at_rest(rest, fixed), fixed_at_goal=fixed)
-    architecture = _architecture(given, settings, boundary, first)
-    if first is not None:
-        _check_first(first, architecture, settings, given, rest)
-    rows, features = _rows(boundary, kit, first)
+    config = settings.config
+    if initial_model is not None:
+        config = replace(config, via_points=initial_model.config.via_points)
+    inference = make_inference_pipeline(loaded, config, scale_time=is_rest_to_rest(zero, fixed), fixed_at_goal=fixed)
+    architecture = _architecture(loaded, settings, boundary, initial_model)
+    if initial_model is not None:
+        _check_initial_model(initial_model, architecture, settings, loaded, zero)
+    rows, features = _rows(boundary, inference, initial_model)
     if settings.imitation:
-        rows = _with_demonstrations(rows, source, given)
-    loss = _loss(given, settings)
+        rows = _with_demonstrations(rows, source, loaded)
+    loss = _loss(loaded, settings)
     held_out = source.checked(check_rows)
-    landing = make_landing(
-        given.problem,
-        given.kernels,
-        steps=settings.landing_steps,
+    projection = make_projection(
+        loaded.problem,
+        loaded.kernels,
+        steps=settings.projection_steps,
         fixed_at_goal=fixed,
         within_limits=settings.within_limits,
     )
     run = Run(
-        learner=Learner(architecture, spec, loss, settings, landing),
+        learner=Learner(architecture, spec, loss, settings, projection),
         names=loss.terms,
         budgets=dict(zip(loss.terms[1:], loss.budgets.tolist(), strict=True)),
         rows=rows,
         features=features,
         metric=_metric(loss, settings),
-        problem=given.record,
-        meaning=meaning,
-        validate=lambda model: validate(model, kit, held_out),
-        rest=rest,
-        first=None if first is None else first.parameters,
-        training={"command": command, **identity(source, settings), "stages": source.dataset.blueprint.stages},
+        problem=loaded.record,
+        config=config,
+        validate=lambda model: validate(model, inference, held_out),
+        zero_conditions=zero,
+        initial_parameters=None if initial_model is None else initial_model.parameters,
+        training={"command": command, **identity(source, settings), "stages": source.dataset.spec.stages},
     )
-    return run, kit
+    return run, inference
 
 
-def _rows(boundary: Boundary, kit: Kit, first: Model | None) -> tuple[Rows, Features]:
-    """Prepare the rows, along the lines that plans of the first model take."""
-    if first is None:
-        return prepare_rows(boundary, kit.prepare)
-    lines = None if kit.detours is None else lambda some: kit.planned(first, some)[0]
-    return prepare_rows(boundary, kit.prepare, features=first.features, lines=lines)
+def _rows(boundary: Boundary, inference: InferencePipeline, initial_model: Model | None) -> tuple[Rows, Features]:
+    """Prepare the rows, with the lines of the initial model's plans."""
+    if initial_model is None:
+        return prepare_rows(boundary, inference.prepare)
+    lines = None if inference.via_points is None else lambda some: inference.planned(initial_model, some)[0]
+    return prepare_rows(boundary, inference.prepare, features=initial_model.features, lines=lines)
 
 
 def identity(source: TrainingData, settings: TrainingSettings) -> dict[str, Any]:
-    """Say what, beside its length, distinguishes one run from another; JSON-able."""
+    """Return the identity of a run without its length; JSON-able."""
     return {"cnpgen": __version__, "dataset": source.describe(), "settings": plain(asdict(settings))}
 
 
-def _with_demonstrations(rows: Rows, source: TrainingData, given: Surroundings) -> Rows:
-    shown = source.demonstrations(given.robot.n)
-    if shown is None:
+def _with_demonstrations(rows: Rows, source: TrainingData, loaded: LoadedProblem) -> Rows:
+    target = source.demonstrations(loaded.robot.n)
+    if target is None:
         raise UsageError(
-            f"{source.dataset.folder} holds no plans that could be imitated: make it with"
+            f"{source.dataset.folder} has no plans to imitate: make it with"
             " make_dataset(..., certify=True) or 'cnpgen make-dataset --certify', or train without imitation"
         )
-    return replace(rows, shown=shown)
+    return replace(rows, target=target)
 
 
-def _check_first(
-    first: Model, architecture: Architecture, settings: TrainingSettings, given: Surroundings, rest: tuple[str, ...]
+def _check_initial_model(
+    model: Model, architecture: Architecture, settings: TrainingSettings, loaded: LoadedProblem, zero: tuple[str, ...]
 ) -> None:
-    """Refuse a model whose parameters would mean something else in this run."""
-    if first.problem.comparable_sha256 != given.record.comparable_sha256:
-        differs = ", ".join(given.record.differences(first.problem)[:4])
+    """Raise an error if the model's parameters cannot be used in this run."""
+    if model.problem.comparable_sha256 != loaded.record.comparable_sha256:
+        differs = ", ".join(loaded.record.differences(model.problem)[:4])
         raise UsageError(f"the model to start from is for another problem, they differ in {differs}")
-    theirs = _said(first.architecture, first.meaning, first.rest)
-    ours = _said(architecture, settings.meaning, rest)
+    theirs = _parameter_definition(model.architecture, model.config, model.zero_conditions)
+    ours = _parameter_definition(architecture, settings.config, zero)
     changed = [
         f"{name} is {theirs[name]!r} there and {ours[name]!r} here" for name in ours if theirs[name] != ours[name]
     ]
@@ -131,43 +133,43 @@ def _check_first(
         raise UsageError(f"the model to start from does not fit: {', '.join(changed)}")
 
 
-def _said(architecture: Architecture, meaning: Meaning, rest: tuple[str, ...]) -> dict[str, Any]:
-    """Return what must be the same for parameters to mean the same."""
-    about = {"path_scale": meaning.path_scale, "zero conditions": rest, "expected_time": meaning.expected_time}
-    return {**asdict(architecture), **about}
+def _parameter_definition(architecture: Architecture, config: ModelConfig, zero: tuple[str, ...]) -> dict[str, Any]:
+    """Return the values that must agree for parameters to be interchangeable."""
+    outputs = {"path_scale": config.path_scale, "zero conditions": zero, "expected_time": config.expected_time}
+    return {**asdict(architecture), **outputs}
 
 
 def _architecture(
-    given: Surroundings, settings: TrainingSettings, boundary: Boundary, first: Model | None
+    loaded: LoadedProblem, settings: TrainingSettings, boundary: Boundary, initial_model: Model | None
 ) -> Architecture:
-    spec, blocks = given.problem.trajectory, usual_blocks(boundary) if first is None else first.features.blocks
+    spec = loaded.problem.trajectory
+    blocks = usual_blocks(boundary) if initial_model is None else initial_model.features.blocks
     return Architecture(
-        inputs=count_features(blocks, given.robot.n),
+        inputs=count_features(blocks, loaded.robot.n),
         hidden=settings.hidden,
         layers=settings.layers,
-        path_outputs=given.robot.n * (spec.path_control_points - 3 - boundary.fixed_at_goal),
+        path_outputs=loaded.robot.n * (spec.path_control_points - 3 - boundary.fixed_at_goal),
         rate_outputs=spec.rate_control_points,
     )
 
 
-def _loss(given: Surroundings, settings: TrainingSettings) -> PlanLoss:
-    backend = given.kernels.backend
-    names = PlanLoss(given.problem, nodes=settings.nodes, backend=backend).terms  # its kernels are built when needed
-    usual = suggested_margins(names)
+def _loss(loaded: LoadedProblem, settings: TrainingSettings) -> PlanLoss:
+    backend = loaded.kernels.backend
+    usual = suggested_margins(loaded.problem)
     margins = replace(usual, factors={**usual.factors, **settings.margins})
-    loss = PlanLoss(given.problem, nodes=settings.nodes, form=settings.form, backend=backend, margins=margins)
-    loss.load_kernels()  # so that no step is slow because of it
+    loss = PlanLoss(loaded.problem, nodes=settings.nodes, form=settings.form, backend=backend, margins=margins)
+    loss.load_kernels()  # outside the timed steps
     return loss
 
 
 def _metric(loss: PlanLoss, settings: TrainingSettings) -> Metric:
     learned = settings.metric.kind == "learned"
-    weights = loss.weights0 if learned else suggested_weights(loss.terms, loss.weights0)
+    weights = loss.weights0 if learned else suggested_weights(loss.problem, loss.weights0)
     return Metric(weights, loss.budgets, settings.metric)
 
 
 def begin_run(run: Run, length: Length) -> State:
-    """Start a run; find out how many steps it has."""
+    """Return the initial state of a run; determine its number of steps."""
     if length.steps is not None:
         steps = int(length.steps)
     elif length.epochs is not None:
@@ -180,8 +182,8 @@ def begin_run(run: Run, length: Length) -> State:
 
 def _fresh(run: Run, steps: int) -> State:
     settings = run.learner.settings
-    if run.first is not None:
-        parameters = run.first.copy()
+    if run.initial_parameters is not None:
+        parameters = run.initial_parameters.copy()
     else:
         parameters = initial_parameters(
             run.learner.architecture,
@@ -193,13 +195,13 @@ def _fresh(run: Run, steps: int) -> State:
 
 
 def _step_seconds(run: Run) -> float:
-    """Measure how long a step takes [s of CPU time], on a state that is thrown away."""
+    """Measure the CPU time of a step [s], on a temporary state."""
     state, metric = _fresh(run, 10_000), run.metric.state()
     state.imitating = 0
     gradient, times = np.empty_like(state.adam.parameters), []
-    for _ in range(WARMING + TIMED):
-        begun = time.process_time()
+    for _ in range(WARM_UP_STEPS + TIMED_STEPS):
+        started = time.process_time()
         run.step(state, gradient)
-        times.append(time.process_time() - begun)
+        times.append(time.process_time() - started)
     run.metric.load_state(metric)
-    return float(np.median(times[WARMING:]))
+    return float(np.median(times[WARM_UP_STEPS:]))

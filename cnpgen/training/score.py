@@ -1,11 +1,11 @@
-"""What a model is worth: its plans for validation rows, judged by Pinocchio and Coal."""
+"""Score a model: its plans for validation rows, judged by Pinocchio and Coal."""
 
 import math
 from typing import Any
 
 import numpy as np
 
-from cnpgen.planner.kit import Kit
+from cnpgen.planner.inference_pipeline import InferencePipeline
 from cnpgen.planner.model import Model
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.trajectory.boundary import Boundary
@@ -13,21 +13,23 @@ from cnpgen.trajectory.boundary import Boundary
 MEANS = ("duration_s", "z_error_mm_s", "vertical_error_rad_s")
 
 
-def validate(model: Model, kit: Kit, boundary: Boundary, *, workers: int | None = 1) -> dict[str, Any]:
-    """Plan and judge.
+def validate(
+    model: Model, inference: InferencePipeline, boundary: Boundary, *, workers: int | None = 1
+) -> dict[str, Any]:
+    """Plan for validation rows and judge the plans.
 
     Args:
         model: The model.
-        kit: The kit of its problem.
+        inference: Inference pipeline of its problem.
         boundary: Boundary conditions of N validation rows.
-        workers: Processes that judge.
+        workers: Number of processes that judge.
 
     Returns:
-        For JSON: number of ``plans``; shares that are ``valid``, and by the paper's rules ``paper_valid``; the means of
-        some metrics; ``broken``, condition -> plans that break it; ``score``, what models are compared by: one per cent
-        of the plans is worth one per cent of the motion time.
+        JSON-able: number of ``plans``; fractions ``valid`` and, by the paper's rules, ``paper_valid``; means of some
+        metrics; ``broken``, condition -> number of violating plans; ``score``, which compares models: 1 % of the plans
+        counts as much as 1 % of the motion time.
     """
-    plans = kit.plan(model, boundary)
+    plans = inference.plan(model, boundary)
     summary = evaluate_plans(plans, workers=workers).summary()
     metrics = summary["metrics_of_all"]
     duration = float(np.mean(plans.duration))
@@ -36,6 +38,10 @@ def validate(model: Model, kit: Kit, boundary: Boundary, *, workers: int | None 
         "valid": summary["valid_ratio"],
         "paper_valid": summary["paper_valid_ratio"],
         **{name: metrics[name]["mean"] for name in MEANS if name in metrics},
-        "broken": {name: each["plans_out"] for name, each in summary["conditions"].items() if each["plans_out"]},
+        "broken": {
+            name: condition["violating_plans"]
+            for name, condition in summary["conditions"].items()
+            if condition["violating_plans"]
+        },
         "score": summary["valid_ratio"] - math.log(duration),
     }

@@ -1,4 +1,4 @@
-"""How a model is trained."""
+"""Training settings and the length of a run."""
 
 import math
 from collections.abc import Mapping
@@ -7,7 +7,7 @@ from typing import Any
 
 from cnpgen.errors import UsageError
 from cnpgen.losses.metric_settings import BOUNDED, PUBLISHED, MetricSettings
-from cnpgen.planner.model import Meaning
+from cnpgen.planner.model import ModelConfig
 from cnpgen.planner.tasks import EXPECTED_TIMES
 from cnpgen.schema.arguments import integer, number
 
@@ -17,11 +17,11 @@ METRICS = {
     "learned": PUBLISHED,
     "bounded": BOUNDED,
 }
-LEAST = {
+MIN_INTEGERS = {
     "hidden": 1, "layers": 1, "batch_size": 1, "nodes": 1, "shifts": 1,
-    "warm_up": 0, "seed": 0, "bending_steps": 0, "landing_steps": 0,
+    "warm_up": 0, "seed": 0, "line_projection_steps": 0, "projection_steps": 0,
 }  # fmt: skip
-INTERVALS = {
+VALID_INTERVALS = {
     "learning_rate": "(0, inf)", "final_rate": "[0, 1]", "path_scale": "(0, inf)", "head_scale": "[0, inf)",
     "rate_bias": "(-inf, inf)", "sample_clip": "(0, inf]", "batch_clip": "(0, inf]", "memory": "[0, 1)",
     "imitation": "[0, 1)",
@@ -30,31 +30,32 @@ INTERVALS = {
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingSettings:
-    """What decides, together with rows, problem and number of steps, every bit of a trained model.
+    """Settings that, together with rows, problem and number of steps, determine a trained model to the bit.
 
     Attributes:
         hidden: Width of the network's layers.
         layers: Depth of its trunk.
-        batch_size: Rows per step; all of them where there are fewer.
-        learning_rate: Its peak.
-        final_rate: The last learning rate, as a fraction of the peak.
-        warm_up: Steps until the peak.
-        seed: Seed of the first parameters and of the order of rows.
-        path_scale: What the configuration head's output is a multiple of [rad].
-        head_scale: Factor of the heads' first weights.
-        rate_bias: Logarithm of the first guess of expected time over duration.
-        bending_steps: Gauss-Newton steps that bend the line onto the manifold.
-        landing_steps: Likewise of what the network gives.
-        within_limits: Whether both keep control points within the joint limits.
-        paced: Whether the planner fits rates to the limits behind the network; steps do not see it, validations do.
-        nodes: Quadrature nodes of the loss.
-        shifts: So many shifted sets of nodes are used in turn, so that nothing hides between them.
+        batch_size: Rows per step; all of them if there are fewer.
+        learning_rate: Peak learning rate.
+        final_rate: Last learning rate, as a fraction of the peak.
+        warm_up: Number of steps until the peak.
+        seed: Seed of the initial parameters and of the order of rows.
+        path_scale: Factor of the configuration head's output [rad].
+        head_scale: Factor of the heads' initial weights.
+        rate_bias: Logarithm of the initial guess of expected time over duration.
+        line_projection_steps: Gauss-Newton steps that project the line onto the equalities.
+        projection_steps: Gauss-Newton steps that project the path onto the equalities.
+        within_limits: Whether both clip control points to the joint limits.
+        time_parametrized: Whether the planner fits rates to the limits after the network; training steps do not include
+            it, validations do.
+        nodes: Number of quadrature nodes of the loss.
+        shifts: Number of shifted sets of nodes, used in turn to cover the phases between nodes.
         sample_clip: Largest norm of a sample's gradient, in running medians.
         batch_clip: Largest norm of a batch's gradient, in running norms.
-        memory: Of the average of the parameters.
-        metric: How the weights of the constraint terms change.
-        expected_time: What the network's rates are multiples of the inverse of; see ``Meaning``.
-        margins: Constraint term -> what its limits are multiplied by, in (0, 1], where not the usual factor.
+        memory: Decay of the average of the parameters.
+        metric: Schedule of the weights of the constraint terms.
+        expected_time: Unit of durations; see ``ModelConfig``.
+        margins: Constraint term -> factor of its limits, in (0, 1], that replaces the usual one.
         imitation: Fraction of the run, at its beginning, that imitates the plans of a certified dataset.
     """
 
@@ -68,10 +69,10 @@ class TrainingSettings:
     path_scale: float = 0.5
     head_scale: float = 0.1
     rate_bias: float = -0.5
-    bending_steps: int = 1
-    landing_steps: int = 1
+    line_projection_steps: int = 1
+    projection_steps: int = 1
     within_limits: bool = False
-    paced: bool = False
+    time_parametrized: bool = False
     nodes: int = 32
     shifts: int = 16
     sample_clip: float = 30.0
@@ -83,41 +84,43 @@ class TrainingSettings:
     imitation: float = 0.0
 
     def __post_init__(self) -> None:
-        for name, least in LEAST.items():
+        for name, least in MIN_INTEGERS.items():
             integer(name, getattr(self, name), least=least)
-        for name, interval in INTERVALS.items():
+        for name, interval in VALID_INTERVALS.items():
             _within(name, getattr(self, name), interval)
         _within("growth", self.metric.growth, "(0, inf)")
         for term, factor in self.margins.items():
             _within(f"margin of {term!r}", factor, "(0, 1]")
         if self.expected_time not in EXPECTED_TIMES:
-            raise UsageError(f"expected_time must be one of {', '.join(EXPECTED_TIMES)}, got {self.expected_time!r}")
+            raise UsageError(
+                f"must be one of {', '.join(EXPECTED_TIMES)}, got {self.expected_time!r}", argument="expected_time"
+            )
 
     @property
     def form(self) -> str:
-        """Form of the loss: "paper" where the metric is the paper's, whose budgets are meant for it, else "signed"."""
+        """Form of the loss: "paper" for the paper's metric, whose budgets are defined for it, else "signed"."""
         return "paper" if self.metric.kind == "learned" and self.metric.every == "epoch" else "signed"
 
     @property
-    def meaning(self) -> Meaning:
-        """What the network's outputs stand for."""
-        return Meaning(
+    def config(self) -> ModelConfig:
+        """Definition of the network's outputs."""
+        return ModelConfig(
             path_scale=self.path_scale,
-            bending_steps=self.bending_steps,
-            landing_steps=self.landing_steps,
+            line_projection_steps=self.line_projection_steps,
+            projection_steps=self.projection_steps,
             expected_time=self.expected_time,
             within_limits=self.within_limits,
-            paced=self.paced,
+            time_parametrized=self.time_parametrized,
         )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Length:
-    """How long a run is: one of the three.
+    """Length of a run, by exactly one of the three.
 
     Attributes:
-        steps: Steps.
-        epochs: Times that every row is trained on.
+        steps: Number of steps.
+        epochs: Number of epochs.
         cpu_seconds: CPU time of the steps [s].
     """
 
@@ -126,18 +129,18 @@ class Length:
     cpu_seconds: float | None = None
 
     def __post_init__(self) -> None:
-        given = {name: value for name, value in vars(self).items() if value is not None}
-        if len(given) != 1:
-            raise UsageError(f"say how long to train by one of steps, epochs or cpu_seconds, got {given or 'none'}")
+        lengths = {name: value for name, value in vars(self).items() if value is not None}
+        if len(lengths) != 1:
+            raise UsageError(f"pass exactly one of steps, epochs or cpu_seconds, got {lengths or 'none'}")
         if self.steps is not None:
             integer("steps", self.steps, least=1)
         else:
-            _within(*given.popitem(), "(0, inf)")
+            _within(*lengths.popitem(), "(0, inf)")
 
 
 def _within(name: str, value: Any, interval: str) -> None:
-    """Refuse what is no number, or not in an interval such as ``[0, 1)``, which may hold infinity."""
+    """Raise an error if a value is no number, or outside an interval such as ``[0, 1)``, which may include infinity."""
     low, high = map(float, interval[1:-1].split(","))
-    found = value if isinstance(value, float) and math.isinf(value) else number(name, value)
-    if not low <= found <= high or (found == low and interval[0] == "(") or (found == high and interval[-1] == ")"):
+    real = value if isinstance(value, float) and math.isinf(value) else number(name, value)
+    if not low <= real <= high or (real == low and interval[0] == "(") or (real == high and interval[-1] == ")"):
         raise UsageError(f"{name} must be in {interval}, got {value!r}")

@@ -1,4 +1,4 @@
-"""One step of training: batch, network, loss, gradient, parameters."""
+"""One training step: batch, network, loss, gradient, parameters."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,15 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.losses.plan_loss import LossValue
-from cnpgen.planner.control_points import ControlPoints, control_points, pull_back
-from cnpgen.planner.landing import Landing
+from cnpgen.planner.control_points import ControlPoints, control_points, vjp
 from cnpgen.planner.network.architecture import Architecture
 from cnpgen.planner.network.forward import backward, forward
+from cnpgen.planner.projection import Projection
 from cnpgen.training.adam import Adam
 from cnpgen.training.clipping import Clipping
-from cnpgen.training.rows import Rows
 from cnpgen.training.settings import TrainingSettings
-from cnpgen.trajectory.spec import TrajectorySpec
+from cnpgen.training.training_rows import Rows
+from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
 Array = NDArray[Any]
 
@@ -24,39 +24,39 @@ Array = NDArray[Any]
 Loss = Callable[..., LossValue]
 
 
-def imitation_loss(points: ControlPoints, shown: ControlPoints) -> LossValue:
-    """Half the squared distances of path control points [rad^2] and of the logarithms of rate control points.
+def imitation_loss(points: ControlPoints, target: ControlPoints) -> LossValue:
+    """Return half the squared distances of path control points [rad^2] and of logarithms of rate control points.
 
     Args:
         points: Control points of N motions.
-        shown: Those of their demonstrations.
+        target: Control points of their demonstrations.
 
     Returns:
         Distances as ``total``, and as the only column of ``terms``; their gradients.
     """
-    by_path = points.path - shown.path
-    logs = np.log(points.rate / shown.rate)
+    by_path = points.path - target.path
+    logs = np.log(points.rate / target.rate)
     total = 0.5 * (np.einsum("ijk,ijk->i", by_path, by_path) + np.einsum("ij,ij->i", logs, logs))
     return LossValue(total, total[:, None], by_path, logs / points.rate)
 
 
 @dataclass(frozen=True)
 class Learner:
-    """What a step needs and does not change.
+    """Constants of a training step.
 
     Attributes:
         architecture: The network's architecture.
         spec: Degree and numbers of control points.
         loss: The loss.
         settings: The settings.
-        landing: What bends the network's plans onto the manifold; None where nothing does.
+        projection: Projection of the network's paths onto the equalities; None if there is none.
     """
 
     architecture: Architecture
     spec: TrajectorySpec
     loss: Loss
     settings: TrainingSettings
-    landing: Landing | None = None
+    projection: Projection | None = None
 
     def gradient(
         self, parameters: Array, rows: Rows, weights: Array, *, shift: float, clipping: Clipping, out: Array
@@ -67,9 +67,9 @@ class Learner:
             parameters: The parameters.
             rows: The batch.
             weights: Weight of every constraint term, shape (m,).
-            shift: Of the quadrature nodes, in [0, 1).
-            clipping: Running size of the samples' gradients.
-            out: Where to, shape (n_parameters,).
+            shift: Shift of the quadrature nodes, in [0, 1).
+            clipping: Running norms of the gradients.
+            out: Output array, shape (n_parameters,).
 
         Returns:
             The terms of every sample, shape (N, 1 + m).
@@ -78,7 +78,12 @@ class Learner:
         def cost(points: ControlPoints) -> LossValue:
             start_tip = rows.tasks.start_xyz
             return self.loss(
-                points.path, points.rate, weights=weights, tops=rows.tops, start_tip=start_tip, shift=shift
+                points.path,
+                points.rate,
+                weights=weights,
+                obstacle_poses=rows.obstacle_poses,
+                start_tip=start_tip,
+                shift=shift,
             )
 
         return self._gradient(parameters, rows, cost, clipping, out)
@@ -89,9 +94,9 @@ class Learner:
         Returns:
             The distance of every sample, shape (N, 1).
         """
-        shown = rows.shown
-        assert shown is not None
-        return self._gradient(parameters, rows, lambda points: imitation_loss(points, shown), clipping, out)
+        target = rows.target
+        assert target is not None
+        return self._gradient(parameters, rows, lambda points: imitation_loss(points, target), clipping, out)
 
     def _gradient(
         self,
@@ -102,34 +107,34 @@ class Learner:
         out: Array,
     ) -> Array:
         network = self.architecture.split(parameters)
-        given = forward(network, rows.features)
+        activations = forward(network, rows.features)
         scale = self.settings.path_scale
-        points = control_points(rows.tasks, given.path, given.log_rate, scale=scale, spec=self.spec)
-        value = cost(self._landed(points, rows))
-        phi, log_rate = self._pulled_back(rows, points, value)
+        points = control_points(rows.tasks, activations.path, activations.log_rate, scale=scale, spec=self.spec)
+        value = cost(self._projected(points, rows))
+        phi, log_rate = self._output_gradients(rows, points, value)
         factors = self._factors(phi, log_rate, clipping)
         phi *= factors
         log_rate *= factors
-        backward(network, given, path_gradient=phi, log_rate_gradient=log_rate, out=self.architecture.split(out))
+        backward(network, activations, path_gradient=phi, log_rate_gradient=log_rate, out=self.architecture.split(out))
         return value.terms
 
-    def _pulled_back(self, rows: Rows, points: ControlPoints, value: LossValue) -> tuple[Array, Array]:
-        """Return the loss's gradients with respect to both heads, through the landing and the boundary conditions."""
+    def _output_gradients(self, rows: Rows, points: ControlPoints, value: LossValue) -> tuple[Array, Array]:
+        """Return the loss's gradients with respect to both heads."""
         by_path, by_rate = (
-            each.astype(points.path.dtype, copy=False) for each in (value.path_gradient, value.rate_gradient)
+            gradient.astype(points.path.dtype, copy=False) for gradient in (value.path_gradient, value.rate_gradient)
         )
-        if self.landing is not None:
-            by_path = self.landing.pull_back(points.path, rows.tops, by_path)
+        if self.projection is not None:
+            by_path = self.projection.vjp(points.path, rows.obstacle_poses, by_path)
         scale = self.settings.path_scale
-        return pull_back(rows.tasks, points, path_gradient=by_path, rate_gradient=by_rate, scale=scale, spec=self.spec)
+        return vjp(rows.tasks, points, path_gradient=by_path, rate_gradient=by_rate, scale=scale, spec=self.spec)
 
-    def _landed(self, points: ControlPoints, rows: Rows) -> ControlPoints:
-        if self.landing is None:
+    def _projected(self, points: ControlPoints, rows: Rows) -> ControlPoints:
+        if self.projection is None:
             return points
-        return ControlPoints(self.landing.land(points.path, rows.tops), points.rate)
+        return ControlPoints(self.projection.project(points.path, rows.obstacle_poses), points.rate)
 
     def _factors(self, phi: Array, log_rate: Array, clipping: Clipping) -> Array:
-        """Return what the gradient of every sample is multiplied by, shape (N, 1); one that is not finite becomes 0."""
+        """Return the factors of the samples' gradients, shape (N, 1); a gradient that is not finite becomes 0."""
         norms = np.sqrt(np.einsum("ij,ij->i", phi, phi) + np.einsum("ij,ij->i", log_rate, log_rate))
         usable = np.isfinite(norms)
         if not usable.all():
@@ -139,7 +144,7 @@ class Learner:
         return (factors / len(factors))[:, None]
 
     def update(self, adam: Adam, clipping: Clipping, gradient: Array, *, rate: float) -> None:
-        """Clip the gradient of a batch and take Adam's step; one that is not finite is only counted as a step."""
+        """Clip the gradient of a batch and take an Adam step; one that is not finite only increments the step count."""
         norm = float(np.sqrt(np.dot(gradient, gradient)))
         if np.isfinite(norm):
             gradient *= clipping.batch_factor(norm, limit=self.settings.batch_clip)

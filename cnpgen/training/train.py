@@ -1,4 +1,4 @@
-"""Training a model on a dataset: a file in the end, a checkpoint and a log on the way."""
+"""Train a model on a dataset: a model file at the end, a checkpoint and a log during the run."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -8,38 +8,38 @@ from typing import Any
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.machine.threads import one_thread
 from cnpgen.machine.times import NO_TIME, Stopwatch, Times
-from cnpgen.planner.kit import Kit, surroundings
+from cnpgen.planner.inference_pipeline import InferencePipeline, loaded_problem
 from cnpgen.planner.model import Model
 from cnpgen.planner.model_file import find_model, load_model, save_model
-from cnpgen.problems.record import as_record
+from cnpgen.problems.problem_record import as_record
 from cnpgen.schema.arguments import integer
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.files.documents import differences, plain
 from cnpgen.training.checkpoint import Checkpoints
 from cnpgen.training.data import TrainingData, open_training_data
-from cnpgen.training.files import CHECKPOINT, LOG, check_beside, check_out, sweep_beside
 from cnpgen.training.log import TrainingLog
+from cnpgen.training.output_files import CHECKPOINT, LOG, check_beside, check_out, remove_temporary_files
 from cnpgen.training.prepare import begin_run, identity, prepare_run
-from cnpgen.training.run import Run, Watcher
 from cnpgen.training.score import validate
 from cnpgen.training.settings import Length, TrainingSettings
-from cnpgen.training.state import State
+from cnpgen.training.training_run import Run, Watcher
+from cnpgen.training.training_state import State
 
-SECONDS = 120.0  # of CPU time, if nobody says how long
-MOST_JUDGED = 2000  # validation rows that the last model is judged on
+DEFAULT_CPU_TIME_S = 120.0
+MAX_SCORED_ROWS = 2000  # validation rows for the final score
 
 
 @dataclass(frozen=True)
 class Trained:
-    """What came of a run.
+    """Result of a run.
 
     Attributes:
         model: The best model.
         path: Its file.
-        score: What ``validate`` says of it on up to 2,000 validation rows that it was not chosen by.
-        made: Whether it was made now; False if it was there already.
-        times: Where the time of this run went, the last validation included; of one that was interrupted, since it went
-            on. The model's ``training`` has the CPU time of all steps and validations.
+        score: Result of ``validate`` on up to 2,000 validation rows that were not used to select it.
+        made: Whether it was made now; False if it existed.
+        times: Times of this run including the final validation; of a resumed run, since it was resumed. The model's
+            ``training`` has the CPU time of all steps and validations.
     """
 
     model: Model
@@ -65,65 +65,70 @@ def train_model(
     begin: Callable[[State, Run], None] | None = None,
     watch: Watcher | None = None,
 ) -> Trained:
-    """Train a model, or go on with one that was interrupted; one that is there already is returned as it is.
+    """Train a model, or resume an interrupted run; an existing model of the same run is returned.
 
-    Beside the model there are a log, ``.jsonl``, and as long as it is not finished a checkpoint, ``.checkpoint``. Cut
-    off and resumed, a run gives the parameters that it would have given uncut, to the bit.
+    The run writes a log, ``.jsonl``, and until it is finished a checkpoint, ``.checkpoint``, beside the model. An
+    interrupted and resumed run gives the same parameters to the bit as an uninterrupted one.
 
     Args:
         folder: The dataset.
         out: The model's file, ``.h5``.
-        steps: How long, in steps.
-        epochs: How long, in passes over all rows.
-        cpu_seconds: How long, in CPU time of the steps [s]: how long a step takes is measured before, and their number
-            is then fixed. Compiling, reading rows and validating come on top. If nothing says how long, 120 s.
-        settings: How to train.
-        start_from: A model, by name or path, whose parameters and features the run begins with, instead of random
-            parameters; width, depth and the meaning of outputs in the settings must be those that it has.
-        check_rows: Validation rows that models are compared by on the way, half of them at most; the best one is judged
-            on up to 2,000 others.
-        command: What the model says that it was made by.
-        force: Replace the model, log and picture that are there; throw away another run's checkpoint.
-        workers: Processes of the last validation; training itself is one process.
+        steps: Length in steps.
+        epochs: Length in epochs.
+        cpu_seconds: Length in CPU time of the steps [s]: the time of a step is measured first, and the number of steps
+            is then fixed. Compiling, reading rows and validation are not included. The default is 120 s.
+        settings: Training settings.
+        start_from: Model, by name or path, whose parameters and features replace random ones; width, depth and output
+            definition in the settings must be the same.
+        check_rows: Number of validation rows that models are compared on during the run, at most half of them; the best
+            one is scored on up to 2,000 others.
+        command: Command recorded in the model.
+        force: Replace an existing model, log and picture; discard another run's checkpoint.
+        workers: Number of processes of the final validation; training itself uses one process.
         begin: Called once before the first step.
         watch: Called with every line of the log.
 
     Raises:
-        UsageError: An argument cannot be meant, there is no model to start from or it is for something else, or there
-            is another model, another run's checkpoint, or a log or picture of something else.
+        UsageError: An argument is invalid, the initial model is missing or does not fit, or there is another model,
+            another run's checkpoint, or a log or picture of another origin.
         DatasetError: The dataset or the checkpoint is damaged.
         MachineError: The disk is full, or the loss is not finite any more.
     """
     clock = Stopwatch()
-    lasts = {"steps": steps, "epochs": epochs, "cpu_seconds": cpu_seconds}
+    lengths = {"steps": steps, "epochs": epochs, "cpu_seconds": cpu_seconds}
     settings = settings or TrainingSettings()
-    job = _job(folder, Path(out), settings, lasts, check_rows=check_rows, start_from=start_from)
+    job = _job(folder, Path(out), settings, lengths, check_rows=check_rows, start_from=start_from)
     if not force:
         if job.out.exists() and not job.checkpoints.path.exists():
             return _finished(job)
         check_beside(job.out)
-    with one_thread(), surroundings(as_record(job.source.dataset.problem)) as given:
-        run, kit = prepare_run(
-            job.source, given, job.settings, first=job.first, check_rows=job.check_rows, command=command
+    with one_thread(), loaded_problem(as_record(job.source.dataset.problem)) as loaded:
+        run, inference = prepare_run(
+            job.source,
+            loaded,
+            job.settings,
+            initial_model=job.initial_model,
+            check_rows=job.check_rows,
+            command=command,
         )
         state = job.checkpoints.load(discard=force) or begin_run(run, job.length)
         clock.prepared()
         if begin is not None:
             begin(state, run)
         journal = TrainingLog(job.out.with_suffix(LOG), state.log)
-        run.go_on(state, job.checkpoints, journal, watch)
+        run.train(state, job.checkpoints, journal, watch)
         job.checkpoints.save(state)
-        trained = _kept(job, run, state, kit=kit, journal=journal, workers=workers)
+        trained = _saved(job, run, state, inference=inference, journal=journal, workers=workers)
     clock.computed_here()
     return replace(trained, times=clock.times())
 
 
 @dataclass(frozen=True)
 class _Job:
-    """What is to be trained, on what, from what, for how long, and where it goes."""
+    """Inputs and outputs of a run."""
 
     source: TrainingData
-    first: Model | None
+    initial_model: Model | None
     out: Path
     settings: TrainingSettings
     length: Length
@@ -135,33 +140,42 @@ def _job(
     folder: str | Path,
     out: Path,
     settings: TrainingSettings,
-    lasts: Mapping[str, Any],
+    lengths: Mapping[str, Any],
     *,
     check_rows: int,
     start_from: str | Path | None,
 ) -> _Job:
-    """Check what was asked for, open the dataset, and read the model to start from."""
-    given = {name: value for name, value in lasts.items() if value is not None} or {"cpu_seconds": SECONDS}
-    length, check_rows = Length(**given), integer("check_rows", check_rows, least=1)
+    """Check the arguments, open the dataset, and read the initial model."""
+    passed = {name: value for name, value in lengths.items() if value is not None} or {
+        "cpu_seconds": DEFAULT_CPU_TIME_S
+    }
+    length, check_rows = Length(**passed), integer("check_rows", check_rows, least=1)
     check_out(out)
-    sweep_beside(out)
+    remove_temporary_files(out)
     source = open_training_data(folder)
-    first, digest = _first(start_from)
-    asked = {**identity(source, settings), "length": plain(given), "check_rows": check_rows, "start_from": digest}
-    return _Job(source, first, out, settings, length, check_rows, Checkpoints(out.with_suffix(CHECKPOINT), asked))
+    initial_model, digest = _read_initial_model(start_from)
+    run_identity = identity(source, settings) | {
+        "length": plain(passed),
+        "check_rows": check_rows,
+        "start_from": digest,
+    }
+    checkpoints = Checkpoints(out.with_suffix(CHECKPOINT), run_identity)
+    return _Job(source, initial_model, out, settings, length, check_rows, checkpoints)
 
 
-def _first(start_from: str | Path | None) -> tuple[Model | None, str | None]:
-    """Read the model to start from, and its file's sha256; None where there is none."""
+def _read_initial_model(start_from: str | Path | None) -> tuple[Model | None, str | None]:
+    """Read the model to start from, and its file's sha256; None if there is none."""
     if start_from is None:
         return None, None
     return load_model(start_from), file_sha256(find_model(start_from))
 
 
-def _kept(job: _Job, run: Run, state: State, *, kit: Kit, journal: TrainingLog, workers: int | None) -> Trained:
-    """Judge the best model and write it; the log's last line is not in the checkpoint, so that it comes but once."""
+def _saved(
+    job: _Job, run: Run, state: State, *, inference: InferencePipeline, journal: TrainingLog, workers: int | None
+) -> Trained:
+    """Score the best model and write it; the log's last line is not in the checkpoint, so it is written once."""
     best = run.model(state.best.parameters)
-    score = validate(best, kit, job.source.judged(MOST_JUDGED, after=job.check_rows), workers=workers)
+    score = validate(best, inference, job.source.judged(MAX_SCORED_ROWS, after=job.check_rows), workers=workers)
     journal.write({"step": state.adam.step, "best": state.best.step, "final": score})
     training = {**best.training, **job.checkpoints.identity, **_outcome(state, score)}
     model = replace(best, log=journal.text, training=training)
@@ -171,21 +185,23 @@ def _kept(job: _Job, run: Run, state: State, *, kit: Kit, journal: TrainingLog, 
 
 
 def _finished(job: _Job) -> Trained:
-    """Return the model that is there if it is the one that was asked for."""
-    path, identity, hint = job.out, job.checkpoints.identity, "train another file, or replace it with force=True"
+    """Return the existing model if it is of the same run."""
+    path, identity, hint = job.out, job.checkpoints.identity, "train another file, or replace it with {force}"
     try:
         model = load_model(path)
     except DatasetError as error:
-        raise UsageError(f"{path} exists and is no model ({error}): {hint}") from error
-    found = {name: model.training.get(name) for name in identity}
-    changed = list(map(str, differences(found, identity)))
+        raise UsageError(f"{path} exists and is no model ({error}): {hint}", remedies={"force": True}) from error
+    existing = {name: model.training.get(name) for name in identity}
+    changed = list(map(str, differences(existing, identity)))
     if changed:
-        raise UsageError(f"{path} is another model, it differs in {', '.join(changed[:4])}: {hint}")
+        raise UsageError(
+            f"{path} is another model, it differs in {', '.join(changed[:4])}: {hint}", remedies={"force": True}
+        )
     return Trained(model, path, model.training["score"], made=False)
 
 
 def _outcome(state: State, score: Mapping[str, Any]) -> dict[str, Any]:
-    """Say how training went, for the model's file."""
+    """Return steps, times and score of a run, for the model's file."""
     return {
         "steps": state.adam.step,
         "best_step": state.best.step,

@@ -1,4 +1,4 @@
-"""Boundary control points: position, velocity and acceleration at the ends, exactly (paper, Appendix A)."""
+"""Boundary conditions, and the control points that meet them exactly (paper, Appendix A)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -9,27 +9,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
-from cnpgen.trajectory.spec import TrajectorySpec
 from cnpgen.trajectory.spline import EndDerivatives, end_derivatives
+from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
 Array = NDArray[np.float64]
 
 
 class Scaling(Protocol):
-    """What rows were normalised with, as far as it is needed here."""
+    """Normalization of a dataset, as far as it is needed here."""
 
     def denormalize(self, rows: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Bring rows back into their units."""
+        """Convert normalized rows to SI units."""
         ...
 
 
-class Unsaid(Enum):
-    """An argument that was not given, where None means something."""
+class Missing(Enum):
+    """A missing argument, where None is a valid value."""
 
-    UNSAID = "not said"
+    MISSING = "missing"
 
 
-UNSAID = Unsaid.UNSAID
+MISSING = Missing.MISSING
 
 
 @dataclass(frozen=True)
@@ -53,22 +53,25 @@ class Boundary:
     goal_ddq: Array | None = None
 
     @classmethod
-    def from_batch(cls, batch: Mapping[str, Any], normalization: Scaling | Unsaid | None = UNSAID) -> "Boundary":
-        """Take the boundary conditions out of a batch of rows, in their units, whatever else is in it.
+    def from_batch(cls, batch: Mapping[str, Any], normalization: Scaling | Missing | None = MISSING) -> "Boundary":
+        """Read the boundary conditions from a batch of rows, in SI units; ignore its other fields.
 
         Args:
-            batch: Field name -> values, shape (N, n): a batch, rows, or any mapping; arrays, or tensors.
-            normalization: What the rows were normalised with; None for rows in their units. Batches of a dataset know
-                it themselves, of other mappings it must be said.
+            batch: Field name -> values, shape (N, n): a batch or another mapping of arrays or tensors.
+            normalization: Normalization of the rows, or None for rows in SI units. It may be omitted for batches of a
+                dataset, which hold it; other mappings need it.
 
         Raises:
-            UsageError: A boundary condition is not among the fields, or it is not known how they were normalised.
+            UsageError: A boundary condition is missing in the fields, or the normalization is unknown.
         """
-        scaling = getattr(batch, "normalization", UNSAID) if normalization is UNSAID else normalization
-        if isinstance(scaling, Unsaid):
+        scaling = getattr(batch, "normalization", MISSING) if normalization is MISSING else normalization
+        if isinstance(scaling, Missing):
             kind = type(batch).__name__
-            raise UsageError(f"normalization= must be said of a {kind}: dataset.normalization, or None for SI units")
-        names = [each.name for each in fields(cls)]
+            raise UsageError(
+                f"a {kind} needs {{normalization}}, which is dataset.normalization, or None for SI units",
+                remedies={"normalization": None},
+            )
+        names = [entry.name for entry in fields(cls)]
         missing = [name for name in names if name not in batch and name != "goal_ddq"]
         if missing:
             raise UsageError(f"the batch lacks {', '.join(missing)}: it has the fields {', '.join(map(str, batch))}")
@@ -80,15 +83,15 @@ class Boundary:
 
     @property
     def fixed_at_goal(self) -> int:
-        """Number of path control points that the goal fixes (the paper's N_d)."""
+        """Number of path control points that the goal determines (the paper's N_d)."""
         return 2 if self.goal_ddq is None else 3
 
-    def fewest_points(self, degree: int) -> int:
-        """Return how many path control points a spline of a degree needs at least to meet these conditions."""
+    def min_control_points(self, degree: int) -> int:
+        """Return the minimum number of path control points of a spline of this degree that meets these conditions."""
         return max(degree + 2, 3 + self.fixed_at_goal)
 
-    def given(self) -> dict[str, Array]:
-        """Return the boundary conditions that there are: name -> values."""
+    def conditions(self) -> dict[str, Array]:
+        """Return the boundary conditions that are not None: name -> values."""
         return {name: values for name, values in vars(self).items() if values is not None}
 
     def __len__(self) -> int:
@@ -106,7 +109,7 @@ class Boundary:
 
 
 def start_points(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> Array:
-    """First three path control points.
+    """Compute the first three path control points.
 
     Args:
         boundary: Boundary conditions.
@@ -114,19 +117,19 @@ def start_points(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> Array
         spec: Degree and numbers of control points.
 
     Returns:
-        Shape (N, 3, n), in rad.
+        Control points [rad], shape (N, 3, n).
 
     Raises:
-        UsageError: Boundary conditions of different numbers of joints are mixed.
+        UsageError: Boundary conditions have different numbers of joints.
     """
     _check_joints(boundary)
     path, speed = _end_derivatives(spec)
-    slope = speed.eta * (rate[:, 1:2] - rate[:, :1])
-    return _three(boundary.start_q, boundary.start_dq, boundary.start_ddq, rate[:, :1], slope=slope, path=path)
+    dr = speed.eta * (rate[:, 1:2] - rate[:, :1])
+    return _three(boundary.start_q, boundary.start_dq, boundary.start_ddq, rate[:, :1], dr=dr, path=path)
 
 
 def goal_points(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> Array:
-    """Last two path control points, or three where the goal's acceleration is given, in the order of the path.
+    """Compute the last two path control points, or three if the goal's acceleration is prescribed, in path order.
 
     Args:
         boundary: Boundary conditions.
@@ -134,33 +137,33 @@ def goal_points(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> Array:
         spec: Degree and numbers of control points.
 
     Returns:
-        Shape (N, 2 or 3, n), in rad.
+        Control points [rad], shape (N, 2 or 3, n).
 
     Raises:
-        UsageError: Boundary conditions of different numbers of joints are mixed.
+        UsageError: Boundary conditions have different numbers of joints.
     """
     _check_joints(boundary)
     path, speed = _end_derivatives(spec)
-    # Reversed in phase, r' and p' change sign: the goal is a start with -dq.
+    # With reversed phase, r' and p' change sign: the goal is a start with -dq.
     if boundary.goal_ddq is None:
         before = boundary.goal_q - boundary.goal_dq / rate[:, -1:] / path.eta
         return np.concatenate([before[:, None], boundary.goal_q[:, None]], axis=1)
-    slope = speed.eta * (rate[:, -2:-1] - rate[:, -1:])
-    points = _three(boundary.goal_q, -boundary.goal_dq, boundary.goal_ddq, rate[:, -1:], slope=slope, path=path)
+    dr = speed.eta * (rate[:, -2:-1] - rate[:, -1:])
+    points = _three(boundary.goal_q, -boundary.goal_dq, boundary.goal_ddq, rate[:, -1:], dr=dr, path=path)
     return points[:, ::-1]
 
 
 def _check_joints(boundary: Boundary) -> None:
-    """Refuse conditions that are of different robots, before NumPy does in its own words."""
+    """Raise an error if the conditions have different numbers of joints."""
     joints = {name: np.shape(values)[-1:] for name, values in vars(boundary).items() if values is not None}
     if len(set(joints.values())) > 1:
-        found = ", ".join(f"{name} {n[0] if n else None}" for name, n in joints.items())
-        raise UsageError(f"boundary conditions must all be of the same joints, got of each: {found}")
+        counts = ", ".join(f"{name} {n[0] if n else None}" for name, n in joints.items())
+        raise UsageError(f"boundary conditions must have the same number of joints, got: {counts}")
 
 
 def _end_derivatives(spec: TrajectorySpec) -> tuple[EndDerivatives, EndDerivatives]:
     """Return eta and beta of p and of r."""
-    if spec.path_control_points < spec.degree + 2:  # a single span, whose second derivative is another
+    if spec.path_control_points < spec.degree + 2:  # with a single span, the second derivative has another factor
         raise UsageError(
             f"boundary accelerations need at least {spec.degree + 2} path control points of degree {spec.degree},"
             f" got {spec.path_control_points}"
@@ -169,20 +172,20 @@ def _end_derivatives(spec: TrajectorySpec) -> tuple[EndDerivatives, EndDerivativ
     return path, end_derivatives(spec.rate_control_points, spec.degree)
 
 
-def _three(q: Array, dq: Array, ddq: Array, rate: Array, *, slope: Array, path: EndDerivatives) -> Array:
-    """Control points at s = 0 from q, dq, ddq, r(0) and r'(0)."""
+def _three(q: Array, dq: Array, ddq: Array, rate: Array, *, dr: Array, path: EndDerivatives) -> Array:
+    """Compute the control points at s = 0 from q, dq, ddq, r(0) and r'(0)."""
     eta, beta = path.eta, path.beta
     first = dq / rate  # p'(0)
-    second = (ddq - first * slope * rate) / rate**2  # p''(0), from ddq = p'' r^2 + p' r' r
+    second = (ddq - first * dr * rate) / rate**2  # p''(0), from ddq = p'' r^2 + p' r' r
     c1 = q + first / eta
     c2 = second / beta - 2 * q + 3 * c1
-    points = np.empty((len(q), 3, q.shape[1]), c2.dtype)  # np.stack takes as long as all that came before
+    points = np.empty((len(q), 3, q.shape[1]), c2.dtype)  # np.stack takes as long as the computation
     points[:, 0], points[:, 1], points[:, 2] = q, c1, c2
     return points
 
 
 def assemble(boundary: Boundary, interior: Array, rate: Array, spec: TrajectorySpec) -> Array:
-    """Path control points from the interior ones.
+    """Compute all path control points from the interior ones.
 
     Args:
         boundary: Boundary conditions.
@@ -191,16 +194,16 @@ def assemble(boundary: Boundary, interior: Array, rate: Array, spec: TrajectoryS
         spec: Degree and numbers of control points.
 
     Returns:
-        Shape (N, C, n), in rad.
+        Control points [rad], shape (N, C, n).
 
     Raises:
-        UsageError: Boundary conditions of different numbers of joints are mixed, or C is below degree + 2.
+        UsageError: Boundary conditions have different numbers of joints, or C is below degree + 2.
     """
     return np.concatenate([start_points(boundary, rate, spec), interior, goal_points(boundary, rate, spec)], axis=1)
 
 
 def anchor_line(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> Array:
-    """Interior control points on the line from C_2 to C_{C - N_d} (paper, eq. of the configuration points).
+    """Compute interior control points on the line from C_2 to C_{C - N_d} (paper, eq. of the configuration points).
 
     Args:
         boundary: Boundary conditions.
@@ -208,7 +211,7 @@ def anchor_line(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> Array:
         spec: Degree and numbers of control points.
 
     Returns:
-        Shape (N, C - 3 - N_d, n), in rad.
+        Control points [rad], shape (N, C - 3 - N_d, n).
 
     Raises:
         UsageError: As of ``assemble``.

@@ -1,4 +1,4 @@
-"""Boundary conditions as callers write them: one motion or many, rest left out."""
+"""Checks and broadcasting of boundary conditions that a user passes: one motion or many, zero terms omitted."""
 
 import math
 
@@ -25,17 +25,17 @@ def boundary_of(  # noqa: PLR0917 - in the order of the paper
 
     Args:
         n: Number of planned joints.
-        start_q: Shape (n,) or (N, n).
-        start_dq: Likewise, or None for zero.
-        start_ddq: Likewise, or None for zero.
-        goal_q: Likewise.
-        goal_dq: Likewise, or None for zero.
-        goal_ddq: Likewise, or None where goal accelerations are free.
+        start_q: Start positions [rad], shape (n,) or (N, n), as of every array here.
+        start_dq: Start velocities [rad/s], or None for zero.
+        start_ddq: Start accelerations [rad/s^2], or None for zero.
+        goal_q: Goal positions [rad].
+        goal_dq: Goal velocities [rad/s], or None for zero.
+        goal_ddq: Goal accelerations [rad/s^2], or None if they are free.
 
     Raises:
-        UsageError: A shape is wrong, or something is not finite.
+        UsageError: A shape is wrong, or a value is not finite.
     """
-    given = {
+    arguments = {
         "start_q": start_q,
         "start_dq": start_dq,
         "start_ddq": start_ddq,
@@ -43,15 +43,15 @@ def boundary_of(  # noqa: PLR0917 - in the order of the paper
         "goal_dq": goal_dq,
         "goal_ddq": goal_ddq,
     }
-    arrays = {name: _rows(name, values, n) for name, values in given.items() if values is not None}
+    arrays = {name: _rows(name, values, n) for name, values in arguments.items() if values is not None}
     rows = max(len(values) for values in arrays.values())
     for name, values in arrays.items():
         if len(values) not in {1, rows}:
             raise UsageError(f"{name} has {len(values)} rows, another boundary condition has {rows}")
     if goal_ddq is None:
-        del given["goal_ddq"]
+        del arguments["goal_ddq"]
     zero = np.zeros((1, n))
-    return Boundary(**{name: _repeated(arrays.get(name, zero), rows) for name in given})
+    return Boundary(**{name: _repeated(arrays.get(name, zero), rows) for name in arguments})
 
 
 def _rows(name: str, values: ArrayLike, n: int) -> Array:

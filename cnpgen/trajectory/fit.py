@@ -1,11 +1,11 @@
-"""Fitting a motion to a time-sampled trajectory, so that anybody's planner can be evaluated and refined.
+"""Fit of a motion to a time-sampled trajectory, so that plans of any planner can be evaluated and refined.
 
-A trajectory q(t) is many motions: any r(s) > 0 is possible, and the path p(s) that goes with it is q(t(s)). What
-differs is how well a spline of few control points follows that path. Phase proportional to time is exact for
-polynomials, but spends control points where the robot stands still; phase proportional to arc length is the opposite,
-and impossible at rest, where r would be zero. So a few mixtures of both are tried. The best of them is improved by
-least squares over log r, with the path eliminated (variable projection). The path is fitted at the phases that r really
-gives the samples: whatever r is, it costs no drift in time.
+A trajectory q(t) corresponds to many motions: any r(s) > 0 is possible, with the path p(s) = q(t(s)). They differ in
+how well a spline of few control points fits that path. Phase proportional to time is exact for polynomials, but spends
+control points where the robot rests. Phase proportional to arc length does the opposite, and is impossible at rest,
+where r would be zero. Therefore a few mixtures of both are tried. The best one is improved by least squares over log r,
+with the path eliminated (variable projection, Golub and Pereyra 1973). The path is fitted at the phases that r assigns
+to the samples, so that no r causes a drift in time.
 """
 
 from dataclasses import dataclass
@@ -18,53 +18,53 @@ from numpy.typing import ArrayLike, NDArray
 from cnpgen.errors import UsageError
 from cnpgen.schema.arguments import numbers
 from cnpgen.trajectory.boundary import Boundary, assemble
-from cnpgen.trajectory.motion import Motion, lasting
 from cnpgen.trajectory.samples import checked_samples, resampled, sampled_boundary
-from cnpgen.trajectory.spec import TrajectorySpec
 from cnpgen.trajectory.spline import basis, chebyshev, clamped_knots
+from cnpgen.trajectory.spline_motion import Motion, scaled_to_duration
+from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
 Array = NDArray[np.float64]
 
-MIXTURES = (0.0, 0.3, 0.6, 0.9)  # part of the arc length in the phase
-ENOUGH = 1e-6  # rad: errors below this count as equal, and the simplest r wins
-MOST = 2000  # samples that the search for r looks at
-FARTHEST = 4.0  # how much log r may change in it
-SMOOTH_PATH, SMOOTH_RATE = 1e-8, 3e-5  # weights of p''' and of second differences of log r, beside positions [rad]
+ARC_LENGTH_FRACTIONS = (0.0, 0.3, 0.6, 0.9)  # of the arc length in the phase
+MIN_FIT_ERROR_RAD = 1e-6  # smaller errors count as equal, and the simplest r is chosen
+MAX_RATE_FIT_SAMPLES = 2000  # in the optimization of r
+MAX_LOG_RATE_CHANGE = 4.0  # in the optimization of r
+PATH_SMOOTHNESS, RATE_SMOOTHNESS = 1e-8, 3e-5  # weights of p''' and of second differences of log r; positions: rad
 
 
 def fit_motion(
     t: ArrayLike, q: ArrayLike, dq: ArrayLike | None = None, *, spec: TrajectorySpec, boundary: Boundary | None = None
 ) -> Motion:
-    """Fit a motion to samples of one trajectory; ``largest_error`` tells how well.
+    """Fit a motion to samples of one trajectory; ``largest_error`` returns the error of the fit.
 
     Args:
         t: Times of the samples [s], shape (K,), increasing; the motion starts at the first one.
         q: Joint positions [rad], shape (K, n).
-        dq: Joint velocities [rad/s], shape (K, n): with them, a cubic is meant between samples.
+        dq: Joint velocities [rad/s], shape (K, n): with them, samples are connected by cubics.
         spec: Degree and numbers of control points.
-        boundary: Boundary conditions of the one motion, which hold exactly; ``sampled_boundary`` by default.
+        boundary: Boundary conditions of the motion, met exactly; ``sampled_boundary`` by default.
 
     Returns:
         One motion of duration ``t[-1] - t[0]``.
 
     Raises:
-        UsageError: A shape is wrong, the times do not increase, or something is not finite.
+        UsageError: A shape is wrong, the times do not increase, or a value is not finite.
     """
     times, positions, velocities = checked_samples(t, q, dq)
     if boundary is None:
         boundary = sampled_boundary(times, positions, velocities)
     boundary = _checked_boundary(boundary, positions.shape[1])
     fit = _Fit(*resampled(times - times[0], positions, velocities), times[-1] - times[0], spec, boundary)
-    rates = [fit.mixed_rate(mixture) for mixture in MIXTURES]
+    rates = [fit.mixed_rate(mixture) for mixture in ARC_LENGTH_FRACTIONS]
     errors = [fit.error(rate) for rate in rates]
-    rate = rates[int(np.argmin(np.maximum(errors, ENOUGH)))]
-    if min(errors) > ENOUGH and len(fit.t) > spec.path_control_points:
-        rate = min(rate, fit.thinned(MOST).improved_rate(rate), key=fit.error)
+    rate = rates[int(np.argmin(np.maximum(errors, MIN_FIT_ERROR_RAD)))]
+    if min(errors) > MIN_FIT_ERROR_RAD and len(fit.t) > spec.path_control_points:
+        rate = min(rate, fit.thinned(MAX_RATE_FIT_SAMPLES).improved_rate(rate), key=fit.error)
     return Motion(fit.path(rate).control[None], rate, spec.degree)
 
 
 def largest_error(motion: Motion, t: ArrayLike, q: ArrayLike) -> float:
-    """Compute how far one motion is from samples at most, over all joints and samples [rad].
+    """Compute the maximum distance of one motion from samples over all joints and samples [rad].
 
     Args:
         motion: One motion; it starts at the first sample.
@@ -76,25 +76,25 @@ def largest_error(motion: Motion, t: ArrayLike, q: ArrayLike) -> float:
 
 
 def _checked_boundary(boundary: Boundary, n: int) -> Boundary:
-    """Return the boundary as arrays, if it is one of one motion."""
-    found = {name: numbers(f"the boundary's {name}", row) for name, row in vars(boundary).items() if row is not None}
-    for name, row in found.items():
+    """Return the boundary conditions of one motion as arrays; check their shapes."""
+    arrays = {name: numbers(f"the boundary's {name}", row) for name, row in vars(boundary).items() if row is not None}
+    for name, row in arrays.items():
         if row.shape != (1, n):
             raise UsageError(f"the boundary's {name} must have shape (1, {n}), got {row.shape}")
         if not np.isfinite(row).all():
             raise UsageError(f"the boundary's {name} must be finite, got {row[0]}")
-    return Boundary(**found)
+    return Boundary(**arrays)
 
 
 @dataclass(frozen=True)
 class _Path:
-    """The least squares for the path, given r.
+    """The least-squares fit of the path for a fixed r.
 
     Attributes:
         s: Phases of the samples, shape (K,).
-        rows: Its matrix for all control points, shape (K + smoothing rows, C).
-        control: The control points, shape (C, n).
-        residual: Shape (K + smoothing rows, n).
+        rows: Matrix of the fit for all control points, shape (K + smoothing rows, C).
+        control: Control points [rad], shape (C, n).
+        residual: Residuals, shape (K + smoothing rows, n).
     """
 
     s: Array
@@ -105,12 +105,12 @@ class _Path:
 
 @dataclass(frozen=True)
 class _Fit:
-    """What is fitted: K samples of a trajectory that begins at t = 0. Rates are control points of shape (N, R).
+    """The fitting problem: K samples of a trajectory from t = 0. Rates are control points of shape (N, R).
 
     Attributes:
         t: Times [s], shape (K,).
         q: Joint positions [rad], shape (K, n).
-        duration: Of the whole trajectory [s].
+        duration: Duration of the trajectory [s].
         spec: Degree and numbers of control points.
         boundary: Boundary conditions of one motion.
     """
@@ -126,78 +126,78 @@ class _Fit:
         """The interior path control points."""
         return slice(3, self.spec.path_control_points - self.boundary.fixed_at_goal)
 
-    def thinned(self, most: int) -> "_Fit":
-        """Leave out samples evenly until there are at most ``most``."""
-        step = -(-len(self.t) // most)
+    def thinned(self, max_samples: int) -> "_Fit":
+        """Subsample evenly to at most ``max_samples``."""
+        step = -(-len(self.t) // max_samples)
         return _Fit(self.t[::step], self.q[::step], self.duration, self.spec, self.boundary)
 
     def mixed_rate(self, mixture: float) -> Array:
-        """Choose r so that the phase is part arc length, the rest time; shape (1, R).
+        """Choose r so that the phase is a mixture of arc length and time, shape (1, R).
 
-        Every control point is the mean of ds/dt around its Greville abscissa: all are positive.
+        Every control point is the mean of ds/dt around its Greville abscissa, so all are positive.
         """
         time = self.t / self.duration
         length = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(self.q, axis=0), axis=1)))
         s = time + mixture * (length / length[-1] - time) if length[-1] > 0 else time
         points, degree = self.spec.rate_control_points, self.spec.degree
-        middle = sliding_window_view(clamped_knots(points, degree)[1:-1], degree).mean(axis=1)
+        greville = sliding_window_view(clamped_knots(points, degree)[1:-1], degree).mean(axis=1)
         half = 0.5 / (points - degree)
-        low, high = np.clip(middle - half, 0, 1), np.clip(middle + half, 0, 1)
+        low, high = np.clip(greville - half, 0, 1), np.clip(greville + half, 0, 1)
         passed = np.interp(high, s, self.t) - np.interp(low, s, self.t)
         return self._timed(((high - low) / passed)[None])
 
     def improved_rate(self, rate: Array) -> Array:
-        """Minimise the squared errors over log r, beginning with a rate of shape (1, R)."""
+        """Minimize the squared errors over log r, starting from a rate of shape (1, R)."""
         from scipy.optimize import least_squares
 
         first = np.log(rate[0])
-        bounds = first - FARTHEST, first + FARTHEST
-        found = least_squares(self._residual, first, self._jacobian, bounds, ftol=1e-4, max_nfev=40)
-        return self._timed(np.exp(found.x)[None])
+        bounds = first - MAX_LOG_RATE_CHANGE, first + MAX_LOG_RATE_CHANGE
+        solution = least_squares(self._residual, first, self._jacobian, bounds, ftol=1e-4, max_nfev=40)
+        return self._timed(np.exp(solution.x)[None])
 
     def error(self, rate: Array) -> float:
-        """Largest error at the samples [rad]."""
+        """Compute the maximum error at the samples [rad]."""
         return float(np.abs(self.path(rate).residual[: len(self.t)]).max())
 
     def path(self, rate: Array) -> _Path:
         """Fit the path for a rate of shape (1, R)."""
         points, degree = self.spec.path_control_points, self.spec.degree
         s = self._motion(rate).phase_at(self.t[None])[0]
-        smoothing = SMOOTH_PATH * np.sqrt(len(s)) * _third_derivative(points, degree)
+        smoothing = PATH_SMOOTHNESS * np.sqrt(len(s)) * _third_derivative(points, degree)
         rows = np.concatenate([basis(s, points, degree), smoothing])
-        wanted = np.concatenate([self.q, np.zeros((len(smoothing), self.q.shape[1]))])
+        target = np.concatenate([self.q, np.zeros((len(smoothing), self.q.shape[1]))])
         control = self._fixed(rate)[0]
-        control[self.free] = np.linalg.lstsq(rows[:, self.free], wanted - rows @ control, rcond=None)[0]
-        return _Path(s, rows, control, rows @ control - wanted)
+        control[self.free] = np.linalg.lstsq(rows[:, self.free], target - rows @ control, rcond=None)[0]
+        return _Path(s, rows, control, rows @ control - target)
 
     def _timed(self, rates: Array) -> Array:
-        """Scale rates so that the motions last as long as the trajectory."""
-        return lasting(rates, self.duration, self.spec)
+        """Scale rates to the duration of the trajectory."""
+        return scaled_to_duration(rates, self.duration, self.spec)
 
     def _motion(self, rates: Array) -> Motion:
         return Motion(np.zeros((len(rates), self.spec.path_control_points, 1)), rates, self.spec.degree)
 
     def _fixed(self, rates: Array) -> Array:
-        """Path control points with the interior ones zero, shape (N, C, n)."""
+        """Compute the boundary control points, with interior ones of zero, shape (N, C, n)."""
         interior = np.zeros((len(rates), self.free.stop - 3, self.q.shape[1]))
         return assemble(self.boundary[np.zeros(len(rates), int)], interior, rates, self.spec)
 
     def _residual(self, log_rate: Array) -> Array:
-        """Residuals of the best path, then what keeps r smooth."""
+        """Compute the residuals of the best path, followed by those of the smoothness of r."""
         residual = self.path(self._timed(np.exp(log_rate)[None])).residual
         return np.concatenate([residual.ravel(), _second_difference(len(self.t), len(log_rate)) @ log_rate])
 
     def _jacobian(self, log_rate: Array) -> Array:
-        """Derivative of the residuals, leaving out how the projection turns (Kaufman's variable projection)."""
+        """Differentiate the residuals without the derivative of the projection (Kaufman 1975)."""
         step = 1e-6
         rate = self._timed(np.exp(log_rate)[None])
         others = self._timed(rate * np.exp(step * np.eye(len(log_rate))))
         path = self.path(rate)
         speed = self._motion(rate).at(path.s).rate[0]
         shift = (self.t - self._motion(others).time_at(path.s)) * speed / step  # of s at equal times, shape (R, K)
-        slope = basis(path.s, self.spec.path_control_points, self.spec.degree, 1) @ path.control
+        dp = basis(path.s, self.spec.path_control_points, self.spec.degree, 1) @ path.control
         changes = np.einsum("kc,rcn->knr", path.rows, (self._fixed(others) - self._fixed(rate)) / step)
-        changes[: len(self.t)] += slope[:, :, None] * shift.T[:, None]
+        changes[: len(self.t)] += dp[:, :, None] * shift.T[:, None]
         onto, _ = np.linalg.qr(path.rows[:, self.free])
         changes -= np.tensordot(onto, np.tensordot(onto, changes, (0, 0)), 1)
         return np.concatenate([changes.reshape(-1, len(log_rate)), _second_difference(len(self.t), len(log_rate))])
@@ -205,12 +205,12 @@ class _Fit:
 
 @cache
 def _third_derivative(points: int, degree: int) -> Array:
-    """Rows of norm 1 that measure p''': they choose the smoothest path where the samples leave it open."""
+    """Return rows of norm 1 that penalize p''': they select the smoothest path if the samples do not determine it."""
     rows = basis(chebyshev(4 * points), points, degree, 3)
     return np.asarray(rows / np.linalg.norm(rows, 2))
 
 
 @cache
 def _second_difference(samples: int, points: int) -> Array:
-    """Rows that keep r smooth where it is a matter of taste how r and p share the motion."""
-    return np.asarray(np.diff(np.eye(points), 2, axis=0) * (SMOOTH_RATE * np.sqrt(samples)))
+    """Return rows that penalize second differences of log r, where r and p are not determined separately."""
+    return np.asarray(np.diff(np.eye(points), 2, axis=0) * (RATE_SMOOTHNESS * np.sqrt(samples)))

@@ -1,4 +1,4 @@
-"""Motions that follow one another: each is cut at a moment, and the next goes on from there without a jump."""
+"""Sequences of motions: each part is cut at a time, and the next one continues from that state without a jump."""
 
 from dataclasses import dataclass
 
@@ -6,34 +6,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
-from cnpgen.trajectory.moment import states_at_times
-from cnpgen.trajectory.motion import Motion, States
 from cnpgen.trajectory.spline import end_derivatives
+from cnpgen.trajectory.spline_motion import Motion, States, states_at_times
 
 Array = NDArray[np.float64]
 
-GAP = 1e-9  # rad, rad/s and rad/s^2: what rounding leaves where one motion begins in the state of another
-ROUNDING = 4 * np.finfo(float).eps  # of control points: in accelerations of motions of milliseconds that is more
+MAX_JOINT_GAP = 1e-9  # rad, rad/s and rad/s^2: rounding error between a state and a motion that starts from it
+CONTROL_POINT_ROUNDING = 4 * np.finfo(float).eps  # relative; dominates in accelerations of motions of milliseconds
 
 
 @dataclass(frozen=True)
 class JoinedMotion:
-    """N motions, each of P parts, one after the other.
+    """N motions, each a sequence of P parts.
 
     Attributes:
-        parts: The parts, N motions each, of the same joints.
-        begins: When each part takes over [s], shape (P, N), ascending from 0.
+        parts: Parts, N motions each, of the same joints.
+        start_times: Start time of each part [s], shape (P, N), ascending from 0.
 
     Raises:
-        UsageError: A part does not begin in the state in which the one before it is cut.
+        UsageError: A part does not start in the state at which the previous part is cut.
     """
 
     parts: tuple[Motion, ...]
-    begins: Array
+    start_times: Array
 
     def __post_init__(self) -> None:
         for index in range(1, len(self.parts)):
-            _check_joint(self.parts[index - 1], self.parts[index], *self.begins[index - 1 : index + 1])
+            _check_joint(self.parts[index - 1], self.parts[index], *self.start_times[index - 1 : index + 1])
 
     def __repr__(self) -> str:
         return f"<JoinedMotion: {len(self)} of {len(self.parts)} parts>"
@@ -42,46 +41,48 @@ class JoinedMotion:
         return len(self.parts[0])
 
     def __getitem__(self, index: list[int]) -> "JoinedMotion":
-        return JoinedMotion(tuple(part[index] for part in self.parts), self.begins[:, index])
+        return JoinedMotion(tuple(part[index] for part in self.parts), self.start_times[:, index])
 
     def duration(self) -> Array:
-        """Duration from the start of the first part to the end of the last [s], shape (N,)."""
-        last: Array = self.begins[-1] + self.parts[-1].duration()
+        """Compute the duration from the start of the first part to the end of the last [s], shape (N,)."""
+        last: Array = self.start_times[-1] + self.parts[-1].duration()
         return last
 
     def at_times(self, t: Array) -> States:
-        """Evaluate the motions at times t [s], shape (N, K); where a part takes over it is that part's state."""
-        every = [part.at_times(t - begin[:, None]) for part, begin in zip(self.parts, self.begins, strict=True)]
-        found = {name: values.copy() for name, values in vars(every[0]).items()}
-        for states, begin in zip(every[1:], self.begins[1:], strict=True):
-            later = t >= begin[:, None]
+        """Evaluate the motions at times t [s], shape (N, K); at a start time, return the state of the later part."""
+        parts = [part.at_times(t - start[:, None]) for part, start in zip(self.parts, self.start_times, strict=True)]
+        joined = {name: values.copy() for name, values in vars(parts[0]).items()}
+        for states, start in zip(parts[1:], self.start_times[1:], strict=True):
+            later = t >= start[:, None]
             for name, values in vars(states).items():
-                found[name][later] = values[later]
-        return States(**found)
+                joined[name][later] = values[later]
+        return States(**joined)
 
 
-def _check_joint(before: Motion, after: Motion, begun: Array, begins: Array) -> None:
-    """Refuse parts that do not go on where the part before is cut, and cuts that are outside of it."""
-    duration, cut = before.duration(), begins - begun
+def _check_joint(before: Motion, after: Motion, start: Array, cut_time: Array) -> None:
+    """Raise an error for cuts outside the part before, and for parts that do not start in its state at the cut."""
+    duration, cut = before.duration(), cut_time - start
     outside = ~((cut >= 0) & (cut <= duration * (1 + 1e-12)))
     if outside.any():
         row = int(outside.argmax())
-        whole = f"from {begun[row]:.6g} to {begun[row] + duration[row]:.6g} s"
-        raise UsageError(f"plan {row} cannot be cut at {begins[row]:.6g} s: what is cut lasts {whole}")
+        interval = f"from {start[row]:.6g} to {start[row] + duration[row]:.6g} s"
+        raise UsageError(f"plan {row} cannot be cut at {cut_time[row]:.6g} s: its last part lasts {interval}")
     left, right = states_at_times(before, cut), states_at_times(after, np.zeros_like(cut))
-    allowed = GAP + _rounding(before) + _rounding(after)
-    for name, unit, one, other, most in zip(
-        ("q", "dq", "ddq"), ("rad", "rad/s", "rad/s^2"), left, right, allowed, strict=True
+    tolerance = MAX_JOINT_GAP + _rounding(before) + _rounding(after)
+    for name, unit, end, begin, max_gap in zip(
+        ("q", "dq", "ddq"), ("rad", "rad/s", "rad/s^2"), left, right, tolerance, strict=True
     ):
-        gap = np.abs(other - one).max(axis=1)
-        if not (gap <= most).all():
-            row = int(np.argmax(np.nan_to_num(gap - most, nan=np.inf)))
-            text = f"{name} jumps by {gap[row]:.3g} {unit} at {begins[row]:.6g} s, expected at most {most[row]:.3g}"
+        gap = np.abs(begin - end).max(axis=1)
+        if not (gap <= max_gap).all():
+            row = int(np.argmax(np.nan_to_num(gap - max_gap, nan=np.inf)))
+            text = (
+                f"{name} jumps by {gap[row]:.3g} {unit} at {cut_time[row]:.6g} s, expected at most {max_gap[row]:.3g}"
+            )
             raise UsageError(f"plan {row} cannot be joined: {text}")
 
 
 def _rounding(motion: Motion) -> Array:
-    """Estimate what rounding of control points makes of positions, velocities and accelerations, shape (3, N)."""
+    """Estimate the errors of positions, velocities and accelerations by rounding of control points, shape (3, N)."""
     ends, largest = end_derivatives(motion.path.shape[1], motion.degree), motion.rate.max(axis=1)
     orders = np.array([np.ones_like(largest), ends.eta * largest, ends.beta * largest**2])
-    return np.asarray(ROUNDING * np.abs(motion.path).max(axis=(1, 2)) * orders)
+    return np.asarray(CONTROL_POINT_ROUNDING * np.abs(motion.path).max(axis=(1, 2)) * orders)

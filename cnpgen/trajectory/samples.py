@@ -1,4 +1,4 @@
-"""Time-sampled trajectories of other planners: checked, resampled, and their boundary conditions read off."""
+"""Time-sampled trajectories of other planners: checks, resampling, and estimation of their boundary conditions."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -9,9 +9,9 @@ from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]
 
-DENSE = 400  # samples; between fewer, the cubic through positions and velocities is sampled
-WINDOWS = (5, 8, 12, 18, 27, 40, 60, 90, 135, 200)  # samples at each end that velocities and accelerations are read off
-AT_REST = 2e-3  # velocities this small, in mean speeds, and accelerations ten times it, per duration, count as zero
+MIN_DENSE_SAMPLES = 400  # fewer samples are resampled from the cubic through positions and velocities
+WINDOWS = (5, 8, 12, 18, 27, 40, 60, 90, 135, 200)  # samples at each end for estimating velocity and acceleration
+MAX_REST_SPEED_RATIO = 2e-3  # of the mean speed: smaller velocities are 0; accelerations: ten times, per duration
 
 
 def checked_samples(t: ArrayLike, q: ArrayLike, dq: ArrayLike | None) -> tuple[Array, Array, Array | None]:
@@ -23,48 +23,52 @@ def checked_samples(t: ArrayLike, q: ArrayLike, dq: ArrayLike | None) -> tuple[A
         dq: Joint velocities [rad/s], shape (K, n), or None.
 
     Raises:
-        UsageError: A shape is wrong, the times do not increase, or something is not finite.
+        UsageError: A shape is wrong, the times do not increase, or a value is not finite.
     """
     times, positions = numbers("t", t), numbers("q", q)
     velocities = None if dq is None else numbers("dq", dq)
     if times.ndim != 1 or positions.ndim != 2 or len(positions) != len(times) or not positions.shape[1]:
-        raise UsageError(f"t must have shape (K,) and q shape (K, n), got {times.shape} and {positions.shape}")
+        raise UsageError(
+            f"must have shape (K,) and q shape (K, n), got {times.shape} and {positions.shape}", argument="t"
+        )
     if velocities is not None and velocities.shape != positions.shape:
-        raise UsageError(f"dq must have the shape of q, {positions.shape}, got {velocities.shape}")
+        raise UsageError(f"must have the shape of q, {positions.shape}, got {velocities.shape}", argument="dq")
     if len(times) < 2:
         raise UsageError(f"a trajectory needs at least 2 samples, got {len(times)}")
     for name, values in (("t", times), ("q", positions), ("dq", velocities)):
         if values is not None and not np.isfinite(values).all():
-            where = int(np.argmin(np.isfinite(values).reshape(len(values), -1).all(axis=1)))
-            raise UsageError(f"{name} must be finite, got {values[where]} in sample {where}")
+            index = int(np.argmin(np.isfinite(values).reshape(len(values), -1).all(axis=1)))
+            raise UsageError(f"{name} must be finite, got {values[index]} in sample {index}")
     if np.any(np.diff(times) <= 0):
-        where = int(np.argmin(np.diff(times) > 0))
-        raise UsageError(f"t must increase, got {times[where]} s in sample {where}, then {times[where + 1]} s")
+        index = int(np.argmin(np.diff(times) > 0))
+        raise UsageError(
+            f"must increase, got {times[index]} s in sample {index}, then {times[index + 1]} s", argument="t"
+        )
     return times, positions, velocities
 
 
 def resampled(t: Array, q: Array, dq: Array | None) -> tuple[Array, Array]:
-    """Return times and positions: more of them where velocities say what happens between sparse samples.
+    """Return times and positions, resampled by cubic Hermite interpolation if they are sparse and have velocities.
 
     Args:
         t: Times [s], shape (K,).
         q: Joint positions [rad], shape (K, n).
         dq: Joint velocities [rad/s], shape (K, n), or None.
     """
-    if dq is None or len(t) >= DENSE:
+    if dq is None or len(t) >= MIN_DENSE_SAMPLES:
         return t, q
     from scipy.interpolate import CubicHermiteSpline
 
-    between = np.linspace(0, 1, -(-DENSE // (len(t) - 1)), endpoint=False)
+    between = np.linspace(0, 1, -(-MIN_DENSE_SAMPLES // (len(t) - 1)), endpoint=False)
     finer = np.append(t[:-1, None] + np.diff(t)[:, None] * between, t[-1])
     return finer, CubicHermiteSpline(t, q, dq)(finer)
 
 
 def sampled_boundary(t: ArrayLike, q: ArrayLike, dq: ArrayLike | None = None) -> Boundary:
-    """Read the boundary conditions off samples of one trajectory.
+    """Estimate the boundary conditions of one trajectory from its samples.
 
-    Positions are those of the first and the last sample, and so are velocities where they are given. Other derivatives
-    are those of cubics through the samples next to the ends; where they are tiny, the joint is taken to be at rest.
+    Positions, and velocities if they are passed, are those of the first and the last sample. Other derivatives are
+    those of cubics through the samples next to the ends; negligible values are set to zero.
 
     Args:
         t: Times [s], shape (K,).
@@ -72,10 +76,10 @@ def sampled_boundary(t: ArrayLike, q: ArrayLike, dq: ArrayLike | None = None) ->
         dq: Joint velocities [rad/s], shape (K, n), or None.
 
     Returns:
-        Boundary conditions of one motion; the goal's acceleration is free.
+        Boundary conditions of one motion with a free goal acceleration.
 
     Raises:
-        UsageError: A shape is wrong, the times do not increase, or something is not finite.
+        UsageError: A shape is wrong, the times do not increase, or a value is not finite.
     """
     times, positions, velocities = checked_samples(t, q, dq)
     times, path = resampled(times - times[0], positions, velocities)
@@ -86,39 +90,39 @@ def sampled_boundary(t: ArrayLike, q: ArrayLike, dq: ArrayLike | None = None) ->
 
 
 def _derivatives(t: Array, q: Array, velocity: Array | None) -> tuple[Array, Array]:
-    """Velocity, unless it is known, and acceleration at t = 0."""
-    slowest = AT_REST * np.abs(q[-1] - q[0]).max() / t[-1]
+    """Estimate the velocity, unless it is known, and the acceleration at t = 0."""
+    min_speed = MAX_REST_SPEED_RATIO * np.abs(q[-1] - q[0]).max() / t[-1]
     travel, first = q[1:] - q[0], 1
     if velocity is None:
         velocity = _cubic(t[1:], travel, first)
-        velocity = np.where(np.abs(velocity) < slowest, 0.0, velocity)
+        velocity = np.where(np.abs(velocity) < min_speed, 0.0, velocity)
     if len(t) < 3:
         return velocity, np.zeros_like(velocity)
     travel, first = travel - velocity * t[1:, None], 2
     acceleration = 2 * _cubic(t[1:], travel, first)
-    return velocity, np.where(np.abs(acceleration) < 10 * slowest / t[-1], 0.0, acceleration)
+    return velocity, np.where(np.abs(acceleration) < 10 * min_speed / t[-1], 0.0, acceleration)
 
 
 def _cubic(t: Array, travel: Array, first: int) -> Array:
-    """Coefficient of t^first of the cubic without lower powers through the first samples, shape (n,).
+    """Fit a cubic without powers below t^first to the first samples and return its coefficient of t^first, shape (n,).
 
-    A wide window averages noise, a narrow one follows the motion: of several, the one whose residuals promise the
-    smallest standard error is taken.
+    A wide window averages noise, a narrow one follows the motion: the window with the smallest estimated standard error
+    is chosen.
 
     Args:
         t: Times after the start [s], shape (K,).
-        travel: What is left to explain [rad], shape (K, n).
-        first: The lowest power.
+        travel: Displacements to fit [rad], shape (K, n).
+        first: Lowest power.
     """
     widths = [min(width, len(t)) for width in WINDOWS if width <= max(len(t) // 5, WINDOWS[0])]
     best = np.inf, np.zeros(travel.shape[1])
     for width in widths:
         powers = (t[:width, None] / t[width - 1]) ** np.arange(first, min(width, 3) + 1)
         inverse = np.linalg.pinv(powers)
-        found = inverse @ travel[:width]
+        coefficients = inverse @ travel[:width]
         freedom = max(width - powers.shape[1], 1)
-        variance = np.sum((powers @ found - travel[:width]) ** 2) / freedom
+        variance = np.sum((powers @ coefficients - travel[:width]) ** 2) / freedom
         error = np.sqrt(variance * np.sum(inverse[0] ** 2)) / t[width - 1] ** first
         if error < best[0]:
-            best = error, found[0] / t[width - 1] ** first
+            best = error, coefficients[0] / t[width - 1] ** first
     return best[1]

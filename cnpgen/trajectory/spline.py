@@ -1,4 +1,8 @@
-"""Clamped uniform B-splines: knots, basis matrices, pieces, and what their control points are worth at the ends."""
+"""Clamped uniform B-splines: knots, basis functions, derivatives, extrema, and quadrature cells.
+
+The NumPy evaluations of splines are here: a matrix of basis functions (``basis``), Horner's rule in the power basis of
+each span (``horner``, ``derivatives``), and one phase of each of N splines (``derivatives_of_each``).
+"""
 
 from dataclasses import dataclass
 from functools import cache
@@ -9,7 +13,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-HUGE = 1e150  # control points beyond it are scaled before their products, which would be infinite, are taken
+MAX_UNSCALED = 1e150  # larger control points are scaled, because products of them would overflow
+ORDERS = 3  # of ``derivatives_of_each``: value, first and second derivative
 
 
 def clamped_knots(points: int, degree: int) -> Array:
@@ -19,7 +24,7 @@ def clamped_knots(points: int, degree: int) -> Array:
 
 
 def basis(s: Array, points: int, degree: int, order: int = 0) -> Array:
-    """Evaluate every basis function, or a derivative of it.
+    """Evaluate every basis function, or a derivative of it, by the Cox-de Boor recursion.
 
     Args:
         s: Phases in [0, 1], shape (K,).
@@ -30,12 +35,12 @@ def basis(s: Array, points: int, degree: int, order: int = 0) -> Array:
     Returns:
         Shape (K, C): ``basis(s, C, D, order) @ control_points`` is the derivative of the spline.
     """
-    knots, worth = derivative(points, degree, order)
+    knots, matrix = derivative(points, degree, order)
     degree -= order
-    first = np.clip(np.searchsorted(knots, s, side="right") - 1, degree, len(worth) - 1) - degree
+    first = np.clip(np.searchsorted(knots, s, side="right") - 1, degree, len(matrix) - 1) - degree
     values = np.zeros((len(s), points))
     for k, weight in enumerate(_cox_de_boor(s, knots, degree, first)):
-        values += weight[:, None] * worth[first + k]
+        values += weight[:, None] * matrix[first + k]
     return values
 
 
@@ -58,7 +63,7 @@ def derivative(points: int, degree: int, order: int) -> tuple[Array, Array]:
 
 
 def _cox_de_boor(s: Array, knots: Array, degree: int, first: NDArray[np.intp]) -> Array:
-    """Evaluate the D + 1 basis functions that are not 0 at phases s, by the recursion that SciPy uses, too.
+    """Evaluate the D + 1 basis functions that are not 0 at phases s, by the recursion that SciPy uses.
 
     Args:
         s: Phases, shape (K,).
@@ -80,8 +85,8 @@ def _cox_de_boor(s: Array, knots: Array, degree: int, first: NDArray[np.intp]) -
     return weights
 
 
-def pieces(control: Array, degree: int) -> Array:
-    """Turn N splines into polynomials between their knots, for ``pick`` and ``horner``.
+def power_coefficients(control: Array, degree: int) -> Array:
+    """Convert N splines to the power basis of each span, for ``select_spans`` and ``horner``.
 
     Args:
         control: Control points, shape (N, C) or (N, C, n).
@@ -90,66 +95,115 @@ def pieces(control: Array, degree: int) -> Array:
     Returns:
         Coefficients of the powers of (s - left knot), highest first, shape (D + 1, spans, N, ...).
     """
-    matrices = taylor(control.shape[1], degree)[::-1]
+    matrices = taylor_coefficients(control.shape[1], degree)[::-1]
     columns = control.reshape(*control.shape[:2], prod(control.shape[2:]))
     powers = np.ascontiguousarray((matrices[:, None] @ columns).swapaxes(1, 2))  # motion by motion
     return powers.reshape(*matrices.shape[:2], len(control), *control.shape[2:])
 
 
 @cache
-def taylor(points: int, degree: int) -> Array:
+def taylor_coefficients(points: int, degree: int) -> Array:
     """Return the Taylor coefficients of every basis function at every left knot, lowest power first.
 
     Returns:
-        Shape (D + 1, spans, C): ``taylor(C, D)[k] @ control_points`` are the coefficients of (s - left knot)^k.
+        Shape (D + 1, spans, C): entry k times the control points gives the coefficients of (s - left knot)^k.
     """
     left = np.arange(points - degree) / (points - degree)
     return np.stack([basis(left, points, degree, order) / factorial(order) for order in range(degree + 1)])
 
 
-def pick(coefficients: Array, s: Array) -> tuple[Array, Array]:
-    """Pick, for every spline, the pieces in which its own phases are.
+def select_spans(coefficients: Array, s: Array) -> tuple[Array, Array]:
+    """Select, for every spline, the coefficients of the spans that contain its phases.
 
     Args:
-        coefficients: What ``pieces`` returned.
+        coefficients: Result of ``power_coefficients``.
         s: Phases in [0, 1], shape (N, K).
 
     Returns:
-        ``(picked, offset)``: coefficients, shape (D + 1, N, K, ...), and s - left knot, shape (N, K).
+        ``(selected, offset)``: coefficients, shape (D + 1, N, K, ...), and s - left knot, shape (N, K).
     """
     spans = coefficients.shape[1]
     span = np.clip(np.nan_to_num(s) * spans, 0, spans - 1).astype(np.intp)
     return coefficients[:, span, np.arange(len(s))[:, None]], s - span / spans
 
 
-def horner(picked: Array, offset: Array, order: int = 0) -> Array:
-    """Evaluate what ``pick`` returned, or a derivative of it.
+def horner(selected: Array, offset: Array, order: int = 0) -> Array:
+    """Evaluate the polynomials of ``select_spans``, or a derivative of them, by Horner's rule.
 
     Returns:
-        Shape (N, K, ...).
+        Values, shape (N, K, ...).
     """
-    degree = len(picked) - 1
-    offset = offset.reshape(*offset.shape, *(1,) * (picked.ndim - 3))
-    value = np.zeros(picked.shape[1:])
+    degree = len(selected) - 1
+    offset = offset.reshape(*offset.shape, *(1,) * (selected.ndim - 3))
+    value = np.zeros(selected.shape[1:])
     for power in range(degree, order - 1, -1):
-        value = value * offset + perm(power, order) * picked[degree - power]
+        value = value * offset + perm(power, order) * selected[degree - power]
     return value
 
 
-def extremes(control: Array, degree: int) -> tuple[Array, Array]:
-    """Return where on [0, 1] one spline of finite control points, shape (C,), ends or turns, and its values there."""
+def derivatives(control: Array, degree: int, s: Array, *, orders: int) -> list[Array]:
+    """Evaluate one spline and its first derivatives together at many phases by Horner's rule.
+
+    Args:
+        control: Control points, shape (C, n).
+        degree: Degree D, at least 3.
+        s: Phases in [0, 1], shape (K,).
+        orders: Number of results: 1 is the spline alone.
+
+    Returns:
+        Arrays of shape (n, K).
+    """
+    spans = len(control) - degree
+    span = np.clip(s * spans, 0, spans - 1).astype(np.intp)
+    offset = s - span / spans
+    powers = control.T @ taylor_coefficients(len(control), degree).transpose(0, 2, 1)  # (D + 1, n, spans)
+    coefficients = powers.take(span, axis=2)
+    values = [coefficients[-1], *(np.zeros_like(coefficients[-1]) for _ in range(orders - 1))]
+    for coefficient in coefficients[-2::-1]:
+        for order in range(orders - 1, 0, -1):
+            values[order] = values[order] * offset + values[order - 1]
+        values[0] = values[0] * offset + coefficient
+    return [factorial(order) * value for order, value in enumerate(values)]
+
+
+def derivatives_of_each(control: Array, degree: int, s: Array) -> Array:
+    """Evaluate N splines and their first two derivatives, each at its own phase, shape (3, N, n).
+
+    Args:
+        control: Control points, shape (N, C, n).
+        degree: Degree D.
+        s: Phases in [0, 1], shape (N,).
+    """
+    spans = control.shape[1] - degree
+    span = np.minimum((s * spans).astype(np.intp), spans - 1)
+    factor, exponent = _powers(degree)
+    powers = factor * (s - span / spans)[:, None, None] ** exponent  # (N, 3, D + 1)
+    table = taylor_coefficients(control.shape[1], degree)[:, span].swapaxes(0, 1)  # (N, D + 1, C)
+    return np.asarray((powers @ table @ control).swapaxes(0, 1))
+
+
+@cache
+def _powers(degree: int) -> tuple[Array, Array]:
+    """Return factors and exponents of x in the derivatives of x^k, shape (3, D + 1) each."""
+    orders, powers = range(ORDERS), range(degree + 1)
+    factor = np.array([[perm(k, order) for k in powers] for order in orders], float)
+    return factor, np.array([[max(k - order, 0) for k in powers] for order in orders])
+
+
+def extrema(control: Array, degree: int) -> tuple[Array, Array]:
+    """Return the ends and the critical points of one spline on [0, 1], shape (C,) and finite, and its values there."""
     from scipy.interpolate import BSpline, PPoly
 
-    scale = 2.0**-600 if np.abs(control).max() > HUGE else 1.0  # a power of two, which changes no digit
+    scale = 2.0**-600 if np.abs(control).max() > MAX_UNSCALED else 1.0  # a power of two, exact in floating point
     spline = BSpline(clamped_knots(len(control), degree), control * scale, degree)
-    turning = PPoly.from_spline(spline.derivative()).roots(extrapolate=False)
-    s = np.clip(np.concatenate([[0.0, 1.0], turning[np.isfinite(turning)]]), 0, 1)
+    roots = PPoly.from_spline(spline.derivative()).roots(extrapolate=False)
+    s = np.clip(np.concatenate([[0.0, 1.0], roots[np.isfinite(roots)]]), 0, 1)
     return s, np.asarray(spline(s)) / scale
 
 
 @dataclass(frozen=True)
 class EndDerivatives:
-    """Derivatives of a clamped uniform B-spline at s = 0 (mirrored at s = 1).
+    """Factors of the derivatives of a clamped uniform B-spline at s = 0 (mirrored at s = 1).
 
     ``x'(0) = eta (c1 - c0)`` with ``eta = D (C - D)`` (the paper's Appendix A prints the square of C - D) and
     ``x''(0) = beta (c2 - 3 c1 + 2 c0)`` with ``beta = D (D - 1) / 2 (C - D)^2``; both need C >= D + 2.
@@ -177,14 +231,14 @@ def chebyshev(count: int) -> Array:
 
 @cache
 def graded_edges(points: int, degree: int) -> Array:
-    """Return edges of cells on [0, 1] in which 1 / r is smooth enough for eight Gauss nodes.
+    """Return the edges of quadrature cells on [0, 1] in which 1 / r is smooth enough for eight Gauss nodes.
 
-    Four cells per span, and cells that shrink by halves towards s = 0 and s = 1: there the first basis function is
-    0.01 wide, and 1 / r is nearly singular where the first control point is much smaller than the second. With cells
-    of equal size the duration of such motions is wrong in the third digit.
+    There are four cells per span, and cells that halve towards s = 0 and s = 1. There the first basis function is 0.01
+    wide, and 1 / r is nearly singular if the first control point is much smaller than the second. With cells of equal
+    size the duration of such motions is wrong in the third digit.
 
     Returns:
-        Ascending, from 0 to 1; the knots are among them.
+        Edges, ascending from 0 to 1, including the knots.
     """
     spans = points - degree
     end = 0.5 ** np.arange(24, 2, -1)
@@ -192,10 +246,10 @@ def graded_edges(points: int, degree: int) -> Array:
 
 
 def edges_around(s: Array, points: int, degree: int) -> Array:
-    """Return the edges of ``graded_edges`` and, between them, those of cells that shrink towards phases s, shape (K,).
+    """Return the edges of ``graded_edges`` and of cells that halve towards phases s, shape (K,).
 
-    They are for an r that turns close to 0 between its ends.
+    They are for an r with a minimum close to 0 between its ends.
     """
-    away = np.concatenate([[0.0], 0.5 ** np.arange(26, 2, -1)]) / (points - degree)
-    close = np.concatenate([s[:, None] - away, s[:, None] + away], axis=None)
+    offsets = np.concatenate([[0.0], 0.5 ** np.arange(26, 2, -1)]) / (points - degree)
+    close = np.concatenate([s[:, None] - offsets, s[:, None] + offsets], axis=None)
     return np.union1d(graded_edges(points, degree), close[(close > 0) & (close < 1)])

@@ -1,1 +1,1 @@
-"""Is it right? Datasets by files, rows, numbers, documents and blocks; this machine."""
+"""Validation of datasets, by files, rows, values, documents and blocks, and of this machine."""

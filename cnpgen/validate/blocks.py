@@ -1,4 +1,4 @@
-"""Blocks of a dataset made again from its seed, to compare them with what is stored."""
+"""Regeneration of blocks of a dataset from its seed, for a comparison with the stored rows."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,26 +9,26 @@ import numpy as np
 from cnpgen.errors import MachineError, UsageError
 from cnpgen.kernels.library import Backend, choose_backend
 from cnpgen.machine.versions import versions
-from cnpgen.make.load import restored
+from cnpgen.make.make_shards import Job, blocks_of, prepare, shard_columns
 from cnpgen.make.recipe import DatasetRecipe, recipe_digest
-from cnpgen.make.shards import Job, blocks_of, prepare, shard_columns
-from cnpgen.store.blueprint import REVISION, Blueprint, ShardTask
+from cnpgen.make.recipe_file import restored
 from cnpgen.store.check import Finding
+from cnpgen.store.dataset_spec import GENERATOR_REVISION, DatasetSpec, ShardTask
 from cnpgen.store.reader import StoredDataset
 
-PORTABLE = 1e-9  # what the rows of another machine or backend may differ by when they are made again, in SI units
-PORTABLE_FLOAT32 = 1e-5  # likewise, where rows are stored as float32
+MAX_REGENERATION_ERROR = 1e-9  # in SI units; accepted difference of rows made on another machine or backend
+MAX_REGENERATION_ERROR_FLOAT32 = 1e-5  # in SI units; accepted difference of rows stored as float32
 
 
 @dataclass(frozen=True)
 class Regeneration:
-    """Blocks that were made again.
+    """Result of the regeneration of blocks.
 
     Attributes:
-        made: How many.
-        blocks: How many there are to choose from.
-        identical: How many came out with the same bits.
-        findings: What differs by more than arithmetic.
+        made: Number of regenerated blocks.
+        blocks: Number of blocks of the dataset.
+        identical: Number of regenerated blocks that are bitwise identical.
+        findings: Differences above the tolerance.
     """
 
     made: int = 0
@@ -37,75 +37,79 @@ class Regeneration:
     findings: tuple[Finding, ...] = ()
 
 
-def make_again(folder: Path, blueprint: Blueprint, tasks: list[ShardTask], count: int) -> Regeneration:
-    """Make random blocks again.
+def regenerate_blocks(folder: Path, spec: DatasetSpec, tasks: list[ShardTask], count: int) -> Regeneration:
+    """Regenerate random blocks and compare them with the stored rows.
 
     Args:
-        folder: The dataset.
-        blueprint: Its blueprint.
-        tasks: The shards whose blocks may be chosen.
-        count: How many blocks to choose; all of them if there are fewer.
+        folder: Folder of the dataset.
+        spec: Specification of the dataset.
+        tasks: Shards to choose blocks from.
+        count: Number of blocks; all of them if there are fewer.
 
     Raises:
-        MachineError: The backend that made the dataset does not work here.
-        UsageError: The blocks of this version have another size.
+        MachineError: The backend of the dataset does not work on this machine.
+        UsageError: The block size of this version differs.
     """
-    size = blueprint.block_rows
-    pieces = [(task, block) for task in tasks for block in blocks_of(task, size)]
-    backend, cache_folder = backend_of(folder, blueprint)
-    dataset = StoredDataset(folder, blueprint, None)  # whatever became of the manifest
-    chosen = np.random.default_rng().permutation(len(pieces))[:count]
+    size = spec.block_rows
+    blocks = [(task, block) for task in tasks for block in blocks_of(task, size)]
+    backend, cache_folder = backend_of(folder, spec)
+    dataset = StoredDataset(folder, spec, None)  # without the manifest, which may be damaged
+    chosen = np.random.default_rng().permutation(len(blocks))[:count]
     identical, findings = 0, []
-    with restored(blueprint) as recipe:
-        prepared = prepare(Job(folder, blueprint, recipe.pipeline, backend, cache_folder))
+    with restored(spec) as recipe:
+        prepared = prepare(Job(folder, spec, recipe.pipeline, backend, cache_folder))
         if prepared.block_rows != size:
             raise UsageError(f"the blocks of {folder} have {size} rows, those of this version {prepared.block_rows}")
-        for task, block in (pieces[index] for index in chosen):
+        for task, block in (blocks[index] for index in chosen):
             start = max(block * size, task.first_row)
             stop = min((block + 1) * size, task.first_row + task.rows)
-            again, _ = next(
-                shard_columns(prepared, blueprint, [ShardTask(task.split, task.index, start, stop - start)])
-            )
+            again, _ = next(shard_columns(prepared, spec, [ShardTask(task.split, task.index, start, stop - start)]))
             same, problem = _compare(dataset.read(task.split, start=start, stop=stop), again)
             identical += same
             if problem:
-                text = f"block {block} made again from the seed: {problem}{_explanation(blueprint, recipe)}"
+                text = f"block {block} made again from the seed: {problem}{_explanation(spec, recipe)}"
                 findings.append(Finding(task.file, text))
-    return Regeneration(len(chosen), len(pieces), identical, tuple(findings))
+    return Regeneration(len(chosen), len(blocks), identical, tuple(findings))
 
 
-def backend_of(folder: Path, blueprint: Blueprint) -> tuple[Backend, Path]:
-    """Return the backend that made a dataset, and its cache folder.
+def backend_of(folder: Path, spec: DatasetSpec) -> tuple[Backend, Path]:
+    """Return the backend of a dataset and its cache folder.
 
     Raises:
-        MachineError: It does not work here.
+        MachineError: The backend does not work on this machine.
     """
     try:
-        return choose_backend(blueprint.backend)
+        return choose_backend(spec.backend)
     except MachineError as error:
         raise MachineError(
-            f"{folder} was made by the {blueprint.backend} backend, which does not work here ({error}): its blocks"
-            " cannot be made again; all checks but regenerate= work without it"
+            f"{folder} was made by the {spec.backend} backend, which does not work here ({error}): its blocks"
+            " cannot be made again; all checks but {{regenerate}} work without it",
+            remedies={"regenerate": None},
         ) from error
 
 
 def _compare(stored: dict[str, Any], again: dict[str, Any]) -> tuple[bool, str]:
-    """Return whether all bits are the same, and what differs by more than arithmetic on another machine can explain."""
+    """Return whether the values are bitwise identical, and the first difference above the tolerance."""
     same = all(np.array_equal(stored[name], values) for name, values in again.items())
     for name, values in again.items():
-        allowed = {"f": PORTABLE, "i": 0}[values.dtype.kind] if values.dtype != np.float32 else PORTABLE_FLOAT32
-        off = np.abs(stored[name].astype(float) - values.astype(float))
-        if not (off <= allowed).all():
-            return same, f"{name} differs by {off.max():.3g}"
+        difference = np.abs(stored[name].astype(float) - values.astype(float))
+        if not (difference <= _regeneration_tolerance(values.dtype)).all():
+            return same, f"{name} differs by {difference.max():.3g}"
     return same, ""
 
 
-def _explanation(blueprint: Blueprint, recipe: DatasetRecipe) -> str:
-    """Name the libraries and plug-ins that are not those that made the dataset."""
+def _regeneration_tolerance(dtype: np.dtype[Any]) -> float:
+    if dtype.kind == "i":
+        return 0.0
+    return MAX_REGENERATION_ERROR_FLOAT32 if dtype == np.float32 else MAX_REGENERATION_ERROR
+
+
+def _explanation(spec: DatasetSpec, recipe: DatasetRecipe) -> str:
+    """Name the libraries and plug-ins that have changed since the dataset was made."""
     now = versions()
-    other = [f"{name} {was} -> {now.get(name)}" for name, was in blueprint.versions.items() if now.get(name) != was]
-    if blueprint.revision != REVISION:
-        other.append(f"revision of the generator {blueprint.revision} -> {REVISION}")
-    if recipe_digest(recipe) != blueprint.recipe_sha256:  # its own recipe: only code can differ
-        other.append("the code of its plug-ins has changed")
-    return f" (made with other versions: {', '.join(other)})" if other else ""
+    changed = [f"{name} {old} -> {now.get(name)}" for name, old in spec.versions.items() if now.get(name) != old]
+    if spec.revision != GENERATOR_REVISION:
+        changed.append(f"revision of the generator {spec.revision} -> {GENERATOR_REVISION}")
+    if recipe_digest(recipe) != spec.recipe_sha256:  # the recipe is that of the dataset, so only code can differ
+        changed.append("the code of its plug-ins has changed")
+    return f" (made with other versions: {', '.join(changed)})" if changed else ""

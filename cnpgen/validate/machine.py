@@ -1,6 +1,6 @@
-"""What this machine has of what cnpgen needs, and what to do about the rest.
+"""Check of this machine: libraries, compiler, cores, cache and recipes, with a remedy for every problem.
 
-Nothing is imported before it is checked, so that a broken library is a line in the report and not a traceback.
+A library is imported only within its check, so that a broken library is reported and not raised as an exception.
 """
 
 import importlib
@@ -17,7 +17,7 @@ from typing import Any
 
 from cnpgen.machine.threads import users_environment
 
-NEEDED = {  # module -> the project on PyPI that has it
+REQUIRED_PROJECTS = {  # module -> project on PyPI
     "numpy": "numpy",
     "scipy": "scipy",
     "casadi": "casadi",
@@ -30,7 +30,7 @@ NEEDED = {  # module -> the project on PyPI that has it
     "daqp": "daqp",
     "threadpoolctl": "threadpoolctl",
 }
-OPTIONAL = {"matplotlib": "matplotlib"}
+OPTIONAL_PROJECTS = {"matplotlib": "matplotlib"}
 
 VARIABLES = (
     "OMP_NUM_THREADS",
@@ -44,17 +44,17 @@ VARIABLES = (
     "PYTHONPATH",
 )
 
-ENOUGH_DISK = 10**9  # bytes
+MIN_DISK_BYTES = 10**9
 
-# What only this project of a name that is easily mistaken has.
-_TELLTALES = {"pinocchio": "buildModelFromUrdf", "coal": "Box"}
+# Attributes that distinguish these projects from others with the same module name.
+_DISTINCTIVE_ATTRIBUTES = {"pinocchio": "buildModelFromUrdf", "coal": "Box"}
 
 _VECTOR_FLAGS = (("avx512f", "avx512"), ("avx2", "avx2"), ("avx", "avx"), ("asimd", "neon"), ("sse2", "sse2"))
 
 
 @dataclass(kw_only=True)
 class _Findings:
-    """What is found on the way."""
+    """Problems and notes of all checks."""
 
     problems: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -62,29 +62,29 @@ class _Findings:
 
 @dataclass(frozen=True, kw_only=True)
 class MachineReport:
-    """What a machine has.
+    """Properties and problems of a machine.
 
     Attributes:
         cnpgen: Version of cnpgen.
         python: Version of Python.
-        executable: Its path.
+        executable: Path of the Python interpreter.
         platform: Operating system and processor.
-        cores: Cores that this process may use.
-        cores_present: Cores of the machine.
-        vector: The widest vector instructions: "avx512", "avx2", "avx", "neon", "sse2" or "unknown".
+        cores: Number of cores that this process may use.
+        cores_present: Number of cores of the machine.
+        vector: Widest vector instructions: "avx512", "avx2", "avx", "neon", "sse2" or "unknown".
         libraries: Project -> version, "missing" or "broken".
         hdf5: Version of the HDF5 library.
-        environment: The variables that matter and that the user has set.
-        compiler: The C compiler and its version, empty if there is none.
-        backend: The kernels that would run, empty if none.
-        backend_reason: Why.
-        cache_folder: Where kernels are cached.
-        cache_writable: Whether they can be.
-        cache_used: Whether those that are there are loaded: only if nobody else may change them.
-        recipes: How many recipes were found where.
-        free_bytes: Free disk space in the working directory; 0 where it is gone.
-        problems: What keeps cnpgen from working, each with its remedy.
-        notes: What makes it slower, or is worth knowing.
+        environment: Relevant environment variables set by the user.
+        compiler: C compiler and its version; empty if there is none.
+        backend: Backend of the kernels; empty if none works.
+        backend_reason: Reason for the choice of the backend.
+        cache_folder: Folder of cached kernels.
+        cache_writable: Whether kernels can be cached.
+        cache_used: Whether cached kernels are loaded; they are not if other users may change them.
+        recipes: Number and folder of the recipes.
+        free_bytes: Free disk space in the working directory [bytes]; 0 if it does not exist.
+        problems: Problems that prevent cnpgen from working, each with a remedy.
+        notes: Remarks, for example on a lower speed.
     """
 
     cnpgen: str
@@ -110,7 +110,7 @@ class MachineReport:
 
     @property
     def ok(self) -> bool:
-        """Whether everything that cnpgen needs works."""
+        """Whether there are no problems."""
         return not self.problems
 
     def to_dict(self) -> dict[str, Any]:
@@ -119,14 +119,14 @@ class MachineReport:
 
 
 def check_machine() -> MachineReport:
-    """Look at this machine; never raises because of what it finds."""
-    found = _Findings()
-    libraries = _check_libraries(found)
-    cores, present = _check_cores(found)
-    theirs = users_environment()
-    cache = _or(_cache_folder, "")
-    backend, reason, writable = _check_backend(found, cache)
-    cache_used = _check_cache(found, cache)
+    """Check this machine; problems are reported and not raised."""
+    findings = _Findings()
+    libraries = _check_libraries(findings)
+    cores, present = _check_cores(findings)
+    environment = users_environment()
+    cache = _value_or(_cache_folder, "")
+    backend, reason, writable = _check_backend(findings, cache)
+    cache_used = _check_cache(findings, cache)
     return MachineReport(
         cnpgen=_version_of("cnpgen"),
         python=platform.python_version(),
@@ -136,27 +136,27 @@ def check_machine() -> MachineReport:
         cores_present=present,
         vector=vector_instructions(),
         libraries=libraries,
-        hdf5=_or(_hdf5_version, "unknown"),
-        environment={name: theirs[name] for name in VARIABLES if theirs.get(name)},
-        compiler=_or(_compiler, ""),
+        hdf5=_value_or(_hdf5_version, "unknown"),
+        environment={name: environment[name] for name in VARIABLES if environment.get(name)},
+        compiler=_value_or(_compiler, ""),
         backend=backend,
         backend_reason=reason,
         cache_folder=cache,
         cache_writable=writable,
         cache_used=cache_used,
-        recipes=_check_recipes(found),
-        free_bytes=_check_disk(found),
-        problems=tuple(found.problems),
-        notes=tuple(found.notes),
+        recipes=_check_recipes(findings),
+        free_bytes=_check_disk(findings),
+        problems=tuple(findings.problems),
+        notes=tuple(findings.notes),
     )
 
 
-def _or(look: Callable[[], str], otherwise: str) -> str:
-    """Return what there is to see, or something else where the libraries for looking are broken."""
+def _value_or(read: Callable[[], str], default: str) -> str:
+    """Return the result of ``read``, or a default if a library is broken."""
     try:
-        return look()
+        return read()
     except Exception:  # noqa: BLE001 - broken libraries raise anything; they are reported by _check_libraries
-        return otherwise
+        return default
 
 
 def _one_line(error: Exception) -> str:
@@ -170,19 +170,19 @@ def _version_of(project: str) -> str:
         return "not installed, run from its source"
 
 
-def _check_libraries(found: _Findings) -> dict[str, str]:
+def _check_libraries(findings: _Findings) -> dict[str, str]:
     versions = {}
-    for module, project in NEEDED.items():
+    for module, project in REQUIRED_PROJECTS.items():
         versions[project], problem = _try_library(module, project)
-        found.problems += [problem] if problem else []
-    for module, project in OPTIONAL.items():
+        findings.problems += [problem] if problem else []
+    for module, project in OPTIONAL_PROJECTS.items():
         versions[project], problem = _try_library(module, project)
-        found.notes += [f"{problem}, for 'cnpgen inspect --plot' only"] if problem else []
+        findings.notes += [f"{problem}, for 'cnpgen inspect --plot' only"] if problem else []
     return versions
 
 
 def _try_library(module: str, project: str) -> tuple[str, str]:
-    """Import a library; return its version and what is wrong with it, if anything."""
+    """Import a library; return its version and a description of its problem, if any."""
     install = f"{sys.executable} -m pip install"
     try:
         imported = importlib.import_module(module)
@@ -195,30 +195,30 @@ def _try_library(module: str, project: str) -> tuple[str, str]:
             "broken",
             f"{project} cannot be imported ({_one_line(error)}): run '{install} --force-reinstall {project}'",
         )
-    telltale = _TELLTALES.get(module)
-    if telltale and not hasattr(imported, telltale):
+    attribute = _DISTINCTIVE_ATTRIBUTES.get(module)
+    if attribute and not hasattr(imported, attribute):
         remedy = f"run '{sys.executable} -m pip uninstall {module}', then '{install} --force-reinstall {project}'"
         return "broken", f"the module {module!r} that is installed is another project of that name: {remedy}"
     return str(getattr(imported, "__version__", "")) or _version_of(project), ""
 
 
-def _check_cores(found: _Findings) -> tuple[int, int]:
-    """Return the cores that are available and those that are there."""
+def _check_cores(findings: _Findings) -> tuple[int, int]:
+    """Return the number of available cores and of all cores."""
     present = os.cpu_count() or 1
     available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else present
     try:
         from joblib import cpu_count
 
-        granted = int(cpu_count())  # knows the limits of containers, too
+        granted = int(cpu_count())  # respects the limits of containers
     except Exception:  # noqa: BLE001 - reported by _check_libraries
         granted = available
     if granted < available:
-        found.notes.append(f"this container may use {granted} of {available} cores: run with workers={granted}")
+        findings.notes.append(f"this container may use {granted} of {available} cores: use at most {granted} workers")
     return min(granted, available), present
 
 
 def vector_instructions() -> str:
-    """Name the widest vector instructions of the processor."""
+    """Return the widest vector instructions of the processor."""
     if platform.machine().lower() in {"arm64", "aarch64"}:
         return "neon"
     try:
@@ -248,8 +248,8 @@ def _cache_folder() -> str:
     return str(default_cache_folder())
 
 
-def _check_backend(found: _Findings, cache: str) -> tuple[str, str, bool]:
-    """Choose a backend as a run would; return it, the reason and whether the cache can be written."""
+def _check_backend(findings: _Findings, cache: str) -> tuple[str, str, bool]:
+    """Choose the backend; return it, the reason, and whether the cache is writable."""
     try:
         from cnpgen.kernels.library import choose_backend
 
@@ -258,63 +258,63 @@ def _check_backend(found: _Findings, cache: str) -> tuple[str, str, bool]:
             backend, folder = choose_backend()
     except Exception as error:  # noqa: BLE001 - broken libraries raise anything
         text = _one_line(error)
-        found.problems += [] if found.problems else [f"no backend works ({text}): reinstall cnpgen"]
+        findings.problems += [] if findings.problems else [f"no backend works ({text}): reinstall cnpgen"]
         return "", text, False
-    found.notes += [str(warning.message) for warning in caught]
+    findings.notes += [str(warning.message) for warning in caught]
     if str(folder) != cache:
-        shutil.rmtree(folder, ignore_errors=True)  # it was made for this look only
-    reason = (
-        "a test kernel was compiled and computes what it should" if backend == "compiled" else "no C compiler works"
-    )
+        shutil.rmtree(folder, ignore_errors=True)  # a temporary folder of this check
+    reason = "a test kernel was compiled and is correct" if backend == "compiled" else "no C compiler works"
     return backend, reason, str(folder) == cache
 
 
-def _check_cache(found: _Findings, cache: str) -> bool:
-    """Return whether the kernels in the cache may be loaded, and note those that may not."""
-    from cnpgen.kernels.cache import distrusted, distrusted_files
+def _check_cache(findings: _Findings, cache: str) -> bool:
+    """Return whether cached kernels may be loaded, and note those that may not."""
+    from cnpgen.kernels.cache import trust_problem, untrusted_files
 
-    if not cache or not Path(cache).is_dir() or distrusted(Path(cache)):  # the choice of a backend has said why
+    if not cache or not Path(cache).is_dir() or trust_problem(Path(cache)):  # noted by the choice of the backend
         return False
-    if files := distrusted_files(Path(cache)):
-        found.notes.append(
-            f"kernels in the cache that others may have changed are not used ({len(files)}): delete them, the first one"
+    if files := untrusted_files(Path(cache)):
+        findings.notes.append(
+            f"cached kernels that other users may have changed are not used ({len(files)}): delete them, the first one"
             f" is {files[0]}"
         )
     return True
 
 
-def _check_recipes(found: _Findings) -> str:
+def _check_recipes(findings: _Findings) -> str:
     """Load every shipped dataset recipe with its robot."""
     try:
         from cnpgen.errors import PluginError
-        from cnpgen.make.load import load_dataset_recipe
-        from cnpgen.problems.robot import load_robot
+        from cnpgen.make.recipe_file import load_dataset_recipe
+        from cnpgen.problems.load_robot import load_robot
         from cnpgen.schema.catalogue import list_recipes, recipes_root
 
-        names, without = list(list_recipes("dataset")), []
+        names, missing = list(list_recipes("dataset")), []
         for name in names:
             try:
                 load_robot(load_dataset_recipe(name).pipeline.problem)
             except PluginError:
-                without.append(name)
+                missing.append(name)
     except Exception as error:  # noqa: BLE001 - broken libraries raise anything
         text = _one_line(error)
-        found.problems += [] if found.problems else [f"the shipped recipes cannot be loaded ({text}): reinstall cnpgen"]
+        findings.problems += (
+            [] if findings.problems else [f"the shipped recipes cannot be loaded ({text}): reinstall cnpgen"]
+        )
         return f"cannot be loaded: {text}"
     if not names:
-        found.problems.append(f"there are no recipes in {recipes_root()}: reinstall cnpgen")
-    more = f", but for those of {', '.join(without)}: pip install 'cnpgen[robots]'" if without else ""
+        findings.problems.append(f"there are no recipes in {recipes_root()}: reinstall cnpgen")
+    more = f", but for those of {', '.join(missing)}: pip install 'cnpgen[robots]'" if missing else ""
     return f"{len(names)} datasets in {recipes_root()}, their robots load{more}"
 
 
-def _check_disk(found: _Findings) -> int:
+def _check_disk(findings: _Findings) -> int:
     try:
         free = shutil.disk_usage(Path.cwd()).free
     except OSError as error:
-        found.notes.append(f"the working directory cannot be looked at ({error.strerror}): go to another one")
+        findings.notes.append(f"the working directory cannot be read ({error.strerror}): change to another one")
         return 0
-    if free < ENOUGH_DISK:
-        found.notes.append(
-            f"only {free / 1e6:,.0f} MB are free in {Path.cwd()}: choose another out= for large datasets"
+    if free < MIN_DISK_BYTES:
+        findings.notes.append(
+            f"only {free / 1e6:,.0f} MB are free in {Path.cwd()}: choose another folder for large datasets"
         )
     return free

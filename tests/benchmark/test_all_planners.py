@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cnpgen.benchmark.run import Benchmark, run_benchmark
+from cnpgen.benchmark.run_suite import Benchmark, run_benchmark
 from cnpgen.schema import registry
 from tests.conftest import some
 

@@ -8,12 +8,12 @@ import pytest
 from scipy.integrate import quad
 from scipy.optimize import LinearConstraint, minimize
 
+from cnpgen.benchmark.benchmark_planner import Setting
 from cnpgen.benchmark.judging import judge_answer
-from cnpgen.benchmark.planner import Setting
 from cnpgen.benchmark.planners.aqp import AQP, nearest_in_null_space
-from cnpgen.benchmark.planners.boxes import boxes_of
 from cnpgen.benchmark.planners.knots import knot_constraints
-from cnpgen.benchmark.planners.plane import HIGH, LOW, PlanePath, stopping_path, striking_path
+from cnpgen.benchmark.planners.obstacle_boxes import boxes_of
+from cnpgen.benchmark.planners.table_plane import HIGH, LOW, PlanePath, stopping_path, striking_path
 from cnpgen.benchmark.planners.tip import Tip
 from cnpgen.benchmark.planners.trajopt import TrajOpt, Transcription
 from cnpgen.benchmark.process import PlannerProcess
@@ -105,18 +105,18 @@ def length_of(path: PlanePath) -> float:
 def test_paths_in_the_plane_are_smooth_of_their_length_and_end_where_they_should(hit: tuple[float, float]) -> None:
     start, end = np.array([0.65, 0.0]), np.array(hit)
     way = np.array([2.478, 0.0]) - end
-    strike = striking_path(start, end, way, 1.5)
-    np.testing.assert_allclose(strike.at(0.0), start, atol=1e-12)
-    np.testing.assert_allclose(strike.at(strike.length), end, atol=1e-12)
-    assert length_of(strike) == pytest.approx(strike.length, abs=1e-4)
-    last = strike.at(strike.length) - strike.at(strike.length - 1e-5)
+    hit = striking_path(start, end, way, 1.5)
+    np.testing.assert_allclose(hit.at(0.0), start, atol=1e-12)
+    np.testing.assert_allclose(hit.at(hit.length), end, atol=1e-12)
+    assert length_of(hit) == pytest.approx(hit.length, abs=1e-4)
+    last = hit.at(hit.length) - hit.at(hit.length - 1e-5)
     np.testing.assert_allclose(last / np.linalg.norm(last), way / np.linalg.norm(way), atol=1e-3)
-    steps = np.diff([strike.at(s) for s in np.linspace(0, strike.length, 2000)], axis=0)
+    steps = np.diff([hit.at(s) for s in np.linspace(0, hit.length, 2000)], axis=0)
     heading = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
     assert np.abs(np.diff(heading)).max() < 0.1  # no corner
-    points = np.array(list(strike.sampled(0.01)))
+    points = np.array(list(hit.sampled(0.01)))
     assert np.all((points > LOW - 1e-9) & (points < HIGH + 1e-9))
-    stop = stopping_path(strike)
+    stop = stopping_path(hit)
     np.testing.assert_allclose(stop.at(0.0), end, atol=1e-12)
     first = stop.at(1e-5) - stop.at(0.0)
     np.testing.assert_allclose(first / np.linalg.norm(first), way / np.linalg.norm(way), atol=1e-3)

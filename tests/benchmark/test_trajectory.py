@@ -10,7 +10,7 @@ from cnpgen.benchmark.simulator.plant import PLANTS
 from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.errors import UsageError
 from cnpgen.plans import Plans, make_plans
-from tests.examples.jerky import jerky_plan
+from tests.examples.jerk_limits import jerk_limited_plan
 from tests.examples.plans import load
 
 T = np.linspace(0, 1, 5)
@@ -85,7 +85,7 @@ def test_jumps_in_the_velocity_of_a_linear_trajectory_are_seen_as_accelerations(
 
 @pytest.mark.parametrize("known", ["positions", "velocities", "accelerations"])
 def test_jerks_are_judged_where_a_problem_limits_them(known: str) -> None:
-    example = jerky_plan("transport")
+    example = jerk_limited_plan("transport")
     motion = example.motion
     plan = make_plans(
         example.problem, example.boundary, path_control_points=motion.path, rate_control_points=motion.rate

@@ -8,7 +8,7 @@ import pinocchio as pin
 import pytest
 import scipy  # which imports its statistics when they are asked for: that takes a second
 
-from cnpgen.benchmark.planner import Setting
+from cnpgen.benchmark.benchmark_planner import Setting
 from cnpgen.benchmark.planners import steering
 from cnpgen.benchmark.planners.cbirrt import Search
 from cnpgen.benchmark.planners.mpc_mpnet import MPCMPNet, ProposedExtension
@@ -31,7 +31,7 @@ from cnpgen.errors import DatasetError, UsageError
 from cnpgen.planner.network.architecture import Architecture, initial_parameters
 from cnpgen.planner.network.forward import forward
 from cnpgen.plans import Plans, open_problem
-from cnpgen.refine.plans import solve_plans
+from cnpgen.refine.refine_plans import solve_plans
 from tests.conftest import some
 
 PROBLEM_OF = {"hits-81": "airhockey", "heavy-100": "heavy-object"}
@@ -41,8 +41,8 @@ def one_of(suite: str, index: int = 0) -> Plans:
     return load_suite(suite).problems(index + 1)[0][index]
 
 
-def tops_of(check: StateCheck, task: Plans) -> np.ndarray:
-    return check.tops(task.columns["start_xyz"][0], task.columns["goal_xyz"][0])
+def poses_of(check: StateCheck, task: Plans) -> np.ndarray:
+    return check.obstacle_poses(task.columns["start_xyz"][0], task.columns["goal_xyz"][0])
 
 
 @pytest.mark.parametrize("suite", some(["hits-81", "heavy-100"], 1, "slow"))
@@ -56,7 +56,7 @@ def test_states_are_allowed_as_pinocchio_and_the_search_in_joint_space_have_it(s
     q[150:] = random.uniform(robot.position_lower, robot.position_upper, (50, robot.n)) * 1.1
     dq, ddq = random.normal(0, 0.6, (2, *q.shape)) * np.stack([robot.velocity_limit, robot.acceleration_limit])[:, None]
     dq[:75], ddq[:75] = plan.dq[0][:75], plan.ddq[0][:75]
-    tips, allowed = check(q, dq, ddq, tops_of(check, task))
+    tips, allowed = check(q, dq, ddq, poses_of(check, task))
     data, expected = robot.model.createData(), []
     for state in zip(q, dq, ddq, strict=True):
         torque = pin.rnea(robot.model, data, *state)
@@ -90,7 +90,7 @@ def test_a_tree_of_sst_keeps_its_limits_and_comes_nearer_to_the_goal() -> None:
     start_xyz, goal = task.columns["start_xyz"][0], task.columns["goal_xyz"][0]
     check = StateCheck(problem, robot)
     tree = Tree(np.concatenate([task.boundary.start_q[0], task.boundary.start_dq[0]]), start_xyz, HIT, STEP)
-    extend = RandomExtension(tree, robot, check, tops_of(check, task), goal, np.random.default_rng(0))
+    extend = RandomExtension(tree, robot, check, poses_of(check, task), goal, np.random.default_rng(0))
     found = tree.grow(extend, goal, time_limit=60, most=3000)
     assert found is not None
     ways(found, STEP, robot.acceleration_limit)
@@ -106,7 +106,7 @@ def test_a_tree_keeps_the_cheapest_node_of_every_witness_and_extends_the_cheapes
     slow, quick = np.zeros((5, 2)), np.ones((2, 2))
     assert tree.add(0, slow, np.array([1.0, 0, 0])) == 1
     assert tree.add(0, quick, np.array([1.01, 0, 0])) == 2  # cheaper, of the same witness
-    assert tree.add(0, slow, np.array([1.0, 0.01, 0])) == 2  # dearer: the other one is kept
+    assert tree.add(0, slow, np.array([1.0, 0.01, 0])) == 2  # more expensive: the other one is kept
     assert tree.selected(np.array([1.0, 0, 0])) == 2
     assert tree.add(0, slow, np.array([1.04, 0, 0])) == 3
     assert tree.selected(np.array([1.04, 0, 0])) == 2  # the nearest one took longer
@@ -118,7 +118,7 @@ def steering_of(task: Plans, seed: int = 0) -> Steering:
     problem, robot = open_problem(task.problem)
     check = StateCheck(problem, robot)
     spread = steering.HIT if problem.object_size is None else steering.TRANSPORT
-    return Steering(check, tops_of(check, task), robot.acceleration_limit, spread, np.random.default_rng(seed))
+    return Steering(check, poses_of(check, task), robot.acceleration_limit, spread, np.random.default_rng(seed))
 
 
 def test_controls_are_followed_as_pinocchio_integrates_and_only_as_far_as_states_are_allowed() -> None:
@@ -194,7 +194,7 @@ def misses(network: Proposals, plans: Plans) -> float:
     wrong, far = [], states.q[:, 1] - states.q[:, 0]
     for index in range(len(plans)):
         task = plans[index]
-        proposal = network.propose(now[index], task.boundary.goal_q[0], tops_of(check, task), random)
+        proposal = network.propose(now[index], task.boundary.goal_q[0], poses_of(check, task), random)
         wrong.append(proposal - states.q[index, 1])
     return float(np.linalg.norm(wrong) / np.linalg.norm(far))
 

@@ -46,8 +46,8 @@ def test_a_short_benchmark_of_all_planners(tmp_path: Path, capsys: pytest.Captur
 
 def test_mistakes_are_said_in_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["benchmark"]) == 2
-    assert "which suite?" in capsys.readouterr().err
+    assert "the argument SUITE is missing" in capsys.readouterr().err
     assert main(["benchmark", "hits-81", "--plant", "heavier", "-o", str(tmp_path)]) == 2
     assert "goes with --simulate only" in capsys.readouterr().err
     assert main(["benchmark", "hits-81", "--video", "-o", str(tmp_path)]) == 2
-    assert "--video films plans as they are executed: it goes with --simulate only" in capsys.readouterr().err
+    assert "--video needs --simulate" in capsys.readouterr().err

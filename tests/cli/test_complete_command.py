@@ -5,7 +5,7 @@ import json
 import numpy as np
 
 from cnpgen.cli.main import main
-from cnpgen.plans.load import load_plans
+from cnpgen.plans.plan_file import load_plans
 
 TABLE = "goal_xyz.x,goal_xyz.y,hit_angle\n1.0,0.1,0.0\n3.0,0.0,0.1\n1.1,-0.2,0.2\n"
 

@@ -15,14 +15,14 @@ from cnpgen.cli.describe import (
     recipe_to_dict,
     table,
 )
-from cnpgen.make.load import load_dataset_recipe
-from cnpgen.pipelines.load import load_pipeline
-from cnpgen.problems.load import load_problem
+from cnpgen.make.recipe_file import load_dataset_recipe
+from cnpgen.pipelines.pipeline_file import load_pipeline
+from cnpgen.problems.problem_file import load_problem
 from cnpgen.schema.catalogue import list_recipes
 from cnpgen.schema.keys import Range
 from cnpgen.store.files.documents import plain
 from tests.examples.example_robots import with_robots
-from tests.examples.jerky import jerky
+from tests.examples.jerk_limits import jerk_limited
 from tests.examples.shaped_robot import KINDS as EVERY_KIND
 from tests.examples.shaped_robot import write_problem
 
@@ -85,7 +85,7 @@ def test_the_limits_of_every_joint_are_shown():
     )
     assert "-2.967 to 2.967" in text
     assert "11.87" in text
-    problem, robot = jerky("airhockey")
+    problem, robot = jerk_limited("airhockey")
     limited = describe(problem)
     assert re.search(r"acceleration +jerk +torque", limited)
     assert all(f" {limit:.6g} " in limited for limit in robot.jerk_limit)
@@ -106,8 +106,8 @@ def test_obstacles_of_every_kind_are_described_by_what_is_theirs(tmp_path):
 
 
 def test_the_objective_is_described():
-    assert "objective  shortest time, and centrifugal 0.01 s^2/m" in describe(load_problem("airhockey"))
-    assert re.search(r"objective +shortest time\n", describe(load_problem("heavy-object")))
+    assert "objective  minimum time, and centrifugal 0.01 s^2/m" in describe(load_problem("airhockey"))
+    assert re.search(r"objective +minimum time\n", describe(load_problem("heavy-object")))
 
 
 def test_the_links_of_a_shape_and_their_pairs_are_listed(tmp_path):

@@ -88,7 +88,7 @@ def test_what_is_there_is_replaced_only_by_force(run: Run, hits: Path) -> None:
         before = [path.read_bytes() for path in sorted(Path().rglob("*")) if path.is_file()]
         code, _, err = run(*words, "--rate", 10)
         assert code == 2
-        assert err == f"cnpgen: error: {out} is there already; --force replaces what has the same name\n"
+        assert err == f"cnpgen: error: {out} exists; --force replaces files of the same name\n"
         assert [path.read_bytes() for path in sorted(Path().rglob("*")) if path.is_file()] == before
         assert run(*words, "--rate", 10, "--force")[0] == 0
         assert [path.read_bytes() for path in sorted(Path().rglob("*")) if path.is_file()] != before
@@ -106,7 +106,7 @@ def test_plans_that_are_known_not_to_be_valid_are_exported_with_a_warning(run: R
     status = np.where(np.arange(14) == 3, PlanStatus.VALID, PlanStatus.INVALID).astype(np.uint8)
     save_plans(tmp_path / "bad.h5", replace(plans, status=status))
     code, _, err = run(tmp_path / "bad.h5", "--to", "npz", "--rate", 50)
-    text = "not valid by their status ('cnpgen evaluate' says why): plans 0, 1, 2, 4, 5, 6, 7, 8, 9, 10 and 3 more"
+    text = "not valid by their status ('cnpgen evaluate' reports why): plans 0, 1, 2, 4, 5, 6, 7, 8, 9, 10 and 3 more"
     assert (code, err.splitlines()[0]) == (0, f"cnpgen: warning: {text}")
     _, _, err = run(tmp_path / "bad.h5", "--to", "npz", "--rate", 50, "--plan", "3", "--force")
     assert "warning" not in err

@@ -11,12 +11,12 @@ import cnpgen
 from cnpgen.cli.describe_keys import part_of
 from cnpgen.cli.init.text import toml
 from cnpgen.cli.main import main
-from cnpgen.make.load import load_dataset_recipe
-from cnpgen.problems.load import load_problem
+from cnpgen.make.recipe_file import load_dataset_recipe
+from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import resolved
-from cnpgen.problems.robot import load_robot
+from cnpgen.problems.problem_file import load_problem
 from cnpgen.schema.keys import PerJoint, Range, keys
-from cnpgen.world.state import World
+from cnpgen.world.world import World
 from tests.examples.example_robots import folder as robots
 from tests.examples.example_robots import needs_robots
 from tests.examples.shaped_robot import write_crane
@@ -97,7 +97,7 @@ def test_what_was_found_out_is_said_at_the_top(crane):
     assert re.search(r"swing +revolute +-2.5 to 2.5 +2 +100\n", about)
     for found in ("stay at zero: grip", "5 kg in 5 links that move", "claw", "overhang [mm]"):
         assert found in about
-    assert "kept apart by" in about
+    assert "checked by" in about
     assert "of the draws" in (crane / "pipeline.toml").read_text(encoding="utf-8")
 
 
@@ -227,7 +227,7 @@ def test_several_links_that_carry_none_are_listed(tmp_path, capsys):
     )
     urdf.write_text(urdf.read_text().replace("</robot>", f"{camera}</robot>"))
     said = refused(capsys, 2, tmp_path / "arm", "--urdf", urdf)
-    assert "--tip says which frame of arm.urdf the task is about: 2 links carry no other: end, camera" in said
+    assert "--tip must name the tip frame of arm.urdf: 2 links have no child: end, camera" in said
 
 
 def test_a_frame_that_nothing_moves_is_refused(tmp_path, capsys):
@@ -255,7 +255,7 @@ def test_joints_in_a_circle_are_refused(tmp_path, capsys):
     circle = joint.format("one", "a", "b") + joint.format("two", "b", "a")
     (tmp_path / "arm.urdf").write_text(f'<robot name="r"><link name="a"/><link name="b"/>{circle}</robot>')
     said = refused(capsys, 2, tmp_path / "arm", "--urdf", tmp_path / "arm.urdf", "--tip", "a")
-    assert "its joints go round in a circle" in said
+    assert "its joints form a cycle" in said
 
 
 @pytest.mark.slow

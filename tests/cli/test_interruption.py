@@ -22,7 +22,7 @@ from cnpgen.kernels.compiler import find_compiler
 from tests.conftest import HANGING, some
 from tests.machine.test_workers import alive
 
-KEPT = "finished shards are kept, run the same command again to go on"
+KEPT = "finished shards are kept; run the same command again to resume"
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(cnpgen.__file__).parents[1])}
 NAMES = {signal.SIGINT: ("interrupted", 130), signal.SIGTERM: ("terminated", 143)}
 
@@ -82,7 +82,7 @@ def check_end(process: subprocess.Popen, number: signal.Signals, offspring: list
     what, code = NAMES[number]
     *others, last = err.splitlines()
     assert (last, out) == (f"cnpgen: {what}: {KEPT}", "")
-    assert process.returncode in {code, -number}  # the latter where a second signal came in its very last moment
+    assert process.returncode in {code, -number}  # the latter where a second signal came in its very last time
     wait_for(lambda: not any(map(alive, offspring)))
     return "\n".join(others)
 
@@ -246,7 +246,7 @@ def test_a_second_interruption_after_a_second_ends_the_process_at_once():
 import os, signal, time
 from cnpgen.cli.interruption import interruptible
 from cnpgen.machine import signals
-signals.ECHO_SECONDS = 0.05
+signals.MIN_REPEAT_INTERVAL_S = 0.05
 with interruptible():
     try:
         os.kill(os.getpid(), signal.SIGTERM)

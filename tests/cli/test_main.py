@@ -22,10 +22,10 @@ from cnpgen.cli.main import main
 from cnpgen.cli.make_command import _yield
 from cnpgen.cli.progress import Meter
 from cnpgen.errors import DatasetError, RecipeError
-from cnpgen.make.blueprint import MAX_ROWS
+from cnpgen.make.resolve_spec import MAX_ROWS
 from cnpgen.store.check import Finding
-from cnpgen.store.fates import Fates
-from cnpgen.validate.dataset import ValidationReport
+from cnpgen.store.sampling_statistics import SamplingStatistics
+from cnpgen.validate.validate_dataset import ValidationReport
 from tests.conftest import HANGING
 
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(cnpgen.errors.__file__).parents[1])}
@@ -101,7 +101,7 @@ def test_anything_else_is_no_whole_number(text):
 
 
 def test_the_bounds_are_those_of_the_library():
-    assert values.MOST_ROWS == MAX_ROWS
+    assert values.MAX_ROWS_ARGUMENT == MAX_ROWS
 
 
 @pytest.mark.parametrize("text", ["1e9x", "0", "-5", "2.5", ""])
@@ -226,7 +226,7 @@ def test_stdout_is_the_folder_and_stderr_a_start_and_a_summary(run, tmp_path):
 def test_a_finished_dataset_is_already_complete(run, hits):
     code, out, err = run(*MAKE, hits)
     assert (code, out) == (0, f"{hits}\n")
-    assert err.splitlines()[:2] == [f"checking {hits}: 200 rows", f"making {hits}: 200 rows, 200 there already"]
+    assert err.splitlines()[:2] == [f"checking {hits}: 200 rows", f"making {hits}: 200 rows, 200 exist already"]
     assert "already complete: 200 rows (train 182, validation 18)" in err
 
 
@@ -235,7 +235,7 @@ def test_quiet_is_quiet(run, hits):
 
 
 def test_reasons_that_round_to_nothing_are_not_summed_up():
-    outcome = Fates(tried=10_000, accepted=7_996, rejections={"too close": 2_000, "rare": 4, "never": 0})
+    outcome = SamplingStatistics(tried=10_000, accepted=7_996, rejections={"too close": 2_000, "rare": 4, "never": 0})
     assert _yield(outcome) == "accepted 80.0% of 10,000 draws; rejected: too close 20.0%"
 
 
@@ -244,10 +244,10 @@ def test_another_dataset_is_refused_until_it_is_forced(run, hits, tmp_path):
     shutil.copytree(hits, folder)
     code, out, err = run(*MAKE, folder, "--seed", "5")
     assert (code, out) == (2, "")
-    assert "are there already" not in err
+    assert "are exist already" not in err
     assert "--force" in err.splitlines()[-1]
     assert run(*MAKE, folder, "--seed", "5", "--force", "--quiet")[0] == 0
-    assert json.loads((folder / "plan.json").read_text())["seed"] == "5"
+    assert json.loads((folder / "specification.json").read_text())["seed"] == "5"
 
 
 def test_parts_make_a_whole(run, tmp_path):
@@ -291,7 +291,7 @@ def test_a_lost_manifest_is_written_again_and_not_passed_over(run, hits, tmp_pat
     (folder / "manifest.json").unlink()
     code, out, err = run(*MAKE, folder)
     assert (code, out) == (0, f"{folder}\n")
-    assert "every row was there already, manifest.json written now: 200 rows (train 182, validation 18)" in err
+    assert "all samples existed, manifest.json written again: 200 rows (train 182, validation 18)" in err
     assert (folder / "manifest.json").read_bytes() == (hits / "manifest.json").read_bytes()
 
 
@@ -308,10 +308,10 @@ def test_a_dry_run_says_what_is_in_the_folder(run, hits, tmp_path):
     shutil.copytree(hits, tmp_path / "half")
     (tmp_path / "half" / "train" / "shard-00000.json").unlink()
     (tmp_path / "half" / "manifest.json").unlink()
-    assert "complete already" in run(*MAKE, hits, "--dry-run")[1]
+    assert "already complete" in run(*MAKE, hits, "--dry-run")[1]
     assert "another dataset: would be refused" in run(*MAKE, hits, "--dry-run", "--seed", "5")[1]
     assert "holds a dataset, which would be replaced" in run(*MAKE, hits, "--dry-run", "--force")[1]
-    assert "1 of 2 shards are there: would go on" in run(*MAKE, tmp_path / "half", "--dry-run")[1]
+    assert "1 of 2 shards exist: would resume" in run(*MAKE, tmp_path / "half", "--dry-run")[1]
     assert "something else: would be refused" in run(*MAKE, tmp_path, "--dry-run")[1]
 
 
@@ -327,15 +327,15 @@ def test_a_dry_run_with_force_says_that_foreign_files_would_be_in_the_way(run, h
 
 def test_a_dry_run_says_what_becomes_of_a_plan_that_is_damaged_or_of_which_nothing_was_made(run, hits, tmp_path):
     folder = Path(shutil.copytree(hits, tmp_path / "hits"))
-    content = (folder / "plan.json").read_bytes()
-    (folder / "plan.json").write_bytes(content[:100])
-    assert "a damaged plan.json: would be refused without --force" in run(*MAKE, folder, "--dry-run")[1]
+    content = (folder / "specification.json").read_bytes()
+    (folder / "specification.json").write_bytes(content[:100])
+    assert "a damaged specification.json: would be refused without --force" in run(*MAKE, folder, "--dry-run")[1]
     assert "would be replaced" in run(*MAKE, folder, "--dry-run", "--force")[1]
     shutil.rmtree(folder / "train")
     shutil.rmtree(folder / "validation")
     for text in (content, content[:100]):
-        (folder / "plan.json").write_bytes(text)
-        assert "nothing was made: would be replaced" in run(*MAKE, folder, "--dry-run", "--seed", "5")[1]
+        (folder / "specification.json").write_bytes(text)
+        assert "without shards: would be replaced" in run(*MAKE, folder, "--dry-run", "--seed", "5")[1]
 
 
 def test_the_estimated_size_is_about_right(run, hits):
@@ -359,7 +359,7 @@ def test_an_interruption_is_130_and_says_how_to_go_on(run, monkeypatch, tmp_path
     monkeypatch.setattr("cnpgen.make.dataset.make_dataset", interrupted)
     code, out, err = run(*MAKE, tmp_path / "x", "--quiet")
     assert (code, out) == (130, "")
-    assert err == "cnpgen: interrupted: finished shards are kept, run the same command again to go on\n"
+    assert err == "cnpgen: interrupted: finished shards are kept; run the same command again to resume\n"
 
 
 @pytest.mark.slow
@@ -392,16 +392,16 @@ def test_a_terminal_sees_a_bar_with_the_draws_tried_and_their_share_accepted(mon
     monkeypatch.setenv("COLUMNS", "120")
     meter = Meter()
     meter.begin("making x", 300, 100)
-    meter(100, Fates(tried=200, accepted=100, rejections={"no": 100}))
+    meter(100, SamplingStatistics(tried=200, accepted=100, rejections={"no": 100}))
     time.sleep(0.2)  # tqdm draws ten times a second
-    meter(100, Fates(tried=100, accepted=100))
+    meter(100, SamplingStatistics(tried=100, accepted=100))
     meter.close()
     assert "100/300" in terminal.getvalue()
     assert "300/300" in terminal.getvalue()
     assert "300 tried, 66.7% accepted" in terminal.getvalue()
     assert "row/s" in terminal.getvalue()
     assert meter.rows == 200
-    assert meter.fates.tried == 300
+    assert meter.sampling.tried == 300
 
 
 def test_a_file_sees_a_single_line(capsys):
@@ -411,7 +411,7 @@ def test_a_file_sees_a_single_line(capsys):
     meter(100)
     meter.close()
     meter.begin("making y", 1)
-    assert capsys.readouterr().err == "making x: 300 rows, 100 there already\nmaking y: 1 row\n"
+    assert capsys.readouterr().err == "making x: 300 rows, 100 exist already\nmaking y: 1 row\n"
     assert meter.rows == 0
 
 
@@ -559,17 +559,21 @@ def test_a_quiet_validation_prints_findings_and_nothing_else(run, hits, tmp_path
 
 def test_validate_says_no_with_a_line_per_finding(run, hits, monkeypatch):
     notes = (Finding("mine.txt", "is not part of the dataset", note=True),)
-    findings = (Finding("train/shard-00000.h5", "is missing"), Finding("plan.json", "was\nchanged"), *notes)
+    findings = (Finding("train/shard-00000.h5", "is missing"), Finding("specification.json", "was\nchanged"), *notes)
     wanted = {}
 
     def validate(folder, **options):
         wanted.update(options)
         return ValidationReport(folder, 18, findings)
 
-    monkeypatch.setattr("cnpgen.validate.dataset.validate_dataset", validate)
+    monkeypatch.setattr("cnpgen.validate.validate_dataset.validate_dataset", validate)
     code, out, err = run("validate", hits, "--regenerate", "3")
     assert code == 1
-    lines = ["train/shard-00000.h5: is missing", "plan.json: was changed", "note: mine.txt: is not part of the dataset"]
+    lines = [
+        "train/shard-00000.h5: is missing",
+        "specification.json: was changed",
+        "note: mine.txt: is not part of the dataset",
+    ]
     assert out.splitlines() == [*lines, f"{hits}: 18 rows, 2 findings"]
     assert err == ""
     assert wanted["regenerate"] == 3
@@ -581,7 +585,7 @@ def test_validate_says_no_with_a_line_per_finding(run, hits, monkeypatch):
 def test_doctor_finds_this_machine_well(run):
     code, out, _ = run("doctor")
     assert code == 0
-    assert "everything that cnpgen needs works" in out
+    assert "all requirements are met" in out
     assert json.loads(run("doctor", "--json")[1])["ok"] is True
 
 

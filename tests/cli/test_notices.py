@@ -24,11 +24,15 @@ def test_what_is_said_for_every_kernel_is_printed_once_per_command(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     def refine(*_: Any, **__: Any) -> NoReturn:
-        for name in ("cnpgen.kernels.compiled", "cnpgen.kernels.compiled", "cnpgen.kernels.together"):
+        for name in (
+            "cnpgen.kernels.compiled_kernel",
+            "cnpgen.kernels.compiled_kernel",
+            "cnpgen.kernels.parallel_compilation",
+        ):
             logging.getLogger(name).info("building it")
         raise UsageError("enough")
 
-    monkeypatch.setattr("cnpgen.refine.plans.refine_plans", refine)
+    monkeypatch.setattr("cnpgen.refine.refine_plans.refine_plans", refine)
     save_plans(tmp_path / "plans.h5", plans_of(load("hit")))
     assert main(["refine", str(tmp_path / "plans.h5"), *options]) == 2
     said = capsys.readouterr().err.replace(str(tmp_path), "FOLDER")

@@ -128,7 +128,7 @@ def test_a_folder_that_is_called_like_a_recipe_does_not_hide_it(
             "airhockey-hot is neither a folder nor a file, dataset or pipeline (did you mean 'airhockey-hit'?)",
         ),
         ("hits.tmol/mine.toml", "no such file: hits.tmol/mine.toml"),
-        ("airhockey-hit", "--n says how many fresh problems of the recipe airhockey-hit are drawn: it is missing"),
+        ("airhockey-hit", "--n is required: the number of fresh problems of the recipe airhockey-hit"),
     ],
 )
 def test_what_cannot_be_solved_because_it_is_not_there_is_said_first(

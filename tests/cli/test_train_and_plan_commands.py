@@ -139,7 +139,7 @@ def test_how_a_model_is_trained_is_said_by_options_and_kept_in_it(tiny, tmp_path
         "reach",
         "--rate-bias",
         "-0.1",
-        "--paced",
+        "--time-parametrized",
         "--within-limits",
     ]
     assert main(["train", str(tiny("airhockey-hit")), "-o", str(path), *SMALL, *chosen]) == 0
@@ -147,12 +147,13 @@ def test_how_a_model_is_trained_is_said_by_options_and_kept_in_it(tiny, tmp_path
     assert (settings["learning_rate"], settings["seed"]) == (2e-3, 7)
     assert (settings["metric"]["kind"], settings["metric"]["growth"]) == ("learned", 3.0)
     assert (settings["margins"], settings["rate_bias"]) == ({"joint-velocity": 0.97, "table": 1.0}, -0.1)
-    meaning = load_model(path).meaning
-    assert (meaning.expected_time, meaning.paced, meaning.within_limits) == ("reach", True, True)
-    said = (
-        "--expected-time reach --rate-bias -0.1 --within-limits --paced --margin joint-velocity=0.97 --margin table=1"
+    config = load_model(path).config
+    assert (config.expected_time, config.time_parametrized, config.within_limits) == ("reach", True, True)
+    options = (
+        "--expected-time reach --rate-bias -0.1 --within-limits --time-parametrized"
+        " --margin joint-velocity=0.97 --margin table=1"
     )
-    assert f"{said} --seed 7 --check 2" in load_model(path).training["command"]
+    assert f"{options} --seed 7 --check 2" in load_model(path).training["command"]
 
 
 @pytest.mark.slow
@@ -264,9 +265,9 @@ def test_refining_goes_on_where_it_was_interrupted(trained, tiny, tmp_path, caps
         patch.setattr("cnpgen.cli.progress.Meter.__call__", interrupted)
         code, text = failing(capsys, [*words, "--refine", "--workers", "1"])
     assert code == 130
-    assert "p.h5.part keeps what is finished, run the same command again to go on" in text
+    assert "p.h5.part keeps all finished problems; run the same command again to resume" in text
     assert main([*words, "--refine", "--workers", "1"]) == 0
-    assert "4 plans, 2 there already" in capsys.readouterr().err
+    assert "4 plans, 2 exist already" in capsys.readouterr().err
     assert len(load_plans(tmp_path / "p.h5")) == 4
 
 
@@ -275,7 +276,7 @@ def test_options_of_refining_are_not_ignored_without_it(trained, tiny, tmp_path,
     plan = ["plan", str(tiny("airhockey-hit")), "--model", str(trained), "-o", str(tmp_path / "p.h5"), *words]
     code, text = failing(capsys, plan)
     assert code == 2
-    assert f"{words[0]} is for --refine" in text
+    assert f"{words[0]} needs --refine" in text
 
 
 def test_some_rows_of_another_split_can_be_chosen(trained, tiny, tmp_path):

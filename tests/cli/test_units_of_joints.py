@@ -14,9 +14,9 @@ from cnpgen.kernels.library import problem_kernels
 from cnpgen.loader.frame import make_frame
 from cnpgen.pipelines.context import Context
 from cnpgen.plans.plans import Plans, make_plans
+from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.robot import load_robot
-from cnpgen.refine.solver.starts import straight
+from cnpgen.refine.initial_guesses import straight_line
 from cnpgen.store.field import Field
 from cnpgen.trajectory.boundary import Boundary
 from tests.problems.test_constraints import gantry_problem
@@ -33,7 +33,7 @@ def gantry(tmp_path_factory: pytest.TempPathFactory) -> Problem:
 def plans(gantry: Problem) -> Plans:
     """A motion along x that is faster than its joint may be, and begins with another velocity than it should."""
     robot, rest, goal = load_robot(gantry), np.zeros((1, 5)), np.array([[0.8, 0.0, 0.0, 0.1, 0.0]])
-    path, rate = straight(Boundary(rest, rest, rest, goal, rest), robot.velocity_limit, gantry.trajectory)
+    path, rate = straight_line(Boundary(rest, rest, rest, goal, rest), robot.velocity_limit, gantry.trajectory)
     control = np.concatenate([np.repeat(rest, 3, axis=0), path, np.repeat(goal, 2, axis=0)])
     asked = Boundary(rest, np.array([[0.0, 0.1, 0.0, 0.0, 0.0]]), rest, goal, rest)
     return make_plans(gantry, asked, path_control_points=control[None], rate_control_points=3 * rate[None])

@@ -22,10 +22,10 @@ import pytest
 
 import cnpgen
 from cnpgen.cli.main import main
-from cnpgen.cli.view.bodies import robot_bodies, tube, wrapped
 from cnpgen.cli.view.serve import stamp
-from cnpgen.problems.load import load_problem
-from cnpgen.problems.robot import load_robot
+from cnpgen.cli.view.view_bodies import robot_bodies, tube, wrapped
+from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.problem_file import load_problem
 from tests.conftest import HANGING, some
 from tests.examples.plan_files import plans_of
 from tests.examples.plans import load
@@ -215,8 +215,8 @@ def test_a_line_is_a_tube_round_its_points():
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["airhockey", "--row", "1"], "--row is for plans and for the folder of a dataset, got airhockey"),
-        (["airhockey", "--split", "train"], "--split is for plans and for the folder of a dataset, got airhockey"),
+        (["airhockey", "--row", "1"], "--row needs plans or the folder of a dataset, got airhockey"),
+        (["airhockey", "--split", "train"], "--split needs plans or the folder of a dataset, got airhockey"),
         (["airhockey", "--problem", "airhockey"], "--problem is for plans and for the folder of a dataset"),
         (["airhockey", "-o", "page.png"], "expected a file that ends in .html, got 'page.png'"),
         (["airhockey", "--serve", "65536"], "expected a port, 0 to 65535, got '65536'"),
@@ -342,7 +342,7 @@ def chromium(page: Path, *options: str, address: str = "") -> str:
         *flags,
         "--virtual-time-budget=8000",
         *options,
-        f"{address or page.as_uri()}#moment=120&ends",
+        f"{address or page.as_uri()}#time=120&ends",
     ]
     done = subprocess.run(command, capture_output=True, text=True, timeout=HANGING, check=True)
     return done.stdout
@@ -353,7 +353,7 @@ def chromium(page: Path, *options: str, address: str = "") -> str:
 def test_a_browser_runs_the_page(page):
     found = chromium(page, "--dump-dom")
     assert 'data-ready="yes"' in found
-    assert content(page)["moments"][120] in re.search(r'<output id="moment">(.*?)</output>', found)[1]
+    assert content(page)["moments"][120] in re.search(r'<output id="time">(.*?)</output>', found)[1]
     assert found.count("<canvas") == 5  # the scene, and four curves
 
 

@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 
 from cnpgen.make.dataset import make_dataset
-from cnpgen.problems.load import load_problem
-from cnpgen.problems.robot import load_robot
+from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.problem_file import load_problem
 from cnpgen.world.path import PathWorld
-from cnpgen.world.state import World
+from cnpgen.world.world import World
 from tests.conftest import HANGING
 
 ROOT = Path(__file__).parents[2]

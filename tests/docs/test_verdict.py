@@ -1,4 +1,4 @@
-"""The page on the verdict names every key of the JSON, and no other."""
+"""The documentation of verdicts lists exactly the keys of the JSON."""
 
 import re
 from pathlib import Path
@@ -13,7 +13,7 @@ PAGE = (Path(__file__).parents[2] / "docs" / "verdict.md").read_text(encoding="u
 
 
 def documented(after: str) -> set[str]:
-    """Keys in the first column of the first table after a text."""
+    """Return the keys in the first column of the first table after a text."""
     table = re.search(r"\| key \|.*?\n\n", PAGE[PAGE.index(after) :] + "\n\n", re.S)
     assert table
     return {key for row in table[0].splitlines()[2:] if row for key in re.findall(r"`([^`]+)`", row.split("|")[1])}
@@ -21,15 +21,15 @@ def documented(after: str) -> set[str]:
 
 def test_every_key_is_documented() -> None:
     plan = load("dragging")
-    found = evaluate_plans(plans_of(plan))
-    (verdict,) = found.rows()
+    evaluation = evaluate_plans(plans_of(plan))
+    (verdict,) = evaluation.rows()
     margin: dict[str, Any] = verdict["worst"]
-    assert documented("\n## JSON") == {"file", "verdicts", *found.summary()}
-    assert documented("\nA verdict:") == set(verdict)
-    assert documented("\nA margin says") == set(margin)
-    for name in ("mean", "median", "p95", "max", "plans_out", "worst_plan", "finished", "broken"):
+    assert documented("\n## JSON") == {"file", "verdicts", *evaluation.summary()}
+    assert documented("\nA verdict has these keys") == set(verdict)
+    assert documented("\nA margin describes") == set(margin)
+    for name in ("mean", "median", "p95", "max", "violating_plans", "worst_plan", "finished", "broken"):
         assert f"`{name}`" in PAGE
-    assert set(found.summary()["conditions"]["tilt"]) == {"plans_out", "worst_plan", *margin}
+    assert set(evaluation.summary()["conditions"]["tilt"]) == {"violating_plans", "worst_plan", *margin}
 
 
 def test_every_metric_and_reason_is_documented() -> None:

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from cnpgen.problems.load import load_problem
 from cnpgen.problems.problem import Problem
+from cnpgen.problems.problem_file import load_problem
 
 LINK = """<link name="l{k}"><inertial><mass value="1"/><origin xyz="0.05 0.01 0"/>
 <inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>"""

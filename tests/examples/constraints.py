@@ -1,18 +1,18 @@
-"""A constraint as a plug-in has it: of the tip's speed, stated in both forms."""
+"""A plug-in constraint of the tip's speed, in both forms."""
 
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from cnpgen.kernels.symbolic.state import SymbolicState
+from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
 from cnpgen.plugins import Condition, Constraint, field
-from cnpgen.world.state import World
+from cnpgen.world.world import World
 
 
 @dataclass(frozen=True, kw_only=True)
 class TipSpeed(Constraint):
-    """The square of the tip's speed: its residual is no fraction of a limit. Only Python can set ``highest``."""
+    """A bound of the squared speed of the tip, not relative to a limit. Only Python can set ``highest``."""
 
     reason = "tip too fast"
     tolerance: float = field("how much faster a motion may be", unit="m^2/s^2", default=1e-3, low=0.0)

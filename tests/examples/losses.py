@@ -1,4 +1,4 @@
-"""Batches of bent plans for the tests of the loss, and an evaluation of it by other means."""
+"""Batches of perturbed plans for the tests of the loss, and its evaluation with SciPy, Pinocchio and Coal."""
 
 from dataclasses import dataclass, replace
 from functools import cache
@@ -9,8 +9,8 @@ import pinocchio as pin
 from scipy.interpolate import BSpline
 
 from cnpgen.losses.plan_loss import PlanLoss
-from cnpgen.problems.obstacles import obstacle_tops
-from cnpgen.world.state import World
+from cnpgen.problems.obstacles import obstacle_poses_of
+from cnpgen.world.world import World
 from tests.examples.plans import KNOTS, PROBLEMS, ROBOTS, load
 
 LABELS = ("hit", "transport")
@@ -19,29 +19,29 @@ PROBLEM_OF = {"hit": "airhockey", "replan": "airhockey", "transport": "heavy-obj
 
 @cache
 def loss(problem: str, **options: Any) -> PlanLoss:
-    """A loss of a shipped problem, built once per session."""
+    """Return a loss of a shipped problem, built once per session."""
     return PlanLoss(PROBLEMS[problem], **{"dtype": "float64", **options})
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Arguments of a loss."""
+    """The arguments of a loss."""
 
     problem: str
     path: np.ndarray
     rate: np.ndarray
-    tops: np.ndarray
+    obstacle_poses: np.ndarray
 
     def __getitem__(self, rows: Any) -> "Batch":
-        return Batch(self.problem, self.path[rows], self.rate[rows], self.tops[rows])
+        return Batch(self.problem, self.path[rows], self.rate[rows], self.obstacle_poses[rows])
 
     def evaluated(self, of: PlanLoss, **options: Any) -> Any:
         weights = np.linspace(1.0, 2.0, len(of.terms) - 1)
-        return of(self.path, self.rate, **{"weights": weights, "tops": self.tops, **options})
+        return of(self.path, self.rate, **{"weights": weights, "obstacle_poses": self.obstacle_poses, **options})
 
 
 def batch(label: str, count: int, by: float = 0.1, seed: int = 0, raised: float = 0.25) -> Batch:
-    """A stored plan with all its control points moved by up to ``by`` rad, at other rates and between other obstacles.
+    """Return a stored plan with its control points moved by up to ``by`` rad, with other rates and obstacles.
 
     Also the ends are moved: at rest, or with an object exactly upright, the loss has kinks.
     """
@@ -49,14 +49,14 @@ def batch(label: str, count: int, by: float = 0.1, seed: int = 0, raised: float 
     random = np.random.default_rng(seed)
     path = plan.motion.path + by * random.uniform(-1, 1, (count, *plan.motion.path.shape[1:]))
     rate = plan.motion.rate * random.uniform(0.9, 1.4, (count, plan.motion.rate.shape[1]))
-    tops = np.repeat(obstacle_tops(plan.problem, plan.start_xyz, plan.goal_xyz), count, axis=0)
-    tops += random.uniform(-0.02, raised, tops.shape)  # obstacles that reach into the arm's way
-    return Batch(PROBLEM_OF[label], path, rate, tops)
+    obstacle_poses = np.repeat(obstacle_poses_of(plan.problem, plan.start_xyz, plan.goal_xyz), count, axis=0)
+    obstacle_poses += random.uniform(-0.02, raised, obstacle_poses.shape)  # obstacles that may collide with the arm
+    return Batch(PROBLEM_OF[label], path, rate, obstacle_poses)
 
 
 @dataclass(frozen=True)
 class States:
-    """States at K phases of one plan, from SciPy's splines; measured by Pinocchio and Coal."""
+    """The states of one plan at K phases, from SciPy's splines."""
 
     q: np.ndarray
     dq: np.ndarray
@@ -71,19 +71,19 @@ def states(path: np.ndarray, rate: np.ndarray, s: np.ndarray) -> States:
 
 
 def huber(x: np.ndarray) -> np.ndarray:
-    """The paper's: quadratic up to 1, linear beyond."""
+    """Return the paper's Huber function: quadratic up to 1, linear above."""
     return np.where(np.abs(x) < 1, 0.5 * x**2, np.abs(x) - 0.5)
 
 
-def step_losses(problem: str, at: States, tops: np.ndarray) -> np.ndarray:
-    """Task loss and Huber(ReLU(violation)) of every constraint at every state, by Pinocchio and Coal, shape (K, 1 + m).
+def step_losses(problem: str, at: States, obstacle_poses: np.ndarray) -> np.ndarray:
+    """Return the task loss and Huber(ReLU(violation)) of every constraint by Pinocchio and Coal, shape (K, 1 + m).
 
     Robot clearance is only right where the robot does not enter an obstacle: Coal's distance of a segment is 0 there.
     """
     robot, chosen = ROBOTS[problem], PROBLEMS[problem]
     world, rows = World(robot, chosen.obstacle, chosen.object_size), []
     for q, dq, ddq in zip(at.q, at.dq, at.ddq, strict=True):
-        world.set_state(q, dq, ddq, tops)
+        world.set_state(q, dq, ddq, obstacle_poses)
         row = [1 + chosen.objective.centrifugal * centrifugal(problem, q, dq, ddq)]
         for constraint in chosen.constraint:
             conditions = constraint.measured(world)
@@ -95,7 +95,7 @@ def step_losses(problem: str, at: States, tops: np.ndarray) -> np.ndarray:
 
 
 def centrifugal(problem: str, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> float:
-    """Curvature of the tip's path times its squared speed [m/s^2], by Pinocchio, rounded off as the loss does."""
+    """Return the curvature of the tip's path times its squared speed [m/s^2], by Pinocchio, smoothed as in the loss."""
     robot = ROBOTS[problem]
     model, data = robot.model, robot.model.createData()
     tip, frame = model.getFrameId(robot.tip), pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
@@ -106,12 +106,12 @@ def centrifugal(problem: str, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) ->
 
 
 def with_weight(of: PlanLoss, term: int) -> np.ndarray:
-    """Weights with which only one constraint term counts beside the time."""
+    """Return weights of 0 for all constraint terms but one."""
     weights = np.zeros(len(of.terms) - 1)
     weights[term] = 3.0
     return weights
 
 
 def moved(given: Batch, path: np.ndarray, rate: np.ndarray) -> Batch:
-    """The batch with other control points."""
+    """Return the batch with other control points."""
     return replace(given, path=path, rate=rate)

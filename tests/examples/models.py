@@ -1,4 +1,4 @@
-"""Small models for the tests: trained for a moment on the small datasets, once per session."""
+"""Small models for the tests: trained for a few steps on small datasets, once per session."""
 
 from dataclasses import replace
 from functools import cache
@@ -9,52 +9,52 @@ import numpy as np
 
 from cnpgen.kernels.library import choose_backend, problem_kernels
 from cnpgen.losses.plan_loss import PlanLoss
-from cnpgen.planner.kit import Surroundings, make_kit
-from cnpgen.planner.landing import Landing, make_landing
-from cnpgen.planner.model import Meaning, Model
+from cnpgen.planner.inference_pipeline import LoadedProblem, make_inference_pipeline
+from cnpgen.planner.model import Model, ModelConfig
 from cnpgen.planner.network.architecture import Architecture, initial_parameters
-from cnpgen.problems.record import record_problem
-from cnpgen.problems.robot import load_robot
-from cnpgen.training.rows import Rows, prepare_rows, resting
+from cnpgen.planner.projection import Projection, make_projection
+from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.problem_record import record_problem
 from cnpgen.training.settings import TrainingSettings
 from cnpgen.training.step import Learner
+from cnpgen.training.training_rows import Rows, prepare_rows, zero_conditions
 from cnpgen.trajectory.boundary import Boundary
 
 SMALL = TrainingSettings(hidden=16, layers=2, batch_size=32, nodes=16)
 
 
 @cache
-def surroundings_of(name: str) -> Surroundings:
-    """A shipped problem with its robot and the kernels of this machine."""
+def loaded_problem_of(name: str) -> LoadedProblem:
+    """Return a shipped problem with its robot and the kernels of this machine."""
     from tests.examples.plans import PROBLEMS
 
     problem = PROBLEMS[name]
     robot, (backend, folder) = load_robot(problem), choose_backend()
     kernels = problem_kernels(problem, robot, backend, folder)
-    return Surroundings(record_problem(problem), problem, robot, kernels)
+    return LoadedProblem(record_problem(problem), problem, robot, kernels)
 
 
-def meaning_of(bending_steps: int, landing_steps: int) -> Meaning:
-    """What outputs mean that are bent in so many steps."""
-    return Meaning(path_scale=0.5, bending_steps=bending_steps, landing_steps=landing_steps)
+def config_of(line_projection_steps: int, projection_steps: int) -> ModelConfig:
+    """Return a configuration with these numbers of projection steps."""
+    return ModelConfig(path_scale=0.5, line_projection_steps=line_projection_steps, projection_steps=projection_steps)
 
 
-def interpreted(given: Surroundings) -> Surroundings:
-    """The same with kernels that are interpreted: for a few plans that is quicker than compiling them."""
-    return replace(given, kernels=replace(given.kernels, backend="numpy"))
+def interpreted(loaded: LoadedProblem) -> LoadedProblem:
+    """Return the same problem with interpreted kernels: for a few plans they are faster than compiling."""
+    return replace(loaded, kernels=replace(loaded.kernels, backend="numpy"))
 
 
-def quickest(name: str, fixed_at_goal: int = 2) -> Surroundings:
-    """The same with kernels that are compiled only where trainings of hits need them: others would take longer."""
-    given = surroundings_of(name)
-    return given if (name, fixed_at_goal) == ("airhockey", 2) else interpreted(given)
+def quickest(name: str, fixed_at_goal: int = 2) -> LoadedProblem:
+    """Return a problem with compiled kernels only if trainings of hits compile them anyway."""
+    loaded = loaded_problem_of(name)
+    return loaded if (name, fixed_at_goal) == ("airhockey", 2) else interpreted(loaded)
 
 
 @cache
-def landing_of(name: str, fixed_at_goal: int = 2) -> Landing:
-    """The landing of a shipped problem."""
-    given = quickest(name, fixed_at_goal)
-    return make_landing(given.problem, given.kernels, steps=1, fixed_at_goal=fixed_at_goal)
+def projection_of(name: str, fixed_at_goal: int = 2) -> Projection:
+    """Return the projection of a shipped problem."""
+    loaded = quickest(name, fixed_at_goal)
+    return make_projection(loaded.problem, loaded.kernels, steps=1, fixed_at_goal=fixed_at_goal)
 
 
 def boundary_of_columns(columns: dict[str, np.ndarray], rows: int) -> Boundary:
@@ -63,45 +63,45 @@ def boundary_of_columns(columns: dict[str, np.ndarray], rows: int) -> Boundary:
 
 
 def accelerated(boundary: Boundary, scale: float = 1.0, seed: int = 9) -> Boundary:
-    """The same, with an acceleration at the goal [rad/s^2]."""
+    """Return the same boundary conditions with accelerations at the goal [rad/s^2]."""
     return replace(boundary, goal_ddq=scale * np.random.default_rng(seed).normal(size=boundary.goal_q.shape))
 
 
-def architecture_of(given: Surroundings, rows: Rows, settings: TrainingSettings) -> Architecture:
+def architecture_of(loaded: LoadedProblem, rows: Rows, settings: TrainingSettings) -> Architecture:
     return Architecture(
         inputs=rows.features.shape[1],
         hidden=settings.hidden,
         layers=settings.layers,
-        path_outputs=(12 - rows.tasks.boundary.fixed_at_goal) * given.robot.n,
+        path_outputs=(12 - rows.tasks.boundary.fixed_at_goal) * loaded.robot.n,
         rate_outputs=20,
     )
 
 
 def untrained_model(name: str, boundary: Boundary, *, seed: int = 0, **changes: Any) -> Model:
-    """A model of a problem with random parameters: plans are bad, but plans."""
-    given, fixed = surroundings_of(name), boundary.fixed_at_goal
-    kit = make_kit(given, meaning_of(0, 0), slow_down=False, fixed_at_goal=fixed)  # preparing takes nothing else of it
-    rows, features = prepare_rows(boundary, kit.prepare)
-    architecture = architecture_of(given, rows, SMALL)
+    """Return a model with random parameters: its plans meet their boundary conditions, but violate limits."""
+    loaded, fixed = loaded_problem_of(name), boundary.fixed_at_goal
+    inference = make_inference_pipeline(loaded, config_of(0, 0), scale_time=False, fixed_at_goal=fixed)
+    rows, features = prepare_rows(boundary, inference.prepare)
+    architecture = architecture_of(loaded, rows, SMALL)
     options = {
-        "problem": given.record,
+        "problem": loaded.record,
         "architecture": architecture,
         "parameters": initial_parameters(architecture, seed=seed, head_scale=0.1, rate_bias=-0.5),
         "features": features,
-        "meaning": Meaning(path_scale=0.3, bending_steps=1, landing_steps=1),
-        "rest": resting(boundary),
+        "config": ModelConfig(path_scale=0.3, line_projection_steps=1, projection_steps=1),
+        "zero_conditions": zero_conditions(boundary),
     }
     return Model(**{**options, **changes})
 
 
 def learner_of(name: str, boundary: Boundary, *, dtype: str, settings: TrainingSettings) -> tuple[Learner, Rows]:
-    """What one step of training needs, in float32 or float64."""
-    given, fixed = quickest(name, boundary.fixed_at_goal), boundary.fixed_at_goal
-    kit = make_kit(given, settings.meaning, slow_down=False, fixed_at_goal=fixed)
-    rows, _ = prepare_rows(boundary, kit.prepare, dtype=dtype)
-    loss = PlanLoss(given.problem, nodes=settings.nodes, dtype=dtype)
-    architecture = architecture_of(given, rows, settings)
-    return Learner(architecture, given.problem.trajectory, loss, settings, landing_of(name, fixed)), rows
+    """Return a learner and rows, in float32 or float64."""
+    loaded, fixed = quickest(name, boundary.fixed_at_goal), boundary.fixed_at_goal
+    inference = make_inference_pipeline(loaded, settings.config, scale_time=False, fixed_at_goal=fixed)
+    rows, _ = prepare_rows(boundary, inference.prepare, dtype=dtype)
+    loss = PlanLoss(loaded.problem, nodes=settings.nodes, dtype=dtype)
+    architecture = architecture_of(loaded, rows, settings)
+    return Learner(architecture, loaded.problem.trajectory, loss, settings, projection_of(name, fixed)), rows
 
 
 def model_path(folder: Path) -> Path:

@@ -1,16 +1,16 @@
-"""Places that are narrow for the crane of ``shaped_robot``: two boxes with poses, so that kernels are compiled once."""
+"""Narrow passages for the crane of ``shaped_robot``: two boxes with poses, so that kernels are compiled once."""
 
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 
-from cnpgen.problems.load import load_problem
+from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.robot import load_robot
-from cnpgen.refine.engine import load_refiner
+from cnpgen.problems.problem_file import load_problem
+from cnpgen.refine.refine_engine import load_refiner
 from cnpgen.refine.refiner import Refiner
-from cnpgen.refine.task import Task
+from cnpgen.refine.task import RefinementTask
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.trajectory.boundary import Boundary
 from tests.examples.shaped_robot import write_problem
@@ -25,7 +25,7 @@ name = "other"
 position = {}
 size = {}
 """
-# Hulls have 1 mm of room on either side in the slot.
+# The hulls have a clearance of 1 mm on either side in the slot.
 SLOT = BOXES.format([0.75, 0.0, 0.3478], [0.5, 1.4, 0.1], [0.75, 0.0, 0.571], [0.5, 1.4, 0.1])
 WALL = BOXES.format([0.55, 0.0, 0.4], [0.9, 0.06, 0.8], [-2.0, 0.0, 0.4], [0.1, 0.1, 0.1])
 LIMITS = """
@@ -40,19 +40,19 @@ IN_SLOT = np.array([[-0.6, -0.3, 0.3, 0.0], [0.6, -0.3, 0.3, 0.0]])
 BESIDE_WALL = np.array([[-0.8, -0.1, 0.4, 0.0], [0.8, -0.1, 0.4, 0.0]])
 
 
-def narrow(where: Path, obstacles: str) -> Problem:
-    """The crane among two boxes."""
-    return load_problem(write_problem(where, obstacles=obstacles, more=LIMITS))
+def narrow(folder: Path, obstacles: str) -> Problem:
+    """Return the problem of the crane among two boxes."""
+    return load_problem(write_problem(folder, obstacles=obstacles, more=LIMITS))
 
 
 @cache
 def refiner(problem: Problem) -> Refiner:
-    """Its refiner."""
+    """Return the refiner of a problem."""
     return load_refiner(problem, load_robot(problem))
 
 
-def between(problem: Problem, ends: np.ndarray) -> Task:
-    """The task of going from one configuration to another, from rest to rest."""
+def between(problem: Problem, ends: np.ndarray) -> RefinementTask:
+    """Return the task of moving from one configuration to another, from rest to rest."""
     (start, goal), rest = ends[:, None], np.zeros((1, ends.shape[1]))
     boundary = Boundary(start, rest, rest, goal, rest)
-    return Task(boundary, place_obstacles(problem.obstacle), np.zeros(3), np.zeros(3))
+    return RefinementTask(boundary, place_obstacles(problem.obstacle), np.zeros(3), np.zeros(3))

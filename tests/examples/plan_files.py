@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from cnpgen.plans import Plans, make_plans
-from cnpgen.store.files.sealed import BLOCK
-from cnpgen.trajectory.motion import Motion
-from tests.examples.plans import Plan, bent, joined, load
+from cnpgen.store.files.checksum_file import HEADER_BYTES
+from cnpgen.trajectory.spline_motion import Motion
+from tests.examples.plans import Plan, joined, load, perturbed
 
 
 def plans_of(*plans: Plan, sample_id: Sequence[int] | None = None) -> Plans:
@@ -25,10 +25,10 @@ def plans_of(*plans: Plan, sample_id: Sequence[int] | None = None) -> Plans:
     )
 
 
-def unsealed(path: Path) -> Path:
+def remove_checksum(path: Path) -> Path:
     """Take the checksum off a file of plans, so that it may be changed."""
     with path.open("r+b") as file:
-        file.write(bytes(BLOCK))
+        file.write(bytes(HEADER_BYTES))
     return path
 
 
@@ -58,7 +58,7 @@ def garbage(label: str = "hit") -> dict[str, tuple[Plan, str]]:
         "infinite rate, which takes no time": (plan.changed(rate=np.inf * plan.motion.rate), "not finite"),
         "almost no time": (plan.changed(rate=plan.motion.rate * 1e12), "boundary conditions"),
         "a year": (plan.changed(rate=plan.motion.rate * 1e-8), "too long"),
-        "metres away": (bent(plan, 100.0), "joint torque limit"),
+        "metres away": (perturbed(plan, 100.0), "joint torque limit"),
         "the goal is the start": (_still(plan), "ok"),
         "right again": (plan, "ok"),
     }

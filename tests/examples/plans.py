@@ -1,4 +1,4 @@
-"""Plans for the tests of the verdict: stored right ones, ways to bend them, and an evaluation by other means."""
+"""Plans for the tests of the verdict: stored valid ones, perturbations, and an independent evaluation."""
 
 import json
 from dataclasses import dataclass, replace
@@ -12,12 +12,12 @@ from scipy.interpolate import BSpline
 
 from cnpgen.judges.plans import Verdict
 from cnpgen.judges.plans.judge import Judge
-from cnpgen.problems.load import load_problem
+from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.robot import load_robot
+from cnpgen.problems.problem_file import load_problem
 from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.boundary import Boundary
-from cnpgen.trajectory.motion import Motion
+from cnpgen.trajectory.spline_motion import Motion
 
 PROBLEMS = {name: load_problem(name) for name in ("airhockey", "heavy-object")}
 ROBOTS = {name: load_robot(problem) for name, problem in PROBLEMS.items()}
@@ -27,7 +27,7 @@ KNOTS = {count: np.r_[np.zeros(8), np.arange(1, count - 7) / (count - 7), np.one
 
 @dataclass(frozen=True)
 class Plan:
-    """One plan and its problem: what ``judge`` is asked about."""
+    """One plan and its problem: the arguments of ``judge``."""
 
     problem: Problem
     robot: Robot
@@ -36,9 +36,9 @@ class Plan:
     start_xyz: np.ndarray
     goal_xyz: np.ndarray
 
-    def judged(self, *, brief: bool = False, **options: Any) -> Verdict:
-        given = self.motion, self.boundary, self.start_xyz, self.goal_xyz
-        (verdict,) = Judge(self.problem, self.robot, **options)(*given, brief=brief)
+    def judged(self, *, early_exit: bool = False, **options: Any) -> Verdict:
+        arguments = self.motion, self.boundary, self.start_xyz, self.goal_xyz
+        (verdict,) = Judge(self.problem, self.robot, **options)(*arguments, early_exit=early_exit)
         return verdict
 
     def changed(self, *, path: np.ndarray | None = None, rate: np.ndarray | None = None) -> "Plan":
@@ -46,7 +46,7 @@ class Plan:
         return replace(self, motion=Motion(old.path if path is None else path, old.rate if rate is None else rate))
 
     def with_constraint(self, kind: str, **changes: Any) -> "Plan":
-        """The same plan in a problem with one constraint changed."""
+        """Return the same plan in a problem with one constraint changed."""
         constraints = tuple(
             replace(constraint, **changes) if type(constraint).__name__ == kind else constraint
             for constraint in self.problem.constraint
@@ -64,7 +64,7 @@ def load(label: str) -> Plan:
 
 
 def joined(*plans: Plan) -> tuple[Any, ...]:
-    """Arguments of ``judge`` for several plans of one problem."""
+    """Return the arguments of ``judge`` for several plans of one problem."""
 
     def stack(values: list[np.ndarray]) -> np.ndarray:
         return np.concatenate(values)
@@ -76,29 +76,29 @@ def joined(*plans: Plan) -> tuple[Any, ...]:
     return plans[0].problem, plans[0].robot, motion, boundary, *xyz
 
 
-def bent(plan: Plan, by: float, *, seed: int = 0) -> Plan:
-    """The plan with its interior control points moved by up to ``by`` rad."""
+def perturbed(plan: Plan, by: float, *, seed: int = 0) -> Plan:
+    """Return the plan with its interior control points moved by up to ``by`` rad."""
     path = plan.motion.path.copy()
     path[:, 3:13] += by * np.random.default_rng(seed).uniform(-1, 1, path[:, 3:13].shape)
     return plan.changed(path=path)
 
 
 def raised(plan: Plan, by: float) -> Plan:
-    """The problem of a plan, starting with the tip ``by`` [m] above the table."""
-    table = next(each for each in plan.problem.constraint if type(each).__name__ == "Table")
+    """Return the plan with a start whose tip is ``by`` [m] above the table."""
+    table = next(c for c in plan.problem.constraint if type(c).__name__ == "Table")
     goal, q = np.r_[plan.start_xyz[0, :2], table.z + by], plan.boundary.start_q[0]
     model, frame = plan.robot.model, plan.robot.model.getFrameId(plan.robot.tip)
     data, axes = model.createData(), pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
     for _ in range(20):
         pin.computeJointJacobians(model, data, q)
-        off = goal - pin.updateFramePlacement(model, data, frame).translation
-        q = q + np.linalg.pinv(pin.getFrameJacobian(model, data, frame, axes)[:3]) @ off
+        error = goal - pin.updateFramePlacement(model, data, frame).translation
+        q = q + np.linalg.pinv(pin.getFrameJacobian(model, data, frame, axes)[:3]) @ error
     return replace(plan, boundary=replace(plan.boundary, start_q=q[None]), start_xyz=goal[None])
 
 
 @dataclass(frozen=True)
-class Course:
-    """A plan evaluated with SciPy's splines and Pinocchio, at many phases."""
+class ReferenceTrajectory:
+    """A plan evaluated with SciPy's splines and Pinocchio at many phases."""
 
     s: np.ndarray
     t: np.ndarray
@@ -114,7 +114,7 @@ class Course:
         return float(simpson(values, x=self.t))
 
 
-def course(plan: Plan, count: int = 4001) -> Course:
+def reference_trajectory(plan: Plan, count: int = 4001) -> ReferenceTrajectory:
     s = np.linspace(0, 1, count)
     path, rate = plan.motion.path[0], plan.motion.rate[0]
     p, r = BSpline(KNOTS[15], path, 7), BSpline(KNOTS[20], rate, 7)
@@ -123,8 +123,8 @@ def course(plan: Plan, count: int = 4001) -> Course:
     jerk = (p(s, 3) * r0**2 + 3 * p(s, 2) * r(s, 1)[:, None] * r0) * r0
     jerk += p(s, 1) * (r(s, 2)[:, None] * r0 + r(s, 1)[:, None] ** 2) * r0
     nodes, weights = np.polynomial.legendre.leggauss(5)
-    middle, half = (s[1:] + s[:-1]) / 2, np.diff(s)[:, None] / 2
-    t = np.concatenate([[0], np.cumsum((half / r(middle[:, None] + half * nodes)) @ weights)])
+    centers, half = (s[1:] + s[:-1]) / 2, np.diff(s)[:, None] / 2
+    t = np.concatenate([[0], np.cumsum((half / r(centers[:, None] + half * nodes)) @ weights)])
     model, data = plan.robot.model, plan.robot.model.createData()
     tip = model.getFrameId(plan.robot.tip)
     poses, tau = [], []
@@ -133,4 +133,6 @@ def course(plan: Plan, count: int = 4001) -> Course:
         pin.framesForwardKinematics(model, data, state[0])
         poses.append(data.oMf[tip].copy())
     rotation = np.array([pose.rotation for pose in poses])
-    return Course(s, t, q, dq, ddq, jerk, np.array(tau), np.array([pose.translation for pose in poses]), rotation)
+    return ReferenceTrajectory(
+        s, t, q, dq, ddq, jerk, np.array(tau), np.array([pose.translation for pose in poses]), rotation
+    )

@@ -1,4 +1,4 @@
-"""The refiner for the tests: of the shipped problems, and of ones that differ from them in their bounds only."""
+"""Refiners of the shipped problems, and of problems that differ from them only in their bounds."""
 
 from functools import cache
 
@@ -8,16 +8,15 @@ import pytest
 from cnpgen.judges.plans import Verdict, judge
 from cnpgen.kernels.compiler import find_compiler
 from cnpgen.kernels.library import KernelLibrary, default_cache_folder, problem_kernels
-from cnpgen.problems.obstacles import obstacle_tops
+from cnpgen.problems.obstacles import obstacle_poses_of
 from cnpgen.problems.problem import Problem
-from cnpgen.refine.jury import Jury
-from cnpgen.refine.polish import refine_task
 from cnpgen.refine.refiner import Refiner
-from cnpgen.refine.solver.criterion import Criterion
-from cnpgen.refine.task import Refined, Task
+from cnpgen.refine.solver.cost_term import CostTerm
+from cnpgen.refine.strategy import PlanChecker, refine_task
+from cnpgen.refine.task import Attempt, RefinementTask
 from cnpgen.trajectory.boundary import Boundary
-from cnpgen.trajectory.motion import Motion
-from cnpgen.world.state import World
+from cnpgen.trajectory.spline_motion import Motion
+from cnpgen.world.world import World
 from tests.examples.plans import PROBLEMS, ROBOTS, Plan
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
@@ -31,37 +30,39 @@ def library(name: str) -> KernelLibrary:
 
 
 @cache
-def refiner(name: str, criterion: Criterion | None = None) -> Refiner:
-    return refiner_of(PROBLEMS[name], criterion)
+def refiner(name: str, cost_term: CostTerm | None = None) -> Refiner:
+    return refiner_of(PROBLEMS[name], cost_term)
 
 
-def refiner_of(problem: Problem, criterion: Criterion | None = None, **options: object) -> Refiner:
-    """The refiner of a problem whose residuals are those of the shipped one."""
+def refiner_of(problem: Problem, cost_term: CostTerm | None = None, **options: object) -> Refiner:
+    """Return the refiner of a problem with the residuals of the shipped one."""
     robot, kernels = ROBOTS[problem.name], library(problem.name)
     return Refiner(
         problem,
         robot,
         kernels=kernels,
         world=World(robot, problem.obstacle, problem.object_size),
-        criterion=criterion,
+        cost_term=cost_term,
         **options,
     )
 
 
-def tops(plan: Plan) -> np.ndarray:
-    return obstacle_tops(plan.problem, plan.start_xyz, plan.goal_xyz)[0]
+def obstacle_poses(plan: Plan) -> np.ndarray:
+    return obstacle_poses_of(plan.problem, plan.start_xyz, plan.goal_xyz)[0]
 
 
-def task(plan: Plan, boundary: Boundary | None = None, **given: np.ndarray) -> Task:
-    return Task(boundary or plan.boundary, tops(plan), plan.start_xyz[0], plan.goal_xyz[0], **given)
+def task(plan: Plan, boundary: Boundary | None = None, **input_plan: np.ndarray) -> RefinementTask:
+    return RefinementTask(
+        boundary or plan.boundary, obstacle_poses(plan), plan.start_xyz[0], plan.goal_xyz[0], **input_plan
+    )
 
 
 def verdict(plan: Plan, boundary: Boundary, path: np.ndarray, rate: np.ndarray) -> Verdict:
     return judge(plan.problem, plan.robot, Motion(path[None], rate[None]), boundary, plan.start_xyz, plan.goal_xyz)[0]
 
 
-def refine(plan: Plan, boundary: Boundary | None = None, **given: np.ndarray) -> Refined:
-    jury = Jury(plan.problem, plan.robot, degree=plan.problem.trajectory.degree)
+def refine(plan: Plan, boundary: Boundary | None = None, **input_plan: np.ndarray) -> Attempt:
+    checker = PlanChecker(plan.problem, plan.robot, degree=plan.problem.trajectory.degree)
     shipped = plan.problem is PROBLEMS[plan.problem.name]
     tool = refiner(plan.problem.name) if shipped else refiner_of(plan.problem)
-    return refine_task(tool, jury, task(plan, boundary, **given))
+    return refine_task(tool, checker, task(plan, boundary, **input_plan))

@@ -11,11 +11,11 @@ class Idle(Stage):
     def describe(self):
         return "roll"
 
-    def provides(self, context):
+    def outputs(self, context):
         return ()
 
     def prepare(self, context):
-        return lambda draws, random: None
+        return lambda candidates, random: None
 
 
 @dataclass(frozen=True, kw_only=True)

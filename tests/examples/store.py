@@ -1,4 +1,4 @@
-"""A small dataset that the tests of the store share, and the rules of its layout."""
+"""A small dataset for the tests of the store, and tests of its layout."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cnpgen.store.blueprint import Blueprint, ShardTask, shards, write_blueprint
-from cnpgen.store.fates import DensityMap, Fates
+from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, shards, write_dataset_spec
 from cnpgen.store.field import Field
 from cnpgen.store.manifest import finalize
-from cnpgen.store.record import ShardRecord, commit_shard
+from cnpgen.store.sampling_statistics import DensityMap, SamplingStatistics
+from cnpgen.store.shard_record import ShardRecord, commit_shard
 
 FIELDS = (
     Field(
@@ -23,7 +23,7 @@ FIELDS = (
     Field("clearance", "m", "smallest distance", role="diagnostic", valid_min=(0.0,), valid_max=(1.0,)),
     Field("sample_id", "1", "index of the row in its split", role="diagnostic", dtype="int64"),
 )
-BLUEPRINT = Blueprint(
+SPEC = DatasetSpec(
     name="two-shards",
     version="1.0.0",
     title='A "small" dataset: for tests',
@@ -42,7 +42,7 @@ BLUEPRINT = Blueprint(
 
 
 def make_columns(task: ShardTask, dtype: str = "float64") -> dict[str, NDArray[Any]]:
-    """Draw a shard's rows, a pure function of the task; the goal's y is constant."""
+    """Return the rows of a shard, a pure function of the task; the y coordinate of the goal is constant."""
     random = np.random.default_rng([len(task.split), task.index])
     columns: dict[str, NDArray[Any]] = {
         "start_q": random.uniform(-2, 2, (task.rows, 3)),
@@ -53,9 +53,9 @@ def make_columns(task: ShardTask, dtype: str = "float64") -> dict[str, NDArray[A
     return columns | {"sample_id": np.arange(task.first_row, task.first_row + task.rows)}
 
 
-def make_fates(task: ShardTask) -> Fates:
+def make_sampling(task: ShardTask) -> SamplingStatistics:
     density = DensityMap((0.6, 2.0), (-0.45, 0.45), np.full((4, 3), 2), np.full((4, 3), 1))
-    return Fates(
+    return SamplingStatistics(
         tried=2 * task.rows,
         accepted=task.rows,
         rejections={"no IK": task.rows - 1, "collision": 1},
@@ -64,24 +64,24 @@ def make_fates(task: ShardTask) -> Fates:
     )
 
 
-def make_shard(folder: Path, blueprint: Blueprint, task: ShardTask) -> ShardRecord:
-    columns, fates = make_columns(task, blueprint.dtype), make_fates(task)
+def make_shard(folder: Path, spec: DatasetSpec, task: ShardTask) -> ShardRecord:
+    columns, sampling = make_columns(task, spec.dtype), make_sampling(task)
     return commit_shard(
         folder,
-        blueprint,
+        spec,
         task,
         columns=columns,
-        fates=fates,
+        sampling=sampling,
         started=f"2026-11-21T02:02:0{2 + task.index}+01:00",
         seconds=0.5,
-        versions=dict(blueprint.versions),
+        versions=dict(spec.versions),
     )
 
 
-def make_shards(folder: Path, blueprint: Blueprint = BLUEPRINT) -> None:
-    write_blueprint(folder, blueprint)
-    for task in shards(blueprint):
-        make_shard(folder, blueprint, task)
+def make_shards(folder: Path, spec: DatasetSpec = SPEC) -> None:
+    write_dataset_spec(folder, spec)
+    for task in shards(spec):
+        make_shard(folder, spec, task)
 
 
 @pytest.fixture
@@ -89,12 +89,12 @@ def dataset(tmp_path: Path) -> Path:
     """A finished dataset."""
     folder = tmp_path / "two-shards-v1"
     make_shards(folder)
-    finalize(folder, BLUEPRINT, notes="Some notes.")
+    finalize(folder, SPEC, notes="Some notes.")
     return folder
 
 
-def test_every_dataset_of_a_shard_is_at_the_root_and_has_the_same_leading_dimension(dataset: Path) -> None:
-    for task in shards(BLUEPRINT):
+def test_all_datasets_of_a_shard_are_at_the_root_and_have_the_same_leading_dimension(dataset: Path) -> None:
+    for task in shards(SPEC):
         with h5py.File(dataset / task.file) as file:
             assert sorted(file) == sorted(field.name for field in FIELDS)
             for item in file.values():
@@ -104,7 +104,7 @@ def test_every_dataset_of_a_shard_is_at_the_root_and_has_the_same_leading_dimens
 
 
 def test_values_are_contiguous_and_aligned_so_that_they_can_be_mapped_into_memory(dataset: Path) -> None:
-    task = shards(BLUEPRINT)[0]
+    task = shards(SPEC)[0]
     expected = make_columns(task)
     with h5py.File(dataset / task.file) as file:
         found = {name: (item.id.get_offset(), item.dtype, item.shape) for name, item in file.items()}
@@ -117,15 +117,15 @@ def test_values_are_contiguous_and_aligned_so_that_they_can_be_mapped_into_memor
 
 def test_a_finished_dataset_has_the_documented_files_and_no_others(dataset: Path) -> None:
     found = sorted(path.relative_to(dataset).as_posix() for path in dataset.rglob("*") if path.is_file())
-    made = [name for task in shards(BLUEPRINT) for name in (task.file, task.sidecar)]
-    assert found == sorted([*made, "README.md", "croissant.json", "manifest.json", "plan.json", "stats.json"])
+    made = [name for task in shards(SPEC) for name in (task.file, task.sidecar)]
+    assert found == sorted([*made, "README.md", "croissant.json", "manifest.json", "specification.json", "stats.json"])
     assert not (dataset / "_work").exists()
 
 
 def test_no_file_depends_on_where_the_dataset_is_or_when_it_was_finished(tmp_path: Path, dataset: Path) -> None:
     again = tmp_path / "elsewhere" / dataset.name
-    make_shards(again, replace(BLUEPRINT))
-    finalize(again, BLUEPRINT, notes="Some notes.")
+    make_shards(again, replace(SPEC))
+    finalize(again, SPEC, notes="Some notes.")
     for path in dataset.rglob("*"):
         if path.is_file():
             assert (again / path.relative_to(dataset)).read_bytes() == path.read_bytes(), path

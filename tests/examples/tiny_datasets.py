@@ -1,4 +1,4 @@
-"""What the tests of make_dataset share: making a tiny dataset, and looking at what is in its folder."""
+"""Tiny datasets for the tests of make_dataset, and the content of their folders."""
 
 import hashlib
 from pathlib import Path
@@ -14,7 +14,7 @@ def make_tiny(folder: Path, name: str = "airhockey-hit", **options: object) -> M
 
 
 def digests(folder: Path) -> dict[str, str]:
-    """Shard -> sha256."""
+    """Return shard -> sha256."""
     return {
         path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
         for path in sorted(folder.glob("*/*.h5"))
@@ -22,12 +22,12 @@ def digests(folder: Path) -> dict[str, str]:
 
 
 def snapshot(folder: Path) -> dict[str, bytes]:
-    """File -> content."""
+    """Return file -> content."""
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def flip(path: Path, where: float = 0.5) -> None:
-    """Change one bit of a file."""
+    """Flip one bit of a file."""
     content = bytearray(path.read_bytes())
     content[round(where * (len(content) - 1))] ^= 1
     path.write_bytes(content)

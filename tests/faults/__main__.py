@@ -1,4 +1,4 @@
-"""Faults in large numbers: ``python -m tests.faults --kills 200 --inputs 100000``; exit code 1 if any is found."""
+"""Fault injection: ``python -m tests.faults --kills 200 --inputs 100000``; exit code 1 if there are findings."""
 
 import argparse
 import sys
@@ -9,11 +9,11 @@ from tests.faults.subjects import SUBJECTS
 
 
 def main() -> int:
-    """Run what is asked for."""
+    """Run the requested faults."""
     parser = argparse.ArgumentParser(prog="python -m tests.faults", description=__doc__)
     parser.add_argument("--inputs", metavar="N", type=int, default=0, help="changed files to read")
-    parser.add_argument("--kills", metavar="N", type=int, default=0, help="processes to kill; their runs go on")
-    parser.add_argument("--seed", metavar="S", type=int, default=0, help="seed of everything")
+    parser.add_argument("--kills", metavar="N", type=int, default=0, help="processes to kill; their runs are resumed")
+    parser.add_argument("--seed", metavar="S", type=int, default=0, help="seed of all faults")
     parser.add_argument("--first", metavar="I", type=int, default=0, help="number of the first input or run")
     parser.add_argument("--kind", choices=tuple(SUBJECTS), action="append", help="only files of this kind")
     arguments = parser.parse_args()
@@ -21,7 +21,7 @@ def main() -> int:
 
 
 def inputs(arguments: argparse.Namespace) -> int:
-    """Read changed files."""
+    """Read changed files; return the exit code."""
     outcome = fuzz(
         arguments.inputs,
         seed=arguments.seed,
@@ -31,19 +31,19 @@ def inputs(arguments: argparse.Namespace) -> int:
     )
     for kind in SUBJECTS:
         print(f"{kind:<10} {outcome.read[kind]:>8,} read {outcome.refused[kind]:>8,} refused")
-    return _told(outcome.findings)
+    return _report(outcome.findings)
 
 
 def kills(arguments: argparse.Namespace) -> int:
-    """Kill processes."""
+    """Kill processes; return the exit code."""
     killed = kill(arguments.kills, seed=arguments.seed, first=arguments.first)
-    for what, count in sorted(killed.runs.items()):
-        print(f"{count:>6,} {what}")
-    print(f"{killed.struck:>6,} processes struck")
-    return _told(killed.findings)
+    for kind, count in sorted(killed.runs.items()):
+        print(f"{count:>6,} {kind}")
+    print(f"{killed.n_signals:>6,} signals sent")
+    return _report(killed.findings)
 
 
-def _told(findings: list[str]) -> int:
+def _report(findings: list[str]) -> int:
     print(f"{len(findings)} findings", *findings, sep="\n")
     return 1 if findings else 0
 

@@ -1,4 +1,4 @@
-"""Files of strangers by the thousand, read in this process under limits: a result or a ``CnpgenError``, no more."""
+"""Fuzzing: changed files are read under limits; the outcome must be a result or a ``CnpgenError``."""
 
 import faulthandler
 import resource
@@ -19,22 +19,22 @@ from cnpgen.errors import CnpgenError
 from tests.faults.good_files import make_good_files
 from tests.faults.subjects import SUBJECTS, Subject, read_quietly
 
-SECONDS, BYTES = 10, 2 << 30  # what reading one file may take
-STUCK = 60  # [s] after which the process itself is ended: something hangs that no signal interrupts
+MAX_READ_TIME_S, MAX_EXTRA_BYTES = 10, 2 << 30  # for reading one file
+MAX_HANG_S = 60  # after it, the process is ended: a library hangs and ignores signals
 
 
 class TooSlowError(Exception):
-    """Reading took longer than ``SECONDS``."""
+    """Reading took longer than ``MAX_READ_TIME_S``."""
 
 
 @dataclass
 class Outcome:
-    """What came of the inputs.
+    """Outcomes of all inputs.
 
     Attributes:
-        read: Kind -> how many were read.
-        refused: Kind -> how many were refused by a ``CnpgenError``.
-        findings: What was neither: one line each.
+        read: Kind -> number of inputs that were read.
+        refused: Kind -> number of inputs that raised a ``CnpgenError``.
+        findings: Other outcomes, one line each.
     """
 
     read: Counter[str] = field(default_factory=Counter)
@@ -50,14 +50,14 @@ def fuzz(
     kinds: tuple[str, ...] = tuple(SUBJECTS),
     progress: Callable[[int], None] | None = None,
 ) -> Outcome:
-    """Make changed files of all kinds in turn and read them.
+    """Read changed files of all kinds in turn.
 
     Args:
-        inputs: How many.
-        seed: Seed; every input is a function of it, its number and its kind.
-        first: Number of the first input.
-        kinds: Which kinds.
-        progress: Called after every input with their number so far.
+        inputs: Number of inputs.
+        seed: Seed; every input is a function of seed, index and kind.
+        first: Index of the first input.
+        kinds: Kinds of files.
+        progress: Called after every input with the number of inputs so far.
     """
     outcome = Outcome()
     with tempfile.TemporaryDirectory(prefix="cnpgen-faults-") as temporary:
@@ -73,7 +73,7 @@ def fuzz(
 
 
 def _try(number: int, seed: int, kind: str, good: Path, folder: Path, outcome: Outcome) -> None:
-    """Make one input and read it; what is found is told at once."""
+    """Make one input and read it; a finding is printed at once."""
     draw, subject = Random(f"{seed} {number} {kind}"), SUBJECTS[kind]
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
@@ -88,17 +88,19 @@ def _try(number: int, seed: int, kind: str, good: Path, folder: Path, outcome: O
     except BaseException as error:
         if isinstance(error, KeyboardInterrupt):
             raise
-        where = traceback.extract_tb(error.__traceback__)[-1]
-        ours = [each for each in traceback.extract_tb(error.__traceback__) if "/cnpgen/" in each.filename]
-        place = f"{ours[-1].filename.rpartition('/cnpgen/')[2]}:{ours[-1].lineno}" if ours else where.filename
+        frames = traceback.extract_tb(error.__traceback__)
+        own_frames = [frame for frame in frames if "/cnpgen/" in frame.filename]
+        place = frames[-1].filename
+        if own_frames:
+            place = f"{own_frames[-1].filename.rpartition('/cnpgen/')[2]}:{own_frames[-1].lineno}"
         finding = f"{kind} {number}: {type(error).__name__} {str(error)[:120]!r} in {place}"
         print(finding, file=sys.stderr, flush=True)
         outcome.findings.append(finding)
 
 
 def _read(subject: Subject, folder: Path, draw: Random) -> None:
-    faulthandler.dump_traceback_later(STUCK, exit=True)
-    signal.alarm(SECONDS)
+    faulthandler.dump_traceback_later(MAX_HANG_S, exit=True)
+    signal.alarm(MAX_READ_TIME_S)
     try:
         read_quietly(subject, folder, draw)
     finally:
@@ -108,14 +110,14 @@ def _read(subject: Subject, folder: Path, draw: Random) -> None:
 
 @contextmanager
 def _limited() -> Iterator[None]:
-    """Limit memory to what there is now and ``BYTES`` more, and time by a signal."""
+    """Limit memory to the present use and ``MAX_EXTRA_BYTES`` more, and time by a signal."""
 
     def too_slow(_number: int, _frame: FrameType | None) -> None:
-        raise TooSlowError(f"{SECONDS} s")
+        raise TooSlowError(f"{MAX_READ_TIME_S} s")
 
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
     before, handler = resource.getrlimit(resource.RLIMIT_AS), signal.signal(signal.SIGALRM, too_slow)
-    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + BYTES, before[1]))
+    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + MAX_EXTRA_BYTES, before[1]))
     try:
         yield
     finally:

@@ -1,4 +1,4 @@
-"""A good file of every kind, from which strangers' files are made."""
+"""A valid file of every kind, the starting point of changed files."""
 
 import json
 import shutil
@@ -8,24 +8,24 @@ from pathlib import Path
 import numpy as np
 
 from cnpgen.make.dataset import make_dataset
-from cnpgen.make.load import load_dataset_recipe
+from cnpgen.make.recipe_file import load_dataset_recipe
 from cnpgen.planner.model_file import save_model
 from cnpgen.plans.save import save_plans
-from cnpgen.refine.journal import open_journal
-from cnpgen.refine.task import Outcome, Refined
+from cnpgen.refine.refinement_journal import open_journal
+from cnpgen.refine.task import Attempt, Outcome
 from cnpgen.schema.catalogue import recipes_root
 from cnpgen.store.shard import read_shard
 from cnpgen.training.checkpoint import Checkpoints
-from cnpgen.training.state import start_state
+from cnpgen.training.training_state import start_state
 from tests.examples.models import boundary_of_columns, untrained_model
-from tests.examples.plan_files import plans_of, unsealed
+from tests.examples.plan_files import plans_of, remove_checksum
 from tests.examples.plans import load as stored_plan
 
-IDENTITY = {"steps": 10}  # of the run that the checkpoint and the journal are of
+IDENTITY = {"steps": 10}  # of the run of the checkpoint and the journal
 
 
 def make_good_files(folder: Path) -> None:
-    """Make a good file of every kind, once."""
+    """Make a valid file of every kind."""
     tiny = replace(load_dataset_recipe("airhockey-hit"), splits={"train": 24, "validation": 8})
     make_dataset(tiny, folder / "set", workers=1, shard_size=24)
     shutil.copytree(recipes_root() / "problems" / "airhockey", folder / "recipes")
@@ -39,14 +39,16 @@ def make_good_files(folder: Path) -> None:
         path.write_text(path.read_text(encoding="utf-8").replace(old, new), encoding="utf-8")
     plan = stored_plan("hit")
     save_plans(folder / "plans.h5", plans_of(plan, plan))
-    shutil.copy(folder / "plans.h5", folder / "unsealed.h5")
-    unsealed(folder / "unsealed.h5")
+    shutil.copy(folder / "plans.h5", folder / "without_checksum.h5")
+    remove_checksum(folder / "without_checksum.h5")
     columns = read_shard(folder / "set" / "train" / "shard-00000.h5")
     model = untrained_model("airhockey", boundary_of_columns(columns, 20))
     save_model(folder / "model.h5", replace(model, training={"dataset": {"name": "x"}, "stages": [{"use": "y"}]}))
     state = start_state(np.zeros(10, np.float32), terms=3, steps=10)
     Checkpoints(folder / "checkpoint", IDENTITY).save(state)
     journal = open_journal(folder / "journal", json.dumps(IDENTITY))
-    done = Refined(np.zeros((15, 6)), np.ones(20), Outcome.SOLVED, "ok", 3, 1.0)
-    journal.append([0], [done])
+    attempt = Attempt(
+        path=np.zeros((15, 6)), rate=np.ones(20), cost=1.0, outcome=Outcome.SOLVED, iterations=3, reason="ok"
+    )
+    journal.append([0], [attempt])
     journal.close()

@@ -1,7 +1,7 @@
-"""Processes that are killed at random moments, and started again: what comes of it is what an uncut run gives.
+"""Runs that are killed at random times and resumed: the result must equal that of an uninterrupted run.
 
-Everything follows from a seed and the number of the kill, but for the moment: a machine that is busy is elsewhere by
-then. A finding names both.
+All choices follow from the seed and the index of the run, which a finding names. The state of the run at the time of
+the signal also depends on the load of the machine.
 """
 
 import os
@@ -18,28 +18,28 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from cnpgen.validate.dataset import validate_dataset
+from cnpgen.validate.validate_dataset import validate_dataset
 from tests.cli.test_interruption import descendants
 from tests.examples.tiny_datasets import digests
 
-HANGS = 300.0  # [s] without an end: then a process waits for something that will not come
-ROUNDS = 3  # times that a run is killed at most, before it may end
+MAX_RUN_TIME_S = 300.0  # longer runs count as hanging
+MAX_KILLS_PER_RUN = 3
 SETTINGS = ("--shard-size", "50", "--quiet")
 SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
-WHO = ("all", "parent", "worker")
+TARGETS = ("all", "parent", "worker")
 
 
 @dataclass
 class Kills:
-    """What came of many kills.
+    """Outcomes of killed runs.
 
     Attributes:
-        struck: How many processes were sent a signal.
-        runs: How many runs were killed, by kind and by how the last killed process ended.
-        findings: What was not as it must be, a line each.
+        n_signals: Number of sent signals.
+        runs: Number of runs by kind and by exit code of the last killed process.
+        findings: Failures, one line each.
     """
 
-    struck: int = 0
+    n_signals: int = 0
     runs: Counter[str] = field(default_factory=Counter)
     findings: list[str] = field(default_factory=list)
 
@@ -49,10 +49,10 @@ class Kind:
     """A command that is killed.
 
     Attributes:
-        prepare: Puts what the command works on into a folder.
-        words: The command for a folder and a number of workers.
-        product: Bytes or digests of what it makes there.
-        codes: Exit codes of an uncut run.
+        prepare: Copies the input of the command into a folder.
+        words: Returns the command for a folder and a number of workers.
+        product: Returns bytes or digests of the result in a folder.
+        codes: Exit codes of an uninterrupted run.
     """
 
     prepare: Callable[[Path, Path], None]
@@ -89,7 +89,7 @@ def _solve(folder: Path, workers: int) -> list[str]:
 
 
 def _dataset(folder: Path) -> object:
-    """Return the digests of a dataset's shards; the dataset must be sound, and nothing left over."""
+    """Return the digests of the shards of a dataset, which must be valid and without temporary files."""
     assert validate_dataset(folder / "out").ok
     assert not (folder / "out" / "_work").exists()
     return digests(folder / "out")
@@ -109,38 +109,38 @@ KINDS = {
 
 
 def kill(count: int, *, seed: int = 0, first: int = 0, kinds: tuple[str, ...] = tuple(KINDS)) -> Kills:
-    """Kill runs of commands at random moments, let them go on, and compare what they make with that of an uncut run.
+    """Kill runs of commands at random times, resume them, and compare the results with uninterrupted runs.
 
     Args:
-        count: How many processes are struck; the last run may be struck more often.
+        count: Minimum number of signals.
         seed: Seed of all choices.
-        first: Number of the first run.
-        kinds: Commands that are run.
+        first: Index of the first run.
+        kinds: Commands to run.
     """
     outcome = Kills()
     with tempfile.TemporaryDirectory(prefix="cnpgen-kills-") as place:
         _share(Path(place) / "shared")
-        uncut = {name: _uncut(KINDS[name], Path(place), name) for name in kinds}
+        uninterrupted = {name: _uninterrupted(KINDS[name], Path(place), name) for name in kinds}
         number = first
-        while outcome.struck < count:
+        while outcome.n_signals < count:
             chosen = random.Random(f"{seed} {number}")
             name = chosen.choice(kinds)
             folder = Path(place) / f"run{number}"
             folder.mkdir()
             try:
-                struck, how = _killed(KINDS[name], folder, chosen, uncut[name])
-                outcome.runs[f"{name}, {how}"] += 1
-                outcome.struck += struck
+                n_signals, ending = _killed(KINDS[name], folder, chosen, uninterrupted[name])
+                outcome.runs[f"{name}, {ending}"] += 1
+                outcome.n_signals += n_signals
             except (AssertionError, subprocess.TimeoutExpired) as error:
                 outcome.findings.append(f"seed {seed}, run {number}, {name}: {type(error).__name__} {error}")
-                outcome.struck += 1
+                outcome.n_signals += 1
             shutil.rmtree(folder)
             number += 1
     return outcome
 
 
 def _share(shared: Path) -> None:
-    """Make what several commands work on: a small dataset, and parts of a larger one."""
+    """Make the inputs of several commands: a small dataset, and parts of a larger one."""
     shared.mkdir()
     make = ["make-dataset", "airhockey-hit", *SETTINGS, "--workers", "1"]
     _finish([*make, "--n", "330", "--out", str(shared / "small")], (0,))
@@ -148,50 +148,50 @@ def _share(shared: Path) -> None:
         _finish([*make, "--n", "660", "--part", f"{k}/2", "--out", str(shared / f"part{k}")], (0,))
 
 
-def _uncut(kind: Kind, place: Path, name: str) -> tuple[object, float]:
-    """Return what a command makes that is not killed, and how long it takes [s]."""
-    (folder := place / f"uncut-{name}").mkdir()
+def _uninterrupted(kind: Kind, place: Path, name: str) -> tuple[object, float]:
+    """Return the result and the duration [s] of an uninterrupted run."""
+    (folder := place / f"uninterrupted-{name}").mkdir()
     kind.prepare(place / "shared", folder)
     begun = time.monotonic()
     _finish(kind.words(folder, 2), kind.codes)
     return kind.product(folder), time.monotonic() - begun
 
 
-def _killed(kind: Kind, folder: Path, chosen: random.Random, uncut: tuple[object, float]) -> tuple[int, str]:
-    """Kill a run, perhaps several times, and let it end; say how often, and how the last killed process ended."""
+def _killed(kind: Kind, folder: Path, chosen: random.Random, uninterrupted: tuple[object, float]) -> tuple[int, str]:
+    """Kill a run at least once and resume it; return the number of signals and the last exit code."""
     kind.prepare(folder.parent / "shared", folder)
-    expected, seconds = uncut
-    struck = 0
-    for _ in range(chosen.randint(1, ROUNDS)):
+    expected, seconds = uninterrupted
+    n_signals = 0
+    for _ in range(chosen.randint(1, MAX_KILLS_PER_RUN)):
         words = kind.words(folder, chosen.choice((1, 2)))
         with subprocess.Popen(_command(words), start_new_session=True, stderr=subprocess.DEVNULL, stdout=-3) as process:
             with suppress(subprocess.TimeoutExpired):
                 process.wait(chosen.uniform(0.2, seconds))
             if process.poll() is None:
-                _strike(process, chosen)
-                struck += 1
-            code = process.wait(HANGS)
+                _hit(process, chosen)
+                n_signals += 1
+            code = process.wait(MAX_RUN_TIME_S)
         assert code in {0, 1, 3, 130, 143, -signal.SIGKILL, -signal.SIGTERM, -signal.SIGINT}, f"it ended with {code}"
-        if (folder / "plans.h5").exists():  # it was faster, and would now refuse to replace them
+        if (folder / "plans.h5").exists():  # the run finished before the signal, and would refuse to replace its plans
             break
     else:
         _finish(kind.words(folder, 2), kind.codes)
     assert kind.product(folder) == expected, "another result"
-    return struck, f"ended with {code}"
+    return n_signals, f"ended with {code}"
 
 
-def _strike(process: subprocess.Popen[bytes], chosen: random.Random) -> None:
+def _hit(process: subprocess.Popen[bytes], chosen: random.Random) -> None:
     """Send a signal to a process, to one of its workers, or to all of them."""
-    number, who = chosen.choice(SIGNALS), chosen.choice(WHO)
+    number, target = chosen.choice(SIGNALS), chosen.choice(TARGETS)
     workers = [pid for pid in descendants(process.pid) if "popen_loky" in _name(pid)]
     try:
-        if who == "worker" and workers:
+        if target == "worker" and workers:
             os.kill(chosen.choice(workers), signal.SIGKILL)
-        elif who == "all":
+        elif target == "all":
             os.killpg(process.pid, number)
         else:
             process.send_signal(number)
-    except ProcessLookupError:  # it was faster
+    except ProcessLookupError:  # the process has ended before
         pass
 
 
@@ -207,6 +207,6 @@ def _command(words: list[str]) -> list[str]:
 
 
 def _finish(words: list[str], codes: tuple[int, ...]) -> None:
-    """Run a command to its end, or count it as hanging."""
-    done = subprocess.run(_command(words), capture_output=True, text=True, check=False, timeout=HANGS)
+    """Run a command to its end."""
+    done = subprocess.run(_command(words), capture_output=True, text=True, check=False, timeout=MAX_RUN_TIME_S)
     assert done.returncode in codes, f"{words[0]} ended with {done.returncode}: {done.stderr[-300:]}"

@@ -1,4 +1,4 @@
-"""Changes that make a stranger's file of a good one: of bytes, of texts, of JSON, of URDF; all from one generator."""
+"""Random changes of valid files: bytes, texts, JSON and URDF."""
 
 import copy
 import json
@@ -26,12 +26,12 @@ WORDS = (b"\0", b"\xff", b"\xff" * 8, b"\0" * 8, b"GCOL\x01\0\0\0", b"TREE", b"O
 
 
 def change_bytes(content: bytes, draw: Random, *, among: list[int] | None = None) -> bytes:
-    """Flip, replace, insert, delete, repeat or cut off bytes.
+    """Flip, replace, insert, delete or cut off bytes.
 
     Args:
         content: The bytes.
-        draw: Where luck comes from.
-        among: Places of which most changes are chosen; anywhere by default.
+        draw: Random number generator.
+        among: Preferred positions of changes; all positions by default.
     """
     data = bytearray(content)
     for _ in range(draw.choice((1, 1, 1, 2, 5, 30))):
@@ -116,7 +116,7 @@ def change_urdf(text: str, draw: Random) -> str:
         return change_text(text, draw)
     tree = ElementTree.fromstring(text)
     for _ in range(draw.choice((1, 1, 2, 5))):
-        parents = [each for each in tree.iter() if len(each)]
+        parents = [element for element in tree.iter() if len(element)]
         parent = draw.choice(parents)
         element = draw.choice(list(parent))
         how = draw.randrange(6)
@@ -132,7 +132,7 @@ def change_urdf(text: str, draw: Random) -> str:
             element.tag = draw.choice(("link", "joint", "mimic", "limit", "x", "inertial"))
         elif element.attrib:
             name = draw.choice(list(element.attrib))
-            others = [each.attrib[name] for each in tree.iter() if name in each.attrib]
+            others = [item.attrib[name] for item in tree.iter() if name in item.attrib]
             values = [*others, *map(str, NUMBERS), *(text for text in TEXTS if text.isprintable()), "0 0", "floating"]
             element.attrib[name] = draw.choice(values)
     return ElementTree.tostring(tree, encoding="unicode")

@@ -1,4 +1,4 @@
-"""The kinds of files that strangers send: how a good one is changed, mostly under a right seal, and how it is read."""
+"""The kinds of untrusted files: how a valid one is changed, mostly with a valid checksum, and how it is read."""
 
 import hashlib
 import json
@@ -18,31 +18,44 @@ import numpy as np
 from cnpgen.cli.inspect_command import inspection_text
 from cnpgen.errors import CnpgenError
 from cnpgen.loader.load import load_dataset
-from cnpgen.make.load import load_dataset_recipe
-from cnpgen.planner.model_file import load_model
+from cnpgen.make.recipe_file import load_dataset_recipe
+from cnpgen.planner.model_file import MODEL_KIND, MODEL_VERSION, load_model
 from cnpgen.planner.planner import Planner
 from cnpgen.plans.boundary_file import read_boundary_file
 from cnpgen.plans.evaluate import evaluate_plans
-from cnpgen.plans.load import load_plans
+from cnpgen.plans.format import PLAN_FILE_VERSION
+from cnpgen.plans.plan_file import load_plans
 from cnpgen.plans.plans import screen
-from cnpgen.problems.load import load_problem
-from cnpgen.problems.record import open_problem
-from cnpgen.problems.robot import load_robot
-from cnpgen.refine.journal import open_journal
-from cnpgen.store.blueprint import from_json
+from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.problem_file import load_problem
+from cnpgen.problems.problem_record import open_problem
+from cnpgen.refine.refinement_journal import open_journal
+from cnpgen.store.dataset_spec import from_json
 from cnpgen.store.files.atomic import file_sha256
+from cnpgen.store.files.checksum_file import (
+    HEADER_BYTES,
+    Content,
+    encode_with_checksum,
+    read_with_checksum,
+    with_checksum,
+)
 from cnpgen.store.files.documents import canonical_sha256, save_document
-from cnpgen.store.files.sealed import BLOCK, Content, read_sealed, seal, under_seal
 from cnpgen.store.inspection import inspect_dataset
 from cnpgen.store.manifest import data_fingerprint
 from cnpgen.store.shard import read_schema, read_shard
-from cnpgen.training.checkpoint import Checkpoints
-from cnpgen.validate.dataset import validate_dataset
-from tests.examples.documents import unsealed
+from cnpgen.training.checkpoint import CHECKPOINT_KIND, CHECKPOINT_VERSION, Checkpoints
+from cnpgen.validate.validate_dataset import validate_dataset
+from tests.examples.documents import read_unverified
 from tests.faults.good_files import IDENTITY
 from tests.faults.mutations import change_bytes, change_json, change_text, change_urdf
 
-DOCUMENTS = ("plan.json", "manifest.json", "stats.json", "train/shard-00000.json", "validation/shard-00000.json")
+DOCUMENTS = (
+    "specification.json",
+    "manifest.json",
+    "stats.json",
+    "train/shard-00000.json",
+    "validation/shard-00000.json",
+)
 
 
 Change = Callable[[Path, Path, Random], None]
@@ -53,8 +66,8 @@ class Subject:
     """A kind of file.
 
     Attributes:
-        change: Puts a changed file into a folder, of good ones in another folder.
-        read: Reads it in every way that cnpgen has.
+        change: Writes a changed copy of a valid file into a folder.
+        read: Reads it with all functions of cnpgen.
     """
 
     change: Change
@@ -91,7 +104,7 @@ def _read_recipe(folder: Path, draw: Random) -> None:
 
 def _read_urdf(folder: Path, draw: Random) -> None:
     robot = load_robot(load_problem(folder / "recipes" / "problem.toml"))
-    assert robot.skeleton is not None
+    assert robot.capsule_axes is not None
 
 
 def _change_document(good: Path, folder: Path, draw: Random) -> None:
@@ -101,25 +114,28 @@ def _change_document(good: Path, folder: Path, draw: Random) -> None:
     if draw.random() < 0.1:
         path.write_bytes(change_bytes(path.read_bytes(), draw))
         return
-    changed = change_json(unsealed(path), draw)
-    if name == "plan.json" and draw.random() < 0.7:
+    changed = change_json(read_unverified(path), draw)
+    if name == "specification.json" and draw.random() < 0.7:
         _follow(folder / "set", changed)
     _save(path, changed)
     if name != "manifest.json":
         _list_again(folder / "set")
 
 
-def _follow(folder: Path, plan: dict[str, Any]) -> None:
-    """Give all documents the fingerprint of a changed plan.json, as a forger would."""
+def _follow(folder: Path, specification: dict[str, Any]) -> None:
+    """Write the fingerprint of a changed specification into all documents, as a forger would."""
     with suppress(CnpgenError, ValueError, KeyError, TypeError):
-        plan["fingerprint"] = from_json(plan).fingerprint
+        specification["fingerprint"] = from_json(specification).fingerprint
     for name in DOCUMENTS[1:]:
-        _save(folder / name, {**unsealed(folder / name), "plan_fingerprint": plan.get("fingerprint")})
+        _save(
+            folder / name,
+            {**read_unverified(folder / name), "specification_fingerprint": specification.get("fingerprint")},
+        )
 
 
 def _list_again(folder: Path) -> None:
-    """Bring the digests in the manifest up to date."""
-    manifest = unsealed(folder / "manifest.json")
+    """Update the digests in the manifest."""
+    manifest = read_unverified(folder / "manifest.json")
     for name, entry in manifest["files"].items():
         entry |= {"sha256": file_sha256(folder / name), "bytes": (folder / name).stat().st_size}
     for split in manifest["splits"].values():
@@ -131,24 +147,24 @@ def _list_again(folder: Path) -> None:
 
 
 def _save(path: Path, document: Mapping[str, Any]) -> None:
-    """Seal a document, whatever is in it."""
+    """Write a document with its checksum; ignore documents that cannot be written."""
     with suppress(TypeError, ValueError, AttributeError, RecursionError):
         save_document(path, document)
 
 
 def _read_set(folder: Path, draw: Random) -> None:
-    """Read a dataset in every way; each way may say no."""
+    """Read a dataset with several functions; each may raise an error."""
     path = folder / "set"
-    ways: list[Callable[[], Any]] = [
+    readers: list[Callable[[], Any]] = [
         lambda: load_dataset(path, verify=draw.random() < 0.5).arrays("train"),
         lambda: next(iter(load_dataset(path, allow_incomplete=True).batches(4))),
         lambda: inspection_text(inspect_dataset(path)),
         lambda: validate_dataset(path, deep=draw.random() < 0.1, workers=1).summary(),
     ]
     failures = []
-    for way in ways:
+    for read in readers:
         try:
-            way()
+            read()
         except CnpgenError as error:
             failures.append(error)
     if failures:
@@ -160,18 +176,18 @@ def _change_shard(good: Path, folder: Path, draw: Random) -> None:
     path = folder / "set" / "train" / "shard-00000.h5"
     path.write_bytes(_changed_hdf5(path.read_bytes(), draw))
     sidecar = path.with_suffix(".json")
-    _save(sidecar, {**unsealed(sidecar), "sha256": file_sha256(path), "bytes": path.stat().st_size})
+    _save(sidecar, {**read_unverified(sidecar), "sha256": file_sha256(path), "bytes": path.stat().st_size})
     _list_again(folder / "set")
 
 
 def _changed_hdf5(content: bytes, draw: Random, *, first: int = 0) -> bytes:
-    """Change the bytes of an HDF5 file, most of them in its headers and not among its numbers."""
+    """Change bytes of an HDF5 file, most of them in its headers."""
     return content[:first] + change_bytes(content[first:], draw, among=_headers(content, first))
 
 
 @cache
 def _headers(content: bytes, first: int) -> list[int]:
-    """List the places of a file that are among many zeros, as headers are, counted from the first."""
+    """List the positions of a file with many zeros around, as in headers, relative to the first."""
     parts = range(first, len(content), 256)
     among = [part for part in parts if part < first + 2048 or content[part : part + 256].count(0) > 100]
     return [place - first for part in among for place in range(part, min(part + 256, len(content)))]
@@ -186,15 +202,15 @@ def _read_shard(folder: Path, draw: Random) -> None:
 
 
 def _change_plans(good: Path, folder: Path, draw: Random) -> None:
-    content = (good / "unsealed.h5").read_bytes()
+    content = (good / "without_checksum.h5").read_bytes()
     path = folder / "plans.h5"
     if draw.random() < 0.3:
         path.write_bytes(content)
         _change_values(path, draw)
     else:
         path.write_bytes(_changed_hdf5(content, draw))
-    if draw.random() < 0.3 and path.stat().st_size > BLOCK:
-        path.write_bytes(under_seal(path.read_bytes(), kind="cnpgen-plans", version=1))
+    if draw.random() < 0.3 and path.stat().st_size > HEADER_BYTES:
+        path.write_bytes(with_checksum(path.read_bytes(), kind="cnpgen-plans", version=PLAN_FILE_VERSION))
 
 
 def _change_values(path: Path, draw: Random) -> None:
@@ -227,7 +243,7 @@ def _change_values(path: Path, draw: Random) -> None:
 
 
 def _comparable(recipe: str, urdf: Any) -> str:
-    from cnpgen.problems.record import ProblemRecord
+    from cnpgen.problems.problem_record import ProblemRecord
 
     with suppress(KeyError, TypeError, AttributeError):
         return ProblemRecord(recipe, urdf.decode() if isinstance(urdf, bytes) else urdf).comparable_sha256
@@ -244,7 +260,7 @@ def _read_plans(folder: Path, draw: Random) -> None:
         evaluate_plans(plans[:2], workers=1).summary()
 
 
-def _change_sealed(name: str, kind: str) -> Change:
+def _change_with_checksum(name: str, kind: str, version: int) -> Change:
     def change(good: Path, folder: Path, draw: Random) -> None:
         content = (good / name).read_bytes()
         path = folder / name
@@ -252,16 +268,18 @@ def _change_sealed(name: str, kind: str) -> Change:
         if how < 0.1:
             path.write_bytes(change_bytes(content, draw))
         elif how < 0.6:
-            path.write_bytes(under_seal(_changed_hdf5(content, draw, first=BLOCK), kind=kind, version=1))
+            path.write_bytes(
+                with_checksum(_changed_hdf5(content, draw, first=HEADER_BYTES), kind=kind, version=version)
+            )
         else:
-            found = read_sealed(good / name, kind=kind, version=1)
-            path.write_bytes(seal(_changed_content(found, draw), kind=kind, version=1))
+            valid = read_with_checksum(good / name, kind=kind, version=version)
+            path.write_bytes(encode_with_checksum(_changed_content(valid, draw), kind=kind, version=version))
 
     return change
 
 
 def _changed_content(content: Content, draw: Random) -> Content:
-    """Change a text or an array of a sealed file."""
+    """Change a text or an array of a file with a checksum."""
     arrays, texts = dict(content.arrays), dict(content.texts)
     if draw.random() < 0.7:
         name = draw.choice([*texts])
@@ -311,14 +329,14 @@ SUBJECTS: dict[str, Subject] = {
     "document": Subject(_change_document, _read_set),
     "shard": Subject(_change_shard, _read_shard),
     "plans": Subject(_change_plans, _read_plans),
-    "model": Subject(_change_sealed("model.h5", "cnpgen-model"), _read_model),
-    "checkpoint": Subject(_change_sealed("checkpoint", "cnpgen-checkpoint"), _read_checkpoint),
+    "model": Subject(_change_with_checksum("model.h5", MODEL_KIND, MODEL_VERSION), _read_model),
+    "checkpoint": Subject(_change_with_checksum("checkpoint", CHECKPOINT_KIND, CHECKPOINT_VERSION), _read_checkpoint),
     "journal": Subject(_change_journal, _read_journal),
 }
 
 
 def read_quietly(subject: Subject, folder: Path, draw: Random) -> None:
-    """Read a changed file; warnings are no failures."""
+    """Read a changed file and ignore warnings."""
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
         subject.read(folder, draw)

@@ -1,4 +1,4 @@
-"""Inputs that once ended in neither a result nor a CnpgenError, each as small as it could be made."""
+"""Minimal inputs that formerly caused neither a result nor a CnpgenError."""
 
 import shutil
 from pathlib import Path
@@ -11,11 +11,11 @@ from cnpgen.errors import DatasetError
 from cnpgen.plans import PlanStatus, load_plans, save_plans
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.plans import screen
-from cnpgen.problems.load import load_problem
-from cnpgen.problems.robot import load_robot
-from cnpgen.store.blueprint import load_blueprint, shards
+from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.problem_file import load_problem
+from cnpgen.store.dataset_spec import load_dataset_spec, shards
 from cnpgen.store.inspection import inspect_dataset
-from cnpgen.store.record import load_record
+from cnpgen.store.shard_record import load_record
 from tests.examples.documents import rewritten
 from tests.examples.plan_files import plans_of
 from tests.examples.plans import load as stored_plan
@@ -24,14 +24,14 @@ from tests.examples.store import dataset  # noqa: F401 - a fixture
 
 @pytest.mark.parametrize("value", [[], {}, [1], {"a": 1}], ids=str)
 def test_a_list_or_a_table_where_a_number_is_expected(dataset: Path, value: Any) -> None:  # noqa: F811
-    task = shards(load_blueprint(dataset))[0]
+    task = shards(load_dataset_spec(dataset))[0]
     rewritten(dataset / task.sidecar, lambda record: record.update(seconds=value))
     with pytest.raises(DatasetError, match="seconds must be a number, got"):
         load_record(dataset, task)
 
 
 def test_a_histogram_with_one_bin_more_than_those_of_other_shards(dataset: Path) -> None:  # noqa: F811
-    task = shards(load_blueprint(dataset))[0]
+    task = shards(load_dataset_spec(dataset))[0]
     rewritten(
         dataset / task.sidecar, lambda record: record["statistics"]["clearance"]["histogram"]["counts"][0].append(0)
     )
@@ -40,14 +40,14 @@ def test_a_histogram_with_one_bin_more_than_those_of_other_shards(dataset: Path)
 
 
 @pytest.mark.parametrize("planned", [True, False])
-def test_a_link_with_the_name_of_a_joint_that_is_held_still(tmp_path: Path, planned: bool) -> None:
+def test_a_link_with_the_name_of_a_fixed_joint(tmp_path: Path, planned: bool) -> None:
     problem = load_problem("airhockey")
     shutil.copytree(problem.path.parent, tmp_path / "airhockey")
     path = tmp_path / "airhockey" / problem.robot.urdf
     joint = "joint_1" if planned else "joint_7"
     path.write_text(path.read_text(encoding="utf-8").replace('"link_3"', f'"{joint}"'), encoding="utf-8")
     robot = load_robot(load_problem(tmp_path / "airhockey" / "problem.toml"))
-    assert robot.skeleton == load_robot(problem).skeleton
+    assert robot.capsule_axes == load_robot(problem).capsule_axes
 
 
 def test_a_rate_whose_differences_are_infinite(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""A few runs that are killed and go on; ``python -m tests.faults --kills 200`` has more."""
+"""A few runs that are killed and resumed; for more run ``python -m tests.faults --kills 200``."""
 
 from pathlib import Path
 
@@ -7,10 +7,10 @@ import pytest
 from tests.faults.kills import KINDS, kill
 
 
-@pytest.mark.extended  # tests/make/test_interrupted.py has single kills at chosen moments
+@pytest.mark.extended  # tests/make/test_interrupted.py has single kills at chosen times
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="needs /proc")
 @pytest.mark.parametrize("kind", KINDS)
-def test_killed_runs_go_on_and_make_what_an_uncut_one_makes(kind):
+def test_killed_and_resumed_runs_give_the_result_of_an_uninterrupted_run(kind):
     killed = kill(2, seed=1, kinds=(kind,))
     assert killed.findings == []
-    assert killed.struck >= 2
+    assert killed.n_signals >= 2

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.examples.loader import ALL, make
-from tests.examples.plans_of_networks import asked_of, at_ends, boundary, outputs
+from tests.examples.plans_of_networks import at_ends, boundary, boundary_for_layer, outputs
 
 jax = pytest.importorskip("jax")
 
@@ -18,8 +18,8 @@ from cnpgen.loader.batch import Batch
 from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.load import load_dataset
 from cnpgen.losses.plan_loss import PlanLoss
-from cnpgen.planner.omega import Omega
-from cnpgen.problems.load import load_problem
+from cnpgen.planner.boundary_layer import BoundaryLayer
+from cnpgen.problems.problem_file import load_problem
 
 pytestmark = pytest.mark.slow
 
@@ -33,7 +33,7 @@ def x64() -> Any:
     return jax.enable_x64(True) if hasattr(jax, "enable_x64") else jax.experimental.enable_x64()
 
 
-def test_arrays_have_the_batch_s_numbers(dataset: Dataset) -> None:
+def test_arrays_have_the_values_of_the_batch(dataset: Dataset) -> None:
     for batch in dataset.batches(8, fields=ALL):
         arrays = to_jax(batch)
         assert list(arrays) == list(ALL)
@@ -43,12 +43,12 @@ def test_arrays_have_the_batch_s_numbers(dataset: Dataset) -> None:
         assert arrays["start_q"].dtype == np.float32
 
 
-def test_all_digits_are_kept_or_it_is_refused(dataset: Dataset) -> None:
+def test_truncation_is_refused(dataset: Dataset) -> None:
     batch = next(iter(dataset.batches(8, fields=ALL, dtype="float64")))
-    with pytest.raises(UsageError, match="would shorten float64"):
+    with pytest.raises(UsageError, match="would truncate float64"):
         to_jax(batch)
     large = Batch(batch.table.astype(np.float32), batch.layout, {"sample_id": batch["sample_id"] + 2**31})
-    with pytest.raises(UsageError, match="would shorten the integers of sample_id"):
+    with pytest.raises(UsageError, match="would truncate the integers of sample_id"):
         to_jax(large)
     with x64():
         for given in (batch, large):
@@ -62,7 +62,7 @@ def test_a_jitted_step_takes_the_batches_of_several_epochs(dataset: Dataset) -> 
     for _ in range(2):
         for batch in batches:
             total = step(total, to_jax(batch))
-    assert abs(total) < 1e-3  # every epoch is all rows, and their normalised mean is 0
+    assert abs(total) < 1e-3  # an epoch has all rows, and their normalized mean is 0
 
 
 # The loss.
@@ -78,7 +78,7 @@ def make_loss(problem: str, dtype: Any, cache_folder: Path, backend: Any) -> Pla
 
 
 def plans(problem: str, count: int) -> dict[str, np.ndarray]:
-    """Draw plans, weights and, where there are obstacles, their heights."""
+    """Draw plans, weights and obstacle poses."""
     found, random = load_problem(problem), np.random.default_rng(1)
     base, spec = np.array(found.robot.base), found.trajectory
     arrays = {
@@ -86,11 +86,11 @@ def plans(problem: str, count: int) -> dict[str, np.ndarray]:
         "rate": random.uniform(1.0, 2.0, (count, spec.rate_control_points)),
         "weights": random.uniform(0.5, 2.0, len(found.constraint)),
     }
-    return arrays | ({"tops": random.uniform(0.2, 0.4, (count, 2))} if problem == "heavy-object" else {})
+    return arrays | ({"obstacle_poses": random.uniform(0.2, 0.4, (count, 2))} if problem == "heavy-object" else {})
 
 
 @pytest.mark.parametrize("jitted", [True, False])
-def test_the_loss_s_gradients_are_those_of_differences(
+def test_the_gradients_of_the_loss_agree_with_differences(
     problem: str, jitted: bool, cache_folder: Path, fastest: Any
 ) -> None:
     loss, given, random = (
@@ -119,7 +119,7 @@ def test_the_loss_s_gradients_are_those_of_differences(
             assert np.sum(found[index] * direction) == pytest.approx(difference / 2, rel=1e-5)
 
 
-def test_the_loss_is_that_of_numpy(problem: str, cache_folder: Path, fastest: Any) -> None:
+def test_the_loss_agrees_with_numpy(problem: str, cache_folder: Path, fastest: Any) -> None:
     loss, given = make_loss(problem, "float32", cache_folder, fastest), plans(problem, 5)
     given = {name: values.astype(np.float32) for name, values in given.items()}
     total, terms = jax.jit(lambda given, shift: plan_loss(loss, **given, shift=shift))(given, 0.25)
@@ -146,13 +146,13 @@ def test_a_batch_of_a_trainer_s_size_does_not_hang(cache_folder: Path, fastest: 
     assert np.isfinite(path).all()
 
 
-def test_float64_is_refused_where_jax_would_shorten_it(cache_folder: Path, fastest: Any) -> None:
+def test_float64_is_refused_if_jax_would_truncate_it(cache_folder: Path, fastest: Any) -> None:
     loss, given = make_loss("airhockey", "float64", cache_folder, fastest), plans("airhockey", 2)
-    with pytest.raises(UsageError, match="would shorten a loss in float64"):
+    with pytest.raises(UsageError, match="would truncate a loss in float64"):
         plan_loss(loss, **given)
 
 
-def test_arrays_are_denormalised_like_numpy_s_also_under_jit(dataset: Dataset) -> None:
+def test_arrays_are_denormalized_like_numpy_arrays_also_under_jit(dataset: Dataset) -> None:
     batch, normalization = next(iter(dataset.batches(8, fields=ALL))), dataset.normalization
     assert normalization is not None
     expected = normalization.denormalize(batch)
@@ -164,31 +164,31 @@ def test_arrays_are_denormalised_like_numpy_s_also_under_jit(dataset: Dataset) -
 
 
 @pytest.mark.parametrize("jitted", [True, False])
-def test_a_plan_that_is_none_touches_no_other_through_grad(jitted: bool, cache_folder: Path, fastest: Any) -> None:
-    """A linear layer makes four plans, one of which runs backwards: it gets the gradient of the other three."""
+def test_an_invalid_plan_does_not_affect_others_through_grad(jitted: bool, cache_folder: Path, fastest: Any) -> None:
+    """Check a linear layer with four plans, one with a negative rate: it gets the gradient of the other three."""
     jnp = jax.numpy
     loss, given = make_loss("airhockey", "float32", cache_folder, fastest), plans("airhockey", 4)
     layer = 0.01 * np.random.default_rng(3).standard_normal((4, 90)).astype(np.float32)
-    ways = (
+    reductions = (
         lambda total: total.mean(),
         lambda total: jnp.nan_to_num(total).mean(),
         lambda total: jnp.where(jnp.isfinite(total), total, 0).mean(),
     )
 
-    def mean(way: Any, variables: Any, rate: Any) -> Any:
+    def mean(reduction: Any, variables: Any, rate: Any) -> Any:
         layer, weights = variables
         path = (given["path"] + (jnp.eye(4) @ layer).reshape(4, 15, 6))[: len(rate)]
-        return way(plan_loss(loss, path, rate, weights=weights)[0]) * len(rate) / 4
+        return reduction(plan_loss(loss, path, rate, weights=weights)[0]) * len(rate) / 4
 
     gradient = jax.grad(mean, argnums=1)
     gradient = jax.jit(gradient, static_argnums=0) if jitted else gradient
     variables = (jnp.asarray(layer), jnp.asarray(given["weights"]))
-    expected = gradient(ways[0], variables, jnp.asarray(given["rate"][:3]))
+    expected = gradient(reductions[0], variables, jnp.asarray(given["rate"][:3]))
     for garbage in (-1.0, np.nan):
         rate = given["rate"].copy()
         rate[3, 4] = garbage
-        for way in ways:
-            for found, want in zip(gradient(way, variables, jnp.asarray(rate)), expected, strict=True):
+        for reduction in reductions:
+            for found, want in zip(gradient(reduction, variables, jnp.asarray(rate)), expected, strict=True):
                 np.testing.assert_allclose(found, want, rtol=1e-4, atol=1e-6)
 
 
@@ -206,7 +206,7 @@ MISTAKES = {
 
 @pytest.mark.parametrize("message", MISTAKES)
 @pytest.mark.parametrize("jitted", [True, False])
-def test_arguments_that_cannot_be_meant_are_named_when_the_function_is_traced(
+def test_invalid_arguments_are_refused_when_the_function_is_traced(
     message: str, jitted: bool, cache_folder: Path, fastest: Any
 ) -> None:
     loss = make_loss("airhockey", "float32", cache_folder, fastest)
@@ -221,14 +221,14 @@ def test_arguments_that_cannot_be_meant_are_named_when_the_function_is_traced(
     assert str(error.value).startswith(message)
 
 
-def test_obstacles_without_heights_are_noticed_when_the_function_is_traced(cache_folder: Path, fastest: Any) -> None:
+def test_missing_obstacle_poses_are_refused_when_the_function_is_traced(cache_folder: Path, fastest: Any) -> None:
     loss, given = make_loss("heavy-object", "float32", cache_folder, fastest), plans("heavy-object", 2)
-    del given["tops"]
-    with pytest.raises(UsageError, match="tops is missing"):
+    del given["obstacle_poses"]
+    with pytest.raises(UsageError, match="obstacle_poses is missing"):
         jax.eval_shape(lambda given: plan_loss(loss, **given)[0], given)
 
 
-def test_a_shift_just_below_one_is_one_of_no_nodes(cache_folder: Path, fastest: Any) -> None:
+def test_a_shift_just_below_one_is_equivalent_to_zero(cache_folder: Path, fastest: Any) -> None:
     loss, given = make_loss("airhockey", "float32", cache_folder, fastest), plans("airhockey", 2)
     step = jax.jit(lambda shift: plan_loss(loss, **given, shift=shift)[0])
     expected = plan_loss(loss, **given)[0]
@@ -236,7 +236,7 @@ def test_a_shift_just_below_one_is_one_of_no_nodes(cache_folder: Path, fastest: 
         np.testing.assert_allclose(found, expected, rtol=1e-5)
 
 
-def test_half_precision_is_taken(cache_folder: Path, fastest: Any) -> None:
+def test_half_precision_is_accepted(cache_folder: Path, fastest: Any) -> None:
     loss, given = make_loss("airhockey", "float32", cache_folder, fastest), plans("airhockey", 2)
     path = jax.numpy.asarray(given.pop("path"), jax.numpy.bfloat16)
     total, gradient = jax.value_and_grad(lambda path: plan_loss(loss, path, **given)[0].sum())(path)
@@ -249,77 +249,82 @@ def test_half_precision_is_taken(cache_folder: Path, fastest: Any) -> None:
 
 
 @pytest.fixture(scope="module")
-def omega(problem: str, cache_folder: Path, fastest: Any) -> Omega:
-    return Omega(problem, backend=fastest, cache_folder=cache_folder)
+def layer(problem: str, cache_folder: Path, fastest: Any) -> BoundaryLayer:
+    return BoundaryLayer(problem, backend=fastest, cache_folder=cache_folder)
 
 
 @pytest.fixture(scope="module")
-def arriving(cache_folder: Path, fastest: Any) -> Omega:
-    """One that holds the acceleration at the goal."""
-    return Omega("airhockey", goal_acceleration="given", backend=fastest, cache_folder=cache_folder)
+def arriving(cache_folder: Path, fastest: Any) -> BoundaryLayer:
+    """Return a layer with the acceleration at the goal."""
+    return BoundaryLayer("airhockey", goal_acceleration="given", backend=fastest, cache_folder=cache_folder)
 
 
-def test_jitted_functions_take_tasks_with_an_acceleration_at_the_goal(arriving: Omega) -> None:
-    given = asked_of(arriving, 2)
+def test_jitted_functions_accept_tasks_with_an_acceleration_at_the_goal(arriving: BoundaryLayer) -> None:
+    given = boundary_for_layer(arriving, 2)
     with x64():
-        said = map(jax.numpy.asarray, outputs(arriving, 2))
-        path, rate = jax.jit(lambda tasks, *said: control_points(arriving, tasks, *said))(arriving.tasks(given), *said)
+        values = map(jax.numpy.asarray, outputs(arriving, 2))
+        path, rate = jax.jit(lambda tasks, *values: control_points(arriving, tasks, *values))(
+            arriving.tasks(given), *values
+        )
         np.testing.assert_allclose(at_ends(path, rate)[5], given.goal_ddq, rtol=0, atol=1e-8)
 
 
-def test_control_points_meet_the_boundary_conditions(omega: Omega) -> None:
-    given = asked_of(omega, 2)
+def test_control_points_meet_the_boundary_conditions(layer: BoundaryLayer) -> None:
+    given = boundary_for_layer(layer, 2)
     wanted = (given.start_q, given.start_dq, given.start_ddq, given.goal_q, given.goal_dq)
     with x64():
-        path, rate = control_points(omega, omega.tasks(given), *map(jax.numpy.asarray, outputs(omega, 2)))
+        path, rate = control_points(layer, layer.tasks(given), *map(jax.numpy.asarray, outputs(layer, 2)))
         for found, expected, exact in zip(at_ends(path, rate), wanted, (1e-12, 1e-10, 1e-8) * 2, strict=False):
             np.testing.assert_allclose(found, expected, rtol=0, atol=exact)
-    path, rate = control_points(omega, omega.tasks(given), *map(jax.numpy.asarray, outputs(omega, 2)))
+    path, rate = control_points(layer, layer.tasks(given), *map(jax.numpy.asarray, outputs(layer, 2)))
     assert path.dtype == rate.dtype == np.float32
     for found, expected, exact in zip(at_ends(path, rate), wanted, (1e-6, 1e-4, 1e-2) * 2, strict=False):
         np.testing.assert_allclose(found, expected, rtol=0, atol=exact)
 
 
 @pytest.mark.parametrize("jitted", [True, False])
-def test_the_gradients_of_control_points_are_those_of_differences(omega: Omega, jitted: bool) -> None:
-    tasks, said, random = omega.tasks(asked_of(omega, 3)), outputs(omega, 3), np.random.default_rng(2)
+def test_the_gradients_of_control_points_agree_with_differences(layer: BoundaryLayer, jitted: bool) -> None:
+    tasks, values, random = layer.tasks(boundary_for_layer(layer, 3)), outputs(layer, 3), np.random.default_rng(2)
 
-    def value(tasks: Any, *said: Any) -> Any:
-        path, rate = control_points(omega, tasks, *said)
+    def value(tasks: Any, *values: Any) -> Any:
+        path, rate = control_points(layer, tasks, *values)
         return (path**2).sum() + (rate**3).sum()
 
     with x64():
         gradient = jax.grad(value, argnums=(1, 2))
-        found = (jax.jit(gradient) if jitted else gradient)(tasks, *map(jax.numpy.asarray, said))
+        found = (jax.jit(gradient) if jitted else gradient)(tasks, *map(jax.numpy.asarray, values))
         for index in range(2):
-            direction = 1e-6 * random.standard_normal(said[index].shape)
+            direction = 1e-6 * random.standard_normal(values[index].shape)
             ends = [
-                value(tasks, *said[:index], said[index] + step, *said[index + 1 :]) for step in (direction, -direction)
+                value(tasks, *values[:index], values[index] + step, *values[index + 1 :])
+                for step in (direction, -direction)
             ]
             difference = float(ends[0]) - float(ends[1])
             assert np.sum(found[index] * direction) == pytest.approx(difference / 2, rel=1e-5)
 
 
-def test_a_layer_learns_through_control_points_and_loss_although_a_plan_overflows(
-    omega: Omega, problem: str, cache_folder: Path, fastest: Any
+def test_a_layer_learns_through_control_points_and_loss_despite_an_overflow(
+    layer: BoundaryLayer, problem: str, cache_folder: Path, fastest: Any
 ) -> None:
     jnp, loss = jax.numpy, make_loss(problem, "float32", cache_folder, fastest)
-    tasks, overflow = omega.tasks(boundary(problem, 4)), np.zeros((4, omega.rate_outputs))
+    tasks, overflow = layer.tasks(boundary(problem, 4)), np.zeros((4, layer.rate_outputs))
     overflow[3] = 1000.0
-    tops = omega.tops(tasks)
+    obstacle_poses = layer.obstacle_poses(tasks)
 
     @jax.jit
     def step(layer: Any, tasks: Any) -> Any:
         def mean(layer: Any) -> Any:
-            phi, log_rate = jnp.split(layer, [omega.path_outputs], axis=1)
-            path, rate = control_points(omega, tasks, jnp.tanh(phi), log_rate + overflow)
-            total, _ = plan_loss(loss, path, rate, weights=loss.weights0, tops=tops, start_tip=tasks.start_xyz)
+            phi, log_rate = jnp.split(layer, [layer.path_outputs], axis=1)
+            path, rate = control_points(layer, tasks, jnp.tanh(phi), log_rate + overflow)
+            total, _ = plan_loss(
+                loss, path, rate, weights=loss.weights0, obstacle_poses=obstacle_poses, start_tip=tasks.start_xyz
+            )
             return total.mean(), total
 
         (_, total), gradient = jax.value_and_grad(mean, has_aux=True)(layer)
         return layer - 1e-2 * gradient / jnp.linalg.norm(gradient), total
 
-    layer, totals = jnp.zeros((4, omega.path_outputs + omega.rate_outputs)), []
+    layer, totals = jnp.zeros((4, layer.path_outputs + layer.rate_outputs)), []
     for _ in range(4):
         layer, total = step(layer, tasks)
         assert np.isfinite(total).tolist() == [True, True, True, False]
@@ -328,7 +333,7 @@ def test_a_layer_learns_through_control_points_and_loss_although_a_plan_overflow
     assert totals[-1] < totals[0]
 
 
-def test_outputs_of_another_width_are_refused_when_the_function_is_traced(omega: Omega) -> None:
-    tasks, (phi, log_rate) = omega.tasks(asked_of(omega, 2)), outputs(omega, 2)
+def test_outputs_of_another_width_are_refused_when_the_function_is_traced(layer: BoundaryLayer) -> None:
+    tasks, (phi, log_rate) = layer.tasks(boundary_for_layer(layer, 2)), outputs(layer, 2)
     with pytest.raises(UsageError, match=r"log_rate must have shape \(2, 20\), got \(2, 19\)"):
-        jax.eval_shape(lambda phi, log_rate: control_points(omega, tasks, phi, log_rate), phi, log_rate[:, 1:])
+        jax.eval_shape(lambda phi, log_rate: control_points(layer, tasks, phi, log_rate), phi, log_rate[:, 1:])

@@ -1,4 +1,4 @@
-"""The recipe of docs/loading.md for Lightning, interrupted in the middle of an epoch; in the extended run only."""
+"""The recipe of docs/loading.md for Lightning, interrupted within an epoch; in the extended run only."""
 
 import re
 import warnings
@@ -10,24 +10,24 @@ import pytest
 from tests.examples.loader import ids, make
 
 with warnings.catch_warnings():
-    warnings.simplefilter("ignore")  # its own imports are not ours to judge
+    warnings.simplefilter("ignore")  # warnings of its imports
     lightning = pytest.importorskip("lightning")
     import torch
 
 from cnpgen.loader.load import load_dataset
 
-pytestmark = [pytest.mark.extended, pytest.mark.filterwarnings("ignore")]  # what it warns of is its own
+pytestmark = [pytest.mark.extended, pytest.mark.filterwarnings("ignore")]  # warnings of Lightning
 
 LOADING = Path(__file__).parents[2] / "docs" / "loading.md"
 EPOCHS, BATCHES = 3, 6  # of 8 rows out of 50
 
 
 class Interruption(Exception):
-    """What stops a run where Lightning does not expect it."""
+    """An exception that stops a run inside a step."""
 
 
 class Recorder(lightning.LightningModule):
-    """A linear model that notes the rows it is trained on, and may be stopped before it has used a batch."""
+    """A linear model that records its training rows and may stop before a batch is used."""
 
     def __init__(self, stop_before: int | None = None) -> None:
         super().__init__()
@@ -40,7 +40,7 @@ class Recorder(lightning.LightningModule):
             raise Interruption
         self.seen.append(batch["sample_id"].tolist())
         loss = (self.layer(batch["start_q"]) - batch["goal_p"]).square().mean()
-        self.log("loss", loss, on_epoch=True)  # which needs the number of rows, that Lightning reads off the batch
+        self.log("loss", loss, on_epoch=True)  # Lightning reads the number of rows from the batch
         return loss
 
     def validation_step(self, batch: Any, _: int) -> None:
@@ -57,14 +57,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def block() -> str:
-    """The code of the documentation."""
+    """Return the code of the documentation."""
     (found,) = [text for text in re.findall(r"```python\n(.*?)```", LOADING.read_text(), re.S) if "DataModule" in text]
     return str(found)
 
 
 @pytest.fixture(scope="module")
 def recipe(block: str) -> Any:
-    """The DataModule of the documentation."""
+    """Return the DataModule of the documentation."""
     module: dict[str, Any] = {}
     exec(block.partition("\n\n\n# ")[0], module)
     return module["Rows"]
@@ -82,7 +82,7 @@ def fit(model: Recorder, data: Any, folder: Path, checkpoint: Path | None = None
 
 
 def with_ids(recipe: Any, folder: Path) -> Any:
-    """Give the recipe's batches with the numbers of their rows."""
+    """Return the recipe with sample numbers in its batches."""
     return recipe(folder, 8, fields=["start_q", "goal_p", "sample_id"])
 
 
@@ -101,7 +101,7 @@ def test_training_resumes_after_the_step_of_the_checkpoint(
     assert torch.equal(resumed.layer.weight, whole.layer.weight)
 
 
-def test_the_first_validation_has_all_rows_whatever_was_tried_before(recipe: Any, folder: Path) -> None:
+def test_the_first_validation_has_all_rows_after_the_sanity_check(recipe: Any, folder: Path) -> None:
     data = with_ids(recipe, folder)
     found = [sum(len(batch["start_q"]) for batch in data.val_dataloader()) for _ in range(2)]
     assert found == [10, 10]
@@ -113,4 +113,4 @@ def test_the_code_of_the_documentation_runs_as_it_is_shown(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "hits").symlink_to(tiny("airhockey-hit"))
     exec(block, {})
-    assert (tmp_path / "middle.ckpt").exists()
+    assert (tmp_path / "partial.ckpt").exists()

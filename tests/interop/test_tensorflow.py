@@ -9,7 +9,7 @@ import pytest
 from tests.examples.loader import ALL, ids, make
 
 with warnings.catch_warnings():
-    warnings.simplefilter("ignore")  # its own imports are not ours to judge
+    warnings.simplefilter("ignore")  # warnings of its imports
     tensorflow = pytest.importorskip("tensorflow")
 
 from cnpgen.interop.tensorflow import to_tensorflow
@@ -24,7 +24,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return load_dataset(make(tmp_path_factory.mktemp("loader") / "set", shard_size=8))
 
 
-def test_tensors_have_the_numbers_of_the_batches(dataset: Dataset) -> None:
+def test_tensors_have_the_values_of_the_batches(dataset: Dataset) -> None:
     expected = list(dataset.batches(8, fields=ALL, drop_last=False))
     found = list(to_tensorflow(dataset.batches(8, fields=ALL, drop_last=False)))
     for tensors, batch in zip(found, expected, strict=True):

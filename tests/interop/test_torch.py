@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from tests.examples.loader import ALL, columns, ids, make
-from tests.examples.plans_of_networks import asked_of, at_ends, outputs
+from tests.examples.plans_of_networks import at_ends, boundary_for_layer, outputs
 
 torch = pytest.importorskip("torch")
 
@@ -24,8 +24,8 @@ from cnpgen.loader import order
 from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.load import load_dataset
 from cnpgen.losses.plan_loss import PlanLoss
-from cnpgen.planner.omega import Omega
-from cnpgen.problems.load import load_problem
+from cnpgen.planner.boundary_layer import BoundaryLayer
+from cnpgen.problems.problem_file import load_problem
 
 pytestmark = [
     pytest.mark.slow,
@@ -43,7 +43,7 @@ def rows(loader: Any) -> list[list[int]]:
     return [batch["sample_id"].tolist() for batch in loader]
 
 
-def test_tensors_have_the_batch_s_numbers_in_the_batch_s_memory(dataset: Dataset) -> None:
+def test_tensors_have_the_values_of_the_batch_in_its_memory(dataset: Dataset) -> None:
     batch = next(iter(dataset.batches(8, fields=ALL)))
     tensors = to_torch(batch)
     assert list(tensors) == list(ALL)
@@ -55,11 +55,11 @@ def test_tensors_have_the_batch_s_numbers_in_the_batch_s_memory(dataset: Dataset
     assert tensors["sample_id"].dtype == torch.int64
 
 
-def test_a_batch_travels_as_one_table_and_has_views_of_it_there(dataset: Dataset) -> None:
+def test_a_batch_is_copied_to_a_device_as_one_table_with_views(dataset: Dataset) -> None:
     batch = next(iter(dataset.batches(8, fields=ALL)))
     tensors = to_torch(batch)
     assert np.shares_memory(tensors.table.numpy(), batch.table)
-    there = tensors.to("meta")  # a device without numbers
+    there = tensors.to("meta")  # a device without data
     assert there.table.is_meta
     assert all(there[name].is_meta and there[name].shape == tensors[name].shape for name in ALL)
     assert all(there[name]._base is there.table for name in ALL if name != "sample_id")
@@ -78,11 +78,11 @@ def test_the_table_comes_through_a_data_loader(dataset: Dataset, workers: int) -
 @pytest.mark.parametrize("batch_size", [1, 2])
 def test_batches_of_batches_are_refused(dataset: Dataset, workers: int, batch_size: int) -> None:
     loader = DataLoader(BatchDataset(dataset.batches(8)), batch_size=batch_size, num_workers=workers)
-    with pytest.raises(UsageError, match="give the DataLoader of a BatchDataset batch_size=None"):
+    with pytest.raises(UsageError, match="its DataLoader needs batch_size=None"):
         next(iter(loader))
 
 
-def test_tensors_are_normalised_and_back_like_arrays(dataset: Dataset) -> None:
+def test_tensors_are_normalized_and_denormalized_like_arrays(dataset: Dataset) -> None:
     batch, normalization = next(iter(dataset.batches(8, fields=ALL))), dataset.normalization
     assert normalization is not None
     expected, found = normalization.denormalize(batch), normalization.denormalize(to_torch(batch))
@@ -94,7 +94,7 @@ def test_tensors_are_normalised_and_back_like_arrays(dataset: Dataset) -> None:
     assert all(np.allclose(again[name], batch[name], atol=1e-5) for name in batch)
 
 
-def test_gradients_go_through_denormalisation(dataset: Dataset) -> None:
+def test_gradients_pass_through_denormalization(dataset: Dataset) -> None:
     normalization = dataset.normalization
     assert normalization is not None
     values = torch.zeros((4, 3), dtype=torch.float64, requires_grad=True)
@@ -104,7 +104,7 @@ def test_gradients_go_through_denormalisation(dataset: Dataset) -> None:
 
 @pytest.mark.parametrize("workers", [0, 1, 2, 3])
 @pytest.mark.parametrize("drop_last", [True, False])
-def test_a_data_loader_gives_the_same_batches_with_any_number_of_workers(
+def test_a_data_loader_yields_the_same_batches_with_any_number_of_workers(
     dataset: Dataset, workers: int, drop_last: bool
 ) -> None:
     wanted = BatchDataset(dataset.batches(7, fields=ALL, drop_last=drop_last))
@@ -140,7 +140,7 @@ def test_with_workers_every_loop_is_the_next_epoch_too(dataset: Dataset, persist
     assert [rows(loader) for _ in range(2)] == [expected[0], expected[1]]
 
 
-def test_a_state_that_is_loaded_between_two_loops_counts_in_workers_too(dataset: Dataset) -> None:
+def test_a_state_loaded_between_two_loops_applies_to_workers_too(dataset: Dataset) -> None:
     batches = dataset.batches(10, fields=ALL)
     loader = DataLoader(BatchDataset(batches), batch_size=None, num_workers=2)
     state, expected = batches.state(batch=2), ids(dataset.batches(10, fields=ALL))
@@ -152,7 +152,7 @@ def test_a_state_that_is_loaded_between_two_loops_counts_in_workers_too(dataset:
 
 
 @pytest.mark.parametrize("persistent", [True, False])
-def test_workers_are_told_the_epoch(dataset: Dataset, persistent: bool) -> None:
+def test_set_epoch_reaches_workers(dataset: Dataset, persistent: bool) -> None:
     wanted = BatchDataset(dataset.batches(10, fields=ALL))
     loader = DataLoader(wanted, batch_size=None, num_workers=2, persistent_workers=persistent)
     for epoch in (0, 1, 2, 0):
@@ -173,7 +173,7 @@ def test_training_resumes_after_any_number_of_used_batches(dataset: Dataset, wor
 
 
 @pytest.mark.parametrize("used", range(1, 13))
-def test_a_state_dict_goes_on_with_the_next_batch_and_the_epochs_after_it(dataset: Dataset, used: int) -> None:
+def test_a_state_dict_continues_with_the_next_batch_and_the_following_epochs(dataset: Dataset, used: int) -> None:
     whole = [rows for epoch in range(3) for rows in ids(dataset.batches(8, fields=ALL, epoch=epoch))]
     assert len(whole) == 18
     interrupted, seen = BatchDataset(dataset.batches(8, fields=ALL)), []
@@ -191,14 +191,14 @@ def test_a_state_dict_goes_on_with_the_next_batch_and_the_epochs_after_it(datase
 
 
 @pytest.mark.parametrize("context", ["fork", "spawn"])
-def test_a_position_that_only_workers_know_is_refused_until_it_is_set_again(dataset: Dataset, context: str) -> None:
+def test_a_position_known_only_to_workers_is_refused_until_it_is_set_again(dataset: Dataset, context: str) -> None:
     batches = dataset.batches(10, fields=ALL)
     wanted = BatchDataset(batches)
     loader = DataLoader(wanted, batch_size=None, num_workers=1, multiprocessing_context=context)
     assert wanted.state_dict() == batches.state(batch=0)
     next(iter(loader))
     for ask in (wanted.state_dict, batches.state):
-        with pytest.raises(UsageError, match=r"workers .* took these batches.* state\(epoch=\.\.\., batch=\.\.\.\)"):
+        with pytest.raises(UsageError, match=r"workers .* read batches ahead.* state\(epoch=\.\.\., batch=\.\.\.\)"):
             ask()
     state = batches.state(epoch=2, batch=3)
     wanted.load_state_dict(state)
@@ -210,7 +210,7 @@ def test_a_position_that_only_workers_know_is_refused_until_it_is_set_again(data
     assert batches.state() == batches.state(epoch=4)
 
 
-def test_all_data_sets_of_the_same_batches_know_what_workers_took(dataset: Dataset) -> None:
+def test_all_data_sets_of_the_same_batches_detect_use_by_workers(dataset: Dataset) -> None:
     batches = dataset.batches(10, fields=ALL)
     for epoch in range(3):
         assert rows(DataLoader(BatchDataset(batches), batch_size=None, num_workers=1)) == ids(
@@ -221,20 +221,20 @@ def test_all_data_sets_of_the_same_batches_know_what_workers_took(dataset: Datas
 
 
 class AskedInWorker(BatchDataset):
-    """Asks for the position where it cannot be known."""
+    """A dataset that requests the position inside a worker."""
 
     def __iter__(self) -> Any:
         self.state_dict()
         return super().__iter__()
 
 
-def test_a_worker_does_not_say_where_the_others_are(dataset: Dataset) -> None:
+def test_a_worker_refuses_to_return_the_position(dataset: Dataset) -> None:
     loader = DataLoader(AskedInWorker(dataset.batches(10)), batch_size=None, num_workers=1)
-    with pytest.raises(UsageError, match="worker of a DataLoader cannot say which batches were used"):
+    with pytest.raises(UsageError, match="worker of a DataLoader has no state of the batches that were used"):
         next(iter(loader))
 
 
-def test_torch_itself_is_left_as_it_was() -> None:
+def test_the_import_does_not_change_torch() -> None:
     code = (
         "from torch.utils.data._utils import collate; before = dict(collate.default_collate_fn_map);"
         "import cnpgen.interop.torch; assert collate.default_collate_fn_map == before"
@@ -252,18 +252,18 @@ def test_fields_of_a_batch_may_be_replaced_by_others_of_their_shape(dataset: Dat
 
 def test_a_batch_of_tensors_is_printed_in_a_line(dataset: Dataset) -> None:
     batch = to_torch(next(iter(dataset.batches(8, fields=ALL))))
-    said = "<batch of 8 rows, torch.float32 on cpu: start_q[3], goal_p[2], clearance, sample_id>"
-    assert repr(batch) == said
+    expected = "<batch of 8 rows, torch.float32 on cpu: start_q[3], goal_p[2], clearance, sample_id>"
+    assert repr(batch) == expected
 
 
-def test_a_worker_in_the_middle_of_windows_gets_its_share(dataset: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_worker_that_starts_within_a_window_gets_its_part(dataset: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(order, "WINDOW_ROWS", 16)
     loader = DataLoader(BatchDataset(dataset.batches(3, fields=ALL)), batch_size=None, num_workers=2)
     assert rows(loader) == ids(dataset.batches(3, fields=ALL))
 
 
 @pytest.mark.parametrize("workers", [0, 2])
-def test_rows_are_read_batch_by_batch_in_torch_s_own_order(dataset: Dataset, workers: int) -> None:
+def test_rows_are_read_batch_by_batch_in_the_order_of_torch(dataset: Dataset, workers: int) -> None:
     wanted = RowDataset(dataset, fields=ALL, normalize=False, dtype="float64")
     generator = torch.Generator().manual_seed(3)
     loader = DataLoader(
@@ -324,7 +324,7 @@ def loss(cache_folder: Path, fastest: Any) -> Callable[..., PlanLoss]:
 
 
 def plans(problem: str, count: int, dtype: Any = torch.float64) -> dict[str, Any]:
-    """Draw plans, weights and, where there are obstacles, their heights."""
+    """Draw plans, weights and obstacle poses."""
     found, random = load_problem(problem), np.random.default_rng(1)
     base, spec = np.array(found.robot.base), found.trajectory
     path = base + 0.3 * random.standard_normal((count, spec.path_control_points, len(base)))
@@ -334,12 +334,12 @@ def plans(problem: str, count: int, dtype: Any = torch.float64) -> dict[str, Any
         "weights": random.uniform(0.5, 2.0, len(found.constraint)),
     }
     if problem == "heavy-object":
-        tensors["tops"] = random.uniform(0.2, 0.4, (count, 2))
+        tensors["obstacle_poses"] = random.uniform(0.2, 0.4, (count, 2))
     return {name: torch.tensor(values, dtype=dtype) for name, values in tensors.items()}
 
 
 @pytest.mark.parametrize("problem", ["airhockey", "heavy-object"])
-def test_the_loss_s_gradients_are_those_that_torch_finds_by_differences(loss: Any, problem: str) -> None:
+def test_the_gradients_of_the_loss_agree_with_gradcheck(loss: Any, problem: str) -> None:
     of, given = loss(problem), plans(problem, 2)
     variables = [given.pop(name).requires_grad_() for name in ("path", "rate", "weights")]
 
@@ -349,7 +349,7 @@ def test_the_loss_s_gradients_are_those_that_torch_finds_by_differences(loss: An
     assert torch.autograd.gradcheck(total, variables, eps=1e-6, rtol=1e-5, atol=1e-5)
 
 
-def test_the_loss_is_that_of_numpy_and_a_sum_of_its_terms(loss: Any) -> None:
+def test_the_loss_agrees_with_numpy_and_is_the_sum_of_its_terms(loss: Any) -> None:
     of, given = loss("airhockey"), plans("airhockey", 5)
     total, terms = plan_loss(of, **given)
     expected = of(**{name: values.numpy() for name, values in given.items()})
@@ -359,7 +359,7 @@ def test_the_loss_is_that_of_numpy_and_a_sum_of_its_terms(loss: Any) -> None:
 
 
 def test_gradients_reach_the_network_that_made_the_plans(loss: Any) -> None:
-    """Two steps down a plan's own gradient, in float32 and through other operations, lower the loss."""
+    """Check that two gradient steps in float32, through other operations, decrease the loss."""
     of, given = loss("airhockey", "float32"), plans("airhockey", 4, torch.float32)
     log_rate = given["rate"].log().requires_grad_()
     values = []
@@ -390,12 +390,12 @@ def test_a_gradient_of_the_weights_alone_is_the_terms(loss: Any) -> None:
     torch.testing.assert_close(given["weights"].grad, terms[:, 1:].sum(0))
 
 
-def test_a_plan_that_is_none_touches_no_other_through_autograd(loss: Any) -> None:
-    """A network makes four plans, one of which runs backwards: its weights get the gradient of the other three."""
+def test_an_invalid_plan_does_not_affect_others_through_autograd(loss: Any) -> None:
+    """Check a network with four plans, one with a negative rate: its weights get the gradient of the other three."""
     of, given = loss("airhockey", "float32"), plans("airhockey", 4, torch.float32)
     weights = given["weights"].requires_grad_()
     network, inputs = torch.nn.Linear(3, 90), torch.eye(4, 3)
-    ways = {
+    reductions = {
         "mean": lambda total: total.mean(),
         "finite": lambda total: total[total.isfinite()].sum() / len(total),
         "nan_to_num": lambda total: total.nan_to_num().mean(),
@@ -403,27 +403,27 @@ def test_a_plan_that_is_none_touches_no_other_through_autograd(loss: Any) -> Non
         "log": lambda total: total.log().mean(),
     }
 
-    def gradients(way: str, rate: Any) -> list[Any]:
+    def gradients(reduction: str, rate: Any) -> list[Any]:
         path = given["path"] + 0.01 * network(inputs).reshape(4, 15, 6)
         total, _ = plan_loss(of, path[: len(rate)], rate, weights=weights)
         scale = len(rate) / 4  # means over three and over four
-        return list(torch.autograd.grad(ways[way](total) * scale, [*network.parameters(), weights]))
+        return list(torch.autograd.grad(reductions[reduction](total) * scale, [*network.parameters(), weights]))
 
     for garbage in (-1.0, float("nan"), 1e-35):
         rate = given["rate"].clone()
         rate[3, 4] = garbage
         if garbage > 0:
             rate[3] = garbage  # the loss overflows
-        for way in ways:
-            expected = gradients("mean" if way != "log" else way, given["rate"][:3])
-            for found, want in zip(gradients(way, rate), expected, strict=True):
+        for reduction in reductions:
+            expected = gradients("mean" if reduction != "log" else reduction, given["rate"][:3])
+            for found, want in zip(gradients(reduction, rate), expected, strict=True):
                 torch.testing.assert_close(found, want, rtol=1e-4, atol=1e-6)
 
 
-def test_weights_and_heights_may_be_arrays_and_any_float_type_is_taken(loss: Any) -> None:
+def test_weights_and_poses_may_be_arrays_and_any_float_type_is_accepted(loss: Any) -> None:
     of, given = loss("heavy-object", "float32"), plans("heavy-object", 3, torch.float32)
     expected = plan_loss(of, **given)[0]
-    arrays = given | {name: given[name].numpy() for name in ("weights", "tops")}
+    arrays = given | {name: given[name].numpy() for name in ("weights", "obstacle_poses")}
     by_name = dict(zip(of.terms[1:], given["weights"].tolist(), strict=True))
     for changed in (arrays, given | {"weights": given["weights"].tolist()}, given | {"weights": by_name}):
         torch.testing.assert_close(plan_loss(of, **changed)[0], expected)
@@ -475,7 +475,7 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("message", MISTAKES)
-def test_arguments_that_cannot_be_meant_are_named(loss: Any, message: str) -> None:
+def test_invalid_arguments_are_refused(loss: Any, message: str) -> None:
     with pytest.raises(UsageError) as error:
         plan_loss(loss("airhockey"), **plans("airhockey", 2) | MISTAKES[message])
     assert str(error.value).startswith(message)
@@ -487,51 +487,51 @@ def test_arguments_that_cannot_be_meant_are_named(loss: Any, message: str) -> No
 @pytest.fixture(
     scope="module", params=[("airhockey", "free"), ("airhockey", "given"), ("heavy-object", "free")], ids=" ".join
 )
-def omega(request: pytest.FixtureRequest, cache_folder: Path, fastest: Any) -> Omega:
+def layer(request: pytest.FixtureRequest, cache_folder: Path, fastest: Any) -> BoundaryLayer:
     problem, acceleration = request.param
-    return Omega(problem, goal_acceleration=acceleration, backend=fastest, cache_folder=cache_folder)
+    return BoundaryLayer(problem, goal_acceleration=acceleration, backend=fastest, cache_folder=cache_folder)
 
 
-def test_control_points_meet_the_boundary_conditions_and_have_gradients(omega: Omega) -> None:
-    given = asked_of(omega, 2)
-    tasks = omega.tasks(given)
-    said = [torch.tensor(part).requires_grad_() for part in outputs(omega, 2)]
-    path, rate = (part.detach() for part in control_points(omega, tasks, *said))
-    wanted = given.given().values()
+def test_control_points_meet_the_boundary_conditions_and_have_gradients(layer: BoundaryLayer) -> None:
+    given = boundary_for_layer(layer, 2)
+    tasks = layer.tasks(given)
+    values = [torch.tensor(part).requires_grad_() for part in outputs(layer, 2)]
+    path, rate = (part.detach() for part in control_points(layer, tasks, *values))
+    wanted = given.conditions().values()
     for found, expected, exact in zip(at_ends(path, rate), wanted, (1e-12, 1e-10, 1e-8) * 2, strict=False):
         np.testing.assert_allclose(found, expected, rtol=0, atol=exact)
     assert torch.autograd.gradcheck(
-        lambda phi, log_rate: control_points(omega, tasks, phi, log_rate), said, eps=1e-6, rtol=1e-4, atol=1e-6,
+        lambda phi, log_rate: control_points(layer, tasks, phi, log_rate), values, eps=1e-6, rtol=1e-4, atol=1e-6,
         fast_mode=True,
     )  # fmt: skip
 
 
-def test_boundary_conditions_may_be_tensors(omega: Omega) -> None:
-    given = asked_of(omega, 2)
+def test_boundary_conditions_may_be_tensors(layer: BoundaryLayer) -> None:
+    given = boundary_for_layer(layer, 2)
     tensors = type(given)(*(None if part is None else torch.tensor(part) for part in vars(given).values()))
-    np.testing.assert_array_equal(omega.tasks(tensors).expected_time, omega.tasks(given).expected_time)
+    np.testing.assert_array_equal(layer.tasks(tensors).expected_time, layer.tasks(given).expected_time)
     tensors.goal_q.requires_grad_()
     with pytest.raises(UsageError, match=r"goal_q must be an array of numbers, got Tensor: .*requires grad"):
-        omega.tasks(tensors)
+        layer.tasks(tensors)
 
 
 @pytest.mark.parametrize(
     ("dtype", "expected"), [("bfloat16", "float32"), ("float32", "float32"), ("float64", "float64")]
 )
-def test_control_points_have_at_least_single_precision(omega: Omega, dtype: str, expected: str) -> None:
-    tasks = omega.tasks(asked_of(omega, 2))
-    said = [torch.tensor(part, dtype=getattr(torch, dtype)).requires_grad_() for part in outputs(omega, 2)]
-    path, rate = control_points(omega, tasks, *said)
+def test_control_points_have_at_least_single_precision(layer: BoundaryLayer, dtype: str, expected: str) -> None:
+    tasks = layer.tasks(boundary_for_layer(layer, 2))
+    values = [torch.tensor(part, dtype=getattr(torch, dtype)).requires_grad_() for part in outputs(layer, 2)]
+    path, rate = control_points(layer, tasks, *values)
     assert path.dtype == rate.dtype == getattr(torch, expected)
     path.sum().backward()
-    assert all(part.grad.dtype == part.dtype and part.grad.abs().sum() > 0 for part in said)
+    assert all(part.grad.dtype == part.dtype and part.grad.abs().sum() > 0 for part in values)
 
 
-def test_functional_gradients_of_control_points_are_the_same_and_second_ones_are_refused(omega: Omega) -> None:
-    tasks, (phi, log_rate) = omega.tasks(asked_of(omega, 2)), map(torch.tensor, outputs(omega, 2))
+def test_functional_gradients_of_control_points_are_the_same_and_second_ones_are_refused(layer: BoundaryLayer) -> None:
+    tasks, (phi, log_rate) = layer.tasks(boundary_for_layer(layer, 2)), map(torch.tensor, outputs(layer, 2))
 
     def scalar(phi: Any) -> Any:
-        return (control_points(omega, tasks, phi, log_rate)[0] ** 2).sum()
+        return (control_points(layer, tasks, phi, log_rate)[0] ** 2).sum()
 
     (expected,) = torch.autograd.grad(scalar(phi.requires_grad_()), [phi])
     torch.testing.assert_close(torch.func.grad(scalar)(phi.detach()), expected)
@@ -539,21 +539,23 @@ def test_functional_gradients_of_control_points_are_the_same_and_second_ones_are
         torch.func.grad(lambda phi: torch.func.grad(scalar)(phi).sum())(phi.detach())
 
 
-def test_a_network_learns_through_control_points_and_loss_although_a_plan_overflows(omega: Omega, loss: Any) -> None:
-    of, tasks = loss(omega.problem.name, "float32"), omega.tasks(asked_of(omega, 4))
+def test_a_network_learns_through_control_points_and_loss_despite_an_overflow(layer: BoundaryLayer, loss: Any) -> None:
+    of, tasks = loss(layer.problem.name, "float32"), layer.tasks(boundary_for_layer(layer, 4))
     torch.manual_seed(0)
-    network = torch.nn.Linear(4, omega.path_outputs + omega.rate_outputs)
+    network = torch.nn.Linear(4, layer.path_outputs + layer.rate_outputs)
     torch.nn.init.normal_(network.weight, std=1e-2)
-    optimiser, values, overflow = torch.optim.Adam(network.parameters(), 1e-3), [], torch.zeros(4, omega.rate_outputs)
+    optimizer, values, overflow = torch.optim.Adam(network.parameters(), 1e-3), [], torch.zeros(4, layer.rate_outputs)
     overflow[3] = 1000.0
     for _ in range(5):
-        phi, log_rate = network(torch.eye(4)).split([omega.path_outputs, omega.rate_outputs], dim=1)
-        path, rate = control_points(omega, tasks, phi.tanh(), log_rate + overflow)
-        total, _ = plan_loss(of, path, rate, weights=of.weights0, tops=omega.tops(tasks), start_tip=tasks.start_xyz)
+        phi, log_rate = network(torch.eye(4)).split([layer.path_outputs, layer.rate_outputs], dim=1)
+        path, rate = control_points(layer, tasks, phi.tanh(), log_rate + overflow)
+        total, _ = plan_loss(
+            of, path, rate, weights=of.weights0, obstacle_poses=layer.obstacle_poses(tasks), start_tip=tasks.start_xyz
+        )
         assert total.isfinite().tolist() == [True, True, True, False]
-        optimiser.zero_grad()
+        optimizer.zero_grad()
         total.mean().backward()
-        optimiser.step()
+        optimizer.step()
         values.append(float(total[:3].mean().detach()))
     assert values[-1] < values[0]
     assert all(part.isfinite().all() for part in network.parameters())

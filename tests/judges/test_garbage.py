@@ -1,4 +1,4 @@
-"""Garbage gets an honest verdict of its own and changes nothing about the plans beside it."""
+"""Invalid inputs get a verdict with the right reason and do not change those of other plans."""
 
 import json
 from collections.abc import Callable
@@ -8,21 +8,21 @@ import numpy as np
 import pytest
 
 from cnpgen.errors import UsageError
-from cnpgen.judges.plans import Reason, judge, summarise
+from cnpgen.judges.plans import Reason, judge, summarize_verdicts
 from tests.conftest import some
-from tests.examples.plans import Plan, bent, joined, load
+from tests.examples.plans import Plan, joined, load, perturbed
 
 
-def _with(plan: Plan, what: str, index: tuple[int, ...], value: float) -> Plan:
-    changed = getattr(plan.motion, what).copy()
+def _with(plan: Plan, name: str, index: tuple[int, ...], value: float) -> Plan:
+    changed = getattr(plan.motion, name).copy()
     changed[(0, *index)] = value
-    return plan.changed(**{what: changed})
+    return plan.changed(**{name: changed})
 
 
 def _boundary_with(plan: Plan, value: float) -> Plan:
-    wanted = plan.boundary.goal_dq.copy()
-    wanted[0, 1] = value
-    return replace(plan, boundary=replace(plan.boundary, goal_dq=wanted))
+    goal_dq = plan.boundary.goal_dq.copy()
+    goal_dq[0, 1] = value
+    return replace(plan, boundary=replace(plan.boundary, goal_dq=goal_dq))
 
 
 GARBAGE: dict[str, tuple[Callable[[Plan], Plan], str | None]] = {
@@ -30,28 +30,28 @@ GARBAGE: dict[str, tuple[Callable[[Plan], Plan], str | None]] = {
     "inf in the path": (lambda plan: _with(plan, "path", (0, 0), -np.inf), "not finite"),
     "nan in the rate": (lambda plan: _with(plan, "rate", (7,), np.nan), "not finite"),
     "inf in the rate": (lambda plan: _with(plan, "rate", (7,), np.inf), "not finite"),
-    "nan wanted": (lambda plan: _boundary_with(plan, np.nan), "not finite"),
+    "nan in the boundary": (lambda plan: _boundary_with(plan, np.nan), "not finite"),
     "nan as the goal": (lambda plan: replace(plan, goal_xyz=plan.goal_xyz * np.nan), "not finite"),
     "no rate": (lambda plan: plan.changed(rate=0 * plan.motion.rate), "rate not positive"),
     "backwards": (lambda plan: plan.changed(rate=-plan.motion.rate), "rate not positive"),
-    "backwards for a while": (lambda plan: _with(plan, "rate", (9,), -50.0), "rate not positive"),
-    "it stops at the goal": (lambda plan: _with(plan, "rate", (19,), 0.0), "rate not positive"),
+    "partly backwards": (lambda plan: _with(plan, "rate", (9,), -50.0), "rate not positive"),
+    "zero rate at the goal": (lambda plan: _with(plan, "rate", (19,), 0.0), "rate not positive"),
     "a control point below 0, r above": (lambda plan: _with(plan, "rate", (9,), -0.1), None),
-    "a year": (lambda plan: plan.changed(rate=plan.motion.rate * 1e-7), "too long"),
-    "forever": (lambda plan: plan.changed(rate=plan.motion.rate * 1e-306), "too long"),
-    "at once": (lambda plan: plan.changed(rate=plan.motion.rate * 1e12), None),
-    "faster than numbers": (lambda plan: plan.changed(rate=plan.motion.rate * 1e300), "not finite"),
-    "metres away": (lambda plan: bent(plan, 100.0), None),
-    "control points beyond reason": (lambda plan: bent(plan, 1e150), None),
-    "too large to square": (lambda plan: bent(plan, 1e300), None),
-    "nowhere": (lambda plan: plan.changed(path=0 * plan.motion.path), "boundary conditions"),
-    "speeds beyond reason": (lambda plan: _with(plan, "rate", (10,), 1e200), None),
+    "a very slow rate": (lambda plan: plan.changed(rate=plan.motion.rate * 1e-7), "too long"),
+    "an infinite duration": (lambda plan: plan.changed(rate=plan.motion.rate * 1e-306), "too long"),
+    "a very fast rate": (lambda plan: plan.changed(rate=plan.motion.rate * 1e12), None),
+    "an overflowing rate": (lambda plan: plan.changed(rate=plan.motion.rate * 1e300), "not finite"),
+    "meters of error": (lambda plan: perturbed(plan, 100.0), None),
+    "very large control points": (lambda plan: perturbed(plan, 1e150), None),
+    "squares that overflow": (lambda plan: perturbed(plan, 1e300), None),
+    "a path of zeros": (lambda plan: plan.changed(path=0 * plan.motion.path), "boundary conditions"),
+    "very large speeds": (lambda plan: _with(plan, "rate", (10,), 1e200), None),
 }
 
 
 @pytest.mark.parametrize("label", ["replan", "transport"])
 @pytest.mark.parametrize("name", GARBAGE)
-def test_garbage_gets_an_honest_verdict(name, label):
+def test_invalid_inputs_get_the_right_reason(name, label):
     make, reason = GARBAGE[name]
     verdict = make(load(label)).judged()
     assert not verdict.valid or name == "a control point below 0, r above"
@@ -63,7 +63,7 @@ def test_garbage_gets_an_honest_verdict(name, label):
 
 
 @pytest.mark.parametrize("label", some(["replan", "transport"], 1, "slow"))
-def test_garbage_changes_nothing_about_the_other_plans(label):
+def test_invalid_inputs_do_not_change_the_other_verdicts(label):
     good = load(label)
     plans = [good]
     for make, _ in GARBAGE.values():
@@ -71,7 +71,7 @@ def test_garbage_changes_nothing_about_the_other_plans(label):
     verdicts = judge(*joined(*plans))
     assert all(verdict == verdicts[0] for verdict in verdicts[::2])
     assert verdicts[0].valid
-    summary = summarise(verdicts)
+    summary = summarize_verdicts(verdicts)
     json.dumps(summary, allow_nan=False)
     assert summary["plans"] == len(verdicts)
     assert sum(summary["reasons"].values()) == len(verdicts)
@@ -92,12 +92,12 @@ def test_garbage_changes_nothing_about_the_other_plans(label):
         lambda plan: replace(plan, boundary=replace(plan.boundary, goal_ddq=np.zeros((3, 6)))),
     ],
 )
-def test_shapes_that_do_not_fit_are_a_usage_error(change):
+def test_shapes_that_do_not_match_raise_a_usage_error(change):
     with pytest.raises(UsageError, match=r"shape|control points"):
         change(load("hit")).judged()
 
 
 @pytest.mark.parametrize("step", [0.0, -1e-3, np.nan, np.inf, 0.0101, 5.0])
-def test_a_time_step_must_be_positive_and_short_enough_to_mean_something(step):
+def test_a_time_step_must_be_positive_and_short_enough(step):
     with pytest.raises(UsageError, match=r"time step must be above 0 and at most 0\.01 s, got"):
         load("hit").judged(step=step)

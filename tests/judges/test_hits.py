@@ -1,4 +1,4 @@
-"""Goals of hits: right ones pass, forged ones whose tips and speeds are right do not."""
+"""Goals of hits: valid ones pass, wrong ones with the right tip positions and speeds fail."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -7,10 +7,10 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cnpgen.judges.rows.hits import HitRule, _gradients, hit_rule, judge_goals, repeated_share, shares_of
+from cnpgen.judges.rows.hits import HitRule, _gradients, hit_rule, judge_goals, repeated_fraction, speed_fractions
 from cnpgen.judges.rows.verify import verify_rows
-from cnpgen.problems.load import load_problem
-from cnpgen.problems.robot import load_robot
+from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.problem_file import load_problem
 from tests.conftest import columns_of
 
 PROBLEM = load_problem("airhockey")
@@ -41,7 +41,7 @@ def wide(columns: Columns) -> Columns:
     return {name: values.reshape(ROWS, -1) for name, values in columns.items()}
 
 
-def test_the_gradient_is_that_of_differences_but_for_rows_of_the_jacobian() -> None:
+def test_the_gradient_agrees_with_differences_up_to_rows_of_the_jacobian() -> None:
     random = np.random.default_rng(0)
     for _ in range(5):
         q, home = (ROBOT.base + random.uniform(-0.5, 0.5, ROBOT.n) for _ in range(2))
@@ -60,17 +60,17 @@ def test_the_goals_of_datasets_pass(rows: tuple[Columns, HitRule]) -> None:
     report = verify_rows(PROBLEM, ROBOT, columns, rule=rule)
     assert report.ok
     assert {"hitting configuration", "hitting velocity"} <= {check.name for check in report.checks}
-    assert repeated_share(shares_of(columns), "float64") == (0, 0.0)
+    assert repeated_fraction(speed_fractions(columns), "float64") == (0, 0.0)
 
 
-def test_without_a_rule_goals_are_anybodys(rows: tuple[Columns, HitRule]) -> None:
+def test_without_a_rule_goals_are_not_checked(rows: tuple[Columns, HitRule]) -> None:
     columns, _ = rows
     names = {check.name for check in verify_rows(PROBLEM, ROBOT, columns).checks}
     assert not {"hitting configuration", "hitting velocity"} & names
 
 
-def test_another_configuration_at_the_same_place_is_found(rows: tuple[Columns, HitRule]) -> None:
-    """The arm is moved where its tip stays, and everything that follows from it is made right again."""
+def test_another_configuration_with_the_same_tip_position_is_reported(rows: tuple[Columns, HitRule]) -> None:
+    """The arm moves in its null space, and all dependent fields are recomputed."""
     columns, rule = rows
     for row in range(ROWS):
         q = columns["goal_q"][row].copy()
@@ -87,35 +87,35 @@ def test_another_configuration_at_the_same_place_is_found(rows: tuple[Columns, H
     columns["goal_dq"] = np.zeros((ROWS, ROBOT.n))
     report = verify_rows(PROBLEM, ROBOT, columns, rule=HitRule(rule.near))
     (failed,) = report.failed
-    assert (failed.name, failed.rows_out) == ("hitting configuration", ROWS)
+    assert (failed.name, failed.n_failed) == ("hitting configuration", ROWS)
 
 
-def test_goals_of_another_start_are_found(rows: tuple[Columns, HitRule]) -> None:
+def test_goals_of_another_start_are_reported(rows: tuple[Columns, HitRule]) -> None:
     columns, rule = rows
     other = HitRule("start" if rule.near == "base" else "base")
     judged = judge_goals(ROBOT, other, wide(columns), np.arange(ROWS), "float64")
-    assert judged[0][0].rows_out == ROWS
+    assert judged[0][0].n_failed == ROWS
 
 
-def test_a_joint_at_its_limit_may_be_pushed_against_it() -> None:
-    """A goal beyond whose limit f still rises is right; one at a limit from which f rises inwards is not."""
+def test_f_may_increase_towards_an_active_joint_limit() -> None:
+    """A goal is valid if f increases towards its active limit, and invalid if f increases away from it."""
     random = np.random.default_rng(3)
     q = ROBOT.base + random.uniform(-0.2, 0.2, ROBOT.n)
     (J,), (gradient,) = _gradients(ROBOT, q[None], q[None], np.array([0.3]))
     columns = {"goal_q": q[None], "start_q": q[None], "hit_angle": np.array([[0.3]])}
-    free = [0, 1, 3]  # as many as the tip has coordinates: f cannot rise there, whatever it is
-    rest = gradient - J.T @ np.linalg.lstsq(J[:, free].T, gradient[free], rcond=None)[0]
+    free = [0, 1, 3]  # as many as tip coordinates, so f cannot increase along them
+    projected = gradient - J.T @ np.linalg.lstsq(J[:, free].T, gradient[free], rcond=None)[0]
     for outwards in (True, False):
         lower, upper = ROBOT.position_lower.copy(), ROBOT.position_upper.copy()
         for joint in set(range(ROBOT.n)) - set(free):
-            (upper if (rest[joint] > 0) == outwards else lower)[joint] = q[joint]
+            (upper if (projected[joint] > 0) == outwards else lower)[joint] = q[joint]
         robot = replace(ROBOT, position_lower=lower, position_upper=upper)
         ((check, _),) = judge_goals(robot, HitRule("start"), columns, np.arange(1), "float64")
-        assert check.rows_out == (0 if outwards else 1)
+        assert check.n_failed == (0 if outwards else 1)
 
 
-def test_a_hit_that_is_not_a_fraction_of_the_fastest_is_found(rows: tuple[Columns, HitRule]) -> None:
-    """The same speed of the tip by other joints: right in everything but that it could be faster."""
+def test_a_hit_that_is_not_a_fraction_of_the_fastest_is_reported(rows: tuple[Columns, HitRule]) -> None:
+    """The same tip speed with other joint velocities, of which it is not the largest multiple."""
     columns, rule = rows
     slow = np.flatnonzero(columns["hit_speed"] < 0.8 * columns["hit_speed_max"])
     row = int(slow[0])
@@ -126,7 +126,7 @@ def test_a_hit_that_is_not_a_fraction_of_the_fastest_is_found(rows: tuple[Column
     assert {check.name: check.worst_row for check in report.failed} == {"hitting velocity": row}
 
 
-def test_where_all_hits_are_at_full_speed_a_slower_one_is_found(rows: tuple[Columns, HitRule]) -> None:
+def test_a_slower_hit_is_reported_if_all_hits_are_at_full_speed(rows: tuple[Columns, HitRule]) -> None:
     columns, _ = rows
     slow = np.flatnonzero(columns["hit_speed"] < columns["hit_speed_max"])
     judged = judge_goals(ROBOT, HitRule(full_speed=1.0), wide(columns), np.arange(ROWS), "float64")
@@ -134,16 +134,16 @@ def test_where_all_hits_are_at_full_speed_a_slower_one_is_found(rows: tuple[Colu
 
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
-def test_hits_that_were_halved_afterwards_are_found(dtype: str) -> None:
+def test_hits_with_halved_speeds_are_reported(dtype: str) -> None:
     random = np.random.default_rng(1)
     highest = random.uniform(0.5, 2.0, 20_000)
-    share = np.where(random.random(20_000) < 0.3, 1.0, random.random(20_000))
-    speeds = {"hit_speed_max": highest.astype(dtype), "hit_speed": (share * highest).astype(dtype)}
-    assert repeated_share(shares_of(speeds), dtype) == (0, 0.0)
+    fraction = np.where(random.random(20_000) < 0.3, 1.0, random.random(20_000))
+    speeds = {"hit_speed_max": highest.astype(dtype), "hit_speed": (fraction * highest).astype(dtype)}
+    assert repeated_fraction(speed_fractions(speeds), dtype) == (0, 0.0)
     speeds["hit_speed"] = (speeds["hit_speed"] * 0.5).astype(dtype)
-    count, value_ = repeated_share(shares_of(speeds), dtype)
+    count, value_ = repeated_fraction(speed_fractions(speeds), dtype)
     assert value_ == pytest.approx(0.5, rel=1e-6)
-    assert abs(count - (share == 1).sum()) < 5
+    assert abs(count - (fraction == 1).sum()) < 5
 
 
 def test_the_rule_is_read_from_the_recorded_stages() -> None:

@@ -1,4 +1,4 @@
-"""The judge: right rows pass, and every kind of corruption is found under its name, in its row and in no other."""
+"""Verification of rows: valid rows pass, and every corruption is reported under its name and in its row only."""
 
 import json
 from collections.abc import Callable
@@ -12,18 +12,18 @@ from scipy.optimize import linprog, minimize_scalar
 
 from cnpgen.errors import DatasetError, RecipeError
 from cnpgen.judges.rows import verify as rows_module
-from cnpgen.judges.rows.fastest_hit import highest_speed
-from cnpgen.judges.rows.report import Check, RowReport, merge
+from cnpgen.judges.rows.hits import highest_speed
+from cnpgen.judges.rows.row_report import Check, RowReport, merge
 from cnpgen.judges.rows.verify import verify_rows
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.constraints.constraint import Condition, Constraint
-from cnpgen.problems.load import load_problem
-from cnpgen.problems.obstacles import obstacle_tops
-from cnpgen.problems.robot import load_robot
+from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.obstacles import obstacle_poses_of
+from cnpgen.problems.problem_file import load_problem
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.solid import solids_of
-from cnpgen.world.scene import Scene
-from cnpgen.world.state import World
+from cnpgen.world.collision_world import CollisionWorld
+from cnpgen.world.world import World
 
 Columns = dict[str, np.ndarray]
 AIRHOCKEY, HEAVY = load_problem("airhockey"), load_problem("heavy-object")
@@ -31,7 +31,7 @@ ROWS = 6
 WORLD_ALIGNED = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 
 
-# --- right rows, made with Pinocchio and NumPy ------------------------------------------------------------------------
+# --- valid rows, made with Pinocchio and NumPy ------------------------------------------------------------------------
 
 
 def jacobian(robot: Robot, q: np.ndarray) -> np.ndarray:
@@ -46,7 +46,7 @@ def tip_pose(robot: Robot, q: np.ndarray) -> pin.SE3:
 
 
 def inverse_kinematics(robot: Robot, q: np.ndarray, xyz: np.ndarray, *, upright: bool) -> np.ndarray | None:
-    """Newton's method for the tip position and, if asked, a vertical z axis; None outside the joint limits."""
+    """Solve for the tip position and optionally a vertical z axis by Newton's method; None outside the joint limits."""
     for _ in range(60):
         pose, J = tip_pose(robot, q), jacobian(robot, q)
         error, rows = xyz - pose.translation, J[:3]
@@ -59,7 +59,7 @@ def inverse_kinematics(robot: Robot, q: np.ndarray, xyz: np.ndarray, *, upright:
 
 
 def sliding_acceleration(robot: Robot, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
-    """The smallest ddq that keeps the tip at its height."""
+    """Compute the smallest ddq that keeps the tip at its height."""
     data = robot.model.createData()
     pin.forwardKinematics(robot.model, data, q, dq, np.zeros(robot.n))
     frame = robot.model.getFrameId(robot.tip)
@@ -69,7 +69,7 @@ def sliding_acceleration(robot: Robot, q: np.ndarray, dq: np.ndarray) -> np.ndar
 
 
 def hit_row(robot: Robot, random: np.random.Generator, *, share: float) -> Columns:
-    """A motion that starts somewhere near the table and hits with a share of the speed that the joints allow."""
+    """Draw a motion that starts near the table and hits with a fraction of the highest possible speed."""
     start_xyz = np.array([random.uniform(0.7, 0.9), random.uniform(-0.2, 0.2), 0.16 + random.uniform(-4e-3, 4e-3)])
     goal_xyz = np.array([random.uniform(0.8, 1.0), random.uniform(-0.2, 0.2), 0.16])
     start_q, goal_q = (inverse_kinematics(robot, robot.base, xyz, upright=False) for xyz in (start_xyz, goal_xyz))
@@ -94,7 +94,7 @@ def hit_row(robot: Robot, random: np.random.Generator, *, share: float) -> Colum
 
 
 def carry_row(robot: Robot, random: np.random.Generator) -> Columns:
-    """A motion from rest over the first pedestal to rest over the second, clear of both."""
+    """Draw a motion from rest over the first pedestal to rest over the second, without contact."""
     row = {name: np.zeros(7) for name in ("start_dq", "start_ddq", "goal_dq")}
     for end, side in (("start", -1), ("goal", 1)):
         row[f"{end}_xyz"] = np.array([random.uniform(0.45, 0.55), side * random.uniform(0.35, 0.5), 0.4])
@@ -108,7 +108,7 @@ def carry_row(robot: Robot, random: np.random.Generator) -> Columns:
 
 
 def is_clear(robot: Robot, q: np.ndarray, row: Columns) -> bool:
-    """Whether points along the arm, 1 mm apart, are 0.145 m from both pedestals."""
+    """Return whether points along the arm at steps of 1 mm have a distance of 0.145 m from both pedestals."""
     data = robot.model.createData()
     pin.forwardKinematics(robot.model, data, q)
     corners = np.array([*(data.oMi[i].translation for i in (2, 4, 6)), tip_pose(robot, q).translation])
@@ -137,7 +137,7 @@ class Case:
 
 @pytest.fixture(scope="module")
 def hits() -> Case:
-    """The last row is at its velocity limit, the first one ends at rest."""
+    """Rows of which the last is at its velocity limit, and the first ends at rest."""
     robot, random = load_robot(AIRHOCKEY), np.random.default_rng(7)
     made = [hit_row(robot, random, share=share) for share in (0.0, 0.2, 0.5, 0.7, 0.9, 1.0)]
     return Case(robot, {name: np.array([row[name] for row in made]) for name in made[0]})
@@ -154,7 +154,7 @@ def failures(report: RowReport) -> set[str]:
     return {check.name for check in report.failed}
 
 
-def test_right_hits_pass(hits):
+def test_valid_hits_pass(hits):
     report = verify_rows(AIRHOCKEY, hits.robot, hits.columns)
     assert failures(report) == set()
     assert report.ok
@@ -175,14 +175,14 @@ def test_right_hits_pass(hits):
     ]
 
 
-def test_right_carries_pass(carries):
+def test_valid_transports_pass(carries):
     report = verify_rows(HEAVY, carries.robot, carries.columns)
     assert failures(report) == set()
     assert {"tilt", "upright", "robot clearance", "object contact"} <= {check.name for check in report.checks}
 
 
-def test_the_highest_speed_of_a_hit_is_highs_s(hits):
-    """Random arms, too, some of whose joints do nothing, or the same."""
+def test_the_highest_speed_of_a_hit_agrees_with_highs(hits):
+    """Includes random arms with joints that have no effect or the same effect."""
     random = np.random.default_rng(3)
     robot, angles = hits.robot, hits.columns["hit_angle"]
     for jacobians, limit in (
@@ -198,7 +198,7 @@ def test_the_highest_speed_of_a_hit_is_highs_s(hits):
             assert speed == pytest.approx(-solved.fun, abs=1e-9)
 
 
-def test_a_wrong_highest_speed_is_found(hits):
+def test_a_wrong_highest_speed_is_reported(hits):
     columns = hits.copy()
     J = np.array([jacobian(hits.robot, q)[:3] for q in columns["goal_q"]])
     columns["hit_speed_max"] = highest_speed(J, columns["hit_angle"], hits.robot.velocity_limit)
@@ -208,13 +208,13 @@ def test_a_wrong_highest_speed_is_found(hits):
     assert [(check.name, check.worst_row) for check in report.failed] == [("highest hit speed", 2)]
 
 
-def test_a_hit_of_an_arm_that_cannot_keep_to_a_line_has_no_highest_speed():
+def test_the_highest_speed_is_infinite_for_an_arm_that_cannot_follow_a_line():
     flat = np.concatenate([np.random.default_rng(0).normal(size=(1, 2, 4)), np.zeros((1, 1, 4))], axis=1)
     assert highest_speed(flat, np.zeros(1), np.ones(4)).tolist() == [np.inf]
 
 
 def distance_of_arm(robot: Robot, q: np.ndarray, boxes: list[tuple[np.ndarray, np.ndarray]]) -> float:
-    """How far the arm's segments are from boxes, a convex problem each, by SciPy."""
+    """Compute the distances of the arm's segments from boxes as convex problems with SciPy."""
     data = robot.model.createData()
     pin.forwardKinematics(robot.model, data, q)
     corners = [*(data.oMi[i].translation.copy() for i in (2, 4, 6)), tip_pose(robot, q).translation.copy()]
@@ -231,16 +231,16 @@ def distance_of_arm(robot: Robot, q: np.ndarray, boxes: list[tuple[np.ndarray, n
 
 @pytest.fixture(scope="module")
 def diagnosed(carries) -> Case:
-    """Carries with the diagnostics of their ends, by Pinocchio's gravity term and SciPy."""
+    """Transports with the diagnostics of their ends, from Pinocchio's gravity term and SciPy."""
     columns, robot = carries.copy(), carries.robot
     radius = next(each.radius for each in HEAVY.constraint if isinstance(each, RobotClearance))
     for end in ("start", "goal"):
         columns[f"{end}_torque_ratio"], columns[f"{end}_clearance"] = np.empty(ROWS), np.empty(ROWS)
     for row in range(ROWS):
-        tops = obstacle_tops(HEAVY, columns["start_xyz"][row], columns["goal_xyz"][row])
+        poses = obstacle_poses_of(HEAVY, columns["start_xyz"][row], columns["goal_xyz"][row])
         boxes = [
             (np.array([box.x.low, box.y.low, -9.0]), np.array([box.x.high, box.y.high, top]))
-            for box, top in zip(HEAVY.obstacle, tops, strict=True)
+            for box, top in zip(HEAVY.obstacle, poses, strict=True)
         ]
         for end in ("start", "goal"):
             q = columns[f"{end}_q"][row]
@@ -250,7 +250,7 @@ def diagnosed(carries) -> Case:
     return Case(robot, columns)
 
 
-def test_right_diagnostics_pass(diagnosed):
+def test_valid_diagnostics_pass(diagnosed):
     report = verify_rows(HEAVY, diagnosed.robot, diagnosed.columns)
     assert report.ok
     assert {"holding torque ratio", "clearance"} <= {check.name for check in report.checks}
@@ -260,20 +260,20 @@ def test_right_diagnostics_pass(diagnosed):
 @pytest.mark.parametrize(
     ("field", "check"), [("torque_ratio", "holding torque ratio"), ("clearance", "clearance")], ids=["torque", "arm"]
 )
-def test_a_wrong_diagnostic_is_found_in_its_row_and_end(diagnosed, end, field, check):
+def test_a_wrong_diagnostic_is_reported_in_its_row_and_end(diagnosed, end, field, check):
     columns = diagnosed.copy()
     columns[f"{end}_{field}"][4] += 1e-7
     report = verify_rows(HEAVY, diagnosed.robot, columns)
     (failed,) = report.failed
-    assert (failed.name, failed.rows_out, failed.worst_row, failed.worst_end) == (check, 1, 4, end)
+    assert (failed.name, failed.n_failed, failed.worst_row, failed.worst_end) == (check, 1, 4, end)
     assert failed.worst == pytest.approx(1e-7, rel=0.1)
-    assert report.out.tolist() == [4]
+    assert report.failed_rows.tolist() == [4]
 
 
 def test_the_diagnostics_of_one_end_alone_are_checked(diagnosed):
     columns = diagnosed.copy()
     del columns["start_clearance"], columns["start_torque_ratio"], columns["goal_torque_ratio"]
-    columns["goal_clearance"][2] = np.nan  # fails as such, and is not compared
+    columns["goal_clearance"][2] = np.nan  # fails as not finite, and is not compared
     report = verify_rows(HEAVY, diagnosed.robot, columns)
     assert failures(report) == {"finite"}
     assert "holding torque ratio" not in {check.name for check in report.checks}
@@ -281,7 +281,7 @@ def test_the_diagnostics_of_one_end_alone_are_checked(diagnosed):
     assert failures(verify_rows(HEAVY, diagnosed.robot, columns)) == {"finite", "clearance"}
 
 
-def test_right_rows_stored_in_single_precision_pass_as_such_only(hits):
+def test_valid_rows_in_single_precision_pass_only_as_float32(hits):
     single = {name: column.astype(np.float32) for name, column in hits.columns.items()}
     limit = hits.robot.velocity_limit.astype(np.float32).astype(float)
     single["goal_dq"] = np.where(np.abs(single["goal_dq"]) >= limit, single["goal_dq"] * (1 - 1e-7), single["goal_dq"])
@@ -293,7 +293,7 @@ def test_right_rows_stored_in_single_precision_pass_as_such_only(hits):
 
 
 def lift(robot: Robot, q: np.ndarray) -> np.ndarray:
-    """Joint velocities that lift the tip at 1 m/s."""
+    """Compute joint velocities that lift the tip at 1 m/s."""
     return np.linalg.pinv(jacobian(robot, q)[:3])[:, 2]
 
 
@@ -376,13 +376,13 @@ def put_infinity(case: Case, columns: Columns, row: int) -> None:
     ],
 )
 @pytest.mark.parametrize("row", [1, ROWS - 1])
-def test_corruption_of_a_hit_is_found_under_its_name_in_its_row(hits, corrupt, names, row):
+def test_corruption_of_a_hit_is_reported_under_its_name_in_its_row(hits, corrupt, names, row):
     columns = hits.copy()
     corrupt(hits, columns, row)
     report = verify_rows(AIRHOCKEY, hits.robot, columns)
     assert failures(report) == names
-    assert report.out.tolist() == [row]
-    assert all((check.rows_out, check.worst_row) == (1, row) for check in report.failed)
+    assert report.failed_rows.tolist() == [row]
+    assert all((check.n_failed, check.worst_row) == (1, row) for check in report.failed)
 
 
 @pytest.mark.parametrize(
@@ -393,12 +393,12 @@ def test_corruption_of_a_hit_is_found_under_its_name_in_its_row(hits, corrupt, n
         (leave_joint_limits, {"joint position", "tip position"}),
     ],
 )
-def test_moved_joints_are_found_among_what_follows_from_them(hits, corrupt, names):
+def test_moved_joints_are_reported_by_the_checks_that_depend_on_them(hits, corrupt, names):
     columns = hits.copy()
     corrupt(hits, columns, 3)
     report = verify_rows(AIRHOCKEY, hits.robot, columns)
     assert failures(report) >= names
-    assert report.out.tolist() == [3]
+    assert report.failed_rows.tolist() == [3]
 
 
 def tilt(case: Case, columns: Columns, row: int) -> None:
@@ -424,26 +424,26 @@ def reach_through_pedestal(case: Case, columns: Columns, row: int) -> None:
         (put_nan, {"finite"}),
     ],
 )
-def test_corruption_of_a_carry_is_found_under_its_name_in_its_row(carries, corrupt, names):
+def test_corruption_of_a_transport_is_reported_under_its_name_in_its_row(carries, corrupt, names):
     columns = carries.copy()
     corrupt(carries, columns, 2)
     report = verify_rows(HEAVY, carries.robot, columns)
     assert failures(report) == names
-    assert report.out.tolist() == [2]
+    assert report.failed_rows.tolist() == [2]
 
 
-def test_arm_in_a_pedestal_is_found(carries):
+def test_an_arm_in_a_pedestal_is_reported(carries):
     columns = carries.copy()
     reach_through_pedestal(carries, columns, 4)
     report = verify_rows(HEAVY, carries.robot, columns)
     assert failures(report) >= {"robot clearance"}
-    assert report.out.tolist() == [4]
+    assert report.failed_rows.tolist() == [4]
     (clearance,) = (check for check in report.checks if check.name == "robot clearance")
     assert clearance.worst == pytest.approx(0.352132, rel=1e-5)
     assert (clearance.worst_row, clearance.worst_end) == (4, "start")
 
 
-# --- torque, and what is known of the goal ----------------------------------------------------------------------------
+# --- torque, and accelerations of the goal ----------------------------------------------------------------------------
 
 
 def with_torque_limit(robot: Robot, joint: int, limit: float) -> Robot:
@@ -457,18 +457,18 @@ def holding_torque(case: Case, end: str, joint: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("end", "other"), [("start", "goal"), ("goal", "start")])
-def test_holding_torque_is_checked_at_both_ends_that_rest(carries, end, other):
-    excess = [holding_torque(carries, end, j).max() - holding_torque(carries, other, j).max() for j in range(7)]
-    joint = int(np.argmax(excess))
+def test_holding_torque_is_checked_at_both_ends_at_rest(carries, end, other):
+    violation = [holding_torque(carries, end, j).max() - holding_torque(carries, other, j).max() for j in range(7)]
+    joint = int(np.argmax(violation))
     torque = holding_torque(carries, end, joint)
     report = verify_rows(HEAVY, with_torque_limit(carries.robot, joint, torque.max() * (1 - 1e-9)), carries.columns)
     (check,) = report.failed
     assert (check.name, check.worst_end, check.worst_row) == ("joint torque", end, int(torque.argmax()))
     assert check.worst == pytest.approx(1e-9 * torque.max(), rel=1e-3)
-    assert report.out.tolist() == [torque.argmax()]
+    assert report.failed_rows.tolist() == [torque.argmax()]
 
 
-def test_torque_at_a_goal_that_moves_is_checked_only_if_its_acceleration_is_stored(hits):
+def test_torque_at_a_moving_goal_is_checked_only_if_its_acceleration_is_stored(hits):
     columns = hits.copy()
     columns["goal_ddq"] = np.array(
         [sliding_acceleration(hits.robot, *pair) for pair in zip(columns["goal_q"], columns["goal_dq"], strict=True)]
@@ -476,13 +476,13 @@ def test_torque_at_a_goal_that_moves_is_checked_only_if_its_acceleration_is_stor
     assert verify_rows(AIRHOCKEY, hits.robot, columns).ok
     columns["goal_ddq"][4] += 1e-6 * lift(hits.robot, columns["goal_q"][4])
     report = verify_rows(AIRHOCKEY, hits.robot, columns)
-    assert (failures(report), report.out.tolist()) == ({"vertical acceleration"}, [4])
+    assert (failures(report), report.failed_rows.tolist()) == ({"vertical acceleration"}, [4])
     strict = with_torque_limit(hits.robot, 1, 1.0)
     del columns["goal_ddq"]
     columns["start_q"], columns["start_xyz"] = columns["goal_q"], columns["goal_xyz"]
     columns["start_dq"], columns["start_ddq"] = 0 * columns["start_dq"], 0 * columns["start_ddq"]
     torque = next(c for c in verify_rows(AIRHOCKEY, strict, columns).checks if c.name == "joint torque")
-    assert torque.rows_out == ROWS
+    assert torque.n_failed == ROWS
 
 
 # --- reports ----------------------------------------------------------------------------------------------------------
@@ -494,10 +494,10 @@ def test_blocks_do_not_change_the_report(hits, monkeypatch):
     rise(hits, columns, 4)
     put_nan(hits, columns, 3)
     whole = verify_rows(AIRHOCKEY, hits.robot, columns)
-    monkeypatch.setattr(rows_module, "BLOCK", 2)
+    monkeypatch.setattr(rows_module, "VERIFICATION_BLOCK_ROWS", 2)
     blocks = verify_rows(AIRHOCKEY, hits.robot, columns)
     assert whole.to_dict() == blocks.to_dict()
-    assert whole.out.tolist() == [1, 3, 4]
+    assert whole.failed_rows.tolist() == [1, 3, 4]
 
 
 def test_merged_reports_are_the_report_of_all_rows(hits):
@@ -515,26 +515,26 @@ def test_no_rows_give_an_empty_report(hits):
     assert merge([report, verify_rows(AIRHOCKEY, hits.robot, hits.columns)]).rows == ROWS
 
 
-def test_report_is_valid_json_even_where_something_could_not_be_evaluated():
+def test_the_report_is_valid_json_if_a_value_could_not_be_evaluated():
     check = Check("torque", "N m", np.inf, 1e-9, 1, 0, "start")
     text = json.dumps(RowReport(1, (check,), np.array([0])).to_dict(), allow_nan=False)
     assert json.loads(text)["checks"][0] == {
         "name": "torque",
         "unit": "N m",
         "worst": None,
-        "allowed": 1e-9,
-        "rows_out": 1,
+        "tolerance": 1e-9,
+        "n_failed": 1,
         "worst_row": 0,
         "worst_end": "start",
     }
 
 
-def test_finite_numbers_too_large_to_compute_with_are_out(hits):
+def test_finite_values_that_overflow_fail(hits):
     columns = hits.copy()
     columns["start_dq"][2] = 1e300
     report = verify_rows(AIRHOCKEY, hits.robot, columns)
     assert {"joint velocity", "joint torque"} <= failures(report)
-    assert report.out.tolist() == [2]
+    assert report.failed_rows.tolist() == [2]
 
 
 @pytest.mark.parametrize(
@@ -546,7 +546,7 @@ def test_finite_numbers_too_large_to_compute_with_are_out(hits):
         (lambda columns: columns.update(goal_xyz=columns["goal_xyz"][:, :2]), r"goal_xyz must have shape \(6, 3\)"),
     ],
 )
-def test_rows_of_another_shape_are_refused(hits, change: Callable[[Columns], None], message):
+def test_rows_of_a_wrong_shape_raise_an_error(hits, change: Callable[[Columns], None], message):
     columns = hits.copy()
     change(columns)
     with pytest.raises(DatasetError, match=message):
@@ -555,7 +555,7 @@ def test_rows_of_another_shape_are_refused(hits, change: Callable[[Columns], Non
 
 @dataclass(frozen=True, kw_only=True)
 class HighElbow(Constraint):
-    """A constraint that cnpgen does not know."""
+    """A constraint of a plug-in."""
 
     reason = "elbow too low"
     tolerance: float = 0.0
@@ -573,30 +573,30 @@ class HighElbow(Constraint):
         return (Condition("elbow", "rad", [float(world.q[1])], np.array([-9.0]), np.array([self.height]), "angle"),)
 
 
-def test_constraint_of_a_plug_in_is_judged(hits):
+def test_a_constraint_of_a_plug_in_is_checked(hits):
     angles = hits.columns["goal_q"][:, 1]
     problem = replace(AIRHOCKEY, constraint=(*AIRHOCKEY.constraint, HighElbow(height=float(np.sort(angles)[-2]))))
     report = verify_rows(problem, hits.robot, hits.columns)
     (check,) = report.failed
-    assert (check.name, check.rows_out, check.worst_end) == ("elbow", 1, "goal")
-    assert report.out.tolist() == [angles.argmax()]
+    assert (check.name, check.n_failed, check.worst_end) == ("elbow", 1, "goal")
+    assert report.failed_rows.tolist() == [angles.argmax()]
 
 
 # --- the world --------------------------------------------------------------------------------------------------------
 
 
-def test_tops_follow_the_object_or_are_fixed():
+def test_obstacle_poses_follow_the_object_or_are_fixed():
     high = replace(HEAVY.obstacle[1], top=0.7, below="")
     problem = replace(HEAVY, obstacle=(HEAVY.obstacle[0], high, HEAVY.obstacle[1]))
-    tops = obstacle_tops(problem, np.array([[0.4, -0.4, 0.5], [0.4, -0.4, 0.6]]), np.array([[0.4, 0.4, 0.3]] * 2))
-    np.testing.assert_allclose(tops, [[0.35, 0.7, 0.15], [0.45, 0.7, 0.15]])
-    np.testing.assert_allclose(obstacle_tops(problem, np.array([0, 0, 0.5]), np.array([0, 0, 0.3])), tops[0])
+    poses = obstacle_poses_of(problem, np.array([[0.4, -0.4, 0.5], [0.4, -0.4, 0.6]]), np.array([[0.4, 0.4, 0.3]] * 2))
+    np.testing.assert_allclose(poses, [[0.35, 0.7, 0.15], [0.45, 0.7, 0.15]])
+    np.testing.assert_allclose(obstacle_poses_of(problem, np.array([0, 0, 0.5]), np.array([0, 0, 0.3])), poses[0])
 
 
-def test_scene_measures_segments_in_order_and_exactly():
-    scene = Scene(None, 3)
+def test_the_collision_world_measures_segments_in_order_and_exactly():
+    scene = CollisionWorld(None, 3)
     scene.place(solids_of(HEAVY.obstacle, np.array([0.5, 0.4])))
-    up = ((0.4, -0.45, 0.6), (0.4, -0.45, 0.9))  # over the first, 0.75 m beside the second
+    up = ((0.4, -0.45, 0.6), (0.4, -0.45, 0.9))  # over the first, 0.75 m from the second
     across = ((0.4, -0.2, 0.2), (0.4, 0.2, 0.2))  # 0.1 m from both
     inside = ((0.3, -0.4, 0.3), (0.5, 0.4, 0.1))
     beside = np.hypot(0.75, 0.2)
@@ -604,35 +604,35 @@ def test_scene_measures_segments_in_order_and_exactly():
     np.testing.assert_allclose(scene.segment_distances([up, across, inside]), expected, atol=1e-9)
 
 
-def test_scene_measures_a_segment_of_no_length():
-    scene = Scene(None, 1)
+def test_the_collision_world_measures_a_segment_of_length_zero():
+    scene = CollisionWorld(None, 1)
     scene.place(solids_of(HEAVY.obstacle, np.array([0.5, 0.4])))
     np.testing.assert_allclose(scene.segment_distances([((0.4, 0.0, 0.2),) * 2]), [0.3, 0.3], atol=1e-9)
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.3, np.pi / 2])
 @pytest.mark.parametrize("depth", [-0.1, -1e-9, 0.0, 1e-9, 1e-3, 0.1])
-def test_scene_measures_how_deep_an_object_enters(turn, depth):
-    scene = Scene((0.2, 0.2, 0.3), 0)
+def test_the_collision_world_measures_the_penetration_depth_of_an_object(turn, depth):
+    scene = CollisionWorld((0.2, 0.2, 0.3), 0)
     scene.place(solids_of(HEAVY.obstacle, np.array([0.5, -3.0])))
     position, rotation = np.array([0.41, -0.44, 0.65 - depth]), pin.exp3(np.array([0.0, 0.0, turn]))
     assert scene.object_distances(position, rotation)[0] == pytest.approx(-depth, abs=1e-10)
 
 
-def test_distance_of_an_object_that_is_not_held_is_refused(hits):
+def test_the_distance_of_a_missing_object_raises_an_error(hits):
     with pytest.raises(RecipeError, match="no \\[object\\]"):
         World(hits.robot, AIRHOCKEY.obstacle, AIRHOCKEY.object_size).object_distances()
 
 
-def test_state_of_a_world_is_replaced_as_a_whole(carries):
+def test_setting_a_state_replaces_the_whole_state(carries):
     world, fresh = (
         World(carries.robot, HEAVY.obstacle, HEAVY.object_size),
         World(carries.robot, HEAVY.obstacle, HEAVY.object_size),
     )
-    tops, zero = np.array([0.3, 0.4]), np.zeros(7)
-    world.set_state(carries.columns["goal_q"][0], zero + 1, zero + 2, tops + 1)
+    poses, zero = np.array([0.3, 0.4]), np.zeros(7)
+    world.set_state(carries.columns["goal_q"][0], zero + 1, zero + 2, poses + 1)
     _ = world.torque, world.tip_velocity, world.segment_distances(), world.object_distances()
-    state = carries.columns["start_q"][0], zero, zero - 1, tops
+    state = carries.columns["start_q"][0], zero, zero - 1, poses
     for one in (world, fresh):
         one.set_state(*state)
     for name in ("q", "dq", "ddq", "torque", "tip_position", "tip_rotation", "tip_velocity", "tip_acceleration"):

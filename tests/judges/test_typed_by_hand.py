@@ -1,7 +1,6 @@
-"""Rows against numbers that are typed in here: a mistake in how limits, frames or obstacles are read would be seen.
+"""Rows compared with literal values of the data sheet and the paper, to detect wrong limits, frames or obstacles.
 
-Everything else recomputes rows from the problem files. This takes the figures of the data sheet and of the paper, as
-literals, and the rows, and nothing of the package but the reader.
+Other tests recompute rows from the problem files. This one uses only the rows and the reader of the package.
 """
 
 from collections.abc import Callable
@@ -33,18 +32,18 @@ ACCELERATION = np.minimum(10 * VELOCITY, 20.0)
 
 
 def placements(q: Array) -> list[tuple[Array, Array]]:
-    """Rotations (N, 3, 3) and origins (N, 3) of the seven joint frames, for q of shape (N, 6 or 7)."""
-    rotation, origin, found = np.eye(3), np.zeros(3), []
+    """Compute rotations (N, 3, 3) and origins (N, 3) of the seven joint frames, for q of shape (N, 6 or 7)."""
+    rotation, origin, frames = np.eye(3), np.zeros(3), []
     for (offset, angles), turn in zip(JOINTS, np.hstack([q, np.zeros((len(q), 7 - q.shape[1]))]).T, strict=True):
         origin = origin + rotation @ np.array(offset, float)
         fixed, moved = Rotation.from_euler("xyz", angles), Rotation.from_euler("z", turn[:, None])
         rotation = rotation @ fixed.as_matrix() @ moved.as_matrix()
-        found.append((rotation, origin))
-    return found
+        frames.append((rotation, origin))
+    return frames
 
 
 def tip(q: Array, length: float) -> Array:
-    """A point on the flange's axis [m], shape (N, 3)."""
+    """Compute a point on the flange's axis [m], shape (N, 3)."""
     rotation, origin = placements(q)[-1]
     return origin + rotation @ np.array([0.0, 0.0, length])
 
@@ -64,10 +63,10 @@ def test_hits_are_within_the_planning_limits_of_the_data_sheet(hits):
         assert np.all(np.abs(hits[f"{end}_q"]) <= POSITION[:6] * (1 + 1e-12))
         assert np.all(np.abs(hits[f"{end}_dq"]) <= VELOCITY[:6] * (1 + 1e-12))
     assert np.all(np.abs(hits["start_ddq"]) <= ACCELERATION[:6] * (1 + 1e-12))
-    assert np.abs(hits["goal_dq"] / VELOCITY[:6]).max() > 0.999999  # and no slower limit was taken for them
+    assert np.abs(hits["goal_dq"] / VELOCITY[:6]).max() > 0.999999  # and no lower limit was used for them
 
 
-def test_the_mallet_is_on_the_table_where_the_row_says(hits):
+def test_the_mallet_is_on_the_table_at_the_stored_position(hits):
     for end in ("start", "goal"):
         position = tip(hits[f"{end}_q"], 0.07 + 0.515)
         assert np.abs(position - hits[f"{end}_xyz"]).max() < 1e-8
@@ -85,20 +84,20 @@ def test_the_mallet_moves_along_the_hit_and_not_up_or_down(hits):
     assert hits["hit_speed"].max() > 1.0
 
 
-def test_the_object_is_carried_upright_between_typed_positions(carries):
+def test_the_object_is_upright_between_literal_positions(carries):
     assert np.all(np.abs(carries["start_q"]) <= POSITION * (1 + 1e-12))
     assert np.all(np.abs(carries["goal_q"]) <= POSITION * (1 + 1e-12))
     for end, (low, high) in (("start", (-0.6, -0.3)), ("goal", (0.3, 0.6))):
         rotation, _ = placements(carries[f"{end}_q"])[-1]
-        centre = tip(carries[f"{end}_q"], 0.07 + 0.1)
+        center = tip(carries[f"{end}_q"], 0.07 + 0.1)
         up = (rotation @ Rotation.from_euler("x", -HALF_PI).as_matrix())[:, :, 2]
-        assert np.abs(centre - carries[f"{end}_xyz"]).max() < 1e-8
+        assert np.abs(center - carries[f"{end}_xyz"]).max() < 1e-8
         assert np.abs(up - [0, 0, 1]).max() < 1e-8
-        assert np.all((centre[:, 0] >= 0.2) & (centre[:, 0] <= 0.6) & (centre[:, 1] >= low) & (centre[:, 1] <= high))
+        assert np.all((center[:, 0] >= 0.2) & (center[:, 0] <= 0.6) & (center[:, 1] >= low) & (center[:, 1] <= high))
 
 
-def test_the_arm_keeps_clear_of_the_typed_pedestals(carries):
-    """Each pedestal ends 0.15 m below the object's centre at its end; within 0.14 m of the arm's line there is none."""
+def test_the_arm_keeps_clear_of_the_literal_pedestals(carries):
+    """Each pedestal is 0.15 m below the object's center at its end; the arm's segments keep 0.14 m of distance."""
     nearest = np.inf
     for q in (carries["start_q"], carries["goal_q"]):
         origins = [origin for _, origin in placements(q)]
@@ -106,10 +105,10 @@ def test_the_arm_keeps_clear_of_the_typed_pedestals(carries):
         points = np.array([a + share * (b - a) for a, b in pairwise(line) for share in np.linspace(0, 1, 51)])
         for end, (low, high) in (("start", (-0.6, -0.3)), ("goal", (0.3, 0.6))):
             top = carries[f"{end}_xyz"][:, 2] - 0.15
-            beyond = [
+            offsets = [
                 points[..., 0] - np.clip(points[..., 0], 0.2, 0.6),
                 points[..., 1] - np.clip(points[..., 1], low, high),
                 np.maximum(points[..., 2] - top, 0.0),
             ]
-            nearest = min(nearest, np.sqrt(np.sum(np.square(beyond), axis=0)).min())
-    assert 0.14 - 1e-8 < nearest < 0.15  # and no wider margin was taken
+            nearest = min(nearest, np.sqrt(np.sum(np.square(offsets), axis=0)).min())
+    assert 0.14 - 1e-8 < nearest < 0.15  # and no larger distance was used

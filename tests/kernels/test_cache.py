@@ -1,4 +1,4 @@
-"""Where kernels are kept: the folder that the environment says, or one that goes away with its process."""
+"""The cache folder of kernels: the choice of the folder, temporary folders, permissions and read-only caches."""
 
 import logging
 import os
@@ -15,19 +15,25 @@ import pytest
 
 from cnpgen.cli.notices import notices
 from cnpgen.errors import MachineError
-from cnpgen.kernels.cache import default_cache_folder, distrusted, distrusted_files, make_private, usable_folder
+from cnpgen.kernels.cache import (
+    default_cache_folder,
+    make_private_folder,
+    trust_problem,
+    untrusted_files,
+    usable_cache_folder,
+)
 from cnpgen.kernels.library import KernelLibrary, choose_backend
 from tests.conftest import needs_compiler, some
 
 posix = pytest.mark.skipif(not hasattr(os, "geteuid"), reason="files have no owners here")
-BUILT: list[str] = []  # what was built and not found in a cache
+BUILT: list[str] = []  # names of functions that were built
 
 FALLBACK = """
 import os, sys, warnings
 from pathlib import Path
-from cnpgen.kernels.cache import usable_folder
+from cnpgen.kernels.cache import usable_cache_folder
 warnings.simplefilter("ignore")
-folder = usable_folder(Path(sys.argv[1]))
+folder = usable_cache_folder(Path(sys.argv[1]))
 child = os.fork()
 if child == 0:
     sys.exit()
@@ -38,7 +44,7 @@ print(folder, folder.is_dir())
 
 @pytest.fixture
 def unwritable(tmp_path: Path) -> Path:
-    """A folder that cannot be made, whoever tries."""
+    """Return a folder that cannot be created, not even by root."""
     (tmp_path / "file").write_text("not a folder")
     return tmp_path / "file" / "cache"
 
@@ -54,7 +60,7 @@ def tripling():
     return ca.Function("tripling", [x], [3 * x])
 
 
-def test_the_cache_is_where_the_environment_says(monkeypatch, tmp_path):
+def test_the_cache_folder_follows_the_environment(monkeypatch, tmp_path):
     monkeypatch.setenv("CNPGEN_CACHE", "/a/b")
     assert default_cache_folder() == Path("/a/b")
     monkeypatch.delenv("CNPGEN_CACHE")
@@ -65,7 +71,7 @@ def test_the_cache_is_where_the_environment_says(monkeypatch, tmp_path):
     assert default_cache_folder() == tmp_path / ".cache" / "cnpgen"
 
 
-def test_a_user_without_home_folder_is_told_what_to_set(monkeypatch):
+def test_without_a_home_folder_the_error_names_the_variable(monkeypatch):
     for name in ("CNPGEN_CACHE", "XDG_CACHE_HOME"):
         monkeypatch.delenv(name, raising=False)
 
@@ -77,15 +83,15 @@ def test_a_user_without_home_folder_is_told_what_to_set(monkeypatch):
         choose_backend()
 
 
-def test_a_folder_that_can_be_written_is_taken_without_a_word(tmp_path):
+def test_a_writable_folder_is_used_without_a_warning(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert usable_folder(tmp_path / "new") == tmp_path / "new"
+        assert usable_cache_folder(tmp_path / "new") == tmp_path / "new"
 
 
-def test_a_file_in_the_place_of_the_folder_is_said_to_be_none(unwritable):
+def test_a_file_at_the_path_of_the_folder_causes_a_warning(unwritable):
     with pytest.warns(RuntimeWarning, match=rf"cannot write the kernel cache {unwritable.parent} \(Not a directory\)"):
-        assert usable_folder(unwritable.parent).is_dir()
+        assert usable_cache_folder(unwritable.parent).is_dir()
 
 
 @needs_compiler
@@ -102,7 +108,7 @@ def test_kernels_are_compiled_in_a_temporary_folder_after_one_warning(unwritable
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system cannot fork")
-def test_a_temporary_folder_is_removed_by_the_process_that_made_it_and_by_no_other(unwritable):
+def test_a_temporary_folder_is_removed_only_by_the_process_that_created_it(unwritable):
     command = [sys.executable, "-c", FALLBACK, str(unwritable)]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     folder, was_there = done.stdout.split()
@@ -111,7 +117,7 @@ def test_a_temporary_folder_is_removed_by_the_process_that_made_it_and_by_no_oth
 
 
 @needs_compiler
-def test_compiling_is_announced_once_and_only_where_it_happens(tmp_path, capsys):
+def test_compilation_is_announced_once_and_only_if_it_happens(tmp_path, capsys):
     library = KernelLibrary("compiled", tmp_path, "test")
     with notices():
         library.load(doubling)
@@ -122,7 +128,7 @@ def test_compiling_is_announced_once_and_only_where_it_happens(tmp_path, capsys)
     assert capsys.readouterr().err == ""
 
 
-def test_notices_are_printed_once_each_and_not_where_quiet_is_asked_for(capsys):
+def test_notices_are_printed_once_each_and_not_in_quiet_mode(capsys):
     logger = logging.getLogger("cnpgen.some.module")
     with notices():
         for text in ("first", "second", "first"):
@@ -134,7 +140,7 @@ def test_notices_are_printed_once_each_and_not_where_quiet_is_asked_for(capsys):
     assert capsys.readouterr() == ("", "")
 
 
-# --- nobody else may change it ----------------------------------------------------------------------------------------
+# --- permissions ------------------------------------------------------------------------------------------------------
 
 
 def mode(path: Path) -> int:
@@ -143,7 +149,7 @@ def mode(path: Path) -> int:
 
 @pytest.fixture
 def give_away(monkeypatch) -> Callable[[Path], None]:
-    """Let a path belong to somebody else, whoever runs the tests."""
+    """Return a function that makes a path appear to belong to another user."""
 
     def give(path: Path) -> None:
         if os.geteuid() == 0:
@@ -156,10 +162,10 @@ def give_away(monkeypatch) -> Callable[[Path], None]:
 
 @posix
 @pytest.mark.parametrize("umask", [0o000, 0o077, 0o277])
-def test_a_new_cache_is_for_its_user_alone_whatever_the_umask_is(tmp_path, umask):
+def test_a_new_cache_is_private_for_any_umask(tmp_path, umask):
     before = os.umask(umask)
     try:
-        folder = usable_folder(tmp_path / "a" / "b")
+        folder = usable_cache_folder(tmp_path / "a" / "b")
         KernelLibrary("numpy", folder, "test").load(doubling)
     finally:
         os.umask(before)
@@ -167,13 +173,13 @@ def test_a_new_cache_is_for_its_user_alone_whatever_the_umask_is(tmp_path, umask
     assert {mode(path) for path in (folder.parent, folder, folder / "tape")} == {0o700}
     (tape,) = (folder / "tape").iterdir()
     assert not mode(tape) & 0o022
-    assert not distrusted(folder)
-    assert not distrusted_files(folder)
+    assert not trust_problem(folder)
+    assert not untrusted_files(folder)
 
 
 @needs_compiler
 @posix
-def test_libraries_that_a_careless_umask_would_open_are_closed(tmp_path):
+def test_libraries_are_not_writable_for_others_under_a_permissive_umask(tmp_path):
     before = os.umask(0)
     try:
         KernelLibrary("compiled", tmp_path / "new", "test").load(doubling)
@@ -185,45 +191,45 @@ def test_libraries_that_a_careless_umask_would_open_are_closed(tmp_path):
 
 
 def refused(folder: Path, why: str) -> None:
-    """The folder is refused by whoever would use it, with the reason, and nothing is put into it."""
+    """Check that the folder is refused with the reason and that nothing is written to it."""
     before = sorted(folder.rglob("*"))
     with pytest.warns(RuntimeWarning, match=f"the kernel cache .* is not used, as .*{why}.*set CNPGEN_CACHE"):
-        assert usable_folder(folder) != folder
+        assert usable_cache_folder(folder) != folder
     with pytest.raises(MachineError, match=why):
         KernelLibrary("numpy", folder, "test").load(doubling)
     assert sorted(folder.rglob("*")) == before
 
 
 @posix
-def test_a_cache_that_others_may_write_to_is_refused(tmp_path):
+def test_a_cache_that_is_writable_for_others_is_refused(tmp_path):
     folder = tmp_path / "above" / "cache"
-    make_private(folder / "lib")
+    make_private_folder(folder / "lib")
     for path in (folder, folder.parent, folder / "lib"):
         for bits in (0o770, 0o702, 0o1777):
             path.chmod(bits)
             if bits == 0o1777 and path == folder.parent:
-                assert not distrusted(folder)  # as in /tmp: nobody moves what is another's
+                assert not trust_problem(folder)  # as in /tmp: only owners rename their entries
             else:
                 refused(folder, f"others may write to {path}")
         path.chmod(0o700)
-    assert not distrusted(folder)
+    assert not trust_problem(folder)
 
 
 @posix
 @pytest.mark.parametrize("name", ["cache", "cache/tape", "."])
 def test_a_cache_that_belongs_to_another_user_is_refused(tmp_path, give_away, name):
     folder = tmp_path / "cache"
-    make_private(folder / "tape")
+    make_private_folder(folder / "tape")
     give_away(tmp_path / name)
     refused(folder, "belongs to another user")
 
 
 @posix
-def test_links_are_followed_to_where_they_lead_and_not_at_all_inside(tmp_path):
+def test_links_to_the_cache_are_followed_and_links_inside_it_are_refused(tmp_path):
     there, folder = tmp_path / "scratch" / "there", tmp_path / "cache"
-    make_private(there)
+    make_private_folder(there)
     folder.symlink_to(there)
-    assert usable_folder(folder) == folder
+    assert usable_cache_folder(folder) == folder
     there.parent.chmod(0o777)
     refused(folder, f"others may write to {there.parent}")
     there.parent.chmod(0o700)
@@ -236,7 +242,7 @@ def test_links_are_followed_to_where_they_lead_and_not_at_all_inside(tmp_path):
 @posix
 @pytest.mark.parametrize("how", some(["open to others", "of another user", "a link"], 1, "slow"))
 @pytest.mark.parametrize("kind", ["lib", "tape"])
-def test_a_planted_file_is_as_if_it_were_not_there_and_is_replaced(tmp_path, give_away, kind, how):
+def test_an_untrusted_file_is_ignored_and_replaced(tmp_path, give_away, kind, how):
     folder = tmp_path / "cache"
     library = KernelLibrary("compiled", folder, "test")
     library.load(doubling)
@@ -251,17 +257,17 @@ def test_a_planted_file_is_as_if_it_were_not_there_and_is_replaced(tmp_path, giv
     else:
         path.rename(tmp_path / "elsewhere")
         path.symlink_to(tmp_path / "elsewhere")
-    assert distrusted_files(folder) == [path]
+    assert untrusted_files(folder) == [path]
     BUILT.clear()
     library.load(doubling)
     assert len(BUILT) == (kind == "tape")
     assert not path.is_symlink()
     assert path.read_bytes() == planted
     assert path.stat().st_ino != inode
-    assert distrusted_files(folder) == []
+    assert untrusted_files(folder) == []
 
 
-def test_a_file_that_is_moved_to_its_place_while_the_cache_is_looked_through_is_nobodys(tmp_path, monkeypatch):
+def test_a_file_that_disappears_while_the_cache_is_checked_causes_no_error(tmp_path, monkeypatch):
     (tmp_path / "tape").mkdir()
     (tmp_path / "tape" / ".unfinished.tmp").write_text("")
     seen = Path.is_symlink
@@ -272,7 +278,7 @@ def test_a_file_that_is_moved_to_its_place_while_the_cache_is_looked_through_is_
         return found
 
     monkeypatch.setattr(Path, "is_symlink", moved)
-    assert distrusted_files(tmp_path) == []
+    assert untrusted_files(tmp_path) == []
 
 
 READ_ONLY = """
@@ -285,8 +291,8 @@ warnings.simplefilter("error")
 logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
 def refuse(**_):
     raise PermissionError(13, "Permission denied")
-cache.tempfile.TemporaryFile = refuse  # root may write everywhere
-folder = cache.usable_folder(Path(sys.argv[1]))
+cache.tempfile.TemporaryFile = refuse  # root can write everywhere
+folder = cache.usable_cache_folder(Path(sys.argv[1]))
 assert folder != Path(sys.argv[1])
 KernelLibrary("compiled", folder, "test").load(doubling)
 assert not BUILT
@@ -297,11 +303,11 @@ assert len(list((folder / "lib").iterdir())) == 1
 
 @pytest.mark.slow
 @needs_compiler
-def test_a_cache_that_can_only_be_read_is_read_and_what_it_lacks_is_compiled_for_the_run(tmp_path):
+def test_a_read_only_cache_is_read_and_missing_kernels_are_compiled_temporarily(tmp_path):
     warm = tmp_path / "warm"
     KernelLibrary("compiled", warm, "test").load(doubling)
     before = sorted(warm.rglob("*"))
     done = subprocess.run([sys.executable, "-c", READ_ONLY, str(warm)], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert done.stdout == f"compiling kernels for this run only: the cache {warm} lacks them and cannot be written\n"
+    assert done.stdout == f"compiling kernels for this run only: the cache {warm} lacks them and is not writable\n"
     assert sorted(warm.rglob("*")) == before

@@ -1,4 +1,4 @@
-"""Kernels: tapes, and the three backends that run them, against each other, against NumPy and against plain Python."""
+"""Tapes and the three backends that run them, against each other, NumPy and plain Python."""
 
 import itertools
 import math
@@ -18,16 +18,16 @@ import numpy as np
 import pytest
 
 from cnpgen.errors import MachineError, UsageError
-from cnpgen.kernels import compiled, compiler
+from cnpgen.kernels import compiled_kernel, compiler
 from cnpgen.kernels import library as library_module
-from cnpgen.kernels.cache import make_private, one_at_a_time
-from cnpgen.kernels.compiled import CompiledKernel, compile_tape
+from cnpgen.kernels.cache import exclusive_lock, make_private_folder
+from cnpgen.kernels.compiled_kernel import CompiledKernel, compile_tape
 from cnpgen.kernels.compiler import find_compiler, vector_flags
 from cnpgen.kernels.emit import emit
-from cnpgen.kernels.interpreted import BLOCK, InterpretedKernel
+from cnpgen.kernels.interpreted_kernel import POINTS_PER_BLOCK, InterpretedKernel
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary, choose_backend
-from cnpgen.kernels.mapped import MappedKernel
+from cnpgen.kernels.mapped_kernel import MappedKernel
 from cnpgen.kernels.tape import CODES, NAMES, Loop, Tape, tape_from_function
 from tests.conftest import HANGING, Prepare, needs_compiler, some
 from tests.machine.test_workers import alive
@@ -62,8 +62,8 @@ BINARY: dict[str, Callable[[ca.SX, ca.SX], ca.SX]] = {
     "OR": ca.logic_or,
     "IF_ELSE_ZERO": lambda a, b: ca.if_else(a, b, 0),
 }
-# What the operations are, in the words of IEEE 754 and C: fmin and fmax ignore a nan, a nan is true.
-MEANING: dict[str, Callable[..., Array]] = {
+# The operations according to IEEE 754 and C: fmin and fmax ignore a nan, a nan is true.
+REFERENCE: dict[str, Callable[..., Array]] = {
     "NEG": np.negative, "SQ": np.square, "TWICE": lambda x: 2 * x, "INV": np.reciprocal, "SQRT": np.sqrt,
     "FABS": np.abs, "SIGN": np.sign, "NOT": lambda x: 1.0 * (x == 0), "EXP": np.exp, "SIN": np.sin, "COS": np.cos,
     "ADD": np.add, "SUB": np.subtract, "MUL": np.multiply, "DIV": np.divide, "FMIN": np.fmin, "FMAX": np.fmax,
@@ -76,7 +76,7 @@ BACKENDS = [pytest.param("compiled", marks=needs_compiler), "numpy", "casadi"]
 
 
 def ulps(found: Array, expected: Array) -> Array:
-    """Distance in units in the last place of what is expected; 0 for two nans or two equal infinities."""
+    """Return the distance in units in the last place of ``expected``; 0 for two nans or two equal infinities."""
     with np.errstate(invalid="ignore"):
         same = (found == expected) | (np.isnan(found) & np.isnan(expected))
         return np.where(same, 0.0, np.abs(found - expected) / np.spacing(np.abs(expected)))
@@ -91,7 +91,7 @@ def kernel_of(function: ca.Function, backend: str, folder: Path, loop: Loop | No
 
 @pytest.fixture(scope="module")
 def operations() -> ca.Function:
-    """Every operation that a tape can hold, applied to the same two numbers."""
+    """Build a function with every operation of a tape, applied to the same two numbers."""
     a, b = ca.SX.sym("a"), ca.SX.sym("b")
     return ca.Function("operations", [a, b], [f(a) for f in UNARY.values()] + [f(a, b) for f in BINARY.values()])
 
@@ -120,26 +120,26 @@ def evaluated(operations: ca.Function, operands: Array, cache_folder: Path) -> d
 def test_all_operations_of_a_tape_are_tested(operations):
     used = {NAMES[code] for code in tape_from_function(operations).operation}
     assert used | {"CONST"} == set(NAMES)
-    assert MEANING.keys() == UNARY.keys() | BINARY.keys()
+    assert REFERENCE.keys() == UNARY.keys() | BINARY.keys()
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("name", [*UNARY, *BINARY])
-def test_operation_does_what_ieee_754_says_on_random_and_special_numbers(evaluated, operands, backend, name):
+def test_operations_follow_ieee_754_on_random_and_special_numbers(evaluated, operands, backend, name):
     with np.errstate(all="ignore"):
-        expected = MEANING[name](*operands[: 1 if name in UNARY else 2])
+        expected = REFERENCE[name](*operands[: 1 if name in UNARY else 2])
     allowed = 2.0 if name in ("SIN", "COS", "EXP") else 0.0
     wrong = np.flatnonzero(ulps(evaluated[backend][name], expected) > allowed)
     assert len(wrong) == 0, [(*operands[:, k], evaluated[backend][name][k], expected[k]) for k in wrong[:5]]
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_sine_and_cosine_are_within_2_ulp_up_to_1e5_also_beside_their_zeros(cache_folder, backend):
+def test_sine_and_cosine_are_within_2_ulp_up_to_1e5_also_next_to_their_zeros(cache_folder, backend):
     random = np.random.default_rng(1)
     turns = np.arange(-70_000, 70_000, 7) * (np.pi / 2)
-    beside = np.concatenate([np.nextafter(turns, side) for side in (-np.inf, np.inf)])
+    neighbors = np.concatenate([np.nextafter(turns, side) for side in (-np.inf, np.inf)])
     angles = np.concatenate(
-        [random.uniform(-10, 10, 20_000), random.uniform(-1e5, 1e5, 20_000), turns, beside, 1e5 - np.arange(100.0)]
+        [random.uniform(-10, 10, 20_000), random.uniform(-1e5, 1e5, 20_000), turns, neighbors, 1e5 - np.arange(100.0)]
     )
     x = ca.SX.sym("x")
     kernel = kernel_of(ca.Function("sincos", [x], [ca.sin(x), ca.cos(x)]), backend, cache_folder)
@@ -150,7 +150,7 @@ def test_sine_and_cosine_are_within_2_ulp_up_to_1e5_also_beside_their_zeros(cach
 
 @pytest.fixture(scope="module")
 def mixed() -> ca.Function:
-    """Two arguments, two results, constants among them, every lane different."""
+    """Build a function with two arguments and two results, constants among them."""
     x, p = ca.SX.sym("x", 3), ca.SX.sym("p", 2)
     first = ca.vertcat(ca.sin(x[0]) * p[1], x[1] / (1 + p[0] ** 2), 2.5, ca.fmax(x[2], p[0]))
     return ca.Function("mixed", [x, p], [first, ca.if_else(x[0] < p[0], x[1] - x[2], ca.sqrt(x[0] ** 2))])
@@ -162,7 +162,7 @@ def mixed_in_numpy(x: Array, p: Array) -> list[Array]:
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("n", [0, 1, 2, 3, 5, 7, 8, 9, BLOCK + 1])
+@pytest.mark.parametrize("n", [0, 1, 2, 3, 5, 7, 8, 9, POINTS_PER_BLOCK + 1])
 def test_batches_of_any_size_are_evaluated_lane_by_lane(mixed, cache_folder, backend, n):
     kernel = kernel_of(mixed, backend, cache_folder)
     random = np.random.default_rng(n)
@@ -174,7 +174,7 @@ def test_batches_of_any_size_are_evaluated_lane_by_lane(mixed, cache_folder, bac
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_a_lane_s_bits_do_not_depend_on_the_batch_that_it_is_in(mixed, cache_folder, backend):
+def test_the_bits_of_a_lane_do_not_depend_on_its_batch(mixed, cache_folder, backend):
     kernel = kernel_of(mixed, backend, cache_folder)
     random = np.random.default_rng(2)
     x, p = random.normal(size=(3, 29)), random.normal(size=(2, 29))
@@ -186,7 +186,7 @@ def test_a_lane_s_bits_do_not_depend_on_the_batch_that_it_is_in(mixed, cache_fol
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_rows_of_arguments_may_be_any_distance_apart(mixed, cache_folder, backend):
+def test_rows_of_arguments_may_have_any_stride(mixed, cache_folder, backend):
     kernel = kernel_of(mixed, backend, cache_folder)
     store = np.random.default_rng(3).normal(size=(12, 60))
     every_other, backwards = store[1:7:2, 11:30], store[5:3:-1, 2:21]
@@ -209,13 +209,13 @@ def test_rows_of_arguments_may_be_any_distance_apart(mixed, cache_folder, backen
         pytest.param((np.zeros(12), np.zeros((2, 4))), id="one dimension"),
     ],
 )
-def test_arguments_that_do_not_fit_are_refused(mixed, cache_folder, backend, arguments):
+def test_arguments_of_a_wrong_shape_or_type_are_refused(mixed, cache_folder, backend, arguments):
     with pytest.raises(ValueError, match="mixed"):
         kernel_of(mixed, backend, cache_folder)(*arguments)
 
 
 @needs_compiler
-def test_arguments_may_be_read_only_or_begin_anywhere(mixed, cache_folder):
+def test_arguments_may_be_read_only_or_unaligned(mixed, cache_folder):
     whole = np.random.default_rng(3).normal(size=(5, 9))
     stored = np.frombuffer(b"\0" + whole.tobytes(), "f8", offset=1).reshape(5, 9)
     assert not stored.flags.aligned
@@ -226,7 +226,7 @@ def test_arguments_may_be_read_only_or_begin_anywhere(mixed, cache_folder):
 
 
 @needs_compiler
-def test_what_only_looks_like_an_array_is_refused_by_compiled_kernels(mixed, cache_folder):
+def test_objects_other_than_arrays_are_refused_by_compiled_kernels(mixed, cache_folder):
     array = np.zeros((3, 4))
     alike = SimpleNamespace(shape=array.shape, dtype=array.dtype, strides=array.strides, size=array.size)
     with pytest.raises(ValueError, match="mixed: arguments must be NumPy arrays"):
@@ -259,14 +259,14 @@ ROOT = Loop(tolerance=1e-3, limit=12)
 
 @pytest.fixture(scope="module")
 def root() -> ca.Function:
-    """Heron's rule for the square root of p; the second state counts the steps."""
+    """Build Heron's iteration for the square root of p; the second state counts the steps."""
     x, p = ca.SX.sym("x", 2), ca.SX.sym("p")
     error = ca.fabs(x[0] * x[0] - p)
     return ca.Function("heron", [x, p], [ca.vertcat(0.5 * (x[0] + p / x[0]), x[1] + 1), error])
 
 
 def heron(x: float, p: float) -> tuple[float, float, float]:
-    """One lane in plain Python."""
+    """Compute one lane in plain Python."""
     error, count = math.nan, 0
     while count < ROOT.limit:
         error = abs(x * x - p)
@@ -285,7 +285,7 @@ def root_lanes(n: int) -> tuple[Array, Array]:
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_a_loop_takes_each_lane_to_convergence_and_one_step_further(root, cache_folder, backend):
+def test_a_loop_iterates_each_lane_to_convergence_plus_one_step(root, cache_folder, backend):
     x, p = root_lanes(100)
     state, error = kernel_of(root, backend, cache_folder, ROOT)(x, p)
     expected = np.array([heron(*lane) for lane in zip(x[0].tolist(), p[0].tolist(), strict=True)]).T
@@ -305,7 +305,7 @@ def test_a_lane_that_does_not_converge_stops_at_the_limit_with_its_error(root, c
 
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("n", [0, 1, 3, 8, 9, 61])
-def test_a_loop_s_lanes_do_not_depend_on_their_neighbours(root, cache_folder, backend, n):
+def test_lanes_of_a_loop_do_not_depend_on_their_neighbors(root, cache_folder, backend, n):
     kernel = kernel_of(root, backend, cache_folder, ROOT)
     x, p = root_lanes(61)
     whole = kernel(x, p)
@@ -342,7 +342,7 @@ def test_solvers_give_the_same_bits_in_any_order_of_lanes(prepare: Prepare, back
 # --- tapes ------------------------------------------------------------------------------------------------------------
 
 
-def test_tapes_come_back_from_their_bytes_as_they_were(mixed, root):
+def test_tapes_are_restored_from_bytes(mixed, root):
     for tape in (tape_from_function(mixed), tape_from_function(root, ROOT)):
         again = Tape.from_bytes(tape.to_bytes())
         assert (again.name, again.inputs, again.outputs, again.loop) == (
@@ -366,7 +366,7 @@ def test_a_function_that_is_built_twice_gives_the_same_bytes(prepare):
     assert first == second
 
 
-def test_damaged_tapes_raise_wherever_the_damage_is(root):
+def test_a_tape_with_any_damaged_byte_raises(root):
     data = tape_from_function(root, ROOT).to_bytes()
     for position in range(0, len(data), 37):
         flipped = bytearray(data)
@@ -379,7 +379,7 @@ def test_damaged_tapes_raise_wherever_the_damage_is(root):
         Tape.from_bytes(data + b"\0")
 
 
-def test_operations_that_tapes_do_not_have_are_refused():
+def test_unsupported_operations_are_refused():
     x = ca.SX.sym("x")
     with pytest.raises(ValueError, match="tangent: operation"):
         tape_from_function(ca.Function("tangent", [x], [ca.tan(x)]))
@@ -395,7 +395,7 @@ def test_sparse_arguments_and_results_are_refused():
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_constants_may_be_infinite_or_no_numbers(cache_folder, backend):
+def test_constants_may_be_infinite_or_nan(cache_folder, backend):
     x = ca.SX.sym("x")
     constants = [math.inf, -math.inf, math.nan, 0.1, -1e300, 5e-324]
     kernel = kernel_of(ca.Function("constants", [x], [ca.vertcat(*constants), x]), backend, cache_folder)
@@ -403,7 +403,7 @@ def test_constants_may_be_infinite_or_no_numbers(cache_folder, backend):
     np.testing.assert_array_equal(found, np.repeat(np.array(constants)[:, None], 5, axis=1))
 
 
-# --- the C that is written --------------------------------------------------------------------------------------------
+# --- emitted C --------------------------------------------------------------------------------------------------------
 
 
 def machine_flags() -> set[str]:
@@ -421,7 +421,8 @@ def machine_flags() -> set[str]:
 def test_the_emitted_c_compiles_for_every_vector_width_and_gives_the_same_numbers(
     prepare: Prepare, tmp_path, monkeypatch, march, needs
 ):
-    from cnpgen.pipelines.stages import ik, motion
+    from cnpgen.pipelines.stages import boundary_motion as motion
+    from cnpgen.pipelines.stages import ik
 
     monkeypatch.setattr(compiler, "vector_flags", lambda: (f"-march={march}",))
     library = prepare("airhockey-replan").context.kernels
@@ -441,10 +442,10 @@ def test_the_emitted_c_compiles_for_every_vector_width_and_gives_the_same_number
         if needs and needs not in machine_flags():
             continue
         found = CompiledKernel(expected.tape, path, tmp_path)(*arguments)
-        settled = np.ones(n, bool) if expected.tape.loop is None else found[1][0] < expected.tape.loop.tolerance
-        assert settled.mean() > 0.9
+        converged = np.ones(n, bool) if expected.tape.loop is None else found[1][0] < expected.tape.loop.tolerance
+        assert converged.mean() > 0.9
         np.testing.assert_allclose(
-            found[0][:, settled], expected(*arguments)[0][:, settled], rtol=1e-12, atol=1e-12, err_msg=march
+            found[0][:, converged], expected(*arguments)[0][:, converged], rtol=1e-12, atol=1e-12, err_msg=march
         )
 
 
@@ -453,7 +454,7 @@ def test_the_emitted_c_compiles_for_every_vector_width_and_gives_the_same_number
 def test_the_emitted_c_compiles_for_aarch64(operations, tmp_path):
     source = tmp_path / "operations.c"
     source.write_text(emit(tape_from_function(operations)))
-    command = ["aarch64-linux-gnu-gcc", *compiler.FLAGS, str(source), "-o", str(tmp_path / "k.so"), "-lm"]
+    command = ["aarch64-linux-gnu-gcc", *compiler.COMPILER_FLAGS, str(source), "-o", str(tmp_path / "k.so"), "-lm"]
     subprocess.run(command, check=True)
 
 
@@ -463,7 +464,7 @@ BUILT: list[str] = []
 
 
 def doubling(*, factor: float = 2.0) -> ca.Function:
-    """A builder that notes that it was called."""
+    """Build a function and record the call."""
     BUILT.append("doubling")
     x = ca.SX.sym("x")
     return ca.Function("doubling", [x], [factor * x])
@@ -484,7 +485,7 @@ def test_a_tape_is_built_once_per_builder_loop_parameters_and_problem(tmp_path):
     assert len(BUILT) == 4
 
 
-def test_a_change_anywhere_in_the_package_of_a_plug_in_changes_its_kernels(tmp_path):
+def test_any_change_in_the_package_of_a_plug_in_changes_its_kernels(tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "__init__.py").write_text("")
     (tmp_path / "mine" / "kernels.py").write_text(
@@ -531,7 +532,7 @@ DAMAGED_LIBRARY = """
 import sys
 from pathlib import Path
 import numpy as np
-from cnpgen.kernels.compiled import CompiledKernel, compile_tape
+from cnpgen.kernels.compiled_kernel import CompiledKernel, compile_tape
 from cnpgen.kernels.tape import Tape
 tape, cache = Tape.from_bytes(Path(sys.argv[1]).read_bytes()), Path(sys.argv[2])
 library = compile_tape(tape, cache)
@@ -573,20 +574,20 @@ def test_a_library_without_a_kernel_is_a_machine_error(root, tmp_path):
 
 @pytest.fixture
 def compilers(monkeypatch) -> list[Path]:
-    """What the compiler is run for."""
+    """Record the files that the compiler is called for."""
     sources: list[Path] = []
-    real = compiled.run_compiler
+    real = compiled_kernel.run_compiler
 
     def run(compiler: str, level: str, source: Path, built: Path) -> None:
         sources.append(source)
         real(compiler, level, source, built)
 
-    monkeypatch.setattr(compiled, "run_compiler", run)
+    monkeypatch.setattr(compiled_kernel, "run_compiler", run)
     return sources
 
 
 @needs_compiler
-def test_a_library_is_compiled_once_however_many_processes_want_it_at_once(root, tmp_path, compilers):
+def test_a_library_is_compiled_once_for_many_concurrent_processes(root, tmp_path, compilers):
     tape = tape_from_function(root, ROOT)
     with ThreadPoolExecutor(3) as pool:
         paths = set(pool.map(lambda _: compile_tape(tape, tmp_path), range(3)))
@@ -597,12 +598,12 @@ def test_a_library_is_compiled_once_however_many_processes_want_it_at_once(root,
 
 
 @needs_compiler
-def test_a_process_that_was_stopped_while_it_compiled_is_not_waited_for_for_ever(root, tmp_path, monkeypatch):
+def test_the_wait_for_a_stopped_compilation_ends_at_the_time_limit(root, tmp_path, monkeypatch):
     tape = tape_from_function(root, ROOT)
-    lock = tmp_path / "lib" / f".{compiled.library_stem(tape, find_compiler())}.lock"
-    make_private(lock.parent)
-    monkeypatch.setattr("cnpgen.kernels.cache.PATIENCE", 0.1)
-    with one_at_a_time(lock):
+    lock = tmp_path / "lib" / f".{compiled_kernel.library_file_stem(tape, find_compiler())}.lock"
+    make_private_folder(lock.parent)
+    monkeypatch.setattr("cnpgen.kernels.cache.MAX_LOCK_WAIT_S", 0.1)
+    with exclusive_lock(lock):
         began = time.monotonic()
         assert compile_tape(tape, tmp_path).exists()
         assert time.monotonic() - began >= 0.1
@@ -615,7 +616,7 @@ def repository() -> Path:
 WARM_START = """
 import sys
 from cnpgen.kernels.library import choose_backend
-from cnpgen.pipelines.load import load_pipeline
+from cnpgen.pipelines.pipeline_file import load_pipeline
 
 from cnpgen.pipelines.prepared import PreparedPipeline
 backend, folder = choose_backend(sys.argv[1])
@@ -635,7 +636,7 @@ def test_a_warm_start_does_not_import_casadi(prepare: Prepare, backend):
 
 
 def test_kernels_of_a_pipeline_restored_from_a_plan_are_those_of_its_files(prepare: Prepare, tmp_path, monkeypatch):
-    from cnpgen.make.load import load_dataset_recipe, restore_dataset_recipe
+    from cnpgen.make.recipe_file import load_dataset_recipe, restore_dataset_recipe
     from cnpgen.problems.problem import resolved
 
     recipe = load_dataset_recipe("airhockey-hit")
@@ -663,7 +664,7 @@ def chosen_with_warnings(wanted: str | None = None) -> tuple[str, Path, list[str
 
 
 @needs_compiler
-def test_the_compiled_backend_is_chosen_without_a_word(own_cache):
+def test_the_compiled_backend_is_chosen_without_a_warning(own_cache):
     assert chosen_with_warnings() == ("compiled", own_cache, [])
     assert chosen_with_warnings("compiled") == ("compiled", own_cache, [])
 
@@ -679,14 +680,14 @@ BROKEN = {
 
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc")
-def test_a_compiler_that_hangs_is_ended_with_all_that_it_has_started(own_cache, monkeypatch, tmp_path):
+def test_a_compiler_that_hangs_is_killed_with_its_child_processes(own_cache, monkeypatch, tmp_path):
     hanging = tmp_path / "cc"
     hanging.write_text(f"#!/bin/sh\nsleep 1000 &\necho $! > {tmp_path}/child\nwait\n")
     hanging.chmod(0o755)
     monkeypatch.setenv("CC", str(hanging))
-    monkeypatch.setattr(compiler, "VERSION_SECONDS", 0.5)
+    monkeypatch.setattr(compiler, "MAX_VERSION_TIME_S", 0.5)
     begun = time.monotonic()
-    with pytest.raises(MachineError, match=r"cc took more than 0\.5 s to say its version"):
+    with pytest.raises(MachineError, match=r"cc took more than 0\.5 s to print its version"):
         choose_backend("compiled")
     assert time.monotonic() - begun < HANGING / 10
     child = int((tmp_path / "child").read_text())
@@ -699,7 +700,7 @@ def test_a_compiler_that_hangs_is_ended_with_all_that_it_has_started(own_cache, 
 @needs_compiler
 @pytest.mark.parametrize("command", ["'{cc}' -g", "{cc} -DNAME='two words'", "{cc}"])
 def test_cc_may_be_a_path_with_spaces_and_options(root, own_cache, monkeypatch, tmp_path, command):
-    """Wrappers such as ccache are named so: CC="ccache gcc"."""
+    """Check wrappers such as ccache: CC="ccache gcc"."""
     path = tmp_path / "my compilers" / "cc" if "'{cc}'" in command or command == "{cc}" else tmp_path / "cc"
     path.parent.mkdir(exist_ok=True)
     path.write_text(f'#!/bin/sh\nprintf "%s|" "$@" >> "{tmp_path}/seen"\nexec {find_compiler()} "$@"\n')
@@ -713,9 +714,9 @@ def test_cc_may_be_a_path_with_spaces_and_options(root, own_cache, monkeypatch, 
 
 
 @needs_compiler
-def test_options_of_the_compiler_are_part_of_what_a_library_is_cached_under(root, own_cache):
+def test_compiler_options_are_part_of_the_cache_key_of_a_library(root, own_cache):
     tape = tape_from_function(root, ROOT)
-    stems = {compiled.library_stem(tape, find_compiler() + options) for options in ("", " -O3", " -O3 -g")}
+    stems = {compiled_kernel.library_file_stem(tape, find_compiler() + options) for options in ("", " -O3", " -O3 -g")}
     assert len(stems) == 3
 
 
@@ -741,19 +742,19 @@ def test_without_a_working_compiler_the_compiled_backend_is_a_machine_error(own_
 
 
 @needs_compiler
-def test_a_compiler_that_makes_wrong_code_is_found_out(own_cache, monkeypatch):
+def test_a_compiler_that_generates_wrong_code_is_detected(own_cache, monkeypatch):
     monkeypatch.setattr(library_module, "CompiledKernel", lambda tape, _path, _folder: lambda x: [x])
     with pytest.raises(MachineError, match="wrong code"):
         choose_backend("compiled")
 
 
-def test_a_tape_that_cannot_be_cached_is_used_nevertheless(tmp_path):
+def test_a_tape_that_cannot_be_cached_is_still_used(tmp_path):
     (tmp_path / "file").write_text("not a folder")
     (result,) = library_in(tmp_path / "file", "numpy").load(doubling)(np.ones((1, 3)))
     np.testing.assert_array_equal(result, 2.0)
 
 
-def test_a_full_disk_leaves_no_half_of_a_tape(tmp_path, monkeypatch):
+def test_a_full_disk_leaves_no_partial_tape(tmp_path, monkeypatch):
     def full(*_arguments: object) -> None:
         raise OSError(28, "No space left on device")
 
@@ -763,15 +764,15 @@ def test_a_full_disk_leaves_no_half_of_a_tape(tmp_path, monkeypatch):
     assert list((tmp_path / "tape").iterdir()) == []
 
 
-def test_a_cached_tape_may_be_read_by_whom_the_umask_allows(tmp_path):
-    """A cache that a group shares: temporary files, which only their owner may read, are not what is kept."""
+def test_a_cached_tape_has_the_read_permissions_of_the_umask(tmp_path):
+    """Check a cache that a group shares: stored files do not have the private mode of temporary files."""
     library_in(tmp_path, "numpy").load(doubling)
     (path,) = (tmp_path / "tape").iterdir()
     (tmp_path / "plain").touch()
     assert path.stat().st_mode == (tmp_path / "plain").stat().st_mode
 
 
-def test_backends_that_do_not_exist_are_named(own_cache):
+def test_unknown_backends_are_refused(own_cache):
     with pytest.raises(UsageError, match="'cuda' does not exist: expected one of compiled, numpy, casadi"):
         choose_backend("cuda")
 
@@ -788,7 +789,7 @@ def test_the_vector_flags_let_the_compiler_use_this_machine(tmp_path):
     assert vector_flags()[0] in ("-march=native", "-mcpu=native")
 
 
-def test_the_selftest_tape_is_the_one_that_casadi_would_make():
+def test_the_selftest_tape_equals_that_of_casadi():
     x = ca.SX.sym("x")
     tape = tape_from_function(ca.Function("twice", [x], [x + x]))
     assert tape.operation.tolist() == [CODES["INPUT"], CODES["TWICE"], CODES["OUTPUT"]]

@@ -1,4 +1,4 @@
-"""Cached tapes follow the source that they are built from: every module that a builder imports is in their key."""
+"""The key of a cached tape covers every module that its builder imports."""
 
 import ast
 import shutil
@@ -9,12 +9,12 @@ import casadi as ca
 import pytest
 
 from cnpgen.kernels import library as library_module
-from cnpgen.kernels.library import PACKAGE, ROOMS, KernelLibrary
+from cnpgen.kernels.library import BUILDER_PACKAGES, PACKAGE_FOLDER, KernelLibrary
 from cnpgen.pipelines.stages.braking import tip_state
-from cnpgen.problems.load import load_problem
-from cnpgen.problems.robot import load_robot
+from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.problem_file import load_problem
 
-# What builders import and may change without another tape.
+# Modules that builders import and whose changes do not affect tapes.
 WITHOUT_EFFECT = {
     "cnpgen.errors": "the words of exceptions",
     "cnpgen.schema": "how recipes are read: what was read is in the problem's identity",
@@ -22,14 +22,14 @@ WITHOUT_EFFECT = {
     "cnpgen.store": "how columns are described and files are written",
 }
 MODULES = {
-    ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__"): path
-    for path in PACKAGE.rglob("*.py")
+    ".".join(path.relative_to(PACKAGE_FOLDER.parent).with_suffix("").parts).removesuffix(".__init__"): path
+    for path in PACKAGE_FOLDER.rglob("*.py")
 }
 
 
 @cache
 def imports(module: str) -> set[str]:
-    """The package's modules that a module imports at run time, inside functions, too."""
+    """Return the modules of the package that a module imports at run time, also inside functions."""
     tree = ast.parse(MODULES[module].read_text(encoding="utf-8"))
     blocks = [node for node in ast.walk(tree) if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)]
     typing_only = {id(node) for block in blocks for node in ast.walk(block)}
@@ -45,7 +45,7 @@ def imports(module: str) -> set[str]:
 
 
 def closure(module: str) -> set[str]:
-    """All of the package's modules that are imported with a module."""
+    """Return all modules of the package that a module imports, directly or not."""
     seen, waiting = {module}, [module]
     while waiting:
         new = imports(waiting.pop()) - seen
@@ -55,7 +55,7 @@ def closure(module: str) -> set[str]:
 
 
 def makes_functions(module: str) -> bool:
-    """Whether a module calls ``casadi.Function``, as builders do."""
+    """Return whether a module calls ``casadi.Function``, as builders do."""
     text = MODULES[module].read_text(encoding="utf-8")
     if "Function(" not in text:
         return False
@@ -66,38 +66,40 @@ def makes_functions(module: str) -> bool:
 BUILDERS = sorted(filter(makes_functions, MODULES))
 
 
-def test_the_builders_of_every_room_are_found() -> None:
+def test_the_builders_of_every_package_are_found() -> None:
     assert {name.split(".")[1] for name in BUILDERS} == {
-        *("benchmark", "losses", "pipelines", "planner", "refine", "kernels"),
+        *("benchmark", "losses", "pipelines", "planner", "refine", "kernels", "problems"),
     }
 
 
 @pytest.mark.parametrize("module", BUILDERS)
-def test_whatever_a_builder_imports_is_in_the_key_of_its_tapes(module: str) -> None:
-    hashed = tuple(f"cnpgen.{room}" for room in (*ROOMS, module.split(".")[1]))
-    known = tuple(f"{room}." for room in (*hashed, *WITHOUT_EFFECT))
-    left_out = sorted(name for name in closure(module) if not f"{name}.".startswith(known))
-    assert not left_out, f"{module} imports {left_out}, whose change would leave its tapes as they are"
+def test_all_imports_of_a_builder_are_in_the_key_of_its_tapes(module: str) -> None:
+    hashed = tuple(f"cnpgen.{package}" for package in (*BUILDER_PACKAGES, module.split(".")[1]))
+    covered = tuple(f"{package}." for package in (*hashed, *WITHOUT_EFFECT))
+    missing = sorted(name for name in closure(module) if not f"{name}.".startswith(covered))
+    assert not missing, f"{module} imports {missing}, whose changes would not change its tapes"
 
 
 @pytest.fixture
 def copy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A copy of the package's source, whose digests are taken instead of the package's."""
+    """Return a copy of the package's source that replaces it in digests."""
     folder = tmp_path / "cnpgen"
-    shutil.copytree(PACKAGE, folder, ignore=shutil.ignore_patterns("__pycache__", "*.so"))
-    monkeypatch.setattr(library_module, "PACKAGE", folder)
+    shutil.copytree(PACKAGE_FOLDER, folder, ignore=shutil.ignore_patterns("__pycache__", "*.so"))
+    monkeypatch.setattr(library_module, "PACKAGE_FOLDER", folder)
     return folder
 
 
 def tapes(folder: Path) -> set[str]:
-    """The names of the cached tapes after a kernel was loaded, by source as it is now."""
+    """Return the names of the cached tapes after loading a kernel with the present source."""
     library_module._digest_of.cache_clear()
     KernelLibrary("numpy", folder, "problem", {"robot": load_robot(load_problem("airhockey"))}).load(tip_state)
     return {path.name for path in (folder / "tape").iterdir()}
 
 
 @pytest.mark.parametrize("changed", ["problems/constraints/joint.py", "pipelines/stages/braking.py", "robots/chain.py"])
-def test_a_change_in_a_folder_within_a_room_changes_the_key_of_a_tape(copy: Path, tmp_path: Path, changed: str) -> None:
+def test_a_change_in_a_subfolder_of_a_package_changes_the_key_of_a_tape(
+    copy: Path, tmp_path: Path, changed: str
+) -> None:
     before = tapes(tmp_path)
     assert len(before) == 1
     with (copy / changed).open("a", encoding="utf-8") as file:
@@ -105,7 +107,7 @@ def test_a_change_in_a_folder_within_a_room_changes_the_key_of_a_tape(copy: Path
     assert len(tapes(tmp_path)) == 2
 
 
-def test_a_change_of_what_no_builder_reads_changes_no_key(copy: Path, tmp_path: Path) -> None:
+def test_a_change_that_no_builder_imports_changes_no_key(copy: Path, tmp_path: Path) -> None:
     before = tapes(tmp_path)
     (copy / "cli" / "main.py").write_text("")
     (copy / "losses" / "terms.py").write_text("")
@@ -113,12 +115,12 @@ def test_a_change_of_what_no_builder_reads_changes_no_key(copy: Path, tmp_path: 
 
 
 def of_a_plug_in() -> ca.Function:
-    """A builder that is not in the package."""
+    """Build a function outside the package."""
     x = ca.SX.sym("x")
     return ca.Function("of_a_plug_in", [x], [2 * x])
 
 
-def test_a_builder_of_a_plug_in_may_use_all_of_the_package(copy: Path) -> None:
+def test_the_key_of_a_plug_in_s_tape_covers_the_whole_package(copy: Path) -> None:
     before = library_module._source_digests(of_a_plug_in)
     library_module._digest_of.cache_clear()
     (copy / "cli" / "main.py").write_text("")

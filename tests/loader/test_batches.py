@@ -1,4 +1,4 @@
-"""Batches: every row once, the same whoever asks, from any cut on."""
+"""Batches: every row once per epoch, equal on all ranks, and resumable at any batch."""
 
 import json
 import threading
@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.loader import kept, order, windows
+from cnpgen.loader import in_memory_rows, order, windows
 from cnpgen.loader.batch import Batch
 from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.load import load_dataset
-from cnpgen.loader.shards import Shard, ShardReader
+from cnpgen.loader.shard_reader import Shard, ShardReader
 from tests.conftest import HANGING
 from tests.examples.loader import ALL, columns, ids, make, same
 
@@ -45,11 +45,11 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 @pytest.fixture(autouse=True, params=["kept in memory", "read in every epoch"])
 def _small_windows(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
     monkeypatch.setattr(order, "WINDOW_ROWS", 20)
-    monkeypatch.setattr(kept, "KEEP_BYTES", 1 << 20 if request.param == "kept in memory" else 0)
+    monkeypatch.setattr(in_memory_rows, "MAX_IN_MEMORY_BYTES", 1 << 20 if request.param == "kept in memory" else 0)
 
 
 def cases(dataset: Dataset, count: int = 12) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Draw splits and options: batches from one row to more than all, one to four ranks."""
+    """Yield random splits and options: batches of one row to more than all rows, one to four ranks."""
     random = np.random.default_rng(list(dataset.splits.values()))
     for _ in range(count):
         split = str(random.choice(list(dataset.splits)))
@@ -69,7 +69,7 @@ def cases(dataset: Dataset, count: int = 12) -> Iterator[tuple[str, dict[str, An
         )
 
 
-def test_every_row_comes_once_per_epoch_and_is_itself(dataset: Dataset) -> None:
+def test_every_row_is_returned_once_per_epoch(dataset: Dataset) -> None:
     for split, options in cases(dataset):
         everything = dataset.arrays(split, fields=ALL, normalize=True)
         batches = dataset.batches(split=split, fields=ALL, **options | {"world": 1})
@@ -83,14 +83,14 @@ def test_every_row_comes_once_per_epoch_and_is_itself(dataset: Dataset) -> None:
                 assert np.array_equal(values, everything[name][batch["sample_id"]].astype(values.dtype))
 
 
-def test_only_the_last_batch_may_be_short(dataset: Dataset) -> None:
+def test_only_the_last_batch_may_be_incomplete(dataset: Dataset) -> None:
     for split, options in cases(dataset):
         sizes = [batch.rows for batch in dataset.batches(split=split, **options | {"world": 1})]
         assert set(sizes[:-1]) <= {options["batch_size"]}
         assert sizes[-1] == options["batch_size"] if options["drop_last"] else 0 < sizes[-1] <= options["batch_size"]
 
 
-def test_all_ranks_together_see_what_one_sees(dataset: Dataset) -> None:
+def test_the_batches_of_all_ranks_together_are_those_of_one_rank(dataset: Dataset) -> None:
     for split, options in cases(dataset):
         world = options["world"]
         whole = list(dataset.batches(split=split, fields=ALL, **options | {"world": 1}))
@@ -102,8 +102,8 @@ def test_all_ranks_together_see_what_one_sees(dataset: Dataset) -> None:
                     assert np.array_equal(values, batch[name][rank::world])
 
 
-def test_any_cut_and_resume_equals_the_uncut_run(dataset: Dataset) -> None:
-    """Over two epochs, through JSON, in new objects, one of which is told another seed and epoch."""
+def test_a_resumed_run_equals_the_uninterrupted_run(dataset: Dataset) -> None:
+    """Over two epochs, through JSON, in new objects, one of them with another seed and epoch."""
     for split, options in cases(dataset, 6):
         uncut = dataset.batches(split=split, fields=ALL, **options)
         expected = [batch for _ in range(2) for batch in uncut]
@@ -119,7 +119,7 @@ def test_any_cut_and_resume_equals_the_uncut_run(dataset: Dataset) -> None:
 
 
 def take(batches: Any, count: int) -> list[Batch]:
-    """Take some batches, going through as many epochs as that needs."""
+    """Return the next batches, over as many epochs as needed."""
     found: list[Batch] = []
     while len(found) < count:
         for batch in batches:
@@ -141,7 +141,7 @@ def test_the_state_is_the_same_on_every_rank_and_may_be_loaded_with_another_worl
     assert ids(alone) == [reference[24:37], reference[37:50]]
 
 
-def test_the_state_is_small_and_says_what_it_is(plain: Dataset) -> None:
+def test_the_state_is_a_small_dict(plain: Dataset) -> None:
     batches = plain.batches(10, seed=3, epoch=2)
     take(batches, 3)
     assert batches.state() == {
@@ -156,7 +156,7 @@ def test_the_state_is_small_and_says_what_it_is(plain: Dataset) -> None:
     }
 
 
-def test_the_state_after_any_number_of_used_batches_needs_none_to_be_taken(plain: Dataset) -> None:
+def test_the_state_after_a_number_of_used_batches_is_computed_without_reading_them(plain: Dataset) -> None:
     for drop_last in (True, False):
         batches, ahead = plain.batches(8, epoch=1, drop_last=drop_last), plain.batches(8, drop_last=drop_last)
         for used in range(len(batches)):
@@ -164,7 +164,7 @@ def test_the_state_after_any_number_of_used_batches_needs_none_to_be_taken(plain
             take(batches, 1)
         assert ahead.state(epoch=1, batch=len(batches)) == batches.state()
         assert (batches.state()["epoch"], batches.state()["row"]) == (2, 0)
-        with pytest.raises(UsageError, match=r"an epoch has \d batches, 8 cannot have been used"):
+        with pytest.raises(UsageError, match=r"batch must be at most \d, the number of batches of an epoch, got 8"):
             ahead.state(batch=8)
 
 
@@ -174,7 +174,7 @@ def test_shapes_and_types_are_known_before_the_first_batch(plain: Dataset) -> No
     assert batches.signature == {name: (values.shape[1:], values.dtype) for name, values in batch.items()}
 
 
-def test_a_loop_that_was_left_goes_on_and_a_finished_one_gives_the_next_epoch(plain: Dataset) -> None:
+def test_an_abandoned_loop_continues_and_a_finished_one_starts_the_next_epoch(plain: Dataset) -> None:
     batches = plain.batches(10, fields=ALL)
     assert ids(take(batches, 2)) + ids(batches) == ids(plain.batches(10, fields=ALL))
     assert batches.epoch == 1
@@ -203,11 +203,11 @@ def test_two_loops_over_the_same_batches_are_refused(plain: Dataset) -> None:
     outer = iter(batches)
     next(outer)
     take(batches, 1)
-    with pytest.raises(UsageError, match="taken by another loop"):
+    with pytest.raises(UsageError, match="another loop over the same batches"):
         next(outer)
 
 
-def test_a_batch_has_arrays_of_its_own(plain: Dataset) -> None:
+def test_a_batch_owns_its_arrays(plain: Dataset) -> None:
     expected = list(plain.batches(10, fields=ALL))
     found = []
     for batch in plain.batches(10, fields=ALL):
@@ -218,7 +218,7 @@ def test_a_batch_has_arrays_of_its_own(plain: Dataset) -> None:
         assert all(np.array_equal(one[name], other[name]) for name in ALL)
 
 
-def test_fields_are_views_of_one_packed_table_in_the_order_asked_for(plain: Dataset) -> None:
+def test_fields_are_views_of_one_packed_table_in_the_requested_order(plain: Dataset) -> None:
     batch = next(iter(plain.batches(8, fields=["clearance", "sample_id", "start_q"])))
     assert list(batch) == ["clearance", "sample_id", "start_q"]
     assert batch.table.shape == (8, 4)
@@ -239,14 +239,14 @@ def test_integers_alone_make_batches_with_an_empty_table(plain: Dataset) -> None
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64", np.float32])
-def test_numbers_come_in_the_type_that_was_asked_for(plain: Dataset, dtype: Any) -> None:
+def test_float_fields_have_the_requested_type(plain: Dataset, dtype: Any) -> None:
     rows = columns(splits=SIZES["last shard short"][0], shard_size=16)
     for batch in plain.batches(16, fields=ALL, normalize=False, dtype=dtype):
         assert batch.table.dtype == dtype
         assert np.array_equal(batch["start_q"], rows["start_q"][batch["sample_id"]].astype(dtype))
 
 
-def test_float32_shards_are_delivered_too(tmp_path: Path) -> None:
+def test_batches_of_float32_shards_have_the_requested_type(tmp_path: Path) -> None:
     dataset = load_dataset(make(tmp_path, dtype="float32"))
     rows = columns(dtype="float32")
     for dtype in ("float32", "float64"):
@@ -256,22 +256,22 @@ def test_float32_shards_are_delivered_too(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("stored", ["float32", "float64"])
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
-def test_batches_and_rows_are_normalised_to_the_same_bit(tmp_path: Path, stored: str, dtype: str) -> None:
+def test_batches_and_rows_are_normalized_to_identical_values(tmp_path: Path, stored: str, dtype: str) -> None:
     dataset = load_dataset(make(tmp_path, dtype=stored))
     (batch,) = dataset.batches(50, fields=ALL, dtype=dtype)
     rows = dataset.rows("train", batch["sample_id"], fields=ALL, normalize=True, dtype=dtype)
     assert all(np.array_equal(rows[name], values) for name, values in batch.items())
 
 
-def test_more_than_all_rows_in_a_batch_are_refused_unless_a_short_one_will_do(plain: Dataset) -> None:
+def test_a_batch_size_above_the_number_of_rows_needs_drop_last_false(plain: Dataset) -> None:
     with pytest.raises(UsageError, match=r"batch_size 51 is more than the 50 rows of split 'train'; drop_last=False"):
         plain.batches(51)
     (batch,) = plain.batches(51, drop_last=False)
     assert batch.rows == 50
 
 
-def test_no_rank_gets_a_batch_of_no_rows(plain: Dataset) -> None:
-    message = "the last batch of 50 rows has 2 for 3 ranks: leave it out with drop_last=True"
+def test_a_last_batch_without_rows_for_a_rank_is_refused(plain: Dataset) -> None:
+    message = "the last batch of 50 rows has 2 for 3 ranks: omit it with drop_last=True"
     with pytest.raises(UsageError, match=message):
         plain.batches(6, world=3, drop_last=False)
     assert [batch.rows for batch in plain.batches(48, world=2, rank=1, drop_last=False)] == [24, 1]
@@ -302,7 +302,7 @@ def test_no_rank_gets_a_batch_of_no_rows(plain: Dataset) -> None:
         ({"fields": ["start_q", "start_q"]}, "one or more different names"),
     ],
 )
-def test_arguments_that_cannot_be_meant_are_refused(plain: Dataset, options: dict[str, Any], message: str) -> None:
+def test_invalid_arguments_are_refused(plain: Dataset, options: dict[str, Any], message: str) -> None:
     with pytest.raises(UsageError, match=message):
         plain.batches(**{"batch_size": 8} | options)
 
@@ -335,7 +335,7 @@ def test_the_state_of_another_dataset_or_split_is_refused(plain: Dataset, tmp_pa
         ({"epoch": None}, "epoch must be an integer"),
     ],
 )
-def test_a_state_that_makes_no_sense_is_refused(plain: Dataset, change: dict[str, Any], message: str) -> None:
+def test_invalid_states_are_refused(plain: Dataset, change: dict[str, Any], message: str) -> None:
     batches = plain.batches(8)
     with pytest.raises((DatasetError, UsageError), match=message):
         batches.load_state(batches.state() | change)
@@ -347,7 +347,7 @@ def test_a_state_that_makes_no_sense_is_refused(plain: Dataset, change: dict[str
         batches.load_state(lacking)
 
 
-def test_resuming_reads_one_window_and_no_earlier_one(plain: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_resuming_does_not_read_previous_windows(plain: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     epoch = order.Order("train", tuple(shard.rows for shard in plain.shards["train"]), 0, 0)
     assert len(epoch.windows) > 1
     batches = plain.batches(2)
@@ -369,13 +369,13 @@ def test_the_next_window_is_read_ahead_by_one_thread_at_a_time(plain: Dataset, m
             running.pop()
 
     monkeypatch.setattr(windows, "pack", counted)
-    monkeypatch.setattr(kept, "pack", counted)
+    monkeypatch.setattr(in_memory_rows, "pack", counted)
     read = record_reads(monkeypatch)
     rest = iter(plain.batches(1))
     next(rest)
     deadline = time.monotonic() + HANGING
     while len({shard.path for shard, _, _ in read}) < len(plain.shards["train"]):
-        time.sleep(0.001)  # the second of two windows is read although nobody asked for it yet
+        time.sleep(0.001)  # the second of two windows is read ahead
         assert time.monotonic() < deadline
     assert sum(1 for _ in rest) == 49
     assert set(most) == {1}
@@ -387,7 +387,7 @@ def test_a_split_that_fits_is_read_once_and_a_larger_one_in_every_epoch(
 ) -> None:
     size = 50 * (2 * 4 + 8)
     for limit, times in ((size, 1), (size - 1, 3)):
-        monkeypatch.setattr(kept, "KEEP_BYTES", limit)
+        monkeypatch.setattr(in_memory_rows, "MAX_IN_MEMORY_BYTES", limit)
         read = record_reads(monkeypatch)
         batches = plain.batches(10, fields=["goal_p", "sample_id"])
         found = [ids(batches) for _ in range(3)]

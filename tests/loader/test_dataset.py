@@ -9,18 +9,17 @@ import pytest
 
 import cnpgen
 from cnpgen.errors import DatasetError, MachineError, UsageError
-from cnpgen.loader import frame
-from cnpgen.loader import shards as shards_module
+from cnpgen.loader import frame, shard_reader
 from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.gather import RowError
 from cnpgen.loader.load import load_dataset
-from cnpgen.problems.load import load_problem
-from cnpgen.problems.record import as_problem, as_record, record_problem
-from cnpgen.store.blueprint import shards, write_blueprint
+from cnpgen.problems.problem_file import load_problem
+from cnpgen.problems.problem_record import as_problem, as_record, record_problem
+from cnpgen.store.dataset_spec import shards, write_dataset_spec
 from cnpgen.store.reader import open_dataset
 from cnpgen.store.shard import read_placements
 from tests.examples.loader import ALL, columns, ids, make
-from tests.examples.store import BLUEPRINT, make_shard
+from tests.examples.store import SPEC, make_shard
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +38,7 @@ def copy(folder: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(folder, tmp_path / "copy"))
 
 
-def test_a_dataset_says_what_is_in_it(dataset: Dataset, folder: Path) -> None:
+def test_a_dataset_describes_its_content(dataset: Dataset, folder: Path) -> None:
     assert dataset.splits == {"train": 50, "validation": 10}
     assert list(dataset) == ["train", "validation"]
     assert len(dataset) == 2
@@ -52,7 +51,7 @@ def test_a_dataset_says_what_is_in_it(dataset: Dataset, folder: Path) -> None:
     assert repr(dataset) == f"<two-shards 1.0.0 in {folder}: 50 train, 10 validation>"
 
 
-def test_what_is_looked_at_is_printed_in_a_line(dataset: Dataset) -> None:
+def test_the_repr_is_one_line(dataset: Dataset) -> None:
     batches = dataset.batches(8, seed=3, fields=ALL)
     batch = next(iter(batches))
     layout = "start_q[3], goal_p[2], clearance, sample_id"
@@ -62,17 +61,17 @@ def test_what_is_looked_at_is_printed_in_a_line(dataset: Dataset) -> None:
     assert repr(dataset.normalization) == "<means and deviations of start_q, goal_p, clearance>"
 
 
-def test_a_split_that_is_not_there_is_refused_with_those_that_are(dataset: Dataset, folder: Path) -> None:
-    said = "has no split 'val'.*only train, validation"
-    for ask in (
+def test_an_unknown_split_is_refused_and_the_existing_ones_are_named(dataset: Dataset, folder: Path) -> None:
+    message = "has no split 'val'.*only train, validation"
+    for read in (
         lambda: dataset["val"],
         lambda: dataset.batches(8, split="val"),
         lambda: dataset.rows("val", [0]),
         lambda: dataset.frame("val"),
         lambda: open_dataset(folder).read("val"),
     ):
-        with pytest.raises(DatasetError, match=said):
-            ask()
+        with pytest.raises(DatasetError, match=message):
+            read()
 
 
 def test_the_problem_of_a_dataset_is_that_of_its_recipe(tiny) -> None:
@@ -83,8 +82,8 @@ def test_the_problem_of_a_dataset_is_that_of_its_recipe(tiny) -> None:
     assert repr(found) == "<problem airhockey of a dataset>"
 
 
-def test_a_dataset_that_does_not_say_its_problem_is_refused(dataset: Dataset) -> None:
-    with pytest.raises(DatasetError, match=r"two-shards does not say its problem: pipeline\.problem is missing"):
+def test_a_dataset_without_a_problem_is_refused(dataset: Dataset) -> None:
+    with pytest.raises(DatasetError, match=r"two-shards does not contain the problem: pipeline\.problem is missing"):
         _ = dataset.problem
 
 
@@ -105,7 +104,7 @@ def test_a_frame_has_a_column_per_joint_and_axis(dataset: Dataset, library: str)
 
 
 @pytest.mark.extended
-def test_a_frame_of_pandas_knows_its_units(dataset: Dataset) -> None:
+def test_a_frame_of_pandas_contains_its_units(dataset: Dataset) -> None:
     pytest.importorskip("pandas")
     units = dataset.frame("train", fields=["goal_p", "clearance"], library="pandas").attrs["units"]
     assert units == {"goal_p.x": "m", "goal_p.y": "m", "clearance": "m"}
@@ -125,7 +124,7 @@ def test_load_dataset_is_a_public_name() -> None:
     assert cnpgen.load_dataset is load_dataset
 
 
-def test_arrays_are_all_rows_as_they_are_stored(dataset: Dataset) -> None:
+def test_arrays_contain_all_rows_in_their_stored_type(dataset: Dataset) -> None:
     found = dataset.arrays("train", fields=dataset.fields)
     for name, values in columns().items():
         assert np.array_equal(found[name], values)
@@ -134,7 +133,7 @@ def test_arrays_are_all_rows_as_they_are_stored(dataset: Dataset) -> None:
     assert list(dataset.arrays()) == ["start_q", "goal_p"]  # no diagnostics, no integers
 
 
-def test_arrays_are_normalised_and_converted_when_asked_for(dataset: Dataset) -> None:
+def test_arrays_are_normalized_and_converted_on_request(dataset: Dataset) -> None:
     raw = dataset.arrays("validation", fields=ALL)
     found = dataset.arrays("validation", fields=ALL, normalize=True, dtype="float32")
     train = columns()
@@ -145,7 +144,7 @@ def test_arrays_are_normalised_and_converted_when_asked_for(dataset: Dataset) ->
 
 
 @pytest.mark.parametrize("indices", [[0], [49, 0, 31, 32, 33, 5, 5], [-1, -50, 3], np.arange(50)[::-7], []])
-def test_rows_come_in_the_order_they_are_asked_for(dataset: Dataset, indices: list[int]) -> None:
+def test_rows_are_returned_in_the_order_of_the_indices(dataset: Dataset, indices: list[int]) -> None:
     found = dataset.rows("train", indices, fields=ALL)
     for name, values in columns().items():
         assert np.array_equal(found[name], values[np.array(indices, int)])
@@ -164,7 +163,7 @@ def test_a_split_is_a_sequence_of_rows(dataset: Dataset) -> None:
 
 
 @pytest.mark.parametrize("row", [50, -51, [3, 50]])
-def test_a_row_that_does_not_exist_is_an_index_error_and_one_of_ours(dataset: Dataset, row: int | list[int]) -> None:
+def test_an_invalid_row_index_is_an_index_error_and_a_cnpgen_error(dataset: Dataset, row: int | list[int]) -> None:
     with pytest.raises(RowError, match=r"split 'train' has 50 rows, there is no row (50|-51)"):
         dataset["train"][row]
     assert issubclass(RowError, IndexError)
@@ -177,8 +176,8 @@ def test_indices_that_are_not_integers_are_refused(dataset: Dataset, indices: li
         dataset.rows("train", indices)
 
 
-def test_few_shards_stay_mapped_however_many_are_visited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shards_module, "MOST_MAPS", 3)
+def test_the_number_of_mapped_shards_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shard_reader, "MAX_MEMORY_MAPS", 3)
     dataset = load_dataset(make(tmp_path, shard_size=4))
     rows = columns(shard_size=4)["start_q"]
     for row in np.random.default_rng(0).integers(50, size=60):
@@ -186,7 +185,7 @@ def test_few_shards_stay_mapped_however_many_are_visited(tmp_path: Path, monkeyp
     assert len(dataset.reader._maps) == 3
 
 
-def test_the_real_thing_is_loaded(tiny) -> None:
+def test_a_made_dataset_is_loaded(tiny) -> None:
     dataset = cnpgen.load_dataset(tiny("airhockey-hit"))
     batches = dataset.batches(200)
     tables = np.concatenate([batch.table for batch in batches])
@@ -198,12 +197,12 @@ def test_the_real_thing_is_loaded(tiny) -> None:
     assert np.abs(tables[:, ~constant].std(0) - 1).max() < 1e-5
 
 
-# What is not whole is refused.
+# Incomplete and damaged datasets are refused.
 
 
 def test_an_unfinished_dataset_is_refused_unless_allowed(tmp_path: Path) -> None:
-    write_blueprint(tmp_path, BLUEPRINT)
-    make_shard(tmp_path, BLUEPRINT, shards(BLUEPRINT)[1])
+    write_dataset_spec(tmp_path, SPEC)
+    make_shard(tmp_path, SPEC, shards(SPEC)[1])
     with pytest.raises(DatasetError, match="unfinished: 1 of 3 shards"):
         load_dataset(tmp_path)
     dataset = load_dataset(tmp_path, allow_incomplete=True)
@@ -218,9 +217,11 @@ def test_an_unfinished_dataset_is_refused_unless_allowed(tmp_path: Path) -> None
     assert dataset.arrays("validation")["start_q"].shape == (0, 3)
 
 
-def test_a_dataset_without_training_rows_cannot_be_normalised_by_itself(dataset: Dataset, tmp_path: Path) -> None:
+def test_a_dataset_without_training_rows_needs_the_normalization_of_another_one(
+    dataset: Dataset, tmp_path: Path
+) -> None:
     lonely = load_dataset(make(tmp_path, splits={"test": 9}))
-    with pytest.raises(DatasetError, match="no training rows to normalise with; pass normalize=False"):
+    with pytest.raises(DatasetError, match="no training rows for the normalization; pass normalize=False"):
         lonely.batches(3, split="test")
     raw = np.concatenate([b["start_q"] for b in lonely.batches(3, split="test", normalize=False, shuffle=False)])
     borrowed = lonely.batches(3, split="test", normalize=dataset.normalization, shuffle=False)
@@ -229,20 +230,20 @@ def test_a_dataset_without_training_rows_cannot_be_normalised_by_itself(dataset:
 
 
 @pytest.mark.parametrize("option", ["allow_incomplete", "verify"])
-def test_options_are_yes_or_no(tmp_path: Path, option: str) -> None:
+def test_options_must_be_bools(tmp_path: Path, option: str) -> None:
     with pytest.raises(UsageError, match=f"{option} must be True or False, got 'no'"):
         load_dataset(make(tmp_path), **{option: "no"})  # type: ignore[arg-type]
 
 
-def test_what_is_no_dataset_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DatasetError, match=r"plan\.json is missing"):
+def test_folders_without_a_dataset_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match=r"specification\.json is missing"):
         load_dataset(tmp_path)
     with pytest.raises(UsageError, match="nowhere is not there, expected the folder of a dataset"):
         load_dataset(tmp_path / "nowhere")
 
 
 @pytest.mark.parametrize("damage", ["missing", "cut off"])
-def test_a_shard_that_is_not_whole_is_noticed_when_the_dataset_is_opened(copy: Path, damage: str) -> None:
+def test_missing_and_cut_off_shards_are_detected_when_the_dataset_is_opened(copy: Path, damage: str) -> None:
     path = copy / "train" / "shard-00000.h5"
     if damage == "missing":
         path.unlink()
@@ -253,10 +254,10 @@ def test_a_shard_that_is_not_whole_is_noticed_when_the_dataset_is_opened(copy: P
     dataset = load_dataset(copy, allow_incomplete=True)
     assert dataset.splits == {"train": 18, "validation": 10}
     assert [sorted(batch) for batch in ids(dataset.batches(18, fields=ALL))] == [list(range(32, 50))]
-    assert dataset.fingerprint != load_dataset(copy, allow_incomplete=True).blueprint.fingerprint
+    assert dataset.fingerprint != load_dataset(copy, allow_incomplete=True).spec.fingerprint
 
 
-def test_a_changed_byte_among_the_numbers_is_noticed_when_the_shard_is_read(copy: Path) -> None:
+def test_a_changed_byte_is_detected_when_the_shard_is_read(copy: Path) -> None:
     path = copy / "train" / "shard-00001.h5"
     content = bytearray(path.read_bytes())
     content[(read_placements(path)[0]["start_q"].offset or 0) + 3] ^= 1
@@ -271,15 +272,15 @@ def test_a_changed_byte_among_the_numbers_is_noticed_when_the_shard_is_read(copy
 
 
 @pytest.mark.parametrize("verify", [True, False])
-def test_a_shard_in_the_place_of_another_is_noticed(copy: Path, tmp_path: Path, verify: bool) -> None:
+def test_a_shard_of_another_dataset_is_detected(copy: Path, tmp_path: Path, verify: bool) -> None:
     other = make(tmp_path / "other", splits={"train": 64})
     shutil.copy(other / "train" / "shard-00000.h5", copy / "train" / "shard-00000.h5")
     dataset = load_dataset(copy, verify=verify)
-    with pytest.raises(DatasetError, match="sha256" if verify else "of another dataset or another place"):
+    with pytest.raises(DatasetError, match="sha256" if verify else "of another dataset or another position"):
         dataset["train"][0]
 
 
-def test_a_shard_that_vanishes_while_it_is_in_use_is_an_error_and_not_a_hang(copy: Path) -> None:
+def test_a_shard_that_is_deleted_during_use_raises_an_error(copy: Path) -> None:
     dataset = load_dataset(copy)
     (copy / "train" / "shard-00001.h5").unlink()
     with pytest.raises(
@@ -289,7 +290,7 @@ def test_a_shard_that_vanishes_while_it_is_in_use_is_an_error_and_not_a_hang(cop
         list(dataset.batches(10))
 
 
-@pytest.mark.parametrize("name", ["manifest.json", "stats.json", "plan.json"])
+@pytest.mark.parametrize("name", ["manifest.json", "stats.json", "specification.json"])
 def test_a_damaged_document_is_refused(copy: Path, name: str) -> None:
     text = (copy / name).read_text()
     (copy / name).write_text(text.replace("0", "1", 1))
@@ -297,10 +298,10 @@ def test_a_damaged_document_is_refused(copy: Path, name: str) -> None:
         load_dataset(copy)
 
 
-def test_statistics_of_another_blueprint_are_refused(copy: Path, tmp_path: Path) -> None:
+def test_statistics_of_another_specification_are_refused(copy: Path, tmp_path: Path) -> None:
     other = make(tmp_path / "other", seed=3)
     shutil.copy(other / "stats.json", copy / "stats.json")
-    with pytest.raises(DatasetError, match=r"stats\.json is of another blueprint than plan\.json"):
+    with pytest.raises(DatasetError, match=r"stats\.json is of another specification than specification\.json"):
         load_dataset(copy)
 
 
@@ -308,4 +309,4 @@ def test_another_dataset_has_another_fingerprint(dataset: Dataset, tmp_path: Pat
     again = load_dataset(make(tmp_path / "again"))
     other = load_dataset(make(tmp_path / "other", seed=3))
     assert dataset.fingerprint == again.fingerprint != other.fingerprint
-    assert replace(BLUEPRINT, seed=3).fingerprint == other.blueprint.fingerprint
+    assert replace(SPEC, seed=3).fingerprint == other.spec.fingerprint

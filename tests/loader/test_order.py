@@ -1,4 +1,4 @@
-"""The order of rows: arithmetic, uniform, the same for ever."""
+"""The order of rows: uniform and reproducible."""
 
 from collections import Counter
 from itertools import permutations
@@ -11,7 +11,7 @@ from cnpgen.loader.order import Order, permutation
 
 
 @pytest.mark.parametrize("size", [0, 1, 2, 3, 63, 64, 65, 1000])
-def test_a_permutation_has_every_number_once(size: int) -> None:
+def test_a_permutation_contains_every_index_once(size: int) -> None:
     found = permutation(size, seed=3, key=(1, 2))
     assert found.dtype == np.int64
     assert sorted(found.tolist()) == list(range(size))
@@ -25,7 +25,7 @@ def test_every_permutation_is_equally_likely() -> None:
 
 
 def test_the_order_of_a_released_version_does_not_change() -> None:
-    """Written down in 2026: whoever resumes with a later version goes on in the same order."""
+    """Reference values of 2026: a run that is resumed with a newer version continues in the same order."""
     assert permutation(8, seed=0, key=(1,)).tolist() == [7, 6, 3, 2, 4, 5, 1, 0]
     epoch = Order("train", (5, 3), seed=1, epoch=2)
     assert [window.shards for window in epoch.windows] == [(0, 1)]
@@ -57,12 +57,12 @@ def test_a_window_has_about_the_rows_it_should(monkeypatch: pytest.MonkeyPatch) 
 
 
 @pytest.mark.parametrize(("rows", "count"), [(393_215, 1), (393_216, 2)])
-def test_a_split_is_shuffled_as_a_whole_up_to_the_size_that_the_docs_say(rows: int, count: int) -> None:
+def test_a_split_is_shuffled_uniformly_up_to_the_documented_size(rows: int, count: int) -> None:
     shards = (4096,) * (rows // 4096) + ((rows % 4096,) if rows % 4096 else ())
     assert len(Order("train", shards, 0, 0).windows) == count
 
 
-def test_without_shuffling_rows_come_as_they_are_stored(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_shuffling_rows_are_in_their_stored_order(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(order, "WINDOW_ROWS", 10)
     found = Order("train", (8, 8, 8), 5, 1, shuffle=False)
     assert [window.shards for window in found.windows] == [(0, 1), (2,)]
@@ -81,8 +81,10 @@ def test_windows_of_one_epoch_are_shuffled_differently(monkeypatch: pytest.Monke
     monkeypatch.setattr(order, "WINDOW_ROWS", 100)
     found = Order("train", (100, 100), 0, 0)
     assert not np.array_equal(found.rows_of(0), found.rows_of(1))
-    dealt = {tuple(window.shards for window in Order("train", (100,) * 8, 0, epoch).windows) for epoch in range(5)}
-    assert len(dealt) == 5  # the shards are dealt out anew in every epoch
+    distributions = {
+        tuple(window.shards for window in Order("train", (100,) * 8, 0, epoch).windows) for epoch in range(5)
+    }
+    assert len(distributions) == 5  # the shards are distributed again in every epoch
 
 
 def test_a_hundred_million_rows_need_no_stored_permutation() -> None:

@@ -1,4 +1,4 @@
-"""A loader in other processes and threads: pickled, spawned, forked in the middle of an epoch."""
+"""A loader in other processes and threads: pickled, spawned, and forked within an epoch."""
 
 import multiprocessing
 import os
@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cnpgen.loader import kept, order
+from cnpgen.loader import in_memory_rows, order
 from cnpgen.loader.batches import Batches
 from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.load import load_dataset
@@ -26,14 +26,14 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 @pytest.fixture(autouse=True, params=["kept in memory", "read in every epoch"])
 def _small_windows(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
     monkeypatch.setattr(order, "WINDOW_ROWS", 16)
-    monkeypatch.setattr(kept, "KEEP_BYTES", 1 << 20 if request.param == "kept in memory" else 0)
+    monkeypatch.setattr(in_memory_rows, "MAX_IN_MEMORY_BYTES", 1 << 20 if request.param == "kept in memory" else 0)
 
 
-def rest(batches: Batches) -> list[list[int]]:
+def remaining_ids(batches: Batches) -> list[list[int]]:
     return ids(batches)
 
 
-def test_a_pickled_loader_goes_on_where_it_was(dataset: Dataset) -> None:
+def test_a_pickled_loader_continues_at_its_position(dataset: Dataset) -> None:
     batches = dataset.batches(5, fields=ALL)
     loop = iter(batches)
     head = [next(loop)["sample_id"].tolist() for _ in range(3)]
@@ -50,19 +50,21 @@ def test_a_pickled_dataset_is_small_and_works_although_it_had_mapped_shards(data
     assert np.array_equal(pickle.loads(content)["train"][7]["start_q"], dataset["train"][7]["start_q"])
 
 
-def test_a_spawned_process_goes_on_where_this_one_is(dataset: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.undo()  # a new process knows nothing of small windows
+def test_a_spawned_process_continues_at_the_position_of_its_parent(
+    dataset: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.undo()  # the patch does not apply to a new process
     batches = dataset.batches(5, fields=ALL)
     loop = iter(batches)
     head = [next(loop)["sample_id"].tolist() for _ in range(3)]
     with multiprocessing.get_context("spawn").Pool(1) as pool:
-        assert head + pool.apply(rest, (batches,)) == ids(dataset.batches(5, fields=ALL))
+        assert head + pool.apply(remaining_ids, (batches,)) == ids(dataset.batches(5, fields=ALL))
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system cannot fork")
 @pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
 @pytest.mark.parametrize("taken", [0, 1, 3])
-def test_a_loop_that_is_forked_goes_on_in_both_processes(dataset: Dataset, taken: int) -> None:
+def test_a_forked_loop_continues_in_both_processes(dataset: Dataset, taken: int) -> None:
     expected = ids(dataset.batches(5, fields=ALL))
     loop = (batch["sample_id"].tolist() for batch in dataset.batches(5, fields=ALL))
     head = [next(loop) for _ in range(taken)]
@@ -71,7 +73,7 @@ def test_a_loop_that_is_forked_goes_on_in_both_processes(dataset: Dataset, taken
 
 
 def forked(loop: Iterator[list[int]]) -> list[list[int]]:
-    """Take the rest of a loop in a forked process."""
+    """Finish a loop in a forked process."""
     reading, writing = os.pipe()
     child = os.fork()
     if not child:
@@ -92,14 +94,14 @@ def test_many_threads_read_the_same_dataset(dataset: Dataset) -> None:
     random = np.random.default_rng(0)
     wanted = [random.integers(50, size=20) for _ in range(40)]
     with ThreadPoolExecutor(8) as pool:
-        loops = [pool.submit(rest, dataset.batches(5, fields=ALL)) for _ in range(20)]
+        loops = [pool.submit(remaining_ids, dataset.batches(5, fields=ALL)) for _ in range(20)]
         reads = [pool.submit(dataset.rows, "train", rows) for rows in wanted]
         assert all(loop.result() == expected for loop in loops)
         for rows, read in zip(wanted, reads, strict=True):
             assert np.array_equal(read.result()["start_q"], everything[rows])
 
 
-def test_a_loop_that_is_left_leaves_no_thread_behind(dataset: Dataset) -> None:
+def test_an_abandoned_loop_leaves_no_thread(dataset: Dataset) -> None:
     import threading
     import time
 

@@ -9,7 +9,7 @@ import pytest
 from cnpgen.losses.plan_loss import LossValue, PlanLoss
 from cnpgen.schema.keys import Range
 from tests.conftest import some
-from tests.examples.jerky import jerky
+from tests.examples.jerk_limits import jerk_limited
 from tests.examples.losses import PROBLEM_OF, Batch, batch, loss, moved, with_weight
 from tests.examples.manifolds import LIMITS, MANIFOLDS, problem_on
 from tests.examples.plans import PROBLEMS
@@ -19,19 +19,21 @@ CASES += [("transport", term, "paper") for term in ("vertical", "robot-clearance
 
 
 def weights_of(of: PlanLoss, term: str) -> np.ndarray:
-    """Only one term counts beside the time; for "time" none does."""
+    """Return weights of 0 for all terms but one; all are 0 for "time"."""
     return with_weight(of, of.terms.index(term) - 1) * (term != "time")
 
 
 def far(label: str) -> Batch:
-    """Plans beyond the joints' limits, off the table, through the pedestals; and some that are close to valid."""
+    """Return plans outside the joint limits, off the table and through pedestals, and some that are almost valid."""
     parts = [batch(label, 3, by=0.1, seed=1), batch(label, 3, by=0.8, seed=2)]
-    path, rate, tops = (np.concatenate([getattr(x, name) for x in parts]) for name in ("path", "rate", "tops"))
-    return Batch(PROBLEM_OF[label], path, rate, tops)
+    path, rate, obstacle_poses = (
+        np.concatenate([getattr(x, name) for x in parts]) for name in ("path", "rate", "obstacle_poses")
+    )
+    return Batch(PROBLEM_OF[label], path, rate, obstacle_poses)
 
 
 def along(given: Batch, of: PlanLoss, direction: tuple[np.ndarray, np.ndarray], **options: Any) -> np.ndarray:
-    """Central difference of the total of every plan along a direction."""
+    """Return the central difference of the total of every plan along a direction."""
     ends = [
         moved(given, given.path + step * direction[0], given.rate + step * direction[1])
         .evaluated(of, gradient=False, **options)
@@ -54,8 +56,8 @@ def check_along_random_directions(
 
 
 @pytest.mark.parametrize(("label", "term", "form"), some(CASES, 6, "slow"))
-def test_the_gradient_of_a_term_along_random_directions_is_that_of_central_differences(label, term, form):
-    backend = {"backend": "numpy"} if form == "paper" else {}  # for six plans that is quicker than compiling
+def test_the_gradient_of_a_term_agrees_with_central_differences(label, term, form):
+    backend = {"backend": "numpy"} if form == "paper" else {}  # faster than compiling for six plans
     of, given, random = loss(PROBLEM_OF[label], form=form, **backend), far(label), np.random.default_rng(3)
     options = {"weights": weights_of(of, term)}
     value = given.evaluated(of, **options)
@@ -64,7 +66,7 @@ def test_the_gradient_of_a_term_along_random_directions_is_that_of_central_diffe
 
 
 @pytest.mark.parametrize("name", some(sorted(MANIFOLDS), 2, "slow"))
-def test_the_gradient_of_every_manifold_is_that_of_central_differences(name):
+def test_the_gradient_of_every_manifold_agrees_with_central_differences(name):
     of = PlanLoss(problem_on(name), dtype="float64", backend="numpy", nodes=16)
     some, random = batch("transport", 3, by=0.5, seed=1), np.random.default_rng(3)
     given = Batch(some.problem, some.path, some.rate, np.zeros((3, 0)))
@@ -75,8 +77,8 @@ def test_the_gradient_of_every_manifold_is_that_of_central_differences(name):
 
 
 @pytest.mark.parametrize("label", some(["hit", "transport"], 1, "slow"))
-def test_the_gradient_of_limited_jerks_is_that_of_central_differences(label):
-    of = PlanLoss(jerky(PROBLEM_OF[label])[0], dtype="float64", backend="numpy", nodes=16)
+def test_the_gradient_of_limited_jerks_agrees_with_central_differences(label):
+    of = PlanLoss(jerk_limited(PROBLEM_OF[label])[0], dtype="float64", backend="numpy", nodes=16)
     given, random = batch(label, 3, by=0.3, seed=1), np.random.default_rng(3)
     term = of.terms.index("joint-jerk")
     value = given.evaluated(of, weights=weights_of(of, "joint-jerk"))
@@ -84,8 +86,8 @@ def test_the_gradient_of_limited_jerks_is_that_of_central_differences(label):
     check_along_random_directions(given, of, value, random, weights=weights_of(of, "joint-jerk"))
 
 
-@pytest.mark.parametrize("start", [0.163, 0.19], ids=["in the band", "beyond it"])
-def test_the_gradient_of_a_motion_that_starts_off_the_table_is_that_of_central_differences(start):
+@pytest.mark.parametrize("start", [0.163, 0.19], ids=["in the band", "outside the band"])
+def test_the_gradient_of_a_motion_that_starts_off_the_table_agrees_with_central_differences(start):
     of, given, random = loss("airhockey"), batch("hit", 6, by=0.1, seed=1), np.random.default_rng(5)
     options = {"weights": 1e4 * weights_of(of, "table"), "start_tip": np.tile([0.65, 0.0, start], (6, 1))}
     value, closed = given.evaluated(of, **options), given.evaluated(of, weights=options["weights"])
@@ -95,7 +97,7 @@ def test_the_gradient_of_a_motion_that_starts_off_the_table_is_that_of_central_d
 
 
 @pytest.mark.parametrize("label", some(["hit", "transport"], 1, "slow"))
-def test_single_components_of_the_gradient_of_all_terms_together_are_those_of_central_differences(label):
+def test_single_components_of_the_gradient_of_all_terms_agree_with_central_differences(label):
     of, given = loss(PROBLEM_OF[label]), far(label)[2:4]
     value = given.evaluated(of)
     random = np.random.default_rng(4)
@@ -114,7 +116,7 @@ def test_a_robot_inside_an_obstacle_has_a_gradient_in_the_signed_form_and_none_i
     problem = PROBLEMS["heavy-object"]
     around = replace(problem.obstacle[0], x=Range(-3.0, 3.0), y=Range(-3.0, 3.0))
     given = batch("transport", 4, by=0.05)
-    inside = replace(given, tops=np.full((4, 1), 2.5))
+    inside = replace(given, obstacle_poses=np.full((4, 1), 2.5))
     for form in ("signed", "paper"):
         of = PlanLoss(replace(problem, obstacle=(around,)), dtype="float64", nodes=8, form=form, backend="numpy")
         term = of.terms.index("robot-clearance")
@@ -126,7 +128,7 @@ def test_a_robot_inside_an_obstacle_has_a_gradient_in_the_signed_form_and_none_i
 
 
 @pytest.mark.parametrize("label", some(["hit", "transport"], 1, "slow"))
-def test_float32_gradients_are_those_of_float64_to_a_thousandth(label):
+def test_float32_gradients_agree_with_float64_to_a_thousandth(label):
     given = far(label)
     exact, rough = given.evaluated(loss(PROBLEM_OF[label])), given.evaluated(loss(PROBLEM_OF[label], dtype="float32"))
     assert rough.total.dtype == rough.terms.dtype == rough.path_gradient.dtype == np.float32

@@ -1,7 +1,9 @@
-"""The metric: the published update by hand, schedules, bounds, and states that go on exactly."""
+"""The metric: the published update by hand, schedules, bounds, and exact restoration of states."""
 
 import json
 import math
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,19 +11,31 @@ import pytest
 from cnpgen.errors import UsageError
 from cnpgen.losses.metric import Metric, alpha_step, average_loss
 from cnpgen.losses.metric_settings import BOUNDED, PUBLISHED, MetricSettings, suggested_weights
+from cnpgen.problems.constraints.axis import Axis
+from cnpgen.problems.constraints.line import Line
+from cnpgen.problems.constraints.plane import Plane
+from cnpgen.problems.constraints.pose import Pose
+from cnpgen.problems.constraints.table import Table
+from cnpgen.problems.constraints.vertical import Vertical
+from tests.examples.constraints import TipSpeed
 from tests.examples.losses import loss
 
 E = math.e
 
 
+def problem_with(*kinds: type) -> Any:
+    """Return a stand-in of a problem with constraints of these classes, which have no values."""
+    return SimpleNamespace(constraint=tuple(object.__new__(kind) for kind in kinds))
+
+
 def test_the_published_update_of_three_terms_by_hand():
-    """alpha_i += gamma log(mean L_i / C_i): ten times too large, as large as allowed, a hundredth of it."""
+    """Check alpha_i += gamma log(mean L_i / C_i) for ratios of 10, 1 and 1/100."""
     alpha = alpha_step([0.0, 1.0, -2.0], [6e-2, 5e-4, 1e-8], [6e-3, 5e-4, 1e-6], gamma=0.01)
     np.testing.assert_allclose(alpha, [0.01 * math.log(10), 1.0, -2.0 - 0.01 * math.log(100)], rtol=1e-14)
 
 
 def test_a_metric_learns_after_epochs_as_published():
-    """Two batches of two plans per epoch: means 2 and 4, then 1 and 1; the budget is 1/e and gamma 1/2."""
+    """Check two batches of two plans per epoch: means 2 and 4, then 1 and 1; the budget is 1/e and gamma 1/2."""
     metric = Metric([1.0], [1 / E], MetricSettings(kind="learned", gamma=0.5, growth=1.0))
     metric.observe([[9.0, 1.0], [9.0, 3.0]], 0.0)
     metric.observe([[9.0, 4.0], [9.0, 4.0]], 0.1)
@@ -34,7 +48,7 @@ def test_a_metric_learns_after_epochs_as_published():
     assert metric.weights(0.4) == pytest.approx([math.exp(first + 0.5)], rel=1e-14)
 
 
-def test_a_metric_learns_after_batches_where_it_is_told_to():
+def test_a_metric_learns_after_batches_if_configured():
     metric = Metric([1.0, 1.0], [1.0, 1.0], MetricSettings(kind="learned", gamma=1.0, growth=1.0, every="batch"))
     metric.observe([[0.0, E, 1 / E]], 0.0)
     assert metric.alpha == pytest.approx([1.0, -1.0])
@@ -42,12 +56,12 @@ def test_a_metric_learns_after_batches_where_it_is_told_to():
     assert metric.alpha == pytest.approx([1.0, -1.0])
 
 
-def test_steps_are_clipped_as_the_authors_do_and_a_term_of_no_loss_falls_by_the_most():
+def test_steps_are_clipped_as_published_and_a_term_without_loss_decreases_by_the_maximum():
     alpha = alpha_step([0.0, 0.0, 0.0], [1e30, 0.0, 1e-30], [1.0, 1.0, 1.0], gamma=0.01)
     np.testing.assert_allclose(alpha, [0.1, -0.1, -0.1], rtol=1e-14)
 
 
-def test_terms_without_a_budget_and_means_that_are_no_numbers_change_nothing():
+def test_terms_without_a_budget_and_means_that_are_nan_change_nothing():
     alpha = alpha_step([0.5, 0.5, 0.5], [3.0, np.nan, np.inf], [0.0, 1.0, 1.0], gamma=0.1)
     assert alpha.tolist() == [0.5, 0.5, 0.5]
 
@@ -55,13 +69,13 @@ def test_terms_without_a_budget_and_means_that_are_no_numbers_change_nothing():
 @pytest.mark.parametrize(
     ("average", "expected"), [("mean", [14.5, 2.0]), ("median", [5.5, 2.0]), ("trimmed", [5.0, 2.0])]
 )
-def test_averages_of_ten_plans_of_which_one_is_far_off(average, expected):
+def test_averages_of_ten_plans_with_one_outlier(average, expected):
     terms = np.stack([[1.0, 2, 3, 4, 5, 6, 7, 8, 9, 100], np.full(10, 2.0)], axis=1)
     assert average_loss(terms, average).tolist() == expected
     assert average_loss(np.concatenate([terms, [[np.nan, 1.0]], [[1.0, np.inf]]]), average).tolist() == expected
 
 
-def test_a_batch_of_no_plan_teaches_nothing():
+def test_a_batch_without_valid_plans_changes_nothing():
     metric = Metric([2.0], [1.0], MetricSettings(kind="learned", every="batch"))
     before = metric.state()
     metric.observe(np.full((4, 2), np.nan), 0.1)
@@ -77,7 +91,7 @@ def test_ramped_weights_grow_geometrically_between_the_ends_of_the_ramp():
 
 
 @pytest.mark.parametrize("kind", ["fixed", "ramped"])
-def test_only_learned_weights_depend_on_what_plans_cost(kind):
+def test_only_learned_weights_depend_on_losses(kind):
     metric = Metric([2.0], [1.0], MetricSettings(kind=kind, every="batch"))
     before = metric.weights(0.5)
     metric.observe([[1.0, 1e3]], 0.5)
@@ -86,7 +100,7 @@ def test_only_learned_weights_depend_on_what_plans_cost(kind):
     assert (metric.weights(1.0) > metric.weights(0.0)).all() == (kind == "ramped")
 
 
-def test_learned_weights_stay_within_their_bounds_and_are_frozen_at_the_end():
+def test_learned_weights_stay_within_their_bounds_and_are_constant_at_the_end():
     settings = MetricSettings(kind="learned", every="batch", gamma=5.0, growth=1.0, lowest=0.1, highest=8.0, frozen=0.5)
     metric = Metric([1.0, 1.0], [1.0, 1.0], settings)
     metric.observe([[0.0, 1e9, 1e-9]], 0.49)
@@ -106,7 +120,7 @@ def test_budgets_of_a_learned_metric_shrink_with_the_ramp():
 
 @pytest.mark.parametrize("settings", [PUBLISHED, BOUNDED, MetricSettings()], ids=["published", "bounded", "ramped"])
 @pytest.mark.parametrize("cut", [0, 3, 7])
-def test_a_metric_that_goes_on_from_its_state_is_the_same_to_the_last_bit(settings, cut):
+def test_a_restored_metric_continues_with_identical_bits(settings, cut):
     def run(metric: Metric, batches: range) -> None:
         for k in batches:
             metric.observe(np.random.default_rng(k).lognormal(size=(16, 4)), k / 10)
@@ -145,7 +159,7 @@ def test_the_state_of_another_metric_is_refused(state):
         ({"ramp": (0.5, 0.5)}, "must begin at 0 or later and before it ends"),
     ],
 )
-def test_settings_that_cannot_be_meant_are_named(options, message):
+def test_invalid_settings_are_refused(options, message):
     with pytest.raises(UsageError, match=message):
         MetricSettings(**options)
 
@@ -158,24 +172,24 @@ def test_settings_that_cannot_be_meant_are_named(options, message):
         ([1.0], [-1.0], r"must be finite and not negative, got \[-1.0\]"),
     ],
 )
-def test_weights_and_budgets_that_cannot_be_meant_are_named(weights, budgets, message):
+def test_invalid_weights_and_budgets_are_refused(weights, budgets, message):
     with pytest.raises(UsageError, match=message):
         Metric(weights, budgets)
 
 
 @pytest.mark.parametrize("name", ["airhockey", "heavy-object"])
-def test_suggested_weights_are_positive_and_there_for_every_term(name):
+def test_suggested_weights_are_positive_and_cover_every_term(name):
     of = loss(name)
-    weights = suggested_weights(of.terms, of.weights0)
+    weights = suggested_weights(of.problem, of.weights0)
     assert weights.shape == of.weights0.shape
     assert (weights > 0).all()
-    assert suggested_weights(("time", "table", "keep-out-2"), [1.0, 3.0]).tolist() == [1e4, 300.0]
+    assert suggested_weights(problem_with(Table, TipSpeed), [1.0, 3.0]).tolist() == [1e4, 300.0]
 
 
-def test_every_manifold_of_the_tip_begins_with_the_weight_of_the_shipped_one_that_is_like_it() -> None:
-    """The table is a plane and 'vertical' an axis; a plug-in's weight would let them go."""
+def test_all_tip_manifolds_have_the_suggested_weight_of_the_similar_shipped_one() -> None:
+    """Check that planes have the weight of the table and axes that of 'vertical'."""
     table, plane, line, pose, vertical, axis = suggested_weights(
-        ("time", "table", "plane", "line-2", "pose", "vertical", "axis"), np.ones(6)
+        problem_with(Table, Plane, Line, Pose, Vertical, Axis), np.ones(6)
     )
     assert plane == line == pose == table
     assert axis == vertical

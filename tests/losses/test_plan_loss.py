@@ -1,4 +1,4 @@
-"""The loss: values against Pinocchio, Coal and SciPy, backends, margins and funnels, and what it refuses."""
+"""The loss: values against Pinocchio, Coal and SciPy, backends, margins, time-varying bounds, and refused arguments."""
 
 import copy
 import pickle
@@ -15,9 +15,9 @@ from cnpgen.losses.quadrature import quadrature
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.problem import Problem
 from cnpgen.schema.keys import field
-from cnpgen.trajectory.motion import Motion
+from cnpgen.trajectory.spline_motion import Motion
 from tests.conftest import needs_compiler, some
-from tests.examples.jerky import jerky
+from tests.examples.jerk_limits import jerk_limited
 from tests.examples.losses import PROBLEM_OF, Batch, batch, huber, loss, states, step_losses
 from tests.examples.plans import PROBLEMS
 
@@ -25,57 +25,57 @@ PROBLEM_NAMES = ("airhockey", "heavy-object")
 LABEL_OF = {"airhockey": "hit", "heavy-object": "transport"}
 
 
-def beside(label: str, count: int = 3) -> Batch:
-    """Plans that break every constraint, but enter no obstacle with the robot: Coal knows no depth of a segment."""
+def slightly_invalid(label: str, count: int = 3) -> Batch:
+    """Return plans that violate every constraint and have no robot segment inside an obstacle."""
     given = batch(label, count, by=0.02 if label == "transport" else 0.1, raised=0.03)
     return replace(given, rate=given.rate * 1.5)
 
 
 @pytest.mark.parametrize("label", some(["hit", "replan", "transport"], 2, "slow"))
 @pytest.mark.parametrize(("rule", "shift"), some([("cosine", 0.3), ("cosine", 0.0), ("gauss", 0.0)], 1, "slow"))
-def test_terms_are_the_quadrature_of_what_pinocchio_and_coal_measure(label, rule, shift):
-    of, given = loss(PROBLEM_OF[label], rule=rule, nodes=24), beside(label)
+def test_terms_agree_with_the_quadrature_of_pinocchio_and_coal(label, rule, shift):
+    of, given = loss(PROBLEM_OF[label], rule=rule, nodes=24), slightly_invalid(label)
     found = given.evaluated(of, shift=shift).terms
     s, weights = quadrature(rule, 24, shift)
     for k in range(len(found)):
         at = states(given.path[k], given.rate[k], s)
-        expected = (weights / at.rate) @ step_losses(given.problem, at, given.tops[k])
-        exact = np.array([name != "object-contact" for name in of.terms])  # a bound where the object is tilted
+        expected = (weights / at.rate) @ step_losses(given.problem, at, given.obstacle_poses[k])
+        exact = np.array([name != "object-contact" for name in of.terms])  # a bound if the object is tilted
         np.testing.assert_allclose(found[k][exact], expected[exact], rtol=1e-9, atol=1e-14)
 
 
-def test_a_nearly_upright_object_in_a_pedestal_costs_what_coal_measures():
+def test_the_term_of_a_nearly_upright_object_in_a_pedestal_agrees_with_coal():
     of, upright = loss("heavy-object", nodes=24), batch("transport", 1, by=0.0, raised=-0.02)
-    given = replace(upright, tops=upright.tops + 0.03)  # 1 cm into the object at both ends
+    given = replace(upright, obstacle_poses=upright.obstacle_poses + 0.03)  # 1 cm into the object at both ends
     s, weights = quadrature("cosine", 24)
     at = states(given.path[0], given.rate[0], s)
-    expected = (weights / at.rate) @ step_losses(given.problem, at, given.tops[0])
+    expected = (weights / at.rate) @ step_losses(given.problem, at, given.obstacle_poses[0])
     assert expected[-1] > 1e-6
     assert given.evaluated(of).terms[0, -1] == pytest.approx(expected[-1], rel=0.02)  # upright to a milliradian
 
 
 @pytest.mark.parametrize("name", PROBLEM_NAMES)
-def test_every_term_counts_in_the_plans_that_the_values_are_compared_on(name):
-    terms = beside(LABEL_OF[name]).evaluated(loss(name)).terms
+def test_every_term_is_positive_in_the_plans_of_the_comparison(name):
+    terms = slightly_invalid(LABEL_OF[name]).evaluated(loss(name)).terms
     silent = {loss(name).terms[k] for k in np.flatnonzero((terms == 0).all(axis=0))}
-    assert silent <= {"joint-position"}  # whose value is compared in the next test
+    assert silent <= {"joint-position"}  # compared in the next test
 
 
-def test_joint_positions_beyond_their_limits_cost_what_the_paper_says():
+def test_the_term_of_joint_positions_outside_their_limits_is_the_published_one():
     of, given = loss("airhockey", nodes=16), batch("hit", 2, by=1.5)
     s, weights = quadrature("cosine", 16)
     for k, found in enumerate(given.evaluated(of).terms[:, of.terms.index("joint-position")]):
         at, robot = states(given.path[k], given.rate[k], s), of._robot
-        beyond = np.maximum(robot.position_lower - at.q, 0) + np.maximum(at.q - robot.position_upper, 0)
-        assert found == pytest.approx((weights / at.rate) @ huber(beyond).sum(axis=1), rel=1e-10)
+        violation = np.maximum(robot.position_lower - at.q, 0) + np.maximum(at.q - robot.position_upper, 0)
+        assert found == pytest.approx((weights / at.rate) @ huber(violation).sum(axis=1), rel=1e-10)
         assert found > 0
 
 
 @pytest.mark.parametrize("rule", ["cosine", "gauss"])
-def test_jerks_beyond_their_limits_cost_what_scipys_splines_say(rule):
-    """One finite difference of an acceleration is all that is known of a jerk here."""
-    problem, robot = jerky("airhockey")
-    of, given = PlanLoss(problem, dtype="float64", backend="numpy", rule=rule, nodes=16), beside("hit")
+def test_the_term_of_jerks_outside_their_limits_agrees_with_scipy_splines(rule):
+    """Compare with finite differences of accelerations."""
+    problem, robot = jerk_limited("airhockey")
+    of, given = PlanLoss(problem, dtype="float64", backend="numpy", rule=rule, nodes=16), slightly_invalid("hit")
     assert of.terms[-1] == "joint-jerk"
     value, plain = given.evaluated(of), given.evaluated(loss("airhockey", rule=rule, nodes=16))
     np.testing.assert_allclose(value.terms[:, :-1], plain.terms, rtol=1e-10)
@@ -84,8 +84,8 @@ def test_jerks_beyond_their_limits_cost_what_scipys_splines_say(rule):
         at, h = states(given.path[k], given.rate[k], s), 1e-7
         after, before = (states(given.path[k], given.rate[k], s + step).ddq for step in (h, -h))
         jerk = (after - before) / (2 * h) * at.rate[:, None]
-        beyond = np.maximum(np.abs(jerk) - robot.jerk_limit, 0)
-        assert found == pytest.approx((weights / at.rate) @ huber(beyond).sum(axis=1), rel=1e-5)
+        violation = np.maximum(np.abs(jerk) - robot.jerk_limit, 0)
+        assert found == pytest.approx((weights / at.rate) @ huber(violation).sum(axis=1), rel=1e-5)
         assert found > 0
 
 
@@ -100,7 +100,7 @@ def test_the_total_is_the_task_loss_and_the_weighted_terms(name):
     assert of.budgets.shape == of.weights0.shape == weights.shape
 
 
-def test_budgets_and_first_weights_are_those_of_the_problem_file():
+def test_budgets_and_first_weights_come_from_the_problem_file():
     of, constraints = loss("airhockey"), PROBLEMS["airhockey"].constraint
     assert of.terms[1:] == ("joint-position", "joint-velocity", "joint-acceleration", "joint-torque", "table")
     assert of.budgets.tolist() == [constraint.budget for constraint in constraints]
@@ -123,7 +123,7 @@ def test_without_a_compiler_the_loss_is_the_same_up_to_rounding(name, dtype):
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 15, 16, 17, 127, 128, 129, 300])
-def test_a_plan_s_loss_does_not_depend_on_the_batch_that_it_is_in(n):
+def test_the_loss_of_a_plan_does_not_depend_on_its_batch(n):
     of, few = loss("airhockey", dtype="float32"), batch("hit", 7)
     rows = np.arange(n) % 7
     value, alone = few[rows].evaluated(of), few.evaluated(of)
@@ -133,7 +133,7 @@ def test_a_plan_s_loss_does_not_depend_on_the_batch_that_it_is_in(n):
     np.testing.assert_allclose(value.path_gradient, alone.path_gradient[rows], rtol=1e-4, atol=1e-3)
 
 
-def test_any_layout_and_type_of_arrays_is_taken():
+def test_arrays_of_any_layout_and_type_are_accepted():
     of, given = loss("airhockey"), batch("hit", 20)
     expected = given.evaluated(of)
     lanes_last = np.ascontiguousarray(given.path.transpose(1, 2, 0)).transpose(2, 0, 1)
@@ -142,7 +142,7 @@ def test_any_layout_and_type_of_arrays_is_taken():
 
 
 @pytest.mark.slow
-def test_without_a_gradient_the_terms_are_the_same_and_the_gradients_are_of_no_plan():
+def test_without_a_gradient_the_terms_are_the_same_and_the_gradients_are_empty():
     of, given = loss("heavy-object"), batch("transport", 3)
     value = given.evaluated(of, gradient=False)
     np.testing.assert_allclose(value.terms, given.evaluated(of).terms, rtol=1e-12)
@@ -150,7 +150,7 @@ def test_without_a_gradient_the_terms_are_the_same_and_the_gradients_are_of_no_p
     assert value.rate_gradient.shape == (0, 20)
 
 
-# --- what is no plan --------------------------------------------------------------------------------------------------
+# --- invalid plans ----------------------------------------------------------------------------------------------------
 
 GARBAGE = {
     "path is nan": ("path", (4, 2), np.nan),
@@ -159,13 +159,13 @@ GARBAGE = {
     "rate is nan": ("rate", (19,), np.nan),
     "rate is zero": ("rate", (5,), 0.0),
     "rate is negative": ("rate", (0,), -1.0),
-    "height is nan": ("tops", (0,), np.nan),
+    "height is nan": ("obstacle_poses", (0,), np.nan),
 }
 
 
 @pytest.mark.parametrize("what", GARBAGE)
 @pytest.mark.parametrize("backend", [pytest.param("compiled", marks=needs_compiler), "numpy"])
-def test_what_is_no_plan_costs_nan_and_touches_no_other(what, backend):
+def test_an_invalid_plan_has_a_loss_of_nan_and_does_not_affect_others(what, backend):
     of, given = loss("heavy-object", dtype="float32", backend=backend), batch("transport", 5)
     expected = given.evaluated(of)
     name, index, value = GARBAGE[what]
@@ -178,14 +178,14 @@ def test_what_is_no_plan_costs_nan_and_touches_no_other(what, backend):
         np.testing.assert_array_equal(getattr(found, part)[others], getattr(expected, part)[others])
 
 
-def test_a_control_point_of_the_rate_below_zero_makes_no_plan_even_where_the_motion_runs_forward():
+def test_a_negative_rate_control_point_is_invalid_even_if_the_rate_is_positive():
     of, given = loss("airhockey"), batch("hit", 2)
     given.rate[1, 9] = -0.01
     assert Motion(given.path, given.rate, 7).runs_forward().all()
     assert np.isnan(given.evaluated(of).total).tolist() == [False, True]
 
 
-def test_control_points_metres_away_cost_much_and_stay_finite():
+def test_losses_of_distant_control_points_are_large_and_finite():
     of, given = loss("airhockey", dtype="float32"), batch("hit", 2)
     value = replace(given, path=given.path * 1e3).evaluated(of)
     assert np.isfinite(value.total).all()
@@ -197,7 +197,7 @@ MISTAKES = {
     "path must have shape (N, 15, 6), got (15, 6)": {"path": np.zeros((15, 6))},
     "rate must have shape (3, 20), got (2, 20)": {"rate": np.ones((2, 20))},
     "rate must be an array of numbers, got str": {"rate": "fast"},
-    "tops must have shape (3, 0), got (3, 2)": {"tops": np.zeros((3, 2))},
+    "obstacle_poses must have shape (3, 0), got (3, 2)": {"obstacle_poses": np.zeros((3, 2))},
     "start_tip must have shape (3, 3), got (3,)": {"start_tip": np.zeros(3)},
     "rate must be an array of numbers, got ndarray: complex128 is no real type": {"rate": np.ones((3, 20)) * 1j},
     "weights must be an array of numbers, got str": {"weights": "abc"},
@@ -211,17 +211,23 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("message", MISTAKES)
-def test_arguments_that_cannot_be_meant_are_named(message):
+def test_invalid_arguments_are_refused(message):
     given = batch("hit", 3)
-    arguments = {"path": given.path, "rate": given.rate, "weights": np.ones(5), "tops": None, **MISTAKES[message]}
+    arguments = {
+        "path": given.path,
+        "rate": given.rate,
+        "weights": np.ones(5),
+        "obstacle_poses": None,
+        **MISTAKES[message],
+    }
     with pytest.raises(CnpgenError) as error:
         loss("airhockey")(**arguments)
     assert str(error.value).startswith(message)
 
 
-def test_missing_heights_of_obstacles_are_an_error():
+def test_missing_obstacle_poses_are_an_error():
     given = batch("transport", 1)
-    with pytest.raises(CnpgenError, match="tops is missing: the problem 'heavy-object' has obstacles"):
+    with pytest.raises(CnpgenError, match="obstacle_poses is missing: the problem 'heavy-object' has obstacles"):
         loss("heavy-object")(given.path, given.rate, weights=np.ones(7))
 
 
@@ -242,12 +248,12 @@ def test_missing_heights_of_obstacles_are_an_error():
         ({"margins": Margins({}, {"table": np.inf})}, "an inset must be a finite number, got inf"),
     ],
 )
-def test_options_that_cannot_be_meant_are_named(options, message):
+def test_invalid_options_are_refused(options, message):
     with pytest.raises(CnpgenError, match=message):
         PlanLoss(PROBLEMS["airhockey"], **options)
 
 
-def test_a_problem_may_be_named_and_nothing_else_is_one():
+def test_a_problem_may_be_given_by_name_and_other_types_are_refused():
     assert PlanLoss("airhockey").terms == loss("airhockey").terms
     with pytest.raises(CnpgenError, match="did you mean 'airhockey'"):
         PlanLoss("airhokey")
@@ -256,7 +262,7 @@ def test_a_problem_may_be_named_and_nothing_else_is_one():
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda of: pickle.loads(pickle.dumps(of))])
-def test_a_loss_that_was_used_can_be_copied_and_sent_to_other_processes(copied):
+def test_a_used_loss_can_be_copied_and_pickled(copied):
     of, given = PlanLoss("airhockey", nodes=8), batch("hit", 2)
     tips = np.array([[0.65, 0.0, 0.19]] * 2)
     expected = [given.evaluated(of, start_tip=tips, gradient=gradient) for gradient in (True, False)]
@@ -265,11 +271,11 @@ def test_a_loss_that_was_used_can_be_copied_and_sent_to_other_processes(copied):
         np.testing.assert_array_equal(given.evaluated(again, start_tip=tips, gradient=gradient).terms, value.terms)
 
 
-# --- margins, funnels, other constraints ------------------------------------------------------------------------------
+# --- margins, time-varying bounds, other constraints ------------------------------------------------------------------
 
 
-def test_margins_cost_what_the_same_limits_in_the_problem_file_would():
-    problem, given = PROBLEMS["airhockey"], beside("hit")
+def test_margins_have_the_effect_of_the_same_limits_in_the_problem_file():
+    problem, given = PROBLEMS["airhockey"], slightly_invalid("hit")
     tighter = replace(
         problem,
         limits=replace(problem.limits, velocity_scale=0.8 * 0.9, acceleration_cap=18.0),
@@ -288,8 +294,8 @@ def test_margins_cost_what_the_same_limits_in_the_problem_file_would():
     assert (found.terms[:, [2, 3, 5]] > given.evaluated(loss("airhockey")).terms[:, [2, 3, 5]]).all()
 
 
-@pytest.mark.parametrize(("start", "allowed"), [(0.163, 0.003), (0.19, 0.005)], ids=["in the band", "beyond it"])
-def test_a_motion_that_starts_off_the_table_is_given_the_funnel_s_way_to_it(start: float, allowed: float):
+@pytest.mark.parametrize(("start", "allowed"), [(0.163, 0.003), (0.19, 0.005)], ids=["in the band", "outside the band"])
+def test_a_motion_that_starts_off_the_table_has_the_time_varying_bound(start: float, allowed: float):
     of, given = loss("airhockey", nodes=32), batch("hit", 2, by=0.1)
     table, column = PROBLEMS["airhockey"].constraint[-1], -1
     tips = np.array([[0.65, 0.0, start], [0.65, 0.0, 0.16]])
@@ -316,7 +322,7 @@ def _tip(of: PlanLoss, q: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, kw_only=True)
 class KeepOut(Constraint):
-    """The tip stays out of a circle: a plug-in that says nothing about training."""
+    """A plug-in constraint without training attributes: the tip stays outside a circle."""
 
     reason = "in the circle"
     radius: float = field("radius", unit="m", low=0.0)
@@ -345,7 +351,7 @@ def plugged_in(radius: float, monkeypatch: pytest.MonkeyPatch) -> Problem:
     return replace(problem, constraint=(*problem.constraint[:2], *two))
 
 
-def test_a_constraint_that_says_nothing_about_training_is_a_term_with_a_gradient(monkeypatch):
+def test_a_constraint_without_training_attributes_is_a_term_with_a_gradient(monkeypatch):
     of, given = PlanLoss(plugged_in(0.5, monkeypatch), dtype="float64", nodes=24, backend="numpy"), batch("hit", 2)
     assert of.terms == ("time", "joint-position", "joint-velocity", "keep-out", "keep-out-2")
     assert (of.budgets[2], of.weights0[2]) == (1e-4, 2.0)
@@ -362,13 +368,13 @@ def test_a_constraint_that_says_nothing_about_training_is_a_term_with_a_gradient
     np.testing.assert_allclose(np.einsum("kcn,kcn->k", value.path_gradient, direction), expected, rtol=1e-6)
 
 
-def test_weights_may_be_given_by_name_and_the_others_are_the_problems():
+def test_weights_may_be_given_by_name_with_the_problem_s_weights_for_others():
     of, some = loss("airhockey"), batch("hit", 3)
     given = some.path, some.rate
     by_name = dict(zip(of.terms[1:], of.weights0.tolist(), strict=True)) | {"table": 3.0}
-    in_order = [by_name[name] for name in of.terms[1:]]
+    ordered_weights = [by_name[name] for name in of.terms[1:]]
     for weights in ({"table": 3.0}, {"table": np.float32(3)}, by_name):
-        np.testing.assert_array_equal(of(*given, weights=weights).total, of(*given, weights=in_order).total)
+        np.testing.assert_array_equal(of(*given, weights=weights).total, of(*given, weights=ordered_weights).total)
     assert of.checked_weights({}).tolist() == of.checked_weights(of.weights0).tolist()
 
 
@@ -381,6 +387,6 @@ def test_weights_may_be_given_by_name_and_the_others_are_the_problems():
         ({"table": -1.0}, "the weight of 'table' must be a number that is not negative, got -1.0"),
     ],
 )
-def test_weights_by_name_that_cannot_be_meant_are_refused(weights, message):
+def test_invalid_weights_by_name_are_refused(weights, message):
     with pytest.raises(CnpgenError, match=message):
         loss("airhockey").checked_weights(weights)

@@ -1,4 +1,4 @@
-"""Quadrature: rules against closed forms and fine grids; what hides between uniform nodes is seen."""
+"""Quadrature rules against closed forms and fine grids, and peaks that uniform nodes miss."""
 
 import numpy as np
 import pytest
@@ -51,12 +51,12 @@ def test_gauss_integrates_polynomials_exactly():
         (("gauss", 8, 0.5), "must be 0, Gauss nodes cannot be moved, got 0.5"),
     ],
 )
-def test_rules_that_do_not_exist_are_refused(arguments, message):
+def test_unknown_rules_are_refused(arguments, message):
     with pytest.raises(UsageError, match=message):
         quadrature(*arguments)
 
 
-def test_shifts_take_turns_and_put_no_node_on_an_end():
+def test_shifts_rotate_and_put_no_node_on_an_end():
     shifts = [rotating_shift(step, 8) for step in range(16)]
     assert shifts[:8] == shifts[8:]
     assert len(set(shifts)) == 8
@@ -66,7 +66,7 @@ def test_shifts_take_turns_and_put_no_node_on_an_end():
     np.testing.assert_allclose(np.diff(together), np.pi / (8 * 32), rtol=1e-6)
 
 
-def test_the_table_holds_the_derivatives_of_both_splines():
+def test_the_table_has_the_derivatives_of_both_splines():
     spec = PROBLEMS["airhockey"].trajectory
     table = basis_table(spec, "cosine", 12, 0.25, "float64")
     for order in range(3):
@@ -89,7 +89,7 @@ def test_64_nodes_are_within_a_few_percent_of_4096(label, rule):
         assert np.median(np.linalg.norm(a - b, axis=1) / np.linalg.norm(b, axis=1)) < 0.1
 
 
-def test_shifts_average_out_what_one_set_of_nodes_misses():
+def test_the_average_over_shifts_reduces_the_error():
     given = batch("hit", 8)
     fine = given.evaluated(loss("airhockey", nodes=4096)).path_gradient
     of = loss("airhockey", nodes=32)
@@ -102,7 +102,7 @@ def test_shifts_average_out_what_one_set_of_nodes_misses():
 
 
 def spiked() -> Batch:
-    """A stored plan whose rate jumps at the end of the phase, with the same boundary conditions: ddq explodes there.
+    """Return a stored plan whose rate jumps at the end of the phase, with the same boundary conditions and a large ddq.
 
     The last basis function of r is about 0.01 wide; this is how training hides from uniform nodes.
     """
@@ -114,13 +114,13 @@ def spiked() -> Batch:
 
 
 def acceleration_loss(given: Batch, s: np.ndarray, weights: np.ndarray) -> tuple[float, np.ndarray]:
-    """The acceleration term by other means, and |ddq| over its limit at every node."""
+    """Return the acceleration term from SciPy's splines, and |ddq| relative to its limit at every node."""
     limit, at = ROBOTS["airhockey"].acceleration_limit, states(given.path[0], given.rate[0], s)
     excess = np.maximum(np.abs(at.ddq) - limit, 0)
     return float((weights / at.rate) @ huber(excess).sum(axis=1)), (np.abs(at.ddq) / limit).max(axis=1)
 
 
-def test_an_acceleration_that_spikes_in_the_last_percent_of_the_phase_is_seen():
+def test_an_acceleration_peak_in_the_last_percent_of_the_phase_is_detected():
     given, of = spiked(), loss("airhockey")
     s, weights = quadrature("cosine", 4096)
     truth, peak = acceleration_loss(given, s, weights)

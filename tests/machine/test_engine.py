@@ -23,12 +23,12 @@ from cnpgen.errors import MachineError, UsageError
 from cnpgen.machine import clusters
 from cnpgen.machine.clusters import Cluster
 from cnpgen.machine.engine import Engine, assembled
-from cnpgen.make.blueprint import draw_up
-from cnpgen.make.dataset import _for_others
-from cnpgen.make.shards import _PREPARED, make_shards
-from cnpgen.store.blueprint import shards, write_blueprint
+from cnpgen.make.dataset import _without_local_paths
+from cnpgen.make.make_shards import _PREPARED, make_shards
+from cnpgen.make.resolve_spec import draw_up
+from cnpgen.store.dataset_spec import shards, write_dataset_spec
 from cnpgen.store.workspace import find_workspace
-from cnpgen.validate.dataset import validate_dataset
+from cnpgen.validate.validate_dataset import validate_dataset
 from tests.conftest import HANGING, TINY_SHARD, tiny_recipe
 from tests.examples.tiny_datasets import digests, make_tiny
 from tests.machine.test_workers import die_once
@@ -39,7 +39,7 @@ ROOT = Path(__file__).parents[2]
 def test_what_cannot_be_meant_is_refused_before_anything_is_made(tmp_path):
     wrong = {
         "engine 'dusk' does not exist: expected one of loky, dask, ray (did you mean 'dask'?)": {"engine": "dusk"},
-        "the address 'host:1' is that of a cluster: say of which with engine= (dask, ray)": {"address": "host:1"},
+        "the address 'host:1' is that of a cluster: choose engine= dask or ray": {"address": "host:1"},
         "workers must be an integer from 1 on, got 0": {"engine": "dask", "workers": 0},
     }
     for text, options in wrong.items():
@@ -66,7 +66,7 @@ def test_every_command_that_shares_work_takes_the_options_and_says_them_in_error
     places = {"out": tmp_path / "out", "tiny": tiny("airhockey-hit"), "plans": tmp_path / "plans.h5"}
     words = [command, *(word.format(**places) for word in COMMANDS[command])]
     assert main([*words, "--address", "a:1"]) == 2
-    assert capsys.readouterr().err.endswith("is that of a cluster: say of which with --engine (dask, ray)\n")
+    assert capsys.readouterr().err.endswith("is that of a cluster: choose --engine dask or ray\n")
     assert not (tmp_path / "out").exists()
     assert main([*words, "--engine", "dusk"]) == 2
     assert "--engine: expected one of loky, dask, ray, got 'dusk' (did you mean 'dask'?)" in capsys.readouterr().err
@@ -86,9 +86,9 @@ def test_a_missing_package_is_named_with_what_installs_it(monkeypatch):
     [(Engine("loky", None, 2), False, 2), (Engine("loky", None, 2), True, 2), (Engine(), True, 1)],
 )
 def test_processes_of_this_machine_are_as_many_as_were_asked_for_or_one_for_little(engine, quick, size):
-    with assembled(engine, 10, quick=quick) as team:
-        assert (team.size, team.is_far) == (size, False)
-        assert list(team.share_out(abs, range(-3, 3), ordered=True)) == [3, 2, 1, 0, 1, 2]
+    with assembled(engine, 10, quick=quick) as pool:
+        assert (pool.size, pool.is_remote) == (size, False)
+        assert list(pool.distribute(abs, range(-3, 3), ordered=True)) == [3, 2, 1, 0, 1, 2]
 
 
 # --- what any cluster is asked for ------------------------------------------------------------------------------------
@@ -121,15 +121,15 @@ class Slow(Cluster):
 
 def test_a_cluster_is_given_two_tasks_per_worker_and_results_come_in_order_if_asked():
     cluster = Slow()
-    assert list(cluster.share_out(abs, range(7))) == [3, 4, 5, 6, 2, 1, 0]
+    assert list(cluster.distribute(abs, range(7))) == [3, 4, 5, 6, 2, 1, 0]
     assert cluster.most == 4
-    assert list(cluster.share_out(abs, range(7), ordered=True)) == list(range(7))
+    assert list(cluster.distribute(abs, range(7), ordered=True)) == list(range(7))
     assert cluster.given_up == 0
 
 
 def test_what_is_under_way_is_given_up_when_the_results_are_not_wanted_any_more():
     cluster = Slow()
-    results = cluster.share_out(abs, range(100))
+    results = cluster.distribute(abs, range(100))
     next(results)
     results.close()
     assert cluster.given_up == 3
@@ -141,7 +141,7 @@ def fail(_task: int) -> None:
 
 def test_what_ends_the_workers_says_what_to_do():
     with pytest.raises(MachineError, match=r"^a worker died .*memory\): try again$"):
-        list(Slow().share_out(fail, range(3), advice=": try again"))
+        list(Slow().distribute(fail, range(3), hint=": try again"))
 
 
 def test_that_nobody_works_is_said_again_after_twice_the_time(monkeypatch, caplog):
@@ -154,11 +154,11 @@ def test_that_nobody_works_is_said_again_after_twice_the_time(monkeypatch, caplo
 
     monkeypatch.setattr(clusters.time, "monotonic", lambda: now[0])
     with caplog.at_level(logging.WARNING):
-        assert list(Slow(look).share_out(abs, [5])) == [5]
+        assert list(Slow(look).distribute(abs, [5])) == [5]
     assert [record.getMessage() for record in caplog.records] == [
-        "nobody is working: the cluster of the test has had no worker for 10 s; waiting for one",
-        "nobody is working: the cluster of the test has had no worker for 20 s; waiting for one",
-        "nobody is working: the cluster of the test has had no worker for 40 s; waiting for one",
+        "the cluster of the test has had no worker for 10 s; waiting for one",
+        "the cluster of the test has had no worker for 20 s; waiting for one",
+        "the cluster of the test has had no worker for 40 s; waiting for one",
     ]
 
 
@@ -166,17 +166,17 @@ def test_a_machine_elsewhere_needs_nothing_but_the_folder_and_refuses_to_make_ot
     recipe = tiny_recipe("airhockey-hit")
     folder = tmp_path / "out"
     job = draw_up(recipe, find_workspace(folder), shard_size=TINY_SHARD, backend="numpy")
-    theirs = pickle.loads(pickle.dumps(_for_others(job)))
+    theirs = pickle.loads(pickle.dumps(_without_local_paths(job)))
     assert theirs.pipeline is theirs.cache_folder is None
     monkeypatch.chdir(tmp_path)
-    write_blueprint(folder, job.blueprint)
-    (result,) = list(make_shards(theirs, shards(job.blueprint)[-1:]))
+    write_dataset_spec(folder, job.spec)
+    (result,) = list(make_shards(theirs, shards(job.spec)[-1:]))
     assert result[0] == 60
     _PREPARED.clear()
     for change in ({"revision": 1}, {"recipe_sha256": "0" * 64}):
-        other = replace(theirs, blueprint=replace(job.blueprint, **change))
+        other = replace(theirs, spec=replace(job.spec, **change))
         with pytest.raises(MachineError, match="has another version of cnpgen, or of a plug-in"):
-            list(make_shards(other, shards(job.blueprint)[-1:]))
+            list(make_shards(other, shards(job.spec)[-1:]))
 
 
 # --- real ones --------------------------------------------------------------------------------------------------------
@@ -244,7 +244,7 @@ def test_a_dataset_is_made_by_two_workers_of_dask_of_which_one_is_killed(tiny, t
 def test_that_the_last_worker_of_dask_is_gone_is_said_until_another_one_comes(
     tmp_path, monkeypatch, caplog, start, scheduler
 ):
-    monkeypatch.setattr(clusters, "SILENT_SECONDS", 2.0)
+    monkeypatch.setattr(clusters, "FIRST_WARNING_S", 2.0)
     first = start(*WORKER)
 
     class Starter(logging.Handler):
@@ -259,9 +259,7 @@ def test_that_the_last_worker_of_dask_is_gone_is_said_until_another_one_comes(
     kill = {"progress": lambda *_: first.kill()}
     made = make_tiny(tmp_path / "out", engine="dask", address=scheduler, workers=None, shard_size=50, **kill)
     assert made.complete
-    assert (
-        f"nobody is working: the dask cluster at {scheduler} has had no worker for 2 s; waiting for one" in caplog.text
-    )
+    assert f"the dask cluster at {scheduler} has had no worker for 2 s; waiting for one" in caplog.text
 
 
 def end_workers(_task: int) -> None:
@@ -274,10 +272,10 @@ def end_workers(_task: int) -> None:
 def test_a_task_that_ends_every_worker_is_a_machine_error(name):
     pytest.importorskip({"dask": "distributed"}.get(name, name))
     with (
-        assembled(Engine(name, None, 2), 3) as team,
+        assembled(Engine(name, None, 2), 3) as pool,
         pytest.raises(MachineError, match=r"^a worker died .*: try again$"),
     ):
-        list(team.share_out(end_workers, range(3), advice=": try again"))
+        list(pool.distribute(end_workers, range(3), hint=": try again"))
 
 
 def refuse(_task: int) -> None:
@@ -288,11 +286,11 @@ def refuse(_task: int) -> None:
 @pytest.mark.filterwarnings("default")
 def test_ray_makes_the_same_bytes_and_gives_the_task_of_a_dead_worker_to_another(tiny, tmp_path):
     ray = pytest.importorskip("ray")
-    with assembled(Engine("ray", None, 2), 6) as team:
-        assert sorted(team.share_out(partial(die_once, tmp_path / "died"), range(6))) == list(range(6))
+    with assembled(Engine("ray", None, 2), 6) as pool:
+        assert sorted(pool.distribute(partial(die_once, tmp_path / "died"), range(6))) == list(range(6))
         assert (tmp_path / "died").exists()
         with pytest.raises(UsageError, match=r"^not this one$"):
-            list(team.share_out(refuse, range(3)))
+            list(pool.distribute(refuse, range(3)))
         made = make_tiny(tmp_path / "out", engine="ray", workers=2)
     assert not ray.is_initialized()
     assert made.complete

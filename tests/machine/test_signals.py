@@ -1,4 +1,4 @@
-"""Signals that wait: nothing is interrupted in the middle, and nothing is swallowed."""
+"""Signals that wait: nothing is interrupted in the centre, and nothing is swallowed."""
 
 import signal
 import subprocess
@@ -8,12 +8,12 @@ import threading
 import pytest
 
 from cnpgen.machine import signals
-from cnpgen.machine.signals import signals_wait
+from cnpgen.machine.signals import signals_deferred
 
 
 def receive(count: int, done: list[int | None]) -> None:
     """Receive so many signals in a block; note at its end which one waits."""
-    with signals_wait() as waiting:
+    with signals_deferred() as waiting:
         for _ in range(count):
             signal.raise_signal(signal.SIGINT)
         done.append(waiting.number)
@@ -32,7 +32,7 @@ def test_the_echo_of_a_signal_waits_too_and_a_later_one_does_not(monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         receive(3, done)
     assert done == [signal.SIGINT]
-    monkeypatch.setattr(signals, "ECHO_SECONDS", 0.0)
+    monkeypatch.setattr(signals, "MIN_REPEAT_INTERVAL_S", 0.0)
     with pytest.raises(KeyboardInterrupt):
         receive(2, done)
     assert len(done) == 1  # the end of the block was not reached
@@ -40,9 +40,9 @@ def test_the_echo_of_a_signal_waits_too_and_a_later_one_does_not(monkeypatch):
 
 def test_handlers_are_as_before_where_no_signal_came_or_the_block_failed():
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    with signals_wait() as waiting:
+    with signals_deferred() as waiting:
         assert waiting.number is None
-    with pytest.raises(ValueError, match="of the block"), signals_wait():
+    with pytest.raises(ValueError, match="of the block"), signals_deferred():
         raise ValueError("of the block")
     assert {number: signal.getsignal(number) for number in before} == before
 
@@ -51,7 +51,7 @@ def test_a_handler_that_only_takes_notes_lets_the_run_go_on():
     seen, before = [], signal.getsignal(signal.SIGTERM)
     signal.signal(signal.SIGTERM, lambda number, _: seen.append(number))
     try:
-        with signals_wait():
+        with signals_deferred():
             signal.raise_signal(signal.SIGTERM)
             assert seen == []
     finally:
@@ -63,7 +63,7 @@ def test_other_threads_may_train_too():
     found = []
 
     def work() -> None:
-        with signals_wait() as waiting:
+        with signals_deferred() as waiting:
             found.append(waiting.number)
 
     thread = threading.Thread(target=work)
@@ -74,7 +74,7 @@ def test_other_threads_may_train_too():
 
 def test_a_block_that_fails_swallows_no_signal():
     def fail() -> None:
-        with signals_wait():
+        with signals_deferred():
             signal.raise_signal(signal.SIGINT)
             raise ZeroDivisionError
 
@@ -87,8 +87,8 @@ def test_a_block_within_a_block_waits_for_the_outer_one_too():
     steps: list[str] = []
 
     def both() -> None:
-        with signals_wait() as outer:
-            with signals_wait() as inner:
+        with signals_deferred() as outer:
+            with signals_deferred() as inner:
                 signal.raise_signal(signal.SIGINT)
                 steps.append(f"inner {inner.came}, outer {outer.came}")
             steps.append(f"outer {outer.came}")
@@ -101,8 +101,8 @@ def test_a_block_within_a_block_waits_for_the_outer_one_too():
 def test_a_process_without_handlers_of_its_own_ends_by_the_signal_and_after_the_block():
     code = """
 import signal
-from cnpgen.machine.signals import signals_wait
-with signals_wait():
+from cnpgen.machine.signals import signals_deferred
+with signals_deferred():
     signal.raise_signal(signal.SIGTERM)
     print("to the end", flush=True)
 print("not reached")

@@ -11,10 +11,11 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from cnpgen.losses import plan_loss
 from cnpgen.losses.plan_loss import PlanLoss
 from cnpgen.machine.threads import one_thread
-from cnpgen.planner import control_points, kit
-from cnpgen.planner.omega import Omega
+from cnpgen.planner import control_points
+from cnpgen.planner import inference_pipeline as inference
+from cnpgen.planner.boundary_layer import BoundaryLayer
 from cnpgen.planner.planner import Planner
-from cnpgen.problems.load import load_problem
+from cnpgen.problems.problem_file import load_problem
 from cnpgen.trajectory.boundary import Boundary
 from tests.conftest import HANGING
 from tests.examples.models import untrained_model
@@ -88,11 +89,11 @@ def loss_call() -> None:
 
 
 def omega_call() -> None:
-    omega = Omega(AIRHOCKEY, bending_steps=0, landing_steps=0, backend="numpy")
+    omega = BoundaryLayer(AIRHOCKEY, line_projection_steps=0, projection_steps=0, backend="numpy")
     tasks = omega.tasks(boundary())
     phi, log_rate = np.zeros((3, omega.path_outputs)), np.zeros((3, omega.rate_outputs))
     points = omega(tasks, phi, log_rate)
-    omega.pull_back(tasks, phi, log_rate, path_gradient=points.path, rate_gradient=points.rate)
+    omega.vjp(tasks, phi, log_rate, path_gradient=points.path, rate_gradient=points.rate)
 
 
 def planner_call() -> None:
@@ -104,8 +105,8 @@ def planner_call() -> None:
     [
         (loss_call, plan_loss, "basis_table", 1),
         (omega_call, control_points, "control_points", 2),
-        (omega_call, control_points, "pull_back", 1),
-        (planner_call, kit, "ends_of", 1),
+        (omega_call, control_points, "vjp", 1),
+        (planner_call, inference, "ends_of", 1),
     ],
 )
 def test_loss_omega_and_planner_compute_with_one_thread(

@@ -15,7 +15,7 @@ import pytest
 
 import cnpgen
 from cnpgen.errors import DatasetError, MachineError, UsageError
-from cnpgen.machine.workers import share_out, signals_held, worker_count
+from cnpgen.machine.workers import distribute, signals_blocked, worker_count
 from tests.conftest import HANGING, some
 from tests.examples.tiny_datasets import digests, make_tiny
 
@@ -23,7 +23,7 @@ ROOT = Path(__file__).parents[2]
 linux = pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="needs /proc")
 
 
-def slowest_first(number: int) -> int:
+def slow_first(number: int) -> int:
     time.sleep(0.05 * (3 - number))
     return number
 
@@ -40,7 +40,7 @@ def test_there_are_no_more_workers_than_tasks():
 @pytest.mark.parametrize("workers", [1, 3])
 @pytest.mark.parametrize("ordered", [False, True])
 def test_every_task_is_done_and_results_come_in_their_order_if_asked(workers, ordered):
-    found = list(share_out(slowest_first, range(3), workers, ordered=ordered))
+    found = list(distribute(slow_first, range(3), workers, ordered=ordered))
     assert found == [0, 1, 2] if ordered or workers == 1 else sorted(found) == [0, 1, 2]
 
 
@@ -53,7 +53,7 @@ def test_tasks_are_fetched_as_they_are_needed():
             fetched.append(number)
             yield 3
 
-    results = share_out(slowest_first, tasks(), 2)
+    results = distribute(slow_first, tasks(), 2)
     next(results)
     results.close()
     assert len(fetched) < 50
@@ -61,10 +61,10 @@ def test_tasks_are_fetched_as_they_are_needed():
 
 KILLED = """
 import os, signal, sys, time
-from cnpgen.machine.workers import share_out
+from cnpgen.machine.workers import distribute
 
 if __name__ == "__main__":
-    for _ in share_out(time.sleep, [0.0, 0.0, 60.0, 60.0], 2):
+    for _ in distribute(time.sleep, [0.0, 0.0, 60.0, 60.0], 2):
         if sys.stdin.readline().strip() == "die":
             os.kill(os.getpid(), signal.SIGKILL)
 """
@@ -74,7 +74,7 @@ KILLED_WHILE_SENDING = """
 import os, signal, sys
 from multiprocessing.connection import Connection
 from cnpgen.errors import DatasetError
-from cnpgen.machine.workers import share_out
+from cnpgen.machine.workers import distribute
 
 whole = Connection._send
 
@@ -93,7 +93,7 @@ def long(task):
 if __name__ == "__main__":
     found = []
     try:
-        for each in share_out(long, range(4), 2, ordered=True):
+        for each in distribute(long, range(4), 2, ordered=True):
             found.append(len(each))
     except DatasetError as error:
         print(found, len(str(error)))
@@ -119,10 +119,10 @@ def long_or_short(size: int) -> bytes:
 def test_results_of_any_length_come_back_and_leave_no_file_behind(monkeypatch, tmp_path):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     sizes = [0, 1000, 2000, 2040, 2048, 2100, 4096, 16_384, 70_000, 3_000_000]
-    assert list(map(len, share_out(long_or_short, sizes, 2, ordered=True))) == sizes
+    assert list(map(len, distribute(long_or_short, sizes, 2, ordered=True))) == sizes
     for size in (10, 100_000):
         with pytest.raises(DatasetError) as caught:
-            list(share_out(long_or_short, [5, -size, 7], 2))
+            list(distribute(long_or_short, [5, -size, 7], 2))
         assert str(caught.value) == "x" * size
         assert "in long_or_short" in caught.value.__notes__[0]
     assert not list(tmp_path.iterdir())
@@ -150,7 +150,7 @@ def fail(_task: int) -> None:
 
 def test_an_error_of_a_task_is_that_error():
     with pytest.raises(ZeroDivisionError, match="on purpose"):
-        list(share_out(fail, range(4), 2))
+        list(distribute(fail, range(4), 2))
 
 
 def die(_task: int) -> None:
@@ -159,7 +159,7 @@ def die(_task: int) -> None:
 
 def test_a_dead_worker_is_a_machine_error_with_advice():
     with pytest.raises(MachineError, match=r"^a worker died \(killed, or out of memory\): try again$"):
-        list(share_out(die, range(4), 2, advice=": try again"))
+        list(distribute(die, range(4), 2, hint=": try again"))
 
 
 # --- signals ----------------------------------------------------------------------------------------------------------
@@ -171,7 +171,7 @@ def blocked(_task: int) -> set[int]:
 
 def test_workers_never_see_the_interruption_that_a_terminal_sends_to_all():
     assert not blocked(0)
-    for found in share_out(blocked, range(4), 2):
+    for found in distribute(blocked, range(4), 2):
         assert {signal.SIGINT, signal.SIGTERM} <= found
     assert not blocked(0)
 
@@ -180,7 +180,7 @@ def test_a_signal_that_comes_while_workers_start_is_only_delayed():
     started, over = [], threading.Event()
 
     def interrupted() -> None:
-        with signals_held():
+        with signals_blocked():
             os.kill(os.getpid(), signal.SIGINT)
             time.sleep(0.05)
             started.append(True)
@@ -199,12 +199,12 @@ def test_a_signal_that_comes_while_workers_start_is_only_delayed():
 
 CHILD = """
 import os, sys, time
-from cnpgen.machine.workers import share_out
+from cnpgen.machine.workers import distribute
 def pid(number):
     time.sleep(number)
     return os.getpid()
 if __name__ == "__main__":
-    for found in share_out(pid, [0.2, 0.2, 100, 100], 2):
+    for found in distribute(pid, [0.2, 0.2, 100, 100], 2):
         print(found, flush=True)
 """
 
@@ -255,7 +255,7 @@ def test_a_backend_that_knows_only_lists_is_given_a_few_tasks_at_a_time():
             yield number
 
     with joblib.parallel_config(backend="multiprocessing"):
-        results = share_out(abs, tasks(), 2)
+        results = distribute(abs, tasks(), 2)
         assert [next(results) for _ in range(20)] == list(range(20))
         results.close()
     assert len(fetched) < 50
@@ -314,5 +314,5 @@ def die_once(marker: Path, task: int) -> int:
 @pytest.mark.filterwarnings("default")
 def test_dask_gives_the_task_of_a_dead_worker_to_another(tmp_path, cluster):
     with joblib.parallel_config(backend="dask"):
-        assert sorted(share_out(partial(die_once, tmp_path / "died"), range(6), 2)) == list(range(6))
+        assert sorted(distribute(partial(die_once, tmp_path / "died"), range(6), 2)) == list(range(6))
     assert (tmp_path / "died").exists()

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
+from cnpgen.make import repair
 from cnpgen.make.dataset import make_dataset
-from cnpgen.store import mending
-from cnpgen.store.blueprint import load_blueprint, shards
+from cnpgen.store.dataset_spec import load_dataset_spec, shards
 from cnpgen.store.layout import MANIFEST
 from cnpgen.store.manifest import load_manifest
-from cnpgen.validate.dataset import validate_dataset
+from cnpgen.validate.validate_dataset import validate_dataset
 from tests.conftest import some, tiny_recipe
 from tests.examples.tiny_datasets import digests, flip, make_tiny, snapshot
 
@@ -29,7 +29,7 @@ def test_a_finished_dataset_is_left_as_it_is(folder):
     before = snapshot(folder)
     times = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
     made = make_tiny(folder)
-    assert (made.made, made.complete, made.mended) == (0, True, ())
+    assert (made.made, made.complete, made.repaired) == (0, True, ())
     assert snapshot(folder) == before
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == times
 
@@ -41,7 +41,7 @@ def test_a_flipped_bit_in_a_shard_or_its_record_is_noticed_and_made_good(tiny, f
     with pytest.warns(RuntimeWarning, match=f"a shard is damaged and is made again: .*{Path(name).stem}"):
         made = make_tiny(folder)
     assert made.made == (250 if "train" in name else 60)
-    assert (made.complete, made.mended) == (True, (name.replace(".json", ".h5"),))
+    assert (made.complete, made.repaired) == (True, (name.replace(".json", ".h5"),))
     assert digests(folder) == digests(tiny("airhockey-hit"))
     assert validate_dataset(folder).ok
 
@@ -65,11 +65,11 @@ def test_a_truncated_shard_is_noticed_and_made_good(tiny, folder, size):
 
 
 def test_several_damaged_shards_are_one_line(tiny, folder):
-    for task in shards(load_blueprint(folder))[1:]:
+    for task in shards(load_dataset_spec(folder))[1:]:
         flip(folder / task.file)
     with pytest.warns(RuntimeWarning, match=r"^3 shards are damaged and are made again: .*shard-00001.h5 was changed"):
         made = make_tiny(folder)
-    assert (made.made, len(made.mended)) == (410, 3)
+    assert (made.made, len(made.repaired)) == (410, 3)
     assert digests(folder) == digests(tiny("airhockey-hit"))
 
 
@@ -88,11 +88,11 @@ def test_lost_files_are_made_again(tiny, folder):
 def test_a_shard_lost_from_a_finished_dataset_is_named_and_the_dataset_unfinished_until_it_is_there(tiny, folder, lost):
     for ending in lost:
         (folder / "train" / f"shard-00001{ending}").unlink()
-    sealed: list[tuple[str, bool]] = []
+    has_checksum: list[tuple[str, bool]] = []
     with pytest.warns(RuntimeWarning, match=r"^a shard is damaged and is made again: .*shard-00001\.(json|h5) is"):
-        made = make_tiny(folder, begin=lambda step, *_: sealed.append((step, (folder / MANIFEST).exists())))
-    assert sealed == [("checking", True), ("making", False)]
-    assert (made.made, made.complete, made.mended) == (250, True, ("train/shard-00001.h5",))
+        made = make_tiny(folder, begin=lambda step, *_: has_checksum.append((step, (folder / MANIFEST).exists())))
+    assert has_checksum == [("checking", True), ("making", False)]
+    assert (made.made, made.complete, made.repaired) == (250, True, ("train/shard-00001.h5",))
     assert digests(folder) == digests(tiny("airhockey-hit"))
 
 
@@ -100,7 +100,7 @@ def test_a_shard_whose_record_was_not_written_before_a_run_ended_is_made_without
     for name in (MANIFEST, "train/shard-00001.json"):
         (folder / name).unlink()
     made = make_tiny(folder)  # warnings are errors
-    assert (made.made, made.complete, made.mended) == (250, True, ())
+    assert (made.made, made.complete, made.repaired) == (250, True, ())
     assert digests(folder) == digests(tiny("airhockey-hit"))
 
 
@@ -119,7 +119,7 @@ def test_a_damaged_document_is_noticed_and_written_again(tiny, folder, name, act
         made = make_tiny(folder)
     unfinished = name == MANIFEST and action == "delete"  # what was begun and not finished is no damage
     assert [str(item.message).startswith(f"written again: {name}: ") for item in said] == [True] * (not unfinished)
-    assert (made.made, made.complete, made.mended) == (0, True, (name,))
+    assert (made.made, made.complete, made.repaired) == (0, True, (name,))
     assert snapshot(folder) == snapshot(tiny("airhockey-hit"))
 
 
@@ -151,7 +151,7 @@ def test_a_part_looks_after_its_own_shards(folder):
         flip(folder / name)
     with pytest.warns(RuntimeWarning, match=r"a shard is damaged .*train.shard-00000"):
         first = make_tiny(folder, part=(0, 2))
-    assert first.mended == ("train/shard-00000.h5",)
+    assert first.repaired == ("train/shard-00000.h5",)
     with pytest.warns(RuntimeWarning, match=r"a shard is damaged .*validation.shard-00000"):
         make_tiny(folder, part=(1, 2))
     assert validate_dataset(folder).ok
@@ -164,21 +164,21 @@ def test_whoever_watches_is_told_of_the_comparison_and_then_of_the_making(folder
         make_tiny(folder, begin=lambda *x: begun.append(x), progress=lambda *x: seen.append(x))
     assert begun == [("checking", folder, 660, 0), ("making", folder, 660, 560)]
     assert [rows for rows, _ in seen] == [250, 250, 100, 60, 100]
-    assert [fates is None for _, fates in seen] == [True] * 4 + [False]
+    assert [sampling is None for _, sampling in seen] == [True] * 4 + [False]
 
 
 def test_shards_are_compared_by_several_threads_and_an_interruption_cancels_the_rest(folder, monkeypatch):
-    blueprint = load_blueprint(folder)
-    tasks = shards(blueprint) * 200
+    spec = load_dataset_spec(folder)
+    tasks = shards(spec) * 200
     compared = []
-    check = mending.check_committed
-    monkeypatch.setattr(mending, "check_committed", lambda *x: (compared.append(x), check(*x))[1])
+    check = repair.check_committed
+    monkeypatch.setattr(repair, "check_committed", lambda *x: (compared.append(x), check(*x))[1])
 
     def interrupt(_task: object) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        mending.find_damaged(folder, blueprint, tasks, progress=interrupt)
+        repair.find_damaged(folder, spec, tasks, progress=interrupt)
     assert 1 <= len(compared) < len(tasks)
 
 
@@ -188,5 +188,5 @@ def test_shard_size_and_backend_of_an_unfinished_dataset_are_kept(tmp_path):
     make_dataset(recipe, tmp_path, shard_size=77, backend="numpy", workers=1, part=(0, 2))
     made = make_dataset(recipe, tmp_path, workers=1)
     assert made.complete
-    assert (made.blueprint.shard_size, made.blueprint.backend) == (77, "numpy")
+    assert (made.spec.shard_size, made.spec.backend) == (77, "numpy")
     assert load_manifest(tmp_path)["shard_size"] == 77

@@ -12,24 +12,24 @@ import pytest
 
 from cnpgen.cli.main import main
 from cnpgen.errors import RecipeError, UsageError
-from cnpgen.judges.rows.plans import PlanCheck, check_plans
+from cnpgen.judges.rows.certified_plans import PlanCheck, check_plans
 from cnpgen.make.certify import NO_PLAN, CertifiedPlan, certified
 from cnpgen.make.dataset import make_dataset
-from cnpgen.make.load import load_dataset_recipe
 from cnpgen.make.merge import _shipped_notes
+from cnpgen.make.recipe_file import load_dataset_recipe
 from cnpgen.planner.model_file import shipped_models
 from cnpgen.plans import load_plans, save_plans
 from cnpgen.plans.boundary_problems import load_boundary_problems, plans_of_rows
 from cnpgen.plans.evaluate import evaluate_plans
+from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import resolved
-from cnpgen.problems.record import record_problem
-from cnpgen.problems.robot import load_robot
-from cnpgen.refine import engine
-from cnpgen.refine.plans import refine_plans
-from cnpgen.refine.task import Refined
+from cnpgen.problems.problem_record import record_problem
+from cnpgen.refine import refine_engine as engine
+from cnpgen.refine.refine_plans import refine_plans
+from cnpgen.refine.task import Attempt
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.reader import open_dataset
-from cnpgen.validate.dataset import validate_dataset
+from cnpgen.validate.validate_dataset import validate_dataset
 from tests.conftest import Prepare, run_stages
 
 ROWS = 12
@@ -45,7 +45,7 @@ def test_every_row_holds_a_plan_that_deep_validation_judges(folder: Path) -> Non
     report = validate_dataset(folder, deep=True, regenerate=1, workers=1)
     assert report.ok
     assert report.to_dict()["plans"] == {"judged": ROWS, "valid": ROWS}
-    assert f"judged at every moment: {ROWS} plans, {ROWS} valid" in report.summary()
+    assert f"judged at all times: {ROWS} plans, {ROWS} valid" in report.summary()
     rows = open_dataset(folder).read("train")
     assert rows["path_control_points"].shape == (11, 15 * 6)
     assert rows["rate_control_points"].shape == (11, 20)
@@ -77,10 +77,10 @@ def test_rows_are_read_with_their_plans_and_these_are_as_good_as_refined(folder:
 @pytest.mark.parametrize("model", [None, "airhockey-hit"])
 def test_a_round_whose_draws_are_all_rejected_needs_no_plans(model: str | None, prepare: Prepare) -> None:
     prepared = prepare(certified(load_dataset_recipe("airhockey-hit"), model=model).pipeline)
-    (*_, (_, plan)), draws = prepared._stages, run_stages(prepared, 4)
-    draws.reject(np.zeros(len(draws.alive), bool), "all of them")
-    plan(draws, np.random.default_rng(0))
-    assert [draws[name].shape for name in ("path_control_points", "rate_control_points", "duration")] == [
+    (*_, (_, plan)), candidates = prepared._stages, run_stages(prepared, 4)
+    candidates.reject(np.zeros(len(candidates.alive), bool), "all of them")
+    plan(candidates, np.random.default_rng(0))
+    assert [candidates[name].shape for name in ("path_control_points", "rate_control_points", "duration")] == [
         (90, 0), (20, 0), (1, 0)
     ]  # fmt: skip
 
@@ -98,7 +98,7 @@ def test_workers_and_interruptions_change_no_byte(folder: Path, tmp_path: Path) 
 def test_samples_without_a_plan_are_counted_under_their_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     solve, count = engine.refine_task, itertools.count()
 
-    def fail_at_every_third(*arguments: Any) -> Refined:
+    def fail_at_every_third(*arguments: Any) -> Attempt:
         found = solve(*arguments)
         return replace(found, reason="off the table") if next(count) % 3 == 0 else found
 
@@ -121,7 +121,7 @@ def test_a_plan_that_does_not_hold_is_found(folder: Path, tmp_path: Path) -> Non
     assert (found.judged, found.valid) == (11, 10)
     assert "1 of 11 plans are not valid, the first one is that of row 3" in found.problems[0]
     wrong = check_plans(problem, robot, rows | {"duration": 2 * rows["duration"]})
-    assert wrong.problems == ("durations are not those of the plans",)
+    assert wrong.problems == ("stored durations differ from those of the plans",)
     assert check_plans(problem, robot, {"start_q": rows["start_q"]}) == PlanCheck()
 
 
@@ -169,11 +169,11 @@ def test_plans_that_begin_with_a_planners_are_judged_alike_and_made_again_alike(
     report = validate_dataset(from_planner, deep=True, regenerate=1, workers=1)
     assert report.ok, report.summary()
     assert report.to_dict()["plans"] == {"judged": ROWS, "valid": ROWS}
-    stage = open_dataset(from_planner).blueprint.stages[-1]
+    stage = open_dataset(from_planner).spec.stages[-1]
     assert (stage["use"], stage["model"], stage["sha256"]) == (
         "certified-plan", "airhockey-hit", file_sha256(shipped_models()["airhockey-hit"]),
     )  # fmt: skip
-    assert _shipped_notes(open_dataset(from_planner).blueprint).startswith("Hits from rest")
+    assert _shipped_notes(open_dataset(from_planner).spec).startswith("Hits from rest")
     one, other = (open_dataset(each).read("train") for each in (folder, from_planner))
     np.testing.assert_array_equal(one["start_q"], other["start_q"])
     assert (one["path_control_points"] != other["path_control_points"]).any()
@@ -204,7 +204,7 @@ def test_a_planner_is_for_certifying(tmp_path: Path, capsys: pytest.CaptureFixtu
     with pytest.raises(UsageError, match="certify=True"):
         make_dataset("airhockey-hit", tmp_path / "out", n=4, model="airhockey-hit")
     assert main(["make-dataset", "airhockey-hit", "-o", str(tmp_path / "out"), "--model", "airhockey-hit"]) == 2
-    assert "--model says where certifying begins: it needs --certify" in capsys.readouterr().err
+    assert "--model needs --certify" in capsys.readouterr().err
     command = ["make-dataset", "airhockey-hit", "--certify", "--model", "airhockey-hot", "--dry-run"]
     assert main(command) == 2
     assert "unknown model 'airhockey-hot'" in capsys.readouterr().err

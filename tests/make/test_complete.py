@@ -51,7 +51,7 @@ def test_one_task_is_written_without_a_list_and_one_value_holds_for_all():
             {"goal_xyz": np.zeros((3, 2)), "hit_angle": [0.0, 1.0]},
             "hit_angle is given for 2 tasks, another",
         ),
-        ({"goal_xyz": np.zeros((0, 2))}, "goal_xyz is of no task"),
+        ({"goal_xyz": np.zeros((0, 2))}, "goal_xyz has no rows"),
         ({"goal_xyz": "here"}, "goal_xyz must be an array of numbers"),
     ],
 )

@@ -12,22 +12,22 @@ import pytest
 
 from cnpgen.errors import MachineError, UsageError
 from cnpgen.kernels.library import choose_backend
-from cnpgen.make import shards as make
-from cnpgen.make.blueprint import draw_up
+from cnpgen.make import make_shards as make
 from cnpgen.make.dataset import _part as make_part
 from cnpgen.make.dataset import is_quick, make_dataset, runs
-from cnpgen.make.load import load_dataset_recipe
-from cnpgen.make.shards import Job, make_shards, shard_columns
+from cnpgen.make.make_shards import Job, make_shards, shard_columns
+from cnpgen.make.recipe_file import load_dataset_recipe
+from cnpgen.make.resolve_spec import draw_up
 from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.pipelines.stages.stage import BLOCK_ROWS
 from cnpgen.schema.catalogue import list_recipes
-from cnpgen.store.blueprint import load_blueprint, shards
-from cnpgen.store.fates import Fates
-from cnpgen.store.layout import MANIFEST, PLAN
+from cnpgen.store.dataset_spec import load_dataset_spec, shards
+from cnpgen.store.layout import MANIFEST, SPECIFICATION
 from cnpgen.store.manifest import load_manifest
-from cnpgen.store.record import pending
+from cnpgen.store.sampling_statistics import SamplingStatistics
+from cnpgen.store.shard_record import pending
 from cnpgen.store.workspace import find_workspace, open_workspace
-from cnpgen.validate.dataset import validate_dataset
+from cnpgen.validate.validate_dataset import validate_dataset
 from tests.conftest import SHIPPED, TINY_SHARD, columns_of, some, tiny_recipe
 from tests.examples.tiny_datasets import SHARDS, digests, make_tiny, snapshot
 
@@ -73,7 +73,7 @@ def test_rows_do_not_depend_on_the_size_of_the_shards(large, tmp_path, size):
 
 def test_fewer_rows_are_the_first_of_each_split(large, tmp_path):
     make_dataset("airhockey-replan", tmp_path / "few", n=1000, workers=1)
-    assert load_blueprint(tmp_path / "few").splits == {"train": 934, "validation": 66}
+    assert load_dataset_spec(tmp_path / "few").splits == {"train": 934, "validation": 66}
     for split, rows in (("train", 934), ("validation", 66)):
         few, many = columns_of(tmp_path / "few", split), columns_of(large, split)
         for name, values in few.items():
@@ -102,7 +102,7 @@ def test_another_seed_makes_other_rows(tiny: Callable[[str], Path], tmp_path):
 def test_a_pipeline_without_a_dataset_recipe_can_be_made(tmp_path):
     made = make_dataset("airhockey-hit", tmp_path / "a", n=50, workers=1)
     as_pipeline = make_dataset(list_recipes("pipeline")["airhockey-hit"], tmp_path / "b", n=50, workers=1)
-    assert as_pipeline.blueprint.splits == {"train": 45, "validation": 5}
+    assert as_pipeline.spec.splits == {"train": 45, "validation": 5}
     assert made.complete
     assert as_pipeline.complete
 
@@ -115,18 +115,18 @@ def test_the_default_folder_is_named_after_the_dataset_and_its_major_version(tmp
 
 def test_planning_writes_nothing(tmp_path):
     job = draw_up(tiny_recipe("airhockey-hit"), find_workspace(tmp_path / "out"))
-    assert sum(job.blueprint.splits.values()) == 660
+    assert sum(job.spec.splits.values()) == 660
     assert list(tmp_path.iterdir()) == []
 
 
 def test_progress_is_told_of_every_shard_and_its_draws(tmp_path):
-    seen: list[tuple[int, Fates]] = []
+    seen: list[tuple[int, SamplingStatistics]] = []
     begun: list[tuple[str, Path, int, int]] = []
     make_tiny(tmp_path / "out", progress=lambda *x: seen.append(x), begin=lambda *x: begun.append(x))
     assert [rows for rows, _ in seen] == [250, 250, 100, 60]
-    assert all(fates.accepted == rows for rows, fates in seen)
+    assert all(sampling.accepted == rows for rows, sampling in seen)
     assert begun == [("making", tmp_path / "out", 660, 0)]
-    total = sum(fates.tried for _, fates in seen)
+    total = sum(sampling.tried for _, sampling in seen)
     assert load_manifest(tmp_path / "out")["yield"]["tried"] == total
 
 
@@ -153,7 +153,7 @@ def test_all_parts_of_a_job_array_make_the_dataset_and_the_last_one_finishes_it(
 
 @pytest.mark.parametrize("m", [1, 2, 3, 5, 8])
 def test_parts_share_no_shard_and_leave_none(job, m):
-    tasks = shards(job.blueprint)
+    tasks = shards(job.spec)
     parts = [make_part(tasks, (k, m)) for k in range(m)]
     assert [task for part in parts for task in part] == tasks
     assert max(map(len, parts)) - min(map(len, parts)) <= 1
@@ -179,9 +179,9 @@ def test_a_shard_that_pinocchio_disagrees_with_is_not_written(tmp_path, monkeypa
     honest = make.shard_columns
 
     def wrong(*arguments):
-        for columns, fates in honest(*arguments):
+        for columns, sampling in honest(*arguments):
             columns["start_q"][-1, 0] += 1e-6
-            yield columns, fates
+            yield columns, sampling
 
     monkeypatch.setattr(make, "shard_columns", wrong)
     with pytest.raises(MachineError, match=r"row 249 of split 'train' fails Pinocchio's check .*try another backend="):
@@ -202,46 +202,46 @@ def test_the_worst_violation_of_every_check_is_recorded(tiny):
 def job(tmp_path_factory: pytest.TempPathFactory) -> Job:
     folder = tmp_path_factory.mktemp("job") / "out"
     job = draw_up(tiny_recipe("airhockey-hit"), find_workspace(folder), shard_size=TINY_SHARD)
-    open_workspace(job.folder, job.blueprint)
+    open_workspace(job.folder, job.spec)
     return job
 
 
 def test_making_a_shard_twice_is_harmless(job):
-    task = shards(job.blueprint)[1]
+    task = shards(job.spec)[1]
     (first,) = make_shards(job, [task])
     before = (job.folder / task.file).read_bytes()
     (second,) = make_shards(job, [task])
     assert (job.folder / task.file).read_bytes() == before
     assert first[0] == second[0] == 250
-    assert task not in pending(job.folder, job.blueprint)
+    assert task not in pending(job.folder, job.spec)
 
 
 def test_shards_are_the_rows_of_their_blocks_made_together_or_with_gaps(job):
     backend, cache = choose_backend()
     prepared = PreparedPipeline(job.pipeline, backend=backend, cache_folder=cache)
-    blueprint = replace(job.blueprint, splits={"train": 3 * BLOCK_ROWS}, shard_size=1900)
-    blocks = [prepared.block(blueprint.seed, "train", index) for index in range(3)]
-    tasks = [task for task in shards(blueprint) if task.index != 3]
+    spec = replace(job.spec, splits={"train": 3 * BLOCK_ROWS}, shard_size=1900)
+    blocks = [prepared.block(spec.seed, "train", index) for index in range(3)]
+    tasks = [task for task in shards(spec) if task.index != 3]
     assert {task.first_row // BLOCK_ROWS for task in tasks} == {0, 1, 2}
-    for task, (columns, fates) in zip(tasks, shard_columns(prepared, blueprint, tasks), strict=True):
+    for task, (columns, sampling) in zip(tasks, shard_columns(prepared, spec, tasks), strict=True):
         rows = slice(task.first_row, task.first_row + task.rows)
         for name, values in columns.items():
             expected = np.concatenate([block.columns[name] for block in blocks], axis=1)[:, rows].T
             np.testing.assert_array_equal(values, expected if values.ndim == 2 else expected[:, 0])
-        assert (fates.accepted, fates.tried) == (task.rows, columns["attempts"].sum())
+        assert (sampling.accepted, sampling.tried) == (task.rows, columns["attempts"].sum())
 
 
 @pytest.fixture
 def rounds(monkeypatch) -> Counter:
     """Count how often the first draws of every block are made."""
     seen: Counter = Counter()
-    pieces = PreparedPipeline.pieces
+    chunks = PreparedPipeline.chunks
 
     def counted(self, seed, split, index, ranges):
         seen[split, index] += 1
-        return pieces(self, seed, split, index, ranges)
+        return chunks(self, seed, split, index, ranges)
 
-    monkeypatch.setattr(PreparedPipeline, "pieces", counted)
+    monkeypatch.setattr(PreparedPipeline, "chunks", counted)
     return seen
 
 
@@ -267,20 +267,20 @@ def test_small_shards_have_the_rows_and_counts_of_large_ones(large, tmp_path):
 
 
 def test_a_second_process_is_started_for_many_rows_or_slow_ones_only(job):
-    blueprint = replace(job.blueprint, backend="compiled", splits={"train": 200_000})
-    assert is_quick(blueprint, shards(blueprint))
-    assert not is_quick(replace(blueprint, backend="numpy"), shards(blueprint))
-    assert not is_quick(replace(blueprint, block_rows=64), shards(blueprint)[:1])
-    more = replace(blueprint, splits={"train": 200_001})
+    spec = replace(job.spec, backend="compiled", splits={"train": 200_000})
+    assert is_quick(spec, shards(spec))
+    assert not is_quick(replace(spec, backend="numpy"), shards(spec))
+    assert not is_quick(replace(spec, block_rows=64), shards(spec)[:1])
+    more = replace(spec, splits={"train": 200_001})
     assert not is_quick(more, shards(more))
 
 
 @pytest.mark.parametrize("size", [64, 1000, 4096, 5000, 8192, 100_000])
 @pytest.mark.parametrize("workers", [1, 2, 16])
 def test_runs_are_the_shards_in_order_and_long_enough_to_share_blocks(job, size, workers):
-    blueprint = replace(job.blueprint, splits={"train": 100_000, "validation": 5000, "test": 0}, shard_size=size)
-    tasks = shards(blueprint)
-    groups = runs(blueprint, tasks, workers)
+    spec = replace(job.spec, splits={"train": 100_000, "validation": 5000, "test": 0}, shard_size=size)
+    tasks = shards(spec)
+    groups = runs(spec, tasks, workers)
     assert [task for group in groups for task in group] == tasks
     for group in groups:
         assert len({task.split for task in group}) == 1
@@ -293,11 +293,11 @@ def test_runs_are_the_shards_in_order_and_long_enough_to_share_blocks(job, size,
 
 
 def test_the_blueprint_says_what_the_rows_came_from(tiny):
-    blueprint = load_blueprint(tiny("airhockey-replan"))
-    assert (tiny("airhockey-replan") / PLAN).is_file()
-    assert blueprint.recipe["pipeline"]["name"] == "airhockey-replan"
-    assert blueprint.robot["joint_names"] == [f"joint_{k}" for k in range(1, 7)]
-    assert blueprint.robot["urdf"].startswith("<?xml") or "<robot" in blueprint.robot["urdf"]
-    assert blueprint.versions["numpy"] == np.__version__
-    assert blueprint.seed == load_dataset_recipe("airhockey-replan").seed
-    assert replace(blueprint, title="another title").fingerprint == blueprint.fingerprint
+    spec = load_dataset_spec(tiny("airhockey-replan"))
+    assert (tiny("airhockey-replan") / SPECIFICATION).is_file()
+    assert spec.recipe["pipeline"]["name"] == "airhockey-replan"
+    assert spec.robot["joint_names"] == [f"joint_{k}" for k in range(1, 7)]
+    assert spec.robot["urdf"].startswith("<?xml") or "<robot" in spec.robot["urdf"]
+    assert spec.versions["numpy"] == np.__version__
+    assert spec.seed == load_dataset_recipe("airhockey-replan").seed
+    assert replace(spec, title="another title").fingerprint == spec.fingerprint

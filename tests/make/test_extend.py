@@ -13,11 +13,11 @@ import cnpgen
 from cnpgen.cli.main import main
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.make import extend as extend_module
-from cnpgen.make import load as load_module
+from cnpgen.make import recipe_file as load_module
 from cnpgen.make.extend import extend_dataset
-from cnpgen.store.blueprint import load_blueprint, shards
+from cnpgen.store.dataset_spec import load_dataset_spec, shards
 from cnpgen.store.inspection import inspect_dataset
-from cnpgen.validate.dataset import validate_dataset
+from cnpgen.validate.validate_dataset import validate_dataset
 from tests.conftest import columns_of
 from tests.examples.tiny_datasets import digests, flip, make_tiny, snapshot
 
@@ -50,7 +50,7 @@ def test_an_extended_dataset_has_the_rows_of_one_made_at_once_beside_shards_that
     after = times(damaged)
     assert {name: after[name] for name in before} == before
     assert {name: (damaged / name).read_bytes() for name in before} == {name: content[name] for name in before}
-    tasks = [task for task in shards(load_blueprint(damaged)) if task.split == "train"]
+    tasks = [task for task in shards(load_dataset_spec(damaged)) if task.split == "train"]
     assert [(task.first_row, task.rows) for task in tasks] == [
         (0, 250),
         (250, 250),
@@ -72,8 +72,8 @@ def test_it_is_proven_like_any_other_and_its_documents_are_of_all_rows(grown, at
     assert (report.rows, report.identical, report.blocks) == (ROWS, report.regenerated, 8)
     found, expected = inspect_dataset(grown), inspect_dataset(at_once)
     assert found.state == "complete"
-    assert found.fates.to_json()["tried"] == expected.fates.to_json()["tried"]
-    assert found.fates.rejections == expected.fates.rejections
+    assert found.sampling.to_json()["tried"] == expected.sampling.to_json()["tried"]
+    assert found.sampling.rejections == expected.sampling.rejections
     for name, statistics in found.statistics.items():
         np.testing.assert_allclose(statistics.mean, expected.statistics[name].mean, rtol=1e-12, atol=1e-15)
         np.testing.assert_array_equal(statistics.minimum, expected.statistics[name].minimum)
@@ -144,8 +144,8 @@ def test_an_extension_that_is_cut_off_goes_on(damaged, grown):
     class Enough(Exception):
         pass
 
-    def stop(_rows: int, fates: object) -> None:
-        if fates is not None:
+    def stop(_rows: int, sampling: object) -> None:
+        if sampling is not None:
             raise Enough
 
     with pytest.raises(Enough):
@@ -158,8 +158,8 @@ def test_an_extension_that_is_cut_off_goes_on(damaged, grown):
     assert (damaged / "README.md").read_bytes() == (grown / "README.md").read_bytes()
 
 
-def test_a_run_that_ends_before_the_new_blueprint_is_written_has_lost_nothing(damaged, grown, monkeypatch):
-    monkeypatch.setattr(extend_module, "write_blueprint", None)
+def test_a_run_that_ends_before_the_new_specification_is_written_loses_no_data(damaged, grown, monkeypatch):
+    monkeypatch.setattr(extend_module, "write_dataset_spec", None)
     with pytest.raises(TypeError):
         extend_dataset(damaged, ROWS)
     monkeypatch.undo()
@@ -170,9 +170,9 @@ def test_a_run_that_ends_before_the_new_blueprint_is_written_has_lost_nothing(da
 @pytest.mark.slow
 def test_splits_that_were_too_small_to_be_there_appear(tmp_path):
     folder = make_tiny(tmp_path / "out", n=5).folder
-    assert load_blueprint(folder).splits == {"train": 5}
+    assert load_dataset_spec(folder).splits == {"train": 5}
     extend_dataset(folder, 44, workers=1)
-    assert load_blueprint(folder).splits == {"train": 40, "validation": 4}
+    assert load_dataset_spec(folder).splits == {"train": 40, "validation": 4}
     assert validate_dataset(folder, deep=True, regenerate=3).ok
 
 
@@ -186,16 +186,17 @@ def test_what_cannot_be_extended_is_refused_and_left_as_it_is(damaged, tmp_path,
     (tmp_path / "empty").mkdir()
     with pytest.raises(DatasetError, match="holds no dataset"):
         extend_dataset(tmp_path / "empty", 1000)
-    monkeypatch.setattr(load_module, "REVISION", 3)
+    monkeypatch.setattr(load_module, "GENERATOR_REVISION", 3)
     with pytest.raises(UsageError, match="was made by another version of cnpgen or of its plug-ins"):
         extend_dataset(damaged, ROWS)
     assert snapshot(damaged) == before
 
 
-def test_a_blueprint_that_shrank_is_refused(tiny):
-    blueprint = load_blueprint(tiny("airhockey-hit"))
-    with pytest.raises(UsageError, match=re.escape("a dataset does not shrink: its splits had {'train': 700}, then")):
-        replace(blueprint, earlier=({"train": 700},))
+def test_a_specification_with_smaller_splits_raises_an_error(tiny):
+    spec = load_dataset_spec(tiny("airhockey-hit"))
+    text = re.escape("the splits of a dataset must not shrink: they had {'train': 700}, then")
+    with pytest.raises(UsageError, match=text):
+        replace(spec, previous_splits=({"train": 700},))
 
 
 def test_the_command_says_what_it_did(damaged, capsys):

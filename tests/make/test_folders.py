@@ -18,8 +18,8 @@ from cnpgen.cli.main import main
 from cnpgen.errors import DatasetError, MachineError, RecipeError, UsageError
 from cnpgen.make.dataset import make_dataset
 from cnpgen.pipelines.prepared import PreparedPipeline
-from cnpgen.store.blueprint import load_blueprint
-from cnpgen.validate.dataset import validate_dataset
+from cnpgen.store.dataset_spec import load_dataset_spec
+from cnpgen.validate.validate_dataset import validate_dataset
 from tests.conftest import TINY_SHARD, some, tiny_recipe
 from tests.examples.tiny_datasets import digests, flip, make_tiny, snapshot
 
@@ -40,7 +40,7 @@ CHANGES = {
 
 @pytest.mark.parametrize("what", CHANGES)
 def test_another_dataset_in_the_folder_is_refused_and_not_touched(folder, what):
-    if CHANGES[what] == {"backend": load_blueprint(folder).backend}:
+    if CHANGES[what] == {"backend": load_dataset_spec(folder).backend}:
         pytest.skip("this is the only backend here")
     before = snapshot(folder)
     words = what.replace("_", " ")
@@ -80,7 +80,7 @@ def test_another_size_is_refused_with_what_can_be_done(folder, rows):
     assert "holds this dataset with 660 rows (train 600, validation 60), not with" in text
     assert f"{rows:,} rows (train {rows * 10 // 11:,}, validation {rows // 11:,})" in text
     extend = "extend_dataset or 'cnpgen extend' adds the rows, or " if rows > 660 else ""
-    assert f"have are the same: {extend}choose another out=, or replace it with force=True" in text
+    assert f"the common rows are the same: {extend}choose another out=, or replace it with force=True" in text
     assert snapshot(folder) == before
 
 
@@ -91,31 +91,31 @@ def test_force_replaces_another_dataset(folder):
     assert sorted(digests(folder)) == ["train/shard-00000.h5", "train/shard-00001.h5", "validation/shard-00000.h5"]
 
 
-# --- blueprints of which nothing was made -----------------------------------------------------------------------------
+# --- specifications without shards ----------------------------------------------------------------------------------
 
 
 def hopeless(monkeypatch) -> None:
     """Let no draw be accepted."""
-    run = PreparedPipeline._round
+    run = PreparedPipeline._sample_batch
 
     def rejected(self, random, size):
-        draws = run(self, random, size)
-        draws.stage = "test"
-        draws.reject(np.zeros(len(draws.alive), bool), "hopeless")
-        return draws
+        candidates = run(self, random, size)
+        candidates.stage = "test"
+        candidates.reject(np.zeros(len(candidates.alive), bool), "hopeless")
+        return candidates
 
-    monkeypatch.setattr(PreparedPipeline, "_round", rejected)
+    monkeypatch.setattr(PreparedPipeline, "_sample_batch", rejected)
 
 
 @pytest.mark.slow
 def test_a_recipe_that_accepts_nothing_does_not_block_the_folder_for_the_corrected_one(tmp_path, monkeypatch):
     hopeless(monkeypatch)
-    with pytest.raises(RecipeError, match=r"0 of .* draws were accepted"):
+    with pytest.raises(RecipeError, match=r"0 of .* candidates were accepted"):
         make_tiny(tmp_path / "out", seed=1, shard_size=77)
     monkeypatch.undo()
-    assert (tmp_path / "out" / "plan.json").is_file()
+    assert (tmp_path / "out" / "specification.json").is_file()
     assert make_tiny(tmp_path / "out", seed=2).complete
-    assert load_blueprint(tmp_path / "out").seed == 2
+    assert load_dataset_spec(tmp_path / "out").seed == 2
     assert validate_dataset(tmp_path / "out").ok
 
 
@@ -124,7 +124,7 @@ def test_a_damaged_blueprint_of_which_nothing_was_made_gives_way(tmp_path, conte
     folder = tmp_path / "out"
     make_tiny(folder, part=(0, 9))
     assert not digests(folder)
-    path = folder / "plan.json"
+    path = folder / "specification.json"
     if content == "cut":
         path.write_bytes(path.read_bytes()[:200])
     else:
@@ -136,11 +136,11 @@ def test_a_damaged_blueprint_of_which_nothing_was_made_gives_way(tmp_path, conte
 @pytest.mark.parametrize("content", some([b"", b"{", b"garbage", None], 2, "slow"))
 def test_a_damaged_blueprint_with_rows_is_refused_until_it_is_forced(folder, content):
     if content is None:
-        flip(folder / "plan.json")
+        flip(folder / "specification.json")
     else:
-        (folder / "plan.json").write_bytes(content)
+        (folder / "specification.json").write_bytes(content)
     before = snapshot(folder)
-    with pytest.raises(DatasetError, match=r"plan.json is damaged: .*; force=True replaces the whole dataset"):
+    with pytest.raises(DatasetError, match=r"specification.json is damaged: .*; force=True replaces the whole dataset"):
         make_tiny(folder)
     assert snapshot(folder) == before
     assert make_tiny(folder, force=True).complete
@@ -148,7 +148,7 @@ def test_a_damaged_blueprint_with_rows_is_refused_until_it_is_forced(folder, con
 
 
 def test_force_works_where_the_blueprint_is_damaged_and_a_record_or_all_documents_are_lost(folder):
-    (folder / "plan.json").write_bytes(b"")
+    (folder / "specification.json").write_bytes(b"")
     for name in ("manifest.json", "stats.json", "README.md", "croissant.json", "validation/shard-00000.json"):
         (folder / name).unlink()
     assert make_tiny(folder, force=True).complete
@@ -156,8 +156,8 @@ def test_force_works_where_the_blueprint_is_damaged_and_a_record_or_all_document
 
 
 def test_force_works_where_the_blueprint_is_lost(folder):
-    (folder / "plan.json").unlink()
-    with pytest.raises(DatasetError, match=r"plan.json is missing; force=True replaces the whole dataset"):
+    (folder / "specification.json").unlink()
+    with pytest.raises(DatasetError, match=r"specification.json is missing; force=True replaces the whole dataset"):
         make_tiny(folder)
     assert make_tiny(folder, force=True).complete
     assert validate_dataset(folder).ok
@@ -167,15 +167,15 @@ def test_force_works_where_the_blueprint_is_lost(folder):
 
 
 @pytest.mark.parametrize("force", [False, True])
-@pytest.mark.parametrize("blueprint", [None, "", "{}", '{"terraform": 1}'])
-def test_a_folder_that_is_no_dataset_is_refused_and_not_touched(tmp_path, force, blueprint):
+@pytest.mark.parametrize("spec", [None, "", "{}", '{"terraform": 1}'])
+def test_a_folder_that_is_no_dataset_is_refused_and_not_touched(tmp_path, force, spec):
     (tmp_path / "thesis.tex").write_text("years of work")
     (tmp_path / "README.md").write_text("mine")
     (tmp_path / "train").mkdir()
     (tmp_path / "train" / "shard-00000.h5").write_text("somebody else's")
     (tmp_path / "train" / "shard-00000.json").write_text('{"weights": 3}')
-    if blueprint is not None:
-        (tmp_path / "plan.json").write_text(blueprint)
+    if spec is not None:
+        (tmp_path / "specification.json").write_text(spec)
     before = snapshot(tmp_path)
     with pytest.raises(UsageError, match="not empty and not a dataset of cnpgen; choose another out="):
         make_tiny(tmp_path, force=force)
@@ -318,8 +318,8 @@ def test_a_folder_that_is_deleted_while_the_dataset_is_made_is_said_to_be_that(t
     ):
         make_tiny(out, progress=lambda *_: shutil.rmtree(out))
     assert not out.exists()
-    with pytest.raises(MachineError, match=r": the plan\.json in it was deleted or moved"):
-        make_tiny(out, progress=lambda *_: (out / "plan.json").unlink())
+    with pytest.raises(MachineError, match=r": its specification\.json was deleted or moved"):
+        make_tiny(out, progress=lambda *_: (out / "specification.json").unlink())
 
 
 @pytest.mark.slow
@@ -345,7 +345,7 @@ WRONG = {
     "dtype": ({"dtype": "float16"}, "dtype must be 'float64' or 'float32', got 'float16'"),
     "backend": ({"backend": "cuda"}, "backend 'cuda' does not exist"),
     "workers": ({"workers": 0}, "workers must be an integer from 1 on, got 0"),
-    "part beyond the last": ({"part": (2, 2)}, "part must be K/M with 0 <= K < M, got 2/2|--force would delete"),
+    "part outside the last": ({"part": (2, 2)}, "part must be K/M with 0 <= K < M, got 2/2|--force would delete"),
     "part of nothing": ({"part": (0, 0)}, "part must be K/M|--force would delete"),
 }
 

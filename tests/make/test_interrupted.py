@@ -16,10 +16,10 @@ import pytest
 
 from cnpgen.errors import MachineError, UsageError
 from cnpgen.make.dataset import make_dataset
-from cnpgen.make.load import load_dataset_recipe
-from cnpgen.store.fates import Fates
+from cnpgen.make.recipe_file import load_dataset_recipe
 from cnpgen.store.layout import MANIFEST
-from cnpgen.validate.dataset import validate_dataset
+from cnpgen.store.sampling_statistics import SamplingStatistics
+from cnpgen.validate.validate_dataset import validate_dataset
 from tests.cli.test_interruption import descendants
 from tests.conftest import TINY_SHARD, columns_of, some, tiny_recipe
 from tests.examples.tiny_datasets import SHARDS, digests, make_tiny
@@ -44,7 +44,7 @@ def times(folder: Path) -> dict[str, int]:
 def test_an_interrupted_dataset_is_finished_with_the_same_bytes(tiny, tmp_path, workers, error):
     folder = tmp_path / "out"
 
-    def interrupt(_rows: int, _fates: Fates | None) -> None:
+    def interrupt(_rows: int, _sampling: SamplingStatistics | None) -> None:
         raise error
 
     with pytest.raises(error):
@@ -64,11 +64,11 @@ def test_an_interrupted_dataset_is_finished_with_the_same_bytes(tiny, tmp_path, 
 CHILD = """
 import sys
 from dataclasses import replace
-from cnpgen.make.load import load_dataset_recipe
+from cnpgen.make.recipe_file import load_dataset_recipe
 from cnpgen.make.dataset import make_dataset
 if __name__ == "__main__":
     recipe = replace(load_dataset_recipe("airhockey-hit"), splits={"train": 600, "validation": 60})
-    def tell(rows, fates):
+    def tell(rows, sampling statistics):
         print(rows, flush=True)
         sys.stdin.readline()
     make_dataset(recipe, sys.argv[1], shard_size=int(sys.argv[3]), workers=int(sys.argv[2]), progress=tell)
@@ -110,7 +110,7 @@ def test_a_killed_run_is_finished_with_the_same_bytes(tiny, tmp_path, workers):
 def test_a_killed_worker_is_a_machine_error_that_says_to_go_on(tmp_path):
     killed: list[int] = []
 
-    def kill(_rows: int, _fates: Fates | None) -> None:
+    def kill(_rows: int, _sampling: SamplingStatistics | None) -> None:
         if not killed:
             names = {pid: Path(f"/proc/{pid}/cmdline").read_text() for pid in descendants(os.getpid())}
             killed.extend(pid for pid, name in names.items() if "popen_loky" in name)
@@ -181,10 +181,10 @@ def test_a_disk_that_is_really_full_loses_nothing(tiny, small_disk):
 def test_another_dataset_in_the_same_folder_meanwhile_stops_the_first(tmp_path):
     folder = tmp_path / "out"
 
-    def replace_it(_rows: int, _fates: Fates | None) -> None:
+    def replace_it(_rows: int, _sampling: SamplingStatistics | None) -> None:
         make_dataset(tiny_recipe("airhockey-replan"), folder, shard_size=400, workers=1, force=True)
 
-    with pytest.raises(UsageError, match="was given to another dataset while this one was made"):
+    with pytest.raises(UsageError, match="was replaced by another dataset while this one was made"):
         make_tiny(folder, progress=replace_it)
     assert validate_dataset(folder).ok
     np.testing.assert_equal(len(columns_of(folder)["start_q"]), 600)

@@ -12,7 +12,7 @@ from cnpgen.cli.main import main
 from cnpgen.errors import DatasetError, MachineError, UsageError
 from cnpgen.make.merge import merge_datasets
 from cnpgen.store.files import atomic
-from cnpgen.validate.dataset import validate_dataset
+from cnpgen.validate.validate_dataset import validate_dataset
 from tests.conftest import some
 from tests.examples.tiny_datasets import SHARDS, digests, flip, make_tiny, snapshot
 
@@ -42,7 +42,7 @@ def test_parts_become_the_dataset_that_was_made_at_once(tiny, made, tmp_path):
     assert [snapshot(part) for part in made] == before
     assert validate_dataset(tmp_path / "out", deep=True, regenerate=2).ok
     assert not (tmp_path / "out" / "_work").exists()
-    for name in ("plan.json", "stats.json"):
+    for name in ("specification.json", "stats.json"):
         assert (tmp_path / "out" / name).read_bytes() == (tiny("airhockey-hit") / name).read_bytes()
 
 
@@ -55,7 +55,7 @@ def test_a_merged_dataset_is_left_as_it_is(made, tmp_path):
     merge_datasets(made, tmp_path / "out")
     before = snapshot(tmp_path / "out")
     again = merge_datasets(made, tmp_path / "out")
-    assert (again.complete, again.made, again.mended) == (True, 0, ())
+    assert (again.complete, again.made, again.repaired) == (True, 0, ())
     assert snapshot(tmp_path / "out") == before
 
 
@@ -72,7 +72,7 @@ def test_a_merge_that_is_cut_off_goes_on(tiny, made, tmp_path, monkeypatch):
         if len(copied) == 9:
             raise OSError(28, os.strerror(28))
 
-    monkeypatch.setattr(atomic, "_synchronise", full)
+    monkeypatch.setattr(atomic, "_synchronize", full)
     with pytest.raises(MachineError, match="No space left"):
         merge_datasets(made, tmp_path / "out")
     monkeypatch.undo()
@@ -125,7 +125,7 @@ def test_a_part_of_another_dataset_is_refused_by_name(made, tmp_path, options, t
 
 def test_places_that_hold_no_dataset_or_another_one_are_refused(made, tmp_path):
     (tmp_path / "empty").mkdir()
-    with pytest.raises(DatasetError, match=r"plan\.json is missing"):
+    with pytest.raises(DatasetError, match=r"specification\.json is missing"):
         merge_datasets([*made, tmp_path / "empty"], tmp_path / "out")
     with pytest.raises(UsageError, match="is not there, expected the folder of a dataset"):
         merge_datasets([tmp_path / "nothing"], tmp_path / "out")

@@ -7,24 +7,24 @@ import pytest
 
 from cnpgen.errors import RecipeError, UsageError
 from cnpgen.kernels.library import choose_backend
-from cnpgen.make.boundary_problems import draw_boundary_problems
 from cnpgen.make.complete import complete
-from cnpgen.make.load import load_dataset_recipe
-from cnpgen.make.on_plan import GOAL, MOMENTS, GoalOfPlan, StartOnPlan, of_plan
+from cnpgen.make.draw_boundary_problems import draw_boundary_problems
+from cnpgen.make.on_plan import GOAL, STATES_PER_REFINED_PLAN, GoalOfPlan, StartOnPlan, of_plan
+from cnpgen.make.recipe_file import load_dataset_recipe
 from cnpgen.make.stage_planner import load_stage_planner, model_sha256
 from cnpgen.pipelines.completion import Completion
 from cnpgen.pipelines.context import load_context
 from cnpgen.pipelines.prepared import random_generator
-from cnpgen.pipelines.stages.stage import Round
+from cnpgen.pipelines.stages.stage import CandidateBatch
 from cnpgen.planner.planner import Planner, states_at
 from cnpgen.schema.keys import Range
 from cnpgen.trajectory.boundary import Boundary
-from cnpgen.validate.dataset import validate_dataset
+from cnpgen.validate.validate_dataset import validate_dataset
 from tests.conftest import Arm, Prepare, run_stages
 
 MODEL = "airhockey-replan"
 OFF = {"q": 2e-3, "dq": 2e-2, "ddq": 2.0}  # rad, rad/s, rad/s^2: what a plan may be off the table by, in joints
-STILL = StartOnPlan(model=MODEL, sha256=model_sha256(MODEL), moved=1.0, moments=Range(0.4, 0.4))
+STILL = StartOnPlan(model=MODEL, sha256=model_sha256(MODEL), moved=1.0, times=Range(0.4, 0.4))
 
 
 @pytest.fixture(scope="module")
@@ -34,26 +34,26 @@ def first(prepare: Prepare):
     return prepared, run_stages(prepared, 160, seed=2)
 
 
-def moved(first, stage: StartOnPlan) -> Round:
+def moved(first, stage: StartOnPlan) -> CandidateBatch:
     """What the stage makes of them."""
-    prepared, draws = first
-    found = Round(len(draws.alive))
-    for name, values in draws.columns.items():
+    prepared, candidates = first
+    found = CandidateBatch(len(candidates.alive))
+    for name, values in candidates.columns.items():
         found[name] = values
     stage.prepare(prepared.context)(found, random_generator(4, "train", 0))
     return found
 
 
-def boundary_of(draws: Round) -> Boundary:
-    return Boundary(*(np.ascontiguousarray(draws[f"{end}"].T) for end in (
+def boundary_of(candidates: CandidateBatch) -> Boundary:
+    return Boundary(*(np.ascontiguousarray(candidates[f"{end}"].T) for end in (
         "start_q", "start_dq", "start_ddq", "goal_q", "goal_dq",
     )))  # fmt: skip
 
 
 def test_starts_are_where_the_motions_are_and_exactly_on_the_table(first) -> None:
-    prepared, draws = first
+    prepared, candidates = first
     found = moved(first, STILL)
-    plans = Planner(MODEL).plan_batch(boundary_of(draws))
+    plans = Planner(MODEL).plan_batch(boundary_of(candidates))
     expected, arm = states_at(plans, 0.4 * plans.duration), Arm(prepared.context.robot)
     for name, values, off in zip(("start_q", "start_dq", "start_ddq"), expected, OFF.values(), strict=True):
         assert np.median(np.abs(found[name].T - values).max(axis=1)) < off / 4
@@ -68,22 +68,24 @@ def test_starts_are_where_the_motions_are_and_exactly_on_the_table(first) -> Non
 
 
 def test_a_share_of_the_starts_stays(first) -> None:
-    draws, found = first[1], moved(first, replace(STILL, moved=0.3))
-    same = (found["start_q"] == draws["start_q"]).all(axis=0)
+    candidates, found = first[1], moved(first, replace(STILL, moved=0.3))
+    same = (found["start_q"] == candidates["start_q"]).all(axis=0)
     assert same.mean() == pytest.approx(0.7, abs=0.15)
     for name in GOAL[:-1]:
-        np.testing.assert_array_equal(found[of_plan(name)], draws[name])
+        np.testing.assert_array_equal(found[of_plan(name)], candidates[name])
 
 
 def test_many_starts_are_on_one_refined_motion_whose_goal_they_may_keep(first) -> None:
-    draws, found = first[1], moved(first, replace(STILL, refined=1.0, moments=Range(0.05, 0.95)))
+    candidates, found = first[1], moved(first, replace(STILL, refined=1.0, times=Range(0.05, 0.95)))
     goals = found["planned_goal_q"]
-    assert len(np.unique(goals, axis=1).T) == -(-goals.shape[1] // MOMENTS)
-    np.testing.assert_array_equal(goals[:, :MOMENTS], np.repeat(draws["goal_q"][:, :1], MOMENTS, axis=1))
-    np.testing.assert_array_equal(found["planned_home_q"][:, 0], draws["start_q"][:, 0])
+    assert len(np.unique(goals, axis=1).T) == -(-goals.shape[1] // STATES_PER_REFINED_PLAN)
+    np.testing.assert_array_equal(
+        goals[:, :STATES_PER_REFINED_PLAN], np.repeat(candidates["goal_q"][:, :1], STATES_PER_REFINED_PLAN, axis=1)
+    )
+    np.testing.assert_array_equal(found["planned_home_q"][:, 0], candidates["start_q"][:, 0])
     used = np.abs(found["start_ddq"]).max(axis=1) / first[0].context.robot.acceleration_limit
     assert used.max() > 0.98  # refined motions use what there is
-    found["home_q"] = draws["start_q"]
+    found["home_q"] = candidates["start_q"]
     GoalOfPlan(share=1.0).prepare(first[0].context)(found, random_generator(0, "train", 0))
     for name in GOAL:
         np.testing.assert_array_equal(found[name], found[of_plan(name)])
@@ -101,14 +103,14 @@ def test_another_file_or_a_model_of_another_problem_is_refused(first) -> None:
 
 @pytest.mark.slow
 def test_the_shipped_dataset_is_what_it_says(tiny) -> None:
-    report = validate_dataset(tiny("airhockey-onthefly"), deep=True, workers=1)
+    report = validate_dataset(tiny("airhockey-online"), deep=True, workers=1)
     assert report.ok, report.summary()
     assert "hitting configuration" in report.summary()
 
 
 @pytest.mark.slow
 def test_goals_that_many_rows_have_are_not_taken_for_hits_that_were_slowed_down() -> None:
-    drawn = draw_boundary_problems("airhockey-onthefly", 3000, seed=7)
+    drawn = draw_boundary_problems("airhockey-online", 3000, seed=7)
     _, count = np.unique(drawn.boundary.goal_q, axis=0, return_counts=True)
     assert count.max() > 3
 
@@ -117,7 +119,7 @@ def test_tasks_keep_their_start_and_their_goal() -> None:
     old = draw_boundary_problems(MODEL, 4, seed=1)
     ends = {name: getattr(old.boundary, name) for name in ("start_q", "start_dq", "start_ddq")}
     asked = {"goal_xyz": old.columns["goal_xyz"], "hit_angle": old.columns["hit_angle"], "hit_speed_share": 0.5}
-    one, other = (complete(name, **ends, **asked) for name in (MODEL, "airhockey-onthefly"))
+    one, other = (complete(name, **ends, **asked) for name in (MODEL, "airhockey-online"))
     assert len(other.plans) == 4
     np.testing.assert_array_equal(other.plans.boundary.start_q, old.boundary.start_q)
     same = np.isin(other.plans.sample_id, one.plans.sample_id)
@@ -125,7 +127,7 @@ def test_tasks_keep_their_start_and_their_goal() -> None:
 
 
 def test_of_the_first_hit_tasks_need_nothing() -> None:
-    pipeline = load_dataset_recipe("airhockey-onthefly").pipeline
+    pipeline = load_dataset_recipe("airhockey-online").pipeline
     completion = Completion(pipeline, load_context(pipeline.problem, *choose_backend(None)), ["goal_xyz", "hit_angle"])
     labels = [label for label, _ in completion._stages]
     assert "5. hitting-configuration" not in labels

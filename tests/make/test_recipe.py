@@ -9,16 +9,16 @@ from pathlib import Path
 import pytest
 
 from cnpgen.errors import RecipeError, UsageError
-from cnpgen.make.load import load_dataset_recipe, load_notes
 from cnpgen.make.recipe import DatasetRecipe, recipe_digest, split_rows
+from cnpgen.make.recipe_file import load_dataset_recipe, load_notes
 from cnpgen.pipelines.pipeline import Pipeline
-from cnpgen.problems.load import load_problem
 from cnpgen.problems.problem import Problem, resolved
+from cnpgen.problems.problem_file import load_problem
 from cnpgen.robots.obstacle import Obstacle
-from cnpgen.robots.spec import LimitSpec, RobotSpec
+from cnpgen.robots.robot_spec import LimitSpec, RobotSpec
 from cnpgen.schema.catalogue import list_recipes
 from cnpgen.schema.keys import Range
-from cnpgen.trajectory.spec import TrajectorySpec
+from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 from tests.examples.stages import Roll
 
 

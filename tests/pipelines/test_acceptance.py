@@ -1,4 +1,4 @@
-"""The last gate: rows that meet every constraint pass, rows with one wrong number do not, and the reason says which."""
+"""Acceptance check: valid rows pass, and rows with one wrong value are rejected under the violated constraint."""
 
 from dataclasses import replace
 
@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from cnpgen.pipelines.acceptance import acceptance
+from cnpgen.pipelines.narrow_phase import unmet
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
-from cnpgen.pipelines.stages.stage import Round
-from cnpgen.pipelines.undecided import unmet
+from cnpgen.pipelines.stages.stage import CandidateBatch
 from cnpgen.problems.constraints.constraint import Condition
 from tests.conftest import SHIPPED, Prepare, needs_compiler, run_stages, some
 
@@ -23,47 +23,51 @@ NO_NUMBERS = [
 STATES = [f"{end}_{what}" for end in ("start", "goal") for what in ("q", "dq", "ddq", "xyz")]
 
 
-def judged(prepared: PreparedPipeline, draws: Round, **changes: np.ndarray) -> Round:
-    """Copy the survivors, change some columns and pass them through the gate."""
-    again = Round(len(draws.alive))
-    for name, values in draws.columns.items():
+def judged(prepared: PreparedPipeline, candidates: CandidateBatch, **changes: np.ndarray) -> CandidateBatch:
+    """Copy the remaining candidates, change some columns and run the acceptance check."""
+    again = CandidateBatch(len(candidates.alive))
+    for name, values in candidates.columns.items():
         again[name] = changes.get(name, values).copy()
-    acceptance(prepared.context, set(draws.columns))(again, random_generator(0, "train", 0))
+    acceptance(prepared.context, set(candidates.columns))(again, random_generator(0, "train", 0))
     return again
 
 
-def fates(draws: Round) -> set[str]:
-    return {draws.reasons[k - 1] for k in set(draws.fate.tolist()) if k}
+def sampling(candidates: CandidateBatch) -> set[str]:
+    return {candidates.reasons[k - 1] for k in set(candidates.outcome.tolist()) if k}
 
 
-def roomy(prepared: PreparedPipeline, draws: Round) -> Round:
-    """Keep what is not on the verge of breaking a constraint already: one small change is to break one constraint."""
+def with_margins(prepared: PreparedPipeline, candidates: CandidateBatch) -> CandidateBatch:
+    """Keep candidates with a margin to every limit, so that one small change violates one constraint."""
     robot = prepared.context.robot
     for end in ("start", "goal"):
-        room = np.minimum(draws[f"{end}_q"].T - robot.position_lower, robot.position_upper - draws[f"{end}_q"].T)
-        draws.reject(room.min(1) > 1e-3, "on a joint limit")
-        if f"{end}_clearance" in draws.columns:
-            draws.reject(draws[f"{end}_clearance"][0] > 7e-3, "close to a pedestal")
-    return draws
+        margin = np.minimum(
+            candidates[f"{end}_q"].T - robot.position_lower, robot.position_upper - candidates[f"{end}_q"].T
+        )
+        candidates.reject(margin.min(1) > 1e-3, "on a joint limit")
+        if f"{end}_clearance" in candidates.columns:
+            candidates.reject(candidates[f"{end}_clearance"][0] > 7e-3, "close to a pedestal")
+    return candidates
 
 
 @pytest.fixture(scope="module")
-def rounds(prepare: Prepare) -> dict[str, tuple[PreparedPipeline, Round]]:
-    return {name: (prepare(name), roomy(prepare(name), run_stages(prepare(name), 250, seed=111))) for name in SHIPPED}
+def batches(prepare: Prepare) -> dict[str, tuple[PreparedPipeline, CandidateBatch]]:
+    return {
+        name: (prepare(name), with_margins(prepare(name), run_stages(prepare(name), 250, seed=111))) for name in SHIPPED
+    }
 
 
 @pytest.mark.parametrize("backend", some(BACKENDS, 1, "slow"))
 @pytest.mark.parametrize("name", SHIPPED)
-def test_what_the_stages_made_passes(prepare: Prepare, rounds, name, backend):
-    _, draws = rounds[name]
-    again = judged(prepare(name, backend), draws)
+def test_candidates_of_the_stages_are_accepted(prepare: Prepare, batches, name, backend):
+    _, candidates = batches[name]
+    again = judged(prepare(name, backend), candidates)
     assert len(again.alive) == again.size > 40
     reasons = [constraint.reason for constraint in prepare(name).context.problem.constraint]
     extra = ["hit not along its direction"] if name.startswith("airhockey") else []
     assert again.reasons == [*reasons, "tip not at its position", *extra]
 
 
-# pipeline, column, row of the column, what is added, and the reason
+# pipeline, column, row of the column, added value, reason
 WRONG = [
     ("airhockey-replan", "start_q", 1, 1e-5, "off the table"),
     ("airhockey-replan", "goal_q", 3, 1e-5, "off the table"),
@@ -95,34 +99,36 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("name", "column", "row", "amount", "reason"), WRONG)
-def test_one_wrong_number_is_rejected_under_its_constraint(rounds, name, column, row, amount, reason):
-    prepared, draws = rounds[name]
-    changed = draws[column].copy()
+def test_one_wrong_value_is_rejected_under_its_constraint(batches, name, column, row, amount, reason):
+    prepared, candidates = batches[name]
+    changed = candidates[column].copy()
     changed[row] += amount
-    again = judged(prepared, draws, **{column: changed})
+    again = judged(prepared, candidates, **{column: changed})
     assert len(again.alive) == 0
     expected = {"off the table", "tip not at its position"} if reason == "vertical or misplaced" else {reason}
-    assert fates(again) <= expected | {"joint torque limit"} if column == "start_ddq" else fates(again) <= expected
+    assert (
+        sampling(again) <= expected | {"joint torque limit"} if column == "start_ddq" else sampling(again) <= expected
+    )
 
 
 @pytest.mark.parametrize(("backend", "value"), NO_NUMBERS)
 @pytest.mark.parametrize("name", some(SHIPPED, 1, "slow"))
-def test_a_number_that_is_none_is_never_accepted_wherever_it_is(prepare: Prepare, rounds, name, backend, value):
-    _, draws = rounds[name]
-    columns = [column for column in [*STATES, "hit_angle", "hit_speed"] if column in draws.columns]
-    places = [(column, row) for column in columns for row in range(len(draws[column]))]
-    assert len(places) <= len(draws.alive)
-    changes = {column: draws[column].copy() for column in columns}
+def test_a_non_finite_value_in_any_column_is_rejected(prepare: Prepare, batches, name, backend, value):
+    _, candidates = batches[name]
+    columns = [column for column in [*STATES, "hit_angle", "hit_speed"] if column in candidates.columns]
+    places = [(column, row) for column in columns for row in range(len(candidates[column]))]
+    assert len(places) <= len(candidates.alive)
+    changes = {column: candidates[column].copy() for column in columns}
     for draw, (column, row) in enumerate(places):
         changes[column][row, draw] = value
-    again = judged(prepare(name, backend), draws, **changes)
+    again = judged(prepare(name, backend), candidates, **changes)
     accepted = [places[draw] for draw in again.alive.tolist() if draw < len(places)]
     assert accepted == []
     assert len(again.alive) == again.size - len(places)
 
 
 @pytest.mark.parametrize(("lower", "upper"), [(-np.inf, 1.0), (-1.0, np.inf), (-1.0, 1.0)])
-def test_a_bound_on_one_side_is_not_met_by_what_is_no_number(lower, upper):
+def test_nan_violates_a_one_sided_bound(lower, upper):
     x = ca.SX.sym("x")
     condition = Condition("x", "m", [x], np.array([lower]), np.array([upper]), "position")
     count = ca.Function("unmet", [x], [unmet(condition, np.array([1e-6]))])
@@ -132,26 +138,26 @@ def test_a_bound_on_one_side_is_not_met_by_what_is_no_number(lower, upper):
 
 
 @pytest.mark.slow
-def test_torques_beyond_their_limits_are_rejected(prepare: Prepare, rounds):
+def test_torques_outside_their_limits_are_rejected(prepare: Prepare, batches):
     for name in ("airhockey-replan", "heavy-object"):
-        prepared, draws = rounds[name]
+        prepared, candidates = batches[name]
         limits = replace(prepared.context.problem.limits, torque_scale=0.01)
         weak = prepare(replace(prepared.pipeline, problem=replace(prepared.context.problem, limits=limits)), "numpy")
-        again = judged(weak, draws)
+        again = judged(weak, candidates)
         assert len(again.alive) < 0.1 * again.size
-        assert fates(again) == {"joint torque limit"}
+        assert sampling(again) == {"joint torque limit"}
 
 
-def test_reasons_are_given_in_the_order_of_the_problem_s_constraints(rounds):
-    """A row that breaks two constraints is counted once, under the first."""
-    prepared, draws = rounds["airhockey-replan"]
-    q, dq = draws["start_q"] + 10.0, draws["start_dq"] + 10.0
-    assert fates(judged(prepared, draws, start_q=q, start_dq=dq)) == {"joint position limit"}
-    assert fates(judged(prepared, draws, start_dq=dq)) == {"joint velocity limit"}
+def test_reasons_have_the_order_of_the_problem_s_constraints(batches):
+    """A row that violates two constraints is counted once, under the first."""
+    prepared, candidates = batches["airhockey-replan"]
+    q, dq = candidates["start_q"] + 10.0, candidates["start_dq"] + 10.0
+    assert sampling(judged(prepared, candidates, start_q=q, start_dq=dq)) == {"joint position limit"}
+    assert sampling(judged(prepared, candidates, start_dq=dq)) == {"joint velocity limit"}
 
 
 @pytest.mark.parametrize("name", some(SHIPPED, 1, "slow"))
-def test_float32_rows_are_judged_as_they_are_stored(prepare: Prepare, name):
+def test_float32_rows_are_checked_as_stored(prepare: Prepare, name):
     block = prepare(name, dtype="float32").block(5, "train", 0, stop=300)
     for field, values in block.columns.items():
         if field not in ("attempts", "sample_id"):

@@ -1,4 +1,4 @@
-"""Completing tasks: rows of datasets come back from what they were drawn as; what has no answer has a reason."""
+"""Completion of tasks: rows of datasets are reproduced from their sampled values; unsolved tasks have a reason."""
 
 from dataclasses import dataclass, replace
 
@@ -12,7 +12,7 @@ from cnpgen.pipelines.stages.stage import Stage
 from cnpgen.store.field import Field
 from tests.conftest import SHIPPED, Arm, Prepare
 
-TASK = {  # what tasks give: what the stages find of it is compared with the row that it is of
+TASK = {  # columns of the tasks; the completed values are compared with their row
     "airhockey-hit": ("start_q", "goal_xyz", "hit_angle", "hit_speed"),
     "airhockey-replan": ("start_q", "start_dq", "start_ddq", "goal_xyz", "hit_angle", "hit_speed"),
     "heavy-object": ("start_q", "goal_xyz"),
@@ -38,7 +38,7 @@ def task_of(prepared: PreparedPipeline, rows: dict[str, np.ndarray]) -> dict[str
     return {name: rows[name] for name in TASK[prepared.pipeline.name]}
 
 
-def test_the_rows_of_a_dataset_come_back_from_what_they_were_drawn_as(prepared, rows):
+def test_rows_of_a_dataset_are_reproduced_from_their_sampled_values(prepared, rows):
     tasks = completed(prepared, task_of(prepared, rows))
     np.testing.assert_array_equal(tasks.alive, np.arange(200))
     assert tasks.why() == ("",) * 200
@@ -46,7 +46,7 @@ def test_the_rows_of_a_dataset_come_back_from_what_they_were_drawn_as(prepared, 
         np.testing.assert_allclose(tasks[name], rows[name], rtol=1e-12, atol=1e-9, err_msg=name)
 
 
-def test_what_comes_of_a_task_does_not_depend_on_the_others(prepared, rows):
+def test_the_result_of_a_task_does_not_depend_on_other_tasks(prepared, rows):
     every, task = completed(prepared, task_of(prepared, rows)), task_of(prepared, rows)
     for i in (0, 7, 199):
         alone = completed(prepared, {name: values[:, i : i + 1] for name, values in task.items()})
@@ -54,7 +54,7 @@ def test_what_comes_of_a_task_does_not_depend_on_the_others(prepared, rows):
             np.testing.assert_array_equal(alone[name][:, 0], every[name][:, i], err_msg=name)
 
 
-def test_a_start_given_by_its_position_is_where_it_is_asked_for(prepared, rows):
+def test_a_start_given_by_its_position_is_at_this_position(prepared, rows):
     tasks = completed(prepared, {name: rows[name] for name in ("start_xyz", "goal_xyz")})
     assert len(tasks.alive) > 150
     arm = Arm(prepared.context.robot)
@@ -63,7 +63,7 @@ def test_a_start_given_by_its_position_is_where_it_is_asked_for(prepared, rows):
     np.testing.assert_array_equal(tasks["start_dq"], 0)
 
 
-def test_a_start_of_which_nothing_is_said_is_the_base_at_rest(prepare):
+def test_a_missing_start_is_the_base_at_rest(prepare):
     prepared = prepare("airhockey-replan")
     tasks = completed(prepared, {"goal_xyz": np.array([[1.0], [0.1]]), "hit_angle": np.array([[0.2]])})
     np.testing.assert_array_equal(tasks["start_q"][:, 0], prepared.context.robot.base)
@@ -73,7 +73,7 @@ def test_a_start_of_which_nothing_is_said_is_the_base_at_rest(prepare):
 
 
 @pytest.mark.parametrize(("given", "share"), [({}, 1.0), ({"hit_speed_share": 0.4}, 0.4), ({"hit_speed": 0.5}, None)])
-def test_a_hit_is_as_fast_as_possible_or_as_it_is_said_to_be(prepare, given, share):
+def test_a_hit_has_the_given_speed_or_the_maximum_speed(prepare, given, share):
     prepared = prepare("airhockey-hit")
     task = {"goal_xyz": np.array([[1.0], [0.1], [0.16]]), "hit_angle": np.array([[0.3]])}
     tasks = completed(prepared, {**task, **{name: np.array([[value]]) for name, value in given.items()}})
@@ -83,7 +83,7 @@ def test_a_hit_is_as_fast_as_possible_or_as_it_is_said_to_be(prepare, given, sha
     np.testing.assert_allclose(moved, speed * np.array([np.cos(0.3), np.sin(0.3), 0]), atol=1e-9)
 
 
-def test_a_hit_without_a_direction_goes_where_the_pipeline_aims(prepare):
+def test_a_hit_without_a_direction_aims_at_the_target_of_the_pipeline(prepare):
     tasks = completed(prepare("airhockey-hit"), {"goal_xyz": np.array([[1.0], [0.1], [0.16]])})
     assert tasks["hit_angle"][0, 0] == pytest.approx(np.arctan2(-0.1, 1.49))
 
@@ -97,7 +97,7 @@ def test_a_hit_without_a_direction_goes_where_the_pipeline_aims(prepare):
         ("start_dq", [0.1, 0, 0, 0, 0, 0], "not at rest at the start"),
     ],
 )
-def test_a_task_without_an_answer_has_a_reason_and_leaves_the_others_alone(prepare, column, value, reason):
+def test_an_unsolved_task_has_a_reason_and_does_not_change_other_tasks(prepare, column, value, reason):
     prepared = prepare("airhockey-hit")
     task = {"start_dq": np.zeros((6, 2)), "goal_xyz": np.array([[1.0, 0.0, 0.16]] * 2).T, "hit_angle": np.ones((1, 2))}
     task |= {"hit_speed": np.full((1, 2), 0.8)}
@@ -107,7 +107,7 @@ def test_a_task_without_an_answer_has_a_reason_and_leaves_the_others_alone(prepa
     np.testing.assert_array_equal(tasks.alive, [0])
 
 
-def test_a_measured_start_may_be_as_far_off_as_motions_may_but_not_further(prepare):
+def test_a_measured_start_has_the_tolerance_of_motions(prepare):
     prepared = prepare("airhockey-replan")
     base = prepared.context.robot.base
     start = np.repeat(base[:, None], 3, axis=1)
@@ -125,39 +125,39 @@ def test_a_measured_start_may_be_as_far_off_as_motions_may_but_not_further(prepa
         (["goal_xyz", "start_q", "start_xyz"], "start_q and start_xyz are both given"),
     ],
 )
-def test_columns_that_no_task_can_have_are_refused(prepare, given, message):
+def test_unknown_columns_raise_an_error(prepare, given, message):
     prepared = prepare("airhockey-replan")
     with pytest.raises(UsageError) as error:
         Completion(prepared.pipeline, prepared.context, given)
     assert message in str(error.value)
 
 
-def test_two_speeds_of_one_hit_are_refused(prepare):
+def test_two_speeds_of_one_hit_raise_an_error(prepare):
     prepared = prepare("airhockey-hit")
-    with pytest.raises(UsageError, match="hit_speed and hit_speed_share both say how fast the hit is"):
+    with pytest.raises(UsageError, match="hit_speed and hit_speed_share both define the speed of the hit"):
         Completion(prepared.pipeline, prepared.context, ["goal_xyz", "hit_speed", "hit_speed_share"])
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Weights(Stage):
-    """A stage of somebody else's that draws two numbers and notes one."""
+    """Stage of a plug-in that draws two values and stores a third as a diagnostic."""
 
     def describe(self) -> str:
         return "draw weights"
 
-    def provides(self, context):
+    def outputs(self, context):
         names = (("mass", "context"), ("drag", "context"), ("ratio", "diagnostic"))
         return tuple(Field(name, "1", name, role=role) for name, role in names)
 
     def prepare(self, context):
-        def work(draws, random):
-            draws["mass"], draws["drag"] = 2 * draws.draw(random, 1), 4 * draws.draw(random, 1)
-            draws["ratio"] = draws["mass"] / draws["drag"]
+        def work(candidates, random):
+            candidates["mass"], candidates["drag"] = 2 * candidates.draw(random, 1), 4 * candidates.draw(random, 1)
+            candidates["ratio"] = candidates["mass"] / candidates["drag"]
 
         return work
 
 
-def test_stages_of_others_take_what_they_provide_and_draw_the_middle_of_what_is_not_given(prepare):
+def test_plug_in_stages_keep_given_outputs_and_replace_random_values_by_their_mean(prepare):
     hits = prepare("airhockey-hit")
     prepared = replace_pipeline(hits, _Weights())
     task = {"goal_xyz": np.array([[1.0], [0.1], [0.16]])}
@@ -170,7 +170,7 @@ def test_stages_of_others_take_what_they_provide_and_draw_the_middle_of_what_is_
 
 
 def replace_pipeline(prepared: PreparedPipeline, stage: Stage) -> PreparedPipeline:
-    """The same preparation of a pipeline with one more stage."""
+    """Prepare the pipeline with one more stage."""
     pipeline = replace(prepared.pipeline, stage=(*prepared.pipeline.stage, stage))
     kernels = prepared.context.kernels
     return PreparedPipeline(pipeline, backend=kernels.backend, cache_folder=kernels.cache_folder)

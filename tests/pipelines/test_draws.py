@@ -1,22 +1,22 @@
-"""What is drawn at random: positions, guesses, directions, speeds, rest. Chi-square and Kolmogorov-Smirnov tests."""
+"""Sampled distributions of positions, guesses, directions and speeds: chi-square and Kolmogorov-Smirnov tests."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-import scipy  # which imports its statistics when they are asked for: that takes a second
+import scipy  # imports its statistics lazily, which takes a second
 
 from cnpgen.errors import RecipeError
-from cnpgen.pipelines.load import load_pipeline
+from cnpgen.pipelines.pipeline_file import load_pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
 from cnpgen.pipelines.stages.draw import DrawPositions
 from cnpgen.pipelines.stages.hit_angle import wrap
-from cnpgen.pipelines.stages.stage import Round
+from cnpgen.pipelines.stages.stage import CandidateBatch
 from cnpgen.schema.keys import Range
 from tests.conftest import SHIPPED, Prepare, run_stages
 
 DRAWS = 40_000
-PROBABLE = 1e-4  # p-value below which a sample is not believed to follow its law
+PROBABLE = 1e-4  # p-value below which a sample is rejected as a sample of its distribution
 
 
 def is_uniform(values: np.ndarray, low: float, high: float) -> bool:
@@ -37,13 +37,13 @@ def stage_of(prepared: PreparedPipeline, kind: str):
 
 
 @pytest.fixture(scope="module", params=SHIPPED)
-def drawn(request: pytest.FixtureRequest, prepare: Prepare) -> tuple[PreparedPipeline, Round]:
+def drawn(request: pytest.FixtureRequest, prepare: Prepare) -> tuple[PreparedPipeline, CandidateBatch]:
     prepared = prepare(request.param)
     return prepared, run_stages(prepared, DRAWS, seed=11, until="DrawPositions")
 
 
 def plain_rejection(stage: DrawPositions, count: int) -> dict[str, np.ndarray]:
-    """The law in a few lines of plain NumPy: uniform in both boxes, thrown away if too close together."""
+    """Sample the distribution with NumPy: uniform in both boxes, rejected if too close together."""
     random = np.random.default_rng(12)
     ends = {}
     for name, box in (("start", stage.start), ("goal", stage.goal)):
@@ -52,27 +52,27 @@ def plain_rejection(stage: DrawPositions, count: int) -> dict[str, np.ndarray]:
     return {name: values[:, apart >= stage.min_distance] for name, values in ends.items()}
 
 
-def test_positions_follow_the_law_of_plain_rejection_sampling(drawn):
-    prepared, draws = drawn
+def test_positions_have_the_distribution_of_plain_rejection_sampling(drawn):
+    prepared, candidates = drawn
     stage = stage_of(prepared, "DrawPositions")
     expected = plain_rejection(stage, DRAWS)
     if stage.min_distance:
-        kept = np.array([len(draws.alive), expected["start"].shape[1]])
+        kept = np.array([len(candidates.alive), expected["start"].shape[1]])
         assert scipy.stats.chi2_contingency([kept, DRAWS - kept]).pvalue > PROBABLE
     for end in ("start", "goal"):
         for axis in range(3):
-            assert scipy.stats.ks_2samp(draws[f"{end}_xyz"][axis], expected[end][axis]).pvalue > PROBABLE
+            assert scipy.stats.ks_2samp(candidates[f"{end}_xyz"][axis], expected[end][axis]).pvalue > PROBABLE
     distances = [np.hypot(*(ends[1] - ends[0])[:2]) for ends in (
-        (draws["start_xyz"], draws["goal_xyz"]), (expected["start"], expected["goal"]),
+        (candidates["start_xyz"], candidates["goal_xyz"]), (expected["start"], expected["goal"]),
     )]  # fmt: skip
     assert scipy.stats.ks_2samp(*distances).pvalue > PROBABLE
 
 
 def test_positions_before_the_rejection_are_uniform_in_their_boxes(drawn):
-    prepared, draws = drawn
+    prepared, candidates = drawn
     stage = stage_of(prepared, "DrawPositions")
     for end, box in (("start", stage.start), ("goal", stage.goal)):
-        for axis, values in zip(box, draws.drawn[f"{end}_xyz"], strict=True):
+        for axis, values in zip(box, candidates.drawn[f"{end}_xyz"], strict=True):
             assert values.shape == (DRAWS,)
             if axis.low == axis.high:
                 np.testing.assert_array_equal(values, axis.low)
@@ -81,16 +81,16 @@ def test_positions_before_the_rejection_are_uniform_in_their_boxes(drawn):
 
 
 def test_start_and_goal_are_independent_before_the_rejection(drawn):
-    _, draws = drawn
-    pairs = np.corrcoef(np.concatenate([draws.drawn["start_xyz"][:2], draws.drawn["goal_xyz"][:2]]))
+    _, candidates = drawn
+    pairs = np.corrcoef(np.concatenate([candidates.drawn["start_xyz"][:2], candidates.drawn["goal_xyz"][:2]]))
     assert np.abs(pairs - np.eye(4)).max() < 4 / np.sqrt(DRAWS)
 
 
-def test_start_and_goal_are_never_closer_than_asked(drawn):
-    prepared, draws = drawn
-    apart = np.hypot(*(draws["goal_xyz"] - draws["start_xyz"])[:2])
+def test_start_and_goal_have_the_minimum_distance(drawn):
+    prepared, candidates = drawn
+    apart = np.hypot(*(candidates["goal_xyz"] - candidates["start_xyz"])[:2])
     assert apart.min() >= stage_of(prepared, "DrawPositions").min_distance
-    assert draws.reasons == ["too close together"]
+    assert candidates.reasons == ["too close together"]
 
 
 def test_boxes_out_of_reach_are_a_mistake_in_the_recipe(prepare):
@@ -107,17 +107,17 @@ def test_boxes_out_of_reach_are_a_mistake_in_the_recipe(prepare):
 def test_guesses_are_uniform_and_independent_in_their_box(prepare, name):
     prepared = prepare(name)
     stage = stage_of(prepared, "StartIK")
-    guess, draws = stage.guess, Round(DRAWS)
-    draws["start_xyz"] = np.zeros((3, DRAWS))
-    stage.prepare(prepared.context)(draws, random_generator(13, "train", 0))
-    values = draws.drawn["guess_q"]
+    guess, candidates = stage.guess, CandidateBatch(DRAWS)
+    candidates["start_xyz"] = np.zeros((3, DRAWS))
+    stage.prepare(prepared.context)(candidates, random_generator(13, "train", 0))
+    values = candidates.drawn["guess_q"]
     assert values.shape == (len(guess), DRAWS)
     for axis, row in zip(guess, values, strict=True):
         assert is_uniform(row, axis.low, axis.high)
     assert np.abs(np.corrcoef(values) - np.eye(len(guess))).max() < 4 / np.sqrt(DRAWS)
 
 
-def test_the_replanning_guess_is_the_one_of_the_decisions(prepare):
+def test_the_replanning_guess_has_the_documented_range(prepare):
     guess = stage_of(prepare("airhockey-replan"), "StartIK").guess
     expected = [(-0.6, 0.6), (0.5, 1.4), (-0.7, 0.7), (-0.7, -0.4), (-0.4, 0.4), (0.4, 1.9)]
     assert [(axis.low, axis.high) for axis in guess] == expected
@@ -140,20 +140,20 @@ def test_without_a_guess_the_search_starts_from_the_base_configuration(prepare):
 
 
 def test_hits_aim_at_the_target_with_uniform_noise(prepare):
-    draws = run_stages(prepare("airhockey-hit"), DRAWS, seed=14, until="HitAngleToGoal")
-    x, y, _ = draws["goal_xyz"]
-    noise = wrap(draws["hit_angle"][0] - np.arctan2(0.0 - y, 2.49 - x))
+    candidates = run_stages(prepare("airhockey-hit"), DRAWS, seed=14, until="HitAngleToGoal")
+    x, y, _ = candidates["goal_xyz"]
+    noise = wrap(candidates["hit_angle"][0] - np.arctan2(0.0 - y, 2.49 - x))
     assert is_uniform(noise, -0.3 - 1e-12, 0.3 + 1e-12)
     assert abs(np.corrcoef(noise, y)[0, 1]) < 4 / np.sqrt(len(noise))
 
 
-def test_replanned_hits_are_uniform_in_the_cone_about_the_line_from_start_to_goal(prepare):
-    draws = run_stages(prepare("airhockey-replan"), DRAWS, seed=15, until="HitAngleInCone")
-    x, y = (draws["goal_xyz"] - draws["start_xyz"])[:2]
-    off = wrap(draws["hit_angle"][0] - np.arctan2(y, x))
+def test_hit_directions_are_uniform_in_the_cone_about_the_line_from_start_to_goal(prepare):
+    candidates = run_stages(prepare("airhockey-replan"), DRAWS, seed=15, until="HitAngleInCone")
+    x, y = (candidates["goal_xyz"] - candidates["start_xyz"])[:2]
+    off = wrap(candidates["hit_angle"][0] - np.arctan2(y, x))
     assert is_uniform(off, -2 * np.pi / 3 - 1e-12, 2 * np.pi / 3 + 1e-12)
-    assert -np.pi <= draws["hit_angle"].min() < -3.1
-    assert 3.1 < draws["hit_angle"].max() <= np.pi
+    assert -np.pi <= candidates["hit_angle"].min() < -3.1
+    assert 3.1 < candidates["hit_angle"].max() <= np.pi
 
 
 def test_angles_are_wrapped_to_half_a_turn_on_either_side():
@@ -168,33 +168,33 @@ def test_angles_are_wrapped_to_half_a_turn_on_either_side():
 
 @pytest.mark.parametrize(("name", "fraction"), [("airhockey-hit", 0.5), ("airhockey-replan", 0.2)])
 def test_the_stated_fraction_of_hits_is_at_full_speed_and_the_rest_uniformly_slower(prepare, name, fraction):
-    draws = run_stages(prepare(name), DRAWS, seed=16, until="HittingVelocity")
-    speed, fastest = draws["hit_speed"][0], draws["hit_speed_max"][0]
+    candidates = run_stages(prepare(name), DRAWS, seed=16, until="HittingVelocity")
+    speed, fastest = candidates["hit_speed"][0], candidates["hit_speed_max"][0]
     full = speed == fastest
     assert is_fraction(full, fraction)
     assert is_uniform((speed / fastest)[~full], 0.0, 1.0)
-    slow = np.abs(draws["goal_dq"]) / prepare(name).context.robot.velocity_limit[:, None]
+    slow = np.abs(candidates["goal_dq"]) / prepare(name).context.robot.velocity_limit[:, None]
     np.testing.assert_array_less(slow.max(0)[~full], 1.0)
 
 
 def test_a_fifth_of_the_starts_is_exactly_at_rest(prepare):
-    draws = run_stages(prepare("airhockey-replan"), DRAWS, seed=17, until="TableVelocity")
-    rest = np.all(draws["start_dq"] == 0.0, axis=0)
+    candidates = run_stages(prepare("airhockey-replan"), DRAWS, seed=17, until="TableVelocity")
+    rest = np.all(candidates["start_dq"] == 0.0, axis=0)
     assert is_fraction(rest, 0.2)
-    np.testing.assert_array_equal(draws["start_tip_velocity"][:, rest], 0.0)
-    slowest = np.abs(draws["start_dq"][:, ~rest]).max(0)
-    assert slowest.min() > 0
+    np.testing.assert_array_equal(candidates["start_tip_velocity"][:, rest], 0.0)
+    max_duration = np.abs(candidates["start_dq"][:, ~rest]).max(0)
+    assert max_duration.min() > 0
 
 
 def test_moving_starts_reach_a_uniform_fraction_of_their_tightest_limit(prepare):
     prepared = prepare("airhockey-replan")
-    draws = run_stages(prepared, DRAWS, seed=18, until="TableVelocity")
-    ratio = (np.abs(draws["start_dq"]) / prepared.context.robot.velocity_limit[:, None]).max(0)
+    candidates = run_stages(prepared, DRAWS, seed=18, until="TableVelocity")
+    ratio = (np.abs(candidates["start_dq"]) / prepared.context.robot.velocity_limit[:, None]).max(0)
     assert is_uniform(ratio[ratio > 0], 0.0, 1.0)
 
 
-def test_accelerations_are_uniform_in_the_interval_that_the_limits_leave(prepare):
-    from cnpgen.pipelines.stages.motion import table_acceleration
+def test_accelerations_are_uniform_in_the_interval_of_the_limits(prepare):
+    from cnpgen.pipelines.stages.boundary_motion import table_acceleration
 
     prepared = prepare("airhockey-replan")
     kernel = prepared.context.kernels.load(table_acceleration)
@@ -210,18 +210,18 @@ def test_accelerations_are_uniform_in_the_interval_that_the_limits_leave(prepare
 
 @pytest.mark.parametrize(("name", "ends"), [("airhockey-hit", ["start"]), ("heavy-object", ["start", "goal"])])
 def test_ends_at_rest_have_zero_velocity_and_acceleration(prepare, name, ends):
-    draws = run_stages(prepare(name), 300)
+    candidates = run_stages(prepare(name), 300)
     for end in ends:
         for what in ("dq", "ddq"):
-            assert draws[f"{end}_{what}"].shape == draws["start_q"].shape
-            np.testing.assert_array_equal(draws[f"{end}_{what}"], 0.0)
+            assert candidates[f"{end}_{what}"].shape == candidates["start_q"].shape
+            np.testing.assert_array_equal(candidates[f"{end}_{what}"], 0.0)
 
 
 # --- batches ----------------------------------------------------------------------------------------------------------
 
 
-def test_a_stage_s_luck_does_not_depend_on_what_an_earlier_one_rejected():
-    whole, thinned = Round(100), Round(100)
+def test_random_numbers_of_a_stage_do_not_depend_on_earlier_rejections():
+    whole, thinned = CandidateBatch(100), CandidateBatch(100)
     random = [np.random.default_rng(21) for _ in range(2)]
     first = whole.draw(random[0], 2)
     keep = np.arange(100) % 3 != 0
@@ -230,53 +230,53 @@ def test_a_stage_s_luck_does_not_depend_on_what_an_earlier_one_rejected():
     np.testing.assert_array_equal(thinned.draw(random[1], 4), whole.draw(random[0], 4)[:, keep])
 
 
-def test_every_rejected_draw_has_one_fate_and_leaves_every_column():
-    draws = Round(10)
-    draws["x"] = np.arange(10.0)[None]
-    draws.reject(np.arange(10) % 2 == 0, "odd")
-    draws["y"] = 2 * draws["x"]
-    draws.reject(draws["x"][0] > 3, "small")
-    draws.reject(np.ones(3, bool), "never")
-    assert draws.reasons == ["odd", "small", "never"]
-    assert draws.fate.tolist() == [2, 1, 2, 1, 0, 1, 0, 1, 0, 1]
-    assert draws.alive.tolist() == [4, 6, 8]
-    np.testing.assert_array_equal(draws["x"], [[4, 6, 8]])
-    np.testing.assert_array_equal(draws["y"], [[8, 12, 16]])
-    np.testing.assert_array_equal(draws.drawn["x"], [np.arange(10)])
+def test_every_rejected_candidate_has_one_outcome_and_is_dropped_from_every_column():
+    candidates = CandidateBatch(10)
+    candidates["x"] = np.arange(10.0)[None]
+    candidates.reject(np.arange(10) % 2 == 0, "odd")
+    candidates["y"] = 2 * candidates["x"]
+    candidates.reject(candidates["x"][0] > 3, "small")
+    candidates.reject(np.ones(3, bool), "never")
+    assert candidates.reasons == ["odd", "small", "never"]
+    assert candidates.outcome.tolist() == [2, 1, 2, 1, 0, 1, 0, 1, 0, 1]
+    assert candidates.alive.tolist() == [4, 6, 8]
+    np.testing.assert_array_equal(candidates["x"], [[4, 6, 8]])
+    np.testing.assert_array_equal(candidates["y"], [[8, 12, 16]])
+    np.testing.assert_array_equal(candidates.drawn["x"], [np.arange(10)])
 
 
-def test_gates_together_reject_under_the_same_reasons_as_one_after_the_other():
+def test_joint_and_sequential_rejections_have_the_same_reasons():
     names, met = ["first", "second", "first again", "none", "second"], np.random.default_rng(3).random((5, 200)) > 0.2
     met[3] = True
-    together, one_by_one = Round(200), Round(200)
-    for draws in (together, one_by_one):
-        draws["x"] = np.arange(200.0)[None]
-        draws.reject(np.arange(200) % 7 != 0, "before")
+    together, one_by_one = CandidateBatch(200), CandidateBatch(200)
+    for candidates in (together, one_by_one):
+        candidates["x"] = np.arange(200.0)[None]
+        candidates.reject(np.arange(200) % 7 != 0, "before")
     together.reject_first(met[:, together.alive], names)
     for name, ok in zip(names, met, strict=True):
         one_by_one.reject(ok[one_by_one.alive], name)
     assert together.reasons == one_by_one.reasons == ["before", "first", "second", "first again", "none"]
-    assert len(set(together.fate.tolist())) == 5
-    for name in ("fate", "alive"):
+    assert len(set(together.outcome.tolist())) == 5
+    for name in ("outcome", "alive"):
         np.testing.assert_array_equal(getattr(together, name), getattr(one_by_one, name))
     np.testing.assert_array_equal(together["x"], one_by_one["x"])
-    assert "y" not in draws.drawn
+    assert "y" not in candidates.drawn
 
 
-def test_columns_of_the_wrong_length_are_refused():
-    draws = Round(4)
+def test_columns_of_the_wrong_length_raise_an_error():
+    candidates = CandidateBatch(4)
     with pytest.raises(ValueError, match=r"column 'x' must have shape \(width, 4\), got \(2, 3\)"):
-        draws["x"] = np.zeros((2, 3))
+        candidates["x"] = np.zeros((2, 3))
     with pytest.raises(ValueError, match="column 'x'"):
-        draws["x"] = np.zeros(4)
+        candidates["x"] = np.zeros(4)
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_every_stage_works_on_a_round_without_survivors(prepare, name):
+def test_every_stage_accepts_an_empty_batch(prepare, name):
     prepared = prepare(name)
-    draws, random = Round(64), random_generator(0, "train", 0)
+    candidates, random = CandidateBatch(64), random_generator(0, "train", 0)
     for stage in load_pipeline(name).stage:
         run = stage.prepare(prepared.context)
-        run(draws, random)
-        draws.reject(np.zeros(len(draws.alive), bool), "everything")
-    assert len(draws.alive) == 0
+        run(candidates, random)
+        candidates.reject(np.zeros(len(candidates.alive), bool), "everything")
+    assert len(candidates.alive) == 0

@@ -1,4 +1,4 @@
-"""Given positions: grids and lists instead of draws, each task once, those without an answer counted."""
+"""Listed positions and grids: each task is used once, and unsolved tasks are counted."""
 
 from pathlib import Path
 
@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 from cnpgen.errors import RecipeError, UsageError
-from cnpgen.make.boundary_problems import draw_boundary_problems
 from cnpgen.make.dataset import make_dataset
-from cnpgen.make.load import load_dataset_recipe
-from cnpgen.pipelines.load import load_pipeline
+from cnpgen.make.draw_boundary_problems import draw_boundary_problems
+from cnpgen.make.recipe_file import load_dataset_recipe
+from cnpgen.pipelines.pipeline_file import load_pipeline
 from cnpgen.pipelines.stages.behind_puck import BehindPuck
-from cnpgen.pipelines.stages.stage import Round
-from cnpgen.store.blueprint import shards
+from cnpgen.pipelines.stages.stage import CandidateBatch
+from cnpgen.store.dataset_spec import shards
 from cnpgen.store.reader import open_dataset
-from cnpgen.store.record import load_record
-from cnpgen.validate.dataset import validate_dataset
+from cnpgen.store.shard_record import load_record
+from cnpgen.validate.validate_dataset import validate_dataset
 from tests.conftest import Arm, Prepare
 
 LIST = """\
@@ -71,40 +71,44 @@ def test_the_81_pucks_are_met_behind_their_centres_as_fast_as_possible(prepare: 
         np.testing.assert_allclose(arm.velocity(q, dq)[:2], rows["hit_speed"][0, i] * along[:, i], atol=1e-9)
 
 
-def test_a_dataset_has_one_row_for_each_answer_and_counts_the_other_tasks(recipe, tmp_path):
+def test_a_dataset_has_one_row_per_solved_task_and_counts_the_others(recipe, tmp_path):
     made = make_dataset(load_dataset_recipe(recipe(THREE)), tmp_path / "rows", workers=1)
     assert made.rows == {"train": 2}
     dataset = open_dataset(made.folder)
     np.testing.assert_allclose(dataset.read("train")["goal_xyz"], [[1.0, 0.1, 0.16], [0.9, -0.2, 0.16]])
     np.testing.assert_array_equal(dataset.read("train")["attempts"], [1, 3])  # a list ends with its last row
-    (task,) = shards(made.blueprint)
-    fates = load_record(made.folder, task).fates
-    assert (fates.tried, fates.accepted, fates.rejections["no hitting configuration"]) == (4, 2, 2)  # the last one, too
+    (task,) = shards(made.spec)
+    sampling = load_record(made.folder, task).sampling
+    assert (sampling.tried, sampling.accepted, sampling.rejections["no hitting configuration"]) == (
+        4,
+        2,
+        2,
+    )  # the last one, too
     assert validate_dataset(made.folder, deep=True, regenerate=1, workers=1).ok
 
 
 def test_shards_of_one_row_hold_the_same_rows_and_the_same_counts(recipe, tmp_path):
     made = make_dataset(load_dataset_recipe(recipe(THREE)), tmp_path / "rows", workers=1, shard_size=1)
-    tried = [load_record(made.folder, task).fates.tried for task in shards(made.blueprint)]
+    tried = [load_record(made.folder, task).sampling.tried for task in shards(made.spec)]
     assert tried == [1, 3]
 
 
-def test_more_rows_than_answers_are_refused_with_the_reasons(recipe, tmp_path):
+def test_more_rows_than_solved_tasks_raise_an_error_with_the_reasons(recipe, tmp_path):
     with pytest.raises(UsageError, match=r"2 rows, of 4 tasks \(2 no hitting configuration\): got n = 3"):
         make_dataset(load_dataset_recipe(recipe(THREE)), tmp_path / "rows", n=3)
     assert not (tmp_path / "rows").exists()
     for n in (3, 5):
-        with pytest.raises(UsageError, match=r"listed: .* rows are asked for"):
+        with pytest.raises(UsageError, match=r"listed: .* rows are requested"):
             draw_boundary_problems(recipe(THREE), n)
     assert len(draw_boundary_problems(recipe(THREE), 2)) == 2
 
 
-def test_no_answer_at_all_is_refused(recipe, tmp_path):
+def test_a_dataset_without_solved_tasks_raises_an_error(recipe, tmp_path):
     with pytest.raises(UsageError, match=r"0 rows, of 1 tasks \(1 no hitting configuration\)"):
         make_dataset(load_dataset_recipe(recipe('goal = ["[3.0, 0, 0.16] m"]')), tmp_path / "rows")
 
 
-def test_two_splits_of_the_same_tasks_are_refused(recipe, tmp_path):
+def test_two_splits_of_the_same_tasks_raise_an_error(recipe, tmp_path):
     recipe(THREE)
     dataset = tmp_path / "dataset.toml"
     dataset.write_text('name = "d"\npipeline = "listed.toml"\n[splits]\ntrain = 1\ntest = 1\n', encoding="utf-8")
@@ -126,13 +130,13 @@ def test_two_splits_of_the_same_tasks_are_refused(recipe, tmp_path):
         ('grid = ["[0, 1] m", "0 m", "0 m"]\ncounts = [2, 0, 1]', "0 is too small, expected at least 1"),
     ],
 )
-def test_mistakes_in_the_recipe_are_said_with_their_keys(recipe, positions, mistake):
+def test_mistakes_in_the_recipe_name_their_keys(recipe, positions, mistake):
     with pytest.raises(RecipeError) as error:
         load_pipeline(recipe(positions))
     assert mistake in str(error.value)
 
 
-def test_starts_can_be_listed_for_a_stage_that_finds_their_joints(tmp_path, prepare):
+def test_listed_starts_are_solved_by_a_later_stage(tmp_path, prepare):
     text = LIST.format(positions=THREE + '\nstart = ["[0.65, 0.02, 0.16] m"]')
     text = text.replace('[[stage]]\nuse = "at-rest"', '[[stage]]\nuse = "start-ik"\n\n[[stage]]\nuse = "at-rest"')
     (tmp_path / "from.toml").write_text(text, encoding="utf-8")
@@ -141,10 +145,10 @@ def test_starts_can_be_listed_for_a_stage_that_finds_their_joints(tmp_path, prep
 
 
 def test_the_mallet_is_behind_the_puck_on_the_line_of_the_hit():
-    draws = Round(2)
-    draws["goal_xyz"], draws["hit_angle"] = (
+    candidates = CandidateBatch(2)
+    candidates["goal_xyz"], candidates["hit_angle"] = (
         np.array([[1.0, 1.0], [0.0, 0.1], [0.16, 0.16]]),
         np.array([[0.0, np.pi / 2]]),
     )
-    BehindPuck(distance=0.07).prepare(None)(draws, np.random.default_rng(0))
-    np.testing.assert_allclose(draws["goal_xyz"].T, [[0.93, 0, 0.16], [1.0, 0.03, 0.16]], atol=1e-15)
+    BehindPuck(distance=0.07).prepare(None)(candidates, np.random.default_rng(0))
+    np.testing.assert_allclose(candidates["goal_xyz"].T, [[0.93, 0, 0.16], [1.0, 0.03, 0.16]], atol=1e-15)

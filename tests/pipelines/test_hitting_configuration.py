@@ -10,7 +10,7 @@ from scipy.optimize import minimize
 from cnpgen.kernels.tape import Loop
 from cnpgen.pipelines.stages.hitting_configuration import HittingConfiguration
 from cnpgen.pipelines.stages.hitting_newton import basic_joints, newton_step
-from cnpgen.pipelines.stages.ik import MAX_STEPS, TOLERANCE, ik_step
+from cnpgen.pipelines.stages.ik import IK_TOLERANCE, MAX_IK_STEPS, ik_step
 from cnpgen.robots.robot import Robot
 from tests.conftest import Arm, Prepare, run_stages, some
 
@@ -20,7 +20,7 @@ DRAWS = 40
 
 @dataclass
 class Search:
-    """The search for one hitting configuration: maximise |J^T d|^2 - |(q0 - q) / L|^2 subject to FK(q) = p."""
+    """The search for one hitting configuration: maximize |J^T d|^2 - |(q0 - q) / L|^2 subject to FK(q) = p."""
 
     robot: Robot
     arm: Arm
@@ -55,24 +55,28 @@ class Search:
 
 @pytest.fixture(scope="module", params=some(["airhockey-hit", "airhockey-replan"], 1, "slow"))
 def solved(request: pytest.FixtureRequest, prepare: Prepare) -> list[tuple[Search, Array, Array]]:
-    """Searches, their first guesses by inverse kinematics, and our solutions."""
+    """Searches, their initial guesses by inverse kinematics, and our solutions."""
     prepared = prepare(request.param)
     robot, arm = prepared.context.robot, Arm(prepared.context.robot)
-    draws = run_stages(prepared, 80, seed=41, until="HittingConfiguration")
-    n = len(draws.alive)
-    home = np.repeat(robot.base[:, None], n, axis=1) if request.param == "airhockey-hit" else draws["start_q"]
-    first = prepared.context.kernels.load(ik_step, Loop(TOLERANCE, MAX_STEPS), vertical=False, max_step=0.4)
-    guess, _ = first(home, draws["goal_xyz"])
-    angle = draws["hit_angle"][0]
+    candidates = run_stages(prepared, 80, seed=41, until="HittingConfiguration")
+    n = len(candidates.alive)
+    home = np.repeat(robot.base[:, None], n, axis=1) if request.param == "airhockey-hit" else candidates["start_q"]
+    first = prepared.context.kernels.load(ik_step, Loop(IK_TOLERANCE, MAX_IK_STEPS), vertical=False, max_step=0.4)
+    guess, _ = first(home, candidates["goal_xyz"])
+    angle = candidates["hit_angle"][0]
     direction = np.stack([np.cos(angle), np.sin(angle), np.zeros(n)])
     return [
-        (Search(robot, arm, draws["goal_xyz"][:, k], direction[:, k], home[:, k]), guess[:, k], draws["goal_q"][:, k])
+        (
+            Search(robot, arm, candidates["goal_xyz"][:, k], direction[:, k], home[:, k]),
+            guess[:, k],
+            candidates["goal_q"][:, k],
+        )
         for k in range(min(n, DRAWS))
     ]
 
 
 def other_starts(search: Search) -> Iterator[Array]:
-    """Near the configuration that the search stays close to, and anywhere."""
+    """Check near the home configuration and at random configurations."""
     random = np.random.default_rng(42)
     low, high = search.robot.position_lower, search.robot.position_upper
     for _ in range(3):
@@ -89,7 +93,7 @@ def test_our_gradient_of_the_objective_is_right(solved):
     np.testing.assert_allclose(search.gradient(guess), numeric, atol=1e-7)
 
 
-def test_slsqp_finds_nothing_better_from_the_same_start(solved):
+def test_slsqp_finds_no_better_optimum_from_the_same_initial_guess(solved):
     assert len(solved) == DRAWS
     same = 0
     for search, guess, ours in solved:
@@ -101,8 +105,8 @@ def test_slsqp_finds_nothing_better_from_the_same_start(solved):
 
 
 @pytest.mark.slow
-def test_slsqp_finds_nothing_better_from_other_starts(solved):
-    """Here of 80 draws; 19,029 runs of SLSQP for 1251 replanning draws and 1362 hits found nothing better either."""
+def test_slsqp_finds_no_better_optimum_from_other_initial_guesses(solved):
+    """80 candidates; 19,029 runs of SLSQP for 1251 replanning candidates and 1362 hits found no better optimum."""
     reached = 0
     for search, _, ours in solved:
         for start in other_starts(search):
@@ -128,10 +132,13 @@ def test_the_projected_gradient_vanishes_and_the_projected_hessian_is_negative(s
         assert np.abs(null.T @ gradient).max() < 1e-7
         multiplier = np.linalg.lstsq(jacobian.T, gradient, rcond=None)[0]
 
-        def slope(q, search=search, multiplier=multiplier):
+        def lagrangian_gradient(q, search=search, multiplier=multiplier):
             return search.gradient(q) - search.arm.jacobian(q)[:3].T @ multiplier
 
-        hessian = [(slope(ours + 1e-6 * e) - slope(ours - 1e-6 * e)) / 2e-6 for e in np.eye(len(ours))]
+        hessian = [
+            (lagrangian_gradient(ours + 1e-6 * e) - lagrangian_gradient(ours - 1e-6 * e)) / 2e-6
+            for e in np.eye(len(ours))
+        ]
         assert np.linalg.eigvalsh(null.T @ np.array(hessian) @ null).max() < 0
 
 
@@ -142,9 +149,13 @@ def test_the_search_improves_on_the_inverse_kinematics(solved):
 
 
 @pytest.mark.parametrize("name", ["airhockey-hit", "airhockey-replan"])
-def test_hardly_a_draw_is_lost(prepare, name):
-    draws = run_stages(prepare(name), 20_000, seed=43, until="HittingConfiguration")
-    lost = [np.sum(draws.fate == 1 + k) for k, text in enumerate(draws.reasons) if text == "no hitting configuration"]
+def test_almost_no_candidate_is_rejected(prepare, name):
+    candidates = run_stages(prepare(name), 20_000, seed=43, until="HittingConfiguration")
+    lost = [
+        np.sum(candidates.outcome == 1 + k)
+        for k, text in enumerate(candidates.reasons)
+        if text == "no hitting configuration"
+    ]
     assert sum(lost) < 20
 
 
@@ -156,32 +167,35 @@ def test_eliminated_joints_move_the_tip_in_all_directions_near_the_base(prepare)
         assert abs(np.linalg.det(arm.jacobian(q)[:3, joints])) > 1e-3
 
 
-def test_a_step_is_never_longer_than_allowed(prepare):
+def test_no_step_exceeds_the_maximum(prepare):
     prepared = prepare("airhockey-replan")
-    draws = run_stages(prepared, 500, seed=45, until="HittingConfiguration")
+    candidates = run_stages(prepared, 500, seed=45, until="HittingConfiguration")
     kernel = prepared.context.kernels.load(newton_step)
-    angle = draws["hit_angle"]
+    angle = candidates["hit_angle"]
     direction = np.concatenate([np.cos(angle), np.sin(angle)])
-    following, length = kernel(draws["start_q"], draws["goal_xyz"], direction, draws["start_q"])
-    moved = np.linalg.norm(following - draws["start_q"], axis=0)
+    following, length = kernel(candidates["start_q"], candidates["goal_xyz"], direction, candidates["start_q"])
+    moved = np.linalg.norm(following - candidates["start_q"], axis=0)
     assert moved.max() <= 0.6 + 1e-12
     np.testing.assert_allclose(moved, np.minimum(length[0], 0.6), rtol=1e-9)
 
 
 def sides(robot: Robot, q: Array) -> Array:
-    """-1 for joints on their lower limits, 1 on their upper ones, -2 and 2 beyond, else 0."""
+    """-1 for joints on their lower limits, 1 on their upper ones, -2 and 2 outside, else 0."""
     low, high = robot.position_lower, robot.position_upper
     return 1.0 * (q >= high) + (q > high) - 1.0 * (q <= low) - (q < low)
 
 
-def test_no_draw_is_lost_at_a_joint_limit(prepare):
-    """Near the inner edge of the reach the optimum of 0.013 % of the draws is beyond the limit of joint 6."""
+def test_no_candidate_is_rejected_at_a_joint_limit(prepare):
+    """Near the inner edge of the reach, the optimum of 0.013 % of the candidates is outside the limit of joint 6."""
     prepared = prepare("airhockey-replan")
     robot, limited = prepared.context.robot, 0
     for seed in range(3):
-        draws = run_stages(prepared, 20_000, seed=seed, until="HittingConfiguration")
-        assert np.count_nonzero(draws.fate == 1 + draws.reasons.index("joint position limit at the goal")) == 0
-        limited += np.count_nonzero((sides(robot, draws["goal_q"].T) != 0).any(axis=1))
+        candidates = run_stages(prepared, 20_000, seed=seed, until="HittingConfiguration")
+        assert (
+            np.count_nonzero(candidates.outcome == 1 + candidates.reasons.index("joint position limit at the goal"))
+            == 0
+        )
+        limited += np.count_nonzero((sides(robot, candidates["goal_q"].T) != 0).any(axis=1))
     assert limited >= 3
 
 
@@ -194,20 +208,20 @@ def cramped(prepare: Prepare) -> list[tuple[Search, Array]]:
         context.robot, position_lower=np.maximum(low, base - 0.6), position_upper=np.minimum(high, base + 0.6)
     )
     kernels = replace(context.kernels, identity="cramped", arguments={**context.kernels.arguments, "robot": robot})
-    draws = run_stages(prepare("airhockey-replan"), 1500, seed=46, until="HitAngleInCone")
-    draws.reject((np.abs(sides(robot, draws["start_q"].T)) < 2).all(axis=1), "elsewhere")
-    HittingConfiguration(near="start").prepare(replace(context, robot=robot, kernels=kernels))(draws, None)
-    angle, q, arm = draws["hit_angle"][0], draws["goal_q"], Arm(robot)
+    candidates = run_stages(prepare("airhockey-replan"), 1500, seed=46, until="HitAngleInCone")
+    candidates.reject((np.abs(sides(robot, candidates["start_q"].T)) < 2).all(axis=1), "elsewhere")
+    HittingConfiguration(near="start").prepare(replace(context, robot=robot, kernels=kernels))(candidates, None)
+    angle, q, arm = candidates["hit_angle"][0], candidates["goal_q"], Arm(robot)
     direction = np.stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))])
     on_limit = (sides(robot, q.T) != 0).any(axis=1)
     return [
-        (Search(robot, arm, draws["goal_xyz"][:, k], direction[:, k], draws["start_q"][:, k]), q[:, k])
+        (Search(robot, arm, candidates["goal_xyz"][:, k], direction[:, k], candidates["start_q"][:, k]), q[:, k])
         for k in np.flatnonzero(on_limit)
     ]
 
 
 @pytest.mark.slow
-def test_optima_on_limits_are_those_of_slsqp(cramped):
+def test_optima_on_limits_agree_with_slsqp(cramped):
     assert len(cramped) > 40
     same = 0
     for search, ours in cramped[:40]:
@@ -219,7 +233,7 @@ def test_optima_on_limits_are_those_of_slsqp(cramped):
     assert same > 60
 
 
-def test_joints_on_their_limits_would_move_outwards_and_the_others_nowhere(cramped):
+def test_the_gradient_points_outwards_for_joints_on_limits_and_vanishes_for_the_others(cramped):
     held = []
     for search, ours in cramped:
         jacobian, gradient = search.arm.jacobian(ours)[:3], search.gradient(ours)

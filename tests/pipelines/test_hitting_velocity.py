@@ -1,4 +1,4 @@
-"""The fastest hit, a linear programme, against HiGHS and against its own dual, also where the arm is degenerate."""
+"""The fastest hit, a linear program, compared with HiGHS and its dual, including degenerate arms."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import linprog
 
 from cnpgen.pipelines.stages.hitting_velocity import HittingVelocity, hitting_velocity
-from cnpgen.pipelines.stages.stage import Round
+from cnpgen.pipelines.stages.stage import CandidateBatch
 from tests.conftest import Arm, Prepare, needs_compiler, run_stages, some
 
 Array = np.ndarray
@@ -42,7 +42,7 @@ KINDS = ["base", "anywhere", "in a vertical plane", "some joints at zero"]
 
 
 @dataclass
-class Programme:
+class Program:
     """max a . v with B v = 0 and |v_i| <= L_i, for one state, from Pinocchio's Jacobian."""
 
     a: Array
@@ -54,17 +54,17 @@ class Programme:
         return -float(linprog(-self.a, A_eq=self.b, b_eq=[0, 0], bounds=bounds, method="highs").fun)
 
 
-def programmes(robot, cases: list[tuple[Array, Array]]) -> list[Programme]:
+def programs(robot, cases: list[tuple[Array, Array]]) -> list[Program]:
     arm = Arm(robot)
     made = []
     for q, d in cases:
         x, y, z = arm.jacobian(q)[:3]
-        made.append(Programme(d[0] * x + d[1] * y, np.array([d[0] * y - d[1] * x, z]), robot.velocity_limit))
+        made.append(Program(d[0] * x + d[1] * y, np.array([d[0] * y - d[1] * x, z]), robot.velocity_limit))
     return made
 
 
 def solve(prepared, backend: str, cases: list[tuple[Array, Array]], kernels_of) -> tuple[Array, Array]:
-    kernel = kernels_of(prepared, backend).load(hitting_velocity, slowest=0.0)
+    kernel = kernels_of(prepared, backend).load(hitting_velocity, min_speed=0.0)
     q, d = (np.array(column).T.copy() for column in zip(*cases, strict=True))
     velocity, speed, _ = kernel(q, d)
     return velocity.T, speed[0]
@@ -72,26 +72,26 @@ def solve(prepared, backend: str, cases: list[tuple[Array, Array]], kernels_of) 
 
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("kind", some(KINDS, 1, "slow"))
-def test_velocities_are_the_optimum_that_highs_finds(prepare: Prepare, kernels_of, kind, backend):
+def test_velocities_agree_with_the_optimum_of_highs(prepare: Prepare, kernels_of, kind, backend):
     prepared = prepare("airhockey-hit")
     cases = states(kind, prepared.context.robot)
     if backend != "compiled":
         cases = cases[::4]
     velocities, speeds = solve(prepared, backend, cases, kernels_of)
-    problems = programmes(prepared.context.robot, cases)
-    for case, programme, v, speed in zip(cases, problems, velocities, speeds, strict=True):
-        best = programme.highs()
+    problems = programs(prepared.context.robot, cases)
+    for case, program, v, speed in zip(cases, problems, velocities, speeds, strict=True):
+        best = program.highs()
         assert speed == pytest.approx(best, rel=1e-9, abs=1e-12), case
-        assert programme.a @ v == pytest.approx(best, rel=1e-9, abs=1e-12), case
-        assert np.all(np.abs(v) <= programme.limit * (1 + 1e-15)), case
-        assert np.abs(programme.b @ v).max() < 1e-12, case
+        assert program.a @ v == pytest.approx(best, rel=1e-9, abs=1e-12), case
+        assert np.all(np.abs(v) <= program.limit * (1 + 1e-15)), case
+        assert np.abs(program.b @ v).max() < 1e-12, case
 
 
 def test_there_are_more_than_500_states_and_many_are_degenerate(prepare: Prepare):
     robot = prepare("airhockey-hit").context.robot
     assert sum(len(states(kind, robot)) for kind in KINDS) > 1000
-    for programme in programmes(robot, states("in a vertical plane", robot)):
-        x, z = programme.b
+    for program in programs(robot, states("in a vertical plane", robot)):
+        x, z = program.b
         odd = np.array([x[j] * z[k] - x[k] * z[j] for j, k in ((0, 2), (0, 4), (2, 4))])
         assert np.abs(odd).max() < 1e-12  # three columns of the equations are parallel
 
@@ -109,20 +109,24 @@ def test_almost_degenerate_states_are_optimal_by_duality(prepare: Prepare, kerne
         for q, d in states("in a vertical plane", robot)[::3]
     ]
     velocities, speeds = solve(prepared, fastest, cases, kernels_of)
-    for case, programme, v, speed in zip(cases, programmes(robot, cases), velocities, speeds, strict=True):
-        assert programme.a @ v == pytest.approx(speed, rel=1e-9), case
-        assert np.all(np.abs(v) <= programme.limit * (1 + 1e-12)), case
-        assert np.abs(programme.b @ v).max() < 1e-9, case
-        assert speed > programme.highs() * (1 - 1e-6), case
+    for case, program, v, speed in zip(cases, programs(robot, cases), velocities, speeds, strict=True):
+        assert program.a @ v == pytest.approx(speed, rel=1e-9), case
+        assert np.all(np.abs(v) <= program.limit * (1 + 1e-12)), case
+        assert np.abs(program.b @ v).max() < 1e-9, case
+        assert speed > program.highs() * (1 - 1e-6), case
 
 
 @pytest.mark.parametrize("name", ["airhockey-hit", "airhockey-replan"])
-def test_hits_of_a_pipeline_are_along_their_direction_and_at_their_speed(prepare: Prepare, name):
+def test_hits_of_a_pipeline_have_their_direction_and_speed(prepare: Prepare, name):
     prepared = prepare(name)
-    draws = run_stages(prepared, 1500, seed=53, until="HittingVelocity")
+    candidates = run_stages(prepared, 1500, seed=53, until="HittingVelocity")
     arm, limit = Arm(prepared.context.robot), prepared.context.robot.velocity_limit
     for q, dq, angle, speed in zip(
-        draws["goal_q"].T, draws["goal_dq"].T, draws["hit_angle"][0], draws["hit_speed"][0], strict=True
+        candidates["goal_q"].T,
+        candidates["goal_dq"].T,
+        candidates["hit_angle"][0],
+        candidates["hit_speed"][0],
+        strict=True,
     ):
         x, y, z = arm.velocity(q, dq)
         assert x * np.cos(angle) + y * np.sin(angle) == pytest.approx(speed, abs=1e-12)
@@ -131,19 +135,19 @@ def test_hits_of_a_pipeline_are_along_their_direction_and_at_their_speed(prepare
         assert np.all(np.abs(dq) <= limit)
 
 
-def test_full_speed_hits_are_at_a_limit(prepare: Prepare):
+def test_full_speed_hits_are_on_a_limit(prepare: Prepare):
     prepared = prepare("airhockey-replan")
-    draws = run_stages(prepared, 3000, seed=54, until="HittingVelocity")
-    full = draws["hit_speed"][0] == draws["hit_speed_max"][0]
-    ratio = np.abs(draws["goal_dq"]) / prepared.context.robot.velocity_limit[:, None]
+    candidates = run_stages(prepared, 3000, seed=54, until="HittingVelocity")
+    full = candidates["hit_speed"][0] == candidates["hit_speed_max"][0]
+    ratio = np.abs(candidates["goal_dq"]) / prepared.context.robot.velocity_limit[:, None]
     np.testing.assert_allclose(ratio.max(0)[full], 1.0, rtol=1e-12)
 
 
-def stage_on(prepared, q: Array, angle: float) -> Round:
-    draws = Round(1)
-    draws["goal_q"], draws["hit_angle"] = q[:, None].copy(), np.array([[angle]])
-    HittingVelocity(full_speed=1.0).prepare(prepared.context)(draws, np.random.default_rng(0))
-    return draws
+def stage_on(prepared, q: Array, angle: float) -> CandidateBatch:
+    candidates = CandidateBatch(1)
+    candidates["goal_q"], candidates["hit_angle"] = q[:, None].copy(), np.array([[angle]])
+    HittingVelocity(full_speed=1.0).prepare(prepared.context)(candidates, np.random.default_rng(0))
+    return candidates
 
 
 def test_a_stretched_arm_that_cannot_move_along_the_hit_is_rejected(prepare: Prepare):
@@ -151,16 +155,16 @@ def test_a_stretched_arm_that_cannot_move_along_the_hit_is_rejected(prepare: Pre
     prepared = prepare("airhockey-hit")
     for q in (np.zeros(6), np.array([0.0, np.pi / 4, 0.0, 0.0, 0.0, 0.0])):
         for angle in (0.0, np.pi / 2, 1.0):
-            draws = stage_on(prepared, q, angle)
-            assert all(np.isfinite(values).all() for values in draws.columns.values()), (q, angle)
+            candidates = stage_on(prepared, q, angle)
+            assert all(np.isfinite(values).all() for values in candidates.columns.values()), (q, angle)
 
 
-def test_hits_slower_than_asked_are_rejected(prepare: Prepare):
+def test_hits_below_the_minimum_speed_are_rejected(prepare: Prepare):
     prepared = prepare("airhockey-hit")
     robot = prepared.context.robot
     assert len(stage_on(prepared, robot.base, 0.0).alive) == 1
-    draws = Round(1)
-    draws["goal_q"], draws["hit_angle"] = robot.base[:, None].copy(), np.zeros((1, 1))
-    HittingVelocity(full_speed=1.0, min_speed=10.0).prepare(prepared.context)(draws, np.random.default_rng(0))
-    assert draws.reasons == ["no hitting velocity"]
-    assert len(draws.alive) == 0
+    candidates = CandidateBatch(1)
+    candidates["goal_q"], candidates["hit_angle"] = robot.base[:, None].copy(), np.zeros((1, 1))
+    HittingVelocity(full_speed=1.0, min_speed=10.0).prepare(prepared.context)(candidates, np.random.default_rng(0))
+    assert candidates.reasons == ["no hitting velocity"]
+    assert len(candidates.alive) == 0

@@ -1,4 +1,4 @@
-"""Inverse kinematics of start and goal: what Pinocchio says of the solutions."""
+"""Inverse kinematics of start and goal, checked with Pinocchio."""
 
 from dataclasses import replace
 
@@ -8,11 +8,11 @@ import pytest
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.tape import Loop
 from cnpgen.pipelines.prepared import PreparedPipeline
-from cnpgen.pipelines.stages.ik import MAX_STEPS, TOLERANCE, GoalIK, ik_step
-from cnpgen.pipelines.stages.stage import Round, TaskRound
+from cnpgen.pipelines.stages.ik import IK_TOLERANCE, MAX_IK_STEPS, GoalIK, ik_step
+from cnpgen.pipelines.stages.stage import CandidateBatch, TaskBatch
 from cnpgen.schema import registry
 from cnpgen.schema.catalogue import read_kind
-from cnpgen.schema.keys import Place
+from cnpgen.schema.keys import RecipeLocation
 from tests.conftest import Arm, Prepare, run_stages
 
 EXACT = 1e-9  # m and rad
@@ -20,48 +20,48 @@ ENDS = [("airhockey-hit", "start"), ("airhockey-replan", "start"), ("heavy-objec
 
 
 @pytest.fixture(scope="module", params=ENDS, ids=" ".join)
-def solved(request: pytest.FixtureRequest, prepare: Prepare) -> tuple[PreparedPipeline, str, Round]:
-    """Enough draws for some that end with joints on their limits, where convergence is slow."""
+def solved(request: pytest.FixtureRequest, prepare: Prepare) -> tuple[PreparedPipeline, str, CandidateBatch]:
+    """Enough candidates to include solutions with joints on their limits, which converge slowly."""
     name, end = request.param
     until = {"start": "StartIK", "goal": "GoalIK"}[end]
-    draws = 40_000 if name == "heavy-object" else 4000
-    return prepare(name), end, run_stages(prepare(name), draws, seed=31, until=until)
+    candidates = 40_000 if name == "heavy-object" else 4000
+    return prepare(name), end, run_stages(prepare(name), candidates, seed=31, until=until)
 
 
 def test_the_tip_is_at_its_position_within_a_nanometre(solved):
-    prepared, end, draws = solved
+    prepared, end, candidates = solved
     arm = Arm(prepared.context.robot)
-    found = np.array([arm.pose(q).translation.copy() for q in draws[f"{end}_q"].T])
-    assert np.linalg.norm(found - draws[f"{end}_xyz"].T, axis=1).max() < EXACT
+    found = np.array([arm.pose(q).translation.copy() for q in candidates[f"{end}_q"].T])
+    assert np.linalg.norm(found - candidates[f"{end}_xyz"].T, axis=1).max() < EXACT
 
 
 def test_every_joint_is_within_its_limits(solved):
-    prepared, end, draws = solved
+    prepared, end, candidates = solved
     robot = prepared.context.robot
-    assert np.all(robot.position_lower[:, None] <= draws[f"{end}_q"])
-    assert np.all(draws[f"{end}_q"] <= robot.position_upper[:, None])
+    assert np.all(robot.position_lower[:, None] <= candidates[f"{end}_q"])
+    assert np.all(candidates[f"{end}_q"] <= robot.position_upper[:, None])
 
 
-def test_almost_every_draw_has_a_solution(solved):
-    prepared, _, draws = solved
-    apart = np.sum(draws.fate == 1 + draws.reasons.index("too close together"))
-    yielded = len(draws.alive) / (draws.size - apart)
+def test_almost_every_candidate_has_a_solution(solved):
+    prepared, _, candidates = solved
+    too_close = np.sum(candidates.outcome == 1 + candidates.reasons.index("too close together"))
+    yielded = len(candidates.alive) / (candidates.size - too_close)
     assert yielded > (0.99 if prepared.context.robot.n == 6 else 0.6)
 
 
 @pytest.mark.parametrize("end", ["start", "goal"])
 def test_the_held_object_stands_upright(prepare, end):
     prepared = prepare("heavy-object")
-    draws = run_stages(prepared, 20_000, seed=32, until="GoalIK")
+    candidates = run_stages(prepared, 20_000, seed=32, until="GoalIK")
     arm = Arm(prepared.context.robot)
-    up = np.array([arm.pose(q).rotation[:, 2].copy() for q in draws[f"{end}_q"].T])
+    up = np.array([arm.pose(q).rotation[:, 2].copy() for q in candidates[f"{end}_q"].T])
     assert np.abs(up[:, :2]).max() < EXACT
     assert up[:, 2].min() > 0
 
 
-def test_an_object_held_upside_down_is_turned_round(prepare):
+def test_an_object_held_upside_down_is_turned_upright(prepare):
     prepared = prepare("heavy-object")
-    kernel = prepared.context.kernels.load(ik_step, Loop(TOLERANCE, MAX_STEPS), vertical=True, max_step=0.8)
+    kernel = prepared.context.kernels.load(ik_step, Loop(IK_TOLERANCE, MAX_IK_STEPS), vertical=True, max_step=0.8)
     good = run_stages(prepared, 400, seed=33, until="StartIK")
     arm = Arm(prepared.context.robot)
     q = good["start_q"].copy()
@@ -69,28 +69,28 @@ def test_an_object_held_upside_down_is_turned_round(prepare):
     tilted = np.array([arm.pose(x).rotation[2, 2] for x in q.T])
     assert np.sum(tilted < -0.5) > 20
     found, error = kernel(q, good["start_xyz"])
-    up = np.array([arm.pose(x).rotation[2, 2] for x in found[:, error[0] < TOLERANCE].T])
+    up = np.array([arm.pose(x).rotation[2, 2] for x in found[:, error[0] < IK_TOLERANCE].T])
     assert len(up) > 100
     np.testing.assert_allclose(up, 1.0, atol=1e-12)
 
 
-def test_positions_out_of_reach_are_rejected_and_not_approximated(prepare):
+def test_positions_out_of_reach_are_rejected(prepare):
     prepared = prepare("airhockey-hit")
-    kernel = prepared.context.kernels.load(ik_step, Loop(TOLERANCE, MAX_STEPS), vertical=False, max_step=0.4)
+    kernel = prepared.context.kernels.load(ik_step, Loop(IK_TOLERANCE, MAX_IK_STEPS), vertical=False, max_step=0.4)
     base = np.repeat(prepared.context.robot.base[:, None], 5, axis=1)
     far = np.array([[3.0, 0.0, 0.16], [1.2, 1.2, 0.16], [0.0, 0.0, 2.9], [5.0, 5.0, 5.0], [0.65, 0.0, 0.16]]).T.copy()
     q, error = kernel(base, far)
     assert np.all(error[0, :4] > 1e-2)
-    assert error[0, 4] < TOLERANCE
+    assert error[0, 4] < IK_TOLERANCE
     assert np.all(np.isfinite(q))
 
 
-def test_no_step_of_a_joint_is_longer_than_asked(prepare):
+def test_no_joint_step_exceeds_the_maximum(prepare):
     prepared = prepare("airhockey-replan")
     kernel = prepared.context.kernels.load(ik_step, vertical=False, max_step=0.05)
-    draws = run_stages(prepared, 300, seed=34, until="StartIK")
-    following, _ = kernel(draws["guess_q"], draws["start_xyz"])
-    assert np.abs(following - draws["guess_q"]).max() <= 0.05 + 1e-12
+    candidates = run_stages(prepared, 300, seed=34, until="StartIK")
+    following, _ = kernel(candidates["guess_q"], candidates["start_xyz"])
+    assert np.abs(following - candidates["guess_q"]).max() <= 0.05 + 1e-12
 
 
 def test_steps_never_leave_the_joint_limits_even_from_a_corner(prepare):
@@ -104,7 +104,7 @@ def test_steps_never_leave_the_joint_limits_even_from_a_corner(prepare):
     assert np.all(following <= robot.position_upper[:, None])
 
 
-def test_a_joint_on_its_limit_leaves_the_way_to_the_others(prepare):
+def test_the_remaining_step_of_a_joint_on_its_limit_is_distributed_over_the_others(prepare):
     prepared = prepare("airhockey-replan")
     robot, kernels = prepared.context.robot, prepared.context.kernels
     narrow = np.array([np.inf, np.inf, 0.05, np.inf, 0.05, np.inf])
@@ -114,39 +114,39 @@ def test_a_joint_on_its_limit_leaves_the_way_to_the_others(prepare):
     }
     arguments = {**kernels.arguments, "robot": replace(robot, **limits)}
     kernels = replace(kernels, backend="numpy", identity="narrow third and fifth joint", arguments=arguments)
-    kernel = kernels.load(ik_step, Loop(TOLERANCE, MAX_STEPS), vertical=False, max_step=0.4)
-    draws = run_stages(prepared, 400, seed=37, until="StartIK")
-    guess = np.clip(draws["guess_q"], limits["position_lower"][:, None], limits["position_upper"][:, None])
-    q, error = kernel(guess, draws["start_xyz"])
-    solved = error[0] < TOLERANCE
+    kernel = kernels.load(ik_step, Loop(IK_TOLERANCE, MAX_IK_STEPS), vertical=False, max_step=0.4)
+    candidates = run_stages(prepared, 400, seed=37, until="StartIK")
+    guess = np.clip(candidates["guess_q"], limits["position_lower"][:, None], limits["position_upper"][:, None])
+    q, error = kernel(guess, candidates["start_xyz"])
+    solved = error[0] < IK_TOLERANCE
     assert solved.mean() > 0.95
     assert np.sum(np.abs(q[[2, 4]][:, solved]).max(0) == 0.05) > 10
     assert np.abs(q[[2, 4]]).max() <= 0.05
     arm = Arm(robot)
     found = np.array([arm.pose(x).translation.copy() for x in q[:, solved].T])
-    assert np.linalg.norm(found - draws["start_xyz"][:, solved].T, axis=1).max() < EXACT
+    assert np.linalg.norm(found - candidates["start_xyz"][:, solved].T, axis=1).max() < EXACT
 
 
 def test_solutions_do_not_depend_on_how_sine_and_cosine_are_rounded(prepare, kernels_of):
-    """The backends' differ in the last bit; few joints left by the limits must not blow that up."""
+    """Backends differ in the last bit; a solve with few free joints must not amplify the difference."""
     prepared = prepare("heavy-object")
     options = {"vertical": True, "max_step": 0.8}
-    draws = run_stages(prepared, 6000, seed=38, until="StartIK")
+    candidates = run_stages(prepared, 6000, seed=38, until="StartIK")
     one, other = (
-        kernels_of(prepared, backend).load(ik_step, Loop(TOLERANCE, MAX_STEPS), **options)
+        kernels_of(prepared, backend).load(ik_step, Loop(IK_TOLERANCE, MAX_IK_STEPS), **options)
         for backend in (prepared.context.kernels.backend, "numpy")
     )
-    turned = np.nextafter(draws["guess_q"], np.inf)
-    first, second = one(draws["guess_q"], draws["start_xyz"]), other(turned, draws["start_xyz"])
+    turned = np.nextafter(candidates["guess_q"], np.inf)
+    first, second = one(candidates["guess_q"], candidates["start_xyz"]), other(turned, candidates["start_xyz"])
     assert np.mean(np.abs(first[0] - second[0]).max(0) > 1e-9) < 1e-3
 
 
 def test_the_goal_is_solved_from_the_start(prepare):
     prepared = prepare("heavy-object")
-    draws = run_stages(prepared, 1500, seed=36, until="GoalIK")
-    kernel = prepared.context.kernels.load(ik_step, Loop(TOLERANCE, MAX_STEPS), vertical=True, max_step=0.8)
-    again, _ = kernel(draws["start_q"], draws["goal_xyz"])
-    np.testing.assert_array_equal(draws["goal_q"], again)
+    candidates = run_stages(prepared, 1500, seed=36, until="GoalIK")
+    kernel = prepared.context.kernels.load(ik_step, Loop(IK_TOLERANCE, MAX_IK_STEPS), vertical=True, max_step=0.8)
+    again, _ = kernel(candidates["start_q"], candidates["goal_xyz"])
+    np.testing.assert_array_equal(candidates["goal_q"], again)
 
 
 def test_a_guess_of_the_wrong_length_is_a_mistake_in_the_recipe(prepare):
@@ -156,7 +156,7 @@ def test_a_guess_of_the_wrong_length_is_a_mistake_in_the_recipe(prepare):
         replace(stage, guess=stage.guess[:5]).prepare(prepared.context)
 
 
-def test_stages_say_what_they_do_with_their_numbers(prepare):
+def test_stages_are_described_with_their_values(prepare):
     heavy, hit = prepare("heavy-object").pipeline, prepare("airhockey-hit").pipeline
     goal = next(stage for stage in heavy.stage if isinstance(stage, GoalIK))
     assert goal.describe() == (
@@ -166,52 +166,54 @@ def test_stages_say_what_they_do_with_their_numbers(prepare):
 
 
 @pytest.fixture(scope="module")
-def anywhere(prepare: Prepare) -> tuple[PreparedPipeline, Round]:
-    """Transports between configurations that were chosen independently of each other, some on joint limits."""
+def anywhere(prepare: Prepare) -> tuple[PreparedPipeline, CandidateBatch]:
+    """Transports between independent configurations, some on joint limits."""
     return prepare("heavy-object-anywhere"), run_stages(prepare("heavy-object-anywhere"), 20_000, seed=39)
 
 
-def test_joints_that_are_held_end_on_their_limits_to_the_bit(anywhere):
+def test_held_joints_end_exactly_on_their_limits(anywhere):
     prepared, _ = anywhere
-    draws = run_stages(prepared, 20_000, seed=40, until="StartIK")
+    candidates = run_stages(prepared, 20_000, seed=40, until="StartIK")
     robot = prepared.context.robot
-    held, limits = draws["held"].astype(bool), (robot.position_lower[:, None], robot.position_upper[:, None])
+    held, limits = candidates["held"].astype(bool), (robot.position_lower[:, None], robot.position_upper[:, None])
     assert set(held.sum(0)) == {0, 1}
     assert held.any(1).all()
-    assert np.all(((draws["start_q"] == limits[0]) | (draws["start_q"] == limits[1]))[held])
+    assert np.all(((candidates["start_q"] == limits[0]) | (candidates["start_q"] == limits[1]))[held])
     arm = Arm(robot)
-    found = np.array([arm.pose(q).translation.copy() for q in draws["start_q"].T])
-    assert np.linalg.norm(found - draws["start_xyz"].T, axis=1).max() < EXACT
+    found = np.array([arm.pose(q).translation.copy() for q in candidates["start_q"].T])
+    assert np.linalg.norm(found - candidates["start_xyz"].T, axis=1).max() < EXACT
 
 
-def test_goals_from_guesses_are_those_that_their_guesses_lead_to(anywhere):
-    prepared, draws = anywhere
+def test_goals_are_the_solutions_of_their_guesses(anywhere):
+    prepared, candidates = anywhere
     stage = next(stage for stage in prepared.pipeline.stage if isinstance(stage, GoalIK))
-    kernel = prepared.context.kernels.load(ik_step, Loop(TOLERANCE, MAX_STEPS), vertical=True, max_step=0.8, hold=True)
-    again, _ = kernel(draws["guess_q"], draws["goal_xyz"], draws["held"])
-    np.testing.assert_array_equal(draws["goal_q"], again)
-    from_start = (draws["guess_q"] == draws["start_q"]).all(0)
+    kernel = prepared.context.kernels.load(
+        ik_step, Loop(IK_TOLERANCE, MAX_IK_STEPS), vertical=True, max_step=0.8, hold=True
+    )
+    again, _ = kernel(candidates["guess_q"], candidates["goal_xyz"], candidates["held"])
+    np.testing.assert_array_equal(candidates["goal_q"], again)
+    from_start = (candidates["guess_q"] == candidates["start_q"]).all(0)
     assert from_start.mean() > stage.from_start
-    assert not draws["held"][:, from_start].any()
-    change = np.abs(draws["goal_q"] - draws["start_q"]).max(0)
+    assert not candidates["held"][:, from_start].any()
+    change = np.abs(candidates["goal_q"] - candidates["start_q"]).max(0)
     assert 0.95 * stage.max_change < change.max() <= stage.max_change
     assert np.median(change[~from_start]) > 1.5 * np.median(change[from_start])
 
 
-def test_tasks_have_goals_that_are_found_from_the_start(prepare, anywhere):
-    prepared, draws = anywhere
+def test_goals_of_tasks_are_solved_from_the_start(prepare, anywhere):
+    prepared, candidates = anywhere
     stage = next(stage for stage in prepared.pipeline.stage if isinstance(stage, GoalIK))
-    round_of, tasks = prepare("heavy-object"), TaskRound(10)
+    round_of, tasks = prepare("heavy-object"), TaskBatch(10)
     for name in ("start_q", "goal_xyz"):
-        tasks[name] = draws[name][:, :10].copy()
+        tasks[name] = candidates[name][:, :10].copy()
     stage.complete(prepared.context, ("start_q", "goal_xyz"))(tasks, np.random.default_rng(0))
-    kernel = round_of.context.kernels.load(ik_step, Loop(TOLERANCE, MAX_STEPS), vertical=True, max_step=0.8)
-    again, error = kernel(draws["start_q"][:, :10], draws["goal_xyz"][:, :10])
-    np.testing.assert_array_equal(tasks["goal_q"], again[:, error[0] < TOLERANCE])
+    kernel = round_of.context.kernels.load(ik_step, Loop(IK_TOLERANCE, MAX_IK_STEPS), vertical=True, max_step=0.8)
+    again, error = kernel(candidates["start_q"][:, :10], candidates["goal_xyz"][:, :10])
+    np.testing.assert_array_equal(tasks["goal_q"], again[:, error[0] < IK_TOLERANCE])
 
 
 @pytest.mark.parametrize("key", ["from_start", "at_limit"])
-def test_goals_from_the_start_alone_have_no_guesses_to_choose_from(key):
+def test_options_of_guesses_require_guesses(key):
     mistakes: list[str] = []
-    read_kind(registry.STAGES, {"use": "goal-ik", key: 0.5}, Place("x.toml"), mistakes)
+    read_kind(registry.STAGES, {"use": "goal-ik", key: 0.5}, RecipeLocation("x.toml"), mistakes)
     assert f"{key}: needs random guesses" in mistakes[0]

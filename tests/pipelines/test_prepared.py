@@ -1,4 +1,4 @@
-"""Blocks: pure functions of seed, split and index, in pieces of any size, the same with any backend."""
+"""Blocks: pure functions of seed, split and index, in chunks of any size, equal for all backends."""
 
 from dataclasses import replace
 from functools import partial
@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 from cnpgen.errors import RecipeError
-from cnpgen.pipelines.piece import Block
+from cnpgen.pipelines.block_chunk import Block
 from cnpgen.pipelines.prepared import PreparedPipeline, as_stored, random_generator
 from cnpgen.pipelines.stages.hitting_velocity import HittingVelocity
-from cnpgen.pipelines.stages.stage import BLOCK_ROWS, Round
-from cnpgen.store.fates import Fates, merge_fates
+from cnpgen.pipelines.stages.stage import BLOCK_ROWS, CandidateBatch
 from cnpgen.store.field import Field
+from cnpgen.store.sampling_statistics import SamplingStatistics, merge_sampling
 from tests.conftest import SHIPPED, Prepare, needs_compiler, some
 
-CLOSE = 1e-9  # SI: what backends may differ by
+CLOSE = 1e-9  # maximum difference of the backends, in SI units
 SEED = 20261121
 
 
@@ -35,18 +35,18 @@ def assert_same_columns(found: dict[str, np.ndarray], expected: dict[str, np.nda
         np.testing.assert_array_equal(found[name], values, err_msg=name)
 
 
-def assert_same_fates(found: Fates, expected: Fates) -> None:
+def assert_same_sampling(found: SamplingStatistics, expected: SamplingStatistics) -> None:
     assert (found.tried, found.accepted) == (expected.tried, expected.accepted)
     assert dict(found.rejections) == dict(expected.rejections)
     for name, density in expected.densities.items():
-        np.testing.assert_array_equal(found.densities[name].drawn, density.drawn)
+        np.testing.assert_array_equal(found.densities[name].candidates, density.candidates)
         np.testing.assert_array_equal(found.densities[name].accepted, density.accepted)
 
 
-def test_a_block_made_twice_is_the_same_to_the_bit(prepared, whole):
+def test_a_block_is_reproducible_bit_for_bit(prepared, whole):
     again = prepared.block(SEED, "train", 0)
     assert_same_columns(again.columns, whole.columns)
-    assert_same_fates(again.fates, whole.fates)
+    assert_same_sampling(again.sampling, whole.sampling)
 
 
 @pytest.mark.parametrize("other", [(SEED + 1, "train", 0), (SEED, "validation", 0), (SEED, "train", 1)])
@@ -57,81 +57,83 @@ def test_blocks_of_another_seed_split_or_index_share_no_row(prepared, whole, oth
     np.testing.assert_array_equal(columns["sample_id"], [np.arange(first, first + 500)])
 
 
-def test_every_stage_takes_a_round_that_has_no_draws_left(prepared):
+def test_every_stage_accepts_a_batch_without_remaining_candidates(prepared):
     for emptied in range(1, len(prepared._stages) + 1):
-        draws, random = Round(8), random_generator(SEED, "train", 0)
+        candidates, random = CandidateBatch(8), random_generator(SEED, "train", 0)
         for _, work in prepared._stages[:emptied]:
-            work(draws, random)
-        draws.reject(np.zeros(len(draws.alive), bool), "all of them")
+            work(candidates, random)
+        candidates.reject(np.zeros(len(candidates.alive), bool), "all of them")
         for _, work in prepared._stages[emptied:]:
-            work(draws, random)
-        prepared._accept(draws, random)
-        assert {draws[field.name].shape[1] for field in prepared.fields[:-2]} == {0}
+            work(candidates, random)
+        prepared._accept(candidates, random)
+        assert {candidates[field.name].shape[1] for field in prepared.fields[:-2]} == {0}
 
 
-def pieces(prepared: PreparedPipeline, cuts: list[int], index: int = 0) -> tuple[dict[str, np.ndarray], Fates]:
-    """Make a block piece by piece."""
+def chunks(
+    prepared: PreparedPipeline, cuts: list[int], index: int = 0
+) -> tuple[dict[str, np.ndarray], SamplingStatistics]:
+    """Compute a block in chunks."""
     made = [
         prepared.block(SEED, "train", index, first=first, stop=stop)
         for first, stop in zip([0, *cuts], [*cuts, BLOCK_ROWS], strict=True)
     ]
     columns = {name: np.concatenate([part.columns[name] for part in made], axis=1) for name in made[0].columns}
-    return columns, merge_fates([part.fates for part in made])
+    return columns, merge_sampling([part.sampling for part in made])
 
 
 @pytest.mark.parametrize(
     "cuts", some([[1], [4095], [100, 1000, 3000], [2048], list(range(512, 4096, 512)), [17, 18]], 2, "slow")
 )
-def test_pieces_of_a_block_are_its_rows_and_their_fates_add_up(prepared, whole, cuts):
-    columns, fates = pieces(prepared, cuts)
+def test_chunks_of_a_block_have_its_rows_and_its_total_statistics(prepared, whole, cuts):
+    columns, sampling = chunks(prepared, cuts)
     assert_same_columns(columns, whole.columns)
-    assert_same_fates(fates, whole.fates)
+    assert_same_sampling(sampling, whole.sampling)
 
 
-def test_pieces_that_are_asked_for_together_are_those_asked_for_one_by_one(prepared, whole):
+def test_chunks_computed_together_equal_chunks_computed_one_by_one(prepared, whole):
     ranges = [(0, 1), (1, 64), (64, 1500), (1700, 1701), (3000, BLOCK_ROWS)]  # with gaps
     drawn = []
-    run = PreparedPipeline._round
+    run = PreparedPipeline._sample_batch
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(PreparedPipeline, "_round", lambda *x: (drawn.append(x[2]), run(*x))[1])
-        together = list(prepared.pieces(SEED, "train", 0, ranges))
-    assert sum(drawn) < 1.3 * whole.fates.tried + 300
+        patch.setattr(PreparedPipeline, "_sample_batch", lambda *x: (drawn.append(x[2]), run(*x))[1])
+        together = list(prepared.chunks(SEED, "train", 0, ranges))
+    assert sum(drawn) < 1.3 * whole.sampling.tried + 300
     assert len(together) == len(ranges)
-    for (first, stop), piece in zip(ranges, together, strict=True):
+    for (first, stop), chunk in zip(ranges, together, strict=True):
         alone = prepared.block(SEED, "train", 0, first=first, stop=stop)
-        assert_same_columns(piece.columns, alone.columns)
-        assert_same_fates(piece.fates, alone.fates)
+        assert_same_columns(chunk.columns, alone.columns)
+        assert_same_sampling(chunk.sampling, alone.sampling)
 
 
-def round_ends(prepared: PreparedPipeline, index: int) -> tuple[list[int], list[int]]:
-    """Rows that there are after each round of a block, and draws rejected at the end of each round."""
+def batch_ends(prepared: PreparedPipeline, index: int) -> tuple[list[int], list[int]]:
+    """Return the rows after each batch of a block, and the rejected candidates at the end of each batch."""
     sizes, tails = [], []
-    run = PreparedPipeline._round
+    run = PreparedPipeline._sample_batch
 
-    def noted(self: PreparedPipeline, random: np.random.Generator, size: int) -> Round:
-        draws = run(self, random, size)
-        sizes.append(len(draws.alive))
-        tails.append(draws.size - 1 - int(draws.alive[-1]))
-        return draws
+    def noted(self: PreparedPipeline, random: np.random.Generator, size: int) -> CandidateBatch:
+        candidates = run(self, random, size)
+        sizes.append(len(candidates.alive))
+        tails.append(candidates.size - 1 - int(candidates.alive[-1]))
+        return candidates
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(PreparedPipeline, "_round", noted)
+        patch.setattr(PreparedPipeline, "_sample_batch", noted)
         prepared.block(SEED, "train", index)
     return np.cumsum(sizes).tolist(), tails
 
 
 @pytest.mark.slow
-def test_a_piece_that_begins_with_a_round_counts_the_draws_rejected_at_the_end_of_the_one_before(prepare: Prepare):
+def test_a_chunk_that_begins_with_a_batch_counts_the_last_rejections_of_the_previous_batch(prepare: Prepare):
     prepared = prepare("heavy-object")
     tested = 0
     for index in range(20):
-        ends, tails = round_ends(prepared, index)
+        ends, tails = batch_ends(prepared, index)
         if tails[0] == 0 or tested == 3:
             continue
         tested += 1
-        whole, (columns, fates) = prepared.block(SEED, "train", index), pieces(prepared, [ends[0]], index)
+        whole, (columns, sampling) = prepared.block(SEED, "train", index), chunks(prepared, [ends[0]], index)
         assert_same_columns(columns, whole.columns)
-        assert_same_fates(fates, whole.fates)
+        assert_same_sampling(sampling, whole.sampling)
     assert tested == 3
 
 
@@ -139,46 +141,46 @@ def test_a_shorter_block_is_the_beginning_of_a_longer_one(prepared, whole):
     for stop in (1, 7, 1500, 2900):
         short = prepared.block(SEED, "train", 0, stop=stop)
         assert_same_columns(short.columns, {name: values[:, :stop] for name, values in whole.columns.items()})
-        assert short.fates.accepted == stop
-        assert short.fates.tried == whole.columns["attempts"][0, :stop].sum()
+        assert short.sampling.accepted == stop
+        assert short.sampling.tried == whole.columns["attempts"][0, :stop].sum()
 
 
 # --- counts -----------------------------------------------------------------------------------------------------------
 
 
-def test_every_draw_is_accepted_or_counted_under_one_reason(prepared, whole):
-    fates = whole.fates
-    assert fates.accepted == BLOCK_ROWS == whole.columns["attempts"].shape[1]
-    assert fates.tried == fates.accepted + sum(fates.rejections.values())
-    assert sum(fates.rejections.values()) > 100
+def test_every_candidate_is_accepted_or_counted_under_one_reason(prepared, whole):
+    sampling = whole.sampling
+    assert sampling.accepted == BLOCK_ROWS == whole.columns["attempts"].shape[1]
+    assert sampling.tried == sampling.accepted + sum(sampling.rejections.values())
+    assert sum(sampling.rejections.values()) > 100
 
 
-def test_attempts_sum_to_the_draws_tried(prepared, whole):
+def test_attempts_sum_to_the_number_of_candidates(prepared, whole):
     attempts = whole.columns["attempts"]
     assert attempts.dtype == np.int64
     assert attempts.min() == 1
-    assert attempts.sum() == whole.fates.tried
+    assert attempts.sum() == whole.sampling.tried
 
 
-def test_attempts_count_the_draws_from_one_row_to_the_next_across_rounds(prepared, whole):
-    """Made again draw by draw: all rounds' fates in one row."""
-    fates: list[int] = []
-    run = PreparedPipeline._round
+def test_attempts_count_the_candidates_between_rows_across_batches(prepared, whole):
+    """The reference concatenates the outcomes of the candidates of all batches."""
+    sampling: list[int] = []
+    run = PreparedPipeline._sample_batch
 
-    def noted(self: PreparedPipeline, random: np.random.Generator, size: int) -> Round:
-        draws = run(self, random, size)
-        fates.extend(draws.fate.tolist())
-        return draws
+    def noted(self: PreparedPipeline, random: np.random.Generator, size: int) -> CandidateBatch:
+        candidates = run(self, random, size)
+        sampling.extend(candidates.outcome.tolist())
+        return candidates
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(PreparedPipeline, "_round", noted)
+        patch.setattr(PreparedPipeline, "_sample_batch", noted)
         prepared.block(SEED, "train", 0)
-    accepted = np.flatnonzero(np.array(fates) == 0)[:BLOCK_ROWS]
+    accepted = np.flatnonzero(np.array(sampling) == 0)[:BLOCK_ROWS]
     np.testing.assert_array_equal(whole.columns["attempts"][0], np.diff(accepted, prepend=-1))
 
 
-def test_every_reason_that_a_stage_or_a_constraint_has_is_listed_even_if_nothing_was_rejected_for_it(prepared, whole):
-    reasons = list(whole.fates.rejections)
+def test_every_reason_of_stages_and_constraints_is_listed_even_without_rejections(prepared, whole):
+    reasons = list(whole.sampling.rejections)
     constraints = [constraint.reason for constraint in prepared.context.problem.constraint]
     assert reasons[0] == "too close together"
     assert [reason for reason in reasons if reason in constraints] == constraints
@@ -186,34 +188,35 @@ def test_every_reason_that_a_stage_or_a_constraint_has_is_listed_even_if_nothing
     assert len(set(reasons)) == len(reasons)
 
 
-def test_density_maps_count_every_draw_and_every_row(prepared, whole):
-    assert whole.fates.densities.keys() == {"start_xyz", "goal_xyz"}
-    for name, density in whole.fates.densities.items():
-        assert density.drawn.sum() == whole.fates.tried
+def test_density_maps_count_every_candidate_and_every_row(prepared, whole):
+    assert whole.sampling.densities.keys() == {"start_xyz", "goal_xyz"}
+    for name, density in whole.sampling.densities.items():
+        assert density.candidates.sum() == whole.sampling.tried
         assert density.accepted.sum() == BLOCK_ROWS
         x, y, _ = whole.columns[name]
         expected, _, _ = np.histogram2d(x, y, density.accepted.shape, [density.x, density.y])
-        np.testing.assert_allclose(density.accepted, expected, atol=2)  # a draw on the line between two cells
+        np.testing.assert_allclose(density.accepted, expected, atol=2)  # a candidate on the line between two cells
 
 
 @pytest.mark.parametrize("name", some(SHIPPED, 1, "slow"))
-def test_nothing_that_the_stages_pass_on_is_rejected_at_the_last_gate(prepare: Prepare, name):
-    """The stages are exact: the gate is there for what nobody has thought of."""
+def test_the_acceptance_check_rejects_no_candidate_of_the_stages(prepare: Prepare, name):
+    """The stages are exact; the acceptance check guards against unforeseen errors."""
     prepared = prepare(name)
-    fates = merge_fates([prepared.block(SEED, "test", index).fates for index in range(8)])
+    sampling = merge_sampling([prepared.block(SEED, "test", index).sampling for index in range(8)])
     gate = [constraint.reason for constraint in prepared.context.problem.constraint]
     gate += ["tip not at its position", "hit not along its direction"]
-    assert {reason: count for reason, count in fates.rejections.items() if reason in gate and count} == {}
+    assert {reason: count for reason, count in sampling.rejections.items() if reason in gate and count} == {}
 
 
-def test_a_pipeline_that_accepts_nothing_is_given_up_with_its_reasons(prepare: Prepare):
+def test_a_pipeline_without_accepted_candidates_raises_an_error_with_the_reasons(prepare: Prepare):
     pipeline = prepare("airhockey-hit").pipeline
     stages = [
         replace(stage, min_speed=100.0) if isinstance(stage, HittingVelocity) else stage for stage in pipeline.stage
     ]
     prepared = prepare(replace(pipeline, stage=tuple(stages)))
     text = (
-        r"airhockey-hit\.toml: 0 of [\d,]+ draws were accepted; of the last [\d,]+, rejected for no hitting velocity \("
+        r"airhockey-hit\.toml: 0 of [\d,]+ candidates were accepted; of the last [\d,]+,"
+        r" rejected for no hitting velocity \("
     )
     with pytest.raises(RecipeError, match=text):
         prepared.block(1, "train", 0)
@@ -222,20 +225,20 @@ def test_a_pipeline_that_accepts_nothing_is_given_up_with_its_reasons(prepare: P
 # --- backends ---------------------------------------------------------------------------------------------------------
 
 
-def same_round(prepared: PreparedPipeline, size: int) -> Round:
-    return prepared._round(random_generator(SEED, "train", 0), size)
+def same_round(prepared: PreparedPipeline, size: int) -> CandidateBatch:
+    return prepared._sample_batch(random_generator(SEED, "train", 0), size)
 
 
 @pytest.mark.parametrize("name", some(SHIPPED, 1, "slow"))
 @pytest.mark.parametrize(("backend", "size"), [pytest.param("compiled", 6000, marks=needs_compiler), ("casadi", 300)])
-def test_backends_agree_on_the_same_draws(prepare: Prepare, name, backend, size):
-    """But for draws on the verge of being rejected and for searches that end in another of two equal optima."""
+def test_backends_agree_on_the_same_candidates(prepare: Prepare, name, backend, size):
+    """Exceptions are candidates close to a rejection limit and searches with two equal optima."""
     one, other = same_round(prepare(name, "numpy"), size), same_round(prepare(name, backend), size)
     flipped = np.setxor1d(one.alive, other.alive)
     assert len(flipped) <= 2
     assert set(one.reasons) == set(other.reasons)
     common = np.intersect1d(one.alive, other.alive)
-    rows = [np.searchsorted(draws.alive, common) for draws in (one, other)]
+    rows = [np.searchsorted(candidates.alive, common) for candidates in (one, other)]
     assert one.columns.keys() == other.columns.keys()
     off = np.zeros(len(common), bool)
     for column in one.columns:
@@ -247,7 +250,7 @@ def test_backends_agree_on_the_same_draws(prepare: Prepare, name, backend, size)
 # --- rows in float32 --------------------------------------------------------------------------------------------------
 
 
-def test_rounding_to_float32_never_leaves_a_limit(prepare: Prepare):
+def test_rounding_to_float32_never_violates_a_limit(prepare: Prepare):
     robot = prepare("heavy-object").context.robot
     field = Field("x", "rad", "", 7, valid_min=tuple(robot.position_lower), valid_max=tuple(robot.position_upper))
     low, high = robot.position_lower[:, None], robot.position_upper[:, None]
@@ -259,10 +262,10 @@ def test_rounding_to_float32_never_leaves_a_limit(prepare: Prepare):
     np.testing.assert_allclose(stored, inside, rtol=2e-7)
 
 
-def test_what_is_beyond_a_limit_before_rounding_stays_beyond(prepare: Prepare):
+def test_values_outside_a_limit_stay_outside_after_rounding(prepare: Prepare):
     field = Field("x", "rad", "", 1, valid_min=(-1 / 3,), valid_max=(1 / 3,))
-    beyond = np.array([[-0.34, 0.34, np.nan]])
-    np.testing.assert_array_equal(as_stored(beyond, field), beyond.astype(np.float32).astype(float))
+    outside = np.array([[-0.34, 0.34, np.nan]])
+    np.testing.assert_array_equal(as_stored(outside, field), outside.astype(np.float32).astype(float))
 
 
 def test_fields_without_limits_are_rounded_to_the_nearest(prepare: Prepare):
@@ -273,7 +276,7 @@ def test_fields_without_limits_are_rounded_to_the_nearest(prepare: Prepare):
 # --- fields -----------------------------------------------------------------------------------------------------------
 
 
-def test_rows_have_the_fields_that_are_promised_in_that_order(prepared, whole):
+def test_rows_have_the_declared_fields_in_order(prepared, whole):
     assert sorted(whole.columns) == sorted(field.name for field in prepared.fields)
     for field in prepared.fields:
         assert whole.columns[field.name].shape == (max(field.width, 1), BLOCK_ROWS)

@@ -1,4 +1,4 @@
-"""Ends of motions of a robot that has a shape: capsules clear them cheaply, the pieces of its links decide."""
+"""Boundary states of a robot with a shape: capsules accept most of them, convex parts decide the others."""
 
 from pathlib import Path
 
@@ -8,18 +8,18 @@ import pytest
 from cnpgen.judges.rows.verify import verify_rows
 from cnpgen.kernels.tape import tape_from_function
 from cnpgen.pipelines.context import Context, load_context
-from cnpgen.pipelines.load import load_pipeline
+from cnpgen.pipelines.narrow_phase import narrow_phase, narrow_phase_of
+from cnpgen.pipelines.pipeline_file import load_pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
 from cnpgen.pipelines.stages.collision import Collision, capsule_clearance
-from cnpgen.pipelines.stages.stage import Round
-from cnpgen.pipelines.undecided import settle, undecided
-from cnpgen.problems.load import load_problem
+from cnpgen.pipelines.stages.stage import CandidateBatch
+from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.robot import load_robot
+from cnpgen.problems.problem_file import load_problem
 from cnpgen.refine.solver.residuals import stage_values
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.world.path import PathWorld
-from cnpgen.world.state import World
+from cnpgen.world.world import World
 from tests.conftest import Prepare, run_stages, some
 from tests.examples.shaped_robot import KINDS, OBSTACLES, write_pipeline, write_problem
 
@@ -31,8 +31,8 @@ def problem(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureReq
     return load_problem(write_problem(tmp_path_factory.mktemp("crane"), obstacles=request.param))
 
 
-def tops_of(context: Context, count: int) -> np.ndarray:
-    """The numbers of the obstacles, shape (numbers, count)."""
+def poses_of(context: Context, count: int) -> np.ndarray:
+    """Return the obstacle poses, shape (width, count)."""
     return np.repeat(place_obstacles(context.problem.obstacle)[:, None], count, axis=1)
 
 
@@ -49,7 +49,7 @@ def drawn(context: Context) -> np.ndarray:
 
 
 def measured(context: Context, drawn: np.ndarray) -> np.ndarray:
-    """The smallest distances of every state [m]: from obstacles, between links."""
+    """Return the minimum distances of every state [m]: from obstacles, between links."""
     world, zero, found = World(context.robot, context.problem.obstacle), np.zeros(context.robot.n), []
     for q in drawn.T:
         world.set_state(q.copy(), zero, zero, place_obstacles(context.problem.obstacle))
@@ -57,69 +57,71 @@ def measured(context: Context, drawn: np.ndarray) -> np.ndarray:
     return np.array(found).T
 
 
-def test_ends_are_decided_by_the_pieces_and_only_where_capsules_are_not_clear(context, drawn, monkeypatch):
-    decide, asked = settle(context, "start"), []
-    tops, still = tops_of(context, drawn.shape[1]), np.zeros_like(drawn)
+def test_convex_parts_decide_states_without_capsule_clearance_only(context, drawn, monkeypatch):
+    decide, checked_counts = narrow_phase_of(context, "start"), []
+    obstacle_poses, still = poses_of(context, drawn.shape[1]), np.zeros_like(drawn)
     real = PathWorld.set_path
-    monkeypatch.setattr(PathWorld, "set_path", lambda *x: (asked.append(x[1].shape[1]), real(*x))[1])
-    broken = decide((drawn, still, still), tops, np.ones(drawn.shape[1], bool))
-    assert all(0.1 < states / drawn.shape[1] < 0.9 for states in asked)
-    assert len(asked) == 2  # obstacles, and the robot itself
+    monkeypatch.setattr(PathWorld, "set_path", lambda *x: (checked_counts.append(x[1].shape[1]), real(*x))[1])
+    broken = decide((drawn, still, still), obstacle_poses, np.ones(drawn.shape[1], bool))
+    assert all(0.1 < states / drawn.shape[1] < 0.9 for states in checked_counts)
+    assert len(checked_counts) == 2  # obstacles, and the robot itself
     monkeypatch.undo()
     distances = measured(context, drawn)
     names = [type(each).__name__ for each in context.problem.constraint]
     np.testing.assert_array_equal(broken[names.index("RobotClearance")], distances[0] < -1e-8)
     np.testing.assert_array_equal(broken[names.index("SelfClearance")], distances[1] < -1e-8)
     assert not broken[names.index("JointPosition")].any()
-    (doubts,) = context.kernels.load(undecided, end="start", dtype="float64")(drawn, still, still, tops)
+    (doubts,) = context.kernels.load(narrow_phase, end="start", dtype="float64")(drawn, still, still, obstacle_poses)
     saved = (doubts[names.index("RobotClearance")] > 0) & (distances[0] > 0)
-    assert saved.sum() > 10  # ends that capsules would have refused
+    assert saved.sum() > 10  # states that capsules alone would reject
 
 
-def test_where_obstacles_stand_elsewhere_in_every_draw_states_are_decided_one_by_one(context, drawn, monkeypatch):
+def test_states_with_different_obstacle_poses_are_checked_one_by_one(context, drawn, monkeypatch):
     few = drawn[:, :60].copy()
-    tops, still = tops_of(context, 60), np.zeros_like(few)
-    other = tops.copy()
+    obstacle_poses, still = poses_of(context, 60), np.zeros_like(few)
+    other = obstacle_poses.copy()
     other[1, 0] += 1.0
-    everybody = np.ones(60, bool)
-    together = settle(context, "start")((few, still, still), tops, everybody)
+    all_states = np.ones(60, bool)
+    together = narrow_phase_of(context, "start")((few, still, still), obstacle_poses, all_states)
     monkeypatch.setattr(PathWorld, "clear_of_obstacles", None)
-    alone = settle(context, "start")((few, still, still), other, everybody)
+    alone = narrow_phase_of(context, "start")((few, still, still), other, all_states)
     np.testing.assert_array_equal(alone[:, 1:], together[:, 1:])
     assert alone.any()
 
 
-def test_what_nobody_asks_for_is_not_decided(context, drawn):
-    tops, still = tops_of(context, drawn.shape[1]), np.zeros_like(drawn)
-    assert not settle(context, "goal")((drawn, still, still), tops, np.zeros(drawn.shape[1], bool)).any()
+def test_states_outside_the_mask_are_not_checked(context, drawn):
+    obstacle_poses, still = poses_of(context, drawn.shape[1]), np.zeros_like(drawn)
+    assert not narrow_phase_of(context, "goal")(
+        (drawn, still, still), obstacle_poses, np.zeros(drawn.shape[1], bool)
+    ).any()
 
 
-def test_a_robot_without_a_shape_leaves_nothing_undecided(prepare: Prepare):
-    assert settle(prepare("heavy-object").context, "start") is None
+def test_a_robot_without_a_shape_needs_no_narrow_phase(prepare: Prepare):
+    assert narrow_phase_of(prepare("heavy-object").context, "start") is None
 
 
-def test_the_collision_stage_keeps_what_the_pieces_do_not_forbid(context, drawn):
-    draws = Round(drawn.shape[1])
-    draws["start_q"], draws["start_xyz"], draws["goal_xyz"] = drawn, drawn[:3], drawn[:3]
-    Collision(end="start", judge="segments").prepare(context)(draws, random_generator(0, "train", 0))
+def test_the_collision_stage_keeps_states_without_collision_of_convex_parts(context, drawn):
+    candidates = CandidateBatch(drawn.shape[1])
+    candidates["start_q"], candidates["start_xyz"], candidates["goal_xyz"] = drawn, drawn[:3], drawn[:3]
+    Collision(end="start", judge="segments").prepare(context)(candidates, random_generator(0, "train", 0))
     distance = measured(context, drawn)[0]
     sure = np.abs(distance) > 5e-4  # Coal's answer with its usual tolerance is not exact
-    kept = np.isin(np.arange(drawn.shape[1]), draws.alive)
+    kept = np.isin(np.arange(drawn.shape[1]), candidates.alive)
     np.testing.assert_array_equal(kept[sure], (distance > 0)[sure])
-    assert draws.reasons == ["arm in collision at the start"]
+    assert candidates.reasons == ["arm in collision at the start"]
 
 
 def test_the_capsules_clearance_is_a_lower_bound(context, drawn):
-    tops = tops_of(context, drawn.shape[1])
-    (clearance,) = context.kernels.load(capsule_clearance)(drawn, tops)
+    obstacle_poses = poses_of(context, drawn.shape[1])
+    (clearance,) = context.kernels.load(capsule_clearance)(drawn, obstacle_poses)
     distance = measured(context, drawn)[0]
     assert (clearance[0] <= np.maximum(distance, 0) + 1e-9).all()
     assert (clearance[0] > 0).mean() > 0.2
 
 
 @pytest.mark.slow
-def test_scenes_of_the_same_kinds_need_no_other_kernels(tmp_path: Path):
-    """Where obstacles are and how large is none of the kernels' business."""
+def test_scenes_with_obstacles_of_the_same_kinds_share_kernels(tmp_path: Path):
+    """Kernels are independent of the poses and sizes of obstacles."""
     found = []
     for number, words in enumerate([("0.08", "0.6", "20"), ("0.12", "0.5", "50")]):
         text = KINDS
@@ -145,5 +147,5 @@ def test_rows_of_such_a_problem_pass_the_check_by_pinocchio_and_coal(tmp_path, p
     report = verify_rows(prepared.context.problem, prepared.context.robot, columns)
     assert report.ok, report.failed
     assert {"robot clearance", "self clearance"} <= {check.name for check in report.checks}
-    draws = run_stages(prepared, 400, seed=1)
-    assert "start_clearance" not in draws.columns
+    candidates = run_stages(prepared, 400, seed=1)
+    assert "start_clearance" not in candidates.columns

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from scipy.interpolate import BSpline
 
-from cnpgen.planner.control_points import control_points, pull_back
-from cnpgen.planner.tasks import SHORTEST_TIME, Tasks, expected_time
+from cnpgen.planner.control_points import control_points, vjp
+from cnpgen.planner.tasks import MIN_EXPECTED_TIME_S, Tasks, expected_time
 from cnpgen.trajectory.boundary import Boundary, anchor_line
-from cnpgen.trajectory.spec import TrajectorySpec
 from cnpgen.trajectory.spline import clamped_knots
-from tests.trajectory.test_slopes import random_boundary
+from cnpgen.trajectory.trajectory_spec import TrajectorySpec
+from tests.trajectory.test_boundary_derivatives import random_boundary
 
 SPEC, N, JOINTS = TrajectorySpec(), 5, 3
 
@@ -30,7 +30,7 @@ def outputs(given: Tasks, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("goal_ddq", [False, True])
-def test_boundary_conditions_hold_whatever_the_network_gives(goal_ddq):
+def test_boundary_conditions_hold_for_any_output(goal_ddq):
     given = tasks(goal_ddq=goal_ddq)
     points = control_points(given, *outputs(given), scale=0.3, spec=SPEC)
     for i in range(N):
@@ -53,7 +53,7 @@ def test_without_outputs_the_path_is_the_papers_line_at_the_expected_time():
     np.testing.assert_allclose(points.path[:, 3:13], anchor_line(given.boundary, points.rate, SPEC), atol=1e-12)
 
 
-def test_what_the_network_gives_is_added_point_by_point_times_its_scale():
+def test_phi_times_scale_is_added_to_the_interior_control_points():
     given = tasks()
     phi, log_rate = outputs(given)
     zero = control_points(given, 0 * phi, log_rate, scale=0.3, spec=SPEC)
@@ -74,7 +74,7 @@ def test_gradients_reach_the_outputs_through_interior_boundary_and_line(goal_ddq
         return (points.path * a).sum(axis=(1, 2)) + (points.rate * b).sum(axis=1)
 
     points = control_points(given, phi, log_rate, scale=0.3, spec=SPEC)
-    by_phi, by_rate = pull_back(given, points, path_gradient=a, rate_gradient=b, scale=0.3, spec=SPEC)
+    by_phi, by_rate = vjp(given, points, path_gradient=a, rate_gradient=b, scale=0.3, spec=SPEC)
     for i in range(phi.shape[1]):
         step = np.zeros_like(phi)
         step[:, i] = 1e-6
@@ -87,8 +87,8 @@ def test_gradients_reach_the_outputs_through_interior_boundary_and_line(goal_ddq
         np.testing.assert_allclose(by_rate[:, i], found, rtol=1e-5, atol=1e-6)
 
 
-def test_the_expected_time_is_that_of_the_slowest_joint_but_never_tiny():
+def test_the_expected_time_is_the_largest_of_the_joints_with_a_lower_bound():
     q = np.zeros((2, 2))
     goal = np.array([[1.0, 3.0], [1e-3, 0.0]])
     boundary = Boundary(q, q, q, goal, q)
-    np.testing.assert_allclose(expected_time(boundary, np.array([2.0, 1.5])), [2.0, SHORTEST_TIME])
+    np.testing.assert_allclose(expected_time(boundary, np.array([2.0, 1.5])), [2.0, MIN_EXPECTED_TIME_S])

@@ -1,4 +1,4 @@
-"""The network's inputs: what they are, and that they are standardised as the training rows were."""
+"""The network's inputs: their values, and standardization by the training rows."""
 
 import numpy as np
 import pytest
@@ -14,14 +14,14 @@ def test_features_of_the_rows_they_were_fitted_to_have_mean_zero_and_deviation_o
     np.testing.assert_allclose(found.std(axis=0), 1, rtol=1e-9)
 
 
-def test_the_moments_of_parts_are_those_of_the_whole():
+def test_mean_and_deviation_of_parts_equal_those_of_the_whole():
     given = tasks()
     whole, parts = fit_features([given]), fit_features(given.take(rows) for rows in (slice(0, 1), slice(1, None)))
     np.testing.assert_allclose(parts.mean, whole.mean, rtol=1e-12, atol=1e-15)
     np.testing.assert_allclose(parts.scale, whole.scale, rtol=1e-9)
 
 
-def test_what_was_constant_in_the_training_rows_is_zero_and_not_nan_for_any_row():
+def test_features_that_were_constant_in_training_rows_are_zero():
     given, other = tasks(seed=0), tasks(seed=1)
     given.boundary.start_dq[:] = 0.5
     features = fit_features([given])
@@ -42,7 +42,7 @@ def test_features_are_states_their_sines_tips_and_the_expected_time():
     np.testing.assert_allclose(raw, np.concatenate(expected, axis=1))
 
 
-def test_the_goals_acceleration_is_a_feature_where_it_is_given():
+def test_the_goal_acceleration_is_a_feature_if_it_is_given():
     assert usual_blocks(tasks().boundary) == USUAL
     given = tasks(goal_ddq=True)
     assert usual_blocks(given.boundary) == BLOCKS
@@ -51,6 +51,6 @@ def test_the_goals_acceleration_is_a_feature_where_it_is_given():
     np.testing.assert_array_equal(raw[:, -3:], given.boundary.goal_ddq)
 
 
-def test_a_block_that_nobody_knows_is_refused_with_those_that_are_known():
+def test_an_unknown_feature_block_raises_an_error_with_the_known_ones():
     with pytest.raises(ValueError, match=r"'colour'.*start_q, start_dq"):
         raw_features(tasks(), ("colour",))

@@ -66,7 +66,7 @@ def test_float32_stays_float32_and_differs_from_float64_by_rounding_only():
         np.testing.assert_allclose(found, getattr(exact, name), atol=2e-6)
 
 
-def test_a_row_does_not_depend_on_the_others():
+def test_rows_are_independent():
     parameters, x = random_parameters(SMALL), np.random.default_rng(4).normal(size=(5, 5))
     together = forward(SMALL.split(parameters), x)
     for i in range(5):
@@ -80,17 +80,17 @@ def first(seed: int, **changes: float) -> Activations:
     return forward(SMALL.split(parameters), np.random.default_rng(5).normal(size=(50, 5)).astype(np.float32))
 
 
-def test_an_untrained_network_plans_nearly_straight_at_nearly_one_rate():
+def test_an_untrained_network_plans_nearly_straight_at_a_nearly_constant_rate():
     given = first(0, head_scale=0.01)
     assert np.abs(given.path).max() < 0.05
     assert np.abs(given.log_rate + 0.5).max() < 0.05
 
 
-def test_seeds_give_the_same_first_parameters_again_and_others_give_others():
+def test_initial_parameters_depend_on_the_seed_only():
     np.testing.assert_array_equal(first(3).path, first(3).path)
     assert np.abs(first(3).path - first(4).path).max() > 1e-3
 
 
-def test_a_network_without_layers_is_refused():
-    with pytest.raises(UsageError, match="at least 1 of layers, got 0"):
+def test_a_network_without_layers_raises_an_error():
+    with pytest.raises(UsageError, match="layers of a network must be at least 1, got 0"):
         Architecture(inputs=5, hidden=7, layers=0, path_outputs=6, rate_outputs=4)

@@ -1,4 +1,4 @@
-"""Model files: what is written comes back; what is damaged, cut off, or of something else is an error."""
+"""Model files: round trip, and errors for damaged, truncated, inconsistent and other files."""
 
 import json
 import time
@@ -14,7 +14,7 @@ from cnpgen.planner import model_file
 from cnpgen.planner.model import Model
 from cnpgen.planner.model_file import find_model, load_model, save_model
 from cnpgen.planner.network.features import STATES
-from cnpgen.store.files.sealed import Content, read_sealed, seal
+from cnpgen.store.files.checksum_file import Content, encode_with_checksum, read_with_checksum
 from tests.conftest import columns_of
 from tests.examples.models import boundary_of_columns, untrained_model
 
@@ -25,49 +25,51 @@ def model(tiny) -> Model:
     return replace(made, training={"command": "cnpgen train", "score": {"valid": 0.5}}, log='{"step": 1}\n')
 
 
-def test_a_model_comes_back_as_it_was_written(model, tmp_path):
+def test_a_loaded_model_equals_the_saved_one(model, tmp_path):
     save_model(tmp_path / "m.h5", model)
     found = load_model(tmp_path / "m.h5")
     np.testing.assert_array_equal(found.parameters, model.parameters)
     np.testing.assert_array_equal(found.features.mean, model.features.mean)
     np.testing.assert_array_equal(found.features.scale, model.features.scale)
-    for name in ("architecture", "meaning", "rest", "training", "log"):
+    for name in ("architecture", "config", "zero_conditions", "training", "log"):
         assert getattr(found, name) == getattr(model, name)
     assert found.features.blocks == model.features.blocks
     assert found.problem.comparable_sha256 == model.problem.comparable_sha256
 
 
-def test_a_model_says_which_expected_time_it_means_unless_it_is_the_usual_one(model, tmp_path):
+def test_a_model_file_contains_the_expected_time_unless_it_is_the_default(model, tmp_path):
     save_model(tmp_path / "m.h5", model)
-    said = json.loads(read_sealed(tmp_path / "m.h5", kind="cnpgen-model", version=1).texts["description"])
-    assert "expected_time" not in said["meaning"]
-    reach = replace(model, meaning=replace(model.meaning, expected_time="reach"))
+    stored = json.loads(read_with_checksum(tmp_path / "m.h5", kind="cnpgen-model", version=2).texts["description"])
+    assert "expected_time" not in stored["config"]
+    reach = replace(model, config=replace(model.config, expected_time="reach"))
     save_model(tmp_path / "r.h5", reach)
-    assert load_model(tmp_path / "r.h5").meaning == reach.meaning
-    save_model(tmp_path / "w.h5", replace(model, meaning=replace(model.meaning, expected_time="soon")))
+    assert load_model(tmp_path / "r.h5").config == reach.config
+    save_model(tmp_path / "w.h5", replace(model, config=replace(model.config, expected_time="soon")))
     with pytest.raises(DatasetError, match="expected_time must be one of distance, reach, got 'soon'"):
         load_model(tmp_path / "w.h5")
 
 
-def test_a_model_says_what_is_done_behind_its_network_unless_it_is_the_usual(model, tmp_path):
+def test_a_model_file_contains_options_after_the_network_unless_they_are_defaults(model, tmp_path):
     save_model(tmp_path / "m.h5", model)
-    said = json.loads(read_sealed(tmp_path / "m.h5", kind="cnpgen-model", version=1).texts["description"])["meaning"]
-    assert set(said) == {"path_scale", "bending_steps", "landing_steps"}
-    both = replace(model, meaning=replace(model.meaning, paced=True, within_limits=True, landing_steps=0))
+    stored = json.loads(read_with_checksum(tmp_path / "m.h5", kind="cnpgen-model", version=2).texts["description"])[
+        "config"
+    ]
+    assert set(stored) == {"path_scale", "line_projection_steps", "projection_steps"}
+    both = replace(model, config=replace(model.config, time_parametrized=True, within_limits=True, projection_steps=0))
     save_model(tmp_path / "b.h5", both)
-    assert load_model(tmp_path / "b.h5").meaning == both.meaning
-    save_model(tmp_path / "w.h5", replace(model, meaning=replace(model.meaning, paced="often")))
-    with pytest.raises(DatasetError, match="paced must be true or false, got 'often'"):
+    assert load_model(tmp_path / "b.h5").config == both.config
+    save_model(tmp_path / "w.h5", replace(model, config=replace(model.config, time_parametrized="often")))
+    with pytest.raises(DatasetError, match="time_parametrized must be true or false, got 'often'"):
         load_model(tmp_path / "w.h5")
 
 
-def test_a_model_comes_back_with_the_corners_of_its_other_lines(model, tmp_path):
-    corners = tuple(map(tuple, np.random.default_rng(0).uniform(-1, 1, (2, 6)).tolist()))
-    cornered = replace(model, meaning=replace(model.meaning, middles=corners))
-    save_model(tmp_path / "c.h5", cornered)
-    assert load_model(tmp_path / "c.h5").meaning == cornered.meaning
-    save_model(tmp_path / "w.h5", replace(model, meaning=replace(model.meaning, middles=((0.1, 0.2),))))
-    with pytest.raises(DatasetError, match="middles must be 6 numbers each"):
+def test_a_loaded_model_has_its_via_points(model, tmp_path):
+    configurations = tuple(map(tuple, np.random.default_rng(0).uniform(-1, 1, (2, 6)).tolist()))
+    with_configurations = replace(model, config=replace(model.config, via_points=configurations))
+    save_model(tmp_path / "c.h5", with_configurations)
+    assert load_model(tmp_path / "c.h5").config == with_configurations.config
+    save_model(tmp_path / "w.h5", replace(model, config=replace(model.config, via_points=((0.1, 0.2),))))
+    with pytest.raises(DatasetError, match="via points must be 6 numbers each"):
         load_model(tmp_path / "w.h5")
 
 
@@ -85,7 +87,7 @@ def test_any_hdf5_reader_opens_a_model_and_finds_the_layers_by_name(model, tmp_p
         assert b"cnpgen train" in file["training"][()].tobytes()
 
 
-def test_a_changed_bit_anywhere_is_noticed(model, tmp_path):
+def test_any_changed_bit_raises_an_error(model, tmp_path):
     save_model(tmp_path / "m.h5", model)
     whole = (tmp_path / "m.h5").read_bytes()
     used = [*range(80), *np.random.default_rng(0).integers(512, len(whole), 60).tolist()]
@@ -98,7 +100,7 @@ def test_a_changed_bit_anywhere_is_noticed(model, tmp_path):
 
 
 @pytest.mark.parametrize("size", [0, 40, 512, 5000, -1])
-def test_a_model_that_was_cut_off_is_an_error(model, tmp_path, size):
+def test_a_truncated_model_raises_an_error(model, tmp_path, size):
     save_model(tmp_path / "m.h5", model)
     whole = (tmp_path / "m.h5").read_bytes()
     (tmp_path / "m.h5").write_bytes(whole[:size])
@@ -107,36 +109,37 @@ def test_a_model_that_was_cut_off_is_an_error(model, tmp_path, size):
 
 
 @pytest.mark.parametrize("place", [3, 9, 20, 40, 200])
-def test_a_model_whose_first_block_was_changed_is_called_damaged_and_nothing_else(model, tmp_path, place):
+def test_a_model_with_a_changed_first_block_is_reported_as_damaged(model, tmp_path, place):
     save_model(tmp_path / "m.h5", model)
     data = bytearray((tmp_path / "m.h5").read_bytes())
     data[place] ^= 0x10 if place != 9 else 0x02  # "mmdel"
     (tmp_path / "m.h5").write_bytes(data)
-    with pytest.raises(DatasetError, match=r"m\.h5 is damaged: its first 512 bytes are not as they were written$"):
+    with pytest.raises(DatasetError, match=r"m\.h5 is damaged: its first 512 bytes were changed$"):
         load_model(tmp_path / "m.h5")
 
 
-def test_a_missing_file_and_other_files_are_named(tmp_path, tiny):
+def test_missing_files_and_files_of_other_kinds_are_named(tmp_path, tiny):
     with pytest.raises(UsageError, match=r"none\.h5 is not there, expected a model"):
         load_model(tmp_path / "none.h5")
     shard = next(tiny("airhockey-hit").rglob("*.h5"))
     with pytest.raises(DatasetError, match="not a model of cnpgen"):
         load_model(shard)
     other = tmp_path / "other.h5"
-    other.write_bytes(seal(Content({}, {"a": "b"}), kind="cnpgen-checkpoint", version=1))
+    other.write_bytes(encode_with_checksum(Content({}, {"a": "b"}), kind="cnpgen-checkpoint", version=1))
     with pytest.raises(DatasetError, match="a checkpoint of cnpgen, not a model"):
         load_model(other)
 
 
-def test_a_newer_format_asks_for_an_upgrade(tmp_path):
-    path = tmp_path / "new.h5"
-    path.write_bytes(seal(Content({}, {}), kind=model_file.KIND, version=99))
-    with pytest.raises(DatasetError, match=r"format version 99.*upgrade"):
+@pytest.mark.parametrize(("version", "remedy"), [(99, "upgrade"), (1, "make it again")])
+def test_other_format_versions_are_named(tmp_path, version, remedy):
+    path = tmp_path / "other.h5"
+    path.write_bytes(encode_with_checksum(Content({}, {}), kind=model_file.MODEL_KIND, version=version))
+    with pytest.raises(DatasetError, match=rf"format version {version}, this cnpgen reads version 2.*{remedy}"):
         load_model(path)
 
 
 @pytest.mark.parametrize("change", ["fewer joints", "unknown features", "no description"])
-def test_a_sealed_file_that_does_not_fit_is_an_error_too(model, tmp_path, change):
+def test_inconsistent_content_with_a_valid_checksum_raises_an_error(model, tmp_path, change):
     content = model_file.model_content(model)
     arrays, texts = dict(content.arrays), dict(content.texts)
     if change == "fewer joints":
@@ -146,7 +149,7 @@ def test_a_sealed_file_that_does_not_fit_is_an_error_too(model, tmp_path, change
     else:
         del texts["description"]
     path = tmp_path / "odd.h5"
-    path.write_bytes(seal(Content(arrays, texts), kind=model_file.KIND, version=1))
+    path.write_bytes(encode_with_checksum(Content(arrays, texts), kind=model_file.MODEL_KIND, version=2))
     with pytest.raises(DatasetError, match="does not fit this version"):
         load_model(path)
 
@@ -162,17 +165,18 @@ def described(part, **values):
 
 FORGERIES = {
     "as many steps as never end": (
-        described("meaning", landing_steps=10**18), "there are at most 20 steps"),
-    "unknown zeros": (described("", rest=["../../x"]), "unknown boundary conditions ../../x"),
-    "zeros that cannot be": (described("", rest=["start_q"]), "start_q: only velocities and accelerations are zero"),
-    "an infinite scale": (described("meaning", path_scale="inf"), "cannot be meant"),
+        described("config", projection_steps=10**18), "there are at most 20 steps"),
+    "unknown zeros": (described("", zero_conditions=["../../x"]), "unknown boundary conditions ../../x"),
+    "zeros that cannot be": (
+        described("", zero_conditions=["start_q"]), "start_q: only velocities and accelerations are zero"),
+    "an infinite scale": (described("config", path_scale="inf"), "is invalid"),
     "layers without end": (described("architecture", layers=10**30), "layers must be a whole"),
     "many layers": (described("architecture", layers=10**9), "1000000000 layers cannot be in"),
     "a wide layer": (described("architecture", hidden=10**9), "must have shape"),
-    "no layer": (described("architecture", layers=0), "at least 1 of layers, got 0"),
+    "no layer": (described("architecture", layers=0), "layers of a network must be at least 1, got 0"),
     "other inputs": (described("architecture", inputs=3), "inputs, path outputs and rate"),
     "a text for a number": (described("architecture", hidden="16"), "hidden must be a whole"),
-    "another key": (described("meaning", more=1), "unexpected keyword argument 'more'"),
+    "another key": (described("config", more=1), "unexpected keyword argument 'more'"),
     "an acceleration that it leaves free": (
         described("", features=[*STATES[:4], "goal_ddq", "sin_cos", "tips", "expected_time"]),
         "its outputs leave goal accelerations free"),
@@ -182,28 +186,28 @@ FORGERIES = {
     "training that is a list": (lambda arrays, texts: texts.update(training="[1]"), "the document must be a table"),
     "a dataset that is a number": (
         lambda arrays, texts: texts.update(training='{"dataset": 1}'), "dataset must be a table, got 1"),
-    "deep training": (lambda arrays, texts: texts.update(training="[" * 10**5), "tables and lists in one another"),
+    "deep training": (lambda arrays, texts: texts.update(training="[" * 10**5), "nested tables and lists"),
     "no problem": (lambda arrays, texts: texts.update(problem_recipe="{}"), "problem_recipe is not that of a problem"),
-    "no text": (lambda arrays, texts: arrays.update(log=np.array([255], np.uint8)), "a text that is not UTF-8"),
+    "no text": (lambda arrays, texts: arrays.update(log=np.array([255], np.uint8)), "one of its texts is not UTF-8"),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("what", FORGERIES)
-def test_what_a_model_declares_is_compared_with_what_it_has(model, tmp_path, what):
-    forge, message = FORGERIES[what]
+@pytest.mark.parametrize("forgery", FORGERIES)
+def test_the_description_of_a_model_is_checked_against_its_arrays(model, tmp_path, forgery):
+    forge, message = FORGERIES[forgery]
     content = model_file.model_content(model)
     arrays, texts = dict(content.arrays), dict(content.texts)
-    texts.pop("log") if what == "no text" else None
+    texts.pop("log") if forgery == "no text" else None
     forge(arrays, texts)
     path = tmp_path / "forged.h5"
-    path.write_bytes(seal(Content(arrays, texts), kind=model_file.KIND, version=1))
-    begun = time.process_time()
+    path.write_bytes(encode_with_checksum(Content(arrays, texts), kind=model_file.MODEL_KIND, version=2))
+    started = time.process_time()
     with pytest.raises(DatasetError, match=rf"forged\.h5 .*{message}"):
         load_model(path)
-    assert time.process_time() - begun < 2
+    assert time.process_time() - started < 2
 
 
-def test_every_bit_of_the_first_block_counts(model, tmp_path):
+def test_any_changed_bit_of_the_first_block_raises_an_error(model, tmp_path):
     save_model(tmp_path / "m.h5", model)
     whole = (tmp_path / "m.h5").read_bytes()
     for place in range(0, 512, 7):
@@ -214,10 +218,10 @@ def test_every_bit_of_the_first_block_counts(model, tmp_path):
             load_model(tmp_path / "m.h5")
 
 
-def test_an_empty_text_and_a_scalar_come_back(tmp_path):
+def test_an_empty_text_and_a_scalar_are_restored(tmp_path):
     path = tmp_path / "x.h5"
-    path.write_bytes(seal(Content({"a": np.array(1.5)}, {"t": ""}), kind="cnpgen-thing", version=1))
-    found = read_sealed(path, kind="cnpgen-thing", version=1)
+    path.write_bytes(encode_with_checksum(Content({"a": np.array(1.5)}, {"t": ""}), kind="cnpgen-thing", version=1))
+    found = read_with_checksum(path, kind="cnpgen-thing", version=1)
     assert found.texts == {"t": ""}
     assert found.arrays["a"] == 1.5
 
@@ -232,7 +236,7 @@ def test_shipped_models_are_found_by_name_and_others_by_path(tmp_path, monkeypat
 
 
 @pytest.mark.parametrize("path", model_file.shipped_models().values(), ids=lambda path: path.stem)
-def test_every_shipped_model_is_small_whole_and_says_how_it_was_made(path):
+def test_every_shipped_model_is_small_intact_and_documented(path):
     assert path.stat().st_size <= 3e6
     model = load_model(path)
     assert model.training["command"].startswith("cnpgen train")
@@ -240,7 +244,7 @@ def test_every_shipped_model_is_small_whole_and_says_how_it_was_made(path):
     assert model.log.count("\n") > 50
 
 
-def test_no_error_is_a_traceback(tmp_path):
-    (tmp_path / "m.h5").write_bytes(b"cnpgen-model 1\nsha256 " + b"0" * 64 + b"\n" + bytes(600))
+def test_a_forged_header_raises_a_cnpgen_error(tmp_path):
+    (tmp_path / "m.h5").write_bytes(b"cnpgen-model 2\nsha256 " + b"0" * 64 + b"\n" + bytes(600))
     with pytest.raises(CnpgenError):
         load_model(tmp_path / "m.h5")

@@ -1,4 +1,4 @@
-"""The planner: boundary conditions to rounding, one or many, replanning without a jump, errors that say why."""
+"""The planner: exact boundary conditions, single plans and batches, continuous replanning, and errors."""
 
 import pickle
 from dataclasses import replace
@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from cnpgen.errors import UsageError
-from cnpgen.make.boundary_problems import draw_boundary_problems
+from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.planner.planner import Planner, states_at
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.join import join_plans
 from cnpgen.plans.status import PlanStatus
-from cnpgen.refine.plans import refine_plans
+from cnpgen.refine.refine_plans import refine_plans
 from cnpgen.trajectory.boundary import Boundary
 from tests.conftest import columns_of, some
 from tests.examples.models import boundary_of_columns, untrained_model
@@ -39,10 +39,10 @@ def test_plans_meet_their_boundary_conditions_by_the_independent_verdict(planner
     verdicts = evaluate_plans(planned(planner, rows), workers=1).verdicts
     for verdict in verdicts:
         for name in ("boundary position", "boundary velocity", "boundary acceleration"):
-            assert verdict.margins[name].excess < 1e-9
+            assert verdict.margins[name].violation < 1e-9
 
 
-def test_one_plan_is_the_same_alone_and_among_others(planner, rows):
+def test_a_plan_is_the_same_alone_and_in_a_batch(planner, rows):
     many = planned(planner, rows)
     assert len(many) == 40
     assert (many.status == PlanStatus.UNKNOWN).all()
@@ -53,7 +53,7 @@ def test_one_plan_is_the_same_alone_and_among_others(planner, rows):
         np.testing.assert_allclose(one.rate_control_points[0], many.rate_control_points[i], rtol=1e-5)
 
 
-def test_what_is_left_out_is_at_rest(planner, rows):
+def test_missing_velocities_and_accelerations_are_zero(planner, rows):
     given = planner.plan(rows.start_q[0], rows.goal_q[0])
     np.testing.assert_array_equal(given.boundary.start_dq, 0)
     np.testing.assert_array_equal(given.boundary.goal_dq, 0)
@@ -70,7 +70,7 @@ def test_tip_positions_are_those_of_pinocchio(planner, rows):
 
 
 @pytest.mark.parametrize("part", some([0.1, 0.6, 0.9, 0.99], 1, "slow"))
-def test_replanning_to_a_goal_that_has_not_moved_never_takes_longer_than_what_was_left(part):
+def test_replanning_to_an_unchanged_goal_never_takes_longer_than_the_remaining_trajectory(part):
     planner, rows = Planner("airhockey-replan"), draw_boundary_problems("airhockey-replan", 8, seed=21).boundary
     old = refine_plans(planner.plan_batch(rows), workers=1).plans
     left = (1 - part) * old.duration
@@ -78,16 +78,16 @@ def test_replanning_to_a_goal_that_has_not_moved_never_takes_longer_than_what_wa
     assert (new.duration <= left * (1 + 1e-12)).all()
     assert evaluate_plans(new, workers=1).valid.all()
     alone = planner.plan_batch(new.boundary)
-    kept = alone.duration >= 0.98 * left
-    assert kept.any()
-    np.testing.assert_allclose(new.duration[~kept], alone.duration[~kept])
-    states, moments = old.motion.at_times, np.linspace(0, 1, 50) * left[:, None]
+    reused = alone.duration >= 0.98 * left
+    assert reused.any()
+    np.testing.assert_allclose(new.duration[~reused], alone.duration[~reused])
+    states, times = old.motion.at_times, np.linspace(0, 1, 50) * left[:, None]
     np.testing.assert_allclose(
-        new.motion.at_times(moments).q[kept], states(moments + part * old.duration[:, None]).q[kept], atol=1e-4
+        new.motion.at_times(times).q[reused], states(times + part * old.duration[:, None]).q[reused], atol=1e-4
     )
 
 
-def test_a_goal_that_has_moved_is_planned_by_the_network_alone(planner, rows):
+def test_a_changed_goal_is_planned_by_the_network_alone(planner, rows):
     old = planned(planner, rows)
     when = 0.9 * old.duration
     for shift in (1e-6, 0.1):
@@ -95,7 +95,7 @@ def test_a_goal_that_has_moved_is_planned_by_the_network_alone(planner, rows):
         np.testing.assert_array_equal(new.path_control_points, planner.plan_batch(new.boundary).path_control_points)
 
 
-def test_one_plan_is_left_for_several_goals_its_own_among_them(planner, rows):
+def test_one_plan_can_be_replanned_to_several_goals_including_its_own(planner, rows):
     old = planned(planner, rows)[:1]
     new = planner.replan(old, 0.5 * old.duration, goal_q=rows.goal_q[:3], goal_dq=rows.goal_dq[:3])
     assert len(new) == 3
@@ -104,7 +104,7 @@ def test_one_plan_is_left_for_several_goals_its_own_among_them(planner, rows):
         np.testing.assert_allclose(each.duration, alone.duration, rtol=1e-7)
 
 
-def test_what_cannot_be_replanned_is_refused(planner, rows):
+def test_replanning_rejects_plans_of_other_types_and_problems(planner, rows):
     old, goal = planned(planner, rows), {"goal_q": rows.goal_q, "goal_dq": rows.goal_dq}
     with pytest.raises(UsageError, match=r"expected Plans, .* got Boundary"):
         planner.replan(rows, 0.1, **goal)
@@ -115,7 +115,7 @@ def test_what_cannot_be_replanned_is_refused(planner, rows):
         planner.replan(draw_boundary_problems("heavy-object", 2, seed=1), 0.0, **goal)
 
 
-def test_replanning_goes_on_without_a_jump_in_position_velocity_or_acceleration(planner, rows):
+def test_replanning_is_continuous_in_position_velocity_and_acceleration(planner, rows):
     old = planned(planner, rows)
     when = 0.4 * old.duration
     new = planner.replan(old, when, goal_q=rows.goal_q[::-1], goal_dq=rows.goal_dq[::-1])
@@ -129,13 +129,13 @@ def test_replanning_goes_on_without_a_jump_in_position_velocity_or_acceleration(
     np.testing.assert_allclose(arrived[1], rows.goal_dq[::-1], atol=1e-8)
 
 
-def test_a_feint_and_then_a_strike_is_one_continuous_motion(planner, rows):
-    """Sampled across both switches, velocities and accelerations are no further apart than a step of time explains."""
-    feint = planner.plan(rows.start_q[0], rows.goal_q[1])
-    second = planner.replan(feint, 0.5 * feint.duration, goal_q=rows.goal_q[2])
-    strike = planner.replan(second, 0.5 * second.duration, goal_q=rows.goal_q[3], goal_dq=rows.goal_dq[3])
+def test_a_replanned_hit_continues_the_first_motion(planner, rows):
+    """Finite differences of positions and velocities across both switches agree with the states."""
+    first = planner.plan(rows.start_q[0], rows.goal_q[1])
+    second = planner.replan(first, 0.5 * first.duration, goal_q=rows.goal_q[2])
+    hit = planner.replan(second, 0.5 * second.duration, goal_q=rows.goal_q[3], goal_dq=rows.goal_dq[3])
     h = 1e-6
-    for old, new in ((feint, second), (second, strike)):
+    for old, new in ((first, second), (second, hit)):
         switch = 0.5 * old.duration[0]
         q0, dq0, ddq0 = states_at(old, switch - h)
         q1, dq1, ddq1 = states_at(new, h)
@@ -143,7 +143,7 @@ def test_a_feint_and_then_a_strike_is_one_continuous_motion(planner, rows):
         np.testing.assert_allclose((dq1 - dq0) / (2 * h), (ddq0 + ddq1) / 2, atol=1e-2)
 
 
-def test_start_and_goal_are_asked_for_first_and_velocities_by_keyword(planner, rows):
+def test_start_and_goal_are_positional_and_velocities_are_keyword_arguments(planner, rows):
     plans = planner.plan(rows.start_q, rows.goal_q)
     np.testing.assert_array_equal(plans.boundary.goal_q, rows.goal_q)
     with pytest.raises(TypeError, match="goal_q"):
@@ -152,8 +152,8 @@ def test_start_and_goal_are_asked_for_first_and_velocities_by_keyword(planner, r
         planner.plan(rows.start_q, rows.goal_q, rows.start_dq)
 
 
-def test_rounding_is_no_motion_and_what_starts_at_rest_can_be_replanned_at_once(tiny):
-    """A plan's own start and end are off zero by 1e-14: replan(plan, 0) and chains of plans must not fail by it."""
+def test_rounding_errors_count_as_rest_so_that_rest_to_rest_plans_can_be_replanned(tiny):
+    """Velocities at the ends of a plan differ from zero by 1e-14: replanning from them must not fail."""
     rest = boundary_of_columns(columns_of(tiny("heavy-object")), 20)
     planner = Planner(untrained_model("heavy-object", rest), backend="numpy")
     plans = planned(planner, rest)
@@ -169,13 +169,13 @@ def test_rounding_is_no_motion_and_what_starts_at_rest_can_be_replanned_at_once(
     np.testing.assert_allclose(planner.plan(q, rest.start_q, start_dq=dq).boundary.start_dq, 0.0, atol=0)
 
 
-def test_a_planner_goes_to_other_processes_without_its_kernels(planner, rows):
-    other = pickle.loads(pickle.dumps(Planner(planner.model, slow_down=False, backend="numpy")))
+def test_a_planner_is_pickled_without_its_kernels(planner, rows):
+    other = pickle.loads(pickle.dumps(Planner(planner.model, scale_time=False, backend="numpy")))
     found = planned(other, rows).path_control_points
     np.testing.assert_allclose(found, planned(planner, rows).path_control_points, atol=1e-5)
 
 
-def test_planners_models_and_plans_say_in_a_line_what_they_are(planner, rows):
+def test_reprs_of_planners_models_and_plans(planner, rows):
     size = f"{planner.model.architecture.layers} x {planner.model.architecture.hidden}"
     assert repr(planner) == f"<Planner for 'airhockey': a network of {size}>"
     assert repr(planner.model) == f"<Model of 'airhockey': a network of {size}>"
@@ -187,19 +187,19 @@ def test_planners_models_and_plans_say_in_a_line_what_they_are(planner, rows):
 
 
 @pytest.mark.parametrize("wrong", [5, None, b"airhockey-hit"])
-def test_what_is_no_model_is_refused_by_its_value(wrong):
-    with pytest.raises(UsageError, match=f"a model is a name or a path, got {wrong!r}"):
+def test_an_invalid_model_argument_raises_an_error_with_its_value(wrong):
+    with pytest.raises(UsageError, match=f"a model must be a name or a path, got {wrong!r}"):
         Planner(wrong)
 
 
 @pytest.mark.parametrize("time", [[0.1, 0.2], "soon", [[0.1]] * 3])
-def test_times_that_are_not_one_for_every_plan_are_refused(planner, rows, time):
+def test_a_wrong_number_of_times_raises_an_error(planner, rows, time):
     one = planned(planner, rows[:1])
     with pytest.raises(UsageError, match="time must be one number or one for each of 1 plans, got"):
         planner.replan(one, time, goal_q=rows.goal_q[0])
 
 
-def test_a_moment_outside_of_the_plan_is_refused(planner, rows):
+def test_a_time_outside_of_the_plan_raises_an_error(planner, rows):
     plans = planned(planner, rows)
     with pytest.raises(UsageError, match=r"plan 0 lasts from 0 to .* cannot be evaluated at -0.1 s"):
         planner.replan(plans, -0.1, goal_q=rows.goal_q)
@@ -211,7 +211,7 @@ def test_a_moment_outside_of_the_plan_is_refused(planner, rows):
         planner.replan(unsolved, 0.1, goal_q=rows.goal_q)
 
 
-def test_a_model_of_motions_from_rest_refuses_moving_starts(tiny, rows):
+def test_a_rest_to_rest_model_rejects_moving_starts(tiny, rows):
     resting = boundary_of_columns(columns_of(tiny("airhockey-hit")), 20)
     planner = Planner(untrained_model("airhockey", resting))
     with pytest.raises(
@@ -230,18 +230,18 @@ def test_a_model_of_motions_from_rest_refuses_moving_starts(tiny, rows):
         ({"goal_q": np.zeros((3, 6)), "start_dq": np.zeros((2, 6))}, "start_dq has 2 rows, another .* has 3"),
     ],
 )
-def test_boundary_conditions_that_cannot_be_meant_are_refused_by_name(planner, wrong, message):
+def test_invalid_boundary_conditions_raise_errors_with_their_name(planner, wrong, message):
     arguments = {"start_q": np.zeros(6), "goal_q": np.ones(6), **wrong}
     with pytest.raises(UsageError, match=message):
         planner.plan(**arguments)
 
 
-def test_goal_accelerations_are_refused(planner, rows):
+def test_goal_accelerations_raise_an_error_if_the_model_leaves_them_free(planner, rows):
     with pytest.raises(UsageError, match="goal_ddq must be None"):
         planner.plan_batch(replace(rows, goal_ddq=np.zeros_like(rows.goal_q)))
 
 
-def test_no_tasks_are_no_plans(planner, rows):
+def test_no_tasks_give_no_plans(planner, rows):
     assert len(planner.plan_batch(rows[:0])) == 0
 
 
@@ -253,9 +253,9 @@ def test_plans_are_the_same_on_every_backend(planner, rows, backend):
     )
 
 
-def test_joint_positions_in_degrees_are_said_to_be_suspicious(planner, rows):
+def test_joint_positions_in_degrees_cause_a_warning(planner, rows):
     with pytest.warns(
         UserWarning, match="start_q of plan 0: joint_2 = 40 rad is far outside of its limits, .* degrees"
-    ) as told:
+    ) as warnings:
         planner.plan(np.array([0, 40.0, 0, -30, 0, 110]), rows.goal_q[0])
-    assert {Path(each.filename).name for each in told} == {"test_planner.py"}  # the line of whoever asked
+    assert {Path(each.filename).name for each in warnings} == {"test_planner.py"}  # the caller's line

@@ -14,9 +14,9 @@ from cnpgen.cli.main import main
 from cnpgen.errors import CnpgenError, DatasetError, RecipeError, UsageError
 from cnpgen.plans import PlanStatus, load_plans, save_plans
 from cnpgen.plans.boundary_problems import load_boundary_problems
-from cnpgen.problems.load import load_problem
-from cnpgen.problems.record import record_problem
-from cnpgen.refine.plans import solve_plans
+from cnpgen.problems.problem_file import load_problem
+from cnpgen.problems.problem_record import record_problem
+from cnpgen.refine.refine_plans import solve_plans
 
 Tiny = Callable[[str], Path]
 RECORD = record_problem(load_problem("airhockey"))
@@ -77,7 +77,7 @@ def test_a_shard_is_of_the_problem_of_its_dataset_and_needs_one_without_it(tiny:
     with pytest.raises(DatasetError, match="boundary problems of problem 'airhockey', not of 'heavy-object'"):
         load_boundary_problems(shard, problem="heavy-object")
     alone = shutil.copy(shard, tmp_path / "alone.h5")
-    with pytest.raises(DatasetError, match=r"does not say its problem: .*'cnpgen solve' takes it"):
+    with pytest.raises(DatasetError, match=r"does not name its problem: .*'cnpgen solve' takes it"):
         load_boundary_problems(alone)
     assert len(load_boundary_problems(alone, problem="airhockey")) == len(found)
 
@@ -93,7 +93,7 @@ def test_plans_in_a_file_are_not_looked_at(tmp_path: Path, rows) -> None:
     ("changed", "attributes", "message"),
     [
         ({"goal_q": None, "start_q": None}, {}, r"lacks start_q and goal_q: boundary conditions are needed"),
-        ({}, {}, r"does not say its problem: set its attribute 'problem'"),
+        ({}, {}, r"does not name its problem: set its attribute 'problem'"),
         ({}, {"problem": "airhokey"}, r"attribute 'problem'.*did you mean 'airhockey'"),
         ({}, {"problem": "airhockey", "problem_sha256": "0" * 64}, r"is of another 'airhockey'"),
         ({"start_q": np.zeros((3, 7))}, {"problem": "airhockey"}, r"start_q must have shape \(6,\) or \(N, 6\)"),
@@ -152,7 +152,7 @@ def test_solve_makes_plans_for_a_file_of_boundary_conditions(rows, write, tmp_pa
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        (["tasks.h5"], "tasks.h5 does not say its problem: set its attribute 'problem' to a name or a file, or pass"),
+        (["tasks.h5"], "tasks.h5 does not name its problem: set its attribute 'problem' to a name or a file, or pass"),
         (["tasks.h5", "--n", "2"], "--split, --first and --n are for the folder of a dataset, got a file"),
         (["tasks.csv", "--n", "2"], "tasks.csv is a table, expected a recipe: 'cnpgen complete NAME tasks.csv -o"),
         (["pucks.h5"], "pucks.h5 lacks start_q and goal_q: boundary conditions are needed to plan; of tasks in the"),

@@ -15,7 +15,7 @@ from cnpgen.judges.plans import Verdict, judge
 from cnpgen.plans import PlanStatus, load_plans, save_plans
 from cnpgen.plans.evaluate import evaluate_plans
 from tests.examples.plan_files import garbage, plans_of
-from tests.examples.plans import bent, joined, load
+from tests.examples.plans import joined, load, perturbed
 
 
 def told(verdicts: Iterable[Verdict]) -> list[dict[str, Any]]:
@@ -24,7 +24,7 @@ def told(verdicts: Iterable[Verdict]) -> list[dict[str, Any]]:
 
 
 def test_verdicts_are_those_of_judge() -> None:
-    plans = [load("transport"), load("dragging"), bent(load("transport"), 0.02)]
+    plans = [load("transport"), load("dragging"), perturbed(load("transport"), 0.02)]
     found = evaluate_plans(plans_of(*plans))
     assert told(found.verdicts) == told(judge(*joined(*plans)))
     assert found.valid.tolist() == [True, False, False]
@@ -67,7 +67,7 @@ def test_plans_in_memory_and_in_a_file_get_one_verdict_where_a_tip_position_was_
 
 @pytest.mark.slow
 def test_processes_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cnpgen.plans.evaluate, "PART", 3)
+    monkeypatch.setattr(cnpgen.plans.evaluate, "PLANS_PER_TASK", 3)
     plans = plans_of(*(plan for plan, _ in garbage().values()))
     counts: list[int] = []
     one, two = (evaluate_plans(plans, workers=workers, progress=counts.append) for workers in (1, 2))
@@ -76,7 +76,7 @@ def test_processes_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_file_is_judged_as_the_plans_that_were_saved(tmp_path: Path) -> None:
-    plans = plans_of(load("hit"), bent(load("hit"), 0.05), sample_id=[7, 9])
+    plans = plans_of(load("hit"), perturbed(load("hit"), 0.05), sample_id=[7, 9])
     save_plans(tmp_path / "plans.h5", plans)
     found = evaluate_plans(load_plans(tmp_path / "plans.h5"))
     assert told(found.verdicts) == told(evaluate_plans(plans).verdicts)
@@ -104,7 +104,7 @@ def test_arguments_that_make_no_sense_are_refused(arguments: dict[str, Any]) -> 
 
 
 def test_a_status_can_be_kept_with_the_plans(tmp_path: Path) -> None:
-    plans = plans_of(load("hit"), bent(load("hit"), 0.05))
+    plans = plans_of(load("hit"), perturbed(load("hit"), 0.05))
     judged = replace(plans, status=evaluate_plans(plans).status)
     save_plans(tmp_path / "judged.h5", judged)
     assert load_plans(tmp_path / "judged.h5").status.tolist() == [PlanStatus.VALID, PlanStatus.INVALID]

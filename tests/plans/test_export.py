@@ -16,8 +16,8 @@ from cnpgen.errors import DatasetError, MachineError, UsageError
 from cnpgen.plans import Plans
 from cnpgen.plans.export import FORMS, Exported, export_plans
 from cnpgen.plans.formats import sample_plan
-from cnpgen.problems.load import load_problem
-from cnpgen.trajectory.motion import Motion
+from cnpgen.problems.problem_file import load_problem
+from cnpgen.trajectory.spline_motion import Motion
 from tests.plans.test_plans import AIRHOCKEY, draw_plans, garbage
 
 FIELDS = ("q", "dq", "ddq", "jerk")

@@ -9,7 +9,7 @@ import pytest
 
 from cnpgen.cli.main import main
 from cnpgen.errors import UsageError
-from cnpgen.make.boundary_problems import draw_boundary_problems
+from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.planner.planner import Planner, states_at
 from cnpgen.plans.export import export_plans
 from cnpgen.plans.join import join_plans
@@ -29,7 +29,7 @@ def planner() -> Planner:
 
 @pytest.fixture(scope="module")
 def three(planner) -> tuple[Plans, Plans, Plans, np.ndarray, np.ndarray]:
-    """Plans, those that take over from them at a moment, and those that take over from these at another."""
+    """Plans, those that take over from them at a time, and those that take over from these at another."""
     goals = draw_boundary_problems("airhockey-replan", 3, seed=3).boundary
     first = planner.plan_batch(goals)
     switch = 0.3 * first.duration
@@ -97,7 +97,10 @@ def test_a_jump_is_refused_with_its_size_place_and_time(three):
     [
         (lambda first, second, at: (first, second[:2], at), "3 plans are followed by 2"),
         (lambda first, second, at: (first, second, [0.1, 0.2]), "at must be one number or one for each of 3 plans"),
-        (lambda first, second, at: (first, second, 60.0), r"plan 0 cannot be cut at 60 s: what is cut lasts from 0 to"),
+        (
+            lambda first, second, at: (first, second, 60.0),
+            r"plan 0 cannot be cut at 60 s: its last part lasts from 0 to",
+        ),
         (lambda first, second, at: (first, second, -0.1), r"plan 0 cannot be cut at -0.1 s"),
         (lambda first, second, at: (first, "plans.h5", at), "expected Plans"),
         (lambda first, second, at: (first, unsolved(second), at), "plan 0 has no control points yet"),

@@ -14,11 +14,11 @@ from cnpgen.plans.export import export_plans
 from cnpgen.plans.join import join_plans
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.save import save_plans
-from cnpgen.problems.record import open_problem
-from cnpgen.refine.plans import refine_plans, solve_plans
+from cnpgen.problems.problem_record import open_problem
+from cnpgen.refine.refine_plans import refine_plans, solve_plans
 from tests.conftest import some
 
-MODELS = ("airhockey-onthefly", "heavy-object", "airhockey-replan")  # paced, slowed down, with strikes
+MODELS = ("airhockey-online", "heavy-object", "airhockey-replan")  # time-parametrized, scaled in time, with hits
 
 
 @pytest.fixture(scope="module", params=some(MODELS, 2, "slow"))
@@ -47,5 +47,5 @@ def test_what_makes_no_sense_of_nothing_is_refused(planner: Planner, none: Plans
     for plans in (none, join_plans(none, none)):
         with pytest.raises(DatasetError, match="none of the 0 plans"):
             export_plans(plans, tmp_path / "out", to="csv")
-    with pytest.raises(UsageError, match="goal_xyz is of no task"):
+    with pytest.raises(UsageError, match="goal_xyz has no rows"):
         complete("airhockey-replan", goal_xyz=np.zeros((0, 3)))

@@ -34,13 +34,13 @@ from cnpgen.plans import (
 from cnpgen.plans.boundary_problems import load_boundary_problems
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.export import export_plans
-from cnpgen.problems.load import load_problem
+from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import resolved
-from cnpgen.problems.robot import load_robot
-from cnpgen.refine.plans import refine_plans
-from cnpgen.store.files.sealed import under_seal
+from cnpgen.problems.problem_file import load_problem
+from cnpgen.refine.refine_plans import refine_plans
+from cnpgen.store.files.checksum_file import with_checksum
 from cnpgen.trajectory.boundary import Boundary, anchor_line, assemble
-from tests.examples.plan_files import unsealed
+from tests.examples.plan_files import remove_checksum
 
 DOCS = Path(__file__).parents[2] / "docs" / "plan-format.md"
 AIRHOCKEY, HEAVY = load_problem("airhockey"), load_problem("heavy-object")
@@ -214,14 +214,14 @@ def test_a_problem_beside_the_file_or_in_the_call(tmp_path: Path) -> None:
     fields = {name: np.zeros((3, 7)) for name in ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq")}
     fields |= {"path_control_points": np.zeros((3, 15, 7))}
     beside = write_minimal(tmp_path / "a.h5", **fields, attributes={"problem": "heavy/problem.toml"})
-    unsaid = write_minimal(tmp_path / "b.h5", **fields, attributes={"problem": None})
+    missing = write_minimal(tmp_path / "b.h5", **fields, attributes={"problem": None})
     assert load_plans(beside).problem.name == "heavy-object"
     assert (
         load_plans(beside, problem="heavy-object").problem.comparable_sha256 == record_problem(HEAVY).comparable_sha256
     )
-    assert load_plans(unsaid, problem=HEAVY).problem == record_problem(HEAVY)
-    with pytest.raises(DatasetError, match=r"b\.h5 does not say its problem: set its attribute 'problem'"):
-        load_plans(unsaid)
+    assert load_plans(missing, problem=HEAVY).problem == record_problem(HEAVY)
+    with pytest.raises(DatasetError, match=r"b\.h5 does not name its problem: set its attribute 'problem'"):
+        load_plans(missing)
 
 
 def test_tolerances_of_the_call_count_and_do_not_make_another_problem(tmp_path: Path) -> None:
@@ -334,7 +334,7 @@ def test_a_damaged_problem_is_said(tmp_path: Path, recipe: Any) -> None:
 
 def test_a_changed_problem_is_said(tmp_path: Path) -> None:
     save_plans(tmp_path / "plan.h5", draw_plans())
-    with h5py.File(unsealed(tmp_path / "plan.h5"), "a") as file:
+    with h5py.File(remove_checksum(tmp_path / "plan.h5"), "a") as file:
         file.attrs["problem_recipe"] = RECORD.recipe.replace('"velocity_scale": 0.8', '"velocity_scale": 0.9')
     with pytest.raises(DatasetError, match="its problem was changed after it was written"):
         load_plans(tmp_path / "plan.h5")
@@ -396,7 +396,7 @@ def test_missing_and_foreign_files_are_said(tmp_path: Path) -> None:
 @pytest.mark.filterwarnings("ignore:.* puts the tip:RuntimeWarning")
 def test_cut_off_and_changed_files_never_give_anything_but_plans_or_an_error(tmp_path: Path) -> None:
     save_plans(tmp_path / "plan.h5", draw_plans(columns={"x": np.ones(N)}))
-    content, path, draws = unsealed(tmp_path / "plan.h5").read_bytes(), tmp_path / "broken.h5", random.Random(0)
+    content, path, draws = remove_checksum(tmp_path / "plan.h5").read_bytes(), tmp_path / "broken.h5", random.Random(0)
     for length in [*range(0, len(content), len(content) // 40), len(content) - 1]:
         path.write_bytes(content[:length])
         with pytest.raises(DatasetError, match=r"broken\.h5"):
@@ -428,7 +428,7 @@ def test_a_changed_bit_anywhere_in_a_sealed_file_is_noticed(tmp_path: Path) -> N
             load_plans(path)
     path.write_bytes(b"written by another lab, sha256 unknown".ljust(512, b"\0") + content[512:])
     found = load_plans(path)
-    assert not found.sealed
+    assert not found.has_checksum
     assert_equal(found, plans)
 
 
@@ -436,15 +436,15 @@ def test_the_reader_says_whether_a_file_has_a_checksum(tmp_path: Path) -> None:
     plans = draw_plans()
     save_plans(tmp_path / "plan.h5", plans)
     found = load_plans(tmp_path / "plan.h5")
-    assert found.sealed
-    assert found[:2].sealed
-    assert load_boundary_problems(tmp_path / "plan.h5").sealed
+    assert found.has_checksum
+    assert found[:2].has_checksum
+    assert load_boundary_problems(tmp_path / "plan.h5").has_checksum
     assert evaluate_plans(found[:1], workers=1).summary()["checksum"] == "right"
-    assert not plans.sealed
-    with h5py.File(unsealed(tmp_path / "plan.h5"), "a") as file:
+    assert not plans.has_checksum
+    with h5py.File(remove_checksum(tmp_path / "plan.h5"), "a") as file:
         file["loss"] = np.arange(float(N))
     found = load_plans(tmp_path / "plan.h5")
-    assert not found.sealed
+    assert not found.has_checksum
     assert found.columns["loss"].tolist() == list(range(N))
     assert evaluate_plans(found[:1], workers=1).summary()["checksum"] == "none"
 
@@ -452,8 +452,8 @@ def test_the_reader_says_whether_a_file_has_a_checksum(tmp_path: Path) -> None:
 def test_a_file_of_a_newer_format_asks_for_an_upgrade(tmp_path: Path) -> None:
     save_plans(tmp_path / "plan.h5", draw_plans())
     content = (tmp_path / "plan.h5").read_bytes()
-    (tmp_path / "plan.h5").write_bytes(under_seal(content, kind="cnpgen-plans", version=2))
-    with pytest.raises(DatasetError, match=r"plan\.h5 has format version 2, this cnpgen reads up to 1: upgrade"):
+    (tmp_path / "plan.h5").write_bytes(with_checksum(content, kind="cnpgen-plans", version=2))
+    with pytest.raises(DatasetError, match=r"plan\.h5 has format version 2, this cnpgen reads version 1: upgrade"):
         load_plans(tmp_path / "plan.h5")
 
 

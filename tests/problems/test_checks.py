@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from cnpgen.errors import RecipeError
-from cnpgen.problems.load import load_problem
-from cnpgen.problems.robot import load_robot
+from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.problem_file import load_problem
 from tests.examples.shaped_robot import JOINTS, urdf, write_problem
 
 TORQUE = '[[constraint]]\nuse = "joint-torque"\ntolerance = "0.5 %"\n'

@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cnpgen.problems.load import load_problem
+from cnpgen.problems.problem_file import load_problem
 from cnpgen.refine.solver.residuals import stage_jacobian, stage_values
 from tests.problems.test_constraints import HEAVY, KINDS, Bench, gantry_problem, measured_forms, values
 
@@ -89,8 +89,8 @@ def test_a_robot_inside_an_obstacle_has_a_depth_and_a_gradient() -> None:
     assert np.isfinite(found).all()
     for joint in range(7):
         near = [np.array(residuals(q + sign * step * np.eye(7)[joint], *state[1:])).ravel() for sign in (1, -1)]
-        slope = (near[0] - near[1])[deepest] / (2 * step)
-        assert found[deepest, joint] == pytest.approx(slope, abs=1e-6)
+        gradient = (near[0] - near[1])[deepest] / (2 * step)
+        assert found[deepest, joint] == pytest.approx(gradient, abs=1e-6)
     assert np.abs(found[deepest]).max() > 0.1
 
 
@@ -117,17 +117,17 @@ def test_an_upright_objects_contact_moves_as_coal_measures_it(tmp_path: Any) -> 
     jacobian = ca.Function("j", inputs, [ca.densify(ca.jacobian(function(*inputs)[0], ca.vertcat(*inputs)))])
     checked = 0
     while checked < 25:
-        q, dq, ddq, tops = here.random_state(random)
+        q, dq, ddq, obstacle_poses = here.random_state(random)
         q[:2], q[4] = (random.uniform(0.1, 0.7), random.uniform(-0.7, 0.7)), 0.0
 
-        def measured(q_: np.ndarray, tops_: np.ndarray, rates: Any = (dq, ddq)) -> np.ndarray:
-            here.world.set_state(q_.copy(), *rates, tops_.copy())
+        def measured(q_: np.ndarray, obstacle_poses_: np.ndarray, rates: Any = (dq, ddq)) -> np.ndarray:
+            here.world.set_state(q_.copy(), *rates, obstacle_poses_.copy())
             return values(measured_forms(KINDS["object-contact"], here.world)[0])
 
-        inside = measured(q, tops) < -1e-3
+        inside = measured(q, obstacle_poses) < -1e-3
         if inside.any():
-            found = np.array(jacobian(q, dq, ddq, tops))[:, [0, 1, 2, 3, -2, -1]]
-            expected = differences(measured, [q, tops])[:, [0, 1, 2, 3, -2, -1]]
+            found = np.array(jacobian(q, dq, ddq, obstacle_poses))[:, [0, 1, 2, 3, -2, -1]]
+            expected = differences(measured, [q, obstacle_poses])[:, [0, 1, 2, 3, -2, -1]]
             np.testing.assert_allclose(found[inside], expected[inside], atol=2e-3)
             checked += 1
 
@@ -142,10 +142,10 @@ def test_an_edge_that_enters_between_two_corners_is_seen_exactly(tmp_path: Any, 
     face = np.array([np.cos(turn), -np.sin(turn)])  # outward normal of the side that the pedestal's corner is in
     q = np.zeros(5)
     q[:2], q[3] = corner - face * (half[0] - depth), -turn
-    tops = np.array([0.6, -5.0])
-    here.world.set_state(q, np.zeros(5), np.zeros(5), tops)
+    obstacle_poses = np.array([0.6, -5.0])
+    here.world.set_state(q, np.zeros(5), np.zeros(5), obstacle_poses)
     expected = here.world.object_distances()[0]
-    (found, _) = np.array(function(q, np.zeros(5), np.zeros(5), tops)[0]).ravel()
+    (found, _) = np.array(function(q, np.zeros(5), np.zeros(5), obstacle_poses)[0]).ravel()
     assert found == pytest.approx(expected, abs=1e-9)
     if 0 < turn < np.pi / 2:
         assert found == pytest.approx(-depth, abs=1e-9)
@@ -173,9 +173,9 @@ def test_the_stages_of_a_motion_have_the_derivatives_of_their_values(problem: st
     value, both = stage_values(here.robot, here.problem), stage_jacobian(here.robot, here.problem)
     n = here.robot.n
     for _ in range(8):
-        q, *_, tops = here.random_state(random)
+        q, *_, obstacle_poses = here.random_state(random)
         w = np.concatenate([q, random.normal(size=2 * n), random.uniform(0.5, 2, 1), random.normal(size=1)])
-        g, jacobian = (np.array(part) for part in both(w, tops))
-        np.testing.assert_allclose(g, np.array(value(w, tops)), rtol=1e-13, atol=1e-13)
-        expected = differences(lambda at, heights=tops: np.array(value(at, heights)).ravel(), [w])
+        g, jacobian = (np.array(part) for part in both(w, obstacle_poses))
+        np.testing.assert_allclose(g, np.array(value(w, obstacle_poses)), rtol=1e-13, atol=1e-13)
+        expected = differences(lambda at, heights=obstacle_poses: np.array(value(at, heights)).ravel(), [w])
         np.testing.assert_allclose(jacobian.reshape(len(w), -1).T, expected, rtol=1e-6, atol=1e-5)

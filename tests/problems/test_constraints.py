@@ -12,10 +12,10 @@ import pinocchio as pin
 import pytest
 
 from cnpgen.kernels.symbolic.linalg import symbols
-from cnpgen.kernels.symbolic.state import SymbolicState
+from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
 from cnpgen.problems.constraints.axis import Axis
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
-from cnpgen.problems.constraints.constraint import EXACTNESS, Condition, Constraint
+from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES, Condition, Constraint
 from cnpgen.problems.constraints.joint import JointAcceleration, JointJerk, JointPosition, JointTorque, JointVelocity
 from cnpgen.problems.constraints.line import Line
 from cnpgen.problems.constraints.needs import measured_needs, symbolic_needs
@@ -25,15 +25,15 @@ from cnpgen.problems.constraints.self_clearance import SelfClearance
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.constraints.tip_speed import TipSpeed
 from cnpgen.problems.constraints.vertical import Vertical
-from cnpgen.problems.load import load_problem
+from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.robot import load_robot
+from cnpgen.problems.problem_file import load_problem
 from cnpgen.robots.robot import Robot
-from cnpgen.robots.solid import count_numbers
-from cnpgen.robots.spec import LimitSpec, RobotSpec
+from cnpgen.robots.robot_spec import LimitSpec, RobotSpec
+from cnpgen.robots.solid import pose_width
 from cnpgen.schema.keys import Range
 from cnpgen.schema.registry import CONSTRAINTS, load, names
-from cnpgen.world.state import World
+from cnpgen.world.world import World
 from tests.examples.constraints import TipSpeed as SpeedOfPlugin
 
 AIRHOCKEY, HEAVY = load_problem("airhockey"), load_problem("heavy-object")
@@ -81,10 +81,10 @@ class Bench:
         self.problem, self.robot = problem, load_robot(problem)
         self.world = World(self.robot, problem.obstacle, problem.object_size)
 
-    def state(self, q: Any, dq: Any = 0.0, ddq: Any = 0.0, tops: Any = -5.0) -> World:
-        n, m = self.robot.n, count_numbers(self.problem.obstacle)
+    def state(self, q: Any, dq: Any = 0.0, ddq: Any = 0.0, obstacle_poses: Any = -5.0) -> World:
+        n, m = self.robot.n, pose_width(self.problem.obstacle)
         self.world.set_state(
-            *(np.broadcast_to(x, n).astype(float) for x in (q, dq, ddq)), np.broadcast_to(tops, m) * 1.0
+            *(np.broadcast_to(x, n).astype(float) for x in (q, dq, ddq)), np.broadcast_to(obstacle_poses, m) * 1.0
         )
         return self.world
 
@@ -100,10 +100,12 @@ class Bench:
 
     def symbolic(self, constraint: Constraint) -> tuple[ca.Function, list[tuple[Condition, ...]]]:
         columns = [symbols(name, self.robot.n) for name in ("q", "dq", "ddq")] + [
-            symbols("tops", len(self.problem.obstacle))
+            symbols("obstacle_poses", len(self.problem.obstacle))
         ]
-        (q, dq, ddq, tops), size = [scalars for _, scalars in columns], self.problem.object
-        state = SymbolicState(self.robot, q, dq, ddq, tops, self.problem.obstacle, size.size if size else None)
+        (q, dq, ddq, obstacle_poses), size = [scalars for _, scalars in columns], self.problem.object
+        state = SymbolicState(
+            self.robot, q, dq, ddq, obstacle_poses, self.problem.obstacle, size.size if size else None
+        )
         forms = [constraint.symbolic(state), *(constraint.symbolic_at(state, end) for end in ("start", "goal"))]
         outputs = [ca.vertcat(*(g for condition in form for g in condition.g)) for form in forms]
         return ca.Function("forms", [column for column, _ in columns], outputs), forms
@@ -177,10 +179,10 @@ def test_symbolic_contact_of_an_upright_object_agrees_with_the_measurement(bench
     function, _ = bench.symbolic(KINDS["object-contact"])
     overlapping = 0
     for _ in range(300):
-        q, dq, ddq, tops = bench.random_state(random)
+        q, dq, ddq, obstacle_poses = bench.random_state(random)
         q[:2], q[4] = (random.uniform(0.1, 0.7), random.uniform(-0.7, 0.7)), 0.0
-        found = [np.array(value).ravel() for value in function(q, dq, ddq, tops)]
-        bench.world.set_state(q, dq, ddq, tops)
+        found = [np.array(value).ravel() for value in function(q, dq, ddq, obstacle_poses)]
+        bench.world.set_state(q, dq, ddq, obstacle_poses)
         for symbolic, measured in zip(found, measured_forms(KINDS["object-contact"], bench.world), strict=True):
             expected = values(measured)
             np.testing.assert_allclose(np.minimum(symbolic, 0.0), np.minimum(expected, 0.0), atol=1e-9)
@@ -195,11 +197,11 @@ def test_both_forms_state_the_same_conditions(benches, name):
     _, forms = bench.symbolic(KINDS[name])
     for symbolic, measured in zip(forms, measured_forms(KINDS[name], bench.state(0.1)), strict=True):
         for a, b in zip(symbolic, measured, strict=True):
-            assert (a.name, a.unit, a.exactness, len(a.g)) == (b.name, b.unit, b.exactness, len(b.g))
+            assert (a.name, a.unit, a.tolerance_kind, len(a.g)) == (b.name, b.unit, b.tolerance_kind, len(b.g))
             np.testing.assert_array_equal(a.lower, b.lower)
             np.testing.assert_array_equal(a.upper, b.upper)
             assert len(a.g) == len(a.lower) == len(a.upper)
-            assert a.exactness in EXACTNESS["float64"]
+            assert a.tolerance_kind in BOUNDARY_TOLERANCES["float64"]
 
 
 HIGHEST = {  # the highest derivative of q that the conditions of a kind depend on, at its ends where these are others
@@ -224,8 +226,8 @@ HIGHEST = {  # the highest derivative of q that the conditions of a kind depend 
 def test_what_conditions_depend_on_is_found_out_from_both_forms(benches, name):
     bench, kind = benches["heavy-object"], {**KINDS, "of a plug-in": SpeedOfPlugin()}[name]
     (_, q), (dq_sx, dq), (ddq_sx, ddq) = (symbols(what, bench.robot.n) for what in ("q", "dq", "ddq"))
-    tops, box = symbols("tops", len(bench.problem.obstacle))[1], bench.problem.object
-    state = SymbolicState(bench.robot, q, dq, ddq, tops, bench.problem.obstacle, box.size)
+    obstacle_poses, box = symbols("obstacle_poses", len(bench.problem.obstacle))[1], bench.problem.object
+    state = SymbolicState(bench.robot, q, dq, ddq, obstacle_poses, bench.problem.obstacle, box.size)
     assert [symbolic_needs(each, dq_sx, ddq_sx) for each in kind.symbolic_at(state, "start")] == HIGHEST[name]
     assert measured_needs([partial(kind.measured_at, end="start")], bench.world) == HIGHEST[name]
     assert measured_needs([kind.measured], bench.world) == HIGHEST[name][: len(kind.measured(bench.world))]
@@ -235,10 +237,10 @@ def test_what_conditions_depend_on_is_found_out_from_both_forms(benches, name):
 def test_conditions_depend_on_no_higher_derivative_than_was_found(benches, name):
     bench, random = benches["heavy-object"], np.random.default_rng(6)
     needs = measured_needs(forms_of(KINDS[name]), bench.world)
-    q, dq, ddq, tops = bench.random_state(random)
+    q, dq, ddq, obstacle_poses = bench.random_state(random)
     forms = []
     for order in (2, 1, 0):
-        bench.world.set_state(q, dq if order > 0 else 0 * dq, ddq if order > 1 else 0 * ddq, tops)
+        bench.world.set_state(q, dq if order > 0 else 0 * dq, ddq if order > 1 else 0 * ddq, obstacle_poses)
         forms.append([c for form in measured_forms(KINDS[name], bench.world) for c in form])
     for full, no_ddq, still, need in zip(*forms, needs, strict=True):
         if need < 2:
@@ -271,7 +273,7 @@ def out_of_bounds(form: tuple[Condition, ...]) -> dict[str, float]:
     for condition in form:
         g = np.array(condition.g, float)
         excess = np.maximum(condition.lower - g, g - condition.upper)
-        if np.any(excess > condition.slack("float64")):
+        if np.any(excess > condition.tolerance("float64")):
             broken[condition.name] = condition.violation()
     return broken
 
@@ -486,26 +488,26 @@ def test_directions_that_are_none_are_refused(kind: type[Constraint], given: dic
 def test_robot_clearance_is_met_at_the_radius_and_violated_closer(benches):
     bench, clearance = benches["gantry"], KINDS["robot-clearance"]
     high = [0.4, -0.45, 1.0, 0.3, 0.0]  # the tip is 1.65 m above the world, over the first pedestal
-    expect(clearance, bench.state(high, tops=[1.65 - 0.14, -5.0]), {})
-    expect(clearance, bench.state(high, tops=[1.65 - 0.14 + 1e-6, -5.0]), {"robot clearance": 1e-6})
-    expect(clearance, bench.state(high, tops=[1.8, -5.0]), {"robot clearance": 0.14 + 0.15})
+    expect(clearance, bench.state(high, obstacle_poses=[1.65 - 0.14, -5.0]), {})
+    expect(clearance, bench.state(high, obstacle_poses=[1.65 - 0.14 + 1e-6, -5.0]), {"robot clearance": 1e-6})
+    expect(clearance, bench.state(high, obstacle_poses=[1.8, -5.0]), {"robot clearance": 0.14 + 0.15})
 
 
 def test_object_contact_is_met_by_touching_and_violated_by_entering_deeper(benches):
     bench, contact = benches["gantry"], KINDS["object-contact"]
     high = [0.4, -0.45, 1.0, 0.3, 0.0]
     bottom = 1.65 - 0.15
-    expect(contact, bench.state(high, tops=[bottom, -5.0]), {})
-    expect(contact, bench.state(high, tops=[bottom + 1e-3, -5.0]), {})
-    expect(contact, bench.state(high, tops=[bottom + 1e-3 + 1e-6, -5.0]), {"object contact": 1e-6})
-    expect(contact, bench.state(high, tops=[bottom + 0.05, -5.0]), {"object contact": 0.049})
+    expect(contact, bench.state(high, obstacle_poses=[bottom, -5.0]), {})
+    expect(contact, bench.state(high, obstacle_poses=[bottom + 1e-3, -5.0]), {})
+    expect(contact, bench.state(high, obstacle_poses=[bottom + 1e-3 + 1e-6, -5.0]), {"object contact": 1e-6})
+    expect(contact, bench.state(high, obstacle_poses=[bottom + 0.05, -5.0]), {"object contact": 0.049})
 
 
 # --- conditions -------------------------------------------------------------------------------------------------------
 
 
-def condition(g: list[float], lower: list[float], upper: list[float], exactness: str = "limit") -> Condition:
-    return Condition("test", "1", g, np.array(lower, float), np.array(upper, float), exactness)
+def condition(g: list[float], lower: list[float], upper: list[float], tolerance_kind: str = "limit") -> Condition:
+    return Condition("test", "1", g, np.array(lower, float), np.array(upper, float), tolerance_kind)
 
 
 def test_violation_is_the_worst_excess():
@@ -518,8 +520,10 @@ def test_what_is_no_number_is_an_infinite_violation():
 
 
 def test_slack_of_limits_is_relative_to_them_and_of_the_rest_absolute():
-    np.testing.assert_allclose(condition([0.0, 0.0], [-300.0, -0.5], [100.0, np.inf]).slack("float64"), [3e-10, 1e-12])
-    np.testing.assert_array_equal(condition([0.0], [-300.0], [300.0], "velocity").slack("float32"), [1e-5])
+    np.testing.assert_allclose(
+        condition([0.0, 0.0], [-300.0, -0.5], [100.0, np.inf]).tolerance("float64"), [3e-10, 1e-12]
+    )
+    np.testing.assert_array_equal(condition([0.0], [-300.0], [300.0], "velocity").tolerance("float32"), [1e-5])
 
 
 # --- what a motion may do that a boundary state may not
@@ -538,10 +542,12 @@ def test_tolerance_of_a_motion_is_absolute_or_a_fraction_of_the_limit(benches, n
 def test_funnel_lets_a_motion_down_to_the_table_and_nothing_else_in(benches):
     s, start = np.array([0.0, 0.1, 0.2, 0.3, 1.0]), np.array([0.8, 0.1, 0.157])
     rectangle, height = KINDS["table"].measured(benches["airhockey"].state(benches["airhockey"].robot.base))
-    np.testing.assert_allclose(KINDS["table"].funnel(height, s, start), [0.003, 0.003, 0.0015, 0.0, 0.0], atol=1e-15)
+    np.testing.assert_allclose(
+        KINDS["table"].bound_relaxation(height, s, start), [0.003, 0.003, 0.0015, 0.0, 0.0], atol=1e-15
+    )
     far = np.array([[0.8, 0.1, 0.36], [0.8, 0.1, 0.1], [0.8, 0.1, 0.163]])  # no further than start_band
     widths = np.array([[5e-3], [5e-3], [3e-3]]) * [1.0, 1.0, 0.5, 0.0, 0.0]
-    np.testing.assert_allclose(KINDS["table"].funnel(height, s, far), widths, atol=1e-15)
+    np.testing.assert_allclose(KINDS["table"].bound_relaxation(height, s, far), widths, atol=1e-15)
     for name, kind in KINDS.items():
         for condition in kind.measured(benches["heavy-object"].state(0.1)) if name != "table" else (rectangle,):
-            np.testing.assert_array_equal(kind.funnel(condition, s, start), np.zeros(5))
+            np.testing.assert_array_equal(kind.bound_relaxation(condition, s, start), np.zeros(5))

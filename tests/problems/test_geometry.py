@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 
 from cnpgen.errors import RecipeError
-from cnpgen.problems.load import load_problem
+from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem, resolved
-from cnpgen.problems.record import as_problem, open_problem, record_problem
-from cnpgen.problems.robot import load_robot
+from cnpgen.problems.problem_file import load_problem
+from cnpgen.problems.problem_record import as_problem, open_problem, record_problem
 from tests.examples.shaped_robot import LINKS, SELF, write_crane, write_problem
 
 RADIUS = 'radius = "0.1 m"'
@@ -101,7 +101,9 @@ def test_a_record_has_the_shape_without_the_files(problem, tmp_path):
     restored, robot = open_problem(record)
     assert restored.identity == identity
     assert repr(robot.shape.pairs) == repr(shape.pairs)
-    assert [piece.vertices.tobytes() for piece in robot.shape.pieces] == [p.vertices.tobytes() for p in shape.pieces]
+    assert [piece.vertices.tobytes() for piece in robot.shape.convex_parts] == [
+        p.vertices.tobytes() for p in shape.convex_parts
+    ]
     assert record_problem(as_problem(record)).comparable_sha256 == record.comparable_sha256
 
 

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cnpgen.planner.kit import surroundings
-from cnpgen.planner.model import Meaning, Model
+from cnpgen.planner.inference_pipeline import loaded_problem
+from cnpgen.planner.model import Model, ModelConfig
 from cnpgen.planner.planner import Planner, states_at
-from cnpgen.problems.load import load_problem
+from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.record import open_problem, record_problem
-from cnpgen.problems.robot import load_robot
-from cnpgen.robots.spec import HeldObject
+from cnpgen.problems.problem_file import load_problem
+from cnpgen.problems.problem_record import open_problem, record_problem
+from cnpgen.robots.robot_spec import HeldObject
 from cnpgen.schema import registry
 from cnpgen.schema.keys import Range, keys
 from cnpgen.trajectory.boundary import Boundary
@@ -112,7 +112,7 @@ def test_code_and_undeclared_fields_of_a_plug_in_change_it(monkeypatch: pytest.M
 def test_a_problem_that_is_read_from_its_record_is_the_same_one(name: str) -> None:
     record = record_problem(SHIPPED[name])
     assert open_problem(record)[0].identity == SHIPPED[name].identity
-    with surroundings(record, "numpy") as given:
+    with loaded_problem(record, "numpy") as given:
         assert given.kernels.identity == SHIPPED[name].identity
 
 
@@ -126,7 +126,7 @@ def boundary(n: int, speed: float) -> Boundary:
 def model() -> Model:
     """An untrained model of the shipped problem, without Gauss-Newton steps: their kernels take seconds to build."""
     return untrained_model(
-        "airhockey", boundary(6, 0.3), meaning=Meaning(path_scale=0.3, bending_steps=0, landing_steps=0)
+        "airhockey", boundary(6, 0.3), config=ModelConfig(path_scale=0.3, line_projection_steps=0, projection_steps=0)
     )
 
 

@@ -10,16 +10,16 @@ from scipy.interpolate import BSpline
 
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.symbolic.linalg import symbols
-from cnpgen.kernels.symbolic.state import SymbolicState, jerk_along
+from cnpgen.kernels.symbolic.symbolic_state import SymbolicState, jerk_along
 from cnpgen.problems.constraints.joint import JointJerk
 from cnpgen.problems.constraints.needs import measured_needs, symbolic_needs
-from cnpgen.problems.load import load_problem
+from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.record import record_problem
-from cnpgen.problems.robot import load_robot
+from cnpgen.problems.problem_file import load_problem
+from cnpgen.problems.problem_record import record_problem
 from cnpgen.refine.solver.residuals import stage_jacobian, stage_values
-from cnpgen.world.state import World
-from tests.examples.jerky import jerky
+from cnpgen.world.world import World
+from tests.examples.jerk_limits import jerk_limited
 from tests.examples.plans import PROBLEMS
 
 JERK = JointJerk(tolerance=0.01)
@@ -50,7 +50,7 @@ def test_where_none_are_given_they_are_five_a_second_times_those_of_the_accelera
 
 def test_a_problem_without_them_is_written_down_as_before_there_were_any() -> None:
     assert "jerk" not in record_problem(PROBLEMS["airhockey"]).recipe
-    problem, robot = jerky("airhockey")
+    problem, robot = jerk_limited("airhockey")
     with record_problem(problem).restored() as restored:
         np.testing.assert_array_equal(load_robot(restored).jerk_limit, robot.jerk_limit)
 
@@ -90,7 +90,7 @@ def state_of(problem: Problem, jerk: list | None) -> SymbolicState:
 
 
 def test_both_forms_state_the_same_limits_of_what_they_are_given() -> None:
-    problem, robot = jerky("airhockey")
+    problem, robot = jerk_limited("airhockey")
     column, jerk = symbols("jerk", robot.n)
     (symbolic,) = JERK.symbolic(state_of(problem, jerk))
     world, values = World(robot), np.random.default_rng(1).normal(size=robot.n)
@@ -103,27 +103,27 @@ def test_both_forms_state_the_same_limits_of_what_they_are_given() -> None:
     for each in (symbolic, measured):
         np.testing.assert_array_equal(each.upper, robot.jerk_limit)
         np.testing.assert_array_equal(each.lower, -robot.jerk_limit)
-        assert (each.name, each.unit, each.exactness) == ("joint jerk", "rad/s^3", "limit")
+        assert (each.name, each.unit, each.tolerance_kind) == ("joint jerk", "rad/s^3", "limit")
     np.testing.assert_allclose(JERK.allowed(measured), 0.01 * robot.jerk_limit)
     assert symbolic_needs(symbolic, ca.SX.sym("dq"), ca.SX.sym("ddq"), column) == 3
 
 
 def test_a_boundary_state_has_no_jerk_and_meets_the_limits() -> None:
-    problem, robot = jerky("airhockey")
+    problem, robot = jerk_limited("airhockey")
     world = World(robot)
     assert JERK.measured(world) == JERK.measured_at(world, "goal") == ()
     assert JERK.symbolic(state_of(problem, None)) == JERK.symbolic_at(state_of(problem, None), "start") == ()
 
 
 def test_what_depends_on_the_jerk_is_found_out() -> None:
-    problem, robot = jerky("airhockey")
+    problem, robot = jerk_limited("airhockey")
     forms = [constraint.measured for constraint in problem.constraint]
     assert measured_needs(forms, World(robot), jerk=True) == [0, 1, 2, 2, *[0] * 2, 3]
     assert measured_needs(forms, World(robot)) == [0, 1, 2, 2, *[0] * 2]
 
 
 def test_residuals_of_a_motion_have_the_jerk_and_its_derivatives() -> None:
-    problem, robot = jerky("airhockey")
+    problem, robot = jerk_limited("airhockey")
     n, random = robot.n, np.random.default_rng(4)
     w = np.concatenate([robot.base, random.normal(size=3 * n), [0.9, 0.4, -0.3]])
     p1, p2, p3, (r, r1, r2) = w[n : 2 * n], w[2 * n : 3 * n], w[3 * n : 4 * n], w[4 * n :]
@@ -142,6 +142,6 @@ def test_residuals_of_a_motion_have_the_jerk_and_its_derivatives() -> None:
 def test_residuals_of_other_problems_are_of_no_third_derivative() -> None:
     assert PROBLEMS["airhockey"].path_orders == 3
     plain, n = PROBLEMS["airhockey"], 6
-    limited = replace(plain, limits=jerky("airhockey")[0].limits)  # given, and not constrained
+    limited = replace(plain, limits=jerk_limited("airhockey")[0].limits)  # given, and not constrained
     for problem in (plain, limited):
         assert stage_values(load_robot(problem), problem).size1_in(0) == 3 * n + 2

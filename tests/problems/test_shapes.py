@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from cnpgen.kernels.symbolic.linalg import symbols
-from cnpgen.kernels.symbolic.segments import segment_distance
-from cnpgen.kernels.symbolic.state import SymbolicState
+from cnpgen.kernels.symbolic.segment_distance import segment_distance
+from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.constraints.self_clearance import SelfClearance
-from cnpgen.problems.load import load_problem
-from cnpgen.robots.shape.pairs import segment_distances
+from cnpgen.problems.problem_file import load_problem
+from cnpgen.robots.shape.link_pairs import segment_distances
 from cnpgen.robots.solid import place_obstacles
 from tests.conftest import some
 from tests.examples.shaped_robot import KINDS, write_problem
@@ -23,7 +23,7 @@ from tests.problems.test_constraint_derivatives import differences
 from tests.problems.test_constraints import Bench
 
 CLEARANCES = {"obstacles": RobotClearance(tolerance=1e-4, distance=0.02), "itself": SelfClearance(tolerance=1e-4)}
-TOPS = np.array([0.3, 0.9])
+OBSTACLE_POSES = np.array([0.3, 0.9])
 
 
 @pytest.fixture(scope="module")
@@ -31,10 +31,12 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
     return Bench(load_problem(write_problem(tmp_path_factory.mktemp("crane"))))
 
 
-def symbolic(bench: Bench, constraint: Constraint, form: str, tops: np.ndarray = TOPS) -> tuple[ca.Function, Condition]:
+def symbolic(
+    bench: Bench, constraint: Constraint, form: str, obstacle_poses: np.ndarray = OBSTACLE_POSES
+) -> tuple[ca.Function, Condition]:
     """How much larger the smallest distance of a form is than it must be, as a function of q; the form's condition."""
     (q_sx, q), zero = symbols("q", bench.robot.n), [0.0] * bench.robot.n
-    state = SymbolicState(bench.robot, q, zero, zero, tops.tolist(), bench.problem.obstacle, None)
+    state = SymbolicState(bench.robot, q, zero, zero, obstacle_poses.tolist(), bench.problem.obstacle, None)
     found = constraint.symbolic_at(state, "goal") if form == "symbolic_at" else getattr(constraint, form)(state)
     (condition,) = found
     return ca.Function("room", [q_sx], [ca.mmin(ca.vertcat(*condition.g) - condition.lower)]), condition
@@ -47,12 +49,12 @@ def states(bench: Bench, count: int, seed: int) -> np.ndarray:
 
 def room(bench: Bench, constraint: Constraint, q: np.ndarray) -> float:
     """How much larger the smallest measured distance is than it must be [m]."""
-    (condition,) = constraint.measured(bench.state(q, tops=TOPS))
+    (condition,) = constraint.measured(bench.state(q, obstacle_poses=OBSTACLE_POSES))
     return float(np.min(np.array(condition.g) - condition.lower))
 
 
 @pytest.mark.parametrize("name", CLEARANCES)
-@pytest.mark.parametrize("form", some(["symbolic", "penalised", "symbolic_at"], 1, "slow"))
+@pytest.mark.parametrize("form", some(["symbolic", "penalized", "symbolic_at"], 1, "slow"))
 def test_what_capsules_clear_is_clear(bench, name, form):
     """Of pairs of links whose capsules are no use, the solvers' forms know nothing."""
     function, condition = symbolic(bench, CLEARANCES[name], form)
@@ -66,18 +68,18 @@ def test_what_capsules_clear_is_clear(bench, name, form):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("form", ["symbolic", "penalised"])
+@pytest.mark.parametrize("form", ["symbolic", "penalized"])
 def test_what_capsules_clear_of_obstacles_of_every_kind_is_clear(tmp_path, form):
     bench = Bench(load_problem(write_problem(tmp_path, obstacles=KINDS)))
-    constraint, tops = CLEARANCES["obstacles"], place_obstacles(bench.problem.obstacle)
-    function, condition = symbolic(bench, constraint, form, tops)
+    constraint, obstacle_poses = CLEARANCES["obstacles"], place_obstacles(bench.problem.obstacle)
+    function, condition = symbolic(bench, constraint, form, obstacle_poses)
     assert condition.sufficient
     assert len(constraint.solved(bench.world)[0].g) == len(condition.g)
     clear = 0
     for q in states(bench, 300, seed=1):
         if float(function(q)) >= 0:
             clear += 1
-            (measured,) = constraint.measured(bench.state(q, tops=tops))
+            (measured,) = constraint.measured(bench.state(q, obstacle_poses=obstacle_poses))
             assert min(measured.g) >= constraint.distance
     assert clear > 30
 
@@ -109,7 +111,7 @@ def test_the_distance_that_is_asked_for_is_kept(bench):
 def _distance() -> tuple[ca.Function, ca.Function]:
     points = [symbols(name, 3) for name in "abcd"]
     (a, b, c, d), columns = [scalars for _, scalars in points], [column for column, _ in points]
-    distance = segment_distance((a, b), (c, d), hold=lambda value: value)
+    distance = segment_distance((a, b), (c, d), freeze=lambda value: value)
     gradient = ca.densify(ca.jacobian(distance, ca.vertcat(*columns)))
     return ca.Function("distance", columns, [distance]), ca.Function("gradient", columns, [gradient])
 
@@ -158,7 +160,7 @@ def test_a_problem_with_a_shape_is_judged_by_its_pieces_along_a_path(tmp_path: P
 
     path = np.linspace(*states(bench, 2, seed=8), 60).T
     world = PathWorld(bench.robot, bench.problem.obstacle)
-    world.set_path(path, 0 * path, 0 * path, TOPS)
+    world.set_path(path, 0 * path, 0 * path, OBSTACLE_POSES)
     for constraint in CLEARANCES.values():
         (condition,) = constraint.measured(world)
         least = min(float(np.min(each)) for each in condition.g)

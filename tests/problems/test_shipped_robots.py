@@ -11,15 +11,15 @@ import pytest
 
 from cnpgen import evaluate_plans, refine_plans, solve_plans
 from cnpgen.judges.rows.verify import verify_rows
-from cnpgen.make.boundary_problems import draw_boundary_problems
 from cnpgen.make.dataset import make_dataset
-from cnpgen.pipelines.load import load_pipeline
+from cnpgen.make.draw_boundary_problems import draw_boundary_problems
+from cnpgen.pipelines.pipeline_file import load_pipeline
 from cnpgen.planner.planner import Planner
 from cnpgen.plans import Plans
 from cnpgen.plans.boundary_problems import load_boundary_problems
 from cnpgen.problems.constraints.joint import JointJerk
-from cnpgen.problems.load import load_problem
-from cnpgen.problems.robot import load_robot
+from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.problem_file import load_problem
 from cnpgen.trajectory.boundary import Boundary
 from tests.conftest import Prepare
 from tests.examples.example_robots import SHIPPED, folder, needs_robots
@@ -61,7 +61,7 @@ def test_rows_and_plans_of_the_shipped_planner_touch_nothing(name: str, prepare:
 @pytest.mark.parametrize("name", SHIPPED)
 def test_rows_are_what_pinocchio_and_coal_call_valid_and_touch_nothing(name: str) -> None:
     problem, drawn = load_problem(name), draw_boundary_problems(name, ROWS, seed=4)
-    columns = drawn.boundary.given() | drawn.columns
+    columns = drawn.boundary.conditions() | drawn.columns
     found = verify_rows(problem, load_robot(problem), columns)
     assert found.rows == ROWS
     assert len(found.out) == 0

@@ -1,4 +1,4 @@
-"""Refining that is cut off by a killed worker or a full disk: nothing finished is lost, and the next run goes on."""
+"""Refinement interrupted by a killed worker or a full disk: finished plans are kept, and the next run resumes."""
 
 import errno
 import os
@@ -11,13 +11,13 @@ import pytest
 
 from cnpgen.cli.main import main
 from cnpgen.errors import MachineError
-from cnpgen.make.boundary_problems import draw_boundary_problems
+from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.plans import load_plans, save_plans
 from cnpgen.plans.plans import Plans
-from cnpgen.refine.plans import refine_plans
+from cnpgen.refine.refine_plans import refine_plans
 from tests.cli.test_interruption import descendants
 from tests.conftest import some
-from tests.refine.test_plans import same
+from tests.refine.test_refine_plans import same
 
 N = 14
 linux = pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="needs /proc")
@@ -42,13 +42,11 @@ def kill_workers(_plans: int, _valid: int) -> None:
 
 @pytest.mark.slow
 @linux
-def test_what_was_finished_before_a_worker_was_killed_is_not_made_again(
+def test_plans_finished_before_a_worker_was_killed_are_not_made_again(
     problems: Plans, solved: Plans, tmp_path: Path
 ) -> None:
     journal, begun = tmp_path / "journal", []
-    with pytest.raises(
-        MachineError, match=r"a worker died .*journal holds what is finished; start again with the same"
-    ):
+    with pytest.raises(MachineError, match=r"a worker died .*journal has the finished plans; the same call"):
         refine_plans(problems, workers=2, journal=journal, progress=kill_workers)
     found = refine_plans(problems, workers=1, journal=journal, begin=lambda *numbers: begun.append(numbers))
     ((total, there),) = begun
@@ -58,7 +56,7 @@ def test_what_was_finished_before_a_worker_was_killed_is_not_made_again(
 
 
 @pytest.mark.parametrize("number", some([errno.ENOSPC, errno.EDQUOT], 1, "slow"))
-def test_a_disk_that_is_full_is_told_with_what_to_do_and_what_fits_counts(
+def test_a_full_disk_is_reported_with_a_remedy_and_earlier_plans_count(
     problems: Plans, solved: Plans, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
 ) -> None:
     journal, flush, calls, begun = tmp_path / "journal", os.fsync, [], []
@@ -91,10 +89,10 @@ if __name__ == "__main__":
 @pytest.mark.slow
 @linux
 @pytest.mark.parametrize(("limit", "workers"), [(12_000, "2"), (30_000, "1")])
-def test_a_file_that_cannot_grow_is_one_line_and_the_same_command_goes_on(
+def test_a_file_that_cannot_grow_is_reported_in_one_line_and_the_same_command_resumes(
     problems: Plans, solved: Plans, tmp_path: Path, limit: int, workers: str
 ) -> None:
-    """The smaller limit stops the journal in the middle of a plan, the larger one the file of plans at the end."""
+    """The smaller limit stops the journal within a plan, the larger one the plan file at the end."""
     given, out = tmp_path / "problems.h5", tmp_path / "out.h5"
     save_plans(given, problems)
     words = ["refine", str(given), "-o", str(out), "--workers", workers]

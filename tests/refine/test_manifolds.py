@@ -1,4 +1,4 @@
-"""Every manifold of the tip in the refiner: motions from rest to rest that keep it, found from nothing."""
+"""Refiner on every tip manifold: motions from rest to rest that stay on it, without input plan."""
 
 from pathlib import Path
 
@@ -6,28 +6,27 @@ import numpy as np
 import pytest
 
 from cnpgen.kernels.library import problem_kernels
-from cnpgen.refine.jury import Jury
-from cnpgen.refine.polish import refine_task
 from cnpgen.refine.refiner import Refiner
-from cnpgen.refine.task import Task
+from cnpgen.refine.strategy import PlanChecker, refine_task
+from cnpgen.refine.task import RefinementTask
 from cnpgen.trajectory.boundary import Boundary
-from cnpgen.world.state import World
+from cnpgen.world.world import World
 from tests.examples.manifolds import MANIFOLDS, ROBOT, ends_on, problem_on
 
-REPEATS = pytest.mark.extended  # beside a plane and a pose
-MARKS = {"plane": (), "rectangle": REPEATS, "line": REPEATS}  # of the others one is enough in the default run, too
+REPEATS = pytest.mark.extended  # similar to a plane and a pose
+MARKS = {"plane": (), "rectangle": REPEATS, "line": REPEATS}  # the others are slow
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=MARKS.get(name, pytest.mark.slow)) for name in MANIFOLDS])
-def test_a_motion_on_a_manifold_is_found_from_nothing(name: str, tmp_path: Path) -> None:
+def test_a_motion_on_a_manifold_is_found_without_input_plan(name: str, tmp_path: Path) -> None:
     problem, q, world = problem_on(name), ends_on(name), World(ROBOT, (), None)
     rest, tips = np.zeros((1, ROBOT.n)), []
-    for each in q:
-        world.set_state(each, 0 * each, 0 * each, np.zeros(0))
+    for configuration in q:
+        world.set_state(configuration, 0 * configuration, 0 * configuration, np.zeros(0))
         tips.append(world.tip_position)
     kernels = problem_kernels(problem, ROBOT, "numpy", tmp_path)
     tool = Refiner(problem, ROBOT, kernels=kernels, world=world)
     boundary = Boundary(q[0][None], rest, rest, q[1][None], rest)
-    found = refine_task(tool, Jury(problem, ROBOT, degree=7), Task(boundary, np.zeros(0), *tips))
+    found = refine_task(tool, PlanChecker(problem, ROBOT, degree=7), RefinementTask(boundary, np.zeros(0), *tips))
     assert found.valid, found
     assert np.linalg.norm(tips[1] - tips[0]) > 0.2

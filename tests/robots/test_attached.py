@@ -9,12 +9,12 @@ import pinocchio as pin
 import pytest
 
 from cnpgen.errors import RecipeError
-from cnpgen.problems.load import load_problem
+from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem, resolved
-from cnpgen.problems.record import open_problem, record_problem
-from cnpgen.problems.robot import load_robot
+from cnpgen.problems.problem_file import load_problem
+from cnpgen.problems.problem_record import open_problem, record_problem
 from cnpgen.robots.robot import Robot
-from cnpgen.world.state import World
+from cnpgen.world.world import World
 
 ROOT = Path(__file__).parents[2]
 HEAVY = ROOT / "problems" / "heavy-object"
@@ -63,7 +63,7 @@ def test_a_tip_with_an_offset_and_a_payload_are_what_a_tool_in_the_urdf_is(tmp_p
             np.testing.assert_allclose(getattr(one, what), getattr(other, what), atol=1e-9, rtol=1e-9)
     np.testing.assert_allclose(robot.chain.tip_translation, by_hand.chain.tip_translation, atol=1e-12)
     np.testing.assert_allclose(robot.chain.joints[-1].inertia, by_hand.chain.joints[-1].inertia, atol=1e-12)
-    assert robot.skeleton == by_hand.skeleton
+    assert robot.capsule_axes == by_hand.capsule_axes
 
 
 @pytest.mark.parametrize(
@@ -75,21 +75,21 @@ def test_a_tip_with_an_offset_and_a_payload_are_what_a_tool_in_the_urdf_is(tmp_p
 )
 def test_a_payload_may_be_a_box_of_uniform_density_or_a_point(tmp_path, payload, expected):
     problem = written(tmp_path, more=f"[payload]\nmass = 12.0\n{payload}")
-    np.testing.assert_allclose(problem.payload.moments, expected, atol=1e-12)
+    np.testing.assert_allclose(problem.payload.times, expected, atol=1e-12)
     empty = load_robot(load_problem("heavy-object"))
     inertia = load_robot(problem).model.inertias[7]
     assert inertia.mass == pytest.approx(empty.model.inertias[7].mass + 12.0)
     if payload:
         reference = pin.Inertia.FromBox(12.0, 0.1, 0.2, 0.3).inertia
-        np.testing.assert_allclose(problem.payload.moments, reference, atol=1e-12)
+        np.testing.assert_allclose(problem.payload.times, reference, atol=1e-12)
 
 
 @pytest.mark.parametrize(
     ("keys", "text"),
     [
         (f"{INERTIA}size = [0.1, 0.1, 0.1]\n", "has both an 'inertia' and a 'size'"),
-        ("inertia = [1.0, 1.0, 3.0, 0.0, 0.0, 0.0]\n", "no body has the principal moments 1, 1, 3 kg m^2"),
-        ("inertia = [1.0, 1.0, 1.0, 2.0, 0.0, 0.0]\n", "no body has the principal moments -1, 1, 3 kg m^2"),
+        ("inertia = [1.0, 1.0, 3.0, 0.0, 0.0, 0.0]\n", "no body has the principal times 1, 1, 3 kg m^2"),
+        ("inertia = [1.0, 1.0, 1.0, 2.0, 0.0, 0.0]\n", "no body has the principal times -1, 1, 3 kg m^2"),
     ],
 )
 def test_inertias_that_no_body_has_are_refused(tmp_path, keys, text):

@@ -11,12 +11,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cnpgen.errors import RecipeError
-from cnpgen.problems.load import load_problem
-from cnpgen.problems.obstacles import obstacle_tops
-from cnpgen.problems.record import as_problem, record_problem
+from cnpgen.problems.obstacles import obstacle_poses_of
+from cnpgen.problems.problem_file import load_problem
+from cnpgen.problems.problem_record import as_problem, record_problem
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.inline import corners_of
-from cnpgen.robots.solid import count_numbers, place_obstacles, solids_of
+from cnpgen.robots.solid import place_obstacles, pose_width, solids_of
 from tests.examples.shaped_robot import KINDS, WEDGE, write_problem
 
 HERE = (0.1, 0.2, 0.3)
@@ -68,7 +68,7 @@ def test_an_upright_box_has_no_pose(tmp_path: Path) -> None:
 def test_kinds_are_where_their_keys_say(tmp_path: Path) -> None:
     problem = load_problem(write_problem(tmp_path, obstacles=KINDS))
     wall, ball, post, pipe, wedge = solids_of(problem.obstacle, place_obstacles(problem.obstacle))
-    assert count_numbers(problem.obstacle) == 15 + 4 + 7 + 7 + 12
+    assert pose_width(problem.obstacle) == 15 + 4 + 7 + 7 + 12
     turn = Rotation.from_euler("xyz", [0, 0, 20], degrees=True).as_matrix()
     corner = np.array([0.5, 0.0, 0.15]) + turn @ [0.05, 0.25, 0.15]
     assert np.linalg.norm(wall.position + wall.corners - corner, axis=1).min() < 1e-12
@@ -113,7 +113,7 @@ def test_tops_hold_the_numbers_of_all_obstacles(tmp_path: Path) -> None:
     problem = load_problem(write_problem(tmp_path, obstacles=KINDS))
     upright = load_problem(write_problem(tmp_path)).obstacle
     problem = replace(problem, obstacle=(*upright, *problem.obstacle))
-    tops = obstacle_tops(problem, np.zeros((4, 3)), np.zeros((4, 3)))
-    assert tops.shape == (4, 2 + 45)
-    np.testing.assert_array_equal(tops[:, :2], [[0.3, 0.9]] * 4)
-    np.testing.assert_array_equal(tops[2], place_obstacles(problem.obstacle))
+    obstacle_poses = obstacle_poses_of(problem, np.zeros((4, 3)), np.zeros((4, 3)))
+    assert obstacle_poses.shape == (4, 2 + 45)
+    np.testing.assert_array_equal(obstacle_poses[:, :2], [[0.3, 0.9]] * 4)
+    np.testing.assert_array_equal(obstacle_poses[2], place_obstacles(problem.obstacle))

@@ -1,4 +1,4 @@
-"""Loading robots: scaled limits, the skeleton, and what is said about joints, tips and URDFs that do not fit."""
+"""Loading robots: scaled limits, the capsule axes, and what is said about joints, tips and URDFs that do not fit."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -9,9 +9,9 @@ import pinocchio as pin
 import pytest
 
 from cnpgen.errors import RecipeError
-from cnpgen.problems.load import load_problem
+from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.robot import load_robot
+from cnpgen.problems.problem_file import load_problem
 
 HEAVY = load_problem("heavy-object")
 AIRHOCKEY = load_problem("airhockey")
@@ -64,17 +64,17 @@ def test_position_scale_narrows_limits_about_their_middle(tmp_path):
 
 def test_skeleton_of_the_heavy_object_is_shoulder_elbow_wrist_object():
     robot = load_robot(HEAVY)
-    assert robot.skeleton == ((1, 3), (3, 5), (5, 7))
+    assert robot.capsule_axes == ((1, 3), (3, 5), (5, 7))
     model, data = robot.model, robot.model.createData()
     pin.framesForwardKinematics(model, data, np.linspace(-1, 1, 7))
     points = [*(data.oMi[i].translation for i in range(1, 8)), data.oMf[model.getFrameId(robot.tip)].translation]
-    lengths = [np.linalg.norm(points[b] - points[a]) for a, b in robot.skeleton]
+    lengths = [np.linalg.norm(points[b] - points[a]) for a, b in robot.capsule_axes]
     np.testing.assert_allclose(lengths, [0.42, 0.4, 0.251], atol=1e-12)
 
 
 def test_skeleton_ends_at_the_tip_where_joint_7_is_locked():
     robot = load_robot(AIRHOCKEY)
-    assert robot.skeleton == ((1, 3), (3, 5), (5, 6))
+    assert robot.capsule_axes == ((1, 3), (3, 5), (5, 6))
     assert robot.n == 6
 
 
@@ -83,7 +83,7 @@ def test_locked_joints_in_the_middle_leave_a_bent_skeleton():
     robot = load_robot(changed(HEAVY, joints=joints, base=(0.0,) * 6))
     assert robot.joint_names == joints
     assert robot.chain.joints[3].mass > 0
-    assert robot.skeleton[-1][1] == robot.n
+    assert robot.capsule_axes[-1][1] == robot.n
 
 
 def test_unknown_joint_is_named_with_the_nearest_one():

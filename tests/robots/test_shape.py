@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 
 from cnpgen.errors import RecipeError
-from cnpgen.problems.load import load_problem
-from cnpgen.problems.robot import load_robot
+from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.problem_file import load_problem
 from cnpgen.robots.attached import Attached
 from cnpgen.robots.robot import reduced_model
-from cnpgen.robots.shape import pairs
+from cnpgen.robots.shape import link_pairs as pairs
 from cnpgen.robots.shape import shape as module
 from cnpgen.robots.shape.capsule import covering_capsule
-from cnpgen.robots.shape.files import find_named_file
+from cnpgen.robots.shape.convex_part import PRISM_SIDES, ConvexPart, link_convex_parts
 from cnpgen.robots.shape.hull import coal_hull, hull_corners
 from cnpgen.robots.shape.inline import with_inline_meshes
-from cnpgen.robots.shape.piece import SIDES, Piece, link_pieces
+from cnpgen.robots.shape.mesh_files import find_named_file
 from cnpgen.robots.shape.shape import Shape, load_shape
 from cnpgen.robots.shape.srdf import disabled_pairs, with_disabled_pairs
 from tests.examples.shaped_robot import CLAW, LINKS, PLANNED, WEDGE, urdf, write_crane, write_problem
@@ -73,13 +73,13 @@ def test_addresses_of_files_and_relative_paths_are_read_and_others_refused(tmp_p
 
 def test_pieces_are_what_the_elements_say(tmp_path):
     file = write_crane(tmp_path)
-    pieces = {piece.link: piece for piece in link_pieces(with_inline_meshes(file.read_text(), file))}
+    pieces = {piece.link: piece for piece in link_convex_parts(with_inline_meshes(file.read_text(), file))}
     base, turret, arm = pieces["base"], pieces["turret"], pieces["arm"]
     np.testing.assert_allclose(
         [base.vertices.min(axis=0), base.vertices.max(axis=0)], [[-0.15, -0.15, 0], [0.15, 0.15, 0.1]]
     )
     across = np.linalg.norm(turret.vertices[:, :2], axis=1)
-    np.testing.assert_allclose(across, 0.07 / np.cos(np.pi / SIDES))
+    np.testing.assert_allclose(across, 0.07 / np.cos(np.pi / PRISM_SIDES))
     np.testing.assert_allclose(np.unique(np.round(turret.vertices[:, 2], 12)), [0, 0.2])
     np.testing.assert_allclose(arm.vertices, [[0.05, 0, 0], [0.35, 0, 0]], atol=1e-12)
     assert arm.radius == 0.05
@@ -95,7 +95,15 @@ def test_a_text_with_its_meshes_needs_no_file(tmp_path):
     text = with_inline_meshes(file.read_text(), file)
     shutil.rmtree(tmp_path / "crane")
     assert with_inline_meshes(text, file) is text
-    assert [piece.link for piece in link_pieces(text)] == ["base", "turret", "arm", "fore", "hand", "hand", "claw"]
+    assert [piece.link for piece in link_convex_parts(text)] == [
+        "base",
+        "turret",
+        "arm",
+        "fore",
+        "hand",
+        "hand",
+        "claw",
+    ]
 
 
 def test_capsules_are_no_reason_for_the_parser_to_complain(tmp_path, capfd):
@@ -119,7 +127,7 @@ def test_what_is_no_mesh_is_said_to_be_none(tmp_path):
 
 def test_only_meshes_of_a_bounded_size_are_given_to_their_reader(tmp_path, monkeypatch):
     file = write_crane(tmp_path)
-    monkeypatch.setattr("cnpgen.robots.shape.inline.MOST_MESH_BYTES", 400)
+    monkeypatch.setattr("cnpgen.robots.shape.inline.MAX_MESH_BYTES", 400)
     with pytest.raises(RecipeError, match=r"wedge.stl: has 484 bytes, expected a mesh of at most 400$"):
         with_inline_meshes(file.read_text(), file)
     (tmp_path / "crane" / "secret.txt").write_text("secret")
@@ -136,7 +144,7 @@ def test_only_meshes_of_a_bounded_size_are_given_to_their_reader(tmp_path, monke
 
 def test_a_mesh_too_fine_to_be_worked_with_is_refused(tmp_path, monkeypatch):
     file = write_crane(tmp_path)
-    monkeypatch.setattr("cnpgen.robots.shape.inline.MOST_CORNERS", 5)
+    monkeypatch.setattr("cnpgen.robots.shape.inline.MAX_CORNERS", 5)
     with pytest.raises(RecipeError, match=r"wedge.stl: the mesh's hull has 6 corners, expected at most 5: simplify"):
         with_inline_meshes(file.read_text(), file)
 
@@ -156,7 +164,7 @@ def test_corners_that_a_stranger_wrote_into_a_text_are_those_of_a_body(corners, 
     content = base64.b64encode(np.array(corners, "<f8").tobytes()).decode()
     mesh = f'<geometry><mesh filename="data:application/octet-stream;base64,{content}"/></geometry>'
     with pytest.raises(RecipeError, match="the collision geometry of link 'hand' cannot be read") as caught:
-        link_pieces(urdf({**LINKS, "hand": [mesh], "fore": [], "claw": []}))
+        link_convex_parts(urdf({**LINKS, "hand": [mesh], "fore": [], "claw": []}))
     assert text in str(caught.value)
 
 
@@ -166,14 +174,14 @@ def test_corners_that_a_stranger_wrote_into_a_text_are_those_of_a_body(corners, 
         ('<geometry><box size="0.1 0.1"/></geometry>', "needs 3 numbers as 'size', got '0.1 0.1'"),
         ('<geometry><box size="0.1 0.1 -1"/></geometry>', "lengths must be positive and finite, got -1 m"),
         ('<geometry><sphere radius="big"/></geometry>', "could not convert string to float"),
-        ('<geometry><cone radius="1"/></geometry>', "<cone> is none of box, sphere, cylinder, capsule and mesh"),
+        ('<geometry><cone radius="1"/></geometry>', "<cone> is not a box, sphere, cylinder, capsule or mesh"),
         ('<geometry><sphere radius="1"/></geometry><origin xyz="0 nan 0"/>', "numbers that are not finite"),
         ("<geometry/>", "it has no <geometry>"),
     ],
 )
 def test_what_cannot_be_read_is_named_with_its_link(element, text):
     with pytest.raises(RecipeError, match="the collision geometry of link 'hand' cannot be read") as caught:
-        link_pieces(urdf({**LINKS, "hand": [element], "fore": [], "claw": []}))
+        link_convex_parts(urdf({**LINKS, "hand": [element], "fore": [], "claw": []}))
     assert text in str(caught.value)
 
 
@@ -198,7 +206,7 @@ def inside(points: np.ndarray, capsule: module.Capsule) -> np.ndarray:
 def test_capsules_hold_every_point_of_their_links(shape):
     random = np.random.default_rng(1)
     by_link = {capsule.link: capsule for capsule in shape.capsules}
-    for piece in shape.pieces:
+    for piece in shape.convex_parts:
         shares = random.dirichlet(np.full(len(piece.vertices), 0.2), 500)
         within = np.concatenate([shares @ piece.vertices, piece.vertices])
         assert (inside(within, by_link[piece.link]) >= piece.radius - 1e-12).all(), piece.link
@@ -211,7 +219,7 @@ def test_the_overhang_is_how_far_a_capsule_sticks_out_of_the_hull(shape):
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     point, place, request = coal.Sphere(0.0), coal.Transform3s(), coal.DistanceRequest()
     for capsule in (each for each in shape.capsules if each.link in ("base", "turret", "fore", "claw")):
-        (piece,) = (each for each in shape.pieces if each.link == capsule.link)
+        (piece,) = (each for each in shape.convex_parts if each.link == capsule.link)
         hull, out = coal_hull(piece.vertices), []
         for end in (capsule.first, capsule.second):
             for surface in end + capsule.radius * normals:
@@ -227,15 +235,15 @@ def test_a_link_that_is_a_capsule_is_covered_by_itself(shape):
 
 
 def test_the_search_finds_less_overhang_than_the_best_start(monkeypatch):
-    long_box = Piece("box", np.array([[x, y, z] for x in (0, 0.4) for y in (0, 0.1) for z in (0, 0.14)]))
+    long_box = ConvexPart("box", np.array([[x, y, z] for x in (0, 0.4) for y in (0, 0.1) for z in (0, 0.14)]))
     found = covering_capsule([long_box]).overhang
-    monkeypatch.setattr("cnpgen.robots.shape.capsule.STARTS", 0)
+    monkeypatch.setattr("cnpgen.robots.shape.capsule.SEARCH_DIRECTIONS", 0)
     assert found < 0.95 * covering_capsule([long_box]).overhang
 
 
 @pytest.mark.slow
 def test_capsules_and_pairs_are_kept_and_what_was_damaged_is_found_again(tmp_path, monkeypatch, shape):
-    monkeypatch.setattr(pairs, "SAMPLES", 300)
+    monkeypatch.setattr(pairs, "SAMPLED_STATES", 300)
     file = write_crane(tmp_path)
     again = load(file, tmp_path / "kept")
     assert [c.radius for c in again.capsules] == [c.radius for c in shape.capsules]
@@ -257,7 +265,7 @@ def test_capsules_and_pairs_are_kept_and_what_was_damaged_is_found_again(tmp_pat
 
 
 def test_nothing_is_kept_where_others_may_write(tmp_path, monkeypatch):
-    monkeypatch.setattr(pairs, "SAMPLES", 300)
+    monkeypatch.setattr(pairs, "SAMPLED_STATES", 300)
     problem = load_problem(write_problem(tmp_path))
     for mode, count in ((0o700, 1), (0o777, 0)):
         cache = tmp_path / f"cache-{mode}"

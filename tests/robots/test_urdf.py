@@ -9,12 +9,12 @@ import pinocchio as pin
 import pytest
 
 from cnpgen.errors import RecipeError
-from cnpgen.problems.load import load_problem
+from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.record import open_problem, record_problem
-from cnpgen.problems.robot import load_robot
-from cnpgen.robots.urdf import MOST_BYTES, MOST_DEPTH, read_urdf, urdf_tree
-from cnpgen.world.state import World
+from cnpgen.problems.problem_file import load_problem
+from cnpgen.problems.problem_record import open_problem, record_problem
+from cnpgen.robots.urdf import MAX_DEPTH, MAX_URDF_BYTES, read_urdf, urdf_tree
+from cnpgen.world.world import World
 
 SHIPPED = load_problem("heavy-object")
 LIMIT = '<limit lower="-1" upper="1" velocity="1" effort="1"/>'
@@ -55,7 +55,7 @@ def chain(count: int, kind: str = "fixed") -> str:
     ("urdf", "message"),
     [
         (chain(5000), "it has 5,001 links, expected at most 1,000"),
-        ("<robot>" + "<x>" * 10_000 + "</x>" * 10_000 + "</robot>", f"more than {MOST_DEPTH} elements in one another"),
+        ("<robot>" + "<x>" * 10_000 + "</x>" * 10_000 + "</robot>", f"more than {MAX_DEPTH} nested elements"),
         ('<!DOCTYPE robot [<!ENTITY a "aaaa">]><robot name="&a;"/>', "it has a document type"),
         (shipped_with(("robot name=", "robot name=")).replace("<robot ", "<robot title='Grün' ", 1).encode("latin-1"),
          r"line \d+: not UTF-8: byte 0xfc; save the URDF as UTF-8"),
@@ -83,7 +83,7 @@ def test_so_it_is_in_the_record_of_a_problem() -> None:
 def test_a_file_that_is_too_large_is_not_read(tmp_path: Path) -> None:
     path = problem_with(tmp_path, "")
     with (tmp_path / "robot.urdf").open("wb") as file:
-        file.truncate(MOST_BYTES + 1)
+        file.truncate(MAX_URDF_BYTES + 1)
     with pytest.raises(RecipeError, match="has 8,388,609 bytes, expected a URDF of at most 8,388,608"):
         load(path)
 
@@ -130,7 +130,7 @@ def test_a_link_may_have_the_name_of_its_joint(tmp_path: Path) -> None:
     for world in worlds:
         world.set_state(q, q, q, np.zeros(2))
     np.testing.assert_array_equal(worlds[0].tip_position, worlds[1].tip_position)
-    assert usual.skeleton == robot.skeleton
+    assert usual.capsule_axes == robot.capsule_axes
 
 
 def test_a_link_may_have_the_name_of_any_joint(tmp_path: Path) -> None:
@@ -146,11 +146,11 @@ def test_a_link_may_have_the_name_of_any_joint(tmp_path: Path) -> None:
             text = urdf.replace(f'<joint name="{joint}"', f'<joint name="{link}"', 1)
             problem = replace(shipped, path=problem_with(tmp_path, text), robot=there)
             robot = load_robot(problem)
-            assert robot.skeleton == usual.skeleton
+            assert robot.capsule_axes == usual.capsule_axes
             np.testing.assert_array_equal(robot.chain.tip_translation, usual.chain.tip_translation)
 
 
 def test_a_tree_as_deep_as_robots_are_is_read() -> None:
-    inside = "<x>" * (MOST_DEPTH - 1) + "</x>" * (MOST_DEPTH - 1)
+    inside = "<x>" * (MAX_DEPTH - 1) + "</x>" * (MAX_DEPTH - 1)
     assert urdf_tree(f"<robot>{inside}</robot>").tag == "robot"
     assert pin.buildModelFromXML(chain(1000 - 1)).nframes == 2 * 999 + 2

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from cnpgen.errors import RecipeError, UsageError
-from cnpgen.make.blueprint import draw_up
 from cnpgen.make.dataset import make_dataset
-from cnpgen.make.load import as_dataset_recipe
 from cnpgen.make.recipe import DatasetRecipe
-from cnpgen.pipelines.load import load_pipeline
+from cnpgen.make.recipe_file import as_dataset_recipe
+from cnpgen.make.resolve_spec import draw_up
+from cnpgen.pipelines.pipeline_file import load_pipeline
 from cnpgen.schema.arguments import flag, integer, number, numbers
 from cnpgen.store.workspace import find_workspace
-from cnpgen.validate.dataset import validate_dataset
+from cnpgen.validate.validate_dataset import validate_dataset
 from tests.conftest import tiny_recipe
 from tests.examples.tiny_datasets import make_tiny
 
@@ -115,7 +115,7 @@ def test_a_wrong_type_is_a_usage_error_that_names_the_argument_and_touches_nothi
 def test_whole_numbers_of_numpy_make_the_blueprint_of_python_s(tmp_path: Path) -> None:
     recipe, place = tiny_recipe("airhockey-hit"), find_workspace(tmp_path)
     jobs = [draw_up(recipe, place, n=kind(50), seed=kind(3), shard_size=kind(20)) for kind in (int, np.int64)]
-    assert jobs[0].blueprint.fingerprint == jobs[1].blueprint.fingerprint
+    assert jobs[0].spec.fingerprint == jobs[1].spec.fingerprint
 
 
 @pytest.mark.parametrize("out", [3, b"folder", "", "  "])
@@ -148,7 +148,7 @@ def test_splits_that_no_file_could_have_are_refused(tmp_path: Path, splits: Any,
 
 @pytest.mark.parametrize("regenerate", [1.5, "1", True, -1])
 def test_the_number_of_blocks_to_make_again_is_an_integer(tmp_path: Path, regenerate: Any) -> None:
-    (tmp_path / "plan.json").write_text('{"format": "cnpgen-plan"}')
+    (tmp_path / "specification.json").write_text('{"format": "cnpgen-plan"}')
     with pytest.raises(UsageError, match="regenerate must be an integer from 0 on, got "):
         validate_dataset(tmp_path, regenerate=regenerate)
 

@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 
 from cnpgen.errors import RecipeError
-from cnpgen.make.load import load_dataset_recipe
 from cnpgen.make.recipe import recipe_digest
-from cnpgen.pipelines.load import load_pipeline
+from cnpgen.make.recipe_file import load_dataset_recipe
+from cnpgen.pipelines.pipeline_file import load_pipeline
 from cnpgen.problems.constraints.constraint import Constraint
-from cnpgen.problems.load import load_problem
 from cnpgen.problems.problem import resolved
+from cnpgen.problems.problem_file import load_problem
 from cnpgen.schema import catalogue, registry
 from cnpgen.schema.catalogue import list_recipes, recipes_root
 from cnpgen.schema.keys import Range, field

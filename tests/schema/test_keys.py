@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from cnpgen.schema.keys import Place, Range, field, keys, to_dict
+from cnpgen.schema.keys import Range, RecipeLocation, field, keys, to_dict
 from cnpgen.schema.parsing import parse
 
 
@@ -45,7 +45,7 @@ class Cart:
 
 def read(text: str) -> tuple[Cart | None, list[str]]:
     mistakes: list[str] = []
-    return parse(Cart, tomllib.loads(text), where=Place("cart.toml"), mistakes=mistakes), mistakes
+    return parse(Cart, tomllib.loads(text), where=RecipeLocation("cart.toml"), mistakes=mistakes), mistakes
 
 
 def mistakes_of(text: str) -> list[str]:
@@ -208,7 +208,7 @@ def test_a_string_must_match_its_pattern():
 
 def test_what_is_not_a_table_is_a_mistake():
     mistakes: list[str] = []
-    assert parse(Cart, 3, where=Place("cart.toml"), mistakes=mistakes) is None
+    assert parse(Cart, 3, where=RecipeLocation("cart.toml"), mistakes=mistakes) is None
     assert mistakes == ["cart.toml: expected a table, got 3"]
 
 
@@ -222,8 +222,8 @@ def test_a_value_error_of_the_constructor_is_a_mistake():
                 raise ValueError(f"{self.even} is odd")
 
     mistakes: list[str] = []
-    assert parse(Picky, {"even": 2}, where=Place("f"), mistakes=mistakes) == Picky(2)
-    assert parse(Picky, {"even": 3}, where=Place("f"), mistakes=mistakes) is None
+    assert parse(Picky, {"even": 2}, where=RecipeLocation("f"), mistakes=mistakes) == Picky(2)
+    assert parse(Picky, {"even": 3}, where=RecipeLocation("f"), mistakes=mistakes) is None
     assert mistakes == ["f: 3 is odd"]
 
 
@@ -247,29 +247,29 @@ def test_a_type_that_recipes_cannot_hold_is_a_mistake():
         when: complex = field("a complex number")
 
     mistakes: list[str] = []
-    assert parse(Odd, {"when": 2}, where=Place("f"), mistakes=mistakes) is None
+    assert parse(Odd, {"when": 2}, where=RecipeLocation("f"), mistakes=mistakes) is None
     assert "not one that a recipe can hold" in mistakes[0]
 
 
 def test_a_reader_replaces_the_table_of_a_type():
     def by_size(value, where, mistakes):
         if value != "big":
-            mistakes.append(where.says("no such size"))
+            mistakes.append(where.message("no such size"))
             return None
         return Wheel(radius=1.0)
 
     mistakes: list[str] = []
     table = {"name": "cart", "front": "big", "wheel": ["big", "small"]}
-    assert parse(Cart, table, where=Place("f"), mistakes=mistakes, readers={Wheel: by_size}) is None
+    assert parse(Cart, table, where=RecipeLocation("f"), mistakes=mistakes, readers={Wheel: by_size}) is None
     assert mistakes == ["f: wheel 2: no such size"]
     table["wheel"] = ["big"]
-    cart = parse(Cart, table, where=Place("f"), mistakes=[], readers={Wheel: by_size})
+    cart = parse(Cart, table, where=RecipeLocation("f"), mistakes=[], readers={Wheel: by_size})
     assert cart is not None
     assert (cart.front, cart.wheel) == (Wheel(radius=1.0), (Wheel(radius=1.0),))
 
 
 def test_earlier_mistakes_do_not_spoil_a_correct_table():
-    assert parse(Wheel, {"radius": 0.5}, where=Place("f"), mistakes=["something else"]) == Wheel(radius=0.5)
+    assert parse(Wheel, {"radius": 0.5}, where=RecipeLocation("f"), mistakes=["something else"]) == Wheel(radius=0.5)
 
 
 def test_keys_lists_what_a_table_may_hold():
@@ -299,7 +299,7 @@ def test_to_dict_is_plain_json_and_reads_back_as_the_same_object():
     assert json.loads(json.dumps(plain)) == plain
     assert plain["stops"] == [[0.0, 0.1], [1.0, 2.0], [3.0, 3.0]]
     assert "path" not in plain
-    assert parse(Cart, plain, where=Place("f"), mistakes=[]) == cart
+    assert parse(Cart, plain, where=RecipeLocation("f"), mistakes=[]) == cart
 
 
 def test_to_dict_labels_nested_objects():
@@ -309,6 +309,6 @@ def test_to_dict_labels_nested_objects():
 
 
 def test_a_place_names_file_and_key():
-    assert (Place("f") / "robot" / "base").says("x") == "f: robot.base: x"
-    assert (Place("f") / "stage" / 3 / "cone").says("x") == "f: stage 4.cone: x"
-    assert Place("f").says("x") == "f: x"
+    assert (RecipeLocation("f") / "robot" / "base").message("x") == "f: robot.base: x"
+    assert (RecipeLocation("f") / "stage" / 3 / "cone").message("x") == "f: stage 4.cone: x"
+    assert RecipeLocation("f").message("x") == "f: x"

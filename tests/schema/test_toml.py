@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from cnpgen.errors import RecipeError
-from cnpgen.make.load import load_dataset_recipe
-from cnpgen.schema.toml import MOST_BYTES, MOST_PARTS, kind_of_file, read_table
+from cnpgen.make.recipe_file import load_dataset_recipe
+from cnpgen.schema.toml import MAX_KEY_PARTS, MAX_RECIPE_BYTES, kind_of_file, read_table
 
 
 def mistakes_of(path: Path) -> list[str]:
@@ -21,11 +21,11 @@ def mistakes_of(path: Path) -> list[str]:
     ("text", "message"),
     [
         ("name = 1\n" + "a." * 50_000 + "b = 1", "line 2: a key has more than 16 parts"),
-        ('"a" . ' * MOST_PARTS + "b = 1", "line 1: a key has more than 16 parts"),
+        ('"a" . ' * MAX_KEY_PARTS + "b = 1", "line 1: a key has more than 16 parts"),
         ("[" + "a." * 2_000 + "b]", "line 1: a key has more than 16 parts"),
         ("a = {" + "b." * 40 + "c = 1}", "line 1: a key has more than 16 parts"),
         ("a = " + "[" * 5_000, "line 1: not valid TOML"),
-        ("a" * (MOST_BYTES + 1), "has 262,145 bytes, expected a recipe of at most 262,144"),
+        ("a" * (MAX_RECIPE_BYTES + 1), "has 262,145 bytes, expected a recipe of at most 262,144"),
         ("a" * 100_000 + "=" + "b" * 100_000, "not valid TOML"),
         ("a = " + "9" * 5_000, "not valid TOML"),
     ],

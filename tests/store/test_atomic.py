@@ -1,4 +1,4 @@
-"""Atomic files: whole or absent, whatever the disk says."""
+"""Atomic writing: a file is complete or absent, even if the disk fails."""
 
 import errno
 import hashlib
@@ -21,7 +21,7 @@ def failing(code: int) -> Callable[..., None]:
     return fail
 
 
-def test_a_written_file_is_whole_and_nothing_else_is_left(tmp_path: Path) -> None:
+def test_a_written_file_is_complete_and_leaves_no_temporary_file(tmp_path: Path) -> None:
     write_file(tmp_path / "a" / "b.txt", "grün\n")
     write_file(tmp_path / "a" / "b.txt", b"again")
     assert (tmp_path / "a" / "b.txt").read_bytes() == b"again"
@@ -58,13 +58,13 @@ def test_a_failing_disk_is_a_machine_error_that_leaves_the_old_file(
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_full_disk_is_named_with_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_error_for_a_full_disk_has_a_hint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "fsync", failing(errno.ENOSPC))
     with pytest.raises(MachineError, match=r"free some space and try again"):
         write_file(tmp_path / "a", b"new")
 
 
-def test_a_write_that_the_system_cuts_off_leaves_nothing(tmp_path: Path) -> None:
+def test_a_write_that_exceeds_the_file_size_limit_leaves_no_file(tmp_path: Path) -> None:
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     try:
@@ -83,7 +83,7 @@ def test_a_folder_below_a_file_is_a_machine_error(tmp_path: Path) -> None:
         write_file(tmp_path / "file" / "a", b"x")
 
 
-def test_an_interrupted_write_leaves_nothing(tmp_path: Path) -> None:
+def test_an_interrupted_write_leaves_no_file(tmp_path: Path) -> None:
     def interrupted() -> None:
         with committing(tmp_path / "a") as temporary:
             temporary.write_bytes(b"half")

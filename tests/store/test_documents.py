@@ -1,4 +1,4 @@
-"""Sealed JSON: every changed byte is noticed."""
+"""JSON documents with a checksum: every changed byte is detected."""
 
 import json
 import os
@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from cnpgen.errors import DatasetError
+from cnpgen.store.files.document_structure import ANY_KEY, ANYTHING, NUMBER, TEXT, WHOLE, Nullable, check_structure
 from cnpgen.store.files.documents import canonical_sha256, load_document, parse_json, plain, render, save_document
-from cnpgen.store.files.forms import ANYTHING, EVERY, NUMBER, TEXT, WHOLE, Maybe, check_form
-from cnpgen.store.files.limits import DOCUMENT_BYTES, DOCUMENT_DEPTH
+from cnpgen.store.files.size_limits import MAX_DOCUMENT_BYTES, MAX_DOCUMENT_DEPTH
 
 DOCUMENT = {
     "format": "test",
@@ -21,9 +21,9 @@ DOCUMENT = {
 }
 
 
-def test_documents_survive_a_round_trip(tmp_path: Path) -> None:
+def test_documents_round_trip(tmp_path: Path) -> None:
     save_document(tmp_path / "a.json", DOCUMENT)
-    assert load_document(tmp_path / "a.json", "test", version=1, form={}) == json.loads(json.dumps(DOCUMENT))
+    assert load_document(tmp_path / "a.json", "test", version=1, structure={}) == json.loads(json.dumps(DOCUMENT))
 
 
 def test_rendered_json_is_json_with_short_lists_on_one_line() -> None:
@@ -45,7 +45,7 @@ def test_the_canonical_digest_ignores_order_and_nothing_else() -> None:
     assert canonical_sha256({"a": 1}) != canonical_sha256({"a": 1.0})
 
 
-def test_every_flipped_byte_is_noticed(tmp_path: Path) -> None:
+def test_every_flipped_byte_is_detected(tmp_path: Path) -> None:
     path = tmp_path / "a.json"
     save_document(path, DOCUMENT)
     good = path.read_bytes()
@@ -53,47 +53,53 @@ def test_every_flipped_byte_is_noticed(tmp_path: Path) -> None:
         for mask in (0x01, 0x20, 0x80):
             path.write_bytes(good[:position] + bytes([good[position] ^ mask]) + good[position + 1 :])
             with pytest.raises(DatasetError, match=r"a\.json"):
-                load_document(path, "test", version=1, form={})
+                load_document(path, "test", version=1, structure={})
     path.write_bytes(good.replace(b" ", b"\t", 1))
     with pytest.raises(DatasetError, match="changed after it was written"):
-        load_document(path, "test", version=1, form={})
+        load_document(path, "test", version=1, structure={})
 
 
-def test_every_truncation_is_noticed(tmp_path: Path) -> None:
+def test_every_truncation_is_detected(tmp_path: Path) -> None:
     path = tmp_path / "a.json"
     save_document(path, DOCUMENT)
     good = path.read_bytes()
     for length in range(len(good)):
         path.write_bytes(good[:length])
         with pytest.raises(DatasetError, match="damaged"):
-            load_document(path, "test", version=1, form={})
+            load_document(path, "test", version=1, structure={})
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
-    [({"format": "other"}, "not a test file"), ({"format_version": 2}, "upgrade cnpgen")],
+    [
+        ({"format": "other"}, "not a test file"),
+        ({"format_version": 2}, "has format version 2, this cnpgen reads version 1: upgrade cnpgen"),
+        ({"format_version": 0}, "has format version 0, this cnpgen reads version 1: make it again"),
+    ],
 )
-def test_other_and_newer_formats_are_refused_by_name(tmp_path: Path, change: dict[str, object], message: str) -> None:
+def test_other_formats_and_versions_are_refused_and_named(
+    tmp_path: Path, change: dict[str, object], message: str
+) -> None:
     save_document(tmp_path / "a.json", {**DOCUMENT, **change})
     with pytest.raises(DatasetError, match=message):
-        load_document(tmp_path / "a.json", "test", version=1, form={})
+        load_document(tmp_path / "a.json", "test", version=1, structure={})
 
 
 def test_missing_and_foreign_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="missing"):
-        load_document(tmp_path / "a.json", "test", version=1, form={})
+        load_document(tmp_path / "a.json", "test", version=1, structure={})
     (tmp_path / "a.json").write_text("[1]")
     with pytest.raises(DatasetError, match="JSON object"):
-        load_document(tmp_path / "a.json", "test", version=1, form={})
+        load_document(tmp_path / "a.json", "test", version=1, structure={})
 
 
 @pytest.mark.parametrize(
-    ("form", "message"),
+    ("structure", "message"),
     [
         ({"absent": TEXT}, r"a\.json is damaged: absent is missing"),
         ({"nested": {"nothing": TEXT}}, "damaged: nested.nothing must be a text, got None"),
         (
-            {"nested": {EVERY: ANYTHING}, "text": WHOLE},
+            {"nested": {ANY_KEY: ANYTHING}, "text": WHOLE},
             "damaged: text must be a whole number from 0 to 9223372036854775807",
         ),
         ({"floats": [WHOLE]}, r"damaged: floats\[0\] must be a whole number from 0 to \d+, got 0.1"),
@@ -102,62 +108,64 @@ def test_missing_and_foreign_files_are_refused(tmp_path: Path) -> None:
         ({"nested": {"yes": NUMBER}}, "damaged: nested.yes must be a number, got True"),
         ({"nested": [TEXT]}, "damaged: nested must be a list, got a table"),
         ({"text": {"a": TEXT}}, "damaged: text must be a table, got 'a"),
-        ({"nested": {EVERY: Maybe(TEXT)}}, "damaged: nested.empty must be a text, got a table"),
+        ({"nested": {ANY_KEY: Nullable(TEXT)}}, "damaged: nested.empty must be a text, got a table"),
         ({"format_version": TEXT}, "format_version must be a text, got 1"),
     ],
 )
-def test_a_document_of_another_form_is_damaged_where_it_differs(tmp_path: Path, form: object, message: str) -> None:
+def test_a_document_with_another_structure_is_refused_and_the_key_is_named(
+    tmp_path: Path, structure: object, message: str
+) -> None:
     save_document(tmp_path / "a.json", DOCUMENT)
     with pytest.raises(DatasetError, match=message):
-        load_document(tmp_path / "a.json", "test", version=1, form=form)
+        load_document(tmp_path / "a.json", "test", version=1, structure=structure)
 
 
-def test_a_document_of_the_form_is_read() -> None:
-    form = {"floats": [NUMBER], "nested": {"table": [[WHOLE]], "nothing": Maybe(TEXT), "list": [TEXT]}, "text": TEXT}
-    check_form(json.loads(json.dumps(DOCUMENT)), form)
-    check_form({"a": "inf", "b": -1, "c": 1e300}, {EVERY: NUMBER})
+def test_a_document_with_the_expected_structure_is_accepted() -> None:
+    nested = {"table": [[WHOLE]], "nothing": Nullable(TEXT), "list": [TEXT]}
+    check_structure(json.loads(json.dumps(DOCUMENT)), {"floats": [NUMBER], "nested": nested, "text": TEXT})
+    check_structure({"a": "inf", "b": -1, "c": 1e300}, {ANY_KEY: NUMBER})
     for wrong in (-1, 2**63, 1.0, "1", None, True):
         with pytest.raises(ValueError, match=r"^a must be a whole number"):
-            check_form({"a": wrong}, {"a": WHOLE})
+            check_structure({"a": wrong}, {"a": WHOLE})
     with pytest.raises(ValueError, match=r"^a must be a number, got -1000"):
-        check_form({"a": -(10**400)}, {"a": NUMBER})
+        check_structure({"a": -(10**400)}, {"a": NUMBER})
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("[" * 200_000, "tables and lists in one another"),
-        ("[" * 200_000 + "]" * 200_000, "tables and lists in one another"),
-        ("[" * (DOCUMENT_DEPTH + 1) + "]" * (DOCUMENT_DEPTH + 1), "tables and lists in one another"),
-        ('{"a":' * 100 + "1" + "}" * 100, "tables and lists in one another"),
+        ("[" * 200_000, "nested tables and lists"),
+        ("[" * 200_000 + "]" * 200_000, "nested tables and lists"),
+        ("[" * (MAX_DOCUMENT_DEPTH + 1) + "]" * (MAX_DOCUMENT_DEPTH + 1), "nested tables and lists"),
+        ('{"a":' * 100 + "1" + "}" * 100, "nested tables and lists"),
         (r'{"a": "\ud800"}', "surrogates not allowed"),
         ("9" * 5000, "4300 digits"),
     ],
-    ids=["open", "closed", "one too deep", "tables", "half a character", "digits"],
+    ids=["open", "closed", "one too deep", "tables", "single surrogate", "digits"],
 )
-def test_json_that_no_document_has_is_refused(tmp_path: Path, text: str, message: str) -> None:
+def test_invalid_json_is_refused(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         parse_json(text)
     (tmp_path / "a.json").write_text(text)
     with pytest.raises(DatasetError, match=r"a\.json is damaged: not JSON"):
-        load_document(tmp_path / "a.json", "test", version=1, form={})
+        load_document(tmp_path / "a.json", "test", version=1, structure={})
 
 
-def test_json_as_deep_as_documents_may_be_is_read() -> None:
-    assert parse_json("[" * DOCUMENT_DEPTH + "]" * DOCUMENT_DEPTH)[0]
+def test_json_of_the_maximum_depth_is_read() -> None:
+    assert parse_json("[" * MAX_DOCUMENT_DEPTH + "]" * MAX_DOCUMENT_DEPTH)[0]
     assert parse_json(r'"\ud83d\ude00"') == "\U0001f600"
     assert parse_json("3") == 3
 
 
 def test_a_document_that_is_too_large_is_not_read(tmp_path: Path) -> None:
     with (tmp_path / "a.json").open("wb") as file:
-        file.truncate(DOCUMENT_BYTES + 1)
+        file.truncate(MAX_DOCUMENT_BYTES + 1)
     with pytest.raises(DatasetError, match=r"a\.json has 33,554,433 bytes, expected at most 33,554,432"):
-        load_document(tmp_path / "a.json", "test", version=1, form={})
+        load_document(tmp_path / "a.json", "test", version=1, structure={})
 
 
-def test_a_device_is_not_read_and_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+def test_devices_and_pipes_are_refused_without_blocking(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "a.json")
     for path in (Path("/dev/zero"), tmp_path / "a.json"):
         with pytest.raises(DatasetError, match="is not a file"):
-            load_document(path, "test", version=1, form={})
+            load_document(path, "test", version=1, structure={})

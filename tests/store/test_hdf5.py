@@ -1,4 +1,4 @@
-"""The door for HDF5: plain numbers that are in the file itself come through, everything else is refused by name."""
+"""The entry point for HDF5: plain numbers in the file itself are read, everything else is refused and named."""
 
 import ast
 import os
@@ -13,14 +13,14 @@ import pytest
 import cnpgen
 from cnpgen.errors import DatasetError
 from cnpgen.plans import load_plans
+from cnpgen.store.files.checksum_file import HEADER_BYTES, read_with_checksum, with_checksum
 from cnpgen.store.files.hdf5 import opened_hdf5
-from cnpgen.store.files.limits import ALWAYS, EXPANSION
-from cnpgen.store.files.sealed import BLOCK, read_sealed, under_seal
+from cnpgen.store.files.size_limits import MAX_EXPANSION, MIN_EXPANSION_LIMIT_BYTES
 from cnpgen.store.shard import read_placements, read_shard
 from tests.plans.test_plans import write_minimal
 
 Change = Callable[[Any, Path], None]
-SECRET = "the private key of somebody"
+SECRET = "the private key of a user"
 
 
 def outside(file: Any, folder: Path) -> None:
@@ -98,7 +98,7 @@ REFUSED: dict[str, tuple[Change, str]] = {
     "tables": (compound, "note must hold numbers, got"),
     "too many dimensions": (many_dimensions, "note must have at most 4 dimensions"),
     "no space": (nothing, "note must have at most 4 dimensions, got None"),
-    "numbers that nobody has written": (never_written, r"note declares the shape \(1000000000000,\)"),
+    "numbers that were not written": (never_written, r"note declares the shape \(1000000000000,\)"),
     "much out of little": (packed, "note declares the shape .* more than 100 times as many"),
     "chunks that are larger than what they hold": (large_chunks, "note declares the shape"),
     "another filter": (scaled, r"note is packed with filter \[6\], expected gzip, shuffle"),
@@ -106,7 +106,7 @@ REFUSED: dict[str, tuple[Change, str]] = {
 
 
 @pytest.mark.parametrize("what", REFUSED)
-def test_what_is_not_plainly_in_the_file_is_refused_by_name(tmp_path: Path, what: str) -> None:
+def test_datasets_that_are_not_plain_are_refused_and_named(tmp_path: Path, what: str) -> None:
     change, message = REFUSED[what]
     path = write_minimal(tmp_path / "theirs.h5")
     with h5py.File(path, "a") as file:
@@ -117,18 +117,18 @@ def test_what_is_not_plainly_in_the_file_is_refused_by_name(tmp_path: Path, what
 
 
 @pytest.mark.parametrize("what", REFUSED)
-def test_so_it_is_under_a_seal(tmp_path: Path, what: str) -> None:
+def test_datasets_that_are_not_plain_are_refused_in_files_with_a_checksum(tmp_path: Path, what: str) -> None:
     change, message = REFUSED[what]
     path = tmp_path / "model.h5"
-    with h5py.File(path, "w", userblock_size=BLOCK) as file:
+    with h5py.File(path, "w", userblock_size=HEADER_BYTES) as file:
         file["start_q"] = np.zeros((3, 6))
         change(file, tmp_path)
-    path.write_bytes(under_seal(path.read_bytes(), kind="cnpgen-model", version=1))
+    path.write_bytes(with_checksum(path.read_bytes(), kind="cnpgen-model", version=1))
     with pytest.raises(DatasetError, match=rf"model\.h5.*{message}"):
-        read_sealed(path, kind="cnpgen-model", version=1)
+        read_with_checksum(path, kind="cnpgen-model", version=1)
 
 
-def test_what_is_not_asked_for_does_not_matter(tmp_path: Path) -> None:
+def test_datasets_that_are_not_read_are_not_checked(tmp_path: Path) -> None:
     path = write_minimal(tmp_path / "theirs.h5")
     with h5py.File(path, "a") as file:
         outside(file, tmp_path)
@@ -144,7 +144,7 @@ def test_what_is_not_asked_for_does_not_matter(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "how", [{"compression": "gzip"}, {"compression": "lzf"}, {"shuffle": True, "fletcher32": True}, {"chunks": (1, 2)}]
 )
-def test_packed_numbers_are_read(tmp_path: Path, how: dict[str, Any]) -> None:
+def test_compressed_datasets_are_read(tmp_path: Path, how: dict[str, Any]) -> None:
     path = write_minimal(tmp_path / "theirs.h5")
     values = np.arange(12.0).reshape(3, 4)
     with h5py.File(path, "a") as file:
@@ -152,13 +152,13 @@ def test_packed_numbers_are_read(tmp_path: Path, how: dict[str, Any]) -> None:
     assert load_plans(path).columns["note"].tolist() == values.tolist()
 
 
-def test_datasets_are_counted_together(tmp_path: Path) -> None:
+def test_the_size_limit_applies_to_all_datasets_together(tmp_path: Path) -> None:
     path = tmp_path / "many.h5"
-    each = ALWAYS // 8 // 4 + 1
+    each = MIN_EXPANSION_LIMIT_BYTES // 8 // 4 + 1
     with h5py.File(path, "w") as file:
         for index in range(4):
             file.create_dataset(f"note{index}", shape=(each,), dtype="f8")
-    assert EXPANSION * path.stat().st_size < ALWAYS
+    assert MAX_EXPANSION * path.stat().st_size < MIN_EXPANSION_LIMIT_BYTES
     with opened_hdf5(path) as file:
         assert len({name: file[name] for name in ("note0", "note1", "note2")}) == 3
         with pytest.raises(DatasetError, match="note3 declares"):
@@ -170,7 +170,7 @@ def test_datasets_are_counted_together(tmp_path: Path) -> None:
     [["a", "b"], h5py.Empty("f8"), np.zeros(2, [("a", "f8")]), np.array([True])],
     ids=["texts", "nothing", "a table", "yes or no"],
 )
-def test_an_attribute_is_a_text_or_numbers(tmp_path: Path, value: Any) -> None:
+def test_attributes_other_than_texts_and_numbers_are_refused(tmp_path: Path, value: Any) -> None:
     path = write_minimal(tmp_path / "theirs.h5")
     with h5py.File(path, "a") as file:
         file.attrs["degree"] = value
@@ -178,7 +178,7 @@ def test_an_attribute_is_a_text_or_numbers(tmp_path: Path, value: Any) -> None:
         load_plans(path)
 
 
-def test_a_name_that_is_no_text_is_damage(tmp_path: Path) -> None:
+def test_a_name_that_is_not_utf8_is_damage(tmp_path: Path) -> None:
     path = write_minimal(tmp_path / "theirs.h5")
     with h5py.File(path, "a") as file:
         h5py.h5d.create(file.id, b"\xff", h5py.h5t.NATIVE_DOUBLE, h5py.h5s.create_simple((3,)))
@@ -191,32 +191,32 @@ def test_a_device_is_not_a_file() -> None:
         pass
 
 
-def test_a_file_of_nothing_but_a_size_is_refused_by_it(tmp_path: Path) -> None:
-    """A sparse file takes no room on a disk or in an archive."""
-    theirs, sealed = write_minimal(tmp_path / "theirs.h5"), tmp_path / "sealed.h5"
-    sealed.write_bytes(under_seal(bytes(BLOCK) + theirs.read_bytes(), kind="cnpgen-plans", version=1))
+def test_a_huge_sparse_file_is_refused(tmp_path: Path) -> None:
+    """A sparse file needs no space on a disk or in an archive."""
+    theirs, has_checksum = write_minimal(tmp_path / "theirs.h5"), tmp_path / "with a checksum.h5"
+    has_checksum.write_bytes(with_checksum(bytes(HEADER_BYTES) + theirs.read_bytes(), kind="cnpgen-plans", version=1))
     for path, read in (
         (theirs, load_plans),
-        (sealed, load_plans),
-        (sealed, lambda path: read_sealed(path, kind="cnpgen-model", version=1)),
+        (has_checksum, load_plans),
+        (has_checksum, lambda path: read_with_checksum(path, kind="cnpgen-model", version=1)),
     ):
         os.truncate(path, 1 << 40)
         with pytest.raises(DatasetError, match=r"has 1,099,511,627,776 bytes, expected at most"):
             read(path)
 
 
-def test_texts_far_into_a_file_are_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_heaps_at_the_end_of_a_file_are_checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_minimal(tmp_path / "theirs.h5", attributes={"note": "x" * 300})
     content = bytearray(path.read_bytes())
     content[content.index(b"GCOL\x01\0\0\0") + 9] ^= 0x20
     path.write_bytes(content)
-    monkeypatch.setattr("cnpgen.store.files.heaps._PART", 7)
+    monkeypatch.setattr("cnpgen.store.files.heaps._CHUNK_WORDS", 7)
     with pytest.raises(DatasetError, match="its texts at byte"), opened_hdf5(path):
         pass
 
 
 def test_nothing_else_in_the_package_opens_hdf5() -> None:
-    """Files are made in memory by what ``create_hdf5`` returns; only the door reads."""
+    """Files are made in memory by what ``create_hdf5`` returns; only the entry point reads."""
     package = Path(cnpgen.__file__).parent
     opened = []
     texts = {path: path.read_text(encoding="utf-8") for path in package.rglob("*.py")}
@@ -228,7 +228,7 @@ def test_nothing_else_in_the_package_opens_hdf5() -> None:
                 opened.append((path.relative_to(package).as_posix(), node.lineno))
             if isinstance(node, ast.ImportFrom) and node.module == "h5py":
                 assert not {alias.name for alias in node.names} & {"File", "h5f"} or path.name == "hdf5.py"
-    makers = {"store/files/sealed.py", "store/shard.py", "plans/save.py"}
+    makers = {"store/files/checksum_file.py", "store/shard.py", "plans/save.py"}
     assert {name for name, _ in opened} == makers | {"store/files/hdf5.py"}
     for name, line in opened:
         read = texts[package / name].splitlines()[line - 1]

@@ -1,4 +1,4 @@
-"""Damaged texts of variable length: an error, where HDF5 itself would never come back."""
+"""Damaged variable-length texts: an error instead of a hang of HDF5."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from tests.plans.test_plans import write_minimal
 
 @pytest.fixture
 def file(tmp_path: Path) -> tuple[Path, int]:
-    """A file as trainers write it, and where its global heap begins."""
+    """A file with text attributes, and the position of its global heap."""
     path = write_minimal(tmp_path / "theirs.h5", attributes={"note": "x" * 300, "other": "y"})
     return path, path.read_bytes().index(b"GCOL\x01\0\0\0")
 
@@ -25,14 +25,14 @@ def changed(path: Path, at: int, content: bytes) -> None:
     path.write_bytes(data)
 
 
-def test_whole_files_are_read(file: tuple[Path, int]) -> None:
+def test_undamaged_files_are_read(file: tuple[Path, int]) -> None:
     path, _ = file
     check_heaps(path, np.fromfile(path, np.uint8))
     assert len(load_plans(path)) == 3
 
 
 @pytest.mark.parametrize(("offset", "size"), [(9, b"\x20"), (24, b"\x25"), (24, b"\xff" * 8), (8, b"\xff" * 8)])
-def test_a_heap_that_does_not_add_up_is_damage(file: tuple[Path, int], offset: int, size: bytes) -> None:
+def test_a_heap_with_inconsistent_sizes_is_damage(file: tuple[Path, int], offset: int, size: bytes) -> None:
     path, begin = file
     changed(path, begin + offset, size)
     with pytest.raises(DatasetError, match=rf"theirs\.h5 is damaged: its texts at byte {begin} cannot be read"):
@@ -46,13 +46,13 @@ def test_a_heap_that_is_cut_off_is_damage(file: tuple[Path, int]) -> None:
 
 
 def test_numbers_that_look_like_a_heap_are_numbers(tmp_path: Path) -> None:
-    """The signature alone may occur in control points; with a version after it, it is no number that anybody has."""
+    """The signature alone may occur in control points; followed by a version, it is no realistic number."""
     values = np.frombuffer(b"GCOL" + b"\x01\x00\x00\x40", "<f8")
     path = write_minimal(tmp_path / "numbers.h5", loss=np.repeat(values, 3))
     assert load_plans(path).columns["loss"][0] == values[0]
 
 
-def test_an_empty_file_is_no_hdf5_file(tmp_path: Path) -> None:
+def test_an_empty_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "empty.h5").touch()
     with pytest.raises(DatasetError, match="it is empty"), opened_hdf5(tmp_path / "empty.h5"):
         pass

@@ -1,4 +1,4 @@
-"""Hugging Face's ``datasets`` opens a dataset's folder as it is; in the extended run only."""
+"""``datasets`` of Hugging Face opens the folder of a dataset; in the extended run only."""
 
 import warnings
 from pathlib import Path
@@ -9,11 +9,11 @@ import pytest
 from tests.examples.loader import columns, make
 
 with warnings.catch_warnings():
-    warnings.simplefilter("ignore")  # its own imports are not ours to judge
+    warnings.simplefilter("ignore")  # of its imports
     pytest.importorskip("datasets.config")  # "datasets" alone is also a folder of this repository
     import datasets
 
-pytestmark = [pytest.mark.extended, pytest.mark.filterwarnings("ignore")]  # what it warns of is its own
+pytestmark = [pytest.mark.extended, pytest.mark.filterwarnings("ignore")]  # of the library itself
 
 
 @pytest.fixture(autouse=True)

@@ -1,4 +1,4 @@
-"""Inspection: what the blueprint and the sidecars say is what the rows say, of whole and of unfinished datasets."""
+"""Inspection of complete and unfinished datasets: specification and sidecars agree with the rows."""
 
 import builtins
 import dataclasses
@@ -11,10 +11,10 @@ import pytest
 
 from cnpgen.errors import DatasetError, MachineError, UsageError
 from cnpgen.make.dataset import make_dataset
-from cnpgen.store.fates import DensityMap, Fates
+from cnpgen.store.dataset_plot import MIN_CANDIDATES_PER_CELL, plot_dataset
 from cnpgen.store.inspection import inspect_dataset
-from cnpgen.store.plot import ENOUGH, plot_dataset
 from cnpgen.store.reader import open_dataset
+from cnpgen.store.sampling_statistics import DensityMap, SamplingStatistics
 from tests.conftest import some
 
 
@@ -43,7 +43,7 @@ def test_rows_and_state_of_a_complete_dataset(hits):
     assert found.seconds > 0
 
 
-def test_what_is_not_part_of_a_dataset_is_not_counted_in_its_size(hits, tmp_path):
+def test_other_files_in_the_folder_are_not_counted_in_the_size(hits, tmp_path):
     folder = tmp_path / "hits"
     shutil.copytree(hits, folder)
     for name in ("movie.mp4", "train/notes.txt", "_work/.shard-00000.h5.tmp"):
@@ -64,21 +64,21 @@ def test_the_inspection_is_frozen(hits):
         inspect_dataset(hits).bytes = 0
 
 
-def test_the_json_form_has_everything(hits):
+def test_the_json_contains_the_whole_inspection(hits):
     found = inspect_dataset(hits)
     content = json.loads(json.dumps(found.to_dict(), allow_nan=False))
     assert content["complete"] is True
     assert content["rows"]["train"] == {"planned": 182, "stored": 182}
-    assert [item["name"] for item in content["fields"]] == [field.name for field in found.blueprint.fields]
+    assert [item["name"] for item in content["fields"]] == [field.name for field in found.spec.fields]
     assert len(content["fields"][0]["mean"]) == 6
-    assert content["seed"] == str(found.blueprint.seed)
+    assert content["seed"] == str(found.spec.seed)
     assert content["environments"][0]["numpy"] == np.__version__
     density = content["densities"]["goal_xyz"]
-    assert np.sum(density["drawn"]) == content["yield"]["tried"]
+    assert np.sum(density["candidates"]) == content["yield"]["tried"]
     assert np.sum(density["accepted"]) == content["yield"]["accepted"] == 200
 
 
-def test_the_yield_goes_down_to_the_acceptance_in_pipeline_order(hits):
+def test_the_remaining_fraction_decreases_to_the_acceptance_in_pipeline_order(hits):
     found = inspect_dataset(hits).to_dict()["yield"]
     left = [1.0, *(step["left"] for step in found["rejections"])]
     assert left == sorted(left, reverse=True)
@@ -86,7 +86,7 @@ def test_the_yield_goes_down_to_the_acceptance_in_pipeline_order(hits):
     assert found["rejections"][0]["reason"] == "too close together"
 
 
-def test_an_unfinished_dataset_is_inspected_and_says_so(unfinished):
+def test_the_inspection_of_an_unfinished_dataset_reports_its_progress(unfinished):
     found = inspect_dataset(unfinished)
     assert not found.complete
     assert found.state.startswith("unfinished: 1 of 2 shards")
@@ -112,29 +112,31 @@ def test_a_complete_dataset_that_lost_a_shard_is_damaged(hits, tmp_path):
 
 @pytest.mark.parametrize("content", [b"", b"{}", None])
 @pytest.mark.parametrize("name", ["manifest.json", "stats.json"])
-def test_a_document_that_is_not_as_it_was_written_is_damage(hits, tmp_path, name, content):
+def test_a_changed_document_is_reported_as_damage(hits, tmp_path, name, content):
     folder = Path(shutil.copytree(hits, tmp_path / "damaged"))
     written = (folder / name).read_bytes()
     (folder / name).write_bytes(written.replace(b'"train"', b'"trian"') if content is None else content)
     found = inspect_dataset(folder)
     assert not found.complete
     assert found.state.startswith(f"damaged: {name}: ")
-    assert found.state.endswith("; 'cnpgen validate' says more")
+    assert found.state.endswith("; for details run 'cnpgen validate'")
     assert found.to_dict()["damage"][0].startswith(f"{name}: ")
     assert found.rows == {"train": 182, "validation": 18}
 
 
-@pytest.mark.parametrize(("content", "message"), [(None, "plan.json is missing"), (b"{", "plan.json is damaged: ")])
-def test_without_its_blueprint_a_dataset_is_not_inspected_but_still_a_dataset(hits, tmp_path, content, message):
+@pytest.mark.parametrize(
+    ("content", "message"), [(None, "specification.json is missing"), (b"{", "specification.json is damaged: ")]
+)
+def test_a_dataset_without_a_valid_specification_is_refused_with_a_hint(hits, tmp_path, content, message):
     folder = Path(shutil.copytree(hits, tmp_path / "damaged"))
-    (folder / "plan.json").unlink()
+    (folder / "specification.json").unlink()
     if content is not None:
-        (folder / "plan.json").write_bytes(content)
-    with pytest.raises(DatasetError, match=rf"{message}.*; 'cnpgen validate' says what to do"):
+        (folder / "specification.json").write_bytes(content)
+    with pytest.raises(DatasetError, match=rf"{message}.*; for a remedy run 'cnpgen validate'"):
         inspect_dataset(folder)
 
 
-def test_what_is_no_dataset_is_refused(tmp_path):
+def test_folders_without_a_dataset_are_refused(tmp_path):
     with pytest.raises(UsageError, match="not there"):
         inspect_dataset(tmp_path / "nothing")
     with pytest.raises(DatasetError, match="not a dataset of cnpgen"):
@@ -146,51 +148,55 @@ def test_what_is_no_dataset_is_refused(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("suffix", some(["png", "svg"]))
-def test_a_dataset_is_drawn(hits, tmp_path, suffix):
+def test_a_dataset_is_plotted(hits, tmp_path, suffix):
     plot_dataset(inspect_dataset(hits), tmp_path / f"hits.{suffix}")
     assert (tmp_path / f"hits.{suffix}").stat().st_size > 10_000
 
 
 @pytest.mark.slow
-def test_an_unfinished_dataset_is_drawn(unfinished, tmp_path):
+def test_an_unfinished_dataset_is_plotted(unfinished, tmp_path):
     plot_dataset(inspect_dataset(unfinished), tmp_path / "hits.png")
     assert (tmp_path / "hits.png").exists()
 
 
 @pytest.mark.slow
-def test_a_density_map_over_a_single_point_is_drawn(hits, tmp_path, monkeypatch):
+def test_a_density_map_of_a_single_point_is_plotted(hits, tmp_path, monkeypatch):
     found = inspect_dataset(hits)
     density = DensityMap((0.6, 0.6), (0.0, 0.0), np.zeros((4, 4), np.int64), np.zeros((4, 4), np.int64))
-    monkeypatch.setitem(vars(found.summary), "fates", Fates(tried=0, accepted=0, densities={"start_xyz": density}))
+    monkeypatch.setitem(
+        vars(found.summary), "sampling", SamplingStatistics(tried=0, accepted=0, densities={"start_xyz": density})
+    )
     plot_dataset(found, tmp_path / "point.png")
     assert (tmp_path / "point.png").exists()
 
 
-def test_nothing_to_draw_is_said(unfinished, tmp_path):
+def test_a_dataset_without_rows_cannot_be_plotted(unfinished, tmp_path):
     (unfinished / "train" / "shard-00000.json").unlink()
     with pytest.raises(DatasetError, match="no rows yet"):
         plot_dataset(inspect_dataset(unfinished), tmp_path / "hits.png")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("draws", "cells"), [(200, 2), (2_000, 8), (100_000, 24)])
-def test_cells_of_a_map_hold_enough_draws_to_say_something(draws, cells, hits, tmp_path, monkeypatch):
+@pytest.mark.parametrize(("n_candidates", "cells"), [(200, 2), (2_000, 8), (100_000, 24)])
+def test_cells_of_a_density_map_have_enough_candidates(n_candidates, cells, hits, tmp_path, monkeypatch):
     from matplotlib.figure import Figure
 
     random = np.random.default_rng(0)
-    drawn = np.bincount(random.integers(0, 24 * 24, draws), minlength=24 * 24).reshape(24, 24)
-    accepted = random.binomial(drawn, 0.5)
+    candidates = np.bincount(random.integers(0, 24 * 24, n_candidates), minlength=24 * 24).reshape(24, 24)
+    accepted = random.binomial(candidates, 0.5)
     accepted[:12] = 0  # none of the lower half of x
-    density = DensityMap((0.0, 1.0), (0.0, 1.0), drawn, accepted)
+    density = DensityMap((0.0, 1.0), (0.0, 1.0), candidates, accepted)
     found = inspect_dataset(hits)
     figures: list[Figure] = []
     monkeypatch.setattr(Figure, "savefig", lambda self, path: figures.append(self))
-    monkeypatch.setitem(vars(found.summary), "fates", Fates(tried=0, accepted=0, densities={"start_xyz": density}))
+    monkeypatch.setitem(
+        vars(found.summary), "sampling", SamplingStatistics(tried=0, accepted=0, densities={"start_xyz": density})
+    )
     plot_dataset(found, tmp_path / "map.png")
     (picture,) = (image for part in figures[0].subfigs for axis in part.axes for image in axis.get_images())
     share = picture.get_array().T
     assert share.shape == (cells, cells)
-    assert draws / cells**2 >= ENOUGH
+    assert n_candidates / cells**2 >= MIN_CANDIDATES_PER_CELL
     np.testing.assert_array_equal(share[: cells // 2].compressed(), 0)
     assert share[cells // 2 :].mean() == pytest.approx(0.5, abs=0.1)
     (legend,) = (legend for part in figures[0].subfigs for legend in part.legends)
@@ -213,6 +219,6 @@ def test_missing_matplotlib_is_a_hint_and_not_a_traceback(hits, tmp_path, monkey
 
 
 @pytest.mark.slow
-def test_a_picture_that_cannot_be_written_is_a_machine_error(hits, tmp_path):
+def test_a_figure_that_cannot_be_written_is_a_machine_error(hits, tmp_path):
     with pytest.raises(MachineError, match="cannot write"):
         plot_dataset(inspect_dataset(hits), tmp_path / "no" / "such" / "folder.png")

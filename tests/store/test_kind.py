@@ -1,4 +1,4 @@
-"""What is given as an HDF5 file and is none says what it seems to be."""
+"""Error messages for files that are not HDF5 files name their apparent kind."""
 
 import gzip
 import io
@@ -16,12 +16,12 @@ from cnpgen.loader.load import load_dataset
 from cnpgen.planner.model_file import load_model
 from cnpgen.plans import load_plans
 from cnpgen.plans.boundary_problems import load_boundary_problems
+from cnpgen.store.files.checksum_file import read_with_checksum
 from cnpgen.store.files.hdf5 import opened_hdf5
-from cnpgen.store.files.kind import seeming
-from cnpgen.store.files.sealed import read_sealed
+from cnpgen.store.files.kind import apparent_kind
 from cnpgen.store.paths import file_kind
 from cnpgen.store.shard import read_shard
-from cnpgen.validate.dataset import validate_dataset
+from cnpgen.validate.validate_dataset import validate_dataset
 
 
 def archive() -> bytes:
@@ -38,7 +38,7 @@ def array() -> bytes:
 
 FILES = {
     "text": (b"start_q, goal_q\n0.1, 0.2\n", ": it seems to be a text file"),
-    "long text": (b"a" + "é".encode() * 1000, ": it seems to be a text file"),  # cut in the middle of a character
+    "long text": (b"a" + "é".encode() * 1000, ": it seems to be a text file"),  # cut within a character
     "npz": (archive(), ": it seems to be a zip archive, as .npz files are"),
     "npy": (array(), ": it seems to be an array of NumPy"),
     "gzip": (gzip.compress(b"1"), ": it seems to be a gzip archive"),
@@ -48,31 +48,31 @@ FILES = {
 }
 
 
-@pytest.mark.parametrize("what", FILES)
-def test_what_is_no_hdf5_file_is_not_called_cut_off(tmp_path: Path, what: str) -> None:
-    content, said = FILES[what]
+@pytest.mark.parametrize("kind", FILES)
+def test_files_of_other_kinds_are_named_by_their_kind(tmp_path: Path, kind: str) -> None:
+    content, apparent = FILES[kind]
     path = tmp_path / "given.h5"
     path.write_bytes(content)
-    assert seeming(path) == said
+    assert apparent_kind(path) == apparent
     with pytest.raises(DatasetError) as caught, opened_hdf5(path):
         pass
-    assert str(caught.value) == f"{path} is not an HDF5 file, or its beginning is damaged{said}"
+    assert str(caught.value) == f"{path} is not an HDF5 file, or its beginning is damaged{apparent}"
 
 
-def test_every_reader_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_reader_names_the_apparent_kind(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "notes.h5"
     path.write_text("mine")
     for read in (load_plans, read_shard):
         with pytest.raises(DatasetError, match=r"notes\.h5 is not an HDF5 file.*: it seems to be a text file$"):
             read(path)
     with pytest.raises(DatasetError, match=r"is not a model of cnpgen, .*: it seems to be a text file$"):
-        read_sealed(path, kind="cnpgen-model", version=1)
+        read_with_checksum(path, kind="cnpgen-model", version=1)
     assert main(["evaluate", str(path)]) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert "is not an HDF5 file" in line
 
 
-def test_an_hdf5_file_that_is_cut_off_is_called_so(tmp_path: Path) -> None:
+def test_a_cut_off_hdf5_file_is_reported_as_cut_off(tmp_path: Path) -> None:
     path = tmp_path / "cut.h5"
     with h5py.File(path, "w") as file:
         file["x"] = np.arange(10_000.0)
@@ -82,22 +82,22 @@ def test_an_hdf5_file_that_is_cut_off_is_called_so(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("read", [load_plans, load_model, load_boundary_problems])
-def test_a_pipe_is_not_waited_for(tmp_path: Path, read: Callable[[Path], object]) -> None:
+def test_pipes_are_refused_without_blocking(tmp_path: Path, read: Callable[[Path], object]) -> None:
     os.mkfifo(tmp_path / "given.h5")
     with pytest.raises(UsageError, match=r"given\.h5 is (a device or a pipe|not there), expected"):
         read(tmp_path / "given.h5")
 
 
-def test_a_folder_with_a_pipe_in_it_is_looked_at(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "plan.json")
+def test_a_pipe_in_place_of_the_specification_is_refused_without_blocking(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "specification.json")
     with pytest.raises(DatasetError, match="is not a dataset of cnpgen"):
         validate_dataset(tmp_path)
-    with pytest.raises(DatasetError, match=r"plan\.json is not a file"):
+    with pytest.raises(DatasetError, match=r"specification\.json is not a file"):
         load_dataset(tmp_path)
 
 
 @pytest.mark.parametrize("block", [0, 512, 2048])
-def test_hdf5_may_begin_with_a_block_of_its_user(tmp_path: Path, block: int) -> None:
+def test_hdf5_files_with_a_user_block_are_recognized(tmp_path: Path, block: int) -> None:
     with h5py.File(tmp_path / "theirs.h5", "w", userblock_size=block) as file:
         file["path_control_points"] = file["rate_control_points"] = np.zeros(3)
     assert file_kind(tmp_path / "theirs.h5") == "a file of plans"

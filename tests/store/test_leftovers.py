@@ -1,4 +1,4 @@
-"""What killed processes leave: swept by their own machine, and left alone by others, whatever their clocks say."""
+"""Temporary files of killed processes: removed by the same machine only, independent of clocks."""
 
 import os
 import subprocess
@@ -9,8 +9,8 @@ import pytest
 
 from cnpgen.store.files import leftovers
 from cnpgen.store.files.atomic import committing
-from cnpgen.store.files.leftovers import sweep, sweep_all, sweep_file, temporary_name
-from cnpgen.validate.dataset import validate_dataset
+from cnpgen.store.files.leftovers import remove_all_temporary, remove_leftovers, remove_leftovers_of, temporary_name
+from cnpgen.validate.validate_dataset import validate_dataset
 from tests.examples.tiny_datasets import digests, make_tiny
 
 DEAD = """
@@ -21,30 +21,30 @@ print(temporary_name(sys.argv[1]), end="")
 
 
 def of_a_dead_process(name: str) -> str:
-    """The name that a process which is no more gave to a temporary file."""
+    """Return the name of a temporary file of a process that has ended."""
     return subprocess.run([sys.executable, "-c", DEAD, name], capture_output=True, text=True, check=True).stdout
 
 
 @pytest.fixture
 def elsewhere(monkeypatch):
-    """Be another machine."""
+    """Simulate another machine."""
     monkeypatch.setattr(leftovers, "_machine", lambda: "0123456789ab")
 
 
-def test_what_dead_processes_of_this_machine_have_left_is_swept_and_nothing_else(tmp_path: Path) -> None:
-    sweep(tmp_path / "nothing")
+def test_only_temporary_files_of_dead_processes_of_this_machine_are_removed(tmp_path: Path) -> None:
+    remove_leftovers(tmp_path / "nothing")
     dead, mine = of_a_dead_process("a.h5"), temporary_name("a.h5")
     kept = [mine, ".a.h5.1.2.tmp", ".x.tmp", "log.txt", dead.removesuffix(".tmp")]
     for name in (dead, *kept):
         (tmp_path / name).touch()
-        os.utime(tmp_path / name, (0, 0))  # of 1970: age does not count
-    sweep(tmp_path)
+        os.utime(tmp_path / name, (0, 0))  # in 1970; the age is no criterion
+    remove_leftovers(tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(kept)
-    sweep_all(tmp_path)
+    remove_all_temporary(tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted([".x.tmp", "log.txt", dead.removesuffix(".tmp")])
 
 
-def test_a_machine_whose_clock_is_hours_ahead_leaves_what_another_one_is_writing(tmp_path, monkeypatch) -> None:
+def test_a_machine_with_a_wrong_clock_does_not_remove_files_of_another_machine(tmp_path, monkeypatch) -> None:
     dead = of_a_dead_process("a.h5")
     with committing(tmp_path / "a.h5", tmp_path / "_work") as temporary:
         temporary.write_bytes(b"half")
@@ -53,17 +53,17 @@ def test_a_machine_whose_clock_is_hours_ahead_leaves_what_another_one_is_writing
             os.utime(tmp_path / "_work" / name, (0, 0))
         with monkeypatch.context() as patch:
             patch.setattr(leftovers, "_machine", lambda: "0123456789ab")
-            sweep(tmp_path / "_work")
-            sweep_file(tmp_path / "_work" / "a.h5")
+            remove_leftovers(tmp_path / "_work")
+            remove_leftovers_of(tmp_path / "_work" / "a.h5")
             assert len(list((tmp_path / "_work").iterdir())) == 2
-        sweep(tmp_path / "_work")
+        remove_leftovers(tmp_path / "_work")
     assert (tmp_path / "a.h5").read_bytes() == b"half"
     assert not list((tmp_path / "_work").iterdir())
 
 
 @pytest.mark.slow
-def test_a_second_machine_on_the_folder_of_a_dataset_does_not_disturb_the_first(tiny, tmp_path, monkeypatch) -> None:
-    """Each time the first one has written a shard, the other one begins its own part of the same dataset."""
+def test_two_machines_work_in_the_same_folder(tiny, tmp_path, monkeypatch) -> None:
+    """After the first machine has written a shard, the second one starts its part of the same dataset."""
     written, replace = [], Path.replace
 
     def renamed(self: Path, target: Path) -> Path:
@@ -83,7 +83,7 @@ def test_a_second_machine_on_the_folder_of_a_dataset_does_not_disturb_the_first(
     assert validate_dataset(tmp_path / "out").ok
 
 
-def test_nothing_is_swept_through_a_symbolic_link(tmp_path: Path) -> None:
+def test_symbolic_links_to_folders_are_not_followed(tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     name = of_a_dead_process("thesis.tex")
     (tmp_path / "mine" / name).write_text("mine")
@@ -93,5 +93,5 @@ def test_nothing_is_swept_through_a_symbolic_link(tmp_path: Path) -> None:
     assert (tmp_path / "mine" / name).read_text() == "mine"
 
 
-def test_a_name_says_machine_and_process(elsewhere) -> None:
+def test_the_name_of_a_temporary_file_contains_machine_and_process(elsewhere) -> None:
     assert temporary_name("a.h5").startswith(f".a.h5.0123456789ab-{os.getpid()}.")

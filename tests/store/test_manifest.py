@@ -14,23 +14,23 @@ import pytest
 
 from cnpgen.errors import DatasetError, MachineError, UsageError
 from cnpgen.store import manifest as manifest_module
-from cnpgen.store.blueprint import shards, write_blueprint
 from cnpgen.store.check import check_dataset
+from cnpgen.store.dataset_spec import shards, write_dataset_spec
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.manifest import finalize, load_manifest
-from cnpgen.store.record import commit_shard
-from tests.examples.store import BLUEPRINT, FIELDS, dataset, make_columns, make_fates, make_shard, make_shards
+from cnpgen.store.shard_record import commit_shard
+from tests.examples.store import FIELDS, SPEC, dataset, make_columns, make_sampling, make_shard, make_shards
 
 __all__ = ["dataset"]
 
 
-def test_the_manifest_says_what_the_dataset_is(dataset: Path) -> None:
+def test_the_manifest_describes_the_dataset(dataset: Path) -> None:
     manifest = load_manifest(dataset)
     assert manifest["name"] == "two-shards"
     assert manifest["pipeline"] == "toy"
-    assert manifest["recipe"] == BLUEPRINT.recipe
-    assert manifest["seed"] == str(BLUEPRINT.seed)
-    assert manifest["plan_fingerprint"] == BLUEPRINT.fingerprint
+    assert manifest["recipe"] == SPEC.recipe
+    assert manifest["seed"] == str(SPEC.seed)
+    assert manifest["specification_fingerprint"] == SPEC.fingerprint
     assert manifest["features"]["start_q"]["shape"] == [3]
     assert manifest["features"]["start_q"]["units"] == "rad"
     assert manifest["features"]["clearance"]["shape"] == []
@@ -39,7 +39,7 @@ def test_the_manifest_says_what_the_dataset_is(dataset: Path) -> None:
     assert manifest["verification"] == {"plane": 2e-9}
     assert manifest["splits"]["train"]["rows"] == 50
     assert manifest["seconds"] == 1.5
-    assert manifest["environments"] == [dict(BLUEPRINT.versions)]
+    assert manifest["environments"] == [dict(SPEC.versions)]
 
 
 def test_the_manifest_lists_every_other_file_with_its_digest(dataset: Path) -> None:
@@ -53,27 +53,27 @@ def test_the_manifest_lists_every_other_file_with_its_digest(dataset: Path) -> N
     assert all(file_sha256(dataset / name) == sha256 for name, sha256 in listed.items())
 
 
-def test_the_fingerprint_is_what_sha256sum_says(dataset: Path) -> None:
+def test_the_fingerprint_equals_the_output_of_sha256sum(dataset: Path) -> None:
     command = "LC_ALL=C; export LC_ALL; sha256sum */shard-*.h5 | sha256sum"
-    said = subprocess.run(command, shell=True, cwd=dataset, capture_output=True, text=True, check=True).stdout
-    assert load_manifest(dataset)["fingerprint"] == said.split()[0]
+    output = subprocess.run(command, shell=True, cwd=dataset, capture_output=True, text=True, check=True).stdout
+    assert load_manifest(dataset)["fingerprint"] == output.split()[0]
 
 
 def test_stats_are_those_of_all_rows_of_a_split(dataset: Path) -> None:
     stats = json.loads((dataset / "stats.json").read_text())
-    rows = np.concatenate([make_columns(task)["start_q"] for task in shards(BLUEPRINT) if task.split == "train"])
+    rows = np.concatenate([make_columns(task)["start_q"] for task in shards(SPEC) if task.split == "train"])
     found = stats["splits"]["train"]["start_q"]
     np.testing.assert_allclose(found["mean"], rows.mean(axis=0), rtol=1e-12)
     np.testing.assert_allclose(found["std"], rows.std(axis=0), rtol=1e-12)
     assert found["count"] == 50
     assert stats["splits"]["train"]["goal_p"]["constant"] == [False, True]
     assert stats["splits"]["validation"]["start_q"]["count"] == 10
-    assert stats["densities"]["train"]["goal"]["drawn"] == [[4] * 3] * 4
+    assert stats["densities"]["train"]["goal"]["candidates"] == [[4] * 3] * 4
 
 
 def test_finishing_twice_gives_the_same_files(dataset: Path) -> None:
     before = {path: path.read_bytes() for path in dataset.rglob("*") if path.is_file()}
-    finalize(dataset, BLUEPRINT, notes="Some notes.")
+    finalize(dataset, SPEC, notes="Some notes.")
     assert {path: path.read_bytes() for path in dataset.rglob("*") if path.is_file()} == before
     assert load_manifest(dataset)["created"] == "2026-11-21T01:02:03Z"
 
@@ -81,42 +81,42 @@ def test_finishing_twice_gives_the_same_files(dataset: Path) -> None:
 @pytest.mark.slow
 def test_finishing_in_several_processes_at_once_gives_a_good_dataset(dataset: Path) -> None:
     with multiprocessing.get_context("spawn").Pool(3) as pool:
-        manifests = pool.starmap(finalize, [(dataset, BLUEPRINT)] * 9)
+        manifests = pool.starmap(finalize, [(dataset, SPEC)] * 9)
     assert check_dataset(dataset) == []
     assert manifests == [load_manifest(dataset)] * 9
 
 
 def test_records_without_a_start_are_dated_by_the_clock_and_nonsense_is_refused(tmp_path: Path) -> None:
-    blueprint = replace(BLUEPRINT, splits={"train": 10})
-    task = shards(blueprint)[0]
+    spec = replace(SPEC, splits={"train": 10})
+    task = shards(spec)[0]
     for started, good in (("", True), ("yesterday", False)):
         folder = tmp_path / str(good)
-        write_blueprint(folder, blueprint)
-        commit_shard(folder, blueprint, task, columns=make_columns(task), fates=make_fates(task), started=started)
+        write_dataset_spec(folder, spec)
+        commit_shard(folder, spec, task, columns=make_columns(task), sampling=make_sampling(task), started=started)
         if good:
-            assert finalize(folder, blueprint)["created"].endswith("Z")
+            assert finalize(folder, spec)["created"].endswith("Z")
         else:
             with pytest.raises(DatasetError, match="yesterday"):
-                finalize(folder, blueprint)
+                finalize(folder, spec)
 
 
 def test_the_creation_time_follows_source_date_epoch(dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "1763690000")
-    assert finalize(dataset, BLUEPRINT)["created"] == "2025-11-21T01:53:20Z"
+    assert finalize(dataset, SPEC)["created"] == "2025-11-21T01:53:20Z"
     first = (dataset / "manifest.json").read_bytes()
-    finalize(dataset, BLUEPRINT)
+    finalize(dataset, SPEC)
     assert (dataset / "manifest.json").read_bytes() == first
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "yesterday")
     with pytest.raises(UsageError, match="SOURCE_DATE_EPOCH must be whole seconds since 1970, got 'yesterday'"):
-        finalize(dataset, BLUEPRINT)
+        finalize(dataset, SPEC)
 
 
 def test_unfinished_datasets_are_refused_and_every_missing_shard_is_named(tmp_path: Path) -> None:
-    write_blueprint(tmp_path, BLUEPRINT)
-    make_shard(tmp_path, BLUEPRINT, shards(BLUEPRINT)[1])
+    write_dataset_spec(tmp_path, SPEC)
+    make_shard(tmp_path, SPEC, shards(SPEC)[1])
     with pytest.raises(DatasetError) as caught:
-        finalize(tmp_path, BLUEPRINT)
-    assert "1 of 3 shards are there; run make_dataset or 'cnpgen make-dataset' again with the same arguments" in str(
+        finalize(tmp_path, SPEC)
+    assert "1 of 3 shards are finished; run make_dataset or 'cnpgen make-dataset' again with the same arguments" in str(
         caught.value
     )
     assert "train/shard-00000.json is missing" in str(caught.value)
@@ -127,18 +127,18 @@ def test_unfinished_datasets_are_refused_and_every_missing_shard_is_named(tmp_pa
 
 def test_a_long_list_of_missing_shards_is_cut_short(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="and 5 more"):
-        finalize(tmp_path, replace(BLUEPRINT, splits={"train": 320}))
+        finalize(tmp_path, replace(SPEC, splits={"train": 320}))
 
 
 def test_shards_of_another_seed_and_cut_off_shards_are_refused(tmp_path: Path) -> None:
     make_shards(tmp_path)
-    make_shard(tmp_path, replace(BLUEPRINT, seed=1), shards(BLUEPRINT)[0])
-    path = tmp_path / shards(BLUEPRINT)[1].file
+    make_shard(tmp_path, replace(SPEC, seed=1), shards(SPEC)[0])
+    path = tmp_path / shards(SPEC)[1].file
     path.write_bytes(path.read_bytes()[:-1])
     with pytest.raises(
-        DatasetError, match=r"(?s)00000\.json belongs to another blueprint.*00001\.h5 is not the recorded file"
+        DatasetError, match=r"(?s)00000\.json belongs to another specification.*00001\.h5 is not the recorded file"
     ):
-        finalize(tmp_path, BLUEPRINT)
+        finalize(tmp_path, SPEC)
 
 
 @pytest.mark.parametrize("step", ["save_document", "write_file", "_manifest"])
@@ -150,10 +150,10 @@ def test_a_finalize_that_is_killed_leaves_no_manifest(
 
     monkeypatch.setattr(manifest_module, step, killed)
     with pytest.raises(KeyboardInterrupt):
-        finalize(dataset, BLUEPRINT)
+        finalize(dataset, SPEC)
     assert not (dataset / "manifest.json").exists()
     monkeypatch.undo()
-    finalize(dataset, BLUEPRINT)
+    finalize(dataset, SPEC)
     assert (dataset / "manifest.json").exists()
 
 
@@ -164,11 +164,11 @@ def test_a_full_disk_while_finishing_is_a_machine_error(tmp_path: Path, monkeypa
     make_shards(tmp_path)
     monkeypatch.setattr("os.fsync", full)
     with pytest.raises(MachineError, match=r"stats\.json"):
-        finalize(tmp_path, BLUEPRINT)
+        finalize(tmp_path, SPEC)
     assert not (tmp_path / "manifest.json").exists()
 
 
-@pytest.mark.parametrize("damage", [b"", b"{", b'{"format": "cnpgen-dataset", "format_version": 1}\n'])
+@pytest.mark.parametrize("damage", [b"", b"{", b'{"format": "cnpgen-dataset", "format_version": 2}\n'])
 def test_damaged_manifests_are_refused(dataset: Path, damage: bytes) -> None:
     (dataset / "manifest.json").write_bytes(damage)
     with pytest.raises(DatasetError, match=r"manifest\.json is damaged"):
@@ -176,18 +176,18 @@ def test_damaged_manifests_are_refused(dataset: Path, damage: bytes) -> None:
 
 
 def test_datasets_with_an_empty_split_are_finished_like_any_other(tmp_path: Path) -> None:
-    blueprint = replace(BLUEPRINT, splits={"train": 20, "validation": 0})
-    make_shards(tmp_path, blueprint)
-    manifest = finalize(tmp_path, blueprint)
+    spec = replace(SPEC, splits={"train": 20, "validation": 0})
+    make_shards(tmp_path, spec)
+    manifest = finalize(tmp_path, spec)
     assert manifest["splits"]["validation"]["shards"] == []
     assert "validation/*.h5" not in (tmp_path / "README.md").read_text()
 
 
-def test_croissant_lists_the_files_and_promises_no_records(dataset: Path) -> None:
+def test_croissant_lists_the_files_and_has_no_record_sets(dataset: Path) -> None:
     croissant = json.loads((dataset / "croissant.json").read_text())
     assert "recordSet" not in croissant
     assert croissant["license"] == "https://spdx.org/licenses/CC-BY-4.0"
-    assert [item["contentUrl"] for item in croissant["distribution"]] == [task.file for task in shards(BLUEPRINT)]
+    assert [item["contentUrl"] for item in croissant["distribution"]] == [task.file for task in shards(SPEC)]
     for item in croissant["distribution"]:
         content = (dataset / item["contentUrl"]).read_bytes()
         assert item["encodingFormat"] == "application/x-hdf5"
@@ -195,15 +195,13 @@ def test_croissant_lists_the_files_and_promises_no_records(dataset: Path) -> Non
         assert item["sha256"] == hashlib.sha256(content).hexdigest()
 
 
-def test_croissant_says_the_unit_of_every_field(dataset: Path) -> None:
+def test_croissant_contains_the_unit_of_every_field(dataset: Path) -> None:
     croissant = json.loads((dataset / "croissant.json").read_text())
     vocabulary = croissant["@context"]["@vocab"]
     assert vocabulary == croissant["@context"]["sc"] == "https://schema.org/"
     variables = croissant["variableMeasured"]
     assert {item["@type"] for item in variables} == {"sc:PropertyValue"}
-    assert {item["name"]: item["unitText"] for item in variables} == {
-        field.name: field.unit for field in BLUEPRINT.fields
-    }
+    assert {item["name"]: item["unitText"] for item in variables} == {field.name: field.unit for field in SPEC.fields}
     start, goal, clearance, number = variables
     assert start["description"] == "initial joint positions (j1, j2, j3)"
     assert (start["minValue"], start["maxValue"]) == (-2.0, 2.0)
@@ -211,7 +209,7 @@ def test_croissant_says_the_unit_of_every_field(dataset: Path) -> None:
     assert not {"minValue", "maxValue"} & (goal.keys() | number.keys())
 
 
-def test_the_card_says_what_the_fields_are_and_what_was_rejected(dataset: Path) -> None:
+def test_the_card_describes_fields_and_rejections(dataset: Path) -> None:
     card = (dataset / "README.md").read_text()
     assert card.startswith('---\nlicense: "cc-by-4.0"\npretty_name: "A \\"small\\" dataset: for tests"\n')
     assert '  - split: train\n    path: "train/*.h5"\n  - split: validation\n    path: "validation/*.h5"\n---' in card
@@ -224,7 +222,7 @@ def test_the_card_says_what_the_fields_are_and_what_was_rejected(dataset: Path) 
     assert "cnpgen validate . --deep" in card
 
 
-def test_the_card_s_loader_loads_the_dataset(dataset: Path) -> None:
+def test_the_code_in_the_card_loads_the_dataset(dataset: Path) -> None:
     code = (dataset / "README.md").read_text().split("```python\n")[1].split("```")[0]
     names: dict[str, object] = {}
     with contextlib.chdir(dataset), contextlib.redirect_stdout(io.StringIO()):

@@ -1,4 +1,4 @@
-"""Reading rows back."""
+"""Reading rows of stored datasets."""
 
 import os
 import pickle
@@ -13,25 +13,25 @@ import pytest
 from cnpgen.errors import DatasetError
 from cnpgen.loader.load import load_dataset
 from cnpgen.store import intact
-from cnpgen.store.blueprint import shards, write_blueprint
+from cnpgen.store.dataset_spec import shards, write_dataset_spec
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.reader import open_dataset
-from tests.examples.store import BLUEPRINT, dataset, make_columns, make_shard
+from tests.examples.store import SPEC, dataset, make_columns, make_shard
 
 __all__ = ["dataset"]
 
-TRAIN = [make_columns(task) for task in shards(BLUEPRINT) if task.split == "train"]
+TRAIN = [make_columns(task) for task in shards(SPEC) if task.split == "train"]
 
 
-def test_rows_come_back_in_order_and_in_the_blueprint_s_field_order(dataset: Path) -> None:
+def test_rows_and_fields_are_read_in_the_order_of_the_specification(dataset: Path) -> None:
     rows = open_dataset(dataset).read("train")
-    assert list(rows) == [field.name for field in BLUEPRINT.fields]
+    assert list(rows) == [field.name for field in SPEC.fields]
     for name, values in rows.items():
         assert np.array_equal(values, np.concatenate([part[name] for part in TRAIN]))
 
 
 @pytest.mark.parametrize(("start", "stop"), [(0, 50), (0, 0), (50, 50), (31, 33), (5, 7), (32, None), (40, 50)])
-def test_any_range_of_rows_is_that_slice(dataset: Path, start: int, stop: int | None) -> None:
+def test_a_range_of_rows_equals_the_slice(dataset: Path, start: int, stop: int | None) -> None:
     rows = open_dataset(dataset).read("train", fields=["clearance", "goal_p"], start=start, stop=stop)
     assert list(rows) == ["clearance", "goal_p"]
     for name, values in rows.items():
@@ -63,9 +63,9 @@ def test_unknown_splits_and_fields_are_refused(dataset: Path) -> None:
 
 
 def test_unfinished_datasets_are_refused_unless_allowed(tmp_path: Path) -> None:
-    write_blueprint(tmp_path, BLUEPRINT)
-    make_shard(tmp_path, BLUEPRINT, shards(BLUEPRINT)[1])
-    with pytest.raises(DatasetError, match="unfinished: 1 of 3 shards are there; run make_dataset or"):
+    write_dataset_spec(tmp_path, SPEC)
+    make_shard(tmp_path, SPEC, shards(SPEC)[1])
+    with pytest.raises(DatasetError, match="unfinished: 1 of 3 shards are finished; run make_dataset or"):
         open_dataset(tmp_path)
     opened = open_dataset(tmp_path, allow_incomplete=True)
     assert opened.manifest is None
@@ -74,7 +74,7 @@ def test_unfinished_datasets_are_refused_unless_allowed(tmp_path: Path) -> None:
 
 
 def test_damaged_parts_are_refused(dataset: Path) -> None:
-    path = dataset / shards(BLUEPRINT)[0].file
+    path = dataset / shards(SPEC)[0].file
     path.write_bytes(path.read_bytes()[:-1])
     with pytest.raises(
         DatasetError,
@@ -87,7 +87,7 @@ def test_damaged_parts_are_refused(dataset: Path) -> None:
 
 
 def change_a_number(path: Path, field: str = "start_q") -> None:
-    """Overwrite bytes of a value in a committed shard: HDF5 notices nothing."""
+    """Overwrite bytes of a value in a committed shard: HDF5 does not detect it."""
     with h5py.File(path) as file:
         offset = file[field].id.get_offset()
     content = bytearray(path.read_bytes())
@@ -96,8 +96,8 @@ def change_a_number(path: Path, field: str = "start_q") -> None:
 
 
 @pytest.mark.parametrize("finished", [True, False])
-def test_no_reader_gives_numbers_that_were_changed_and_all_say_the_same(dataset: Path, finished: bool) -> None:
-    second = shards(BLUEPRINT)[1]
+def test_all_readers_refuse_changed_values_with_the_same_message(dataset: Path, finished: bool) -> None:
+    second = shards(SPEC)[1]
     change_a_number(dataset / second.file)
     if not finished:
         (dataset / "manifest.json").unlink()
@@ -113,13 +113,13 @@ def test_no_reader_gives_numbers_that_were_changed_and_all_say_the_same(dataset:
     assert "shard-00001.h5 is damaged: its sha256 is not the recorded one; run make_dataset or" in str(by_rows.value)
 
 
-def test_a_shard_is_hashed_once_unless_it_is_written_to(dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_shard_is_hashed_once_unless_it_changes(dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     hashed: list[str] = []
     monkeypatch.setattr(intact, "file_sha256", lambda path: (hashed.append(path.name), file_sha256(path))[1])
     for _ in range(3):
         open_dataset(dataset).read("train", stop=1)
     assert hashed == ["shard-00000.h5"]
-    path = dataset / shards(BLUEPRINT)[0].file
+    path = dataset / shards(SPEC)[0].file
     change_a_number(path)
     os.utime(path, ns=(0, 0))
     with pytest.raises(DatasetError, match="sha256"):
@@ -130,13 +130,13 @@ def test_a_shard_is_hashed_once_unless_it_is_written_to(dataset: Path, monkeypat
 def test_a_folder_that_mixes_two_datasets_is_refused(tmp_path: Path, dataset: Path) -> None:
     from dataclasses import replace
 
-    write_blueprint(tmp_path / "other", replace(BLUEPRINT, seed=1))
-    (dataset / "plan.json").write_bytes((tmp_path / "other" / "plan.json").read_bytes())
+    write_dataset_spec(tmp_path / "other", replace(SPEC, seed=1))
+    (dataset / "specification.json").write_bytes((tmp_path / "other" / "specification.json").read_bytes())
     with pytest.raises(DatasetError, match="mixes two datasets"):
         open_dataset(dataset)
 
 
 def test_importing_the_store_does_not_import_h5py() -> None:
-    modules = ", ".join(f"cnpgen.store.{name}" for name in ("manifest", "check", "reader", "record", "shard"))
+    modules = ", ".join(f"cnpgen.store.{name}" for name in ("manifest", "check", "reader", "shard_record", "shard"))
     code = f"import sys, {modules}; sys.exit('h5py' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[2])

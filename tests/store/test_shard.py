@@ -1,4 +1,4 @@
-"""Shards: what is written is read back, the same bytes every time, and damage is noticed."""
+"""Shards: round trip, reproducible bytes and detection of damage."""
 
 import json
 import multiprocessing
@@ -14,13 +14,13 @@ import pytest
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, MachineError
-from cnpgen.store.blueprint import shard_attributes, shards
+from cnpgen.store.dataset_spec import shard_attributes, shards
 from cnpgen.store.field import Field
 from cnpgen.store.shard import read_attributes, read_schema, read_shard, storage_dtype, write_shard
-from tests.examples.store import BLUEPRINT, FIELDS, make_columns
+from tests.examples.store import FIELDS, SPEC, make_columns
 
-TASK = shards(BLUEPRINT)[0]
-ATTRIBUTES = shard_attributes(BLUEPRINT, TASK)
+TASK = shards(SPEC)[0]
+ATTRIBUTES = shard_attributes(SPEC, TASK)
 
 
 def write(path: Path, *, dtype: str = "float64", **changes: NDArray[Any]) -> int:
@@ -28,7 +28,7 @@ def write(path: Path, *, dtype: str = "float64", **changes: NDArray[Any]) -> int
 
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
-def test_what_is_written_is_read_back(tmp_path: Path, dtype: str) -> None:
+def test_shards_round_trip(tmp_path: Path, dtype: str) -> None:
     path = tmp_path / "train" / "shard-00000.h5"
     size = write(path, dtype=dtype)
     assert size == path.stat().st_size
@@ -43,10 +43,10 @@ def test_what_is_written_is_read_back(tmp_path: Path, dtype: str) -> None:
     assert list(path.parent.iterdir()) == [path]
 
 
-def test_attributes_say_what_the_file_and_its_numbers_are(tmp_path: Path) -> None:
+def test_attributes_describe_the_file_and_its_fields(tmp_path: Path) -> None:
     path = tmp_path / "a.h5"
     write(path)
-    assert read_attributes(path) == {"format": "cnpgen-shard", "format_version": 1, **ATTRIBUTES}
+    assert read_attributes(path) == {"format": "cnpgen-shard", "format_version": 2, **ATTRIBUTES}
     assert read_attributes(path, ["rows", "split"]) == {"rows": 32, "split": "train"}
     schema = read_schema(path)
     start, goal = schema["start_q"].attributes, schema["goal_p"].attributes
@@ -66,10 +66,10 @@ def test_numbers_are_stored_little_endian_in_the_dataset_s_type() -> None:
         storage_dtype(Field("a", "1", "a", dtype="complex64"), "float64")
 
 
-def test_rewriting_gives_the_same_bytes_later_and_elsewhere(tmp_path: Path) -> None:
+def test_the_bytes_of_a_shard_do_not_depend_on_time_and_place(tmp_path: Path) -> None:
     first, second = tmp_path / "a.h5", tmp_path / "other" / "b.h5"
     write(first)
-    time.sleep(1.1)  # HDF5's clock ticks in seconds
+    time.sleep(1.1)  # HDF5 stores times in seconds
     write(second)
     assert first.read_bytes() == second.read_bytes()
 
@@ -117,7 +117,7 @@ def test_a_full_disk_leaves_neither_shard_nor_temporary_file(tmp_path: Path, mon
     assert [path.name for path in tmp_path.rglob("*")] == ["_work"]
 
 
-def test_a_shard_that_does_not_read_back_is_not_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_shard_that_cannot_be_read_after_writing_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_bytes = Path.write_bytes
     monkeypatch.setattr(Path, "write_bytes", lambda self, content: write_bytes(self, bytes(content)[:-100]))
     with pytest.raises(DatasetError, match="damaged or cut off"):
@@ -163,7 +163,7 @@ def test_an_unreadable_shard_is_a_machine_error(tmp_path: Path, monkeypatch: pyt
 
 
 @pytest.mark.slow
-def test_processes_read_the_same_shard_at_once(tmp_path: Path) -> None:
+def test_several_processes_read_the_same_shard_at_the_same_time(tmp_path: Path) -> None:
     path = tmp_path / "a.h5"
     write(path)
     expected = make_columns(TASK)["start_q"].sum()

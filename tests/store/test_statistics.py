@@ -1,4 +1,4 @@
-"""Statistics: those of parts, merged, are those of the whole."""
+"""Statistics: merged statistics of parts equal those of all rows."""
 
 import json
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError
-from cnpgen.store.blueprint import shards
+from cnpgen.store.dataset_spec import shards
 from cnpgen.store.field import Field
 from cnpgen.store.statistics import (
     FieldStatistics,
@@ -19,13 +19,13 @@ from cnpgen.store.statistics import (
     merge_statistics,
     statistics_from_json,
 )
-from tests.examples.store import BLUEPRINT, FIELDS, make_columns
+from tests.examples.store import FIELDS, SPEC, make_columns
 
 FIELD = Field("q", "rad", "positions", 4, valid_min=(-3.0, 0.0, 5.0, -1.0), valid_max=(3.0, 1.0, 5.0, 1.0))
 
 
 def values(rows: int) -> NDArray[np.float64]:
-    """Columns that are spread, off zero, constant and heavy-tailed beyond their limits."""
+    """Return columns that are uniform, far from zero, constant, and heavy-tailed outside their limits."""
     random = np.random.default_rng(rows)
     columns = [random.uniform(-3, 3, rows), 10 + random.random(rows), np.full(rows, 0.1), random.standard_cauchy(rows)]
     return np.stack(columns, axis=1)
@@ -49,14 +49,14 @@ def test_merged_statistics_are_those_of_the_concatenation(cuts: Sequence[int]) -
     assert_same(merged, field_statistics(table, FIELD))
 
 
-def test_a_narrow_column_far_from_zero_keeps_its_deviation() -> None:
+def test_the_deviation_of_a_narrow_column_far_from_zero_is_accurate() -> None:
     table = 1e6 + np.random.default_rng(0).random((1000, 1))
     field = Field("q", "1", "far", 1)
     parts = [{"q": field_statistics(part, field)} for part in np.split(table, 10)]
     np.testing.assert_allclose(merge_statistics(parts)["q"].std, table.std(axis=0), rtol=1e-9)
 
 
-def test_the_numbers_are_numpy_s() -> None:
+def test_mean_deviation_and_histogram_equal_those_of_numpy() -> None:
     table = values(500)
     found = field_statistics(table, FIELD)
     np.testing.assert_allclose(found.mean, table.mean(axis=0), rtol=1e-13)
@@ -65,7 +65,7 @@ def test_the_numbers_are_numpy_s() -> None:
     assert np.array_equal(found.histogram[0], np.histogram(table[:, 0], bins=64, range=(-3, 3))[0])
 
 
-def test_histograms_count_every_row_even_beyond_the_limits() -> None:
+def test_histograms_count_values_outside_the_limits_in_the_first_or_last_bin() -> None:
     table = np.array([[-9.0, 0.0, 5.0, -1.0], [9.0, 1.0, 5.1, 1.0]])
     histogram = field_statistics(table, FIELD).histogram
     assert histogram is not None
@@ -100,7 +100,7 @@ def test_limits_of_another_width_are_refused() -> None:
 
 
 def test_statistics_survive_json_exactly() -> None:
-    found = column_statistics(make_columns(shards(BLUEPRINT)[0]), FIELDS)
+    found = column_statistics(make_columns(shards(SPEC)[0]), FIELDS)
     assert list(found) == [field.name for field in FIELDS]
     for item in found.values():
         content: dict[str, Any] = item.to_json()

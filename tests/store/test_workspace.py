@@ -1,4 +1,4 @@
-"""The folder of a dataset as it is found: what is there, what may be made in it, and who it is given to."""
+"""The folder of a dataset: its content, and whether a dataset can be made in it."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -6,94 +6,104 @@ from pathlib import Path
 import pytest
 
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.store.blueprint import load_blueprint, shards, write_blueprint
+from cnpgen.store.dataset_spec import load_dataset_spec, shards, write_dataset_spec
 from cnpgen.store.workspace import (
     Workspace,
-    begun_blueprint,
     check_clearable,
     check_place,
     find_workspace,
     open_workspace,
-    require_blueprint,
+    require_dataset_spec,
+    started_spec,
 )
-from tests.examples.store import BLUEPRINT, make_shard
+from tests.examples.store import SPEC, make_shard
 
-OTHER = replace(BLUEPRINT, seed=8)
+OTHER = replace(SPEC, seed=8)
 
 
-def test_what_is_in_a_folder_is_found_out(tmp_path: Path) -> None:
+def test_the_content_of_a_folder_is_recognized(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("mine")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("mine")
     (tmp_path / "left" / "_work").mkdir(parents=True)
-    write_blueprint(tmp_path / "begun", BLUEPRINT)
+    write_dataset_spec(tmp_path / "begun", SPEC)
     assert find_workspace(tmp_path / "new" / "deep") == Workspace(tmp_path / "new" / "deep", tmp_path, "nothing")
-    assert find_workspace(tmp_path / "left").holds == "nothing"
-    assert find_workspace(tmp_path / "file" / "below").holds == "a file"
-    assert find_workspace(tmp_path / "mine").holds == "something else"
+    assert find_workspace(tmp_path / "left").content == "nothing"
+    assert find_workspace(tmp_path / "file" / "below").content == "a file"
+    assert find_workspace(tmp_path / "mine").content == "something else"
     begun = find_workspace(tmp_path / "begun")
-    assert (begun.holds, begun.rows, begun.blueprint, begun.damage) == ("a dataset", False, BLUEPRINT, "")
+    assert (begun.content, begun.has_shards, begun.spec, begun.damage) == ("a dataset", False, SPEC, "")
 
 
-def test_a_dataset_whose_blueprint_is_damaged_is_a_dataset_still(tmp_path: Path) -> None:
-    write_blueprint(tmp_path, BLUEPRINT)
-    make_shard(tmp_path, BLUEPRINT, shards(BLUEPRINT)[0])
-    (tmp_path / "plan.json").write_bytes(b"{")
+def test_a_dataset_with_a_damaged_specification_is_recognized_as_a_dataset(tmp_path: Path) -> None:
+    write_dataset_spec(tmp_path, SPEC)
+    make_shard(tmp_path, SPEC, shards(SPEC)[0])
+    (tmp_path / "specification.json").write_bytes(b"{")
     found = find_workspace(tmp_path)
-    assert (found.holds, found.rows, found.blueprint) == ("a dataset", True, None)
-    assert "plan.json is damaged" in found.damage
+    assert (found.content, found.has_shards, found.spec) == ("a dataset", True, None)
+    assert "specification.json is damaged" in found.damage
     with pytest.raises(DatasetError, match=r"damaged.*force=True replaces"):
-        begun_blueprint(found, BLUEPRINT)
+        started_spec(found, SPEC)
     assert check_clearable(found) == [tmp_path / "train"]
 
 
-def test_opening_the_same_folder_again_changes_nothing_and_gives_what_is_there(tmp_path: Path) -> None:
-    assert open_workspace(tmp_path, BLUEPRINT) == BLUEPRINT
-    before = (tmp_path / "plan.json").read_bytes()
-    assert open_workspace(tmp_path, replace(BLUEPRINT, title="other")) == BLUEPRINT
-    assert (tmp_path / "plan.json").read_bytes() == before
+def test_a_dataset_of_an_older_format_is_recognized_and_can_be_replaced(tmp_path: Path) -> None:
+    (tmp_path / "plan.json").write_text('{"format": "cnpgen-plan", "format_version": 2}')
+    (tmp_path / "train").mkdir()
+    (tmp_path / "train" / "shard-00000.h5").write_bytes(b"")
+    workspace = find_workspace(tmp_path)
+    assert (workspace.content, workspace.has_shards, workspace.spec) == ("a dataset", True, None)
+    with pytest.raises(DatasetError, match=r"plan\.json has format version 2, .*force=True replaces the whole dataset"):
+        open_workspace(tmp_path, SPEC)
+    assert open_workspace(tmp_path, SPEC, force=True) == SPEC
+    assert {path.name for path in tmp_path.iterdir()} - {"_work"} == {"specification.json"}
 
 
-def test_another_blueprint_takes_a_folder_without_rows_only(tmp_path: Path) -> None:
-    open_workspace(tmp_path, BLUEPRINT)
+def test_opening_the_same_folder_again_returns_the_existing_specification(tmp_path: Path) -> None:
+    assert open_workspace(tmp_path, SPEC) == SPEC
+    before = (tmp_path / "specification.json").read_bytes()
+    assert open_workspace(tmp_path, replace(SPEC, title="other")) == SPEC
+    assert (tmp_path / "specification.json").read_bytes() == before
+
+
+def test_a_specification_replaces_another_one_only_if_there_are_no_rows(tmp_path: Path) -> None:
+    open_workspace(tmp_path, SPEC)
     assert open_workspace(tmp_path, OTHER) == OTHER
     make_shard(tmp_path, OTHER, shards(OTHER)[0])
     with pytest.raises(UsageError, match=r"holds another dataset \(seed 8 instead of \d+\); choose another out="):
-        open_workspace(tmp_path, BLUEPRINT)
-    assert load_blueprint(tmp_path) == OTHER
-    assert open_workspace(tmp_path, BLUEPRINT, force=True) == BLUEPRINT
+        open_workspace(tmp_path, SPEC)
+    assert load_dataset_spec(tmp_path) == OTHER
+    assert open_workspace(tmp_path, SPEC, force=True) == SPEC
     assert not list(tmp_path.glob("*/shard-*"))
 
 
-def test_a_blueprint_that_differs_in_several_settings_is_refused_with_each_of_them_once(tmp_path: Path) -> None:
-    write_blueprint(tmp_path, BLUEPRINT)
-    make_shard(tmp_path, BLUEPRINT, shards(BLUEPRINT)[0])
-    other = replace(
-        BLUEPRINT, dtype="float32", robot={"name": "another", "joint_names": []}, fields=BLUEPRINT.fields[:2]
-    )
+def test_a_specification_with_several_different_settings_is_refused_and_each_is_named_once(tmp_path: Path) -> None:
+    write_dataset_spec(tmp_path, SPEC)
+    make_shard(tmp_path, SPEC, shards(SPEC)[0])
+    other = replace(SPEC, dtype="float32", robot={"name": "another", "joint_names": []}, fields=SPEC.fields[:2])
     with pytest.raises(UsageError, match=r"\(dtype float64 instead of float32; another robot; another fields\)"):
         open_workspace(tmp_path, other)
 
 
-def test_a_dataset_begun_by_another_process_after_the_first_look_is_noticed(tmp_path: Path) -> None:
+def test_a_dataset_started_by_another_process_after_the_first_check_is_detected(tmp_path: Path) -> None:
     check_place(find_workspace(tmp_path))
-    write_blueprint(tmp_path, OTHER)
+    write_dataset_spec(tmp_path, OTHER)
     make_shard(tmp_path, OTHER, shards(OTHER)[0])
     with pytest.raises(UsageError, match="holds another dataset"):
-        open_workspace(tmp_path, BLUEPRINT)
+        open_workspace(tmp_path, SPEC)
 
 
-def test_a_folder_with_other_things_is_not_turned_into_a_dataset(tmp_path: Path) -> None:
+def test_a_folder_with_other_files_is_refused(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("mine")
     for force in (False, True):
         with pytest.raises(UsageError, match="not empty and not a dataset of cnpgen"):
-            open_workspace(tmp_path, BLUEPRINT, force=force)
+            open_workspace(tmp_path, SPEC, force=force)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
 
-def test_a_folder_that_was_given_to_another_dataset_is_noticed(tmp_path: Path) -> None:
-    open_workspace(tmp_path, BLUEPRINT)
-    require_blueprint(tmp_path, BLUEPRINT)
+def test_a_specification_replaced_by_another_process_is_detected(tmp_path: Path) -> None:
+    open_workspace(tmp_path, SPEC)
+    require_dataset_spec(tmp_path, SPEC)
     open_workspace(tmp_path, OTHER)
-    with pytest.raises(UsageError, match="was given to another dataset"):
-        require_blueprint(tmp_path, BLUEPRINT)
+    with pytest.raises(UsageError, match="was replaced by another dataset"):
+        require_dataset_spec(tmp_path, SPEC)

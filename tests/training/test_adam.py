@@ -1,4 +1,4 @@
-"""Adam against its formulas as published."""
+"""Adam against the published formulas."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from cnpgen.training.adam import start_adam
 
 
 def published(first: np.ndarray, gradients: list[np.ndarray], rate: float) -> np.ndarray:
-    """Algorithm 1 of Kingma and Ba, with its default constants."""
+    """Return the result of Algorithm 1 of Kingma and Ba, with its default constants."""
     x, m, v = first.copy(), np.zeros_like(first), np.zeros_like(first)
     for t, g in enumerate(gradients, 1):
         m = 0.9 * m + 0.1 * g
@@ -18,8 +18,8 @@ def published(first: np.ndarray, gradients: list[np.ndarray], rate: float) -> np
 
 
 @pytest.mark.parametrize("block", [1 << 17, 7])
-def test_the_steps_are_the_published_ones_whatever_the_size_of_a_block(monkeypatch, block):
-    monkeypatch.setattr(module, "BLOCK", block)
+def test_steps_equal_the_published_algorithm_for_any_block_size(monkeypatch, block):
+    monkeypatch.setattr(module, "PARAMETERS_PER_BLOCK", block)
     random = np.random.default_rng(0)
     first, gradients = random.normal(size=50), [random.normal(size=50) for _ in range(30)]
     adam = start_adam(first.copy())

@@ -1,4 +1,4 @@
-"""Imitation: the gradient is that of finite differences, plans come near those of a certified dataset, then go on."""
+"""Imitation: its gradient agrees with finite differences, and plans approach those of a certified dataset."""
 
 import json
 from dataclasses import replace
@@ -12,8 +12,8 @@ from cnpgen.make.certify import certified
 from cnpgen.make.dataset import make_dataset
 from cnpgen.planner.control_points import ControlPoints
 from cnpgen.planner.network.architecture import initial_parameters
+from cnpgen.planner.plan_requests import read_rows
 from cnpgen.planner.planner import Planner
-from cnpgen.planner.requests import read_rows
 from cnpgen.training.clipping import Clipping
 from cnpgen.training.data import open_training_data
 from cnpgen.training.step import imitation_loss
@@ -25,7 +25,7 @@ UNCLIPPED = replace(SMALL, sample_clip=np.inf, batch_clip=np.inf)
 
 
 @pytest.fixture(scope="module")
-def shown(tmp_path_factory) -> Path:
+def target(tmp_path_factory) -> Path:
     """A small certified dataset of hits."""
     folder = tmp_path_factory.mktemp("certified") / "hits"
     recipe = replace(certified(tiny_recipe("airhockey-hit")), splits={"train": 32, "validation": 6})
@@ -38,7 +38,7 @@ def points(seed: int, count: int = 4) -> ControlPoints:
     return ControlPoints(random.normal(size=(count, 15, 6)), np.exp(random.normal(size=(count, 20))))
 
 
-def test_the_distance_is_half_the_squares_of_path_points_and_of_logarithms_of_rates():
+def test_the_distance_is_half_the_squared_differences_of_path_points_and_log_rates():
     one, other = points(0), points(1)
     expected = 0.5 * ((one.path - other.path) ** 2).sum(axis=(1, 2))
     expected += 0.5 * (np.log(one.rate / other.rate) ** 2).sum(axis=1)
@@ -56,15 +56,15 @@ def test_its_gradient_is_that_of_finite_differences():
         return imitation_loss(moved, other).total
 
     found = (total(1e-6) - total(-1e-6)) / 2e-6
-    slope = (value.path_gradient * by_path).sum(axis=(1, 2)) + (value.rate_gradient * by_rate).sum(axis=1)
-    np.testing.assert_allclose(slope, found, rtol=1e-7)
+    gradient = (value.path_gradient * by_path).sum(axis=(1, 2)) + (value.rate_gradient * by_rate).sum(axis=1)
+    np.testing.assert_allclose(gradient, found, rtol=1e-7)
 
 
 @pytest.mark.slow
 def test_network_boundary_and_distance_together_have_the_gradient_of_finite_differences(tiny):
     boundary = boundary_of_columns(columns_of(tiny("airhockey-replan")), 6)
     learner, rows = learner_of("airhockey", boundary, dtype="float64", settings=UNCLIPPED)
-    rows = replace(rows, shown=points(3, 6))
+    rows = replace(rows, target=points(3, 6))
     parameters = initial_parameters(learner.architecture, seed=0, head_scale=1.0, rate_bias=-0.5).astype(float)
     gradient, scratch = np.empty_like(parameters), np.empty_like(parameters)
     learner.imitation_gradient(parameters, rows, clipping=Clipping(), out=gradient)
@@ -78,8 +78,8 @@ def test_network_boundary_and_distance_together_have_the_gradient_of_finite_diff
         assert 2 * gradient @ step == pytest.approx(found, rel=1e-5)
 
 
-def test_demonstrations_are_the_plans_of_the_rows(shown):
-    found, columns = open_training_data(shown).demonstrations(6), columns_of(shown)
+def test_demonstrations_are_the_plans_of_the_rows(target):
+    found, columns = open_training_data(target).demonstrations(6), columns_of(target)
     assert found is not None
     assert found.path.shape == (32, 15, 6)
     np.testing.assert_allclose(found.path[7].ravel(), columns["path_control_points"][7], rtol=1e-6)
@@ -88,9 +88,9 @@ def test_demonstrations_are_the_plans_of_the_rows(shown):
 
 
 @pytest.mark.slow
-def test_a_run_imitates_first_and_then_goes_on_with_the_loss(shown, tmp_path):
+def test_a_run_imitates_first_and_then_minimizes_the_loss(target, tmp_path):
     settings = replace(SMALL, imitation=0.75, hidden=32, warm_up=10)
-    trained = train_model(shown, tmp_path / "m.h5", steps=400, settings=settings, check_rows=2, workers=1)
+    trained = train_model(target, tmp_path / "m.h5", steps=400, settings=settings, check_rows=2, workers=1)
     lines = [json.loads(line) for line in trained.model.log.splitlines()]
     distances = [line["imitation"] for line in lines if "imitation" in line]
     assert len(distances) == 75
@@ -100,16 +100,16 @@ def test_a_run_imitates_first_and_then_goes_on_with_the_loss(shown, tmp_path):
 
 
 @pytest.mark.slow
-def test_an_imitating_run_that_was_cut_goes_on_exactly(shown, tmp_path, monkeypatch):
-    from tests.training.test_run import CutOffError, checkpoints, cut_at
+def test_an_interrupted_imitating_run_resumes_exactly(target, tmp_path, monkeypatch):
+    from tests.training.test_training_run import CutOffError, checkpoints, cut_at
 
-    monkeypatch.setattr(checkpoints, "EVERY", 0.0)
-    monkeypatch.setattr(checkpoints, "SHARE", 0.0)
+    monkeypatch.setattr(checkpoints, "MIN_INTERVAL_S", 0.0)
+    monkeypatch.setattr(checkpoints, "INTERVAL_PER_WRITING_TIME", 0.0)
     settings = replace(SMALL, imitation=0.5)
 
     def train(name: str, **options):
         arguments = {"steps": 20, "settings": settings, "check_rows": 2, "workers": 1, **options}
-        return train_model(shown, tmp_path / name, **arguments)
+        return train_model(target, tmp_path / name, **arguments)
 
     whole = train("whole.h5")
     for step in (4, 9, 14):
@@ -118,19 +118,19 @@ def test_an_imitating_run_that_was_cut_goes_on_exactly(shown, tmp_path, monkeypa
     np.testing.assert_array_equal(train("cut.h5").model.parameters, whole.model.parameters)
 
 
-def test_a_dataset_without_plans_cannot_be_imitated(tiny, tmp_path):
-    with pytest.raises(UsageError, match=r"holds no plans that could be imitated.*certify=True.*--certify"):
+def test_imitating_a_dataset_without_plans_raises_an_error(tiny, tmp_path):
+    with pytest.raises(UsageError, match=r"has no plans to imitate.*certify=True.*--certify"):
         train_model(tiny("airhockey-hit"), tmp_path / "m.h5", steps=4, settings=replace(SMALL, imitation=0.5))
 
 
 @pytest.mark.parametrize("wrong", [-0.1, 1.0, float("nan")])
-def test_a_fraction_that_leaves_nothing_is_refused(wrong):
+def test_an_invalid_fraction_of_imitation_raises_an_error(wrong):
     with pytest.raises(UsageError, match="imitation must be"):
         replace(SMALL, imitation=wrong)
 
 
-def test_a_model_of_a_certified_dataset_plans_for_the_rows_of_the_plain_one(shown, tiny, tmp_path):
-    trained = train_model(shown, tmp_path / "m.h5", steps=4, settings=SMALL, check_rows=2, workers=1)
+def test_a_model_of_a_certified_dataset_plans_for_the_rows_of_the_plain_one(target, tiny, tmp_path):
+    trained = train_model(target, tmp_path / "m.h5", steps=4, settings=SMALL, check_rows=2, workers=1)
     planner = Planner(trained.model)
     asked = read_rows(tiny("airhockey-hit"), planner.model)
     assert len(planner.plan_batch(asked.boundary)) == 60

@@ -1,4 +1,4 @@
-"""Schedule, order of rows, clipping and settings: each follows from little, and says what it refuses."""
+"""Parts of a training run: learning rate, order of rows, clipping, settings."""
 
 import math
 from types import SimpleNamespace
@@ -12,11 +12,14 @@ from cnpgen.losses.margins import suggested_margins
 from cnpgen.losses.metric import Metric
 from cnpgen.losses.metric_settings import MetricSettings
 from cnpgen.planner.network.architecture import Architecture
+from cnpgen.problems.constraints.joint import JointTorque
+from cnpgen.problems.constraints.table import Table
 from cnpgen.training.adam import learning_rate
 from cnpgen.training.clipping import Clipping
 from cnpgen.training.prepare import begin_run
-from cnpgen.training.rows import StepRows
 from cnpgen.training.settings import METRICS, Length, TrainingSettings
+from cnpgen.training.training_rows import StepRows
+from tests.examples.constraints import TipSpeed
 
 
 def rate(step: int) -> float:
@@ -32,7 +35,7 @@ def test_the_learning_rate_rises_to_its_peak_and_falls_as_a_cosine():
     assert (np.diff(rates) < 0).all()
 
 
-def test_an_epoch_sees_every_row_once_but_for_those_that_fill_no_batch():
+def test_an_epoch_contains_every_row_once_except_for_an_incomplete_batch():
     order = StepRows(103, 10, seed=5)
     epoch = np.concatenate([order.batch(step) for step in range(10)])
     assert len(np.unique(epoch)) == 100
@@ -41,7 +44,7 @@ def test_an_epoch_sees_every_row_once_but_for_those_that_fill_no_batch():
     assert (epoch != other).any()
 
 
-def test_the_order_is_arithmetic_in_seed_and_step():
+def test_the_order_of_rows_is_a_function_of_seed_and_step():
     order, again = StepRows(64, 8, seed=1), StepRows(64, 8, seed=1)
     steps = [0, 31, 7, 8, 100, 0]  # in any sequence
     for step in steps:
@@ -63,7 +66,7 @@ def test_nothing_is_clipped_while_most_gradients_are_zero(limit):
     assert clipping.sample == 1.0
 
 
-def test_samples_are_clipped_to_so_many_running_medians():
+def test_samples_are_clipped_relative_to_the_running_median():
     clipping = Clipping()
     norms = np.array([1.0, 2.0, 3.0, 4.0, 1000.0])
     np.testing.assert_allclose(clipping.sample_factors(norms, limit=10.0) * norms, [1, 2, 3, 4, 30])
@@ -71,7 +74,7 @@ def test_samples_are_clipped_to_so_many_running_medians():
     assert clipping.sample == pytest.approx(0.98 * 3 + 0.02 * 30)
 
 
-def test_a_batch_is_clipped_to_so_many_running_norms_and_one_jump_does_not_move_the_norm_far():
+def test_a_batch_is_clipped_relative_to_the_running_norm_which_limits_outliers():
     clipping = Clipping()
     assert clipping.batch_factor(5.0, limit=2.0) == 1.0
     assert clipping.batch == 5.0
@@ -88,7 +91,7 @@ def test_without_a_limit_nothing_is_clipped():
 
 SIZES = ("inputs", "hidden", "layers", "path_outputs", "rate_outputs")
 WRONG: list[tuple[str, Any]] = [
-    ("hidden", 0), ("hidden", 2.5), ("batch_size", -1), ("seed", -1), ("bending_steps", -1), ("nodes", "32"),
+    ("hidden", 0), ("hidden", 2.5), ("batch_size", -1), ("seed", -1), ("line_projection_steps", -1), ("nodes", "32"),
     ("learning_rate", 0.0), ("learning_rate", math.inf), ("learning_rate", "1e-3"), ("final_rate", -5),
     ("memory", 2), ("memory", 1.0), ("imitation", 1.0), ("sample_clip", math.nan), ("head_scale", -0.1),
     ("rate_bias", math.inf), ("warm_up", 1.5),
@@ -96,12 +99,12 @@ WRONG: list[tuple[str, Any]] = [
 
 
 @pytest.mark.parametrize(("name", "value"), WRONG)
-def test_settings_that_cannot_be_meant_are_refused_by_name(name, value):
+def test_invalid_settings_raise_errors_with_their_name(name, value):
     with pytest.raises(UsageError, match=f"^{name} must be .*, got {value!r}"):
         TrainingSettings(**{name: value})
 
 
-def test_weights_that_grow_without_end_are_refused_by_what_was_said():
+def test_infinite_growth_of_weights_raises_an_error():
     with pytest.raises(UsageError, match=r"growth must be .*, got inf"):
         TrainingSettings(metric=MetricSettings(growth=math.inf))
 
@@ -110,13 +113,13 @@ def test_weights_that_grow_without_end_are_refused_by_what_was_said():
     "wrong",
     [{}, {"steps": 5, "epochs": 2}, {"cpu_seconds": 0.0}, {"cpu_seconds": math.inf}, {"steps": 2.5}, {"epochs": "3"}],
 )
-def test_a_run_has_one_length(wrong):
-    with pytest.raises(UsageError, match=r"how long|(steps|epochs|cpu_seconds) must be .*, got "):
+def test_a_run_has_exactly_one_length(wrong):
+    with pytest.raises(UsageError, match=r"pass exactly one of|(steps|epochs|cpu_seconds) must be .*, got "):
         Length(**wrong)
 
 
-def test_a_busy_moment_does_not_make_a_run_short(monkeypatch):
-    """Steps are counted out by how long they usually take, not by what other jobs do to some of the measured ones."""
+def test_a_temporary_load_does_not_shorten_a_run(monkeypatch):
+    """The number of steps follows from the median time of a step, so that other jobs hardly change it."""
     now, taken = [0.0], []
 
     def step(_state: Any, _gradient: Any) -> None:
@@ -127,27 +130,29 @@ def test_a_busy_moment_does_not_make_a_run_short(monkeypatch):
         learner=SimpleNamespace(settings=TrainingSettings(), architecture=Architecture(**dict.fromkeys(SIZES, 2))),
         names=("time", "table"),
         metric=Metric([1.0], [0.0]),
-        first=None,
+        initial_parameters=None,
         step=step,
     )
     monkeypatch.setattr("cnpgen.training.prepare.time.process_time", lambda: now[0])
     assert begin_run(run, Length(cpu_seconds=10.0)).steps == pytest.approx(10_000, abs=1)  # type: ignore[arg-type]
 
 
-def test_the_paper_s_form_of_the_loss_goes_with_the_paper_s_metric():
+def test_the_papers_metric_uses_the_papers_form_of_the_loss():
     forms = {name: TrainingSettings(metric=metric).form for name, metric in METRICS.items()}
     assert forms == {"fixed": "signed", "ramped": "signed", "learned": "paper", "bounded": "signed"}
 
 
 def test_every_constraint_of_a_kind_has_the_margin_of_its_kind():
-    margins = suggested_margins(("time", "table", "table-2", "joint-torque-3", "keep-out-2"))
+    table, torque = (object.__new__(kind) for kind in (Table, JointTorque))
+    problem = SimpleNamespace(constraint=(table, table, torque, torque, torque, object.__new__(TipSpeed)))
+    margins = suggested_margins(problem)  # type: ignore[arg-type]
     assert margins.insets == {"table": 1e-3, "table-2": 1e-3}
-    assert margins.factors == {"joint-torque-3": 0.97}
+    assert margins.factors == {"joint-torque": 0.97, "joint-torque-2": 0.97, "joint-torque-3": 0.97}
 
 
 def test_margins_tighten_the_limits_that_they_name_and_no_others(monkeypatch: pytest.MonkeyPatch):
     from cnpgen.training import prepare
-    from tests.examples.models import interpreted, surroundings_of
+    from tests.examples.models import interpreted, loaded_problem_of
 
     made: list[dict[str, Any]] = []
 
@@ -157,15 +162,15 @@ def test_margins_tighten_the_limits_that_they_name_and_no_others(monkeypatch: py
             super().__init__(*positional, **named)
 
         def load_kernels(self) -> None:
-            """Not now."""
+            """Load nothing."""
 
     monkeypatch.setattr(prepare, "PlanLoss", Watched)
-    given = interpreted(surroundings_of("airhockey"))
+    given = interpreted(loaded_problem_of("airhockey"))
     prepare._loss(given, TrainingSettings(margins={"joint-acceleration": 0.9}))
-    usual = suggested_margins(Watched(given.problem, backend="numpy").terms)
-    factors = made[1]["margins"].factors
+    usual = suggested_margins(given.problem)
+    factors = made[0]["margins"].factors
     assert factors == {**usual.factors, "joint-acceleration": 0.9}
-    assert made[1]["margins"].insets == usual.insets
+    assert made[0]["margins"].insets == usual.insets
     with pytest.raises(UsageError, match="no such term"):
         prepare._loss(given, TrainingSettings(margins={"joint-speed": 0.9}))
 
@@ -177,6 +182,6 @@ def test_margins_tighten_the_limits_that_they_name_and_no_others(monkeypatch: py
         ({"expected_time": "soon"}, "expected_time must be one of distance, reach, got 'soon'"),
     ],
 )
-def test_margins_and_expected_times_that_cannot_be_meant_are_refused(changes: dict[str, Any], message: str):
+def test_invalid_margins_and_expected_times_raise_errors(changes: dict[str, Any], message: str):
     with pytest.raises(UsageError, match=message):
         TrainingSettings(**changes)

@@ -1,4 +1,4 @@
-"""One step of training: the gradient of network, boundary and loss together against finite differences; clipping."""
+"""A training step: the gradient of network, boundary conditions and loss against finite differences; clipping."""
 
 from dataclasses import replace
 
@@ -8,8 +8,8 @@ import pytest
 from cnpgen.planner.network.architecture import initial_parameters
 from cnpgen.training.adam import start_adam
 from cnpgen.training.clipping import Clipping
-from cnpgen.training.rows import Rows
 from cnpgen.training.step import Learner
+from cnpgen.training.training_rows import Rows
 from tests.conftest import columns_of, some
 from tests.examples.models import SMALL, accelerated, boundary_of_columns, learner_of
 
@@ -26,7 +26,7 @@ def prepared(tiny, dataset: str, count: int = 6, *, fixed: int = 2) -> tuple[Lea
 
 
 def weighted(learner: Learner, parameters: np.ndarray, rows: Rows, weights: np.ndarray) -> float:
-    """The mean loss of a batch."""
+    """Return the mean loss of a batch."""
     terms = learner.gradient(parameters, rows, weights, shift=0.3, clipping=Clipping(), out=np.empty_like(parameters))
     return float(np.mean(terms[:, 0] + terms[:, 1:] @ weights))
 
@@ -52,7 +52,7 @@ def test_the_gradient_of_network_boundary_and_loss_together_is_that_of_finite_di
 
 
 @pytest.mark.parametrize("fixed", some([3, 2], 0, "slow"))
-def test_single_parameters_agree_as_well(tiny, fixed):
+def test_derivatives_by_single_parameters_agree_with_finite_differences(tiny, fixed):
     learner, rows, parameters = prepared(tiny, "airhockey-replan", fixed=fixed)
     weights, gradient = np.ones(5), np.empty_like(parameters)
     learner.gradient(parameters, rows, weights, shift=0.3, clipping=Clipping(), out=gradient)
@@ -64,9 +64,9 @@ def test_single_parameters_agree_as_well(tiny, fixed):
 
 
 @pytest.mark.slow
-def test_a_plan_without_a_loss_takes_no_part_in_the_gradient_of_the_others(tiny):
+def test_a_plan_with_a_loss_of_nan_does_not_affect_the_gradient_of_others(tiny):
     learner, rows, parameters = prepared(tiny, "heavy-object")
-    broken = replace(rows, tops=np.where(np.arange(6)[:, None] == 2, np.nan, rows.tops))
+    broken = replace(rows, obstacle_poses=np.where(np.arange(6)[:, None] == 2, np.nan, rows.obstacle_poses))
     weights, gradient = np.ones(7), np.empty_like(parameters)
     terms = learner.gradient(parameters, broken, weights, shift=0.3, clipping=Clipping(), out=gradient)
     assert np.isnan(terms[2]).all()
@@ -77,7 +77,7 @@ def test_a_plan_without_a_loss_takes_no_part_in_the_gradient_of_the_others(tiny)
 
 
 @pytest.mark.slow
-def test_no_sample_counts_more_than_the_limit_allows(tiny):
+def test_the_gradient_of_a_sample_is_clipped_to_the_limit(tiny):
     learner, rows, parameters = prepared(tiny, "heavy-object")
     clipped = replace(learner, settings=replace(UNCLIPPED, sample_clip=1.0))
     alone, weights = [], np.full(7, 1e3)
@@ -97,4 +97,4 @@ def test_a_gradient_that_is_not_finite_changes_no_parameter(tiny):
     adam, before = start_adam(parameters), parameters.copy()
     learner.update(adam, Clipping(), np.full_like(parameters, np.nan), rate=1e-3)
     np.testing.assert_array_equal(adam.parameters, before)
-    assert adam.step == 1  # a run ends all the same
+    assert adam.step == 1  # a run still ends after its number of steps

@@ -1,4 +1,4 @@
-"""Boundary control points: exact in time, by SciPy's derivatives and the chain rule written out here."""
+"""Boundary control points: exact in time, compared with SciPy's derivatives and an explicit chain rule."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -9,7 +9,7 @@ from scipy.interpolate import BSpline
 
 from cnpgen.errors import UsageError
 from cnpgen.trajectory.boundary import Boundary, anchor_line, assemble, goal_points, start_points
-from cnpgen.trajectory.spec import TrajectorySpec
+from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
 N, JOINTS = 5, 6
 
@@ -73,7 +73,7 @@ def test_the_printed_eta_makes_the_boundary_velocity_too_small_by_c_minus_d() ->
     assert not np.allclose(found, boundary.start_dq[0], rtol=0.5)
 
 
-def test_motions_at_rest_have_equal_control_points_there_whatever_the_rate() -> None:
+def test_motions_at_rest_have_equal_boundary_control_points_for_any_rate() -> None:
     random = np.random.default_rng(1)
     q, zero = random.normal(size=(2, N, JOINTS)), np.zeros((N, JOINTS))
     boundary, spec = Boundary(q[0], zero, zero, q[1], zero, zero), TrajectorySpec()
@@ -82,7 +82,7 @@ def test_motions_at_rest_have_equal_control_points_there_whatever_the_rate() -> 
     assert np.abs(goal_points(boundary, rate, spec) - q[1][:, None]).max() < 1e-14
 
 
-def test_the_anchor_line_is_the_paper_s() -> None:
+def test_the_anchor_line_agrees_with_the_paper() -> None:
     """Indices 3 to 12, from C_2 to C_13: i + N_i for 0 <= i <= C - B, B = N_i + N_d + 1 (eq. of the control points)."""
     random = np.random.default_rng(2)
     spec, boundary = TrajectorySpec(), draw_boundary(random, goal_ddq=False)
@@ -99,7 +99,7 @@ def test_the_anchor_line_is_the_paper_s() -> None:
     assert np.array_equal(path[:, 12], path[:, 13])
 
 
-def test_with_the_goal_s_acceleration_one_more_point_is_fixed() -> None:
+def test_a_prescribed_goal_acceleration_fixes_one_more_control_point() -> None:
     random = np.random.default_rng(3)
     spec, boundary = TrajectorySpec(), draw_boundary(random, goal_ddq=True)
     rate = np.exp(random.normal(size=(N, 20)))
@@ -110,7 +110,7 @@ def test_with_the_goal_s_acceleration_one_more_point_is_fixed() -> None:
     assert np.array_equal(line[:, -1], assemble(boundary, line, rate, spec)[:, 12])
 
 
-def test_a_batch_is_its_motions() -> None:
+def test_a_batch_agrees_with_its_single_motions() -> None:
     random = np.random.default_rng(4)
     spec, boundary = TrajectorySpec(), draw_boundary(random, goal_ddq=True)
     rate = np.exp(random.normal(size=(N, 20)))
@@ -126,7 +126,7 @@ def test_a_batch_is_its_motions() -> None:
     assert boundary[np.array([2, 0])].goal_ddq.shape == (2, JOINTS)
 
 
-def test_a_path_of_a_single_span_is_refused() -> None:
+def test_a_path_of_a_single_span_raises_an_error() -> None:
     boundary = draw_boundary(np.random.default_rng(5), goal_ddq=False)
     spec = TrajectorySpec(degree=7, path_control_points=8, rate_control_points=8)
     with pytest.raises(UsageError, match="at least 9 path control points of degree 7, got 8"):
@@ -135,11 +135,11 @@ def test_a_path_of_a_single_span_is_refused() -> None:
         degree=7, path_control_points=9, rate_control_points=8)).shape == (N, 9, JOINTS)  # fmt: skip
 
 
-def test_conditions_of_different_joints_are_refused_by_name() -> None:
+def test_conditions_of_different_joints_raise_an_error_with_their_names() -> None:
     random = np.random.default_rng(2)
     spec = draw_spec(random)
     rate = np.ones((N, spec.rate_control_points))
     mixed = replace(draw_boundary(random, goal_ddq=False), goal_q=np.zeros((N, JOINTS + 1)))
     for points in (start_points, goal_points):
-        with pytest.raises(UsageError, match=f"same joints, got of each: start_q {JOINTS}, .*goal_q {JOINTS + 1}"):
+        with pytest.raises(UsageError, match=f"same number of joints, got: start_q {JOINTS}, .*goal_q {JOINTS + 1}"):
             points(mixed, rate, spec)

@@ -1,4 +1,4 @@
-"""Fitting motions to time-sampled trajectories of other planners."""
+"""Fit of motions to time-sampled trajectories of other planners."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -9,9 +9,9 @@ import pytest
 from cnpgen.errors import UsageError
 from cnpgen.trajectory.boundary import Boundary, assemble
 from cnpgen.trajectory.fit import fit_motion, largest_error
-from cnpgen.trajectory.motion import Motion
 from cnpgen.trajectory.samples import sampled_boundary
-from cnpgen.trajectory.spec import TrajectorySpec
+from cnpgen.trajectory.spline_motion import Motion
+from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 from tests.conftest import some
 
 SPEC = TrajectorySpec()
@@ -57,7 +57,7 @@ def test_a_quintic_is_fitted_exactly_with_phase_proportional_to_time() -> None:
 
 
 @pytest.mark.parametrize("seed", some(range(4), 1, "slow"))
-def test_a_motion_of_the_family_is_found_again(seed: int) -> None:
+def test_a_motion_of_the_family_is_reproduced(seed: int) -> None:
     motion, boundary = own_motion(seed)
     t = np.linspace(0, 0.5, 501)
     q = motion.at(motion.phase_at(t[None])).q[0]
@@ -70,7 +70,7 @@ def test_a_motion_of_the_family_is_found_again(seed: int) -> None:
 
 
 @pytest.mark.slow
-def test_a_trapezoidal_profile_is_followed_within_a_milliradian() -> None:
+def test_a_trapezoidal_profile_is_fitted_within_a_milliradian() -> None:
     t = np.linspace(0, 0.8, 801)
     q = trapezoid(t / 0.8)
     motion = fit_motion(t, q, spec=SPEC)
@@ -80,7 +80,7 @@ def test_a_trapezoidal_profile_is_followed_within_a_milliradian() -> None:
 
 
 @pytest.mark.slow
-def test_standing_still_at_both_ends_keeps_the_rate_positive_and_uses_little_of_the_path() -> None:
+def test_rest_at_both_ends_keeps_the_rate_positive_and_uses_few_control_points() -> None:
     t = np.linspace(0, 1.4, 1401)
     q = minimum_jerk((t - 0.5) / 0.4)
     motion = fit_motion(t, q, spec=SPEC)
@@ -95,7 +95,7 @@ def test_standing_still_at_both_ends_keeps_the_rate_positive_and_uses_little_of_
 
 
 @pytest.mark.parametrize("goal_ddq", [False, True])
-def test_the_given_boundary_holds_exactly_whatever_the_samples_say(goal_ddq: bool) -> None:
+def test_a_prescribed_boundary_holds_exactly_for_other_samples(goal_ddq: bool) -> None:
     t = np.linspace(0, 1, 101)
     q = np.column_stack([np.sin(5 * t), np.cos(3 * t), t])
     random = np.random.default_rng(0)
@@ -110,7 +110,7 @@ def test_the_given_boundary_holds_exactly_whatever_the_samples_say(goal_ddq: boo
         assert np.abs(ends.ddq[0, 1] - parts[5][0]).max() < 1e-11 * max(rate[-1] ** 2, 10)
 
 
-def test_uneven_and_missing_samples_do_not_matter() -> None:
+def test_uneven_and_missing_samples_are_supported() -> None:
     random = np.random.default_rng(1)
     uneven = np.r_[0, np.sort(random.uniform(0, 1, 300)), 1]
     gap = np.r_[np.linspace(0, 0.5, 30), np.linspace(0.8, 1, 200)]
@@ -123,7 +123,7 @@ def test_uneven_and_missing_samples_do_not_matter() -> None:
 
 
 @pytest.mark.slow
-def test_few_samples_with_velocities_mean_cubics_between_them() -> None:
+def test_few_samples_with_velocities_are_connected_by_cubics() -> None:
     from scipy.interpolate import CubicHermiteSpline
 
     t = np.linspace(0, 1, 9)
@@ -158,7 +158,7 @@ def test_two_samples_make_a_straight_motion_at_constant_speed() -> None:
     assert np.abs(states.ddq).max() < 1e-6
 
 
-def test_a_robot_that_never_moves_stays() -> None:
+def test_a_robot_at_rest_stays_at_rest() -> None:
     t = np.linspace(0, 1, 50)
     motion = fit_motion(t, np.full((50, 2), 0.3), spec=SPEC)
     assert np.abs(motion.path - 0.3).max() < 1e-12
@@ -173,7 +173,7 @@ def test_a_robot_that_never_moves_stays() -> None:
         TrajectorySpec(degree=7, path_control_points=60, rate_control_points=50),
     ],
 )
-def test_other_degrees_and_numbers_of_control_points(spec: TrajectorySpec) -> None:
+def test_other_degrees_and_numbers_of_control_points_are_supported(spec: TrajectorySpec) -> None:
     t = np.linspace(0, 1, 101)
     q = np.column_stack([np.sin(3 * t)])
     motion = fit_motion(t, q, spec=spec)
@@ -182,7 +182,7 @@ def test_other_degrees_and_numbers_of_control_points(spec: TrajectorySpec) -> No
 
 
 @pytest.mark.slow
-def test_many_samples_and_long_motions() -> None:
+def test_many_samples_and_long_motions_are_fitted() -> None:
     t = np.linspace(0, 1e4, 20_001)
     q = np.column_stack([np.sin(3e-4 * t), trapezoid(t / 1e4)[:, 0]])
     motion = fit_motion(t, q, spec=SPEC)
@@ -190,7 +190,7 @@ def test_many_samples_and_long_motions() -> None:
     assert motion.duration()[0] == pytest.approx(1e4, rel=1e-9)
 
 
-def test_noise_does_not_become_boundary_accelerations() -> None:
+def test_noise_does_not_cause_boundary_accelerations() -> None:
     random = np.random.default_rng(2)
     t = np.linspace(0, 1, 1001)
     q = minimum_jerk(t)
@@ -200,7 +200,7 @@ def test_noise_does_not_become_boundary_accelerations() -> None:
     assert np.abs(boundary.start_ddq).max() < 1.0
 
 
-def test_the_sampled_boundary_is_that_of_the_curve() -> None:
+def test_the_sampled_boundary_agrees_with_the_curve() -> None:
     t = np.linspace(1, 2, 501)
     q = np.column_stack([np.sin(4 * (t - 1)), (t - 1) ** 2, np.full_like(t, 0.2)])
     dq = np.column_stack([4 * np.cos(4 * (t - 1)), 2 * (t - 1), np.zeros_like(t)])
@@ -238,14 +238,14 @@ T3, Q3 = [0.0, 0.5, 1.0], np.zeros((3, 2))
         (T3, [["a", "b"]] * 3, None, "q must be an array of numbers"),
     ],
 )
-def test_wrong_samples_are_refused(t: object, q: object, dq: object, message: str) -> None:
+def test_invalid_samples_raise_an_error(t: object, q: object, dq: object, message: str) -> None:
     with pytest.raises(UsageError, match=message):
         fit_motion(t, q, dq, spec=SPEC)
     with pytest.raises(UsageError, match=message):
         sampled_boundary(t, q, dq)
 
 
-def test_a_boundary_that_does_not_fit_is_refused() -> None:
+def test_a_boundary_of_a_wrong_shape_raises_an_error() -> None:
     t = np.linspace(0, 1, 20)
     q = np.zeros((20, 3))
     with pytest.raises(UsageError, match=r"start_q must have shape \(1, 3\), got \(1, 2\)"):

@@ -1,4 +1,4 @@
-"""Forged datasets, every digest and statistic made anew: who notices is what docs/dataset-format.md says."""
+"""Forged datasets with valid digests and statistics: the checks of docs/dataset-format.md that detect them."""
 
 import re
 import shutil
@@ -10,16 +10,16 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cnpgen.judges.rows.fastest_hit import highest_speed
+from cnpgen.judges.rows.hits import highest_speed
 from cnpgen.make.dataset import make_dataset
-from cnpgen.make.load import load_dataset_recipe
-from cnpgen.problems.load import load_problem
-from cnpgen.problems.robot import load_robot
-from cnpgen.store.blueprint import load_blueprint, shards
+from cnpgen.make.recipe_file import load_dataset_recipe
+from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.problem_file import load_problem
+from cnpgen.store.dataset_spec import load_dataset_spec, shards
 from cnpgen.store.manifest import finalize
-from cnpgen.store.record import commit_shard, load_record
 from cnpgen.store.shard import read_shard
-from cnpgen.validate.dataset import validate_dataset
+from cnpgen.store.shard_record import commit_shard, load_record
+from cnpgen.validate.validate_dataset import validate_dataset
 from tests.conftest import some
 
 ROBOT = load_robot(load_problem("airhockey"))
@@ -48,7 +48,7 @@ def slow_all_down(columns: Columns) -> None:
         columns[name] *= 0.5
 
 
-def slow_each_down_by_luck(columns: Columns) -> None:
+def slow_each_down_randomly(columns: Columns) -> None:
     factor = np.random.default_rng(0).uniform(0.5, 1.0, len(columns["hit_speed"]))
     columns["hit_speed"] *= factor
     columns["goal_dq"] *= factor[:, None]
@@ -102,7 +102,7 @@ def give_starts_other_goals(columns: Columns) -> None:
 
 
 def choose_the_easy_ones(columns: Columns) -> None:
-    """Rows are sorted, as they would be if those that somebody likes came first."""
+    """Sort the rows, as if a selection came first."""
     order = np.argsort(columns["hit_speed"])
     for name in columns.keys() - {"sample_id"}:
         columns[name][:] = columns[name][order]
@@ -110,7 +110,7 @@ def choose_the_easy_ones(columns: Columns) -> None:
 
 @dataclass(frozen=True)
 class Forgery:
-    """Something that a forger does, and whether --deep notices."""
+    """A forgery, and whether --deep detects it."""
 
     forge: Callable[[Columns], None]
     deep: bool
@@ -123,7 +123,7 @@ FORGERIES = (
     Forgery(hit_too_fast, True),
     Forgery(repeat_a_row, True),
     Forgery(sink_into_the_table, True),
-    Forgery(slow_each_down_by_luck, False),
+    Forgery(slow_each_down_randomly, False),
     Forgery(start_elsewhere, False),
     Forgery(give_starts_other_goals, False),
     Forgery(choose_the_easy_ones, False),
@@ -137,35 +137,35 @@ def honest(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def forged(honest: Path, folder: Path, forge: Callable[[Columns], None]) -> Path:
-    """Forge every shard of a copy and make digests, statistics, records and documents anew."""
+    """Forge every shard of a copy and recompute digests, statistics, records and documents."""
     shutil.copytree(honest, folder)
-    blueprint = load_blueprint(folder)
-    for task in shards(blueprint):
+    spec = load_dataset_spec(folder)
+    for task in shards(spec):
         columns, record = read_shard(folder / task.file), load_record(folder, task)
         columns = {name: values.copy() for name, values in columns.items()}
         forge(columns)
         (folder / task.sidecar).unlink()
         about = {"started": record.started, "seconds": record.seconds, "versions": record.versions}
-        commit_shard(folder, blueprint, task, columns=columns, fates=record.fates, **about)
-    finalize(folder, blueprint)
+        commit_shard(folder, spec, task, columns=columns, sampling=record.sampling, **about)
+    finalize(folder, spec)
     return folder
 
 
-def test_the_honest_dataset_is_sound(honest: Path) -> None:
+def test_the_original_dataset_is_valid(honest: Path) -> None:
     assert validate_dataset(honest, deep=True, regenerate=1, workers=1).ok
 
 
 @pytest.mark.parametrize("forgery", some(FORGERIES, 2, "slow"), ids=lambda forgery: forgery.forge.__name__)
-def test_who_notices_a_forgery(honest: Path, tmp_path: Path, forgery: Forgery) -> None:
+def test_forgeries_are_detected_by_the_expected_checks(honest: Path, tmp_path: Path, forgery: Forgery) -> None:
     folder = forged(honest, tmp_path / "set", forgery.forge)
     assert validate_dataset(folder).ok
     assert validate_dataset(folder, deep=True, workers=1).ok is not forgery.deep
     assert not validate_dataset(folder, regenerate=1).ok
 
 
-def test_the_page_has_these_counts() -> None:
+def test_the_documentation_has_these_counts() -> None:
     text = re.sub(r"\s+", " ", PAGE.read_text(encoding="utf-8"))
-    noticed = sum(forgery.deep for forgery in FORGERIES)
+    detected = sum(forgery.deep for forgery in FORGERIES)
     assert (
-        f"Of {len(FORGERIES)} forged datasets, `validate` notices 0, `--deep` {noticed} and `--regenerate` all" in text
+        f"`validate` detects 0 of {len(FORGERIES)} forged datasets, `--deep` {detected} and `--regenerate` all" in text
     )

@@ -1,4 +1,4 @@
-"""The doctor: what is there, what is missing, and what to do about it."""
+"""Check of the machine: what works, what is missing, and remedies."""
 
 import dataclasses
 import importlib
@@ -26,7 +26,7 @@ def fresh_compiler():
     find_compiler.cache_clear()
 
 
-def test_this_machine_is_well():
+def test_this_machine_has_no_problems():
     report = check_machine()
     assert report.ok, report.problems
     assert report.libraries["pin"][0].isdigit()
@@ -37,12 +37,14 @@ def test_this_machine_is_well():
     assert "8 datasets" in report.recipes
 
 
-def test_every_dependency_is_looked_for():
+def test_every_dependency_is_checked():
     declared = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    assert sorted(machine.NEEDED.values()) == sorted(re.split("[<>=]", each)[0] for each in declared["dependencies"])
+    assert sorted(machine.REQUIRED_PROJECTS.values()) == sorted(
+        re.split("[<>=]", item)[0] for item in declared["dependencies"]
+    )
 
 
-def test_the_report_is_frozen_and_has_a_json_form():
+def test_the_report_is_frozen_and_converts_to_json():
     report = check_machine()
     with pytest.raises(dataclasses.FrozenInstanceError):
         report.backend = ""
@@ -51,7 +53,7 @@ def test_the_report_is_frozen_and_has_a_json_form():
     assert content["libraries"]["numpy"]
 
 
-def test_the_other_project_called_pinocchio_is_recognised(monkeypatch):
+def test_the_other_project_called_pinocchio_is_recognized(monkeypatch):
     monkeypatch.setitem(sys.modules, "pinocchio", types.ModuleType("pinocchio"))
     report = check_machine()
     assert not report.ok
@@ -95,14 +97,14 @@ def test_a_broken_library_is_one_line_with_a_remedy(monkeypatch, error):
     assert "--force-reinstall coal" in report.problems[0]
 
 
-def test_a_working_directory_that_is_gone_is_a_note(monkeypatch, tmp_path):
+def test_a_deleted_working_directory_is_a_note(monkeypatch, tmp_path):
     (tmp_path / "gone").mkdir()
     monkeypatch.chdir(tmp_path / "gone")
     (tmp_path / "gone").rmdir()
     report = check_machine()
     assert report.ok
     assert report.free_bytes == 0
-    assert any(note.startswith("the working directory cannot be looked at (No such file") for note in report.notes)
+    assert any(note.startswith("the working directory cannot be read (No such file") for note in report.notes)
 
 
 def test_a_missing_plotting_library_is_only_a_note(monkeypatch):
@@ -156,7 +158,7 @@ def test_a_container_with_fewer_cores_is_a_note(monkeypatch):
     monkeypatch.setattr(machine.os, "sched_getaffinity", lambda _pid: set(range(64)), raising=False)
     report = check_machine()
     assert report.cores < 64
-    assert any("workers=" in note for note in report.notes)
+    assert any(note.startswith("this container may use") and note.endswith(" workers") for note in report.notes)
 
 
 def test_recipes_that_do_not_load_are_a_problem(monkeypatch, tmp_path):
@@ -167,7 +169,7 @@ def test_recipes_that_do_not_load_are_a_problem(monkeypatch, tmp_path):
 
 
 def test_little_free_disk_is_a_note(monkeypatch):
-    monkeypatch.setattr(machine, "ENOUGH_DISK", 10**30)
+    monkeypatch.setattr(machine, "MIN_DISK_BYTES", 10**30)
     assert any("MB are free" in note for note in check_machine().notes)
 
 
@@ -186,9 +188,9 @@ def test_arm_has_neon(monkeypatch):
     assert vector_instructions() == "neon"
 
 
-def test_variables_that_nobody_set_are_not_reported(monkeypatch):
+def test_variables_that_the_user_did_not_set_are_not_reported(monkeypatch):
     for name in threads.VARIABLES:
-        monkeypatch.setenv(name, "")  # so that it is put back afterwards, set or not
+        monkeypatch.setenv(name, "")  # restored after the test, set or not
         monkeypatch.delenv(name)
     monkeypatch.setenv("MKL_NUM_THREADS", "1")
     monkeypatch.setattr(threads, "_preferred", {})

@@ -1,4 +1,4 @@
-"""Many states at once are what the one-state world says of each, and distances that are skipped hide nothing."""
+"""Many states at once agree with the one-state world, and no smallest distance is skipped."""
 
 import json
 from pathlib import Path
@@ -9,13 +9,13 @@ import pytest
 from scipy.interpolate import BSpline
 
 from cnpgen.errors import RecipeError
-from cnpgen.problems.load import load_problem
+from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.robot import load_robot
+from cnpgen.problems.problem_file import load_problem
 from cnpgen.robots.robot import Robot
-from cnpgen.trajectory.motion import Motion
+from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.world.path import PathWorld
-from cnpgen.world.state import World
+from cnpgen.world.world import World
 from tests.examples.chains import chain
 
 PROBLEMS = {name: load_problem(name) for name in ("airhockey", "heavy-object")}
@@ -24,7 +24,7 @@ PLANS = json.loads((Path(__file__).parents[1] / "data" / "plans.json").read_text
 
 
 def wandering(robot: Robot, *, seed: int, count: int = 150) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Smooth random joint motions, shape (n, count) each; their derivatives are as large as the limits."""
+    """Draw smooth random joint motions, shape (n, count) each, with derivatives as large as the limits."""
     random, s = np.random.default_rng(seed), np.linspace(0, 1, count)
     control = random.uniform(robot.position_lower, robot.position_upper, (9, robot.n))
     curve = BSpline(np.concatenate([[0] * 4, np.linspace(0, 1, 6), [1] * 4]), control[:9], 4)
@@ -32,12 +32,12 @@ def wandering(robot: Robot, *, seed: int, count: int = 150) -> tuple[np.ndarray,
     return curve(s).T, dq * robot.velocity_limit[:, None], ddq * robot.acceleration_limit[:, None]
 
 
-def one_by_one(problem: Problem, robot: Robot, path: tuple[np.ndarray, ...], tops: np.ndarray) -> list[World]:
-    """The same states, each in a world of its own."""
+def one_by_one(problem: Problem, robot: Robot, path: tuple[np.ndarray, ...], poses: np.ndarray) -> list[World]:
+    """Return a separate world for every state."""
     worlds = []
     for q, dq, ddq in zip(*(values.T for values in path), strict=True):
         world = World(robot, problem.obstacle, problem.object_size)
-        world.set_state(q.copy(), dq.copy(), ddq.copy(), tops)
+        world.set_state(q.copy(), dq.copy(), ddq.copy(), poses)
         worlds.append(world)
     return worlds
 
@@ -45,31 +45,31 @@ def one_by_one(problem: Problem, robot: Robot, path: tuple[np.ndarray, ...], top
 @pytest.fixture(scope="module", params=["airhockey", "heavy-object"])
 def both(request: pytest.FixtureRequest) -> tuple[PathWorld, list[World]]:
     problem, robot = PROBLEMS[request.param], ROBOTS[request.param]
-    path, tops = wandering(robot, seed=1), np.full(len(problem.obstacle), 0.3)
+    path, poses = wandering(robot, seed=1), np.full(len(problem.obstacle), 0.3)
     world = PathWorld(robot, problem.obstacle, problem.object_size)
-    world.set_path(*path, tops)
-    return world, one_by_one(problem, robot, path, tops)
+    world.set_path(*path, poses)
+    return world, one_by_one(problem, robot, path, poses)
 
 
 @pytest.mark.parametrize(
-    "what", ["q", "dq", "ddq", "torque", "tip_position", "tip_rotation", "tip_velocity", "tip_acceleration"]
+    "name", ["q", "dq", "ddq", "torque", "tip_position", "tip_rotation", "tip_velocity", "tip_acceleration"]
 )
-def test_every_quantity_is_that_of_the_one_state_world(both, what):
+def test_every_quantity_agrees_with_the_one_state_world(both, name):
     world, worlds = both
-    expected = np.stack([getattr(one, what) for one in worlds], axis=-1)
-    found = getattr(world, what)
+    expected = np.stack([getattr(state, name) for state in worlds], axis=-1)
+    found = getattr(world, name)
     assert found.shape == expected.shape
     np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
 
 
-def test_the_tip_velocity_at_one_state_is_that_of_all(both):
+def test_the_tip_velocity_at_one_state_agrees_with_that_of_all(both):
     world, _ = both
     for k in (0, 7, -1):
         np.testing.assert_array_equal(world.tip_velocity_at(k), world.tip_velocity[:, k])
 
 
-def test_measured_constraints_are_those_of_every_single_state(both):
-    """All but the distances, of which only the smallest is exact."""
+def test_measured_constraints_agree_with_those_of_single_states(both):
+    """Of distances only the smallest is exact."""
     world, worlds = both
     problem = PROBLEMS["heavy-object" if world.robot.n == 7 else "airhockey"]
     for constraint in problem.constraint:
@@ -85,7 +85,7 @@ def test_measured_constraints_are_those_of_every_single_state(both):
                 np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
 
 
-def test_an_object_is_needed_to_measure_its_distances():
+def test_object_distances_without_an_object_raise_an_error():
     with pytest.raises(RecipeError, match="no \\[object\\]"):
         PathWorld(
             ROBOTS["airhockey"], PROBLEMS["airhockey"].obstacle, PROBLEMS["airhockey"].object_size
@@ -109,17 +109,17 @@ def test_states_that_are_not_finite_have_no_distances():
 # --- distances --------------------------------------------------------------------------------------------------------
 
 
-def brute_force(world: PathWorld, problem: Problem, tops: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def brute_force(world: PathWorld, problem: Problem, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     one = World(world.robot, problem.obstacle, problem.object_size)
     segments, objects = [], []
     for state in zip(world.q.T, world.dq.T, world.ddq.T, strict=True):
-        one.set_state(*(values.copy() for values in state), tops)
+        one.set_state(*(values.copy() for values in state), poses)
         segments.append(one.segment_distances())
         objects.append(one.object_distances())
     return np.array(segments).T, np.array(objects).T
 
 
-def assert_nothing_is_hidden(found: list[np.ndarray], expected: np.ndarray) -> None:
+def assert_smallest_is_exact(found: list[np.ndarray], expected: np.ndarray) -> None:
     values = np.array(found)
     assert values.shape == expected.shape
     assert values.min() == pytest.approx(expected.min(), abs=1e-9)
@@ -129,68 +129,70 @@ def assert_nothing_is_hidden(found: list[np.ndarray], expected: np.ndarray) -> N
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_skipping_agrees_with_brute_force_on_random_motions(seed):
-    """Random motions run through the pedestals as often as they stay clear of them."""
+def test_the_search_agrees_with_brute_force_on_random_motions(seed):
+    """About half of the random motions collide with the pedestals."""
     problem, world = (
         PROBLEMS["heavy-object"],
         PathWorld(ROBOTS["heavy-object"], PROBLEMS["heavy-object"].obstacle, PROBLEMS["heavy-object"].object_size),
     )
-    tops = np.random.default_rng(seed).uniform(-0.3, 0.6, 2)
-    world.set_path(*wandering(world.robot, seed=10 + seed, count=400), tops)
-    segments, objects = brute_force(world, problem, tops)
-    assert_nothing_is_hidden(world.segment_distances(), segments)
-    assert_nothing_is_hidden(world.object_distances(), objects)
+    poses = np.random.default_rng(seed).uniform(-0.3, 0.6, 2)
+    world.set_path(*wandering(world.robot, seed=10 + seed, count=400), poses)
+    segments, objects = brute_force(world, problem, poses)
+    assert_smallest_is_exact(world.segment_distances(), segments)
+    assert_smallest_is_exact(world.object_distances(), objects)
 
 
-def test_a_path_that_is_not_exact_measures_only_where_bounds_do_not_show_enough():
-    """Its distances are bounds that are enough, where there are such, and those of an exact path elsewhere."""
+def test_a_path_that_is_not_exact_measures_only_if_bounds_are_not_sufficient():
+    """Its distances are bounds if these are sufficient, and those of an exact path otherwise."""
     problem = PROBLEMS["heavy-object"]
-    world, tops = PathWorld(ROBOTS["heavy-object"], problem.obstacle, problem.object_size), np.full(2, -0.3)
+    world, poses = PathWorld(ROBOTS["heavy-object"], problem.obstacle, problem.object_size), np.full(2, -0.3)
     states = wandering(world.robot, seed=12, count=400)
-    told = {}
+    distances_of = {}
     for exact in (True, False):
-        world.set_path(*states, tops, exact=exact)
+        world.set_path(*states, poses, exact=exact)
         for what in ("segment", "object"):
             distances = getattr(world, f"{what}_distances")
             least = np.min(getattr(world, f"{what}_pairs")().bounds)
-            told[what, exact] = [np.array(distances(enough)) for enough in (least - 1e-3, least + 1e-3)]
+            distances_of[what, exact] = [np.array(distances(sufficient)) for sufficient in (least - 1e-3, least + 1e-3)]
     for what in ("segment", "object"):
-        (known, _), (rough, measured) = told[what, True], told[what, False]
-        assert (rough <= known + 1e-9).all()
-        assert rough.min() < known.min() - 1e-3
+        (known, _), (bounds, measured) = distances_of[what, True], distances_of[what, False]
+        assert (bounds <= known + 1e-9).all()
+        assert bounds.min() < known.min() - 1e-3
         np.testing.assert_array_equal(measured, known)
 
 
-def test_skipping_agrees_with_brute_force_on_a_plan_that_slides_along_a_pedestal():
+def test_the_search_agrees_with_brute_force_on_a_plan_that_slides_along_a_pedestal():
     problem, plan = PROBLEMS["heavy-object"], PLANS["dragging"]
     motion = Motion(np.array([plan["path"]]), np.array([plan["rate"]]))
     states = motion.at(np.linspace(0, 1, 700))
-    world, tops = (
+    world, poses = (
         PathWorld(ROBOTS["heavy-object"], problem.obstacle, problem.object_size),
         np.array([plan["start_xyz"][2], plan["goal_xyz"][2]]) - 0.15,
     )
-    world.set_path(states.q[0].T, states.dq[0].T, states.ddq[0].T, tops)
-    segments, objects = brute_force(world, problem, tops)
-    assert_nothing_is_hidden(world.segment_distances(), segments)
-    assert_nothing_is_hidden(world.object_distances(), objects)
+    world.set_path(states.q[0].T, states.dq[0].T, states.ddq[0].T, poses)
+    segments, objects = brute_force(world, problem, poses)
+    assert_smallest_is_exact(world.segment_distances(), segments)
+    assert_smallest_is_exact(world.object_distances(), objects)
 
 
-def test_nearly_all_states_are_skipped(monkeypatch: pytest.MonkeyPatch):
+def test_nearly_all_states_are_not_measured(monkeypatch: pytest.MonkeyPatch):
     problem, plan = PROBLEMS["heavy-object"], PLANS["transport"]
     states = Motion(np.array([plan["path"]]), np.array([plan["rate"]])).at(np.linspace(0, 1, 1500))
     world = PathWorld(ROBOTS["heavy-object"], problem.obstacle, problem.object_size)
-    tops = np.array([plan["start_xyz"][2], plan["goal_xyz"][2]]) - 0.15
-    world.set_path(states.q[0].T, states.dq[0].T, states.ddq[0].T, tops)
+    poses = np.array([plan["start_xyz"][2], plan["goal_xyz"][2]]) - 0.15
+    world.set_path(states.q[0].T, states.dq[0].T, states.ddq[0].T, poses)
     calls = []
-    for name in ("object_apart", "segment_apart"):
-        measure = getattr(world._scene, name)
-        monkeypatch.setattr(world._scene, name, lambda *where, measure=measure: (calls.append(1), measure(*where))[1])
+    for name in ("object_distance", "segment_distance"):
+        measure = getattr(world._collisions, name)
+        monkeypatch.setattr(
+            world._collisions, name, lambda *where, measure=measure: (calls.append(1), measure(*where))[1]
+        )
     world.object_distances()
     world.segment_distances()
     assert 2 <= len(calls) < 100
 
 
-def test_a_path_is_forgotten_when_the_next_one_is_set():
+def test_setting_a_path_discards_the_previous_one():
     world = PathWorld(ROBOTS["airhockey"], PROBLEMS["airhockey"].obstacle, PROBLEMS["airhockey"].object_size)
     first, second = wandering(world.robot, seed=6), wandering(world.robot, seed=7)
     world.set_path(*first, np.zeros(0))
@@ -200,12 +202,12 @@ def test_a_path_is_forgotten_when_the_next_one_is_set():
     assert not np.array_equal(before[1], world.tip_velocity)
 
 
-# --- the curve that both the refiner and the verdict evaluate ---------------------------------------------------------
+# --- the curve that the refiner and the verdict evaluate ---------------------------------------------------------
 
 
 @pytest.mark.parametrize("label", ["hit", "replan", "transport"])
-def test_a_motion_is_scipys_spline_of_its_control_points(label):
-    """Knots written out; derivatives in time by finite differences of q(t) with t from integrating ds/dt = r(s)."""
+def test_a_motion_equals_scipys_spline_of_its_control_points(label):
+    """Use explicit knots, and finite differences of q(t) with t from integrating ds/dt = r(s)."""
     from scipy.integrate import solve_ivp
 
     path, rate = np.array(PLANS[label]["path"]), np.array(PLANS[label]["rate"])

@@ -1,4 +1,4 @@
-"""Lower bounds of distances are lower bounds, and exact where a face is nearest: checked against Coal."""
+"""Lower bounds of distances: comparison with Coal, exact if a face is closest."""
 
 import coal
 import numpy as np
@@ -17,7 +17,7 @@ def box_between(low: np.ndarray, high: np.ndarray) -> Box:
 
 
 def draw(seed: int, count: int = 400) -> tuple[np.ndarray, np.ndarray, Box]:
-    """Poses of a cuboid near a box: from deep inside to far away, upright, tilted a little or at random."""
+    """Draw poses of a cuboid and a box: overlapping to distant, upright, slightly tilted or random."""
     random = np.random.default_rng(seed)
     low = random.uniform(-0.3, 0, 3)
     box = box_between(low, low + random.uniform(0.1, 0.6, 3))
@@ -59,12 +59,12 @@ def test_bounds_of_a_cuboid_are_never_above_its_distance(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_bounds_of_a_segment_are_never_above_its_distance(seed: int) -> None:
-    middle, rotation, box = draw(seed)
+    center, rotation, box = draw(seed)
     half = 0.2 * rotation[:, 2]
-    ends = np.array([middle - half, middle + half])
+    ends = np.array([center - half, center + half])
     bounds = np.maximum(gaps(ends.min(axis=0), ends.max(axis=0), [box])[0], 0.0)
-    for k in range(middle.shape[1]):
-        distance, direction = coal_distance(coal.Capsule(0.0, 0.4), middle[:, k], rotation[..., k].copy(), box)
+    for k in range(center.shape[1]):
+        distance, direction = coal_distance(coal.Capsule(0.0, 0.4), center[:, k], rotation[..., k].copy(), box)
         assert bounds[k] <= max(distance, 0.0) + 1e-9
         assert separation(ends, box, direction)[k] == pytest.approx(distance, abs=1e-8)
 
@@ -78,6 +78,6 @@ def test_gaps_along_several_axes_form_a_distance() -> None:
     np.testing.assert_allclose(gaps(low, high, [box])[0], [0.5, 0.5, np.sqrt(0.08)], atol=1e-15)
 
 
-def test_of_what_overlaps_the_shallowest_depth_is_the_bound() -> None:
+def test_the_bound_of_overlapping_boxes_is_the_smallest_depth() -> None:
     low, high = np.array([[0.0], [0.0], [0.9]]), np.array([[1.0], [1.0], [1.5]])
     assert gaps(low, high, [box_between(np.zeros(3), np.ones(3))])[0, 0] == pytest.approx(-0.1)

@@ -1,7 +1,7 @@
 """Anchored quadratic programming (docs/references.md, 2), which the authors of the paper compare hits with.
 
 First a path of the tip in the plane, two lines and an arc, with constant acceleration up to the hit; then, sample by
-sample, the joint velocity that follows it, by a quadratic programme in the null space of the tip's Jacobian that draws
+sample, the joint velocity that follows it, by a quadratic program in the null space of the tip's Jacobian that draws
 the arm towards the hitting configuration. It knows limits of positions and velocities, and none of accelerations.
 """
 
@@ -10,14 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.benchmark.planner import Answer, BenchmarkPlanner, Plan, Setting
-from cnpgen.benchmark.planners.plane import PlanePath, stopping_path, striking_path
+from cnpgen.benchmark.benchmark_planner import Answer, BenchmarkPlanner, Plan, Setting
+from cnpgen.benchmark.planners.table_plane import PlanePath, stopping_path, striking_path
 from cnpgen.benchmark.planners.tip import Tip
 from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.errors import UsageError
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.constraints.table import Table
-from cnpgen.problems.record import open_problem
+from cnpgen.problems.problem_record import open_problem
 from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
@@ -63,21 +63,21 @@ class _Follower:
         if speed == 0:
             raise UsageError("it plans hits, and this motion ends at rest")
         for _ in range(TRIES):
-            strike = striking_path(start[:2], self._goal[:2], velocity[:2], speed)
-            stop = stopping_path(strike)
-            found = self._follow(strike, stop, height)
+            hit = striking_path(start[:2], self._goal[:2], velocity[:2], speed)
+            stop = stopping_path(hit)
+            found = self._follow(hit, stop, height)
             if found is not None:
                 return found
             speed *= SLOWER
         return None
 
-    def _follow(self, strike: PlanePath, stop: PlanePath, height: float) -> Trajectory | None:
-        """Follow both parts; None where a quadratic programme has no solution."""
+    def _follow(self, hit: PlanePath, stop: PlanePath, height: float) -> Trajectory | None:
+        """Follow both parts; None where a quadratic program has no solution."""
         from scipy.interpolate import CubicSpline
 
-        count = max(int(np.ceil(strike.duration / PERIOD)), 2)
-        period = strike.duration / count
-        samples = np.array([*strike.sampled(period), *stop.sampled(period)])
+        count = max(int(np.ceil(hit.duration / PERIOD)), 2)
+        period = hit.duration / count
+        samples = np.array([*hit.sampled(period), *stop.sampled(period)])
         t = period * np.arange(len(samples) + 1.0)
         q = [self._boundary.start_q[0]]
         dq = self._boundary.start_dq[0]

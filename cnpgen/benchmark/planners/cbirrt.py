@@ -12,15 +12,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.benchmark.planner import Answer, BenchmarkPlanner, Plan, Setting
-from cnpgen.benchmark.planners.boxes import APART, DEEP, boxes_of, depth, distance
+from cnpgen.benchmark.benchmark_planner import Answer, BenchmarkPlanner, Plan, Setting
+from cnpgen.benchmark.planners.obstacle_boxes import APART, DEEP, boxes_of, depth, distance
 from cnpgen.benchmark.planners.tip import Tip
 from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.errors import MachineError
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.record import open_problem
+from cnpgen.problems.problem_record import open_problem
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.hull import CUBE
 

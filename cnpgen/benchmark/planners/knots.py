@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.benchmark.planners.boxes import Box, boxes_of, depth, distance
+from cnpgen.benchmark.planners.obstacle_boxes import Box, boxes_of, depth, distance
 from cnpgen.benchmark.planners.tip import Tip
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem
@@ -63,23 +63,23 @@ def _carrying(robot: Robot, size: Array, boxes: list[Box]) -> KnotConstraints:
     def of_the_object(q: Array) -> tuple[list[float], Array]:
         position, rotation, J = tip.at(q)
         turning = J[3:]
-        values, slopes = [rotation[2, 2] - 1.0], [np.cross(turning.T, rotation[:, 2])[:, 2]]
+        values, gradients = [rotation[2, 2] - 1.0], [np.cross(turning.T, rotation[:, 2])[:, 2]]
         for box in boxes:
             apart, out = distance(position, box)
             values.append(min(apart - APART, 0.0))
-            slopes.append(out @ J[:3] * (apart < APART))
+            gradients.append(out @ J[:3] * (apart < APART))
             for corner in (CUBE * size) @ rotation.T:
                 deep, out = depth(position + corner, box)
                 values.append(-deep)
-                slopes.append(-out @ (J[:3] + np.cross(turning.T, corner).T))
-        return values, np.array(slopes)
+                gradients.append(-out @ (J[:3] + np.cross(turning.T, corner).T))
+        return values, np.array(gradients)
 
     def knot(q: Array, dq: Array, ddq: Array) -> tuple[Array, Array, Array, Array]:
-        values, slope = of_the_object(q)
+        values, gradient = of_the_object(q)
         pin.computeRNEADerivatives(model, data, q, dq, ddq)
         inertia, torque = np.triu(data.M) + np.triu(data.M, 1).T, np.array(data.tau)
         g = np.concatenate([values, limit - torque, limit + torque])
-        rows = [(slope, data.dtau_dq), (np.zeros_like(slope), data.dtau_dv), (np.zeros_like(slope), inertia)]
+        rows = [(gradient, data.dtau_dq), (np.zeros_like(gradient), data.dtau_dv), (np.zeros_like(gradient), inertia)]
         of_q, of_dq, of_ddq = (np.vstack([first, -torques, torques]) for first, torques in rows)
         return g, of_q, of_dq, of_ddq
 

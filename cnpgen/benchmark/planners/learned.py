@@ -2,12 +2,12 @@
 
 from dataclasses import dataclass
 
-from cnpgen.benchmark.planner import Answer, BenchmarkPlanner, Plan, Setting
+from cnpgen.benchmark.benchmark_planner import Answer, BenchmarkPlanner, Plan, Setting
 from cnpgen.benchmark.planners.solve import near_base
 from cnpgen.errors import UsageError
 from cnpgen.planner.planner import Planner
 from cnpgen.plans.plans import Plans
-from cnpgen.refine.plans import refine_plans
+from cnpgen.refine.refine_plans import refine_plans
 
 
 @dataclass(frozen=True)

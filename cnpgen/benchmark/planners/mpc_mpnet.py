@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.benchmark.planner import Answer, BenchmarkPlanner, Plan, Setting
+from cnpgen.benchmark.benchmark_planner import Answer, BenchmarkPlanner, Plan, Setting
 from cnpgen.benchmark.planners import steering
 from cnpgen.benchmark.planners.proposals import Proposals, load_proposals, shipped_proposals
 from cnpgen.benchmark.planners.state_check import StateCheck
@@ -19,7 +19,7 @@ from cnpgen.benchmark.planners.steering import Steering
 from cnpgen.benchmark.planners.tree import Tree, radii_of
 from cnpgen.errors import UsageError
 from cnpgen.plans.plans import Plans
-from cnpgen.problems.record import open_problem
+from cnpgen.problems.problem_record import open_problem
 
 Array = NDArray[np.float64]
 
@@ -49,7 +49,7 @@ class MPCMPNet(BenchmarkPlanner):
             start_xyz, goal_xyz = task.columns["start_xyz"][0], task.columns["goal_xyz"][0]
             start = np.concatenate([boundary.start_q[0], boundary.start_dq[0]])
             tree = Tree(start, start_xyz, radii_of(problem), steering.STEP)
-            steer = Steering(check, check.tops(start_xyz, goal_xyz), robot.acceleration_limit, spread, random)
+            steer = Steering(check, check.obstacle_poses(start_xyz, goal_xyz), robot.acceleration_limit, spread, random)
             extend = ProposedExtension(tree, network, steer, boundary.goal_q[0])
             return tree.grow(extend, goal_xyz, time_limit=setting.time_limit, most=ITERATIONS)
 
@@ -80,10 +80,13 @@ class ProposedExtension:
         """Take one step; return the node that it led to, 0 if it led nowhere."""
         state, target, random = self.tree.state(self.node), self.goal_q, self.steer.random
         if random.random() >= BIAS:
-            target = self.network.propose(state, self.goal_q, self.steer.tops, random)
+            target = self.network.propose(state, self.goal_q, self.steer.obstacle_poses, random)
         found = self.steer(state, target)
         reached = 0 if found is None else self.tree.add(self.node, *found)
         self.node, self.steps = reached, self.steps + 1
         if found is None or self.steps > MOST_STEPS:
-            self.node, self.steps = self.tree.selected(self.steer.check.random_place(self.steer.tops, random)), 0
+            self.node, self.steps = (
+                self.tree.selected(self.steer.check.random_place(self.steer.obstacle_poses, random)),
+                0,
+            )
         return reached

@@ -1,6 +1,6 @@
 """Which configuration is next on the way to a goal: a network that has seen certified plans (Li et al., 2021).
 
-From a state, the goal and the obstacles it tells the change of every joint within a moment, as a normal distribution:
+From a state, the goal and the obstacles it tells the change of every joint within a time, as a normal distribution:
 the mean from the configuration head, which cannot leave what the joint's velocity limit allows, and the deviation
 from the linear head. Proposals are drawn from it, as those of the authors' network are by dropout. It is trained to
 find what came next on plans likely; datasets/proposals/README.md has the commands.
@@ -20,10 +20,10 @@ from cnpgen.machine.versions import __version__
 from cnpgen.planner.network.architecture import Architecture, Weights, initial_parameters
 from cnpgen.planner.network.forward import backward, forward
 from cnpgen.plans.plans import Plans
-from cnpgen.problems.obstacles import obstacle_tops
-from cnpgen.problems.record import open_problem
+from cnpgen.problems.obstacles import obstacle_poses_of
+from cnpgen.problems.problem_record import open_problem
 from cnpgen.schema.catalogue import recipes_root
-from cnpgen.store.files.sealed import Content, read_sealed, write_sealed
+from cnpgen.store.files.checksum_file import Content, read_with_checksum, write_with_checksum
 from cnpgen.training.adam import learning_rate, start_adam
 
 Array = NDArray[Any]
@@ -43,8 +43,8 @@ class Proposals:
         parameters: All of its numbers, float32.
         mean: Of every input over the training rows, shape (F,).
         scale: One over its standard deviation; 0 where it was constant, shape (F,).
-        reach: The farthest a joint can get within the moment [rad], shape (n,).
-        ahead: The moment [s].
+        reach: The farthest a joint can get within the time [rad], shape (n,).
+        ahead: The time [s].
         training: How it was made, as text.
     """
 
@@ -56,16 +56,16 @@ class Proposals:
     ahead: float
     training: Mapping[str, str] = field(default_factory=dict)
 
-    def propose(self, state: Array, goal_q: Array, tops: Array, random: np.random.Generator) -> Array:
+    def propose(self, state: Array, goal_q: Array, obstacle_poses: Array, random: np.random.Generator) -> Array:
         """Draw a configuration that may be next [rad], shape (n,).
 
         Args:
             state: Where the arm is and how it moves, shape (2 n,).
             goal_q: Where it is to be in the end [rad], shape (n,).
-            tops: Heights of the obstacles' upper faces [m], shape (obstacles,).
+            obstacle_poses: Heights of the obstacles' upper faces [m], shape (obstacles,).
             random: Where random numbers come from.
         """
-        inputs = standardised(inputs_of(state[None], goal_q[None], tops[None]), self.mean, self.scale)
+        inputs = standardised(inputs_of(state[None], goal_q[None], obstacle_poses[None]), self.mean, self.scale)
         given = forward(self._weights, inputs)
         drawn = random.normal(given.path[0], LEAST + np.exp(given.log_rate[0]))
         return np.asarray(state[: len(goal_q)] + self.reach * drawn)
@@ -75,9 +75,9 @@ class Proposals:
         return self.architecture.split(self.parameters)
 
 
-def inputs_of(states: Array, goal_q: Array, tops: Array) -> Array:
+def inputs_of(states: Array, goal_q: Array, obstacle_poses: Array) -> Array:
     """Put inputs beside each other: states (N, 2 n), goals (N, n), how far they are, and obstacles (N, m)."""
-    return np.concatenate([states, goal_q, goal_q - states[:, : goal_q.shape[1]], tops], axis=1)
+    return np.concatenate([states, goal_q, goal_q - states[:, : goal_q.shape[1]], obstacle_poses], axis=1)
 
 
 def standardised(inputs: Array, mean: Array, scale: Array) -> Array:
@@ -94,7 +94,7 @@ def save_proposals(path: str | Path, proposals: Proposals) -> None:
     arrays = {name: getattr(proposals, name) for name in ("parameters", "mean", "scale", "reach")}
     arrays["ahead"] = np.array([proposals.ahead])
     arrays["architecture"] = np.array(list(asdict(proposals.architecture).values()))
-    write_sealed(Path(path), Content(arrays, dict(proposals.training)), kind=KIND, version=VERSION)
+    write_with_checksum(Path(path), Content(arrays, dict(proposals.training)), kind=KIND, version=VERSION)
 
 
 def load_proposals(path: str | Path) -> Proposals:
@@ -104,7 +104,7 @@ def load_proposals(path: str | Path) -> Proposals:
         DatasetError: The file is damaged, or none of these.
         MachineError: The system would not let us read it.
     """
-    content = read_sealed(Path(path), kind=KIND, version=VERSION)
+    content = read_with_checksum(Path(path), kind=KIND, version=VERSION)
     arrays = dict(content.arrays)
     try:
         names = ("inputs", "hidden", "layers", "path_outputs", "rate_outputs")
@@ -136,7 +136,7 @@ def train_proposals(plans: Plans, *, ahead: float, steps: int = STEPS, seed: int
         plans: Valid plans of one problem: rows of a certified dataset, for example.
         ahead: What "next" is: so much later [s].
         steps: Steps of training.
-        seed: Seed of parameters, moments and batches.
+        seed: Seed of parameters, times and batches.
 
     Raises:
         UsageError: There are no plans.
@@ -159,14 +159,14 @@ def train_proposals(plans: Plans, *, ahead: float, steps: int = STEPS, seed: int
 
 
 def _rows(plans: Plans, ahead: float, random: np.random.Generator) -> tuple[Array, Array]:
-    """Return inputs and what the joints moved by afterwards [rad], at random moments of all plans."""
+    """Return inputs and what the joints moved by afterwards [rad], at random times of all plans."""
     first = random.uniform(0, 1, (len(plans), MOMENTS)) * plans.duration[:, None]
     now = plans.motion.at_times(first)
     later = plans.motion.at_times(np.minimum(first + ahead, plans.duration[:, None]))
-    tops = obstacle_tops(plans.problem, plans.columns["start_xyz"], plans.columns["goal_xyz"])
-    goal_q, tops = (np.repeat(each, MOMENTS, axis=0) for each in (plans.boundary.goal_q, tops))
+    obstacle_poses = obstacle_poses_of(plans.problem, plans.columns["start_xyz"], plans.columns["goal_xyz"])
+    goal_q, obstacle_poses = (np.repeat(each, MOMENTS, axis=0) for each in (plans.boundary.goal_q, obstacle_poses))
     states = np.concatenate([now.q, now.dq], axis=2).reshape(len(goal_q), -1)
-    return inputs_of(states, goal_q, tops), (later.q - now.q).reshape(len(goal_q), -1)
+    return inputs_of(states, goal_q, obstacle_poses), (later.q - now.q).reshape(len(goal_q), -1)
 
 
 def _fitted(network: Proposals, features: Array, targets: Array, steps: int, random: np.random.Generator) -> Array:
@@ -195,12 +195,12 @@ def likelihood_gradient(weights: Weights, features: Array, targets: Array, *, ou
     given = forward(weights, features)
     deviation = np.exp(given.log_rate) + LEAST
     off = (given.path - targets) / deviation
-    slope = (1 - off * off) / deviation * (deviation - LEAST)
+    gradient = (1 - off * off) / deviation * (deviation - LEAST)
     backward(
         weights,
         given,
         path_gradient=off / deviation / len(features),
-        log_rate_gradient=slope / len(features),
+        log_rate_gradient=gradient / len(features),
         out=out,
     )
     return float(np.mean(np.sum(off * off / 2 + np.log(deviation), axis=1)))

@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cnpgen.benchmark.planner import BenchmarkPlanner, Plan, Setting
+from cnpgen.benchmark.benchmark_planner import BenchmarkPlanner, Plan, Setting
 from cnpgen.plans.boundary_problems import plans_of_rows
 from cnpgen.plans.plans import Plans
-from cnpgen.problems.record import ProblemRecord, open_problem
-from cnpgen.refine.plans import solve_plans
+from cnpgen.problems.problem_record import ProblemRecord, open_problem
+from cnpgen.refine.refine_plans import solve_plans
 
 
 @dataclass(frozen=True)

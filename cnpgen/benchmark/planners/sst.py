@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.benchmark.planner import Answer, BenchmarkPlanner, Plan, Setting
+from cnpgen.benchmark.benchmark_planner import Answer, BenchmarkPlanner, Plan, Setting
 from cnpgen.benchmark.planners.state_check import StateCheck
 from cnpgen.benchmark.planners.tree import Tree, radii_of
 from cnpgen.plans.plans import Plans
-from cnpgen.problems.record import open_problem
+from cnpgen.problems.problem_record import open_problem
 from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
@@ -39,7 +39,12 @@ class SST(BenchmarkPlanner):
             start_xyz, goal_xyz = task.columns["start_xyz"][0], task.columns["goal_xyz"][0]
             tree = Tree(np.concatenate([boundary.start_q[0], boundary.start_dq[0]]), start_xyz, radii, STEP)
             extend = RandomExtension(
-                tree, robot, check, tops=check.tops(start_xyz, goal_xyz), goal=goal_xyz, random=random
+                tree,
+                robot,
+                check,
+                obstacle_poses=check.obstacle_poses(start_xyz, goal_xyz),
+                goal=goal_xyz,
+                random=random,
             )
             return tree.grow(extend, goal_xyz, time_limit=setting.time_limit, most=ITERATIONS)
 
@@ -54,7 +59,7 @@ class RandomExtension:
         tree: The tree.
         robot: The robot.
         check: What allows states.
-        tops: Heights of the obstacles' upper faces [m], shape (obstacles,).
+        obstacle_poses: Heights of the obstacles' upper faces [m], shape (obstacles,).
         goal: Where the tip is to be [m], shape (3,).
         random: Where random numbers come from.
     """
@@ -62,18 +67,18 @@ class RandomExtension:
     tree: Tree
     robot: Robot
     check: StateCheck
-    tops: Array
+    obstacle_poses: Array
     goal: Array
     random: np.random.Generator
 
     def __call__(self) -> int:
         """Hold a random acceleration for a random time; return the node that this leads to, 0 if it is not allowed."""
         to_goal = self.random.random() < BIAS
-        parent = self.tree.selected(self.goal if to_goal else self.check.random_place(self.tops, self.random))
+        parent = self.tree.selected(self.goal if to_goal else self.check.random_place(self.obstacle_poses, self.random))
         q, dq = np.split(self.tree.state(parent), 2)
         limit = self.robot.acceleration_limit
         ddq = self.random.uniform(-limit, limit) * self.random.random()  # small ones, too: 12 kg need much torque
         t = STEP * np.arange(1.0, self.random.integers(1, MOST_STEPS + 1) + 1)[:, None]
         path_q, path_dq = q + t * (dq + t / 2 * ddq), dq + t * ddq
-        tips, allowed = self.check(path_q, path_dq, np.broadcast_to(ddq, path_q.shape), self.tops)
+        tips, allowed = self.check(path_q, path_dq, np.broadcast_to(ddq, path_q.shape), self.obstacle_poses)
         return self.tree.add(parent, np.concatenate([path_q, path_dq], axis=1), tips[-1]) if allowed.all() else 0

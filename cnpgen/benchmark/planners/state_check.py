@@ -5,15 +5,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.benchmark.planners.boxes import APART, DEEP, require_transport
+from cnpgen.benchmark.planners.obstacle_boxes import APART, DEEP, require_transport
 from cnpgen.kernels.library import choose_backend, problem_kernels
 from cnpgen.kernels.symbolic.linalg import Scalar, Vec, dot, symbols
-from cnpgen.kernels.symbolic.state import SymbolicState
+from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
 from cnpgen.problems.constraints.table import Table
-from cnpgen.problems.obstacles import obstacle_tops
+from cnpgen.problems.obstacles import obstacle_poses_of
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.shape.hull import CUBE
-from cnpgen.robots.solid import count_numbers
+from cnpgen.robots.solid import pose_width
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
@@ -25,7 +25,7 @@ TABLE = 0.01  # m: how far from its height the tip may be
 
 
 class StateCheck:
-    """Checks states of one boundary problem: limits of joints and torques, the manifold, the surroundings.
+    """Checks states of one boundary problem: limits of joints and torques, the manifold, the loaded problem.
 
     Args:
         problem: The problem.
@@ -41,50 +41,52 @@ class StateCheck:
         self._problem, self._robot = problem, robot
         self._kernel = problem_kernels(problem, robot, *choose_backend(None)).load(tip_and_excess)
 
-    def tops(self, start_xyz: Array, goal_xyz: Array) -> Array:
+    def obstacle_poses(self, start_xyz: Array, goal_xyz: Array) -> Array:
         """Return the heights of the obstacles' upper faces [m], shape (obstacles,), from the ends of a motion."""
-        return obstacle_tops(self._problem, start_xyz, goal_xyz)
+        return obstacle_poses_of(self._problem, start_xyz, goal_xyz)
 
-    def __call__(self, q: Array, dq: Array, ddq: Array, tops: Array) -> tuple[Array, NDArray[np.bool_]]:
+    def __call__(self, q: Array, dq: Array, ddq: Array, obstacle_poses: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Look at N states.
 
         Args:
             q: Joint positions [rad], shape (N, n).
             dq: Joint velocities [rad/s], shape (N, n).
             ddq: Joint accelerations [rad/s^2], shape (N, n).
-            tops: What ``tops`` returned.
+            obstacle_poses: What ``obstacle_poses`` returned.
 
         Returns:
             Where the tip is [m], shape (N, 3), and whether the state is allowed, shape (N,).
         """
         lanes = [np.ascontiguousarray(values.T) for values in (q, dq, ddq)]
-        tip, excess = self._kernel(*lanes, np.ascontiguousarray(np.broadcast_to(tops[:, None], (len(tops), len(q)))))
+        tip, excess = self._kernel(
+            *lanes, np.ascontiguousarray(np.broadcast_to(obstacle_poses[:, None], (len(obstacle_poses), len(q))))
+        )
         return np.ascontiguousarray(tip.T), excess[0] <= 0
 
-    def random_place(self, tops: Array, random: np.random.Generator) -> Array:
+    def random_place(self, obstacle_poses: Array, random: np.random.Generator) -> Array:
         """Draw a place: where a random configuration has the tip [m], shape (3,)."""
         q = random.uniform(self._robot.position_lower, self._robot.position_upper)[None]
         still = np.zeros_like(q)
-        return np.asarray(self(q, still, still, tops)[0][0])
+        return np.asarray(self(q, still, still, obstacle_poses)[0][0])
 
 
 def tip_and_excess(robot: "Robot", problem: Problem) -> Any:
-    """Build ``(q, dq, ddq, tops) -> (tip, excess)``: by how much the worst bound is exceeded, in its own unit."""
+    """Build ``(q, dq, ddq, obstacle_poses) -> (tip, excess)``: by how much the worst bound is exceeded, in its own unit."""
     import casadi as ca
 
-    names = (("q", robot.n), ("dq", robot.n), ("ddq", robot.n), ("tops", count_numbers(problem.obstacle)))
-    (q_sx, q), (dq_sx, dq), (ddq_sx, ddq), (tops_sx, tops) = (symbols(name, width) for name, width in names)
-    state = SymbolicState(robot, q, dq, ddq, tops, problem.obstacle, problem.object_size)
+    names = (("q", robot.n), ("dq", robot.n), ("ddq", robot.n), ("obstacle_poses", pose_width(problem.obstacle)))
+    (q_sx, q), (dq_sx, dq), (ddq_sx, ddq), (poses_sx, obstacle_poses) = (symbols(name, width) for name, width in names)
+    state = SymbolicState(robot, q, dq, ddq, obstacle_poses, problem.obstacle, problem.object_size)
     tip, table = state.kinematics.tip, problem.first(Table)
     excess = [ca.fabs(value) - limit for value, limit in zip(dq, robot.velocity_limit.tolist(), strict=True)]
     excess += [ca.fabs(value) - limit for value, limit in zip(state.torque, robot.torque_limit.tolist(), strict=True)]
     excess += [low - value for value, low in zip(q, robot.position_lower.tolist(), strict=True)]
     excess += [value - high for value, high in zip(q, robot.position_upper.tolist(), strict=True)]
-    excess += _off_the_table(table, tip) if table is not None else _off_the_way(state, tops)
+    excess += _off_the_table(table, tip) if table is not None else _off_the_way(state, obstacle_poses)
     worst: Scalar = excess[0]
     for each in excess[1:]:
         worst = ca.fmax(worst, each)
-    return ca.Function("tip_and_excess", [q_sx, dq_sx, ddq_sx, tops_sx], [ca.vertcat(*tip), worst])
+    return ca.Function("tip_and_excess", [q_sx, dq_sx, ddq_sx, poses_sx], [ca.vertcat(*tip), worst])
 
 
 def _off_the_table(table: Table, tip: Vec) -> list[Scalar]:
@@ -98,7 +100,7 @@ def _off_the_table(table: Table, tip: Vec) -> list[Scalar]:
     return [ca.fabs(tip[2] - table.z) - TABLE, *sides]
 
 
-def _off_the_way(state: SymbolicState, tops: Vec) -> list[Scalar]:
+def _off_the_way(state: SymbolicState, obstacle_poses: Vec) -> list[Scalar]:
     """Tilt of the object, its centre near a pedestal, and a corner in one, which reaches down without end."""
     import casadi as ca
 
@@ -108,7 +110,7 @@ def _off_the_way(state: SymbolicState, tops: Vec) -> list[Scalar]:
         for corner in (CUBE * np.array(state.object_size)).tolist()
     ]
     excess: list[Scalar] = [1.0 - rotation[2][2] - UPRIGHT]
-    for box, top in zip(state.obstacles, tops, strict=True):
+    for box, top in zip(state.obstacles, obstacle_poses, strict=True):
         spans = [(span.low, span.high) for span in (box.x, box.y) if span is not None]
         sides = (*spans, (-np.inf, top))
         outside = [

@@ -29,7 +29,7 @@ class Spread:
     acceleration: float
     mean_time: float
     time: float
-    longest: float
+    max_duration: float
 
 
 HIT = Spread(0.4, 0.1, 0.4, 0.5)
@@ -42,14 +42,14 @@ class Steering:
 
     Attributes:
         check: What allows states.
-        tops: Heights of the obstacles' upper faces [m], shape (obstacles,).
+        obstacle_poses: Heights of the obstacles' upper faces [m], shape (obstacles,).
         limit: Limits of the accelerations [rad/s^2], shape (n,).
         spread: What controls are drawn from at first.
         random: Where random numbers come from.
     """
 
     check: StateCheck
-    tops: Array
+    obstacle_poses: Array
     limit: Array
     spread: Spread
     random: np.random.Generator
@@ -87,7 +87,7 @@ class Steering:
     def _drawn(self, mean: Array, deviation: Array) -> Array:
         """Draw controls within their limits: accelerations [rad/s^2] and a time [s], shape (SAMPLES, n + 1)."""
         drawn = self.random.normal(mean, deviation, (SAMPLES, len(mean)))
-        return np.clip(drawn, np.append(-self.limit, STEP), np.append(self.limit, self.spread.longest))
+        return np.clip(drawn, np.append(-self.limit, STEP), np.append(self.limit, self.spread.max_duration))
 
     def followed(self, state: Array, controls: Array) -> tuple[Array, Array, NDArray[np.int64]]:
         """Follow controls from a state.
@@ -101,11 +101,11 @@ class Steering:
             allowed and within the time, one after the other from the first, shape (N,).
         """
         (q, dq), n = np.split(state, 2), len(self.limit)
-        ddq = np.repeat(controls[:, None, :n], round(self.spread.longest / STEP), axis=1)
+        ddq = np.repeat(controls[:, None, :n], round(self.spread.max_duration / STEP), axis=1)
         t = STEP * np.arange(1.0, ddq.shape[1] + 1)[:, None]
         paths = np.concatenate([q + t * (dq + t / 2 * ddq), dq + t * ddq], axis=2)
         flat = paths.reshape(-1, 2 * n)
-        tips, allowed = self.check(flat[:, :n], flat[:, n:], ddq.reshape(-1, n), self.tops)
+        tips, allowed = self.check(flat[:, :n], flat[:, n:], ddq.reshape(-1, n), self.obstacle_poses)
         within = t[:, 0] < controls[:, n:] + STEP / 2
         going = np.logical_and.accumulate(allowed.reshape(within.shape) & within, axis=1)
         return paths, tips.reshape(*within.shape, 3), going.sum(axis=1)

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.benchmark.planner import Answer, BenchmarkPlanner, Plan, Setting
+from cnpgen.benchmark.benchmark_planner import Answer, BenchmarkPlanner, Plan, Setting
 from cnpgen.benchmark.planners.knots import KnotConstraints, knot_constraints
 from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.plans.plans import Plans
-from cnpgen.problems.record import open_problem
+from cnpgen.problems.problem_record import open_problem
 from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.boundary import Boundary
 
@@ -40,7 +40,7 @@ class TrajOpt(BenchmarkPlanner):
 
 
 class Transcription:
-    """One boundary problem as a nonlinear programme.
+    """One boundary problem as a nonlinear program.
 
     Its variables are positions, velocities and accelerations at the knots where these are free, and T, in this order:
     ``x = (q_1 .. q_13, dq_1 .. dq_13, ddq, T)``. Accelerations are free at all knots if the motion must not end at

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from cnpgen.benchmark.simulator.outcome import Seen, puck_is_done
 from cnpgen.benchmark.simulator.plant import Plant, rated_torque
 from cnpgen.benchmark.simulator.reference import Reference
-from cnpgen.benchmark.simulator.scene import Scene
+from cnpgen.benchmark.simulator.simulator_scene import Scene
 from cnpgen.errors import MachineError, UsageError
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem

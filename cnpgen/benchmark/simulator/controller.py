@@ -17,7 +17,7 @@ GAIN = 80.0  # rad/s: where an error that is left alone would be gone after 1/80
 class Controller:
     """Computed torque, within the rated torques: ``M(q) (ddq* + w^2 (q* - q) + 2 w (dq* - dq)) + h(q, dq)``.
 
-    w is ``GAIN``. Where a torque would be beyond its limit, the acceleration is made smaller and keeps its direction:
+    w is ``GAIN``. Where a torque would be outside its limits, the acceleration is made smaller and keeps its direction:
     what holds the arm up comes first. It knows neither friction nor damping, nor what a plant has besides.
 
     Args:

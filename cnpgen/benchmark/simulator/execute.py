@@ -14,7 +14,7 @@ from cnpgen.benchmark.simulator.controller import Controller
 from cnpgen.benchmark.simulator.executed import Executed
 from cnpgen.benchmark.simulator.outcome import Seen, outcome_of, puck_is_done
 from cnpgen.benchmark.simulator.reference import TICK, Reference
-from cnpgen.benchmark.simulator.scene import STEP, Scene, scene_xml
+from cnpgen.benchmark.simulator.simulator_scene import STEP, Scene, scene_xml
 from cnpgen.errors import MachineError, RecipeError
 
 Array = NDArray[np.float64]

@@ -14,7 +14,7 @@ class Executed:
         touched_early: Whether the mallet met the puck with more than 3 cm of the plan's way still to go.
         hit: Whether the mallet met the puck at all.
         scored: Whether the puck went into the opponent's goal.
-        collided: Whether the object or a link entered an obstacle by more than 1 mm, beyond what is legal.
+        collided: Whether the object or a link entered an obstacle by more than 1 mm, outside what is legal.
         hit_time: When mallet and puck met first [s].
         puck_speed: The puck's speed after that [m/s].
         z_error: Integral of |z - height of the table| over the plan's time, as executed [m s].

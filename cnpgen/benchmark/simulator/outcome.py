@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from cnpgen.benchmark.simulator import hockey
 from cnpgen.benchmark.simulator.executed import Executed
 from cnpgen.benchmark.simulator.reference import TICK, Reference
-from cnpgen.benchmark.simulator.scene import Scene
-from cnpgen.judges.plans.metrics import tilt
+from cnpgen.benchmark.simulator.simulator_scene import Scene
+from cnpgen.judges.plans.paper import tilt
 
 Array = NDArray[np.float64]
 

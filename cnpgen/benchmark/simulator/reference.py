@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
-from cnpgen.trajectory.motion import Motion
+from cnpgen.trajectory.spline_motion import Motion
 
 Array = NDArray[np.float64]
 StatesAt = Callable[[Array], tuple[Array, Array, Array]]
@@ -50,7 +50,7 @@ def states_of(motion: Motion) -> StatesAt:
 
 
 def make_reference(states: StatesAt, duration: float, *, acceleration_limit: Array) -> Reference:
-    """Sample a trajectory that lasts ``duration`` and add a stop: each joint is slowed down evenly, all equally long.
+    """Sample a trajectory that lasts ``duration`` and add a stop: each joint is scaled in time evenly, all equally long.
 
     Args:
         states: The trajectory.

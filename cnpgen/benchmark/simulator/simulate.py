@@ -16,19 +16,19 @@ from cnpgen.benchmark.simulator.executed import Executed
 from cnpgen.benchmark.simulator.hockey import puck_of
 from cnpgen.benchmark.simulator.plant import Plant, as_plant
 from cnpgen.benchmark.simulator.reference import Reference, StatesAt, make_reference, states_of
-from cnpgen.benchmark.simulator.scene import Scene
+from cnpgen.benchmark.simulator.simulator_scene import Scene
 from cnpgen.errors import UsageError, counted
-from cnpgen.machine.workers import share_out, worker_count
+from cnpgen.machine.workers import distribute, worker_count
 from cnpgen.plans.plans import Plans, check_plans_type
-from cnpgen.plans.tips import settle_tips
-from cnpgen.problems.obstacles import obstacle_tops
-from cnpgen.problems.record import open_problem
+from cnpgen.plans.tips import correct_tips
+from cnpgen.problems.obstacles import obstacle_poses_of
+from cnpgen.problems.problem_record import open_problem
 from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
 
 FORMAT = "cnpgen-simulation"
-FORMAT_VERSION = 1
+SIMULATION_VERSION = 1
 FLAGS = ("success", "finished", "hit", "scored", "touched_early", "collided")
 ALONE = 20  # plans up to which a second process is not worth its start
 
@@ -60,7 +60,7 @@ class Simulation:
         medians = {name: float(np.median([row[name] for row in rows if name in row])) for name in names}
         return {
             "format": FORMAT,
-            "format_version": FORMAT_VERSION,
+            "format_version": SIMULATION_VERSION,
             "problem": self.plans.problem.name,
             "plant": self.plant.name,
             "plans": len(rows),
@@ -96,14 +96,14 @@ def simulate_plans(
         MachineError: MuJoCo is missing, the environment cannot be imported, or a worker died.
     """
     check_plans_type(plans)
-    plant, plans = as_plant(plant), settle_tips(plans)
+    plant, plans = as_plant(plant), correct_tips(plans)
     load_mujoco()
     if environment is not None:
         plant = challenge_plant(environment)
         check_challenge(*open_problem(plans.problem))
     count = worker_count(1 if workers is None and len(plans) <= ALONE else workers, max(len(plans), 1))
     executed: list[Executed] = []
-    with closing(share_out(partial(_simulate, plant=plant), iter(plans), count, ordered=True)) as results:
+    with closing(distribute(partial(_simulate, plant=plant), iter(plans), count, ordered=True)) as results:
         for each in results:
             executed.append(each)
             if progress is not None:
@@ -169,9 +169,9 @@ def scene_of(problem: Plans, plant: Plant) -> Scene:
         problem: One boundary problem, or a plan for it.
         plant: The robot.
     """
-    meaning, robot = open_problem(problem.problem)
+    loaded, robot = open_problem(problem.problem)
     start_xyz, goal_xyz = problem.columns["start_xyz"][0], problem.columns["goal_xyz"][0]
-    scene = Scene(meaning, robot, plant, obstacle_tops(meaning, start_xyz, goal_xyz))
+    scene = Scene(loaded, robot, plant, obstacle_poses_of(loaded, start_xyz, goal_xyz))
     if scene.height is None:
         return scene
     velocity = _tip_velocity(robot, problem.boundary.goal_q[0], problem.boundary.goal_dq[0])

@@ -1,1 +1,1 @@
-"""``cnpgen init``: recipes for anybody's arm, from its URDF."""
+"""``cnpgen init``: recipes for an arm, from its URDF."""

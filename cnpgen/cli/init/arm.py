@@ -1,4 +1,4 @@
-"""What a URDF says of an arm: its frames and links, the joints that move a tip, and limits that are missing."""
+"""An arm in a URDF: its frames and links, the joints that move a tip, and missing limits."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -10,13 +10,13 @@ from cnpgen.errors import RecipeError, UsageError
 from cnpgen.problems.checks import frames_of, missing_frame, unread_xacro
 from cnpgen.robots.urdf import number_in, read_urdf, urdf_tree
 
-TURN, SLIDE = math.pi, 0.5  # rad and m: ranges to either side, where the URDF has none
-SPEED = 1.0  # rad/s or m/s, where the URDF has none
+DEFAULT_RANGE_RAD, DEFAULT_RANGE_M = math.pi, 0.5  # ranges to either side, where the URDF has none
+DEFAULT_SPEED = 1.0  # rad/s or m/s, where the URDF has none
 
 
 @dataclass(frozen=True)
-class Joint:
-    """A joint that moves, with the limits of the URDF or what is put in their place.
+class ArmJoint:
+    """A movable joint with the limits of the URDF or placeholders.
 
     Attributes:
         name: Its name.
@@ -43,7 +43,7 @@ class Arm:
 
     Attributes:
         urdf: The URDF file.
-        tip: The frame that the task is about.
+        tip: The tip frame.
         planned: The joints between the root and the tip, from the root outwards.
         locked: Names of all other joints that move: they stay at zero.
         moved: The links that planned joints move.
@@ -55,7 +55,7 @@ class Arm:
 
     urdf: Path
     tip: str
-    planned: tuple[Joint, ...]
+    planned: tuple[ArmJoint, ...]
     locked: tuple[str, ...]
     moved: tuple[str, ...]
     frames: tuple[str, ...]
@@ -74,11 +74,11 @@ def read_arm(urdf: Path, tip: str | None) -> Arm:
 
     Args:
         urdf: The URDF file.
-        tip: The frame that the task is about: a link, or a joint; by default the only link that carries no other.
+        tip: The tip frame: a link or a joint; by default the only link without a child.
 
     Raises:
-        RecipeError: It cannot be read, is to be read by xacro, or has no joint that moves the tip.
-        UsageError: There is no such frame, or more than one link that could be meant.
+        RecipeError: The file cannot be read, needs xacro, or has no joint that moves the tip.
+        UsageError: The frame does not exist, or several links have no child.
     """
     try:
         tree = urdf_tree(read_urdf(urdf))
@@ -115,7 +115,7 @@ def read_arm(urdf: Path, tip: str | None) -> Arm:
 
 
 def with_torques(arm: Arm, torques: list[float]) -> Arm:
-    """Return an arm with torques [N m] in the place of those that the URDF does not have."""
+    """Return an arm with torques [N m] in place of missing ones."""
     pairs = zip(arm.planned, torques, strict=True)
     return replace(arm, planned=tuple(replace(each, effort=each.effort or torque) for each, torque in pairs))
 
@@ -124,8 +124,8 @@ def _only_leaf(urdf: Path, links: list[str], joints: Mapping[str, ElementTree.El
     parents = {_end(joint, "parent") for joint in joints.values()}
     leaves = [link for link in links if link not in parents]
     if len(leaves) != 1:
-        found = f"{len(leaves)} links carry no other: {', '.join(leaves)}" if leaves else "every link carries another"
-        raise UsageError(f"--tip says which frame of {urdf.name} the task is about: {found}")
+        leaf_text = f"{len(leaves)} links have no child: {', '.join(leaves)}" if leaves else "every link has a child"
+        raise UsageError(f"--tip must name the tip frame of {urdf.name}: {leaf_text}")
     return leaves[0]
 
 
@@ -137,7 +137,7 @@ def _path(urdf: Path, frame: str, joints: Mapping[str, ElementTree.Element]) -> 
         found.append(joints[link])
         link = _end(joints[link], "parent")
         if len(found) > len(joints):
-            raise RecipeError([f"{urdf}: its joints go round in a circle at link {link!r}"])
+            raise RecipeError([f"{urdf}: its joints form a cycle at link {link!r}"])
     return reversed(found)
 
 
@@ -150,18 +150,18 @@ def _moves(joint: ElementTree.Element) -> bool:
     return joint.get("type", "fixed") != "fixed"
 
 
-def _joint(urdf: Path, joint: ElementTree.Element) -> Joint:
-    """Read a joint, and fill in what is missing."""
+def _joint(urdf: Path, joint: ElementTree.Element) -> ArmJoint:
+    """Read a joint, and fill in missing limits."""
     limit, kind = joint.find("limit"), joint.get("type", "")
     lower, upper, velocity, effort = (_number(urdf, limit, key) for key in ("lower", "upper", "velocity", "effort"))
     missing = {"position": kind == "continuous" or not lower < upper, "velocity": velocity <= 0, "torque": effort <= 0}
-    half = SLIDE if kind == "prismatic" else TURN
-    return Joint(
+    half = DEFAULT_RANGE_M if kind == "prismatic" else DEFAULT_RANGE_RAD
+    return ArmJoint(
         name=joint.get("name", ""),
         kind=kind,
         lower=-half if missing["position"] else lower,
         upper=half if missing["position"] else upper,
-        velocity=SPEED if missing["velocity"] else velocity,
+        velocity=DEFAULT_SPEED if missing["velocity"] else velocity,
         effort=max(effort, 0.0),
         missing=tuple(name for name, is_missing in missing.items() if is_missing),
     )

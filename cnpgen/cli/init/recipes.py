@@ -6,26 +6,26 @@ from pathlib import Path
 
 import numpy as np
 
-from cnpgen.cli.init.arm import Arm, Joint, with_torques
+from cnpgen.cli.init.arm import Arm, ArmJoint, with_torques
 from cnpgen.cli.init.draws import comfortable_base, find_boxes
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.pipelines.pipeline import Pipeline
+from cnpgen.pipelines.stages.boundary_motion import AtRest
 from cnpgen.pipelines.stages.draw import DrawPositions
 from cnpgen.pipelines.stages.ik import GoalIK, StartIK
-from cnpgen.pipelines.stages.motion import AtRest
 from cnpgen.pipelines.stages.stage import Stage
 from cnpgen.pipelines.stages.torque import GravityTorque
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.constraints.joint import JointAcceleration, JointPosition, JointTorque, JointVelocity
 from cnpgen.problems.constraints.self_clearance import SelfClearance
+from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.robot import load_robot
 from cnpgen.robots.robot import Robot
-from cnpgen.robots.spec import LimitSpec, RobotSpec
+from cnpgen.robots.robot_spec import LimitSpec, RobotSpec
 from cnpgen.schema.keys import PerJoint, Range
 
-TURN, SLIDE = 0.5, 0.1  # rad and m: how far guesses of inverse kinematics are from the base configuration
-STATES = 1000  # at which the torques are looked at that are put in the place of missing limits
+GUESS_RANGE_RAD, GUESS_RANGE_M = 0.5, 0.1  # range of inverse kinematics guesses around the base configuration
+TORQUE_STATES = 1000  # random states that determine placeholders of missing torque limits
 
 
 def dataset_of(arm: Arm, name: str, folder: Path, packages: tuple[Path, ...]) -> tuple[DatasetRecipe, Arm, float]:
@@ -33,9 +33,9 @@ def dataset_of(arm: Arm, name: str, folder: Path, packages: tuple[Path, ...]) ->
 
     Args:
         arm: The arm.
-        name: What all three recipes are called.
-        folder: Where they will be written to.
-        packages: Folders in which packages are looked for.
+        name: Name of all three recipes.
+        folder: Folder of the recipes.
+        packages: Folders that are searched for packages.
 
     Returns:
         The dataset with its pipeline and its problem, the arm with torques in the place of missing ones, and which
@@ -74,14 +74,14 @@ def dataset_of(arm: Arm, name: str, folder: Path, packages: tuple[Path, ...]) ->
 
 
 def _problem(arm: Arm, name: str, folder: Path, packages: tuple[str, ...]) -> Problem:
-    """Return the problem, its base configuration in the middle of all limits, without torques."""
+    """Return the problem without torques, with the base configuration at the centre of all limits."""
     missing = {what for joint in arm.planned for what in joint.missing}
-    middle = tuple((joint.lower + joint.upper) / 2 for joint in arm.planned)
+    centre = tuple((joint.lower + joint.upper) / 2 for joint in arm.planned)
     robot = RobotSpec(
         urdf=str(arm.urdf.absolute()),
         joints=tuple(joint.name for joint in arm.planned),
         tip=arm.tip,
-        base=middle,
+        base=centre,
         geometry="urdf" if arm.has_shape else "paper-capsules",
         packages=packages,
     )
@@ -104,7 +104,7 @@ def _problem(arm: Arm, name: str, folder: Path, packages: tuple[str, ...]) -> Pr
 
 
 def _has_masses(robot: Robot) -> bool:
-    """Whether every joint moves something that has a mass: else torques mean nothing."""
+    """Return whether every joint moves a mass; otherwise torques are meaningless."""
     return robot.chain.joints[-1].mass > 0
 
 
@@ -114,9 +114,10 @@ def _torques(robot: Robot) -> list[float]:
 
     model, random = robot.model, np.random.default_rng(0)
     data = model.createData()
-    q = random.uniform(robot.position_lower, robot.position_upper, (STATES, robot.n))
+    q = random.uniform(robot.position_lower, robot.position_upper, (TORQUE_STATES, robot.n))
     dq, ddq = (
-        random.uniform(-limit, limit, (STATES, robot.n)) for limit in (robot.velocity_limit, robot.acceleration_limit)
+        random.uniform(-limit, limit, (TORQUE_STATES, robot.n))
+        for limit in (robot.velocity_limit, robot.acceleration_limit)
     )
     most = np.abs([pin.rnea(model, data, *state) for state in zip(q, dq, ddq, strict=True)]).max(axis=0)
     return [float(max(1, math.ceil(each))) for each in most]
@@ -138,6 +139,6 @@ def _stages(arm: Arm, problem: Problem) -> tuple[Stage, ...]:
     )
 
 
-def _near(joint: Joint, at: float) -> Range:
-    half = SLIDE if joint.kind == "prismatic" else TURN
+def _near(joint: ArmJoint, at: float) -> Range:
+    half = GUESS_RANGE_M if joint.kind == "prismatic" else GUESS_RANGE_RAD
     return Range(round(max(at - half, joint.lower), 4), round(min(at + half, joint.upper), 4))

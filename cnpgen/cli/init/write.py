@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Any
 
 from cnpgen.cli.describe import table, with_units
-from cnpgen.cli.init.arm import SLIDE, SPEED, TURN, Arm
-from cnpgen.cli.init.recipes import STATES
+from cnpgen.cli.init.arm import DEFAULT_RANGE_M, DEFAULT_RANGE_RAD, DEFAULT_SPEED, Arm
+from cnpgen.cli.init.recipes import TORQUE_STATES
 from cnpgen.cli.init.text import recipe_text
 from cnpgen.cli.shape_rows import link_rows, pair_rows
 from cnpgen.make.recipe import DatasetRecipe
-from cnpgen.problems.robot import load_robot
+from cnpgen.problems.load_robot import load_robot
 from cnpgen.robots.robot import Robot
 from cnpgen.store.joint_units import units_of_joints
 
@@ -65,10 +65,10 @@ def _head(title: str) -> list[str]:
 
 def _notes(arm: Arm) -> Mapping[str, str]:
     """Say which values were put in the place of missing ones, and how others were found."""
-    ranges = f"{TURN:.3g} rad, or {SLIDE:g} m, to either side"
-    torques = f"the largest of {STATES:,} random states, at speeds and accelerations within the limits"
-    put = {"position": ranges, "velocity": f"{SPEED:g} rad/s or m/s", "torque": torques}
-    base = "Found by sampling: in front of the robot, far from its limits, with much room to move."
+    ranges = f"{DEFAULT_RANGE_RAD:.3g} rad, or {DEFAULT_RANGE_M:g} m, to either side"
+    torques = f"the largest of {TORQUE_STATES:,} random states, at speeds and accelerations within the limits"
+    put = {"position": ranges, "velocity": f"{DEFAULT_SPEED:g} rad/s or m/s", "torque": torques}
+    base = "Found by sampling: in front of the robot, far from its limits, with high manipulability."
     notes = {"robot.base": base}
     for what, instead in put.items():
         without = [joint.name for joint in arm.planned if what in joint.missing]

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.cli.view.bodies import Body
-from cnpgen.cli.view.scene import Scene
+from cnpgen.cli.view.view_bodies import Body
+from cnpgen.cli.view.view_scene import ViewScene
 from cnpgen.errors import MachineError
 
 _NOTES = {
@@ -21,7 +21,7 @@ _NOTES = {
 _DIGITS = 4  # of shares of limits
 
 
-def page_of(scene: Scene, *, stamp: str = "") -> str:
+def page_of(scene: ViewScene, *, stamp: str = "") -> str:
     """Write a scene as a page.
 
     Args:
@@ -48,13 +48,13 @@ def _viewer() -> str:
         raise MachineError(f"MeshCat's viewer is missing ({error}): pip install 'cnpgen[view]'") from error
 
 
-def _content(scene: Scene) -> dict[str, Any]:
+def _content(scene: ViewScene) -> dict[str, Any]:
     """Return a scene for JSON, arrays as base64 of their bytes."""
     low, high = _extent(scene)
     return {
         "title": scene.title,
         "note": _NOTES[scene.kind],
-        "moments": scene.moments,
+        "labels": scene.labels,
         "times": scene.times.tolist(),
         "joints": scene.joints,
         "joints_and_tip": scene.poses.shape[1],
@@ -64,7 +64,7 @@ def _content(scene: Scene) -> dict[str, Any]:
         "world": [_body(each) for each in scene.world],
         "path": [_body(each, smooth=True) for each in scene.path],
         "held": [_body(each) for each in scene.held],
-        "middle": ((low + high) / 2).tolist(),
+        "centre": ((low + high) / 2).tolist(),
         "size": float(np.linalg.norm(high - low)),
         "curves": [{"name": name, "shares": share.round(_DIGITS).tolist()} for name, share in scene.shares.items()],
     }
@@ -79,9 +79,9 @@ def _packed(values: NDArray[Any], dtype: str) -> str:
     return base64.b64encode(np.ascontiguousarray(values, dtype).tobytes()).decode()
 
 
-def _extent(scene: Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the lowest and the highest corner of the robot at its first and its last moment [m], shape (3,) each."""
-    ends: Sequence[int] = (0, len(scene.moments) - 1)
+def _extent(scene: ViewScene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the lowest and the highest corner of the robot at its first and its last frame [m], shape (3,) each."""
+    ends: Sequence[int] = (0, len(scene.labels) - 1)
     points = [
         body.corners @ scene.poses[k, body.joint, :3, :3].T + scene.poses[k, body.joint, :3, 3]
         for body in (*scene.robot, *scene.held)

@@ -1,4 +1,4 @@
-"""A page that this machine serves to itself, made again when a file behind it changes."""
+"""A page served on the loopback address, made again when one of its files changes."""
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -10,8 +10,8 @@ from urllib.parse import parse_qs, urlsplit
 from cnpgen.errors import CnpgenError, MachineError, UsageError
 
 HOST = "127.0.0.1"
-_NAMES = (HOST, "localhost")  # of this machine, in requests: a stranger's page that has led here says another one
-_REPAIRED = 2  # s: how soon a browser asks again where there was no page
+_NAMES = (HOST, "localhost")  # accepted Host headers; requests that another site redirected have other ones
+_RETRY_S = 2  # time after which a browser reloads an error page
 
 Page = Callable[[int | None, str], str]
 
@@ -19,12 +19,12 @@ Page = Callable[[int | None, str], str]
 def serve(page: Page, watched: Sequence[Path], *, port: int, ready: Callable[[str], None]) -> None:
     """Serve a page until the process is interrupted.
 
-    ``/?row=I`` shows another row. An open page looks every second whether it is out of date, and is then loaded again.
+    ``/?row=I`` shows another row. An open page checks every second whether it is out of date, and then reloads.
 
     Args:
-        page: (row or None, stamp of the files) -> the page as HTML. What it refuses is told in the page's place.
-        watched: The files that the page shows; of a recipe the other files in its folder count, too.
-        port: Where to listen, on this machine alone; 0 for any port that is free.
+        page: (row or None, stamp of the files) -> the page as HTML. Its errors are shown in place of the page.
+        watched: The files that the page depends on; for a recipe also the other files in its folder.
+        port: Port on the loopback address; 0 for any free port.
         ready: Called with the address once it is served.
 
     Raises:
@@ -58,12 +58,12 @@ def serve(page: Page, watched: Sequence[Path], *, port: int, ready: Callable[[st
             self.send_header("Content-Length", str(len(body)))
             self.send_header("Cache-Control", "no-store")
             if status is HTTPStatus.INTERNAL_SERVER_ERROR:
-                self.send_header("Refresh", str(_REPAIRED))
+                self.send_header("Refresh", str(_RETRY_S))
             self.end_headers()
             self.wfile.write(body)
 
         def log_message(self, *_: object) -> None:
-            """Say nothing of requests."""
+            """Do not log requests."""
 
     try:
         server = HTTPServer((HOST, port), Handler)
@@ -75,7 +75,7 @@ def serve(page: Page, watched: Sequence[Path], *, port: int, ready: Callable[[st
 
 
 def stamp(watched: Sequence[Path]) -> str:
-    """Return what changes when one of the files does."""
+    """Return a text that changes when one of the files does."""
     files = [each for path in watched for each in (path.parent.glob("*") if path.suffix == ".toml" else (path,))]
     return " ".join(sorted(map(_state, files)))
 

@@ -1,7 +1,7 @@
-"""The verdict: plans checked with Pinocchio and Coal at every moment, and what is counted and shown of it."""
+"""Verdicts: plans checked with Pinocchio and Coal over the whole motion, their summaries and plots."""
 
 from cnpgen.judges.plans.judge import judge
-from cnpgen.judges.plans.summary import summarise
 from cnpgen.judges.plans.verdict import Margin, Metrics, PaperRule, Reason, Verdict
+from cnpgen.judges.plans.verdict_summary import summarize_verdicts
 
-__all__ = ["Margin", "Metrics", "PaperRule", "Reason", "Verdict", "judge", "summarise"]
+__all__ = ["Margin", "Metrics", "PaperRule", "Reason", "Verdict", "judge", "summarize_verdicts"]

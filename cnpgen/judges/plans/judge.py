@@ -1,7 +1,7 @@
-"""Check plans with Pinocchio and Coal, on a fine time grid and between its moments.
+"""Independent check of plans with Pinocchio and Coal, on a fine time grid and between its samples.
 
-With what optimised them it shares the problem, with its bounds, tolerances and where its obstacles stand, and what
-control points mean (``cnpgen.trajectory``); but no kinematics, dynamics or distances, and no transcription.
+It shares with the optimizers only the problem (bounds, tolerances, obstacle poses) and the definition of the splines
+(``cnpgen.trajectory``): no kinematics, dynamics or distances, and no transcription.
 """
 
 from dataclasses import dataclass
@@ -12,32 +12,45 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
-from cnpgen.judges.plans.between import knots, polynomials
-from cnpgen.judges.plans.closer import look_closer
-from cnpgen.judges.plans.course import Course, Phases, course, course_at, jerks
-from cnpgen.judges.plans.limits import Limits, limits_of
-from cnpgen.judges.plans.measure import boundary_margins, by_name, measure
-from cnpgen.judges.plans.metrics import metrics_of
-from cnpgen.judges.plans.paper import paper_rule
-from cnpgen.judges.plans.peaks import look_at_peaks
-from cnpgen.judges.plans.sampling import CELLS, FEW_CELLS, LONGEST, Samples, few_phases, sample, time_table, times
-from cnpgen.judges.plans.survey import Survey, survey
+from cnpgen.judges.plans.bernstein import knots, polynomials
+from cnpgen.judges.plans.continuous_collision import check_continuous_collision
+from cnpgen.judges.plans.evaluated_trajectory import (
+    EvaluatedTrajectory,
+    Phases,
+    evaluate_at_phases,
+    evaluate_trajectory,
+    jerks,
+)
+from cnpgen.judges.plans.joint_limits import ProvenJointLimits, joint_limits
+from cnpgen.judges.plans.local_maxima import check_local_maxima
+from cnpgen.judges.plans.measure import EvaluationContext, boundary_margins, by_name, evaluation_context, measure
+from cnpgen.judges.plans.paper import metrics_of, paper_rule
+from cnpgen.judges.plans.sampling import (
+    EARLY_EXIT_CELLS,
+    MAX_DURATION_S,
+    TABLE_CELLS,
+    Samples,
+    early_exit_phases,
+    sample,
+    time_table,
+    times,
+)
 from cnpgen.judges.plans.verdict import Margin, Metrics, PaperRule, Reason, Verdict
-from cnpgen.problems.obstacles import obstacle_tops
+from cnpgen.problems.obstacles import obstacle_poses_of
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.boundary import Boundary
-from cnpgen.trajectory.motion import Motion
+from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.world.path import PathWorld
 
 Array = NDArray[np.float64]
 
-LONGEST_STEP = 0.01  # s: looks further apart miss most of what a robot does in between
-BESIDE = 1e-3  # in phase: how far apart looks on either side of a kink are
-_GLANCE = Phases(np.linspace(0, 1, 33))  # phases at which most plans that are not valid show it
+MAX_STEP_S = 0.01  # with longer steps the samples miss most of the motion
+KINK_OFFSET = 1e-3  # in phase, between samples on either side of a kink
+_REFUTATION_PHASES = Phases(np.linspace(0, 1, 33))  # enough to refute most invalid plans
 
 
-def judge(  # noqa: PLR0917 - each of them is half of a plan's meaning
+def judge(  # noqa: PLR0917 - all of them are needed to interpret a plan
     problem: Problem,
     robot: Robot,
     motion: Motion,
@@ -47,75 +60,75 @@ def judge(  # noqa: PLR0917 - each of them is half of a plan's meaning
     *,
     step: float = 1e-3,
 ) -> list[Verdict]:
-    """Judge N plans, each for itself: what one of them holds changes nothing about the others.
+    """Judge N plans independently of each other.
 
-    A plan is valid if it meets its boundary conditions and exceeds every bound by no more than the constraint allows,
-    at every moment. Limits of joint positions, velocities, accelerations and jerks are proven to hold between any two
-    moments (``cnpgen.judges.plans.between``). Every other constraint's ``measured`` form is evaluated with Pinocchio
-    and Coal at moments no further than ``step`` apart and at more of them near both ends (``sampling``); then around
-    every maximum that could decide, until nothing is left to gain (``peaks``), and between moments where contacts could
-    hide more than is allowed (``closer``). Numbers that cannot be evaluated give a verdict that says so, no exception.
+    A plan is valid if it meets its boundary conditions and violates no bound by more than its tolerance over the whole
+    motion. Limits of joint positions, velocities, accelerations and jerks are proven for the whole motion
+    (``bernstein``). The ``measured`` forms of all other constraints are evaluated with Pinocchio and Coal at samples
+    with steps of at most ``step``, and more densely near both ends (``sampling``). Smooth conditions are then searched
+    for local maxima that could change the verdict (``local_maxima``), and distances are checked between samples
+    (``continuous_collision``). Values that cannot be evaluated give a verdict with that reason, not an exception.
 
     Args:
         problem: The problem.
         robot: Its robot.
         motion: N motions.
-        boundary: What they must begin and end with.
-        start_xyz: Tip positions at the start [m], shape (N, 3): they say where obstacles below the object stand.
+        boundary: Boundary conditions of the motions.
+        start_xyz: Tip positions at the start [m], shape (N, 3); they place the obstacles below the object.
         goal_xyz: Tip positions at the goal [m], shape (N, 3).
         step: Time step [s].
 
     Raises:
-        UsageError: Shapes that do not fit together, or a step that is not positive or too long.
+        UsageError: Shapes do not match, or the step is not positive or too long.
     """
     return Judge(problem, robot, step=step)(motion, boundary, start_xyz, goal_xyz)
 
 
 class Judge:
-    """Judges plans of one problem as ``judge`` does, with the memory of Pinocchio and Coal kept from call to call.
+    """Judges plans of one problem as ``judge`` does, and reuses the memory of Pinocchio and Coal between calls.
 
     Args:
         problem: The problem.
         robot: Its robot.
-        step: Time step [s] of what is not brief.
+        step: Time step of verdicts without early exit [s].
 
     Raises:
-        UsageError: The step is not positive, or above ``LONGEST_STEP``.
+        UsageError: The step is not positive, or above ``MAX_STEP_S``.
     """
 
     def __init__(self, problem: Problem, robot: Robot, *, step: float = 1e-3) -> None:
         check_step(step)
         self._problem, self._robot, self._step = problem, robot, step
         self._world = PathWorld(robot, problem.obstacle, problem.object_size)
-        self._limits = limits_of(problem, self._world)
+        self._limits = joint_limits(problem, self._world)
 
     def __call__(
-        self, motion: Motion, boundary: Boundary, start_xyz: Array, goal_xyz: Array, *, brief: bool = False
+        self, motion: Motion, boundary: Boundary, start_xyz: Array, goal_xyz: Array, *, early_exit: bool = False
     ) -> list[Verdict]:
         """Judge N plans; arguments as of ``judge``.
 
-        A brief verdict has neither metrics nor the paper's rule. It is from fewer samples, on which it does not depend
-        whether a plan is valid; how much room conditions have is less exact.
+        A verdict with early exit has neither metrics nor the paper's rule, and starts from fewer samples. Validity does
+        not depend on that, but margins are less accurate.
         """
         plans = self._plans(motion, boundary, start_xyz, goal_xyz)
-        with np.errstate(all="ignore"):  # numbers too large to compute with become inf or nan, and are found to be
-            return [_judge_plan(plan, self._world, self._limits, self._step, brief=brief) for plan in plans]
+        with np.errstate(all="ignore"):  # overflows give inf or nan, which are detected
+            return [_judge_plan(plan, self._world, self._limits, self._step, early_exit=early_exit) for plan in plans]
 
     def refutes(self, motion: Motion, boundary: Boundary, start_xyz: Array, goal_xyz: Array) -> list[bool]:
-        """Say of N plans whether a few samples show that they are not valid; of those that pass nothing is known."""
+        """Return for N plans whether a few samples prove that they are invalid; False proves nothing."""
         plans = self._plans(motion, boundary, start_xyz, goal_xyz)
         with np.errstate(all="ignore"):
             return [_is_refuted(plan, self._world) for plan in plans]
 
     def _plans(self, motion: Motion, boundary: Boundary, start_xyz: Array, goal_xyz: Array) -> "list[_Plan]":
         _check_shapes(self._robot, motion, boundary, start_xyz, goal_xyz)
-        tops = obstacle_tops(self._problem, start_xyz, goal_xyz)
+        poses = obstacle_poses_of(self._problem, start_xyz, goal_xyz)
         return [
             _Plan(
                 self._problem,
                 Motion(motion.path[i : i + 1], motion.rate[i : i + 1], motion.degree),
                 boundary[i : i + 1],
-                tops[i],
+                poses[i],
                 goal_xyz[i],
             )
             for i in range(len(motion))
@@ -123,31 +136,31 @@ class Judge:
 
 
 def check_step(step: float) -> None:
-    """Refuse a time step [s] that is not above 0 and at most ``LONGEST_STEP``.
+    """Check that a time step [s] is above 0 and at most ``MAX_STEP_S``.
 
     Raises:
-        UsageError: It does not.
+        UsageError: The step is outside this range.
     """
-    if not 0 < step <= LONGEST_STEP:
-        raise UsageError(f"the time step must be above 0 and at most {LONGEST_STEP:g} s, got {step:g} s")
+    if not 0 < step <= MAX_STEP_S:
+        raise UsageError(f"the time step must be above 0 and at most {MAX_STEP_S:g} s, got {step:g} s")
 
 
 @dataclass(frozen=True)
 class _Plan:
-    """One motion and what it must do.
+    """One motion with its problem and boundary conditions.
 
     Attributes:
         problem: The problem.
         motion: One motion.
-        boundary: Its boundary conditions.
-        tops: Where the obstacles are, as ``obstacle_tops`` says, shape (numbers,).
-        goal_xyz: Where the tip must end [m], shape (3,).
+        boundary: Boundary conditions of the motion.
+        obstacle_poses: Poses and sizes of the obstacles, shape (width,).
+        goal_xyz: Tip position of the goal [m], shape (3,).
     """
 
     problem: Problem
     motion: Motion
     boundary: Boundary
-    tops: Array
+    obstacle_poses: Array
     goal_xyz: Array
 
     @property
@@ -157,118 +170,128 @@ class _Plan:
 
     @property
     def corners(self) -> frozenset[float]:
-        """Phases at which constraints change abruptly, two on either side of each, and the knots of both splines."""
-        kinks = tuple(s for each in self.problem.constraint for s in each.kinks)
+        """Phases of kinks of constraints, two phases on either side of each, and the knots of both splines."""
+        kinks = tuple(s for constraint in self.problem.constraint for s in constraint.kinks)
         return _corners(self.motion.path.shape[1], self.motion.rate.shape[1], self.motion.degree, kinks)
 
     def is_finite(self) -> bool:
-        numbers = (self.motion.path, self.motion.rate, self.tops, self.goal_xyz, *vars(self.boundary).values())
-        return bool(np.isfinite(np.concatenate([each.ravel() for each in numbers if each is not None])).all())
+        arrays = (self.motion.path, self.motion.rate, self.obstacle_poses, self.goal_xyz, *vars(self.boundary).values())
+        return bool(np.isfinite(np.concatenate([array.ravel() for array in arrays if array is not None])).all())
 
 
 @lru_cache(maxsize=8)
 def _corners(path_points: int, rate_points: int, degree: int, kinks: tuple[float, ...]) -> frozenset[float]:
     """Return the knots of both splines, and two phases on either side of each kink.
 
-    Second differences across a kink say nothing of what lies beside it.
+    Second differences across a kink are no estimates of the second derivative next to it.
     """
-    return knots(path_points, rate_points, degree).union(s + k * BESIDE for s in kinks for k in range(-2, 3))
+    return knots(path_points, rate_points, degree).union(s + k * KINK_OFFSET for s in kinks for k in range(-2, 3))
 
 
 def _check_shapes(robot: Robot, motion: Motion, boundary: Boundary, start_xyz: Array, goal_xyz: Array) -> None:
     n_plans, n = len(motion), robot.n
-    wanted = {
+    expected = {
         "path control points": (motion.path, (n_plans, *motion.path.shape[1:2], n)),
         "rate control points": (motion.rate, (n_plans, *motion.rate.shape[1:2])),
         "start_xyz": (start_xyz, (n_plans, 3)),
         "goal_xyz": (goal_xyz, (n_plans, 3)),
         **{name: (values, (n_plans, n)) for name, values in vars(boundary).items() if values is not None},
     }
-    for name, (values, shape) in wanted.items():
+    for name, (values, shape) in expected.items():
         if np.shape(values) != shape or len(shape) < 2:
-            found = np.shape(values)
-            raise UsageError(f"{name} must have shape {shape} for {n_plans} plans of {n} joints, got {found}")
+            raise UsageError(
+                f"{name} must have shape {shape} for {n_plans} plans of {n} joints, got {np.shape(values)}"
+            )
 
 
-def _judge_plan(plan: _Plan, world: PathWorld, limits: Limits, step: float, *, brief: bool) -> Verdict:
+def _judge_plan(plan: _Plan, world: PathWorld, limits: ProvenJointLimits, step: float, *, early_exit: bool) -> Verdict:
     """Judge one plan."""
-    if fault := _fault(plan):
-        return Verdict(fault)
-    table = time_table(plan.motion.rate[0], plan.motion.degree, cells=FEW_CELLS if brief else CELLS)
-    found = _first_look(plan, table) if brief else _look(plan, table, step)
-    if found is None:
+    if reason := _invalid_reason(plan):
+        return Verdict(reason)
+    table = time_table(plan.motion.rate[0], plan.motion.degree, cells=EARLY_EXIT_CELLS if early_exit else TABLE_CELLS)
+    sampled = _sampled_for_early_exit(plan, table) if early_exit else _sampled(plan, table, step)
+    if sampled is None:
         return Verdict(Reason.TOO_LONG, metrics=Metrics(duration=float(table[1, -1])))
-    states, samples = found
+    states, samples = sampled
     if not states.is_finite():
         return Verdict(Reason.NOT_FINITE, metrics=Metrics(duration=float(samples.t[-1])), samples=len(samples.s))
-    world.set_path(states.q, states.dq, states.ddq, plan.tops, states.jerk, exact=not brief)
+    world.set_path(states.q, states.dq, states.ddq, plan.obstacle_poses, states.jerk, exact=not early_exit)
     ends = boundary_margins(states, plan.boundary, samples, world.robot)
     metrics, paper = Metrics(), PaperRule()
-    if not brief:
+    if not early_exit:
         metrics = metrics_of(plan.problem, world, samples, jerks(plan.motion, samples.s))
-        paper = paper_rule(plan.problem, world, plan.tops, plan.goal_xyz)
-    seen = survey(plan.problem, plan.motion, plan.tops, world, samples, table)
-    margins = [*ends, *_margins(seen, limits, brief=brief)]
+        paper = paper_rule(plan.problem, world, plan.obstacle_poses, plan.goal_xyz)
+    context = evaluation_context(plan.problem, plan.motion, plan.obstacle_poses, world, samples, table)
+    margins = [*ends, *_margins(context, limits, early_exit=early_exit)]
     return Verdict(reason_of(margins), by_name(margins), metrics, paper, len(samples.s))
 
 
-def _margins(survey: Survey, limits: Limits, *, brief: bool) -> list[Margin]:
-    """Measure every constraint, at the samples and between them; the survey's world is moved."""
-    pieces, s, table = polynomials(survey.motion, jerk=survey.problem.uses_jerk), survey.samples.s, survey.table
-    proven = limits.margins(survey.world, pieces, s, table, brief=brief)
-    worst = {id(each): each.margin(survey.problem, survey.samples) for each in survey.measured}
-    for each, margin in chain(look_closer(survey, brief=brief), look_at_peaks(survey)):
-        worst[id(each)] = max(worst[id(each)], margin, key=lambda one: one.severity)
-    found: dict[int, list[Margin]] = {id(constraint): [] for constraint in survey.problem.constraint}
+def _margins(context: EvaluationContext, limits: ProvenJointLimits, *, early_exit: bool) -> list[Margin]:
+    """Measure every constraint, at the samples and between them; the world of the context is moved."""
+    motion = polynomials(context.motion, jerk=context.problem.uses_jerk)
+    proven = limits.margins(context.world, motion, context.samples.s, context.table, early_exit=early_exit)
+    worst = {id(condition): condition.margin(context.problem, context.samples) for condition in context.measured}
+    between_samples = chain(check_continuous_collision(context, early_exit=early_exit), check_local_maxima(context))
+    for condition, margin in between_samples:
+        worst[id(condition)] = max(worst[id(condition)], margin, key=lambda candidate: candidate.severity)
+    margins: dict[int, list[Margin]] = {id(constraint): [] for constraint in context.problem.constraint}
     for constraint, margin in zip(limits.constraints, proven, strict=True):
-        found[id(constraint)].append(margin)
-    for each in survey.measured:
-        found[id(each.constraint)].append(worst[id(each)])
-    return [*chain.from_iterable(found.values())]
+        margins[id(constraint)].append(margin)
+    for condition in context.measured:
+        margins[id(condition.constraint)].append(worst[id(condition)])
+    return [*chain.from_iterable(margins.values())]
 
 
 def _is_refuted(plan: _Plan, world: PathWorld) -> bool:
-    """Whether the ends, or a constraint at one of a few phases, are wrong."""
-    if _fault(plan):
+    """Return whether the ends, or a constraint at one of a few phases, are violated."""
+    if _invalid_reason(plan):
         return True
-    samples = Samples(_GLANCE.s, _GLANCE.s)
-    states = course_at(plan.motion, _GLANCE, jerk=plan.problem.uses_jerk)
+    samples = Samples(_REFUTATION_PHASES.s, _REFUTATION_PHASES.s)
+    states = evaluate_at_phases(plan.motion, _REFUTATION_PHASES, jerk=plan.problem.uses_jerk)
     if not states.is_finite():
         return True
-    world.set_path(states.q, states.dq, states.ddq, plan.tops, states.jerk, exact=False)
+    world.set_path(states.q, states.dq, states.ddq, plan.obstacle_poses, states.jerk, exact=False)
     start_tip = world.tip_position[:, 0]
-    found = [each for kind in plan.problem.constraint for each in measure(kind, world, samples.s, start_tip)]
-    if not all((each.share <= 1).all() for each in found):
+    measured = [
+        condition
+        for constraint in plan.problem.constraint
+        for condition in measure(constraint, world, samples.s, start_tip)
+    ]
+    if not all((condition.relative_violation <= 1).all() for condition in measured):
         return True
     return not all(margin.ok for margin in boundary_margins(states, plan.boundary, samples, world.robot))
 
 
-def _look(plan: _Plan, table: Array, step: float) -> tuple[Course, Samples] | None:
-    """Choose where to look, and look there; None where the motion is too long."""
+def _sampled(plan: _Plan, table: Array, step: float) -> tuple[EvaluatedTrajectory, Samples] | None:
+    """Choose samples and evaluate the motion there; None if its duration is too long."""
     samples = sample(table, step, plan.spans, plan.corners)
-    return (course(plan.motion, samples.s, jerk=plan.problem.uses_jerk), samples) if samples else None
+    return (evaluate_trajectory(plan.motion, samples.s, jerk=plan.problem.uses_jerk), samples) if samples else None
 
 
-def _first_look(plan: _Plan, table: Array) -> tuple[Course, Samples] | None:
-    """Look at few phases, the same ones for every plan of a problem; see ``_look``."""
-    if not table[1, -1] < LONGEST:
+def _sampled_for_early_exit(plan: _Plan, table: Array) -> tuple[EvaluatedTrajectory, Samples] | None:
+    """Evaluate the motion at few phases, the same ones for every plan of a problem; see ``_sampled``."""
+    if not table[1, -1] < MAX_DURATION_S:
         return None
-    phases, jerk = few_phases(plan.spans, plan.corners), plan.problem.uses_jerk
-    exact = any(each.tolerance == 0 for each in plan.problem.constraint)  # then rounding decides: that of ``_look``
-    states = course(plan.motion, phases.s, jerk=jerk) if exact else course_at(plan.motion, phases, jerk=jerk)
+    phases, jerk = early_exit_phases(plan.spans, plan.corners), plan.problem.uses_jerk
+    exact = any(constraint.tolerance == 0 for constraint in plan.problem.constraint)  # use the rounding of ``_sampled``
+    states = (
+        evaluate_trajectory(plan.motion, phases.s, jerk=jerk)
+        if exact
+        else evaluate_at_phases(plan.motion, phases, jerk=jerk)
+    )
     return states, Samples(phases.s, times(phases.s, table))
 
 
-def _fault(plan: _Plan) -> Reason | None:
-    """Say why a plan cannot be evaluated, if it cannot."""
+def _invalid_reason(plan: _Plan) -> Reason | None:
+    """Return the reason for which a plan cannot be evaluated, or None."""
     if not plan.is_finite():
         return Reason.NOT_FINITE
-    forward = plan.motion.rate.min() > 0 or plan.motion.runs_forward()[0]  # r is between its control points
+    forward = plan.motion.rate.min() > 0 or plan.motion.runs_forward()[0]  # r lies between its control points
     return None if forward else Reason.RATE
 
 
 def reason_of(margins: list[Margin]) -> str:
-    """Say why a plan is not valid: its boundary conditions first, then the constraint that is broken worst."""
+    """Return the reason of a verdict: boundary conditions first, then the constraint with the largest severity."""
     broken = [margin for margin in margins if not margin.ok]
     if not broken:
         return Reason.OK

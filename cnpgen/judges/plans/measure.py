@@ -1,9 +1,10 @@
-"""How near one motion comes to every bound: of its boundary conditions and of the problem's constraints.
+"""Margins of one motion: of its boundary conditions and of the problem's constraints.
 
-A margin is measured of each, where the motion comes closest to the bound or is furthest beyond, and is named by joint,
-axis or obstacle.
+Each margin is taken where the motion comes closest to the bound or violates it most, and is named by joint, axis or
+obstacle.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, cast
@@ -11,26 +12,28 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.judges.plans.course import Course
-from cnpgen.judges.plans.sampling import Samples
-from cnpgen.judges.plans.verdict import NOTHING, Margin, Reason
+from cnpgen.judges.plans.evaluated_trajectory import EvaluatedTrajectory, evaluate_trajectory
+from cnpgen.judges.plans.joint_limits import is_proven
+from cnpgen.judges.plans.sampling import Samples, times
+from cnpgen.judges.plans.verdict import ZERO_TOLERANCE, Margin, Reason
 from cnpgen.problems.constraints.clearance import ObjectContact
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.constraints.joint import JointAcceleration, JointJerk, JointPosition, JointTorque, JointVelocity
 from cnpgen.problems.problem import Problem
 from cnpgen.store.joint_units import unit_of
 from cnpgen.trajectory.boundary import Boundary
+from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.world.path import PathWorld
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
-    from cnpgen.world.state import World
+    from cnpgen.world.world import World
 
 Array = NDArray[np.float64]
 
-# How exactly a plan must meet its boundary conditions: unit of joints that turn, and what is allowed. Control points
-# rebuilt in float64 meet 1e-10; ones kept in float32 miss the velocity by some 1e-5 rad/s and are told so.
-BOUNDARY = {
+# Tolerances of the boundary conditions, with the units of revolute joints. Control points that are rebuilt in float64
+# have errors of 1e-10; those kept in float32 have velocity errors of about 1e-5 rad/s, which are reported.
+BOUNDARY_TOLERANCES = {
     "q": ("boundary position", "rad", 1e-6),
     "dq": ("boundary velocity", "rad/s", 1e-6),
     "ddq": ("boundary acceleration", "rad/s^2", 1e-4),
@@ -38,21 +41,21 @@ BOUNDARY = {
 _PER_JOINT = JointPosition | JointVelocity | JointAcceleration | JointJerk | JointTorque
 
 
-def boundary_margins(states: Course, boundary: Boundary, samples: Samples, robot: "Robot") -> list[Margin]:
+def boundary_margins(states: EvaluatedTrajectory, boundary: Boundary, samples: Samples, robot: "Robot") -> list[Margin]:
     """Compare the ends of a motion with its boundary conditions.
 
     Args:
-        states: States of one motion, both ends among them.
+        states: States of one motion, including both ends.
         boundary: Boundary conditions of one motion.
-        samples: When and at which phase they are.
+        samples: Times and phases of the states.
         robot: The robot.
     """
     margins = []
-    for what, (name, unit, allowed) in BOUNDARY.items():
-        start, goal = getattr(boundary, f"start_{what}"), getattr(boundary, f"goal_{what}")
-        wanted = start if goal is None else np.concatenate([start, goal])
-        found = getattr(states, what).T[:: len(samples.s) - 1][: len(wanted)]  # at the start, and at the goal
-        error = np.abs(found - wanted)
+    for quantity, (name, unit, tolerance) in BOUNDARY_TOLERANCES.items():
+        start, goal = getattr(boundary, f"start_{quantity}"), getattr(boundary, f"goal_{quantity}")
+        expected = start if goal is None else np.concatenate([start, goal])
+        actual = getattr(states, quantity).T[:: len(samples.s) - 1][: len(expected)]  # at the start and at the goal
+        error = np.abs(actual - expected)
         end, joint = divmod(int(error.argmax()), error.shape[1])
         margins.append(
             Margin(
@@ -60,10 +63,10 @@ def boundary_margins(states: Course, boundary: Boundary, samples: Samples, robot
                 Reason.BOUNDARY,
                 unit_of(robot.units(unit), joint),
                 robot.joint_names[joint],
-                value=float(found[end, joint]),
-                bound=float(wanted[end, joint]),
-                excess=float(error[end, joint]),
-                allowed=allowed,
+                value=float(actual[end, joint]),
+                bound=float(expected[end, joint]),
+                violation=float(error[end, joint]),
+                tolerance=tolerance,
                 time=float(samples.t[-end]),
                 phase=float(samples.s[-end]),
             )
@@ -72,88 +75,88 @@ def boundary_margins(states: Course, boundary: Boundary, samples: Samples, robot
 
 
 @dataclass(frozen=True)
-class Measured:
+class MeasuredCondition:
     """A condition along a motion.
 
     Attributes:
-        constraint: The constraint that states it.
-        condition: What the constraint measured at K samples.
-        g: The m values [unit of the condition], shape (m, K).
-        wider: How much wider than its bounds it is [unit of the condition], shape (K,).
-        allowed: How far beyond them a motion may be and still be called valid, shape (m,).
+        constraint: Constraint that states the condition.
+        condition: Result of the constraint's measurement at K samples.
+        g: Values [unit of the condition], shape (m, K).
+        relaxation: Distance by which the bounds are relaxed [unit of the condition], shape (K,).
+        tolerance: Accepted violation, shape (m,).
     """
 
     constraint: Constraint
     condition: Condition
     g: Array
-    wider: Array
-    allowed: Array
+    relaxation: Array
+    tolerance: Array
 
     @cached_property
-    def excess(self) -> Array:
-        """How far the values are beyond their bounds, shape (m, K)."""
+    def violation(self) -> Array:
+        """Signed distances of the values outside their bounds, negative inside, shape (m, K)."""
         below, above = self.condition.lower[:, None] - self.g, self.g - self.condition.upper[:, None]
-        return np.asarray(np.maximum(below, above) - self.wider)
+        return np.asarray(np.maximum(below, above) - self.relaxation)
 
     @cached_property
-    def share(self) -> Array:
-        """The excess in multiples of what is allowed, shape (m, K)."""
-        return np.asarray(self.excess / np.maximum(self.allowed, NOTHING)[:, None])
+    def relative_violation(self) -> Array:
+        """Violations in multiples of the tolerance, shape (m, K)."""
+        return np.asarray(self.violation / np.maximum(self.tolerance, ZERO_TOLERANCE)[:, None])
 
     def margin(self, problem: Problem, samples: Samples) -> Margin:
-        """Say where the motion comes closest to breaking the condition, or breaks it most."""
-        part, k = divmod(int(self.share.argmax()), len(samples.s))  # argmax finds the first that is nan, if any is
+        """Return the margin where the motion comes closest to a violation, or violates the condition most."""
+        part, k = divmod(int(self.relative_violation.argmax()), len(samples.s))  # argmax returns the first nan, if any
         low, high, g = self.condition.lower[part], self.condition.upper[part], self.g[part, k]
-        worst = float(self.excess[part, k])
+        violation = float(self.violation[part, k])
         return Margin(
             self.condition.name,
             self.constraint.reason,
             unit_of(self.condition.unit, part),
             name_part(problem, self.constraint, self.condition, part),
             value=float(g),
-            bound=float(low - self.wider[k] if low - g > g - high else high + self.wider[k]),
-            excess=np.inf if np.isnan(worst) else worst,
-            allowed=float(self.allowed[part]),
+            bound=float(low - self.relaxation[k] if low - g > g - high else high + self.relaxation[k]),
+            violation=np.inf if np.isnan(violation) else violation,
+            tolerance=float(self.tolerance[part]),
             time=float(samples.t[k]),
             phase=float(samples.s[k]),
         )
 
 
-def measure(constraint: Constraint, world: PathWorld, s: Array, start_tip: Array) -> list[Measured]:
+def measure(constraint: Constraint, world: PathWorld, s: Array, start_tip: Array) -> list[MeasuredCondition]:
     """Measure the conditions of a constraint along a motion.
 
     Args:
         constraint: The constraint.
         world: The robot at phases s.
         s: Phases, shape (K,).
-        start_tip: Where the tip is at the start of the motion [m], shape (3,).
+        start_tip: Tip position at the start of the motion [m], shape (3,).
     """
-    found = []
-    for condition in constraint.measured(cast("World", world)):  # the same questions, answered for K states
+    measured = []
+    for condition in constraint.measured(cast("World", world)):  # PathWorld has the interface of World for K states
         if condition.g:
             g = np.empty((len(condition.g), len(s)))
             for row, value in zip(g, condition.g, strict=True):
                 row[:] = value
-            wider = constraint.funnel(condition, s, start_tip)
-            found.append(Measured(constraint, condition, g, wider, constraint.allowed(condition)))
-    return found
+            relaxation = constraint.bound_relaxation(condition, s, start_tip)
+            measured.append(MeasuredCondition(constraint, condition, g, relaxation, constraint.allowed(condition)))
+    return measured
 
 
 def by_name(margins: list[Margin]) -> dict[str, Margin]:
-    """Index margins by the names of their conditions; a name that comes again gets a number."""
-    found: dict[str, Margin] = {}
+    """Index margins by the names of their conditions; number repeated names."""
+    named: dict[str, Margin] = {}
     for margin in margins:
-        count = sum(other.name == margin.name for other in found.values())
-        found[f"{margin.name} {count + 1}" if count else margin.name] = margin
-    return found
+        count = sum(other.name == margin.name for other in named.values())
+        named[f"{margin.name} {count + 1}" if count else margin.name] = margin
+    return named
 
 
 def name_part(problem: Problem, constraint: Constraint, condition: Condition, part: int) -> str:
-    """Name one of a condition's values; the only one has no name, those of plug-ins are numbered.
+    """Name one of a condition's values: empty if it is the only one, a number for constraints of plug-ins.
 
     Args:
         problem: The problem.
-        constraint: The constraint that the condition belongs to.
+        constraint: Constraint that the condition belongs to.
         condition: The condition.
         part: Index of the value.
     """
@@ -166,3 +169,62 @@ def name_part(problem: Problem, constraint: Constraint, condition: Condition, pa
     if isinstance(constraint, ObjectContact):
         return problem.obstacle[part].name
     return f"[{part}]"
+
+
+@dataclass(frozen=True)
+class EvaluationContext:
+    """One motion with its measured conditions, and the means to measure them at other phases.
+
+    Attributes:
+        problem: The problem.
+        motion: One motion.
+        obstacle_poses: Poses and sizes of the obstacles, shape (width,).
+        samples: Times and phases of the initial samples.
+        table: Times of the motion (``time_table``).
+        start_tip: Tip position at the start [m], shape (3,).
+        world: The robot; ``move`` moves it.
+        measured: Conditions at the samples.
+    """
+
+    problem: Problem
+    motion: Motion
+    obstacle_poses: Array
+    samples: Samples
+    table: Array
+    start_tip: Array
+    world: PathWorld
+    measured: Sequence[MeasuredCondition]
+
+    def move(self, s: Array) -> None:
+        """Move the robot to phases s, shape (K,)."""
+        states = evaluate_trajectory(self.motion, s, jerk=self.problem.uses_jerk)
+        self.world.set_path(states.q, states.dq, states.ddq, self.obstacle_poses, states.jerk)
+
+    def measure(self, constraint: Constraint, s: Array) -> list[MeasuredCondition]:
+        """Measure a constraint at phases s, shape (K,), to which the robot was moved."""
+        return measure(constraint, self.world, s, self.start_tip)
+
+    def margin(self, measured: MeasuredCondition, s: Array) -> Margin:
+        """Return the margin of a condition that was measured at phases s."""
+        return measured.margin(self.problem, Samples(s, times(s, self.table)))
+
+
+def evaluation_context(  # noqa: PLR0917 - all of them are independent inputs
+    problem: Problem, motion: Motion, obstacle_poses: Array, world: PathWorld, samples: Samples, table: Array
+) -> EvaluationContext:
+    """Measure all conditions of one motion that are not proven, at the samples where the robot is.
+
+    Args:
+        problem: The problem.
+        motion: One motion.
+        obstacle_poses: Poses and sizes of the obstacles, shape (width,).
+        world: The robot at the samples.
+        samples: Times and phases of the samples.
+        table: Times of the motion (``time_table``).
+    """
+    start_tip = world.tip_position[:, 0].copy()
+    constraints = [constraint for constraint in problem.constraint if not is_proven(constraint)]
+    measured = [
+        condition for constraint in constraints for condition in measure(constraint, world, samples.s, start_tip)
+    ]
+    return EvaluationContext(problem, motion, obstacle_poses, samples, table, start_tip, world, measured)

@@ -1,15 +1,16 @@
-"""The paper's own, looser rules of what counts as a valid plan, beside our strict ones.
+"""The paper's own rules of what counts as a valid plan, which are looser than ours, and its metrics.
 
-They follow the authors' baselines and tables; which apply is decided by the constraints that a problem has:
+They follow the authors' baselines and tables. The constraints of a problem determine which rules apply:
 
-* joint velocity and torque within the nominal limits, those before the problem's scales; accelerations likewise, the
-  scale being the velocity's, but only on a table (the rules for the heavy object count none);
-* on a table: the tip within 1 cm of its height and of its rectangle, all the way;
-* where the tip must be vertical: ``1 - R_22 < 0.05`` (18 degrees);
-* a held object: its centre further from every obstacle than half its height less 2 cm, no corner deeper than 2 cm;
+* joint velocity and torque within the nominal limits, those before the problem's scales; on a table also accelerations,
+  with the scale of the velocity (the rules for the heavy object have none);
+* on a table: the tip within 1 cm of its height and of its rectangle over the whole motion;
+* with a vertical constraint: ``1 - R_22 < 0.05`` (18 degrees);
+* a held object: the distance of its center from every obstacle above half its height minus 2 cm, no corner deeper than
+  2 cm;
 * the tip ends within 1 cm of the goal.
 
-Joint positions, the robot's clearance and constraints of plug-ins count nothing here.
+Joint positions, the robot's clearance and constraints of plug-ins are not checked by these rules.
 """
 
 from collections.abc import Iterator
@@ -18,7 +19,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.judges.plans.verdict import PaperRule
+from cnpgen.judges.plans.sampling import Samples
+from cnpgen.judges.plans.verdict import Metrics, PaperRule
 from cnpgen.problems.constraints.clearance import ObjectContact
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.constraints.joint import JointAcceleration, JointTorque, JointVelocity
@@ -32,28 +34,28 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-GOAL = 0.01  # m: goal radius of the paper's CBiRRT
-TABLE = 0.01  # m
-TILT = 0.05  # of 1 - R_22
-OBJECT = 0.02  # m
+MAX_GOAL_DISTANCE_M = 0.01  # goal radius of the paper's CBiRRT
+TABLE_TOLERANCE_M = 0.01
+MAX_TILT = 0.05  # of 1 - R_22
+MAX_OBJECT_DEPTH_M = 0.02
 
 
-def paper_rule(problem: "Problem", world: "PathWorld", tops: Array, goal_xyz: Array) -> PaperRule:
+def paper_rule(problem: "Problem", world: "PathWorld", obstacle_poses: Array, goal_xyz: Array) -> PaperRule:
     """Judge one motion by the paper's rules.
 
     Args:
         problem: The problem.
         world: Its robot at the samples of the motion.
-        tops: Where the obstacles are, as ``obstacle_tops`` says, shape (numbers,).
-        goal_xyz: Where the tip must end [m], shape (3,).
+        obstacle_poses: Poses and sizes of the obstacles, shape (width,).
+        goal_xyz: Tip position of the goal [m], shape (3,).
     """
-    finished = bool(np.linalg.norm(world.tip_position[:, -1] - goal_xyz) < GOAL)
-    broken = tuple(reason for reason, ok in _checks(problem, world, tops) if not ok)
+    finished = bool(np.linalg.norm(world.tip_position[:, -1] - goal_xyz) < MAX_GOAL_DISTANCE_M)
+    broken = tuple(reason for reason, ok in _checks(problem, world, obstacle_poses) if not ok)
     return PaperRule(finished, finished and not broken, broken)
 
 
-def _checks(problem: "Problem", world: "PathWorld", tops: Array) -> Iterator[tuple[str, bool]]:
-    """Yield (reason, whether it is kept); what is nan is not."""
+def _checks(problem: "Problem", world: "PathWorld", obstacle_poses: Array) -> Iterator[tuple[str, bool]]:
+    """Yield pairs of a reason and whether its rule is met; nan values violate a rule."""
     on_table = any(isinstance(constraint, Table) for constraint in problem.constraint)
     for constraint in problem.constraint:
         if isinstance(constraint, JointVelocity | JointTorque) or (
@@ -63,9 +65,9 @@ def _checks(problem: "Problem", world: "PathWorld", tops: Array) -> Iterator[tup
         elif isinstance(constraint, Table):
             yield constraint.reason, _is_on_table(constraint, world.tip_position)
         elif isinstance(constraint, Vertical):
-            yield constraint.reason, bool(np.all(1 - world.tip_rotation[2, 2] < TILT))
+            yield constraint.reason, bool(np.all(1 - world.tip_rotation[2, 2] < MAX_TILT))
         elif isinstance(constraint, ObjectContact):
-            yield constraint.reason, _is_clear(problem, world, tops)
+            yield constraint.reason, _is_clear(problem, world, obstacle_poses)
 
 
 def _is_nominal(constraint: Constraint, problem: "Problem", world: "PathWorld") -> bool:
@@ -80,27 +82,57 @@ def _is_nominal(constraint: Constraint, problem: "Problem", world: "PathWorld") 
 
 
 def _is_on_table(table: Table, tip: Array) -> bool:
-    low = np.array([table.x.low, table.y.low, table.z]) - TABLE
-    high = np.array([table.x.high, table.y.high, table.z]) + TABLE
+    low = np.array([table.x.low, table.y.low, table.z]) - TABLE_TOLERANCE_M
+    high = np.array([table.x.high, table.y.high, table.z]) + TABLE_TOLERANCE_M
     return bool(np.all((low[:, None] < tip) & (tip < high[:, None])))
 
 
-def _is_clear(problem: "Problem", world: "PathWorld", tops: Array) -> bool:
+def _is_clear(problem: "Problem", world: "PathWorld", obstacle_poses: Array) -> bool:
     size = np.array(problem.object_size or (0.0, 0.0, 0.0))
-    centre, reach = world.tip_position, np.linalg.norm(size) / 2
-    measured = world.object_distances() if any(not each.upright for each in problem.obstacle) else []
-    for index, (obstacle, solid) in enumerate(zip(problem.obstacle, solids_of(problem.obstacle, tops), strict=True)):
-        if not obstacle.upright:  # the paper knows upright boxes only
-            if not np.all(measured[index] > -OBJECT):
+    center, reach = world.tip_position, np.linalg.norm(size) / 2
+    measured = world.object_distances() if any(not obstacle.upright for obstacle in problem.obstacle) else []
+    for index, (obstacle, solid) in enumerate(
+        zip(problem.obstacle, solids_of(problem.obstacle, obstacle_poses), strict=True)
+    ):
+        if not obstacle.upright:  # the paper has rules for upright boxes only
+            if not np.all(measured[index] > -MAX_OBJECT_DEPTH_M):
                 return False
             continue
         low, high = solid.low[:, None].copy(), solid.high[:, None]
         if obstacle.height is None:
             low[2] = -np.inf
-        offset = centre - np.clip(centre, low, high)
-        apart = np.sqrt(np.einsum("ik,ik->k", offset, offset))
-        near = world.object_corners(apart < reach)  # elsewhere none is inside
-        depth = np.minimum(near - low, high - near).min(axis=1)
-        if not (np.all(apart > size[2] / 2 - OBJECT) and np.all(depth < OBJECT)):
+        offset = center - np.clip(center, low, high)
+        distance = np.sqrt(np.einsum("ik,ik->k", offset, offset))
+        corners = world.object_corners(distance < reach)  # at other states no corner is inside
+        depth = np.minimum(corners - low, high - corners).min(axis=1)
+        if not (np.all(distance > size[2] / 2 - MAX_OBJECT_DEPTH_M) and np.all(depth < MAX_OBJECT_DEPTH_M)):
             return False
     return True
+
+
+def metrics_of(problem: "Problem", world: "PathWorld", samples: Samples, jerk: Array) -> Metrics:
+    """Compute the metrics of one motion.
+
+    Args:
+        problem: The problem.
+        world: Its robot at the samples.
+        samples: Times and phases of the samples.
+        jerk: Joint jerks at the samples [rad/s^3], shape (n, K); nan if unknown.
+    """
+    robot = world.robot
+    torque_ratio = world.torque / robot.torque_limit[:, None]
+    table = problem.first(Table)
+    upright = any(isinstance(constraint, Vertical) for constraint in problem.constraint)
+    return Metrics(
+        duration=float(samples.t[-1]),
+        effort=samples.integral(np.sum(torque_ratio**2, axis=0)),
+        jerk=float(np.max(np.abs(jerk) / robot.jerk_limit[:, None])),
+        hit_speed=float(np.linalg.norm(world.tip_velocity_at(-1))),
+        z_error=np.nan if table is None else samples.integral(np.abs(world.tip_position[2] - table.z)),
+        vertical_error=samples.integral(tilt(world.tip_rotation)) if upright else np.nan,
+    )
+
+
+def tilt(R: Array) -> Array:
+    """Compute |roll| + |pitch| of rotations ``Rz(yaw) Ry(pitch) Rx(roll)`` [rad], shape (3, 3, K) -> (K,)."""
+    return np.asarray(np.abs(np.arctan2(R[2, 1], R[2, 2])) + np.abs(np.arctan2(R[2, 0], np.hypot(R[2, 1], R[2, 2]))))

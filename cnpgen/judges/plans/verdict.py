@@ -1,4 +1,4 @@
-"""The verdict on one plan: valid or not and why, how much room every condition has, and what the plan is worth."""
+"""The verdict on one plan: validity and reason, the margin of every condition, and metrics."""
 
 import math
 from collections.abc import Mapping
@@ -6,13 +6,13 @@ from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from typing import Any
 
-NOTHING = 1e-200  # stands for an allowed excess of 0, so that the largest excess can still be found
+ZERO_TOLERANCE = 1e-200  # replaces a tolerance of 0 in relative violations, so that they can be compared
 
 
 class Reason(StrEnum):
-    """Why a plan is not valid; one that breaks a constraint has the constraint's own ``reason``, which is a plain text.
+    """Reason for which a plan is not valid.
 
-    These are texts, too, and print in the same way wherever they are.
+    A plan that violates a constraint has the constraint's own ``reason`` instead, which is a plain text.
     """
 
     OK = "ok"
@@ -26,19 +26,19 @@ class Reason(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Margin:
-    """Where a plan comes closest to breaking a condition, or breaks it most.
+    """Margin of a condition where a plan comes closest to violating it, or its largest violation.
 
     Attributes:
-        name: The condition.
-        reason: Under which reason a plan that breaks it is counted.
-        unit: SI unit of value, bound, excess and allowed.
-        part: Which of the condition's values: a joint, an axis, an obstacle, or empty if it has only one.
-        value: The value there.
-        bound: The bound that it is nearest to, or beyond.
-        excess: How far beyond; negative: how far from it. inf if it could not be evaluated.
-        allowed: An excess up to this is called valid.
-        time: When [s].
-        phase: At which phase s.
+        name: Name of the condition.
+        reason: Reason under which a violation is counted.
+        unit: SI unit of value, bound, violation and tolerance.
+        part: Name of the condition's value: a joint, an axis, an obstacle, or empty if it has only one.
+        value: Value of the condition.
+        bound: Bound that is closest or violated.
+        violation: Signed distance outside the bound, negative inside; inf if it could not be evaluated.
+        tolerance: Largest violation that is accepted as valid.
+        time: Time [s].
+        phase: Phase s.
     """
 
     name: str
@@ -47,34 +47,34 @@ class Margin:
     part: str
     value: float
     bound: float
-    excess: float
-    allowed: float
+    violation: float
+    tolerance: float
     time: float
     phase: float
 
     @property
     def ok(self) -> bool:
-        """Whether no more is exceeded than allowed."""
-        return self.excess <= self.allowed
+        """Whether the violation is within the tolerance."""
+        return self.violation <= self.tolerance
 
     @property
     def severity(self) -> float:
-        """Excess in multiples of what is allowed: above 1 is not valid."""
-        return self.excess / max(self.allowed, NOTHING)
+        """Violation in multiples of the tolerance: values above 1 are not valid."""
+        return self.violation / max(self.tolerance, ZERO_TOLERANCE)
 
     def __str__(self) -> str:
-        name = f"{self.name} {self.part}".strip()
-        beyond = f"{abs(self.excess):.3g} {self.unit} {'beyond' if self.excess > 0 else 'within'} {self.bound:.6g}"
-        return f"{name}: {beyond} ({self.allowed:.3g} allowed) at t = {self.time:.4f} s, s = {self.phase:.4f}"
+        name, side = f"{self.name} {self.part}".strip(), "outside" if self.violation > 0 else "within"
+        distance = f"{abs(self.violation):.3g} {self.unit} {side} {self.bound:.6g}"
+        return f"{name}: {distance} (tolerance {self.tolerance:.3g}) at t = {self.time:.4f} s, s = {self.phase:.4f}"
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the margin for JSON, which knows no infinity: what is not finite is None."""
+        """Return the margin for JSON; values that are not finite are None."""
         return {**_for_json({entry.name: getattr(self, entry.name) for entry in fields(self)}), "ok": self.ok}
 
 
 @dataclass(frozen=True)
 class Metrics:
-    """What a plan is worth, by the definitions of the paper's tables; nan where it could not be evaluated.
+    """Metrics of a plan, as defined in the paper's tables; nan if they could not be evaluated.
 
     Attributes:
         duration: Motion time [s].
@@ -93,7 +93,7 @@ class Metrics:
     vertical_error: float = math.nan
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the metrics for JSON in the units of the paper's tables, without what does not apply."""
+        """Return the metrics for JSON in the units of the paper's tables, without those that do not apply."""
         values = {
             "duration_s": self.duration,
             "effort_s": self.effort,
@@ -107,12 +107,12 @@ class Metrics:
 
 @dataclass(frozen=True)
 class PaperRule:
-    """The looser rules by which the paper counts (``cnpgen.judges.plans.paper``).
+    """Result of the paper's looser rules (``cnpgen.judges.plans.paper``).
 
     Attributes:
         finished: Whether the tip ends at the goal.
-        valid: Whether, besides, no constraint is broken by the paper's tolerances.
-        broken: What is, in words.
+        valid: Whether, in addition, no constraint is violated by the paper's tolerances.
+        broken: Reasons of the violated constraints.
     """
 
     finished: bool = False
@@ -122,14 +122,14 @@ class PaperRule:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the independent check says about one plan.
+    """Result of the independent check of one plan.
 
     Attributes:
-        reason: ``Reason.OK``, another ``Reason``, or the ``reason`` of the constraint that is broken worst.
-        margins: Condition -> margin; without any if the plan could not be evaluated.
+        reason: ``Reason.OK``, another ``Reason``, or the ``reason`` of the constraint with the largest violation.
+        margins: Condition -> margin; empty if the plan could not be evaluated.
         metrics: Motion time, errors, effort.
-        paper: The same plan by the paper's rules.
-        samples: Number of moments that were looked at.
+        paper: Result of the paper's rules.
+        samples: Number of samples.
     """
 
     reason: str
@@ -153,7 +153,7 @@ class Verdict:
 
     @property
     def worst(self) -> Margin | None:
-        """The margin of the largest severity: of those that decide about ``reason``, if the plan is not valid."""
+        """The margin of the largest severity, among those with the verdict's reason if the plan is not valid."""
         deciding = [margin for margin in self.margins.values() if margin.reason == self.reason]
         return max(deciding or self.margins.values(), key=lambda margin: margin.severity, default=None)
 

@@ -21,14 +21,14 @@ from cnpgen.robots.chain import Chain, Joint
 
 @dataclass(frozen=True)
 class BodyMotion:
-    """How the body of a joint moves, in its joint's frame.
+    """Motion of the body of a joint, in the joint's frame.
 
     Attributes:
-        rotation: From the joint's frame to the previous one, 3 rows of 3.
+        rotation: Rotation from the joint's frame to the previous one, 3 rows of 3.
         offset: Origin of the joint's frame in the previous one [m].
         omega: Angular velocity [rad/s].
         alpha: Angular acceleration [rad/s^2].
-        acceleration: Acceleration of the origin less gravity [m/s^2].
+        acceleration: Acceleration of the origin minus gravity [m/s^2].
     """
 
     rotation: list[Vec]
@@ -39,7 +39,7 @@ class BodyMotion:
 
 
 def body_motions(chain: Chain, q: Vec, dq: Vec, ddq: Vec) -> list[BodyMotion]:
-    """Motion of every body, the outward recursion of Newton-Euler.
+    """Return the motion of every body by the outward recursion of Newton-Euler.
 
     Args:
         chain: The chain.
@@ -54,7 +54,7 @@ def body_motions(chain: Chain, q: Vec, dq: Vec, ddq: Vec) -> list[BodyMotion]:
     for joint, angle, rate, rate2 in zip(chain.joints, q, dq, ddq, strict=True):
         rotation = product(rows_of(joint.rotation), joint_rotation(joint, angle))
         offset = _offset(joint, angle)
-        acceleration = carried(acceleration, omega, alpha, offset)
+        acceleration = acceleration_at(acceleration, omega, alpha, offset)
         acceleration, omega, alpha = (transposed_times(rotation, x) for x in (acceleration, omega, alpha))
         axis = constants(joint.axis)
         if joint.prismatic:
@@ -68,7 +68,7 @@ def body_motions(chain: Chain, q: Vec, dq: Vec, ddq: Vec) -> list[BodyMotion]:
 
 
 def inverse_dynamics(chain: Chain, q: Vec, dq: Vec, ddq: Vec) -> Vec:
-    """Joint torques [N m] by recursive Newton-Euler, in joint frames.
+    """Return joint torques [N m] by recursive Newton-Euler in joint frames.
 
     Args:
         chain: The chain.
@@ -79,31 +79,31 @@ def inverse_dynamics(chain: Chain, q: Vec, dq: Vec, ddq: Vec) -> Vec:
     motions = body_motions(chain, q, dq, ddq)
     wrenches = [_body_wrench(joint, motion) for joint, motion in zip(chain.joints, motions, strict=True)]
     force: Vec = [0.0, 0.0, 0.0]
-    moment: Vec = [0.0, 0.0, 0.0]
+    torque: Vec = [0.0, 0.0, 0.0]
     torques: Vec = []
     for joint, motion, wrench in zip(chain.joints[::-1], motions[::-1], wrenches[::-1], strict=True):
-        force, moment = add(force, wrench[0]), add(moment, wrench[1])
-        torques.append(dot(constants(joint.axis), force if joint.prismatic else moment))
+        force, torque = add(force, wrench[0]), add(torque, wrench[1])
+        torques.append(dot(constants(joint.axis), force if joint.prismatic else torque))
         force = times(motion.rotation, force)
-        moment = add(times(motion.rotation, moment), cross(motion.offset, force))
+        torque = add(times(motion.rotation, torque), cross(motion.offset, force))
     return torques[::-1]
 
 
-def carried(acceleration: Vec, omega: Vec, alpha: Vec, offset: Vec) -> Vec:
-    """Acceleration of a point of a body at ``offset`` from the one that has ``acceleration``."""
+def acceleration_at(acceleration: Vec, omega: Vec, alpha: Vec, offset: Vec) -> Vec:
+    """Return the acceleration of a point of a body at ``offset`` from a point with ``acceleration``."""
     return add(acceleration, add(cross(alpha, offset), cross(omega, cross(omega, offset))))
 
 
 def _body_wrench(joint: Joint, motion: BodyMotion) -> tuple[Vec, Vec]:
-    """Force and moment about the joint origin that the body of a joint needs for its motion."""
+    """Return the force and the torque about the joint origin that move the body of a joint."""
     com, inertia, omega = constants(joint.com), rows_of(joint.inertia), motion.omega
-    force = scale(carried(motion.acceleration, omega, motion.alpha, com), joint.mass)
+    force = scale(acceleration_at(motion.acceleration, omega, motion.alpha, com), joint.mass)
     spin = add(times(inertia, motion.alpha), cross(omega, times(inertia, omega)))
     return force, add(spin, cross(com, force))
 
 
 def _offset(joint: Joint, angle: Scalar) -> Vec:
-    """Origin of the moved joint frame in the previous frame."""
+    """Return the origin of the moved joint frame in the previous frame."""
     offset = constants(joint.translation)
     if joint.prismatic:
         offset = add(offset, scale(constants(joint.rotation @ joint.axis), angle))

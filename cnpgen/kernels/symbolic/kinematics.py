@@ -1,6 +1,6 @@
 """Kinematics of a chain as CasADi SX: positions, axes, Jacobian, bias acceleration, in the world frame.
 
-Structural zeros of the URDF cost nothing.
+Structural zeros of the URDF cause no operations.
 """
 
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Kinematics:
-    """Positions of a chain at q.
+    """Forward kinematics of a chain at q.
 
     Attributes:
         axes: Joint axes z_i, n lists of 3.
@@ -52,7 +52,7 @@ class Kinematics:
 
 
 def forward_kinematics(chain: Chain, q: Vec) -> Kinematics:
-    """Positions, axes and tip Jacobian of a chain.
+    """Return positions, axes and the tip Jacobian of a chain.
 
     Args:
         chain: The chain.
@@ -77,12 +77,12 @@ def forward_kinematics(chain: Chain, q: Vec) -> Kinematics:
 
 
 def tip_velocity(kin: Kinematics, dq: Vec) -> Vec:
-    """Linear velocity of the tip [m/s] for joint velocities dq [rad/s]."""
+    """Return the linear velocity of the tip [m/s] for joint velocities dq [rad/s]."""
     return [dot([column[row] for column in kin.jacobian], dq) for row in range(3)]
 
 
 def bias_acceleration(kin: Kinematics, dq: Vec) -> Vec:
-    """Acceleration of the tip at ddq = 0, ``dJ/dt dq`` [m/s^2]."""
+    """Return the acceleration of the tip at ddq = 0, ``dJ/dt dq`` [m/s^2]."""
     omega: Vec = [0.0, 0.0, 0.0]
     velocity: Vec = [0.0, 0.0, 0.0]  # of the current joint's origin
     bias: Vec = [0.0, 0.0, 0.0]
@@ -103,7 +103,7 @@ def bias_acceleration(kin: Kinematics, dq: Vec) -> Vec:
 
 
 def tip_position(robot: "Robot") -> Any:
-    """Build ``q -> p``, the tip's position [m], as an SX function."""
+    """Build ``q -> p``, the position of the tip [m], as an SX function."""
     import casadi as ca
 
     q_sx, q = symbols("q", robot.n)
@@ -119,8 +119,8 @@ def joint_rotation(joint: Joint, angle: Scalar) -> list[Vec]:
     a = joint.axis
     outer, cosine, sine = np.outer(a, a), ca.cos(angle), ca.sin(angle)
     skew = np.array([[0, -a[2], a[1]], [a[2], 0, -a[0]], [-a[1], a[0], 0]])
-    rest = np.eye(3) - outer
-    return [[_sum3(outer[i, j], rest[i, j], cosine, skew[i, j], sine) for j in range(3)] for i in range(3)]
+    complement = np.eye(3) - outer
+    return [[_sum3(outer[i, j], complement[i, j], cosine, skew[i, j], sine) for j in range(3)] for i in range(3)]
 
 
 def _sum3(constant: float, a: float, cosine: Scalar, b: float, sine: Scalar) -> Scalar:

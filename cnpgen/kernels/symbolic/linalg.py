@@ -1,4 +1,4 @@
-"""Small linear algebra as SX scalars, and floats where numbers are known; no branches, no pivoting."""
+"""Small linear algebra on SX scalars and floats, without branches and pivoting."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -13,9 +13,9 @@ Vec = list[Scalar]
 
 
 def dot(a: Vector, b: Vector) -> Scalar:
-    """Return the sum of products of two vectors of equal length; products with a zero that is a float are left out.
+    """Return the dot product of two vectors of equal length, without the products with a float zero.
 
-    CasADi leaves them out as well, but takes ten times as long to find them.
+    CasADi drops them as well, but takes ten times as long to find them.
     """
     products = [x * y for x, y in zip(a, b, strict=True) if not (_is_zero(x) or _is_zero(y))]
     return sum(products[1:], products[0]) if products else 0.0
@@ -58,7 +58,7 @@ def factorize(
 
     Args:
         lower: Lower triangle, row i of length i + 1.
-        safeguard: Applied to every pivot, e.g. to keep it positive; None takes it as it is.
+        safeguard: Function applied to every pivot, e.g. to keep it positive; None for no change.
 
     Returns:
         ``(L, inverse of D)``: the strictly lower triangle of L, row i of length i, and 1 / D.
@@ -113,12 +113,12 @@ def symbols(name: str, width: int) -> tuple[Any, Vec]:
 
 
 def constants(values: NDArray[np.float64]) -> Vec:
-    """Return numbers as a vector that holds no symbols."""
+    """Return an array as a vector of floats."""
     return [float(value) for value in values]
 
 
 def rows_of(matrix: NDArray[np.float64]) -> list[Vec]:
-    """Return a matrix of numbers as its rows."""
+    """Return an array as a list of rows of floats."""
     return [constants(row) for row in matrix]
 
 

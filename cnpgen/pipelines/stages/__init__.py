@@ -1,1 +1,1 @@
-"""The stages, one file each: they draw, solve or reject whole rounds of draws."""
+"""Stages, one file each: they sample, solve or reject whole batches of candidates."""

@@ -1,10 +1,7 @@
-"""Stage: can the arm brake before the edge of the table? A roll-out of full braking from both ends.
+"""Stage: reachability by full braking, a roll-out forwards in time from the start and backwards from the goal.
 
-Forwards in time from the start, backwards from the goal.
-
-Each step of 10 ms takes the accelerations that slow the tip down most along the edge's normal, within the
-acceleration and velocity limits and on the manifold: a linear programme with one equality (a continuous knapsack).
-Reversed in time, the goal is a start.
+Each step of 10 ms uses the accelerations that decelerate the tip most along the normal of the table edge. They satisfy
+the acceleration and velocity limits and the manifold: a linear program with one equality (a continuous knapsack).
 """
 
 from dataclasses import dataclass
@@ -18,7 +15,7 @@ from cnpgen.kernels.symbolic.kinematics import bias_acceleration, forward_kinema
 from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, dot, scale, symbols
 from cnpgen.kernels.tape import Loop
 from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.stages.stage import Array, Round, Stage, Work
+from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Stage, StageFunction
 from cnpgen.problems.constraints.table import Table
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
@@ -26,44 +23,45 @@ from cnpgen.store.field import Field
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
 
-STEP = 0.01  # s
-MAX_STEPS = 60
-SUSPECT = 0.08  # s: ends whose straight line stays over the table this long can brake (none failed above 46.4 ms)
+BRAKING_STEP_S = 0.01
+MAX_BRAKING_STEPS = 60
+# Ends whose straight line stays over the table for this time can brake (no failure was observed above 46.4 ms).
+LOOKAHEAD_S = 0.08
 
-SIDES = np.array([[1.0], [-1.0], [1.0], [-1.0]])  # of the edges: high and low x, high and low y
+EDGE_SIDES = np.array([[1.0], [-1.0], [1.0], [-1.0]])  # outward signs of the edges: high and low x, high and low y
 
 
 @dataclass(frozen=True, kw_only=True)
 class BrakingReach(Stage):
-    """Full braking keeps the tip over the table, at the start and, reversed in time, at the goal."""
+    """Stage: full braking keeps the tip over the table, from the start and, reversed in time, from the goal."""
 
-    needs = ("start_q", "start_dq", "goal_q", "goal_dq")
-    margin: float = field("how far before the edge full braking must end", unit="m", default=1e-3, low=0.0)
+    inputs = ("start_q", "start_dq", "goal_q", "goal_dq")
+    margin: float = field("distance before the edge at which full braking must end", unit="m", default=1e-3, low=0.0)
 
     def describe(self) -> str:
-        """Say what is kept."""
+        """Describe the stage in one sentence."""
         return (
             f"require that full braking ends at least {1e3 * self.margin:g} mm before every edge of the table, from"
             " the start forwards and from the goal backwards in time (loses about 0.15 % of the solvable problems,"
             " where the ballistic rule loses 13.7 %)"
         )
 
-    def provides(self, context: Context) -> tuple[Field, ...]:
-        """Nothing."""
+    def outputs(self, context: Context) -> tuple[Field, ...]:
+        """Return no fields."""
         del context
         return ()
 
-    def prepare(self, context: Context) -> Work:
+    def prepare(self, context: Context) -> StageFunction:
         """Load the kernels."""
         table = context.constraint(Table)
         tip = context.kernels.load(tip_state)
-        brake = context.kernels.load(braking_step, Loop(0.5, MAX_STEPS), height=table.z)
+        brake = context.kernels.load(braking_step, Loop(0.5, MAX_BRAKING_STEPS), height=table.z)
 
-        def work(draws: Round, _random: np.random.Generator) -> None:
-            q = np.concatenate([draws["start_q"], draws["goal_q"]], axis=1)
-            dq = np.concatenate([draws["start_dq"], -draws["goal_dq"]], axis=1)
+        def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
+            q = np.concatenate([candidates["start_q"], candidates["goal_q"]], axis=1)
+            dq = np.concatenate([candidates["start_dq"], -candidates["goal_dq"]], axis=1)
             excess = overshoot(tip, brake, table, q, dq, margin=self.margin).reshape(2, -1)
-            draws.reject_first(excess <= -self.margin, ["cannot brake at the start", "cannot brake at the goal"])
+            candidates.reject_first(excess <= -self.margin, ["cannot brake at the start", "cannot brake at the goal"])
 
         return work
 
@@ -71,28 +69,30 @@ class BrakingReach(Stage):
 def overshoot(
     tip: Kernel, brake: Kernel, table: Table, q: Array, dq: Array, *, margin: float = 0.0
 ) -> NDArray[np.float64]:
-    """How far full braking carries the tip beyond the worst edge of the table.
+    """Return the overshoot of full braking over the worst edge of the table.
 
     Args:
         tip: Kernel of ``tip_state``.
-        brake: Kernel of ``braking_step``, iterated.
-        table: The table.
+        brake: Iterated kernel of ``braking_step``.
+        table: Table.
         q: Joint positions [rad], shape (joints, n).
         dq: Joint velocities [rad/s], reversed for the goal, shape (joints, n).
-        margin: Distance from the edges that matters [m].
+        margin: Distance from the edges below which the roll-out is computed [m].
 
     Returns:
-        Distance beyond the edge [m], shape (n,); -inf where a straight line stays this far inside for 80 ms.
+        Distance outside the edge [m], shape (n,); -inf if a straight line stays inside by the margin for 80 ms.
     """
-    position, velocity = (np.repeat(each[:2], 2, axis=0) for each in tip(q, dq))  # for both edges across x and across y
+    position, velocity = (
+        np.repeat(values[:2], 2, axis=0) for values in tip(q, dq)
+    )  # for both edges across x and across y
     edges = np.array([table.x.high, table.x.low, table.y.high, table.y.low])[:, None]
-    ahead = SIDES * (position + SUSPECT * velocity - edges)
-    suspects = (ahead > -margin) & (SIDES * velocity > 0)
+    ahead = EDGE_SIDES * (position + LOOKAHEAD_S * velocity - edges)
+    suspects = (ahead > -margin) & (EDGE_SIDES * velocity > 0)
     worst = np.full(q.shape[1], -np.inf)
-    if not np.count_nonzero(suspects):  # nearly always of single tasks; a fifth of the time of any()
+    if not np.count_nonzero(suspects):  # the usual case of single tasks; a fifth of the time of any()
         return worst
     for which in np.flatnonzero(suspects.any(axis=1)):
-        suspect, side, edge = np.flatnonzero(suspects[which]), SIDES[which, 0], edges[which, 0]
+        suspect, side, edge = np.flatnonzero(suspects[which]), EDGE_SIDES[which, 0], edges[which, 0]
         normal = np.zeros((3, len(suspect)))
         normal[which // 2], normal[2] = side, side * edge
         state = np.concatenate([np.take(q, suspect, 1), np.take(dq, suspect, 1), np.full((1, len(suspect)), -1.0)])
@@ -113,12 +113,12 @@ def tip_state(robot: "Robot") -> Any:
 def braking_step(robot: "Robot", *, height: float) -> Any:
     """Build one step of braking: ``((q, dq, overshoot), (nx, ny, edge)) -> (next state, still running)``.
 
-    ``still running`` is 1 until the tip stops moving along the normal within the step; ``overshoot`` is then how far
-    beyond ``n . p = edge`` it is [m].
+    ``still running`` is 1 until the tip stops along the normal within the step. ``overshoot`` is then its distance
+    outside ``n . p = edge`` [m].
 
     Args:
-        robot: The robot.
-        height: Height that the roll-out is drawn back to [m].
+        robot: Robot.
+        height: Height to which the roll-out is stabilized [m].
     """
     import casadi as ca
 
@@ -129,36 +129,35 @@ def braking_step(robot: "Robot", *, height: float) -> Any:
     velocity, bias = tip_velocity(kin, dq), bias_acceleration(kin, dq)
     along = [edge[0] * column[0] + edge[1] * column[1] for column in kin.jacobian]
     row = [column[2] for column in kin.jacobian]
-    target = -bias[2] - 0.5 * velocity[2] / STEP - 0.1 * (kin.tip[2] - height) / STEP**2
+    target = -bias[2] - 0.5 * velocity[2] / BRAKING_STEP_S - 0.1 * (kin.tip[2] - height) / BRAKING_STEP_S**2
     low, high = _acceleration_box(robot, dq)
     ddq = _knapsack([-x for x in along], row, target, low, high)
     speed = edge[0] * velocity[0] + edge[1] * velocity[1]
-    slowing = -(dot(along, ddq) + edge[0] * bias[0] + edge[1] * bias[1])
-    stops = ca.logic_or(speed <= 0, ca.logic_and(slowing > 0, speed <= slowing * STEP))
+    deceleration = -(dot(along, ddq) + edge[0] * bias[0] + edge[1] * bias[1])
+    stops = ca.logic_or(speed <= 0, ca.logic_and(deceleration > 0, speed <= deceleration * BRAKING_STEP_S))
     now = edge[0] * kin.tip[0] + edge[1] * kin.tip[1] - edge[2]
-    end = now + ca.if_else(speed > 0, 0.5 * speed * speed / ca.fmax(slowing, 1e-9), 0.0)
-    following_q = add(q, scale(add(dq, scale(ddq, 0.5 * STEP)), STEP))
-    following = [*following_q, *add(dq, scale(ddq, STEP)), ca.if_else(stops, end, -1.0)]
+    end = now + ca.if_else(speed > 0, 0.5 * speed * speed / ca.fmax(deceleration, 1e-9), 0.0)
+    following_q = add(q, scale(add(dq, scale(ddq, 0.5 * BRAKING_STEP_S)), BRAKING_STEP_S))
+    following = [*following_q, *add(dq, scale(ddq, BRAKING_STEP_S)), ca.if_else(stops, end, -1.0)]
     return ca.Function("braking", [state_sx, edge_sx], [ca.vertcat(*following), ca.if_else(stops, 0.0, 1.0)])
 
 
 def _acceleration_box(robot: "Robot", dq: Vec) -> tuple[Vec, Vec]:
-    """Accelerations that keep the velocity within its limits over the step."""
+    """Return bounds of the accelerations that keep the velocity within its limits over the step."""
     import casadi as ca
 
     low, high = [], []
     for rate, most, fastest in zip(dq, robot.acceleration_limit, robot.velocity_limit, strict=True):
-        low.append(ca.fmax(-float(most), (-float(fastest) - rate) / STEP))
-        high.append(ca.fmin(float(most), (float(fastest) - rate) / STEP))
+        low.append(ca.fmax(-float(most), (-float(fastest) - rate) / BRAKING_STEP_S))
+        high.append(ca.fmin(float(most), (float(fastest) - rate) / BRAKING_STEP_S))
     return low, high
 
 
 def _knapsack(c: Vec, a: Vec, target: Scalar, low: Vec, high: Vec) -> Vec:
-    """Maximise ``c . x`` subject to ``a . x = target`` and ``low <= x <= high``.
+    """Maximize ``c . x`` subject to ``a . x = target`` and ``low <= x <= high``.
 
-    All but one x sit on a bound, chosen by the sign of ``c - lambda a`` with lambda = c_i / a_i for the one in
-    between: of the n candidates the one that violates its own bounds least is the optimum (by nothing, where there is
-    one).
+    All but one x are on a bound, chosen by the sign of ``c - lambda a`` with lambda = c_i / a_i of the remaining x_i.
+    Of these n solutions, the one with the smallest bound violation is the optimum; it is 0 if the problem is feasible.
     """
     import casadi as ca
 

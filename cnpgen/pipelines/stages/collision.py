@@ -1,11 +1,11 @@
-"""Stage: collisions of the arm and the held object with the obstacles, judged by Coal on both ends.
+"""Stage: collisions of the arm and the held object with the obstacles, checked at both ends.
 
-A test of every capsule's segment against every obstacle comes first, exact for boxes, and rejects almost all collisions
-cheaply; Coal then judges every sample that is left. Obstacles may move with the sample, so each becomes a sliding joint
-of the Pinocchio model: one call checks a whole round without any Python per sample.
+The broad phase tests the capsule axes against every obstacle, exactly for boxes, and rejects most collisions cheaply.
+Coal checks the remaining candidates. Obstacles may differ between candidates, so each is a sliding joint of the
+Pinocchio model: one call checks a whole batch without Python code per candidate.
 
-A robot with a shape is covered by its capsules: samples whose capsules are clear are kept, of all others Coal decides
-with the convex pieces of the links.
+For a robot with a shape, candidates with clearance of all capsules are kept. Coal checks the others with the convex
+parts of the links.
 """
 
 from dataclasses import dataclass, replace
@@ -16,16 +16,16 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.symbolic.linalg import symbols
-from cnpgen.kernels.symbolic.solids import symbolic_solids
-from cnpgen.kernels.symbolic.state import SymbolicState
+from cnpgen.kernels.symbolic.obstacle_distances import symbolic_solids
+from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
 from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.stages.stage import Array, Round, Stage, Work
+from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Stage, StageFunction
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
-from cnpgen.problems.obstacles import obstacle_tops
+from cnpgen.problems.obstacles import obstacle_poses_of
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.shape.hull import coal_hull
 from cnpgen.robots.shape.shape import Shape
-from cnpgen.robots.solid import Box, Solid, count_numbers, height_places, place_obstacles, solids_of
+from cnpgen.robots.solid import Box, Solid, height_places, place_obstacles, pose_width, solids_of
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
 
@@ -35,34 +35,34 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Collision(Stage):
-    """Rejects configurations where the arm or the object enters an obstacle."""
+    """Stage: reject configurations with a collision of the arm or the held object with an obstacle."""
 
-    end: str = field("which end is looked at", choices=("start", "goal", "both"))
-    judge: str = field("what decides: the exact segment test alone, or Coal after it", choices=("segments", "coal"))
+    end: str = field("end that is checked", choices=("start", "goal", "both"))
+    judge: str = field("decision by the exact segment test alone, or also by Coal", choices=("segments", "coal"))
 
     @property
-    def needs(self) -> tuple[str, ...]:
-        """Configurations, and the positions that the obstacles stand below."""
+    def inputs(self) -> tuple[str, ...]:
+        """Configurations, and the tip positions above the obstacles."""
         return (*(f"{end}_q" for end in self._ends()), "start_xyz", "goal_xyz")
 
     def describe(self) -> str:
-        """Say who judges what."""
+        """Describe the stage in one sentence."""
         ends = "both ends" if self.end == "both" else f"the {self.end} configuration"
         how = "by an exact segment-to-box test" if self.judge == "segments" else "judged by Coal on arm and object"
         return f"require {ends} to be free of collision, {how}"
 
-    def provides(self, context: Context) -> tuple[Field, ...]:
-        """The clearance, where the segment test computes it."""
+    def outputs(self, context: Context) -> tuple[Field, ...]:
+        """List the fields of the clearance if the segment test computes it."""
         if self.judge == "coal" or context.robot.shape is not None:
             return ()
-        text = "distance of the arm's skeleton from the nearest obstacle at the {}, less the capsules' radius"
+        text = "distance of the arm's capsule axes from the nearest obstacle at the {}, less the capsules' radius"
         return tuple(Field(f"{end}_clearance", "m", text.format(end), role="diagnostic") for end in self._ends())
 
-    def prepare(self, context: Context) -> Work:
+    def prepare(self, context: Context) -> StageFunction:
         """Load the kernel or build the geometry."""
         clearance = context.constraint(RobotClearance)
         if context.robot.shape is not None:
-            return self._by_pieces(context, clearance.distance)
+            return self._by_convex_parts(context, clearance.distance)
         radius = clearance.radius or 0.0
         if self.judge == "coal":
             return self._by_coal(context, radius + clearance.distance)
@@ -71,107 +71,114 @@ class Collision(Stage):
     def _ends(self) -> tuple[str, ...]:
         return ("start", "goal") if self.end == "both" else (self.end,)
 
-    def _by_segments(self, context: Context, radius: float, least: float) -> Work:
-        kernel = context.kernels.load(skeleton_distance)
+    def _by_segments(self, context: Context, radius: float, clearance: float) -> StageFunction:
+        kernel = context.kernels.load(capsule_axes_distance)
 
-        def work(draws: Round, _random: np.random.Generator) -> None:
+        def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
             for end in self._ends():
-                (distance,) = kernel(draws[f"{end}_q"], sample_tops(context.problem, draws))
-                draws[f"{end}_clearance"] = distance - radius
-                draws.reject(distance[0] > radius + least, f"arm in collision at the {end}")
+                (distance,) = kernel(candidates[f"{end}_q"], candidate_poses(context.problem, candidates))
+                candidates[f"{end}_clearance"] = distance - radius
+                candidates.reject(distance[0] > radius + clearance, f"arm in collision at the {end}")
 
         return work
 
-    def _by_pieces(self, context: Context, distance: float) -> Work:
+    def _by_convex_parts(self, context: Context, distance: float) -> StageFunction:
         kernel = context.kernels.load(capsule_clearance)
         with_object = self.judge == "coal"
         depth = context.constraint(ObjectContact).depth if with_object else 0.0
         problem = context.problem if with_object else replace(context.problem, object=None)
         judge = coal_judge(problem, context.robot, distance, depth)
 
-        def work(draws: Round, _random: np.random.Generator) -> None:
+        def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
             for end in self._ends():
-                q, tops = draws[f"{end}_q"], sample_tops(context.problem, draws)
-                doubtful = np.ones(q.shape[1], bool)
+                q, obstacle_poses = candidates[f"{end}_q"], candidate_poses(context.problem, candidates)
+                remaining = np.ones(q.shape[1], bool)
                 if not with_object:
-                    (clearance,) = kernel(q, tops)
-                    doubtful = ~(clearance[0] > distance)
+                    (clearance,) = kernel(q, obstacle_poses)
+                    remaining = ~(clearance[0] > distance)
                 hit = np.zeros(q.shape[1], bool)
-                if doubtful.any():
-                    hit[doubtful] = judge(q[:, doubtful], tops[:, doubtful])
-                draws.reject(~hit, f"arm in collision at the {end}")
+                if remaining.any():
+                    hit[remaining] = judge(q[:, remaining], obstacle_poses[:, remaining])
+                candidates.reject(~hit, f"arm in collision at the {end}")
 
         return work
 
-    def _by_coal(self, context: Context, radius: float) -> Work:
+    def _by_coal(self, context: Context, radius: float) -> StageFunction:
         depth = context.constraint(ObjectContact).depth
         judge = coal_judge(context.problem, context.robot, radius, depth)
 
-        def work(draws: Round, _random: np.random.Generator) -> None:
-            tops = sample_tops(context.problem, draws)
+        def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
+            obstacle_poses = candidate_poses(context.problem, candidates)
             hit = judge(
-                np.concatenate([draws[f"{end}_q"] for end in self._ends()], axis=1), np.tile(tops, len(self._ends()))
+                np.concatenate([candidates[f"{end}_q"] for end in self._ends()], axis=1),
+                np.tile(obstacle_poses, len(self._ends())),
             )
-            draws.reject(~hit.reshape(len(self._ends()), -1).any(0), "collision (Coal)")
+            candidates.reject(~hit.reshape(len(self._ends()), -1).any(0), "collision (Coal)")
 
         return work
 
 
-def sample_tops(problem: Problem, draws: Round) -> Array:
-    """Where the obstacles are for every draw, as ``obstacle_tops`` says, shape (numbers, n)."""
-    return np.ascontiguousarray(obstacle_tops(problem, draws["start_xyz"].T, draws["goal_xyz"].T).T)
+def candidate_poses(problem: Problem, candidates: CandidateBatch) -> Array:
+    """Return the obstacle poses of every candidate, shape (width, n), see ``obstacle_poses_of``."""
+    return np.ascontiguousarray(obstacle_poses_of(problem, candidates["start_xyz"].T, candidates["goal_xyz"].T).T)
 
 
-def skeleton_distance(robot: "Robot", problem: Problem) -> Any:
-    """Build ``(q, tops) -> smallest distance of a segment of the skeleton from an obstacle`` [m]."""
+def capsule_axes_distance(robot: "Robot", problem: Problem) -> Any:
+    """Build ``(q, obstacle_poses) -> minimum distance of a capsule axis from an obstacle`` [m]."""
     import casadi as ca
 
-    (q_sx, q), (tops_sx, tops) = symbols("q", robot.n), symbols("tops", count_numbers(problem.obstacle))
+    (q_sx, q), (poses_sx, obstacle_poses) = (
+        symbols("q", robot.n),
+        symbols("obstacle_poses", pose_width(problem.obstacle)),
+    )
     zero = [0.0] * robot.n
-    state = SymbolicState(robot, q, zero, zero, tops, problem.obstacle, None)
+    state = SymbolicState(robot, q, zero, zero, obstacle_poses, problem.obstacle, None)
     nearest = ca.SX(np.inf)
     for first, second in state.segments:
         for solid in symbolic_solids(state):
             nearest = ca.fmin(nearest, solid.distance(first, second))
-    return ca.Function("skeleton_distance", [q_sx, tops_sx], [nearest])
+    return ca.Function("capsule_axes_distance", [q_sx, poses_sx], [nearest])
 
 
 def capsule_clearance(robot: "Robot", problem: Problem) -> Any:
-    """Build ``(q, tops) -> smallest distance of a link's capsule from an obstacle`` [m], minus the radius at most."""
+    """Build ``(q, obstacle_poses) -> minimum distance of link capsules from obstacles`` [m], at least -radius."""
     import casadi as ca
 
-    (q_sx, q), (tops_sx, tops) = symbols("q", robot.n), symbols("tops", count_numbers(problem.obstacle))
+    (q_sx, q), (poses_sx, obstacle_poses) = (
+        symbols("q", robot.n),
+        symbols("obstacle_poses", pose_width(problem.obstacle)),
+    )
     zero = [0.0] * robot.n
-    state = SymbolicState(robot, q, zero, zero, tops, problem.obstacle, None)
+    state = SymbolicState(robot, q, zero, zero, obstacle_poses, problem.obstacle, None)
     moving = robot.shape.moving_capsules if robot.shape else ()
     nearest = ca.SX(np.inf)
     for first, second, radius in (state.capsules[capsule.link] for capsule in moving):
         for solid in symbolic_solids(state):
             nearest = ca.fmin(nearest, solid.distance(first, second) - radius)
-    return ca.Function("capsule_clearance", [q_sx, tops_sx], [nearest])
+    return ca.Function("capsule_clearance", [q_sx, poses_sx], [nearest])
 
 
 def coal_judge(problem: Problem, robot: "Robot", radius: float, depth: float) -> Any:
-    """Return a function ``(q (n, N), tops (obstacles, N)) -> collides (N,)`` that asks Coal.
+    """Return a collision check with Coal, ``(q (n, N), obstacle_poses (width, N)) -> collides (N,)``.
 
-    The arm is capsules of the radius, or the pieces of its shape, thicker by the radius. The held object is made
-    smaller by ``depth`` on every side: the contact that is legal does not count, and the touching pair, the slowest
-    case of Coal's algorithms, becomes a clear one.
+    The arm consists of capsules of the radius, or of its convex parts, inflated by the radius. The held object is
+    smaller by ``depth`` on every side. Legal contact is therefore not a collision, and Coal avoids the touching pair,
+    the most expensive case of its algorithms.
     """
     import coal
     import pinocchio as pin
 
     model = robot.model.copy()
     geometry = pin.GeometryModel()
-    moving = _add_pieces(geometry, robot.shape, radius) if robot.shape else _add_capsules(geometry, robot, radius)
+    moving = _add_convex_parts(geometry, robot.shape, radius) if robot.shape else _add_capsules(geometry, robot, radius)
     if problem.object is not None:
         size = np.array(problem.object.size) - 2 * depth
         frame = model.frames[robot.tip_frame]
         box = pin.GeometryObject("object", frame.parentJoint, 0, frame.placement, coal.Box(*size))
         moving.append(geometry.addGeometryObject(box))
-    numbers, heights = place_obstacles(problem.obstacle), height_places(problem.obstacle)
-    numbers[heights] = 0.0
-    solids = solids_of(problem.obstacle, numbers)
+    poses, heights = place_obstacles(problem.obstacle), height_places(problem.obstacle)
+    poses[heights] = 0.0
+    solids = solids_of(problem.obstacle, poses)
     for index, (obstacle, solid) in enumerate(zip(problem.obstacle, solids, strict=True)):
         x, y, z = solid.position
         slide = model.addJoint(0, pin.JointModelPZ(), pin.SE3(np.eye(3), np.array([x, y, 0.0])), f"obstacle_{index}")
@@ -181,8 +188,8 @@ def coal_judge(problem: Problem, robot: "Robot", radius: float, depth: float) ->
             geometry.addCollisionPair(pin.CollisionPair(body, added))
     pool = pin.GeometryPool(model, geometry, 1)
 
-    def judge(q: Array, tops: Array) -> NDArray[np.bool_]:
-        states = np.asfortranarray(np.concatenate([q, tops[heights]]))
+    def judge(q: Array, obstacle_poses: Array) -> NDArray[np.bool_]:
+        states = np.asfortranarray(np.concatenate([q, obstacle_poses[heights]]))
         return np.asarray(pin.computeCollisionsInParallel(1, pool, states, True)).astype(bool)
 
     return judge
@@ -198,21 +205,21 @@ def _coal_shape(solid: Solid) -> Any:
     return hull
 
 
-def _add_pieces(geometry: Any, shape: Shape, distance: float) -> list[int]:
-    """Add the pieces of a robot's shape that move, thicker by a distance [m]."""
+def _add_convex_parts(geometry: Any, shape: Shape, distance: float) -> list[int]:
+    """Add the moving convex parts of a robot, inflated by a distance [m]."""
     import pinocchio as pin
 
     added: list[int] = []
-    for piece in shape.moving_pieces:
-        hull, name = coal_hull(piece.vertices), f"{piece.link}_{len(added)}"
-        hull.setSweptSphereRadius(piece.radius + distance)
-        solid = pin.GeometryObject(name, shape.joints[piece.link], 0, pin.SE3.Identity(), hull)
+    for part in shape.moving_convex_parts:
+        hull, name = coal_hull(part.vertices), f"{part.link}_{len(added)}"
+        hull.setSweptSphereRadius(part.radius + distance)
+        solid = pin.GeometryObject(name, shape.joints[part.link], 0, pin.SE3.Identity(), hull)
         added.append(geometry.addGeometryObject(solid))
     return added
 
 
 def _add_capsules(geometry: Any, robot: "Robot", radius: float) -> list[int]:
-    """Add one capsule per segment of the skeleton, attached to the joint that moves it."""
+    """Add one capsule per capsule axis, attached to the joint that moves it."""
     import coal
     import pinocchio as pin
 
@@ -224,7 +231,7 @@ def _add_capsules(geometry: Any, robot: "Robot", radius: float) -> list[int]:
     origins = [data.oMi[i].translation.copy() for i in range(1, model.njoints)]
     origins.append(data.oMf[robot.tip_frame].translation.copy())
     added = []
-    for a, b in robot.skeleton:
+    for a, b in robot.capsule_axes:
         joint = b  # the body that carries origin b; the joints between a and b lie on the segment's line
         first, second = data.oMi[joint].actInv(origins[a]), data.oMi[joint].actInv(origins[b])
         length = float(np.linalg.norm(second - first))

@@ -1,4 +1,4 @@
-"""Stages: draw the start and goal position of the tip, or the goal's alone."""
+"""Stages: draw the start and goal positions of the tip, or the goal position alone."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -7,77 +7,77 @@ import numpy as np
 
 from cnpgen.errors import RecipeError
 from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.stages.stage import Array, Round, Stage, Work
+from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Stage, StageFunction
 from cnpgen.schema.keys import Range, field
 from cnpgen.store.field import Field
 
 
 @dataclass(frozen=True, kw_only=True)
 class DrawPositions(Stage):
-    """Start and goal position uniform in two boxes, at least ``min_distance`` apart."""
+    """Stage: start and goal positions uniform in two boxes, with a minimum distance."""
 
     start: tuple[Range, Range, Range] = field("box of start positions: x, y, z", unit="m")
     goal: tuple[Range, Range, Range] = field("box of goal positions: x, y, z", unit="m")
-    min_distance: float = field("smallest horizontal distance between the two", unit="m", default=0.0, low=0.0)
+    min_distance: float = field("minimum horizontal distance of start and goal", unit="m", default=0.0, low=0.0)
 
     def describe(self) -> str:
-        """Say what is drawn."""
+        """Describe the stage in one sentence."""
         text = f"draw a start position in {_box(self.start)} m and a goal position in {_box(self.goal)} m"
         return f"{text}, at least {self.min_distance:g} m apart horizontally" if self.min_distance else text
 
-    def provides(self, context: Context) -> tuple[Field, ...]:
-        """Both positions."""
+    def outputs(self, context: Context) -> tuple[Field, ...]:
+        """List the fields of both positions."""
         del context
         return tuple(
             position_field(end, [axis.low for axis in box], [axis.high for axis in box])
             for end, box in (("start", self.start), ("goal", self.goal))
         )
 
-    def prepare(self, context: Context) -> Work:
-        """Check that the boxes can be reached and return the draw."""
+    def prepare(self, context: Context) -> StageFunction:
+        """Check that the boxes are reachable and return the stage function."""
         check_reach(context, (("start", self.start), ("goal", self.goal)))
 
-        def work(draws: Round, random: np.random.Generator) -> None:
-            draws["start_xyz"] = uniform(draws.draw(random, 3), self.start)
-            draws["goal_xyz"] = uniform(draws.draw(random, 3), self.goal)
-            apart = np.hypot(*(draws["goal_xyz"] - draws["start_xyz"])[:2])
-            draws.reject(apart >= self.min_distance, "too close together")
+        def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
+            candidates["start_xyz"] = uniform(candidates.draw(random, 3), self.start)
+            candidates["goal_xyz"] = uniform(candidates.draw(random, 3), self.goal)
+            distance = np.hypot(*(candidates["goal_xyz"] - candidates["start_xyz"])[:2])
+            candidates.reject(distance >= self.min_distance, "too close together")
 
         return work
 
 
 @dataclass(frozen=True, kw_only=True)
 class DrawGoal(Stage):
-    """Goal position uniform in a box, at least ``min_distance`` from the start, wherever that is."""
+    """Stage: goal position uniform in a box, with a minimum distance from the start."""
 
-    needs = ("start_xyz",)
+    inputs = ("start_xyz",)
     goal: tuple[Range, Range, Range] = field("box of goal positions: x, y, z", unit="m")
-    min_distance: float = field("smallest horizontal distance from the start", unit="m", default=0.0, low=0.0)
+    min_distance: float = field("minimum horizontal distance from the start", unit="m", default=0.0, low=0.0)
 
     def describe(self) -> str:
-        """Say what is drawn."""
+        """Describe the stage in one sentence."""
         text = f"draw a goal position in {_box(self.goal)} m"
         return f"{text}, at least {self.min_distance:g} m from the start horizontally" if self.min_distance else text
 
-    def provides(self, context: Context) -> tuple[Field, ...]:
-        """The position."""
+    def outputs(self, context: Context) -> tuple[Field, ...]:
+        """List the field of the position."""
         del context
         return (position_field("goal", [axis.low for axis in self.goal], [axis.high for axis in self.goal]),)
 
-    def prepare(self, context: Context) -> Work:
-        """Check that the box can be reached and return the draw."""
+    def prepare(self, context: Context) -> StageFunction:
+        """Check that the box is reachable and return the stage function."""
         check_reach(context, (("goal", self.goal),))
 
-        def work(draws: Round, random: np.random.Generator) -> None:
-            draws["goal_xyz"] = uniform(draws.draw(random, 3), self.goal)
-            apart = np.hypot(*(draws["goal_xyz"] - draws["start_xyz"])[:2])
-            draws.reject(apart >= self.min_distance, "too close together")
+        def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
+            candidates["goal_xyz"] = uniform(candidates.draw(random, 3), self.goal)
+            distance = np.hypot(*(candidates["goal_xyz"] - candidates["start_xyz"])[:2])
+            candidates.reject(distance >= self.min_distance, "too close together")
 
         return work
 
 
 def check_reach(context: Context, boxes: Iterable[tuple[str, tuple[Range, ...]]]) -> None:
-    """Refuse boxes of positions, each with what it is called, that the arm is too short for."""
+    """Raise RecipeError if the arm cannot reach one of the boxes, given as (name, box)."""
     mistakes = []
     shoulder = context.robot.chain.joints[0].translation
     for name, box in boxes:
@@ -93,7 +93,7 @@ def check_reach(context: Context, boxes: Iterable[tuple[str, tuple[Range, ...]]]
 
 
 def position_field(end: str, low: Sequence[float], high: Sequence[float]) -> Field:
-    """Describe the field of the tip's position at an end, within a box [m]."""
+    """Describe the field of the tip position at an end, bounded by a box [m]."""
     text = f"{end} position of the tip"
     return Field(f"{end}_xyz", "m", text, 3, ("x", "y", "z"), "context", "world", tuple(low), tuple(high))
 

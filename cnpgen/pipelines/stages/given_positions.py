@@ -1,4 +1,4 @@
-"""Stage: positions that are listed, or evenly spaced in a box, one after the other instead of drawn."""
+"""Stage: listed positions, or positions on a grid, in order and without random sampling."""
 
 import math
 from collections.abc import Iterator
@@ -9,27 +9,27 @@ import numpy as np
 from cnpgen.kernels.symbolic.kinematics import tip_position
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.draw import position_field
-from cnpgen.pipelines.stages.stage import Array, Round, Stage, Work
+from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Stage, StageFunction
 from cnpgen.schema.keys import Range, field
 from cnpgen.store.field import Field
 
 Position = tuple[float, float, float]
-MOST_TASKS = 100_000
+MAX_TASKS = 100_000
 
 
 @dataclass(frozen=True, kw_only=True)
 class GivenPositions(Stage):
-    """Goal positions of a list or a grid, from start positions of a list, or from the base configuration."""
+    """Stage: goal positions of a list or a grid, with listed start positions or the base configuration."""
 
     goal: tuple[Position, ...] = field("goal positions: x, y, z of each", unit="m", default=())
-    grid: tuple[Range, ...] = field("box of goal positions instead: x, y, z", unit="m", default=())
-    counts: tuple[int, ...] = field("how many there are in the box along x, y, z, ends included", low=1, default=())
+    grid: tuple[Range, ...] = field("box of goal positions instead of a list: x, y, z", unit="m", default=())
+    counts: tuple[int, ...] = field("number of positions along x, y, z, ends included", low=1, default=())
     start: tuple[Position, ...] = field(
-        "start positions: one for all or one for each; none: the base configuration", unit="m", default=()
+        "start positions, one for all or one per goal; default: the base configuration", unit="m", default=()
     )
 
     def find_mistakes(self) -> Iterator[tuple[str, str]]:
-        """Yield (key, what is wrong with it)."""
+        """Yield (key, mistake) pairs."""
         if bool(self.goal) == bool(self.grid):
             yield "goal", "either a list of goals or a grid must be given, and not both"
         for key in ("grid", "counts"):
@@ -37,25 +37,25 @@ class GivenPositions(Stage):
                 yield key, f"expected 3 entries, for x, y and z, got {len(getattr(self, key))}"
         if self.counts and not self.grid:
             yield "counts", "counts are for a grid, and there is none"
-        if self.tasks > MOST_TASKS:
-            yield "counts", f"a grid of {self.tasks:,} goals is too large, expected at most {MOST_TASKS:,}"
+        if self.tasks > MAX_TASKS:
+            yield "counts", f"a grid of {self.tasks:,} goals is too large, expected at most {MAX_TASKS:,}"
             return
         if len(self.start) not in {0, 1, self.tasks}:
             yield "start", f"expected one position for all, or one for each of {self.tasks}, got {len(self.start)}"
 
     @property
     def tasks(self) -> int:
-        """How many goals there are."""
+        """Number of goals."""
         return len(self.goal) or math.prod(self.counts)
 
     def describe(self) -> str:
-        """Say which positions."""
-        what = "goals in a list" if self.goal else f"goals on a grid of {' x '.join(map(str, self.counts))}"
+        """Describe the stage in one sentence."""
+        goals = "goals in a list" if self.goal else f"goals on a grid of {' x '.join(map(str, self.counts))}"
         origin = "listed start positions" if self.start else "the base configuration"
-        return f"take {self.tasks:,} {what}, one after the other, from {origin}"
+        return f"take {self.tasks:,} {goals}, one after the other, from {origin}"
 
-    def provides(self, context: Context) -> tuple[Field, ...]:
-        """Both positions, and the start configuration where it is the base."""
+    def outputs(self, context: Context) -> tuple[Field, ...]:
+        """List the fields of both positions, and of the start configuration if it is the base."""
         boxes = (("start", self._starts(context)), ("goal", self._goals()))
         positions = tuple(
             position_field(end, points.min(axis=0).tolist(), points.max(axis=0).tolist()) for end, points in boxes
@@ -63,27 +63,27 @@ class GivenPositions(Stage):
         base = context.joint_field("start_q", "rad", "joint positions at the start")
         return positions if self.start else (*positions, base)
 
-    def prepare(self, context: Context) -> Work:
+    def prepare(self, context: Context) -> StageFunction:
         """List the positions."""
         columns = {"start_xyz": self._starts(context).T, "goal_xyz": self._goals().T}
         if not self.start:
             columns["start_q"] = context.robot.base[:, None]
 
-        def work(draws: Round, _random: np.random.Generator) -> None:
+        def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
             for name, values in columns.items():
-                draws[name] = np.ascontiguousarray(np.broadcast_to(values, (len(values), draws.size)))
+                candidates[name] = np.ascontiguousarray(np.broadcast_to(values, (len(values), candidates.size)))
 
         return work
 
     def _goals(self) -> Array:
-        """Positions of the goal [m], shape (tasks, 3); of a grid x varies most slowly."""
+        """Return the goal positions [m], shape (tasks, 3); in a grid, x is the outer loop."""
         if self.goal:
             return np.array(self.goal)
         axes = [np.linspace(axis.low, axis.high, count) for axis, count in zip(self.grid, self.counts, strict=True)]
         return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
     def _starts(self, context: Context) -> Array:
-        """Positions of the start [m], shape (tasks or 1, 3)."""
+        """Return the start positions [m], shape (tasks or 1, 3)."""
         if self.start:
             return np.array(self.start)
         (tip,) = context.kernels.load(tip_position)(context.robot.base[:, None])

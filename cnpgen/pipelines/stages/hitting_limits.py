@@ -1,9 +1,10 @@
-"""Hitting configurations on joint limits: where the optimum lies beyond a limit, the joint is held on it.
+"""Hitting configurations on joint limits, computed by an active-set method.
 
 The step of ``hitting_newton`` eliminates the constraint through three joints that must be free to move. Here any joint
-may be held, so the step is taken in all of them: with ``J_F`` the Jacobian without the columns of held joints,
-maximise ``g . s + s^T H s / 2`` subject to ``J_F s = p - FK(q)``. Adding ``J_F^T J_F`` with a large factor to ``-H``
-changes no solution and makes it positive definite near one, so that two symmetric solves without pivoting do.
+may be held on its limit, so the step is computed in all joints. With ``J_F`` the Jacobian without the columns of held
+joints, maximize ``g . s + s^T H s / 2`` subject to ``J_F s = p - FK(q)``. Adding a large multiple of ``J_F^T J_F`` to
+``-H`` changes no solution and makes it positive definite near a solution. Two symmetric solves without pivoting then
+suffice.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -25,43 +26,43 @@ from cnpgen.kernels.symbolic.linalg import (
     subtract,
     symbols,
 )
-from cnpgen.pipelines.stages.hitting_newton import TOLERANCE, Expansion, expand, safeguard, shortened
+from cnpgen.pipelines.stages.hitting_newton import NEWTON_TOLERANCE_RAD, Expansion, expand, safeguard, shortened
 from cnpgen.pipelines.stages.stage import Array
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
 
-STIFFNESS = 1e3  # of J_F^T J_F beside -H: both are in m^2/rad^2, and of order 1
+CONSTRAINT_WEIGHT = 1e3  # weight of J_F^T J_F relative to -H: both are in m^2/rad^2, and of order 1
 
 
 def within_limits(robot: "Robot", kernel: Kernel, q: Array, *parameters: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Move optima that are beyond joint limits to the nearest ones within, by an active-set method.
+    """Move optima outside joint limits to nearby optima within, by an active-set method.
 
-    Joints beyond their limits are put on them and held; whoever is beyond after solving for the others is held, too;
-    of the joints that would rather move inwards the one that pulls most is let go.
+    Joints outside their limits are set to the limit and held. Joints that leave their limits after a solve for the
+    others are held, too. Of the held joints with an inward gradient, the one with the largest is released.
 
     Args:
-        robot: The robot.
-        kernel: Of ``held_step``, iterated.
+        robot: Robot.
+        kernel: Iterated kernel of ``held_step``.
         q: Optima of the search without limits [rad], shape (n, N).
-        parameters: Positions, directions and homes, as the kernel takes them.
+        parameters: Positions, directions and homes, in the order of the kernel's arguments.
 
     Returns:
-        ``(q, found)``: configurations within the limits [rad], shape (n, N); whether each is an optimum, shape (N,).
+        ``(q, found)``: configurations within the limits [rad], shape (n, N), and a mask of the optima, shape (N,).
     """
     low, high = robot.position_lower[:, None], robot.position_upper[:, None]
-    side = np.where(q > high, 1.0, np.where(q < low, -1.0, 0.0))  # of the limits that joints are held on, else 0
+    side = np.where(q > high, 1.0, np.where(q < low, -1.0, 0.0))  # sign of the limit on which a joint is held, else 0
     q, left = np.clip(q, low, high), np.arange(q.shape[1])
     for _ in range(2 * robot.n):
         held = np.take(side, left, axis=1)
         state = np.concatenate([np.take(q, left, axis=1), np.zeros_like(held)])
-        given = [np.take(values, left, axis=1) for values in parameters]
-        state, step = kernel(state, *given, np.abs(held))
+        arguments = [np.take(values, left, axis=1) for values in parameters]
+        state, step = kernel(state, *arguments, np.abs(held))
         moved, pull = np.split(state, 2)
         q[:, left] = np.clip(moved, low, high)
         change = _change(held, np.where(moved > high, 1.0, np.where(moved < low, -1.0, 0.0)), pull)
         side[:, left] = held + change
-        left = left[(change != 0).any(0) | ~(step[0] < TOLERANCE)]
+        left = left[(change != 0).any(0) | ~(step[0] < NEWTON_TOLERANCE_RAD)]
         if len(left) == 0:
             break
     found = np.ones(q.shape[1], bool)
@@ -69,21 +70,21 @@ def within_limits(robot: "Robot", kernel: Kernel, q: Array, *parameters: Array) 
     return q, found
 
 
-def _change(held: Array, beyond: Array, pull: Array) -> Array:
-    """Say which joints are to be held, 1 or -1, or let go: 1 on a lower and -1 on an upper limit; 0 for the others."""
+def _change(held: Array, outside: Array, pull: Array) -> Array:
+    """Return the change of the held sides: the side of a new hold, minus the side of a released hold, otherwise 0."""
     inwards = -held * pull
-    least = (inwards == inwards.max(axis=0)) & (inwards > 0) & ~beyond.any(axis=0)
-    return np.where(least, -held, np.where(held == 0, beyond, 0.0))
+    released = (inwards == inwards.max(axis=0)) & (inwards > 0) & ~outside.any(axis=0)
+    return np.where(released, -held, np.where(held == 0, outside, 0.0))
 
 
 def held_step(robot: "Robot") -> Any:
     """Build one Newton step in the joints that are not held: ``((q, pull), p, d, q0, held) -> (next, |step|)``.
 
-    ``held`` is 1 for joints that stay where they are; ``pull`` is where the objective would move them, the tip staying
-    at p: the derivative of the Lagrangian. It is computed, not used.
+    ``held`` is 1 for joints that stay constant. ``pull`` is the gradient of the Lagrangian, an output that the step
+    does not use.
 
     Args:
-        robot: The robot; every joint must be revolute.
+        robot: Robot with revolute joints only.
 
     Returns:
         A ``casadi.Function`` with arguments of width 2 n, 3, 2, n, n.
@@ -102,7 +103,7 @@ def held_step(robot: "Robot") -> Any:
 
 
 def _step(here: Expansion, miss: Vec, free: Vec) -> tuple[Vec, Vec]:
-    """Newton step in the joints whose ``free`` is 1, 0 in those whose is 0; and the gradient of the Lagrangian."""
+    """Return the Newton step in the joints with ``free`` 1, 0 in the others, and the gradient of the Lagrangian."""
     n, jacobian = here.n, here.kin.jacobian
     rows = [[column[row] * x for column, x in zip(jacobian, free, strict=True)] for row in range(3)]
     gradient = [g * x for g, x in zip(here.gradient, free, strict=True)]
@@ -111,12 +112,15 @@ def _step(here: Expansion, miss: Vec, free: Vec) -> tuple[Vec, Vec]:
     hessian = here.hessian(multiplier)
 
     def stiff(i: int, j: int) -> Scalar:
-        value = STIFFNESS * dot([row[i] for row in rows], [row[j] for row in rows]) - free[i] * free[j] * hessian[i][j]
+        value = (
+            CONSTRAINT_WEIGHT * dot([row[i] for row in rows], [row[j] for row in rows])
+            - free[i] * free[j] * hessian[i][j]
+        )
         return value + (1.0 - free[i]) if i == j else value
 
     factors = factorize([[stiff(i, j) for j in range(i + 1)] for i in range(n)], safeguard)
     towards = [dot([row[j] for row in rows], miss) for j in range(n)]
-    step = substitute(*factors, add(gradient, scale(towards, STIFFNESS)))
+    step = substitute(*factors, add(gradient, scale(towards, CONSTRAINT_WEIGHT)))
     spread = [substitute(*factors, row) for row in rows]
     lower = [[dot(rows[i], spread[j]) for j in range(i + 1)] for i in range(3)]
     force = solve(lower, [dot(row, step) - e for row, e in zip(rows, miss, strict=True)])

@@ -1,8 +1,8 @@
 """Newton's method for the hitting configuration: one step as an SX function.
 
-Maximise ``f(q) = |J(q)^T d|^2 - |(q0 - q) / L|^2`` subject to ``FK(q) = p`` (reference 2, section on hitting): ``d``
-is the unit hitting direction in the table plane, ``J`` the translational Jacobian of the tip, ``q0`` the
-configuration that the search stays close to, ``L`` the rated joint velocities. The optimality conditions are solved
+Maximize ``f(q) = |J(q)^T d|^2 - |(q0 - q) / L|^2`` subject to ``FK(q) = p`` (reference 2, section on hitting): ``d``
+is the unit hitting direction in the table plane, ``J`` the translational Jacobian of the tip, ``q0`` the home
+configuration, ``L`` the rated joint velocities. The optimality conditions are solved
 in closed form: ``d^2 p / dq_j dq_k = z_min(j,k) x J_max(j,k)``, hence gradient ``2 A a`` with ``a = J^T d`` and
 ``A_jk = d . (z_min x J_max)``, and Hessian ``2 A A + 2 d . (dz_min x J_max + z_min x dJ_max)`` with ``dz``, ``dJ``
 the derivatives along ``a``. The constraint is eliminated through three basic joints, so that each step factorizes
@@ -33,14 +33,14 @@ from cnpgen.kernels.symbolic.linalg import (
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
 
-MAX_STEP = 0.6  # rad, Euclidean norm of one Newton step
-MIN_PIVOT = 1e-3  # smallest |pivot| of the reduced Hessian: keeps every step an ascent direction
-TOLERANCE = 1e-6  # rad, length of the last step taken; the next one would be its square
-MAX_STEPS = 40
+MAX_NEWTON_STEP_RAD = 0.6  # Euclidean norm of one Newton step
+MIN_PIVOT = 1e-3  # minimum |pivot| of the reduced Hessian: every step is an ascent direction
+NEWTON_TOLERANCE_RAD = 1e-6  # length of the last step; convergence is quadratic
+MAX_NEWTON_STEPS = 40
 
 
 def objective(robot: "Robot") -> Any:
-    """Build ``(q, d, q0) -> f``: the squared manipulability along d less the penalty on the distance from q0."""
+    """Build ``(q, d, q0) -> f``: the squared manipulability along d minus the penalty on the distance from q0."""
     import casadi as ca
 
     (q_sx, q), (d_sx, d), (home_sx, home) = symbols("q", robot.n), symbols("d", 2), symbols("q0", robot.n)
@@ -60,7 +60,7 @@ class Expansion:
         direction: d, 3.
         gain: ``J^T d``, n.
         second: ``d^2 p / dq_j dq_k``, symmetric, n x n lists of 3.
-        slope: ``A_jk = d . d^2 p / dq_j dq_k``, symmetric, n x n.
+        gain_gradient: ``A_jk = d . d^2 p / dq_j dq_k``, symmetric, n x n.
         weight: ``1 / L^2``, n.
     """
 
@@ -69,7 +69,7 @@ class Expansion:
     direction: Vec
     gain: Vec
     second: list[list[Vec]]
-    slope: list[Vec]
+    gain_gradient: list[Vec]
     weight: list[float]
 
     @property
@@ -79,7 +79,7 @@ class Expansion:
 
     def hessian(self, multiplier: Vec) -> list[list[Scalar]]:
         """Hessian of ``f - multiplier . FK``, full symmetric n x n."""
-        kin, slope = self.kin, self.slope
+        kin, gain_gradient = self.kin, self.gain_gradient
         axis_rates, column_rates = _rates(kin, self.gain)
         across = [cross(self.direction, axis) for axis in kin.axes]
         across_rate = [cross(self.direction, rate) for rate in axis_rates]
@@ -87,7 +87,7 @@ class Expansion:
         for j in range(self.n):
             for k in range(j, self.n):
                 third = dot(across_rate[j], kin.jacobian[k]) + dot(across[j], column_rates[k])
-                value = 2.0 * (dot(slope[j], slope[k]) + third) - dot(multiplier, self.second[j][k])
+                value = 2.0 * (dot(gain_gradient[j], gain_gradient[k]) + third) - dot(multiplier, self.second[j][k])
                 hessian[j][k] = hessian[k][j] = value - 2.0 * self.weight[j] if j == k else value
         return hessian
 
@@ -96,30 +96,30 @@ def expand(robot: "Robot", q: Vec, d: Vec, home: Vec) -> Expansion:
     """Expand objective and constraint at q.
 
     Args:
-        robot: The robot; every joint must be revolute.
+        robot: Robot with revolute joints only.
         q: Joint positions [rad], n scalars.
         d: Unit hitting direction in the table plane, 2.
-        home: The configuration to stay close to [rad], n.
+        home: Home configuration [rad], n.
     """
     kin = forward_kinematics(robot.chain, q)
     direction = [d[0], d[1], 0.0]
     weight = [1.0 / float(value) ** 2 for value in robot.rated_velocity]
     gain = [d[0] * column[0] + d[1] * column[1] for column in kin.jacobian]
     second = _second_derivatives(kin)
-    slope = [[d[0] * entry[0] + d[1] * entry[1] for entry in row] for row in second]
-    gradient = [2.0 * dot(slope[j], gain) + 2.0 * weight[j] * (home[j] - q[j]) for j in range(robot.n)]
-    return Expansion(kin, gradient, direction, gain, second, slope, weight)
+    gain_gradient = [[d[0] * entry[0] + d[1] * entry[1] for entry in row] for row in second]
+    gradient = [2.0 * dot(gain_gradient[j], gain) + 2.0 * weight[j] * (home[j] - q[j]) for j in range(robot.n)]
+    return Expansion(kin, gradient, direction, gain, second, gain_gradient, weight)
 
 
 def _second_derivatives(kin: Kinematics) -> list[list[Vec]]:
-    """d^2 p / dq_j dq_k = z_min x J_max."""
+    """Return ``d^2 p / dq_j dq_k = z_min x J_max``."""
     n = len(kin.axes)
     upper = {(j, k): cross(kin.axes[j], kin.jacobian[k]) for j in range(n) for k in range(j, n)}
     return [[upper[min(j, k), max(j, k)] for k in range(n)] for j in range(n)]
 
 
 def _rates(kin: Kinematics, rate: Vec) -> tuple[list[Vec], list[Vec]]:
-    """Derivatives of the joint axes and of the columns of the Jacobian where the joints move at these rates."""
+    """Return the time derivatives of the joint axes and of the Jacobian's columns at given joint rates."""
     turning: Vec = [0.0, 0.0, 0.0]
     origin_rate: Vec = [0.0, 0.0, 0.0]
     previous: Vec = [0.0, 0.0, 0.0]
@@ -140,7 +140,7 @@ def newton_step(robot: "Robot") -> Any:
     """Build one Newton step as an SX function ``(q, p, d, q0) -> (next q, |step|)``.
 
     Args:
-        robot: The robot; every joint must be revolute.
+        robot: Robot with revolute joints only.
 
     Returns:
         A ``casadi.Function`` with arguments of width n, 3, 2, n.
@@ -156,23 +156,23 @@ def newton_step(robot: "Robot") -> Any:
 
 
 def shortened(q: Vec, step: Vec) -> tuple[Any, Scalar]:
-    """Return ``q + step``, the step not longer than ``MAX_STEP``, and the length that it would have had."""
+    """Return ``q + step`` with the step shortened to ``MAX_NEWTON_STEP_RAD``, and the full length of the step."""
     import casadi as ca
 
     length = ca.sqrt(dot(step, step))
-    factor = ca.fmin(1.0, MAX_STEP / ca.fmax(length, 1e-12))
+    factor = ca.fmin(1.0, MAX_NEWTON_STEP_RAD / ca.fmax(length, 1e-12))
     return ca.vertcat(*add(q, scale(step, factor))), length
 
 
 def safeguard(pivot: Scalar) -> Scalar:
-    """Keep a pivot of the negative Hessian away from zero and positive."""
+    """Return a positive pivot of the negative Hessian, at least ``MIN_PIVOT``."""
     import casadi as ca
 
     return ca.fmax(ca.fabs(pivot), MIN_PIVOT)
 
 
 def _reduced_step(here: Expansion, miss: Vec, basic: tuple[int, int, int]) -> Vec:
-    """Newton step: basic joints close the miss, free joints climb the reduced gradient."""
+    """Return the Newton step: basic joints correct the position, free joints follow the reduced Newton direction."""
     import casadi as ca
 
     n, jacobian = here.n, here.kin.jacobian
@@ -185,7 +185,9 @@ def _reduced_step(here: Expansion, miss: Vec, basic: tuple[int, int, int]) -> Ve
     hessian = here.hessian(multiplier)
     curved = [[dot(row, column) for row in hessian] for column in null]  # H Z
     lower = [[-dot(null[i], curved[j]) for j in range(i + 1)] for i in range(len(null))]
-    right = [dot(column, here.gradient) + dot(bent, normal) for column, bent in zip(null, curved, strict=True)]
+    right = [
+        dot(column, here.gradient) + dot(projected, normal) for column, projected in zip(null, curved, strict=True)
+    ]
     climb = substitute(*factorize(lower, safeguard), right)
     step = normal
     for amount, column in zip(climb, null, strict=True):
@@ -194,7 +196,7 @@ def _reduced_step(here: Expansion, miss: Vec, basic: tuple[int, int, int]) -> Ve
 
 
 def _null_space(jacobian: list[Vec], inverse: list[Vec], basic: tuple[int, int, int]) -> list[Vec]:
-    """Columns of Z, one per free joint: moving it alone, with the basic joints keeping the tip in place."""
+    """Return the columns of Z, one per free joint: it moves alone, and the basic joints keep the tip in place."""
     columns = []
     for j in range(len(jacobian)):
         if j not in basic:
@@ -207,10 +209,10 @@ def _null_space(jacobian: list[Vec], inverse: list[Vec], basic: tuple[int, int, 
 
 
 def basic_joints(robot: "Robot") -> tuple[int, int, int]:
-    """Choose the joints through which the tip position is eliminated.
+    """Choose the three joints that eliminate the tip position.
 
-    The three whose Jacobian is typically the best part of the arm's: the largest median over configurations near the
-    base of ``|det J_B| / sqrt(det J J^T)``. (The largest least value would be decided by a few odd configurations.)
+    They maximize the median of ``|det J_B| / sqrt(det J J^T)`` over configurations near the base. (A few unusual
+    configurations would determine the minimum.)
     """
     import pinocchio as pin
 

@@ -1,13 +1,13 @@
-"""Stage: the fastest joint velocity along the hit, a linear programme solved exactly.
+"""Stage: the fastest joint velocity along the hit, a linear program solved exactly.
 
-Maximise ``a . v`` subject to ``B^T v = 0`` and ``|v_i| <= L_i``, where ``a_i`` is the tip's velocity along the hit
+Maximize ``a . v`` subject to ``B^T v = 0`` and ``|v_i| <= L_i``, where ``a_i`` is the tip's velocity along the hit
 and ``b_i`` its two components across it per unit of joint i. The dual, ``min over y in R^2 of sum_i L_i |a_i - b_i .
 y|``, has its minimum where two residuals vanish: n (n - 1) / 2 candidates, evaluated without branches. Joints with
 non-zero residual go to the limit of its sign.
 
-In half of the poses of an arm with intersecting axes three or more residuals vanish together and the optimum is a
-face. The joints left are then given the velocity ``v_i = t L_i sign(b_i . z)`` of smallest t that closes the
-equations: again a linear programme, whose dual has its optimum at a ``z`` orthogonal to one of the b_i.
+In half of the poses of an arm with intersecting axes, three or more residuals vanish together and the optimum is a
+face. The remaining joints then get the velocity ``v_i = t L_i sign(b_i . z)`` with the smallest t that satisfies the
+equations. This is again a linear program, and its dual has its optimum at a ``z`` orthogonal to one of the b_i.
 """
 
 from collections.abc import Callable, Collection
@@ -21,37 +21,35 @@ from cnpgen.errors import UsageError
 from cnpgen.kernels.symbolic.kinematics import forward_kinematics
 from cnpgen.kernels.symbolic.linalg import Scalar, Vec, dot, symbols
 from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.stages.stage import Array, Round, Stage, Work
+from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Stage, StageFunction
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
 
-VANISHING = 1e-11  # m: a residual below this is zero
-SHARE = "hit_speed_share"  # the column in which tasks say how fast, as a fraction of the highest possible speed
-PARALLEL = 1e-9  # relative size of a determinant that is taken for zero
+ZERO_RESIDUAL_M = 1e-11  # residuals below this are treated as zero
+SPEED_SHARE_COLUMN = "hit_speed_share"  # task column: hit speed as a fraction of the maximum speed
+PARALLEL_TOLERANCE = 1e-9  # relative determinants below this are treated as zero
 
 
 @dataclass(frozen=True, kw_only=True)
 class HittingVelocity(Stage):
-    """Joint velocities of the goal: along the hit exactly, as fast as possible or scaled down."""
+    """Stage: joint velocities of the goal, exactly along the hit, at the maximum speed or scaled down."""
 
-    needs = ("goal_q", "hit_angle")
-    full_speed: float = field(
-        "fraction of the hits at the highest possible speed; the others are scaled", low=0.0, high=1.0
-    )
-    min_speed: float = field("hits that cannot be faster than this are rejected", unit="m/s", default=1e-3, low=1e-9)
+    inputs = ("goal_q", "hit_angle")
+    full_speed: float = field("fraction of the hits at the maximum speed; the others are scaled", low=0.0, high=1.0)
+    min_speed: float = field("minimum of the maximum speed of a hit", unit="m/s", default=1e-3, low=1e-9)
 
     def describe(self) -> str:
-        """Say how fast."""
+        """Describe the stage in one sentence."""
         slower = (
             f"; scale it uniformly in [0, 1) in {1 - self.full_speed:.4g} of the cases" if self.full_speed < 1 else ""
         )
-        return f"solve the linear programme for the fastest joint velocity along the hit{slower}"
+        return f"solve the linear program for the fastest joint velocity along the hit{slower}"
 
-    def provides(self, context: Context) -> tuple[Field, ...]:
-        """The joint velocity and the speeds."""
+    def outputs(self, context: Context) -> tuple[Field, ...]:
+        """List the joint velocity and the speeds."""
         return (
             context.joint_field("goal_dq", "rad/s", "joint velocities at the goal", "target"),
             Field("hit_speed", "m/s", "speed of the tip along the hit at the goal", role="context", frame="world"),
@@ -64,62 +62,70 @@ class HittingVelocity(Stage):
             ),
         )
 
-    def prepare(self, context: Context) -> Work:
+    def prepare(self, context: Context) -> StageFunction:
         """Load the kernel."""
 
-        def draw_share(draws: Round, random: np.random.Generator, _speed: Array) -> Array:
-            factor, choice = draws.draw(random, 1), draws.draw(random, 1)
+        def draw_share(candidates: CandidateBatch, random: np.random.Generator, _speed: Array) -> Array:
+            factor, choice = candidates.draw(random, 1), candidates.draw(random, 1)
             return np.where(choice < self.full_speed, 1.0, factor)
 
         return self._solve(context, draw_share)
 
-    def takes(self, context: Context) -> tuple[Field, ...]:
-        """How fast: the speed, or its share of the highest possible one, which is 1 where neither is given."""
-        share = Field(SHARE, "1", "speed of the hit, as a fraction of the highest possible one", role="context")
-        return self.provides(context)[1], share
+    def task_inputs(self, context: Context) -> tuple[Field, ...]:
+        """List the speed, and its share of the maximum speed; the share is 1 if neither is given."""
+        share = Field(
+            SPEED_SHARE_COLUMN, "1", "speed of the hit, as a fraction of the highest possible one", role="context"
+        )
+        return self.outputs(context)[1], share
 
-    def complete(self, context: Context, given: Collection[str]) -> Work:
-        """Load the kernel, for the speed that is given."""
-        if {"hit_speed", SHARE} <= set(given):
-            raise UsageError(f"hit_speed and {SHARE} both say how fast the hit is: give one of them")
+    def complete(self, context: Context, given: Collection[str]) -> StageFunction:
+        """Load the kernel for the given speed or share."""
+        if {"hit_speed", SPEED_SHARE_COLUMN} <= set(given):
+            raise UsageError(f"hit_speed and {SPEED_SHARE_COLUMN} both define the speed of the hit: give one of them")
 
-        def given_share(draws: Round, _random: np.random.Generator, speed: Array) -> Array:
-            if SHARE in given:
-                return draws[SHARE]
-            return draws["hit_speed"] / speed if "hit_speed" in given else np.ones_like(speed)
+        def given_share(candidates: CandidateBatch, _random: np.random.Generator, speed: Array) -> Array:
+            if SPEED_SHARE_COLUMN in given:
+                return candidates[SPEED_SHARE_COLUMN]
+            return candidates["hit_speed"] / speed if "hit_speed" in given else np.ones_like(speed)
 
         solve = self._solve(context, given_share)
 
-        def work(draws: Round, random: np.random.Generator) -> None:
-            solve(draws, random)
-            possible = (draws["hit_speed"] > 0) & (draws["hit_speed"] <= draws["hit_speed_max"])
-            draws.reject(possible[0], "hit speed not between 0 and the highest possible one")
+        def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
+            solve(candidates, random)
+            possible = (candidates["hit_speed"] > 0) & (candidates["hit_speed"] <= candidates["hit_speed_max"])
+            candidates.reject(possible[0], "hit speed not between 0 and the highest possible one")
 
         return work
 
-    def _solve(self, context: Context, share: Callable[[Round, np.random.Generator, Array], Array]) -> Work:
-        kernel = context.kernels.load(hitting_velocity, slowest=self.min_speed)
+    def _solve(
+        self, context: Context, share: Callable[[CandidateBatch, np.random.Generator, Array], Array]
+    ) -> StageFunction:
+        kernel = context.kernels.load(hitting_velocity, min_speed=self.min_speed)
 
-        def work(draws: Round, random: np.random.Generator) -> None:
-            direction = np.concatenate([np.cos(draws["hit_angle"]), np.sin(draws["hit_angle"])])
-            velocity, speed, found = kernel(draws["goal_q"], direction)
-            factor = share(draws, random, speed)
-            draws["goal_dq"], draws["hit_speed"], draws["hit_speed_max"] = velocity * factor, speed * factor, speed
-            draws.reject(found[0] > 0, "no hitting velocity")
+        def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
+            direction = np.concatenate([np.cos(candidates["hit_angle"]), np.sin(candidates["hit_angle"])])
+            velocity, speed, found = kernel(candidates["goal_q"], direction)
+            factor = share(candidates, random, speed)
+            candidates["goal_dq"], candidates["hit_speed"], candidates["hit_speed_max"] = (
+                velocity * factor,
+                speed * factor,
+                speed,
+            )
+            candidates.reject(found[0] > 0, "no hitting velocity")
 
         return work
 
 
-def hitting_velocity(robot: "Robot", *, slowest: float) -> Any:
-    """Build the linear programme as an SX function ``(q, d) -> (dq, speed, found)``.
+def hitting_velocity(robot: "Robot", *, min_speed: float) -> Any:
+    """Build the linear program as an SX function ``(q, d) -> (dq, speed, found)``.
 
     Args:
-        robot: The robot.
-        slowest: The least speed that is a hit [m/s].
+        robot: Robot.
+        min_speed: Minimum speed of a hit [m/s].
 
     Returns:
-        A ``casadi.Function`` with arguments of width n, 2; dq [rad/s] maximises the tip's speed [m/s] along d; found is
-        1 if that is a hit, and 0 also where the Jacobian is singular and dq is not finite.
+        A ``casadi.Function`` with arguments of width n, 2; dq [rad/s] maximizes the tip's speed [m/s] along d.
+        ``found`` is 0 for slower hits, and if the Jacobian is singular and dq is not finite.
     """
     import casadi as ca
 
@@ -128,9 +134,9 @@ def hitting_velocity(robot: "Robot", *, slowest: float) -> Any:
     along = [d[0] * column[0] + d[1] * column[1] for column in jacobian]
     across = [[d[0] * column[1] - d[1] * column[0], column[2]] for column in jacobian]
     velocity, speed = maximise(along, across, [float(x) for x in robot.velocity_limit])
-    found = ca.logic_and(slowest <= speed, speed < np.inf)
-    for each in velocity:
-        found = ca.logic_and(found, ca.fabs(each) < np.inf)
+    found = ca.logic_and(min_speed <= speed, speed < np.inf)
+    for rate in velocity:
+        found = ca.logic_and(found, ca.fabs(rate) < np.inf)
     return ca.Function("hitting_velocity", [q_sx, d_sx], [ca.vertcat(*velocity), speed, found])
 
 
@@ -148,7 +154,7 @@ def maximise(a: Vec, b: list[Vec], limit: list[float]) -> tuple[Vec, Scalar]:
     for i, j in combinations(range(n), 2):
         det = _det(b[i], b[j])
         size = ca.fabs(b[i][0] * b[j][1]) + ca.fabs(b[i][1] * b[j][0])
-        usable = ca.fabs(det) > PARALLEL * size
+        usable = ca.fabs(det) > PARALLEL_TOLERANCE * size
         inverse = 1.0 / ca.if_else(usable, det, 1.0)
         candidate = [(a[i] * b[j][1] - b[i][1] * a[j]) * inverse, (b[i][0] * a[j] - a[i] * b[j][0]) * inverse]
         value: Scalar = 0.0
@@ -159,7 +165,7 @@ def maximise(a: Vec, b: list[Vec], limit: list[float]) -> tuple[Vec, Scalar]:
         best = ca.if_else(better, value, best)
         y = [ca.if_else(better, new, old) for new, old in zip(candidate, y, strict=True)]
     residual = [a[k] - dot(b[k], y) for k in range(n)]
-    left = [ca.fabs(r) < VANISHING for r in residual]
+    left = [ca.fabs(r) < ZERO_RESIDUAL_M for r in residual]
     fixed = [ca.if_else(free, 0.0, bound * ca.sign(r)) for free, bound, r in zip(left, limit, residual, strict=True)]
     missing = [-dot([b[k][c] for k in range(n)], fixed) for c in range(2)]
     rest = _smallest_ratio([[x * free for x in b_k] for b_k, free in zip(b, left, strict=True)], limit, missing)
@@ -181,7 +187,7 @@ def _smallest_ratio(b: list[Vec], limit: list[float], target: Vec) -> Vec:
             if k != j:
                 weight = weight + limit[k] * ca.fabs(dot(b[k], normal))
         size = dot(normal, normal)
-        usable = weight > PARALLEL * ca.sqrt(size) * 1e-3
+        usable = weight > PARALLEL_TOLERANCE * ca.sqrt(size) * 1e-3
         value = dot(target, normal) / ca.if_else(usable, weight, 1.0)
         better = ca.logic_and(usable, ca.fabs(value) > ratio)
         ratio = ca.if_else(better, ca.fabs(value), ratio)
@@ -190,7 +196,7 @@ def _smallest_ratio(b: list[Vec], limit: list[float], target: Vec) -> Vec:
         pivot = [ca.if_else(better, new, old) for new, old in zip(b[j], pivot, strict=True)]
     ratio = ca.fmax(ratio, 0.0)
     length = ca.sqrt(dot(pivot, pivot))
-    parallel = [ca.fabs(dot(x, z)) <= PARALLEL * length * ca.sqrt(dot(x, x)) for x in b]
+    parallel = [ca.fabs(dot(x, z)) <= PARALLEL_TOLERANCE * length * ca.sqrt(dot(x, x)) for x in b]
     v = [
         ca.if_else(same, 0.0, ratio * bound * ca.sign(dot(x, z)))
         for same, bound, x in zip(parallel, limit, b, strict=True)

@@ -1,4 +1,4 @@
-"""Stages: inverse kinematics of the start and of the goal, position alone or position and vertical orientation."""
+"""Stages: inverse kinematics of start and goal, for the position alone or with a vertical orientation."""
 
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
@@ -12,42 +12,42 @@ from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, dot, gram, scale, s
 from cnpgen.kernels.tape import Loop
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.draw import uniform
-from cnpgen.pipelines.stages.stage import Round, Stage, Work
+from cnpgen.pipelines.stages.stage import CandidateBatch, Stage, StageFunction
 from cnpgen.schema.keys import Range, field
 from cnpgen.store.field import Field
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
 
-TOLERANCE = 1e-9  # m and rad, before the last step (quadratically convergent, but not with joints on their limits)
-MAX_STEPS = 24
-DAMPING = 1e-9
-# The step that respects the joint limits is damped by min(MOST_DAMPING, DAMPING_RATE |e|^2) as well: where the limits
-# leave hardly enough joints, an undamped step amplifies rounding until no two machines find the same solution. Damping
-# that vanishes with the error e leaves the convergence quadratic.
-MOST_DAMPING = 1e-2
-DAMPING_RATE = 1e-1
+IK_TOLERANCE = 1e-9  # m and rad, before the last step (quadratic convergence, except with joints on their limits)
+MAX_IK_STEPS = 24
+IK_DAMPING = 1e-9
+# Additional damping min(MAX_LIMIT_DAMPING, LIMIT_DAMPING_RATE |e|^2) of the step within joint limits. If the limits
+# leave hardly enough free joints, an undamped step amplifies rounding errors until solutions differ between machines.
+# The damping vanishes with the error e, so convergence stays quadratic.
+MAX_LIMIT_DAMPING = 1e-2
+LIMIT_DAMPING_RATE = 1e-1
 
 
 @dataclass(frozen=True, kw_only=True)
 class _IK(Stage):
-    """Gauss-Newton with clipped steps that saturate at the joint limits."""
+    """Base class: Gauss-Newton inverse kinematics with clipped steps that saturate at the joint limits."""
 
-    orientation: str = field("what the tip's orientation must be", choices=("free", "vertical"), default="free")
-    max_step: float = field("largest change of a joint in one iteration", unit="rad", default=0.4, low=1e-3)
+    orientation: str = field("required orientation of the tip", choices=("free", "vertical"), default="free")
+    max_step: float = field("maximum change of a joint per iteration", unit="rad", default=0.4, low=1e-3)
 
-    def _solve(self, context: Context, end: str, initial: str, *, hold: bool = False) -> Work:
+    def _solve(self, context: Context, end: str, initial: str, *, hold: bool = False) -> StageFunction:
         options = {"vertical": self.orientation == "vertical", "max_step": self.max_step, "hold": hold}
-        kernel = context.kernels.load(ik_step, Loop(TOLERANCE, MAX_STEPS), **options)
+        kernel = context.kernels.load(ik_step, Loop(IK_TOLERANCE, MAX_IK_STEPS), **options)
         low, high = context.robot.position_lower[:, None], context.robot.position_upper[:, None]
 
-        def work(draws: Round, _random: np.random.Generator) -> None:
-            held = (draws["held"],) if hold else ()
-            q, error = kernel(draws[initial], draws[f"{end}_xyz"], *held)
-            draws[f"{end}_q"] = q
-            draws.reject(error[0] < TOLERANCE, f"no inverse kinematics of the {end}")
-            q = draws[f"{end}_q"]
-            draws.reject(((low <= q) & (q <= high)).all(0), f"joint position limit at the {end}")
+        def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
+            held = (candidates["held"],) if hold else ()
+            q, error = kernel(candidates[initial], candidates[f"{end}_xyz"], *held)
+            candidates[f"{end}_q"] = q
+            candidates.reject(error[0] < IK_TOLERANCE, f"no inverse kinematics of the {end}")
+            q = candidates[f"{end}_q"]
+            candidates.reject(((low <= q) & (q <= high)).all(0), f"joint position limit at the {end}")
 
         return work
 
@@ -57,108 +57,108 @@ class _IK(Stage):
 
 @dataclass(frozen=True, kw_only=True)
 class GuessedIK(_IK):
-    """From a random guess, or from the base configuration."""
+    """Base class: inverse kinematics from a random guess or from the base configuration."""
 
-    guess: tuple[Range, ...] = field("box of random guesses; none: the base configuration", unit="rad", default=())
+    guess: tuple[Range, ...] = field("box of random guesses; default: the base configuration", unit="rad", default=())
     at_limit: float = field(
-        "fraction of the guesses of which one joint, any of them, is put on one of its limits and held there",
+        "fraction of the guesses with one random joint held on one of its limits",
         low=0.0,
         high=1.0,
         default=0.0,
-        late=True,
+        since_version=2,
     )
 
     def _origin(self) -> str:
-        """Say from where."""
+        """Describe the initial guess."""
         box = " x ".join(f"[{g.low:.4g}, {g.high:.4g}]" for g in self.guess)
         held = f", with one joint held on a limit in {100 * self.at_limit:.4g} % of the cases" if self.at_limit else ""
         return (f"a random guess in {box} rad" if self.guess else "the base configuration") + held
 
-    def _solve_guessed(self, context: Context, end: str) -> Work:
+    def _solve_guessed(self, context: Context, end: str) -> StageFunction:
         guess, solve = self._guesses(context), self._solve_from_guess(context, end)
 
-        def work(draws: Round, random: np.random.Generator) -> None:
-            guess(draws, random)
-            solve(draws, random)
+        def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
+            guess(candidates, random)
+            solve(candidates, random)
 
         return work
 
-    def _solve_from_guess(self, context: Context, end: str) -> Work:
+    def _solve_from_guess(self, context: Context, end: str) -> StageFunction:
         return self._solve(context, end, "guess_q", hold=self.at_limit > 0)
 
-    def _guesses(self, context: Context) -> Work:
-        """Return what draws guesses."""
+    def _guesses(self, context: Context) -> StageFunction:
+        """Return the stage function that draws initial guesses."""
         n = context.robot.n
         if self.guess and len(self.guess) != n:
             raise RecipeError([f"guess: needs {n} ranges, one per planned joint, got {len(self.guess)}"])
         guess = self.guess or tuple(Range(float(x), float(x)) for x in context.robot.base)
 
-        def work(draws: Round, random: np.random.Generator) -> None:
-            draws["guess_q"] = uniform(draws.draw(random, n), guess)
+        def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
+            candidates["guess_q"] = uniform(candidates.draw(random, n), guess)
             if self.at_limit:
-                self._put_on_limits(draws, random, context.robot)
+                self._put_on_limits(candidates, random, context.robot)
 
         return work
 
-    def _put_on_limits(self, draws: Round, random: np.random.Generator, robot: "Robot") -> None:
-        choice, joint, side = draws.draw(random, 3)
+    def _put_on_limits(self, candidates: CandidateBatch, random: np.random.Generator, robot: "Robot") -> None:
+        choice, joint, side = candidates.draw(random, 3)
         which = np.minimum((joint * robot.n).astype(int), robot.n - 1)
         held = (np.arange(robot.n)[:, None] == which) & (choice < self.at_limit)
         limit = np.where(side < 0.5, robot.position_lower[:, None], robot.position_upper[:, None])
-        draws["guess_q"] = np.where(held, limit, draws["guess_q"])
-        draws["held"] = held.astype(float)
+        candidates["guess_q"] = np.where(held, limit, candidates["guess_q"])
+        candidates["held"] = held.astype(float)
 
 
 @dataclass(frozen=True, kw_only=True)
 class StartIK(GuessedIK):
-    """Joint positions of the start, from the base configuration or from a random guess."""
+    """Stage: joint positions of the start, from the base configuration or from a random guess."""
 
-    needs = ("start_xyz",)
+    inputs = ("start_xyz",)
 
     def describe(self) -> str:
-        """Say from where."""
+        """Describe the stage in one sentence."""
         return f"solve the start configuration{self._how()} from {self._origin()}"
 
-    def provides(self, context: Context) -> tuple[Field, ...]:
-        """The start configuration."""
+    def outputs(self, context: Context) -> tuple[Field, ...]:
+        """List the field of the start configuration."""
         return (context.joint_field("start_q", "rad", "joint positions at the start"),)
 
-    def prepare(self, context: Context) -> Work:
+    def prepare(self, context: Context) -> StageFunction:
         """Load the kernel."""
         return self._solve_guessed(context, "start")
 
 
 @dataclass(frozen=True, kw_only=True)
 class GoalIK(GuessedIK):
-    """Joint positions of the goal, from the start configuration, or from a guess that knows nothing of it."""
+    """Stage: joint positions of the goal, from the start configuration or from an independent guess."""
 
-    needs = ("goal_xyz", "start_q")
+    inputs = ("goal_xyz", "start_q")
     guess: tuple[Range, ...] = field(
-        "box of random guesses; none: the start configuration", unit="rad", default=(), late=True
+        "box of random guesses; default: the start configuration", unit="rad", default=(), since_version=2
     )
     from_start: float = field(
-        "fraction of the goals that are found from the start configuration, though there are guesses",
+        "fraction of the goals that start from the start configuration in spite of guesses",
         low=0.0,
         high=1.0,
         default=0.0,
-        late=True,
+        since_version=2,
     )
     max_change: float | None = field(
-        "largest difference of a joint between start and goal; goals farther away are rejected",
+        "maximum difference of a joint between start and goal",
         unit="rad",
         low=1e-3,
         default=None,
-        late=True,
+        since_version=2,
     )
 
     def find_mistakes(self) -> Iterator[tuple[str, str]]:
-        """Yield (key, what is wrong with it)."""
+        """Yield (key, mistake) pairs."""
         for name in ("from_start", "at_limit"):
             if getattr(self, name) and not self.guess:
                 yield name, "needs random guesses: give guess, too"
 
     def describe(self) -> str:
-        """Say from where."""
+        """Describe the stage in one sentence."""
         origin = self._origin() if self.guess else "the start configuration"
         if self.from_start:
             origin += f", but in {100 * self.from_start:.4g} % of the cases from the start configuration"
@@ -166,40 +166,40 @@ class GoalIK(GuessedIK):
             origin += f"; no joint may be farther than {self.max_change:.4g} rad from the start"
         return f"solve the goal configuration{self._how()} from {origin}"
 
-    def provides(self, context: Context) -> tuple[Field, ...]:
-        """The goal configuration."""
+    def outputs(self, context: Context) -> tuple[Field, ...]:
+        """List the field of the goal configuration."""
         return (context.joint_field("goal_q", "rad", "joint positions at the goal", "target"),)
 
-    def prepare(self, context: Context) -> Work:
+    def prepare(self, context: Context) -> StageFunction:
         """Load the kernel."""
-        search, most = self._search(context), self.max_change
-        if most is None:
+        search, max_change = self._search(context), self.max_change
+        if max_change is None:
             return search
 
-        def work(draws: Round, random: np.random.Generator) -> None:
-            search(draws, random)
-            change = np.abs(draws["goal_q"] - draws["start_q"]).max(0)
-            draws.reject(change <= most, "goal configuration too far from the start's")
+        def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
+            search(candidates, random)
+            change = np.abs(candidates["goal_q"] - candidates["start_q"]).max(0)
+            candidates.reject(change <= max_change, "goal configuration too far from the start's")
 
         return work
 
-    def _search(self, context: Context) -> Work:
+    def _search(self, context: Context) -> StageFunction:
         if not self.guess:
             return self._solve(context, "goal", "start_q")
         guess, solve = self._guesses(context), self._solve_from_guess(context, "goal")
 
-        def work(draws: Round, random: np.random.Generator) -> None:
-            guess(draws, random)
-            there = draws.draw(random, 1)[0] < self.from_start
-            draws["guess_q"] = np.where(there, draws["start_q"], draws["guess_q"])
+        def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
+            guess(candidates, random)
+            there = candidates.draw(random, 1)[0] < self.from_start
+            candidates["guess_q"] = np.where(there, candidates["start_q"], candidates["guess_q"])
             if self.at_limit:
-                draws["held"] = np.where(there, 0.0, draws["held"])
-            solve(draws, random)
+                candidates["held"] = np.where(there, 0.0, candidates["held"])
+            solve(candidates, random)
 
         return work
 
-    def complete(self, context: Context, given: Collection[str]) -> Work:
-        """Search from the start: goals of tasks are to be close to where the arm is."""
+    def complete(self, context: Context, given: Collection[str]) -> StageFunction:
+        """Search from the start configuration: goals of tasks are near it."""
         if self.guess:
             return GoalIK(orientation=self.orientation, max_step=self.max_step).complete(context, given)
         return super().complete(context, given)
@@ -208,14 +208,14 @@ class GoalIK(GuessedIK):
 def ik_step(robot: "Robot", *, vertical: bool, max_step: float, hold: bool = False) -> Any:
     """Build one step of inverse kinematics as an SX function ``(q, p) -> (next q, |error|)``.
 
-    A joint that the step would carry beyond its limit is put on the limit and the rest of the step is redistributed
-    over the others, once.
+    A joint that would leave its limits is set to the limit. The rest of the step is redistributed once over the other
+    joints.
 
     Args:
-        robot: The robot.
+        robot: Robot.
         vertical: Whether the tip's z axis must be vertical, too.
-        max_step: Largest change of a joint [rad].
-        hold: Whether there is a third argument, which is 1 for joints that stay where they are and 0 for all others.
+        max_step: Maximum change of a joint [rad].
+        hold: Whether there is a third argument, 1 for joints that stay constant and 0 for the others.
     """
     import casadi as ca
 
@@ -230,7 +230,7 @@ def ik_step(robot: "Robot", *, vertical: bool, max_step: float, hold: bool = Fal
     if hold:
         rows = [[x * (1 - stays) for x, stays in zip(row, held, strict=True)] for row in rows]
     square = dot(error, error)
-    step, factor = _clipped(rows, error, max_step, DAMPING)
+    step, factor = _clipped(rows, error, max_step, IK_DAMPING)
     target = add(q, step)
     free = [
         ca.logic_and(float(low) <= x, x <= float(high))
@@ -239,16 +239,17 @@ def ik_step(robot: "Robot", *, vertical: bool, max_step: float, hold: bool = Fal
     moved = [ca.if_else(ok, 0.0, _clip(x, robot, i) - q[i]) for i, (ok, x) in enumerate(zip(free, target, strict=True))]
     rest = [factor * e - dot(row, moved) for e, row in zip(error, rows, strict=True)]
     left = [[x * ok for x, ok in zip(row, free, strict=True)] for row in rows]
-    again, _ = _clipped(left, rest, max_step, DAMPING + ca.fmin(MOST_DAMPING, DAMPING_RATE * square))
+    again, _ = _clipped(left, rest, max_step, IK_DAMPING + ca.fmin(MAX_LIMIT_DAMPING, LIMIT_DAMPING_RATE * square))
     following = [_clip(x, robot, i) for i, x in enumerate(add(add(q, moved), again))]
     given = [q_sx, p_sx, held_sx] if hold else [q_sx, p_sx]
     return ca.Function("ik", given, [ca.vertcat(*following), ca.sqrt(square)])
 
 
 def _tilt(kin: Kinematics) -> tuple[Vec, list[Vec]]:
-    """Angular error of the tip's z axis about world x and y, and its Jacobian rows.
+    """Return the angular error of the tip's z axis about world x and y, and its Jacobian rows.
 
-    ``z x e_z`` scaled by ``2 / (1 + z_z) = 2 tan(angle / 2) / sin(angle)``, so that upside down is no fixed point.
+    The error is ``z x e_z`` scaled by ``2 / (1 + z_z) = 2 tan(angle / 2) / sin(angle)``, so that the inverted
+    orientation is not a fixed point.
     """
     import casadi as ca
 
@@ -261,7 +262,7 @@ def _tilt(kin: Kinematics) -> tuple[Vec, list[Vec]]:
 
 
 def _clipped(rows: list[Vec], error: Vec, max_step: float, damping: Scalar) -> tuple[Vec, Scalar]:
-    """Least-norm step that closes the error, shortened to ``max_step``; returns it and the factor of shortening."""
+    """Return the least-norm step that corrects the error, shortened to ``max_step``, and the factor of shortening."""
     import casadi as ca
 
     weights = solve(gram(rows, damping), error)

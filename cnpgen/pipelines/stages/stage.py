@@ -1,4 +1,4 @@
-"""The contract of a stage, and the round of draws that stages work on."""
+"""Base class of stages, and the batch of candidates that stages process."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Sequence
@@ -16,28 +16,28 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-BLOCK_ROWS = 4096  # rows per block, unless a stage wants fewer
+BLOCK_ROWS = 4096  # rows per block, unless a stage requires fewer
 
 
-class Round:
-    """A round of draws and the columns that are known of those still alive.
+class CandidateBatch:
+    """Batch of candidates and the columns of the remaining ones.
 
     Attributes:
-        size: Number of draws of the round, N.
-        alive: Index of each surviving draw in the round, shape (n,), ascending.
-        fate: For every draw of the round, 0 while alive, else 1 + the index of its reason, shape (N,).
-        reasons: The reasons seen so far, in order of first use.
-        columns: Name -> values of the surviving draws, shape (width, n), contiguous rows.
-        stage: Label of the stage that works on the round now.
-        origins: Reason -> label of the stage that first gave it.
-        drawn: Name -> values of all draws, shape (width, N), for columns written before any rejection.
-        last: Whether no draws can follow, so that all of this round count.
+        size: Number of candidates in the batch, N.
+        alive: Indices of the remaining candidates in the batch, shape (n,), ascending.
+        outcome: 0 for remaining candidates, otherwise 1 + the index of the rejection reason, shape (N,).
+        reasons: Rejection reasons, in order of first use.
+        columns: Name -> values of the remaining candidates, shape (width, n), contiguous rows.
+        stage: Label of the current stage.
+        origins: Reason -> label of the stage that used it first.
+        drawn: Name -> values of all candidates, shape (width, N), for columns written before any rejection.
+        last: Whether this is the last batch of the pipeline, so that all its candidates are counted.
     """
 
     def __init__(self, size: int, *, last: bool = False) -> None:
         self.size, self.last = size, last
         self.alive = np.arange(size)
-        self.fate = np.zeros(size, np.uint16)
+        self.outcome = np.zeros(size, np.uint16)
         self.reasons: list[str] = []
         self.columns: dict[str, Array] = {}
         self.drawn: dict[str, Array] = {}
@@ -55,18 +55,18 @@ class Round:
             self.drawn[name] = values
 
     def draw(self, random: np.random.Generator, width: int) -> Array:
-        """Draw uniform numbers in [0, 1) for every draw of the round; return the survivors', shape (width, n)."""
+        """Draw uniform numbers in [0, 1) for all N candidates; return those of the remaining ones, shape (width, n)."""
         numbers = random.random((width, self.size))
         return numbers if len(self.alive) == self.size else np.take(numbers, self.alive, axis=1)
 
     def reject(self, ok: Any, reason: str) -> None:
-        """End the draws where ``ok`` (shape (n,)) is false under ``reason`` and drop them from every column."""
+        """Reject the candidates with a false ``ok``, shape (n,), under a reason, and drop them from every column."""
         self.reject_first(ok[None], [reason])
 
     def reject_first(self, met: Any, reasons: Sequence[str]) -> None:
-        """End the draws where a row of ``met`` (shape (reasons, n)) is false, under the reason of the first such row.
+        """Reject the candidates with a false entry in ``met``, shape (reasons, n), under the reason of the first one.
 
-        All reasons count as seen, in their order, whether they end a draw or not.
+        All reasons are registered, in their order, even without a rejection.
         """
         for reason in reasons:
             if reason not in self.origins:
@@ -76,106 +76,106 @@ class Round:
             return
         numbers = np.array([1 + self.reasons.index(reason) for reason in reasons])
         ok = met.all(axis=0)
-        self.fate[self.alive[~ok]] = numbers[met[:, ~ok].argmin(axis=0)]
+        self.outcome[self.alive[~ok]] = numbers[met[:, ~ok].argmin(axis=0)]
         keep = np.flatnonzero(ok)
         self.alive = self.alive[keep]
         self.columns = {name: np.take(values, keep, axis=1) for name, values in self.columns.items()}
 
 
-Work = Callable[[Round, np.random.Generator], None]
-"""What a stage does to a round of draws."""
+StageFunction = Callable[[CandidateBatch, np.random.Generator], None]
+"""Function of (candidates, random) that writes columns of a batch and rejects candidates of it."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Stage(ABC):
     """One step of a pipeline.
 
-    A kind of stage is a frozen dataclass whose fields are the keys of its ``[[stage]]`` table; it is registered under
+    A kind of stage is a frozen dataclass whose fields are the keys of its ``[[stage]]`` table. It is registered under
     a name in cnpgen's registry or by a package's entry point in the group ``cnpgen.stages``.
 
     Attributes:
-        block_rows: The largest blocks that rows may be made in; a stage that takes long for a row says less.
-        renews: Columns that later stages find anew. Stages before this one that find or use them do nothing for tasks.
+        block_rows: Maximum number of rows per block; expensive stages use smaller blocks.
+        replaces: Columns that later stages compute again. For tasks, earlier stages that write or read them
+            are omitted.
     """
 
     block_rows: ClassVar[int] = BLOCK_ROWS
-    renews: ClassVar[tuple[str, ...]] = ()
+    replaces: ClassVar[tuple[str, ...]] = ()
 
     @property
     def tasks(self) -> int | None:
-        """How many draws there are at all, where they are listed and each is made once; None where they never end."""
+        """Number of listed tasks, each of which is used once; None for unlimited random candidates."""
         return None
 
     @property
-    def needs(self) -> tuple[str, ...]:
-        """Columns that earlier stages must have written; those that depend on no key can be an attribute of a class."""
+    def inputs(self) -> tuple[str, ...]:
+        """Columns that earlier stages must write; a class attribute if they are independent of the keys."""
         return ()
 
     @abstractmethod
     def describe(self) -> str:
-        """Say in one sentence, with this stage's numbers and their units, what it does."""
+        """Describe the stage in one sentence, with its values and units."""
 
     @abstractmethod
-    def provides(self, context: "Context") -> tuple[Field, ...]:
-        """List the fields that this stage writes into the dataset, in order."""
+    def outputs(self, context: "Context") -> tuple[Field, ...]:
+        """List the stored fields that this stage writes, in order."""
 
     def writes(self, context: "Context") -> tuple[str, ...]:
-        """List the columns that this stage writes, stored or not; by default the fields that it provides."""
-        return tuple(field.name for field in self.provides(context))
+        """List the columns that this stage writes, stored or not; by default its outputs."""
+        return tuple(field.name for field in self.outputs(context))
 
     @abstractmethod
-    def prepare(self, context: "Context") -> Work:
-        """Load what the stage needs (kernels, geometry) and return the function that does its work.
+    def prepare(self, context: "Context") -> StageFunction:
+        """Load the kernels and geometry of the stage and return its stage function.
 
         Args:
-            context: The problem, its robot and the kernel loader.
+            context: Problem, robot and kernel library.
 
         Returns:
-            A function of (draws, random) that writes columns of a round and rejects draws of it. It must use
-            ``draws.draw`` for randomness.
+            A function of (candidates, random) that writes columns of a batch and rejects candidates of it. It must draw
+            random numbers with ``candidates.draw`` only.
         """
 
-    def takes(self, context: "Context") -> tuple[Field, ...]:
-        """List the fields that tasks may give instead; by default all that it provides but diagnostics."""
-        return tuple(field for field in self.provides(context) if field.role != "diagnostic")
+    def task_inputs(self, context: "Context") -> tuple[Field, ...]:
+        """List the fields that tasks may give instead; by default all outputs except diagnostics."""
+        return tuple(field for field in self.outputs(context) if field.role != "diagnostic")
 
-    def complete(self, context: "Context", given: Collection[str]) -> Work:
-        """Prepare the stage for tasks whose columns are partly given: what is given stays, what is not is found.
+    def complete(self, context: "Context", given: Collection[str]) -> StageFunction:
+        """Prepare the stage for tasks: keep the given columns and compute the missing ones.
 
-        By default a stage has nothing to do where all that it takes is given, and does its own work where nothing is.
-        What it draws is then always the middle of what it could be (see ``TaskRound``).
+        By default the stage does nothing if all its task inputs are given, and runs as usual if none is given. Its
+        random numbers are then replaced by their mean (see ``TaskBatch``).
 
         Args:
-            context: As of ``prepare``.
-            given: Names of the columns that are known of every task.
+            context: Problem, robot and kernel library.
+            given: Names of the columns that every task has.
 
         Raises:
-            UsageError: Columns that belong together are given in part.
+            UsageError: Some but not all task inputs of the stage are given.
         """
-        names = [field.name for field in self.takes(context)]
+        names = [field.name for field in self.task_inputs(context)]
         known, missing = [name for name in names if name in given], [name for name in names if name not in given]
         if known and missing:
             raise UsageError(f"{', '.join(known)}: tasks that give this must also give {', '.join(missing)}")
         return leave if known else self.prepare(context)
 
 
-def leave(draws: Round, random: np.random.Generator) -> None:
-    """Do nothing: what the stage would find is given."""
+def leave(candidates: CandidateBatch, random: np.random.Generator) -> None:
+    """Do nothing: the columns of the stage are given."""
 
 
-class TaskRound(Round):
-    """Tasks in the place of draws: nothing of them is random.
+class TaskBatch(CandidateBatch):
+    """Batch of tasks instead of random candidates.
 
-    What a stage still draws, since it is not given, is the middle of all that it could be, for every task: no noise.
-    What comes of one task so depends on no other.
+    All random numbers are replaced by their mean. The result of a task is therefore independent of the other tasks.
     """
 
     def draw(self, random: np.random.Generator, width: int) -> Array:
-        """Return 0.5 for every survivor, shape (width, n)."""
+        """Return 0.5 for every remaining task, shape (width, n)."""
         del random
         return np.full((width, len(self.alive)), 0.5)
 
     def why(self) -> tuple[str, ...]:
-        """Return why each of the N tasks has no answer; empty where it has one."""
+        """Return the rejection reason of each of the N tasks; empty for solved tasks."""
         texts = ["", *self.reasons]
-        return tuple(texts[fate] for fate in self.fate.tolist())
+        return tuple(texts[outcome] for outcome in self.outcome.tolist())

@@ -8,7 +8,7 @@ import numpy as np
 from cnpgen.kernels.symbolic.dynamics import inverse_dynamics
 from cnpgen.kernels.symbolic.linalg import symbols
 from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.stages.stage import Round, Stage, Work
+from cnpgen.pipelines.stages.stage import CandidateBatch, Stage, StageFunction
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
 
@@ -18,35 +18,35 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class GravityTorque(Stage):
-    """Rejects configurations in which holding still needs more torque than the limit, at one end."""
+    """Stage: reject configurations of one end whose holding torque is above the limit."""
 
-    end: str = field("which end is looked at", choices=("start", "goal"))
+    end: str = field("end that is checked", choices=("start", "goal"))
 
     @property
-    def needs(self) -> tuple[str, ...]:
-        """The configuration."""
+    def inputs(self) -> tuple[str, ...]:
+        """Joint positions of the end."""
         return (f"{self.end}_q",)
 
     def describe(self) -> str:
-        """Say where."""
+        """Describe the stage in one sentence."""
         return (
             f"require that the torque that holds the {self.end} configuration, payload included, is within its limits"
         )
 
-    def provides(self, context: Context) -> tuple[Field, ...]:
-        """The largest torque as a fraction of its limit."""
+    def outputs(self, context: Context) -> tuple[Field, ...]:
+        """List the field of the largest torque as a fraction of its limit."""
         del context
         text = f"largest holding torque at the {self.end}, as a fraction of its planning limit"
         return (Field(f"{self.end}_torque_ratio", "1", text, role="diagnostic", valid_min=(0.0,), valid_max=(1.0,)),)
 
-    def prepare(self, context: Context) -> Work:
+    def prepare(self, context: Context) -> StageFunction:
         """Load the kernel."""
         kernel = context.kernels.load(torque_ratio)
 
-        def work(draws: Round, _random: np.random.Generator) -> None:
-            (ratio,) = kernel(draws[f"{self.end}_q"])
-            draws[f"{self.end}_torque_ratio"] = ratio
-            draws.reject(ratio[0] <= 1.0, f"joint torque limit at the {self.end}")
+        def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
+            (ratio,) = kernel(candidates[f"{self.end}_q"])
+            candidates[f"{self.end}_torque_ratio"] = ratio
+            candidates.reject(ratio[0] <= 1.0, f"joint torque limit at the {self.end}")
 
         return work
 

@@ -1,1 +1,1 @@
-"""The neural planner's pure part: features, network, and the control points that it stands for, with gradients."""
+"""The neural network: features, architecture, forward and backward pass."""

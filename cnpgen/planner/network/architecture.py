@@ -1,4 +1,4 @@
-"""The architecture of the network (paper, section on the neural network) and where its numbers are in one vector."""
+"""The architecture of the network (paper, section on the neural network), with all parameters in one vector."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,10 +18,10 @@ class Layer:
     """One affine layer ``y = x W + b``.
 
     Attributes:
-        name: Its name, as model files have it.
+        name: Its name in model files.
         inputs: Width of x.
         outputs: Width of y.
-        start: Where W begins in the vector of all parameters; b follows.
+        start: Offset of W in the vector of all parameters; b follows.
     """
 
     name: str
@@ -31,15 +31,15 @@ class Layer:
 
     @property
     def stop(self) -> int:
-        """Where the next layer begins."""
+        """Offset of the next layer."""
         return self.start + (self.inputs + 1) * self.outputs
 
     def weight(self, parameters: Array) -> Array:
-        """View W of a vector of all parameters, shape (inputs, outputs)."""
+        """Return a view of W, shape (inputs, outputs), of a vector of all parameters."""
         return parameters[self.start : self.stop - self.outputs].reshape(self.inputs, self.outputs)
 
     def bias(self, parameters: Array) -> Array:
-        """View b of a vector of all parameters, shape (outputs,)."""
+        """Return a view of b, shape (outputs,), of a vector of all parameters."""
         return parameters[self.stop - self.outputs : self.stop]
 
 
@@ -51,8 +51,8 @@ class Architecture:
         inputs: Number of features.
         hidden: Width of the trunk and of the configuration head.
         layers: Depth of the trunk.
-        path_outputs: Numbers that the configuration head gives (the paper's phi): interior points times joints.
-        rate_outputs: Logarithms that the time head gives: control points of r.
+        path_outputs: Outputs of the configuration head (the paper's phi): interior points times joints.
+        rate_outputs: Outputs of the time head: logarithms of the control points of r.
     """
 
     inputs: int
@@ -67,16 +67,16 @@ class Architecture:
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if value < 1:
-                raise UsageError(f"a network needs at least 1 of {name}, got {value}")
+                raise UsageError(f"{name} of a network must be at least 1, got {value}")
 
     @cached_property
     def trunk(self) -> tuple[Layer, ...]:
-        """The tanh layers that both heads share."""
-        found: list[Layer] = []
+        """The tanh layers shared by both heads."""
+        layers: list[Layer] = []
         for index in range(self.layers):
-            inputs, start = (found[-1].outputs, found[-1].stop) if found else (self.inputs, 0)
-            found.append(Layer(f"trunk_{index}", inputs, self.hidden, start))
-        return tuple(found)
+            inputs, start = (layers[-1].outputs, layers[-1].stop) if layers else (self.inputs, 0)
+            layers.append(Layer(f"trunk_{index}", inputs, self.hidden, start))
+        return tuple(layers)
 
     @cached_property
     def heads(self) -> tuple[Layer, Layer, Layer]:
@@ -87,11 +87,11 @@ class Architecture:
 
     @property
     def all_layers(self) -> tuple[Layer, ...]:
-        """Every layer, in the order of the vector of parameters."""
+        """All layers, in the order of the parameter vector."""
         return (*self.trunk, *self.heads)
 
     def split(self, parameters: Array) -> Weights:
-        """View W and b of every layer of a vector of all parameters, shape (n_parameters,)."""
+        """Return views of W and b of every layer, of a vector of all parameters, shape (n_parameters,)."""
         return tuple((layer.weight(parameters), layer.bias(parameters)) for layer in self.all_layers)
 
     @property
@@ -101,15 +101,15 @@ class Architecture:
 
 
 def initial_parameters(architecture: Architecture, *, seed: int, head_scale: float, rate_bias: float) -> Array:
-    """Draw parameters: Glorot's uniform distribution, small last layers, biases of zero but the time head's.
+    """Draw parameters by Glorot's uniform distribution; biases are zero except that of the time head.
 
-    With small last layers an untrained network plans the straight line at a constant rate, which is a fair start.
+    With small last layers an untrained network plans the straight line at a constant rate.
 
     Args:
         architecture: The architecture.
         seed: Seed.
         head_scale: Factor of both heads' last weights.
-        rate_bias: Bias of the time head: the logarithm of the first guess of (expected time / duration).
+        rate_bias: Bias of the time head: logarithm of the initial (expected time / duration).
 
     Returns:
         float32, shape (n_parameters,).

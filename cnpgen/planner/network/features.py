@@ -1,4 +1,4 @@
-"""The network's inputs: start and goal states and what follows from them, standardised as in the training rows."""
+"""The network's inputs: start and goal states and derived values, standardized by the training rows."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -14,19 +14,19 @@ Array = NDArray[Any]
 
 STATES = ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq")
 USUAL = (*STATES, "sin_cos", "tips", "expected_time")
-ARRIVAL = "goal_ddq"  # where goal accelerations are given
+ARRIVAL = "goal_ddq"  # only if goal accelerations are given
 BLOCKS = (*USUAL, ARRIVAL)
-CONSTANT = 1e-7  # a feature whose standard deviation is below this, in SI units, says nothing
+MIN_DEVIATION = 1e-7  # SI units; features with a smaller standard deviation are constant
 
 
 @dataclass(frozen=True)
 class Features:
-    """Standardised features.
+    """Standardized features.
 
     Attributes:
-        blocks: Which of ``BLOCKS``, in order.
+        blocks: Selected names of ``BLOCKS``, in order.
         mean: Mean of every feature over the training rows, shape (F,).
-        scale: One over its standard deviation; 0 where it was constant, shape (F,).
+        scale: Reciprocal of the standard deviation; 0 for constant features, shape (F,).
     """
 
     blocks: tuple[str, ...]
@@ -42,12 +42,12 @@ class Features:
 
 
 def usual_blocks(boundary: Boundary) -> tuple[str, ...]:
-    """Return what a network is told of tasks with such boundary conditions."""
+    """Return the feature blocks of tasks with such boundary conditions."""
     return USUAL if boundary.goal_ddq is None else BLOCKS
 
 
 def fit_features(parts: Iterable[Tasks], blocks: tuple[str, ...] = USUAL) -> Features:
-    """Measure mean and standard deviation of every feature on the training rows, which come in parts."""
+    """Compute mean and standard deviation of every feature over the training rows, given in parts."""
     count, mean, squares = 0, np.zeros(1), np.zeros(1)
     for tasks in parts:
         raw = raw_features(tasks, blocks)
@@ -55,21 +55,21 @@ def fit_features(parts: Iterable[Tasks], blocks: tuple[str, ...] = USUAL) -> Fea
         squares = squares + raw.var(axis=0) * len(raw) + new**2 * (count * len(raw) / total)  # Chan et al., 1983
         count, mean = total, mean + new * (len(raw) / total)
     deviation = np.sqrt(squares / count)
-    constant = deviation < CONSTANT
+    constant = deviation < MIN_DEVIATION
     return Features(blocks, mean, np.where(constant, 0.0, 1 / np.where(constant, 1.0, deviation)))
 
 
 def raw_features(tasks: Tasks, blocks: tuple[str, ...]) -> Array:
     """Compute features in their own units.
 
-    * ``start_q`` to ``goal_dq``, and ``goal_ddq`` where it is given: the states [rad, rad/s, rad/s^2];
-    * ``sin_cos``: sines and cosines of start and goal positions, whose products forward kinematics is made of;
+    * ``start_q`` to ``goal_dq``, and ``goal_ddq`` if it is given: the states [rad, rad/s, rad/s^2];
+    * ``sin_cos``: sines and cosines of start and goal positions, whose products appear in the forward kinematics;
     * ``tips``: tip positions at start and goal [m];
     * ``expected_time``: its logarithm.
 
     Args:
         tasks: The tasks.
-        blocks: Which of them.
+        blocks: Selected names.
 
     Returns:
         float64, shape (N, F).
@@ -79,7 +79,7 @@ def raw_features(tasks: Tasks, blocks: tuple[str, ...]) -> Array:
 
 
 def count_features(blocks: tuple[str, ...], joints: int) -> int:
-    """Return how many features some of ``BLOCKS`` have, for a robot of so many planned joints."""
+    """Return the number of features of some of ``BLOCKS``, for a number of planned joints."""
     widths = {**dict.fromkeys((*STATES, ARRIVAL), joints), "sin_cos": 4 * joints, "tips": 6, "expected_time": 1}
     return sum(widths[name] for name in blocks)
 
@@ -95,4 +95,4 @@ def _block(tasks: Tasks, name: str) -> tuple[Array, ...]:
         return tasks.start_xyz, tasks.goal_xyz
     if name == "expected_time":
         return (np.log(tasks.expected_time)[:, None],)
-    raise ValueError(f"no block of features is called {name!r}: expected one of {', '.join(BLOCKS)}")
+    raise ValueError(f"unknown feature block {name!r}: expected one of {', '.join(BLOCKS)}")

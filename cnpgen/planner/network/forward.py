@@ -1,4 +1,4 @@
-"""The network as functions of its weights: forwards, and backwards from the gradient of what it gave."""
+"""Forward and backward pass of the network."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -13,7 +13,7 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True)
 class Activations:
-    """What every layer gave for N inputs; the backward pass needs all of it.
+    """Outputs of every layer for N inputs, as needed by the backward pass.
 
     Attributes:
         trunk: The input and every trunk layer's output, shape (N, inputs) and (N, hidden).
@@ -32,7 +32,7 @@ def forward(weights: Weights, features: Array) -> Activations:
     """Evaluate the network.
 
     Args:
-        weights: What ``Architecture.split`` gives, float32 or float64.
+        weights: Result of ``Architecture.split``, float32 or float64.
         features: Inputs, shape (N, inputs), of the same type.
     """
     *trunk_weights, hidden_weights, path_weights, (rate_weight, rate_bias) = weights
@@ -59,11 +59,11 @@ def backward(
     """Write the gradient of a scalar with respect to all weights.
 
     Args:
-        weights: What the activations were computed with.
-        activations: What ``forward`` gave.
+        weights: Weights that the activations were computed with.
+        activations: Result of ``forward``.
         path_gradient: Gradient of the scalar with respect to ``activations.path``, shape (N, path_outputs).
-        log_rate_gradient: Likewise to ``activations.log_rate``, shape (N, rate_outputs).
-        out: Where to, as ``weights``.
+        log_rate_gradient: Gradient of the scalar with respect to ``activations.log_rate``, shape (N, rate_outputs).
+        out: Output arrays, structured as ``weights``.
     """
     top, hidden = activations.trunk[-1], activations.path_hidden
     gradient = _through_tanh(path_gradient, activations.path)
@@ -76,19 +76,19 @@ def backward(
     for index in range(len(weights) - 4, -1, -1):
         gradient = _through_tanh(gradient, activations.trunk[index + 1])
         _weight_gradient(activations.trunk[index], gradient, out[index])
-        if index:  # nobody asks for the gradient of the features
+        if index:  # the gradient of the features is not needed
             gradient = gradient @ weights[index][0].T
 
 
 def _through_tanh(gradient: Array, y: Array) -> Array:
-    """Gradient before a tanh from that behind it: times ``1 - y^2``."""
-    slope: Array = y * y
-    np.subtract(1.0, slope, out=slope)
-    slope *= gradient
-    return slope
+    """Return the gradient before a tanh from that after it: times ``1 - y^2``."""
+    derivative: Array = y * y
+    np.subtract(1.0, derivative, out=derivative)
+    derivative *= gradient
+    return derivative
 
 
 def _weight_gradient(x: Array, gradient: Array, out: tuple[Array, Array]) -> None:
-    """Write the gradient of a layer's weights from its input and the gradient behind it."""
+    """Write the gradient of a layer's weights from its input and the gradient of its output."""
     np.matmul(x.T, gradient, out=out[0])
     np.sum(gradient, axis=0, out=out[1])

@@ -1,1 +1,1 @@
-"""The constraint manifold: one file per kind of condition, each in a symbolic and in a measured form."""
+"""Constraints: one file per kind, each in a symbolic and a measured form."""

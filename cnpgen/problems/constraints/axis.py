@@ -1,4 +1,4 @@
-"""An axis of the tip along a direction of the world, or within an angle of it."""
+"""Constraints that align an axis of the tip with a world direction, exactly or within an angle."""
 
 from abc import abstractmethod
 from collections.abc import Sequence
@@ -14,28 +14,30 @@ from cnpgen.problems.constraints.tip_manifold import Vector, along, beside, unit
 from cnpgen.schema.keys import field
 
 if TYPE_CHECKING:
-    from cnpgen.kernels.symbolic.state import SymbolicState
-    from cnpgen.world.state import World
+    from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
+    from cnpgen.world.world import World
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
 class TipAxis(Constraint):
-    """The tip's axis a held along the world's direction d: ``e1 . R a = e2 . R a = 0`` and ``d . R a > 0``.
+    """Base class: the tip's axis a is along the world direction d: ``e1 . R a = e2 . R a = 0`` and ``d . R a > 0``.
 
     e1 and e2 are orthogonal to d: ``1 - d . R a`` has no gradient at the solution, and these two are the tilt [rad] to
     first order.
     """
 
+    training_weight = 300.0
+
     @property
     @abstractmethod
     def directions(self) -> tuple[list[float], list[float]]:
-        """The axis in the tip's frame and the direction in the world, unit vectors; kinds keep them."""
+        """Return the axis in the tip frame and the direction in the world, unit vectors; subclasses cache them."""
 
     @cached_property
     def across(self) -> list[list[float]]:
-        """Two unit vectors of the world orthogonal to the direction."""
+        """Return two world unit vectors orthogonal to the direction."""
         found: list[list[float]] = beside(np.array(self.directions[1])).tolist()
         return found
 
@@ -60,19 +62,19 @@ class TipAxis(Constraint):
 
 @dataclass(frozen=True, kw_only=True)
 class Axis(TipAxis):
-    """An axis of the tip is within an angle of a direction; with no angle it is along it, and rests at the ends."""
+    """Constraint: a tip axis is within an angle of a direction, or aligned with it and at rest at the ends."""
 
     reason = "tool tilted"
-    axis: Vector = field("the axis in the tip's frame, of any length", default=(0.0, 0.0, 1.0))
-    direction: Vector = field("the direction in the world, of any length", default=(0.0, 0.0, 1.0))
-    angle: float = field("how far the axis may be from the direction", unit="rad", default=0.0, low=0.0, high=1.5)
-    tolerance: float = field("how much further a motion may tilt and still be called valid", unit="rad", low=1e-9)
+    axis: Vector = field("axis in the tip frame, of any length", default=(0.0, 0.0, 1.0))
+    direction: Vector = field("direction in the world, of any length", default=(0.0, 0.0, 1.0))
+    angle: float = field("maximum angle between axis and direction", unit="rad", default=0.0, low=0.0, high=1.5)
+    tolerance: float = field("additional angle that a valid motion may have", unit="rad", low=1e-9)
 
     def __post_init__(self) -> None:
-        """Check that both directions are some.
+        """Check both directions.
 
         Raises:
-            ValueError: They are not.
+            ValueError: A direction is zero or not finite.
         """
         unit(self.axis, "axis")
         unit(self.direction, "direction")
@@ -83,13 +85,13 @@ class Axis(TipAxis):
         return unit(self.axis, "axis").tolist(), unit(self.direction, "direction").tolist()
 
     def allowed(self, condition: Condition) -> Array:
-        """Return how far a motion may be outside: the cosine's share of the tolerance where there is an angle."""
+        """Return the tolerance of motions; with an angle, that of its cosine."""
         if not self.angle:
             return super().allowed(condition)
         return np.full(len(condition.g), np.cos(self.angle) - np.cos(min(self.angle + self.tolerance, np.pi)))
 
     def symbolic_at(self, state: "SymbolicState", end: End) -> tuple[Condition, ...]:
-        """State the tilt, and that the axis rests, if it is held."""
+        """State the tilt and, for an aligned axis, its rates."""
         found = super().symbolic_at(state, end)
         if self.angle:
             return found
@@ -97,7 +99,7 @@ class Axis(TipAxis):
         return (*found, *self._resting(state.kinematics.rotation, *turning))
 
     def measured_at(self, world: "World", end: End) -> tuple[Condition, ...]:
-        """Evaluate the tilt, and whether the axis rests, if it is held."""
+        """Evaluate the tilt and, for an aligned axis, its rates."""
         found = super().measured_at(world, end)
         if self.angle:
             return found
@@ -113,7 +115,7 @@ class Axis(TipAxis):
         return (Condition("tilt cosine", "1", cosine, *bounds, "angle"),)
 
     def _resting(self, rotation: Sequence[Any], omega: Sequence[Any], alpha: Sequence[Any]) -> tuple[Condition, ...]:
-        """Return how fast the axis u turns away from the direction: ``w x u`` and ``a x u + w x (w x u)`` across it."""
+        """Return the rates of the axis u orthogonal to the direction, from ``w x u`` and ``a x u + w x (w x u)``."""
         axis, _ = self.directions
         u = [along(axis, row) for row in rotation]
         rate = _cross(omega, u)

@@ -13,18 +13,16 @@ from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.schema.keys import field
 
 if TYPE_CHECKING:
-    from cnpgen.kernels.symbolic.state import SymbolicState
+    from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
     from cnpgen.robots.robot import Robot
-    from cnpgen.world.state import World
+    from cnpgen.world.world import World
 
 
 @dataclass(frozen=True, kw_only=True)
 class _RelativeLimit(Constraint):
-    """A symmetric limit whose tolerance is a fraction of it."""
+    """Base class: symmetric limit with a relative tolerance."""
 
-    tolerance: float = field(
-        "how far beyond the limit a motion may be and still be called valid, as a fraction", low=0.0
-    )
+    tolerance: float = field("violation that a valid motion may have, as a fraction of the limit", low=0.0)
 
     def allowed(self, condition: Condition) -> NDArray[np.float64]:
         """Return the fraction of the limit, shape (m,)."""
@@ -42,10 +40,11 @@ def _between(robot: "Robot", q: list[Any]) -> tuple[Condition, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class JointPosition(Constraint):
-    """Every joint is between its limits of position: ``lower <= q <= upper``."""
+    """Constraint: joint positions are within their limits: ``lower <= q <= upper``."""
 
     reason = "joint position limit"
-    tolerance: float = field("how far a motion may be off and still be called valid", unit="rad", low=0.0)
+    training_weight, training_factor = 4000.0, 0.999
+    tolerance: float = field("violation that a valid motion may have", unit="rad", low=0.0)
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the limits on q [rad]."""
@@ -58,9 +57,10 @@ class JointPosition(Constraint):
 
 @dataclass(frozen=True, kw_only=True)
 class JointVelocity(_RelativeLimit):
-    """No joint is faster than its limit of velocity: ``|dq| <= limit``."""
+    """Constraint: joint velocities are within their limits: ``|dq| <= limit``."""
 
     reason = "joint velocity limit"
+    training_weight, training_factor = 100.0, 0.99
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the limits on dq [rad/s]."""
@@ -73,9 +73,10 @@ class JointVelocity(_RelativeLimit):
 
 @dataclass(frozen=True, kw_only=True)
 class JointAcceleration(_RelativeLimit):
-    """No joint accelerates by more than its limit: ``|ddq| <= limit``."""
+    """Constraint: joint accelerations are within their limits: ``|ddq| <= limit``."""
 
     reason = "joint acceleration limit"
+    training_weight, training_factor = 5.0, 0.985
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the limits on ddq [rad/s^2]."""
@@ -90,22 +91,23 @@ class JointAcceleration(_RelativeLimit):
 
 @dataclass(frozen=True, kw_only=True)
 class JointJerk(_RelativeLimit):
-    """No joint has more jerk than its limit: ``|jerk| <= limit``; it is bounded, not continuous.
+    """Constraint: joint jerks are within their limits: ``|jerk| <= limit``; they may be discontinuous.
 
-    It is about motions: a boundary state has no jerk, and meets it.
+    Boundary states have no jerk and always satisfy it.
     """
 
     reason = "joint jerk limit"
+    training_weight, training_factor = 0.01, 0.97
     uses_jerk: ClassVar[bool] = True
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
-        """State the limits on the jerk [rad/s^3], where the state has one."""
+        """State the limits on the jerk [rad/s^3], if the state has a jerk."""
         if state.jerk is None:
             return ()
         return _within("joint jerk", state.robot.units("rad/s^3"), state.jerk, state.robot.jerk_limit)
 
     def measured(self, world: "World") -> tuple[Condition, ...]:
-        """Compare the jerk [rad/s^3] with the limits, where the state has one."""
+        """Compare the jerk [rad/s^3] with the limits, if the state has a jerk."""
         if world.jerk is None:
             return ()
         return _within("joint jerk", world.robot.units("rad/s^3"), list(world.jerk), world.robot.jerk_limit)
@@ -113,9 +115,10 @@ class JointJerk(_RelativeLimit):
 
 @dataclass(frozen=True, kw_only=True)
 class JointTorque(_RelativeLimit):
-    """No joint needs more torque than its limit, payload included: ``|ID(q, dq, ddq)| <= limit``."""
+    """Constraint: joint torques, including the payload, are within their limits: ``|ID(q, dq, ddq)| <= limit``."""
 
     reason = "joint torque limit"
+    training_weight, training_factor = 1.5, 0.97
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the limits on the inverse dynamics [N m]."""

@@ -1,44 +1,44 @@
-"""The tip on a line of any direction, or on a piece of it."""
+"""Constraint: the tip on a line of any direction, or on a segment of it."""
 
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from cnpgen.problems.constraints.tip_manifold import FUNNEL, Place, TipManifold, Vector, beside, unit
+from cnpgen.problems.constraints.tip_manifold import BOUND_KINKS, TipManifold, TipRegion, Vector, beside, unit
 from cnpgen.schema.keys import Range, field
 
 
 @dataclass(frozen=True, kw_only=True)
 class Line(TipManifold):
-    """The tip is on a line through ``point``, along ``direction``; at the ends it moves and accelerates along it."""
+    """Constraint: the tip is on a line through ``point`` along ``direction``; its end derivatives are along it."""
 
     reason = "off the line"
-    kinks = FUNNEL
+    kinks = BOUND_KINKS
     inside_name, held_name = "line piece", "line distance"
     velocity_name, acceleration_name = "velocity across the line", "acceleration across the line"
-    point: Vector = field("a point of the line", unit="m")
-    direction: Vector = field("its direction, of any length")
-    piece: Range | None = field("how far along it the tip may be from the point", unit="m", default=None)
-    start_band: float = field("how far off a motion may start", unit="m", default=0.0, low=0.0)
-    tolerance: float = field("how far a motion may be off and still be called valid", unit="m", low=1e-9)
+    point: Vector = field("point of the line", unit="m")
+    direction: Vector = field("direction of the line, of any length")
+    piece: Range | None = field("range of the tip along the line, from the point", unit="m", default=None)
+    start_band: float = field("violation that the start of a motion may have", unit="m", default=0.0, low=0.0)
+    tolerance: float = field("violation that a valid motion may have", unit="m", low=1e-9)
 
     def __post_init__(self) -> None:
-        """Check that the direction is one.
+        """Check the direction.
 
         Raises:
-            ValueError: It is not.
+            ValueError: It is zero or not finite.
         """
         unit(self.direction, "direction")
 
     @cached_property
-    def place(self) -> Place:
-        """The line."""
+    def place(self) -> TipRegion:
+        """Region of the tip: the line."""
         direction = unit(self.direction, "direction")
         bounded, ranges = ([direction.tolist()], (self.piece,)) if self.piece else ((), ())
-        return Place(np.array(self.point), beside(direction).tolist(), bounded, ranges)
+        return TipRegion(np.array(self.point), beside(direction).tolist(), bounded, ranges)
 
     @property
     def band(self) -> float:
-        """How far off the line a motion may start [m]."""
+        """Maximum distance of a start from the line [m]."""
         return self.start_band

@@ -1,6 +1,6 @@
-"""The highest derivative of q that a condition depends on: found out from its forms, so that nobody declares it.
+"""Derivative order of conditions: the highest derivative of q that a condition depends on, derived from its forms.
 
-0 is a condition on positions, 1 one on velocities, too, 2 one on accelerations, 3 one on jerks.
+The order is 0 for positions, 1 for velocities, 2 for accelerations and 3 for jerks.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -13,21 +13,21 @@ from cnpgen.problems.constraints.constraint import Condition
 from cnpgen.robots.solid import place_obstacles
 
 if TYPE_CHECKING:
-    from cnpgen.world.state import World
+    from cnpgen.world.world import World
 
 Array = NDArray[np.float64]
 
-_SHARES = (0.1, 0.9, 10.0)  # of the limits
-_MIXED = np.cos(np.arange(64.0))  # joints move to both sides, none at the speed of another
+_SHARES = (0.1, 0.9, 10.0)  # fractions of the limits
+_MIXED = np.cos(np.arange(64.0))  # both signs and distinct magnitudes
 
 
 def symbolic_needs(condition: Condition, *derivatives: Any) -> int:
-    """Say what a condition in symbolic form depends on.
+    """Return the derivative order of a condition in symbolic form.
 
     Args:
-        condition: The condition.
-        derivatives: SX columns: of the symbols that are in the velocities, of those that are in the accelerations
-            alone and, where states have jerks, of those that are in these alone.
+        condition: Condition with SX expressions.
+        derivatives: SX columns of the symbols of the velocities, of those in the accelerations alone and, for states
+            with jerks, of those in the jerks alone.
     """
     import casadi as ca
 
@@ -39,15 +39,15 @@ def symbolic_needs(condition: Condition, *derivatives: Any) -> int:
 def measured_needs(
     forms: "Iterable[Callable[[World], Iterable[Condition]]]", world: "World", *, jerk: bool = False
 ) -> list[int]:
-    """Say what conditions in measured form depend on, in their order: what changes where dq, ddq or the jerk does.
+    """Return the derivative orders of conditions in measured form: which of dq, ddq and the jerk change their values.
 
-    They are asked where one of these is not a number and, as a form may swallow that, where it is far below its limit,
-    near it, and far above.
+    The conditions are evaluated with one of these nan and, since a form may ignore nan, far below, near and far above
+    its limit.
 
     Args:
-        forms: What evaluates them: ``measured`` of every constraint, or ``measured_at`` for an end.
-        world: Where they are evaluated; it is left at rest in the base configuration.
-        jerk: Whether states have jerks: those of motions do, boundary states do not.
+        forms: Functions that evaluate them: ``measured`` of every constraint, or ``measured_at`` for an end.
+        world: World for the evaluation; it is left at rest in the base configuration.
+        jerk: Whether states have jerks, as those of motions, unlike boundary states.
     """
     robot, forms = world.robot, list(forms)
     limits = [robot.velocity_limit, robot.acceleration_limit, *([robot.jerk_limit] if jerk else [])]
@@ -62,11 +62,11 @@ def measured_needs(
 def _changed(
     forms: "Sequence[Callable[[World], Iterable[Condition]]]", world: "World", states: Sequence[Sequence[Array]]
 ) -> list[bool]:
-    """Say which conditions have another value at one of the states than at rest; the world is left at rest."""
-    tops, rest = place_obstacles(world.obstacles), [np.zeros(world.robot.n) for _ in states[0]]
+    """Return which conditions differ between one of the states and rest; the world is left at rest."""
+    obstacle_poses, rest = place_obstacles(world.obstacles), [np.zeros(world.robot.n) for _ in states[0]]
 
     def values(dq: Array, ddq: Array, jerk: Array | None = None) -> list[Array]:
-        world.set_state(world.robot.base, dq, ddq, tops, jerk)
+        world.set_state(world.robot.base, dq, ddq, obstacle_poses, jerk)
         return [np.array(each.g, float) for form in forms for each in form(world)]
 
     moving = [values(*state) for state in states]

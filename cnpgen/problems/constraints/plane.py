@@ -1,4 +1,4 @@
-"""The tip in a plane of any direction, or in a rectangle of it."""
+"""Constraint: the tip in a plane of any direction, or in a rectangle of it."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -6,47 +6,47 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.problems.constraints.tip_manifold import FUNNEL, Place, TipManifold, Vector, beside, unit
+from cnpgen.problems.constraints.tip_manifold import BOUND_KINKS, TipManifold, TipRegion, Vector, beside, unit
 from cnpgen.schema.keys import Range, field
 
 
 @dataclass(frozen=True, kw_only=True)
 class Plane(TipManifold):
-    """The tip p stays in a plane: ``normal . (p - point) = 0``; at the ends it moves and accelerates along it only."""
+    """Constraint: the tip p stays in a plane, ``normal . (p - point) = 0``; its end derivatives are in the plane."""
 
     reason = "off the plane"
-    kinks = FUNNEL
+    kinks = BOUND_KINKS
     inside_name, held_name = "plane rectangle", "plane distance"
     velocity_name, acceleration_name = "velocity across the plane", "acceleration across the plane"
-    point: Vector = field("a point of the plane", unit="m")
-    normal: Vector = field("a direction across it, of any length")
-    along: Vector | None = field("the direction in the plane that u is measured along", default=None)
-    u: Range | None = field("how far the tip may be from the point in the direction of along", unit="m", default=None)
-    v: Range | None = field("likewise across along and normal (normal x along)", unit="m", default=None)
-    start_band: float = field("how far off a motion may start", unit="m", default=0.0, low=0.0)
-    tolerance: float = field("how far a motion may be off and still be called valid", unit="m", low=1e-9)
+    point: Vector = field("point of the plane", unit="m")
+    normal: Vector = field("normal of the plane, of any length")
+    along: Vector | None = field("direction in the plane along which u is measured", default=None)
+    u: Range | None = field('range of the tip along "along", from the point', unit="m", default=None)
+    v: Range | None = field("range of the tip along normal x along, from the point", unit="m", default=None)
+    start_band: float = field("violation that the start of a motion may have", unit="m", default=0.0, low=0.0)
+    tolerance: float = field("violation that a valid motion may have", unit="m", low=1e-9)
 
     def __post_init__(self) -> None:
-        """Check that the directions are some.
+        """Check the directions.
 
         Raises:
-            ValueError: They are not, or u and v have no direction to be measured along.
+            ValueError: A direction is zero or not finite, or the range of u or v has no direction.
         """
         if self.along is None and (self.u or self.v):
             raise ValueError("u and v need a direction in the plane that u is measured along: along = [1, 0, 0]")
         self._axes()
 
     @cached_property
-    def place(self) -> Place:
-        """The plane."""
+    def place(self) -> TipRegion:
+        """Region of the tip: the plane."""
         normal, axes = self._axes()
         given = [(axis, each) for axis, each in zip(axes, (self.u, self.v), strict=True) if each]
         bounded = [axis.tolist() for axis, _ in given]
-        return Place(np.array(self.point), [normal.tolist()], bounded, tuple(each for _, each in given))
+        return TipRegion(np.array(self.point), [normal.tolist()], bounded, tuple(each for _, each in given))
 
     @property
     def band(self) -> float:
-        """How far off the plane a motion may start [m]."""
+        """Maximum distance of a start from the plane [m]."""
         return self.start_band
 
     def _axes(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

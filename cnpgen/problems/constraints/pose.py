@@ -1,4 +1,4 @@
-"""The tip in one orientation, and where it may be: a task space region (Berenson, 2011) that does not turn."""
+"""Constraint: the tip with a fixed orientation in a box, a task space region (Berenson, 2011) without rotation."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,21 +9,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.problems.constraints.constraint import Condition, End
-from cnpgen.problems.constraints.tip_manifold import Place, TipManifold
+from cnpgen.problems.constraints.tip_manifold import TipManifold, TipRegion
 from cnpgen.schema.keys import Range, field
 
 if TYPE_CHECKING:
-    from cnpgen.kernels.symbolic.state import SymbolicState
-    from cnpgen.world.state import World
+    from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
+    from cnpgen.world.world import World
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Pose(TipManifold):
-    """The tip is turned one way, ``R = R_wanted``, in a box of the world; at the ends it does not turn.
+    """Constraint: fixed orientation ``R = R_wanted`` in a box of the world, without rotation at the ends.
 
-    Where a range is a single point, that coordinate is held. The three values of the orientation are the axis times the
+    A range of a single point fixes that coordinate. The three values of the orientation are the axis times the
     sine of the angle of ``R_wanted^T R``: angles [rad] to first order, and 0 at half a turn, too, which is excluded.
     """
 
@@ -31,24 +31,24 @@ class Pose(TipManifold):
     inside_name, held_name = "pose box", "pose position"
     velocity_name, acceleration_name = "velocity out of the pose", "acceleration out of the pose"
     rpy: tuple[float, float, float] = field("orientation in the world: roll, pitch, yaw, as in a URDF", unit="rad")
-    x: Range | None = field("where the tip may be along world x", unit="m", default=None)
-    y: Range | None = field("where the tip may be along world y", unit="m", default=None)
-    z: Range | None = field("where the tip may be along world z", unit="m", default=None)
-    tolerance: float = field("how far a motion may turn [rad] or be off [m] and still be called valid", low=1e-9)
+    x: Range | None = field("range of the tip along world x", unit="m", default=None)
+    y: Range | None = field("range of the tip along world y", unit="m", default=None)
+    z: Range | None = field("range of the tip along world z", unit="m", default=None)
+    tolerance: float = field("rotation [rad] or offset [m] that a valid motion may have", low=1e-9)
 
     @cached_property
-    def place(self) -> Place:
-        """The box, and in which directions it has no width."""
+    def place(self) -> TipRegion:
+        """Region of the tip: the box, with fixed directions of zero width."""
         given = [(row, each) for row, each in zip(np.eye(3), (self.x, self.y, self.z), strict=True) if each]
         held = [(row, each.low) for row, each in given if each.low == each.high]
         free = [(row, each) for row, each in given if each.low < each.high]
         point = sum((row * value for row, value in held), start=np.zeros(3))
         rows = [[row.tolist() for row, _ in pairs] for pairs in (held, free)]
-        return Place(point, held=rows[0], bounded=rows[1], ranges=tuple(each for _, each in free))
+        return TipRegion(point, held=rows[0], bounded=rows[1], ranges=tuple(each for _, each in free))
 
     @property
     def rotation(self) -> Array:
-        """The wanted rotation, shape (3, 3)."""
+        """Required rotation, shape (3, 3)."""
         (cr, cp, cy), (sr, sp, sy) = np.cos(self.rpy), np.sin(self.rpy)
         roll, pitch, yaw = (
             np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]]),
@@ -89,7 +89,7 @@ class Pose(TipManifold):
 
 
 def _turning(omega: Sequence[Any], alpha: Sequence[Any]) -> tuple[Condition, ...]:
-    """State that the tip does not turn, nor begin to."""
+    """State that the angular velocity and acceleration of the tip are zero."""
     zero = np.zeros(3)
     return (
         Condition("turning", "rad/s", list(omega), zero, zero, "velocity", ("x", "y", "z")),

@@ -1,4 +1,4 @@
-"""Self-collision: links of the robot that joints move against each other do not touch."""
+"""Self-collision constraint: links that move relative to each other do not touch."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -11,40 +11,40 @@ from cnpgen.problems.constraints.constraint import Condition, Constraint, End
 from cnpgen.schema.keys import field
 
 if TYPE_CHECKING:
-    from cnpgen.kernels.symbolic.state import SymbolicState
+    from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
     from cnpgen.robots.robot import Robot
-    from cnpgen.robots.shape.pairs import LinkPair
+    from cnpgen.robots.shape.link_pairs import LinkPair
     from cnpgen.world.path import PathWorld
-    from cnpgen.world.state import World
+    from cnpgen.world.world import World
 
 
 @dataclass(frozen=True, kw_only=True)
 class SelfClearance(Constraint):
-    """Two links of a pair that is not left out are further than ``distance`` from each other.
+    """Constraint: the links of every pair that is not left out are further than ``distance`` from each other.
 
-    It needs the geometry of the URDF. Judges measure the links' convex pieces. Solvers keep the capsules of those pairs
-    apart whose capsules hardly ever overlap where the links do not; of the others only judges know.
+    It requires the geometry of the URDF. Judges measure the convex parts of the links. Solvers use the capsules of
+    pairs whose capsules hardly ever overlap unless the links do; only judges check the other pairs.
     """
 
     reason = "robot in collision with itself"
-    distance: float = field("how far links must be from each other", unit="m", low=0.0, default=0.0)
-    tolerance: float = field("how deep links may enter each other in a valid motion", unit="m", low=0.0)
+    distance: float = field("minimum distance of links", unit="m", low=0.0, default=0.0)
+    tolerance: float = field("penetration depth of links that a valid motion may have", unit="m", low=0.0)
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
-        """State the distances of the capsules' axes [m] of the pairs that are for solvers."""
+        """State the distances of the capsules' axes [m] of the pairs for solvers."""
         return self._apart(state, _for_solvers(state.robot))
 
     def measured(self, world: "World") -> tuple[Condition, ...]:
-        """Measure the signed distances of the links' pieces with Coal [m]."""
+        """Measure the signed distances of the convex parts with Coal [m]."""
         (found,) = self._least(world.self_distances(self.distance), [0.0], sufficient=False)
         shape = world.robot.shape
-        links = [piece.link for piece in shape.pieces] if shape else []
+        links = [piece.link for piece in shape.convex_parts] if shape else []
         pairs = shape.apart if shape else ()
         return (replace(found, parts=tuple(f"{links[i]}, {links[j]}" for i, j in pairs)),)
 
-    def met(self, path: "PathWorld", slack: float) -> NDArray[np.bool_]:
-        """Say at which states the links' pieces are far enough apart."""
-        return path.clear_of_itself(self.distance - slack)
+    def met(self, path: "PathWorld", tolerance: float) -> NDArray[np.bool_]:
+        """Return a mask of the states with sufficient distances between the convex parts."""
+        return path.clear_of_itself(self.distance - tolerance)
 
     def solved(self, world: "World") -> tuple[Condition, ...]:
         """Return the conditions of the capsules."""
@@ -56,10 +56,10 @@ class SelfClearance(Constraint):
         return self._apart(state, _looked_at(state.robot))
 
     def _apart(self, state: "SymbolicState", pairs: "Sequence[LinkPair]") -> tuple[Condition, ...]:
-        from cnpgen.kernels.symbolic.segments import segment_distance
+        from cnpgen.kernels.symbolic.segment_distance import segment_distance
 
         ends = [(state.capsules[pair.first], state.capsules[pair.second]) for pair in pairs]
-        distances = [segment_distance((a, b), (c, d), hold=state.hold) for (a, b, _), (c, d, _) in ends]
+        distances = [segment_distance((a, b), (c, d), freeze=state.freeze) for (a, b, _), (c, d, _) in ends]
         return self._least(distances, _radii(state.robot, pairs), sufficient=True)
 
     def _least(self, distances: list[Any], radii: list[float], *, sufficient: bool) -> tuple[Condition, ...]:
@@ -74,11 +74,11 @@ def _looked_at(robot: "Robot") -> "list[LinkPair]":
 
 
 def _for_solvers(robot: "Robot") -> "list[LinkPair]":
-    """List those of them whose capsules solvers keep apart."""
+    """List the pairs whose capsules solvers use."""
     return [pair for pair in _looked_at(robot) if pair.for_solvers]
 
 
 def _radii(robot: "Robot", pairs: "Sequence[LinkPair]") -> list[float]:
-    """Sums of the radii of the capsules of pairs [m]."""
+    """Return the sums of the capsule radii of pairs [m]."""
     radius = {capsule.link: capsule.radius for capsule in robot.shape.capsules} if robot.shape else {}
     return [radius[pair.first] + radius[pair.second] for pair in pairs]

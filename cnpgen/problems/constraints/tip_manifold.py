@@ -1,8 +1,7 @@
-"""The tip on a point, a line or a plane of the world: what ``table``, ``plane``, ``line`` and ``pose`` have in common.
+"""Base of ``table``, ``plane``, ``line`` and ``pose``: the tip on a point, a line or a plane of the world.
 
-A manifold is an orthonormal frame at a point, of whose directions some are held: along those the tip stays at the
-point, and where a motion begins or ends it moves and accelerates along the others only (paper, Appendix B, for the
-table).
+A manifold is an orthonormal frame at a point with some fixed directions. Along these the tip stays at the point. At its
+ends, a motion has velocity and acceleration along the other directions only (paper, Appendix B, for the table).
 """
 
 from abc import abstractmethod
@@ -18,24 +17,24 @@ from cnpgen.problems.constraints.constraint import Condition, Constraint, End
 from cnpgen.schema.keys import Range
 
 if TYPE_CHECKING:
-    from cnpgen.kernels.symbolic.state import SymbolicState
-    from cnpgen.world.state import World
+    from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
+    from cnpgen.world.world import World
 
 Array = NDArray[np.float64]
 Vector = tuple[float, float, float]
-Vectors = Sequence[Sequence[float]]  # numbers of Python, which are multiplied with one at a time
-FUNNEL = (0.1, 0.3)  # phases between which a motion that starts off the manifold must come to it
+Vectors = Sequence[Sequence[float]]  # Python floats, used in scalar products
+BOUND_KINKS = (0.1, 0.3)  # phases between which a motion that starts off the manifold must reach it
 
 
 @dataclass(frozen=True)
-class Place:
-    """Where the tip must be.
+class TipRegion:
+    """Region of the tip: a manifold with ranges.
 
     Attributes:
         point: A point of the manifold [m], shape (3,).
         held: Unit vectors along which the tip stays at the point, k of them.
         bounded: Unit vectors along which it stays in a range, m of them, orthogonal to the others.
-        ranges: Those ranges, measured from the point [m], m of them.
+        ranges: Ranges relative to the point [m], m of them.
     """
 
     point: Array
@@ -45,12 +44,12 @@ class Place:
 
     @cached_property
     def height(self) -> Array:
-        """Where the tip is held along each of ``held``, measured from the world's origin [m], shape (k,)."""
+        """Coordinates along each of ``held``, relative to the world's origin [m], shape (k,)."""
         return np.asarray(np.array(self.held) @ self.point)
 
     @cached_property
     def bounds(self) -> tuple[Array, Array]:
-        """Between which it stays along each of ``bounded``, measured likewise [m], shape (m,) each."""
+        """Bounds along each of ``bounded``, relative to the world's origin [m], shape (m,) each."""
         origin = np.array(self.bounded) @ self.point
         low, high = (np.array([getattr(each, end) for each in self.ranges]) for end in ("low", "high"))
         return origin + low, origin + high
@@ -58,7 +57,9 @@ class Place:
 
 @dataclass(frozen=True, kw_only=True)
 class TipManifold(Constraint):
-    """The tip at a place; kinds say which."""
+    """Base class: the tip stays in a region that subclasses define."""
+
+    training_weight = 1e4  # one weight for position and orientation of a pose
 
     inside_name: ClassVar[str]
     held_name: ClassVar[str]
@@ -68,16 +69,16 @@ class TipManifold(Constraint):
 
     @property
     @abstractmethod
-    def place(self) -> Place:
-        """Where the tip must be; kinds keep it, since it is asked for at every state."""
+    def place(self) -> TipRegion:
+        """Region of the tip; subclasses cache it, since it is used at every state."""
 
     @property
     def band(self) -> float:
-        """How far off the manifold a motion may start [m]."""
+        """Maximum distance of a start from the manifold [m]."""
         return 0.0
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
-        """State where the tip is [m]."""
+        """State the tip position [m]."""
         return self._position(state.kinematics.tip, 0.0)
 
     def measured(self, world: "World") -> tuple[Condition, ...]:
@@ -94,15 +95,15 @@ class TipManifold(Constraint):
         position = self._position(list(world.tip_position), self._band_at(end))
         return (*position, *self._moving(list(world.tip_velocity), list(world.tip_acceleration)))
 
-    def funnel(self, condition: Condition, s: Array, start_tip: Array) -> Array:
-        """Let a motion that starts off the manifold reach it: ``start_off`` until s = 0.1, nothing from s = 0.3 on."""
+    def bound_relaxation(self, condition: Condition, s: Array, start_tip: Array) -> Array:
+        """Relax the bounds for a start off the manifold: by ``start_off`` until s = 0.1, by zero from s = 0.3 on."""
         if condition.name != self.held_name:
-            return super().funnel(condition, s, start_tip)
-        open_: Array = np.minimum(np.maximum((FUNNEL[1] - s) / (FUNNEL[1] - FUNNEL[0]), 0.0), 1.0)
+            return super().bound_relaxation(condition, s, start_tip)
+        open_: Array = np.minimum(np.maximum((BOUND_KINKS[1] - s) / (BOUND_KINKS[1] - BOUND_KINKS[0]), 0.0), 1.0)
         return self.start_off(start_tip)[..., None] * open_
 
     def start_off(self, start_tip: Array) -> Array:
-        """Return how far off the manifold motions may begin [m]: as far as they do, up to ``band``.
+        """Return the relaxation for the starts of motions [m]: their distance from the manifold, at most ``band``.
 
         Args:
             start_tip: Positions of the tip at the start [m], shape (..., 3).
@@ -154,7 +155,7 @@ def unit(vector: Sequence[float] | Array, what: str) -> Array:
     """Return a vector divided by its length.
 
     Raises:
-        ValueError: It has none.
+        ValueError: The length is zero or not finite.
     """
     given = np.array(vector, float)
     length = np.linalg.norm(given)
@@ -164,7 +165,7 @@ def unit(vector: Sequence[float] | Array, what: str) -> Array:
 
 
 def beside(direction: Array) -> Array:
-    """Return two unit vectors orthogonal to a unit vector and to each other, shape (2, 3); x and y beside z."""
+    """Return two unit vectors orthogonal to a unit vector and to each other, shape (2, 3); x and y for z."""
     first = np.eye(3)[int(np.argmin(np.abs(direction)))]
     first = first - direction * (direction @ first)
     first = first / np.linalg.norm(first)

@@ -1,4 +1,4 @@
-"""A bound on how fast the tip moves."""
+"""Constraint on the speed of the tip."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,20 +11,20 @@ from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.schema.keys import field
 
 if TYPE_CHECKING:
-    from cnpgen.kernels.symbolic.state import SymbolicState
-    from cnpgen.world.state import World
+    from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
+    from cnpgen.world.world import World
 
 
 @dataclass(frozen=True, kw_only=True)
 class TipSpeed(Constraint):
-    """The tip is no faster than a limit, ``|v| <= limit``; stated of the square, which has a gradient at rest, too."""
+    """Constraint: tip speed within a limit, ``|v| <= limit``, stated for the square, a smooth function."""
 
     reason = "tip too fast"
-    limit: float = field("highest speed of the tip", unit="m/s", low=1e-6)
-    tolerance: float = field("how much faster a motion may be and still be called valid", unit="m/s", low=0.0)
+    limit: float = field("maximum speed of the tip", unit="m/s", low=1e-6)
+    tolerance: float = field("additional speed that a valid motion may have", unit="m/s", low=0.0)
 
     def allowed(self, condition: Condition) -> NDArray[np.float64]:
-        """Return by how much the square may exceed that of the limit [m^2/s^2]."""
+        """Return the tolerance of the square of the speed [m^2/s^2]."""
         return np.full(len(condition.g), (self.limit + self.tolerance) ** 2 - self.limit**2)
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:

@@ -1,1 +1,1 @@
-"""Why a boundary problem has no solution, where that can be proven."""
+"""Proofs that a boundary problem has no solution."""

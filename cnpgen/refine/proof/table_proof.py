@@ -1,9 +1,9 @@
-"""How far the tip must leave a table soon after the start, or shortly before the goal.
+"""Proof that the tip must leave a table soon after the start, or shortly before the goal.
 
-At a time t from an end every joint is somewhere in its interval (``cnpgen.refine.proof.reachable``). The smallest
-exceedance of the table's rectangle over that box, with the tip at the table's height, is found by sequential linear
-programming; the multipliers at its end give a combination of the table's bounds that ``bound_projection`` proves to be
-exceeded in the whole box.
+At a time t from an end every joint is within an interval (``cnpgen.refine.proof.reachable_positions``). Sequential
+linear programming minimizes the violation of the table's rectangle over that box, with the tip at the table's height.
+The multipliers at the minimum combine the table's bounds to one direction, along which ``bound_projection`` proves the
+violation for the whole box.
 """
 
 from collections.abc import Iterator
@@ -14,62 +14,63 @@ from numpy.typing import NDArray
 
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem
-from cnpgen.refine.proof.reachable import Departure, JointLimits, departures, joint_limits, moments
-from cnpgen.refine.proof.tip_bound import Arm, bound_projection
+from cnpgen.refine.proof.reachable_positions import EndState, JointLimits, end_states, joint_limits, sample_times
+from cnpgen.refine.proof.tip_bound import ArmKinematics, bound_projection
 from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]
-FLOOR = -0.01  # m: more room than this is not told from this
-PENALTY = 10.0  # of the height, per metre of the rectangle
-SLACK = 5e-5  # m, for what happens between the moments that the verdict looks at
-VERGE = 1.5e-3  # m to spare up to which it is a matter of luck whether a spline of the usual size fits
-CARRIED = 1e-4  # m: nothing is said of an end that is near the edge, but from where the tip is not carried further
-STARTS = 3
-TRIED = 3  # moments whose exceedance is to be proven, the largest first
-STEPS = 15
-CLOSE = 1e-7  # m, gain at which the search ends
+MIN_VIOLATION_M = -0.01  # larger distances from the edge count as this one
+HEIGHT_WEIGHT = 10.0  # of a violation of the height, relative to the rectangle
+TIP_MARGIN_M = 5e-5  # for motion between the times of the verdict
+VERGE_DISTANCE_M = 1.5e-3  # from the edge, up to which splines of the usual size may be too coarse
+MIN_DRIFT_M = 1e-4  # further out than the end itself; an end at rest near the edge is not on the verge
+LOCAL_SEARCHES = 3  # from different configurations
+MAX_PROOFS = 3  # of times with a violation, the largest first
+MAX_LP_STEPS = 15
+MIN_GAIN_M = 1e-7  # at which a local search ends
 
 
 @dataclass(frozen=True)
 class TableBounds:
-    """The bounds of all tables of a problem: ``normals @ tip <= limits``.
+    """Bounds of all tables of a problem: ``normals @ tip <= limits``.
 
     Attributes:
         normals: Unit vectors, shape (m, 3).
-        limits: Shape (m,) [m].
-        height: Which rows are about the height, shape (m,).
+        limits: Limits [m], shape (m,).
+        height: Mask of the rows of the height, shape (m,).
     """
 
     normals: Array
     limits: Array
     height: NDArray[np.bool_]
 
-    def exceedance(self, tip: Array) -> tuple[float, float]:
-        """Return how far a tip is outside of the rectangle, at least ``FLOOR``, and how far off the height [m]."""
-        excess = self.normals @ tip - self.limits
-        return max(float(excess[~self.height].max()), FLOOR), max(float(excess[self.height].max()), 0.0)
+    def violation(self, tip: Array) -> tuple[float, float]:
+        """Return the violation of the rectangle, at least ``MIN_VIOLATION_M``, and of the height by a tip [m]."""
+        violation = self.normals @ tip - self.limits
+        rectangle, height = violation[~self.height].max(), violation[self.height].max()
+        return max(float(rectangle), MIN_VIOLATION_M), max(float(height), 0.0)
 
 
 def table_bounds(problem: Problem, start_tip: Array, *, tolerances: float) -> TableBounds | None:
-    """Return the bounds of the problem's tables, or None where it has none.
+    """Return the bounds of the problem's tables, or None if it has none.
 
-    The height is always held within its tolerance, and a motion that starts off the table may be as far off as the
-    table's ``start_off`` all along: when it must have come down depends on its phase, not on time.
+    The height is bounded by its tolerance. A motion that starts off the table may be off by the table's ``start_off``
+    at any time, since the time-varying bound depends on its phase.
 
     Args:
         problem: The problem.
         start_tip: Tip at the start [m], shape (3,).
-        tolerances: Fraction of the tolerance by which the rectangles are larger.
+        tolerances: Fraction of the tolerance by which the rectangles are enlarged.
     """
-    tables = [each for each in problem.constraint if isinstance(each, Table)]
+    tables = [constraint for constraint in problem.constraint if isinstance(constraint, Table)]
     if not tables:
         return None
     limits = []
     for table in tables:
-        room = tolerances * table.tolerance + SLACK
-        band = table.tolerance + SLACK + float(table.start_off(start_tip))
-        limits += [table.x.high + room, room - table.x.low, table.y.high + room, room - table.y.low]
+        margin = tolerances * table.tolerance + TIP_MARGIN_M
+        band = table.tolerance + TIP_MARGIN_M + float(table.start_off(start_tip))
+        limits += [table.x.high + margin, margin - table.x.low, table.y.high + margin, margin - table.y.low]
         limits += [table.z + band, band - table.z]
     normals = np.repeat(np.eye(3), 2, axis=0) * np.tile([1.0, -1.0], 3)[:, None]
     height = np.tile(np.arange(6) >= 4, len(tables))
@@ -77,14 +78,15 @@ def table_bounds(problem: Problem, start_tip: Array, *, tolerances: float) -> Ta
 
 
 @dataclass(frozen=True)
-class Exceedance:
-    """The smallest exceedance that was found at one moment.
+class TableViolation:
+    """Smallest violation found at one time.
 
     Attributes:
         time: Time from the end [s].
-        value: Exceedance of the rectangle, at least ``FLOOR``, plus ``PENALTY`` times that of the height [m].
-        multipliers: Of the table's bounds, shape (m,).
-        box: Where the joints can be: (lower, upper), shape (n,) each.
+        value: Violation of the rectangle, at least ``MIN_VIOLATION_M``, plus ``HEIGHT_WEIGHT`` times that of the height
+            [m].
+        multipliers: Multipliers of the table's bounds, shape (m,).
+        box: Reachable joint positions: (lower, upper), shape (n,) each.
     """
 
     time: float
@@ -93,20 +95,20 @@ class Exceedance:
     box: tuple[Array, Array]
 
     def weight(self, bounds: TableBounds) -> float:
-        """What the multipliers make of a metre off the table: 1, or ``PENALTY`` where the height alone is missed."""
+        """Return the weight of one metre off the table: 1, or ``HEIGHT_WEIGHT`` if only the height is violated."""
         total = float(self.multipliers.sum())
         return 1.0 if float(self.multipliers[~bounds.height].sum()) > 0.5 else max(total, 1.0)
 
 
 @dataclass(frozen=True)
-class Leaving:
-    """The tip leaves the table, or nearly so, whatever the motion does.
+class TableExit:
+    """Instant at which the tip leaves the table, or nearly so, in every motion.
 
     Attributes:
         end: "start" or "goal".
-        time: Time from there [s].
-        distance: How far off the table it is at least, or, negative, how far from its edge at most [m].
-        proven: Whether that is proven, with all tolerances; else it is what local searches found, without.
+        time: Time from that end [s].
+        distance: Smallest distance off the table, or, negative, largest distance from its edge [m].
+        proven: Whether it is proven with all tolerances; otherwise a local search without tolerances found it.
     """
 
     end: str
@@ -115,91 +117,91 @@ class Leaving:
     proven: bool
 
 
-def find_leaving(problem: Problem, robot: Robot, boundary: Boundary) -> Leaving | None:
-    """Find where the tip must leave a table; where that cannot be proven, where it has less room than ``VERGE``.
+def find_table_exit(problem: Problem, robot: Robot, boundary: Boundary) -> TableExit | None:
+    """Find a proven exit from a table, or else one with less than ``VERGE_DISTANCE_M`` to the edge, or None.
 
     Args:
         problem: The problem.
         robot: Its robot.
         boundary: Boundary conditions of one motion.
     """
-    arm, nearly = Arm(robot), None
+    arm, nearly = ArmKinematics(robot), None
     start_tip = arm.at(boundary.start_q[0]).position
     exact, wide = (table_bounds(problem, start_tip, tolerances=tolerances) for tolerances in (0.0, 1.0))
     if exact is None or wide is None:
         return None
-    limits, wider = (joint_limits(problem, robot, tolerances=tolerances) for tolerances in (0.0, 1.0))
-    times = moments(boundary, wider)
-    for end, departure in departures(boundary).items():
-        found = _exceedances(arm, exact, departure, limits, times)
-        worst = max(found, key=lambda each: each.value, default=None)
-        if worst is None or worst.value < max(-VERGE, _merit(exact, arm.at(departure.q).position) + CARRIED):
+    limits, relaxed = (joint_limits(problem, robot, tolerances=tolerances) for tolerances in (0.0, 1.0))
+    times = sample_times(boundary, relaxed)
+    for end, state in end_states(boundary).items():
+        worst = max(_violations(arm, exact, state, limits, times), key=lambda item: item.value, default=None)
+        end_merit = _merit(exact, arm.at(state.q).position)
+        if worst is None or worst.value < max(-VERGE_DISTANCE_M, end_merit + MIN_DRIFT_M):
             continue
-        certain = _prove(arm, wide, _exceedances(arm, wide, departure, wider, times))
-        if certain is not None:
-            return Leaving(end, *certain, proven=True)
+        proof = _prove(arm, wide, _violations(arm, wide, state, relaxed, times))
+        if proof is not None:
+            return TableExit(end, *proof, proven=True)
         if nearly is None or worst.value > nearly.distance:
-            nearly = Leaving(end, worst.time, worst.value, proven=False)
+            nearly = TableExit(end, worst.time, worst.value, proven=False)
     return nearly
 
 
-def _exceedances(
-    arm: Arm, bounds: TableBounds, departure: Departure, limits: JointLimits, times: Array
-) -> list[Exceedance]:
-    """Search for the smallest exceedance at some times from an end [s]; those where no joint can be are left out."""
-    boxes = [(float(time), departure.box(float(time), limits)) for time in times]
+def _violations(
+    arm: ArmKinematics, bounds: TableBounds, state: EndState, limits: JointLimits, times: Array
+) -> list[TableViolation]:
+    """Search for the smallest violation at some times from an end [s], except where no position is reachable."""
+    boxes = [(float(time), state.box(float(time), limits)) for time in times]
     return [_smallest(arm, bounds, time, box) for time, box in boxes if (box[0] <= box[1]).all()]
 
 
-def _prove(arm: Arm, bounds: TableBounds, found: list[Exceedance]) -> tuple[float, float] | None:
-    """Prove the exceedance at one of some moments: (time from the end [s], distance off the table [m]), or None."""
-    worst = sorted((each for each in found if each.value > 0), key=lambda each: -each.value)
-    for each in worst[:TRIED]:
-        direction, limit = bounds.normals.T @ each.multipliers, float(bounds.limits @ each.multipliers)
-        for share in (0.8, 0.0):
-            least = bound_projection(arm, direction, *each.box, above=limit + share * each.value)
-            if least is not None:
-                return each.time, (least - limit) / each.weight(bounds)
+def _prove(arm: ArmKinematics, bounds: TableBounds, violations: list[TableViolation]) -> tuple[float, float] | None:
+    """Prove a violation at one time: (time from the end [s], distance off the table [m]), or None."""
+    positive = sorted((item for item in violations if item.value > 0), key=lambda item: -item.value)
+    for item in positive[:MAX_PROOFS]:
+        direction, limit = bounds.normals.T @ item.multipliers, float(bounds.limits @ item.multipliers)
+        for fraction in (0.8, 0.0):
+            bound = bound_projection(arm, direction, *item.box, above=limit + fraction * item.value)
+            if bound is not None:
+                return item.time, (bound - limit) / item.weight(bounds)
     return None
 
 
-def _smallest(arm: Arm, bounds: TableBounds, time: float, box: tuple[Array, Array]) -> Exceedance:
-    """Search from some configurations; one without exceedance ends it."""
-    best: Exceedance | None = None
-    for q in _starts(*box):
+def _smallest(arm: ArmKinematics, bounds: TableBounds, time: float, box: tuple[Array, Array]) -> TableViolation:
+    """Search from several configurations; stop at one without violation."""
+    best: TableViolation | None = None
+    for q in _initial_configurations(*box):
         value, multipliers = _search(arm, bounds, q, box)
         if best is None or value < best.value:
-            best = Exceedance(time, value, multipliers, box)
-        if value <= FLOOR:
+            best = TableViolation(time, value, multipliers, box)
+        if value <= MIN_VIOLATION_M:
             break
     assert best is not None
     return best
 
 
-def _starts(lower: Array, upper: Array) -> Iterator[Array]:
+def _initial_configurations(lower: Array, upper: Array) -> Iterator[Array]:
     random = np.random.default_rng(0)
     yield (lower + upper) / 2
-    for _ in range(STARTS - 1):
+    for _ in range(LOCAL_SEARCHES - 1):
         yield random.uniform(lower, upper)
 
 
-def _search(arm: Arm, bounds: TableBounds, q: Array, box: tuple[Array, Array]) -> tuple[float, Array]:
-    """Minimise from q by linear programmes on a shrinking box; return the exceedance and the multipliers there."""
+def _search(arm: ArmKinematics, bounds: TableBounds, q: Array, box: tuple[Array, Array]) -> tuple[float, Array]:
+    """Minimize from q by linear programs on a shrinking box; return the violation and the multipliers."""
     radius = float((box[1] - box[0]).max())
     value = _merit(bounds, arm.at(q).position)
     multipliers: Array = np.zeros(len(bounds.limits))
-    for _ in range(STEPS):
-        near = np.maximum(box[0], q - radius), np.minimum(box[1], q + radius)
-        solved = _linear_step(arm, bounds, q, near)
-        if solved is None:
+    for _ in range(MAX_LP_STEPS):
+        region = np.maximum(box[0], q - radius), np.minimum(box[1], q + radius)
+        solution = _linear_step(arm, bounds, q, region)
+        if solution is None:
             break
-        step, model, multipliers = solved
+        step, predicted, multipliers = solution
         new = _merit(bounds, arm.at(q + step).position)
         if new < value:
             gain, q, value = value - new, q + step, new
-            if gain < CLOSE:
+            if gain < MIN_GAIN_M:
                 break
-        elif value - model < CLOSE:
+        elif value - predicted < MIN_GAIN_M:
             break
         else:
             radius *= 0.3
@@ -207,25 +209,25 @@ def _search(arm: Arm, bounds: TableBounds, q: Array, box: tuple[Array, Array]) -
 
 
 def _merit(bounds: TableBounds, tip: Array) -> float:
-    outside, off = bounds.exceedance(tip)
-    return outside + PENALTY * off
+    rectangle, height = bounds.violation(tip)
+    return rectangle + HEIGHT_WEIGHT * height
 
 
 def _linear_step(
-    arm: Arm, bounds: TableBounds, q: Array, near: tuple[Array, Array]
+    arm: ArmKinematics, bounds: TableBounds, q: Array, region: tuple[Array, Array]
 ) -> tuple[Array, float, Array] | None:
-    """Minimise the linearised exceedance: (step, exceedance predicted, multipliers), or None without a solution."""
+    """Minimize the linearized violation: (step, predicted violation, multipliers), or None without a solution."""
     from scipy.optimize import linprog
 
     tip, n = arm.at(q), len(q)
     elastic = np.stack([~bounds.height, bounds.height], axis=1)
     rows = np.hstack([bounds.normals @ tip.jacobian, -elastic.astype(float)])
-    sides = [(low - x, high - x) for low, high, x in zip(*near, q, strict=True)]
+    sides = [(low - x, high - x) for low, high, x in zip(*region, q, strict=True)]
     solved = linprog(
-        np.r_[np.zeros(n), 1.0, PENALTY],
+        np.r_[np.zeros(n), 1.0, HEIGHT_WEIGHT],
         A_ub=rows,
         b_ub=bounds.limits - bounds.normals @ tip.position,
-        bounds=[*sides, (FLOOR, None), (0.0, None)],
+        bounds=[*sides, (MIN_VIOLATION_M, None), (0.0, None)],
         method="highs",
     )
     if solved.status != 0:

@@ -1,1 +1,1 @@
-"""Sequential quadratic programming over the transcribed problem."""
+"""Solver of the refiner: sequential quadratic programming over the transcribed problem."""

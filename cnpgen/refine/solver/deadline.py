@@ -1,27 +1,27 @@
-"""How much time is left for the steps of several iterations."""
+"""Deadline of the iterations of a solver."""
 
 import time
 from dataclasses import dataclass
 
-UNEVEN = 1.3  # times the longest step that there was is left for the next
+STEP_TIME_FACTOR = 1.3  # times the largest duration of a step so far is reserved for the next
 
 
 @dataclass
 class Deadline:
-    """When the steps of some iterations should be over.
+    """Time at which iterations must have ended.
 
     Attributes:
-        until: As ``time.perf_counter`` counts [s].
-        longest: What the longest step so far took, and some more [s].
+        until: Time in the clock of ``time.perf_counter`` [s].
+        max_duration: Time reserved for one step: the largest so far, times ``STEP_TIME_FACTOR`` [s].
     """
 
     until: float
-    longest: float = 0.0
+    max_duration: float = 0.0
 
     def allows(self, steps: int) -> bool:
-        """Whether there is time for as many steps."""
-        return time.perf_counter() + steps * self.longest <= self.until
+        """Return whether there is time for so many steps."""
+        return time.perf_counter() + steps * self.max_duration <= self.until
 
     def note(self, begun: float) -> None:
-        """Take note of a step that is over and begun at ``begun``."""
-        self.longest = max(self.longest, UNEVEN * (time.perf_counter() - begun))
+        """Record a step that started at ``begun`` and has just ended."""
+        self.max_duration = max(self.max_duration, STEP_TIME_FACTOR * (time.perf_counter() - begun))

@@ -1,4 +1,4 @@
-"""Collocation grids: phases, spline bases there, and quadrature nodes; everything that no motion changes."""
+"""Collocation grids: phases, spline bases and quadrature nodes, which do not depend on the motion."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -7,14 +7,14 @@ from itertools import permutations
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.trajectory.spec import TrajectorySpec
 from cnpgen.trajectory.spline import basis, chebyshev, graded_edges
+from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
-NODES = 4  # Gauss nodes per cell of the time integral: wrong by less than 1e-9 of it
-CRITERION_NODES = 40
-BEGINNING = 1e-6  # a phase as good as 0, where jerks differ by some percent from those at the next point of a grid
+NODES_PER_CELL = 4  # Gauss nodes of the time integral: relative error below 1e-9
+COST_NODES = 40
+FIRST_JERK_PHASE = 1e-6  # close enough to 0; jerks there differ by some percent from those at the next grid point
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Bases:
         rate: Basis of r and its derivatives, shape (orders - 1, K, R).
         path_at: ``path`` phase by phase, shape (K, C, orders).
         rate_at: ``rate`` phase by phase, shape (K, orders - 1, R).
-        support: How many control points count at a phase: those whose basis functions are not 0 there.
+        support: Number of control points with nonzero basis functions at a phase.
     """
 
     path: Array
@@ -36,13 +36,13 @@ class Bases:
     support: int
 
     @cached_property
-    def along(self) -> tuple[Array, Array]:
+    def phases_last(self) -> tuple[Array, Array]:
         """``path`` and ``rate`` with the phases last, shape (orders, C, K) and (orders - 1, R, K)."""
         return np.ascontiguousarray(self.path.swapaxes(1, 2)), np.ascontiguousarray(self.rate.swapaxes(1, 2))
 
     @cached_property
-    def supported_from(self) -> tuple[Indices, Indices]:
-        """First of the control points of p and of r that count at every phase, shape (K,) each."""
+    def first_support(self) -> tuple[Indices, Indices]:
+        """Index of the first control point of p and of r in the support of every phase, shape (K,) each."""
         return _first(self.path, self.support), _first(self.rate, self.support)
 
     def states(self, path: Array, rate: Array) -> Array:
@@ -62,52 +62,52 @@ class Bases:
 
 @dataclass(frozen=True)
 class Grid:
-    """A grid on (0, 1].
+    """Grid on (0, 1].
 
     Attributes:
-        s: Phases, shape (K,); s = 0 is left out, nothing but the jerk can be changed there.
-        bases: Bases there, three orders of p and two of r, or four and three where the jerk is constrained.
-        gauss: Basis of r at the nodes of the time integral, shape (Q, R).
-        weights: Quadrature weights of the time integral, shape (Q,).
-        criterion: Bases at the Gauss nodes of the criterion's integral, four orders of p and three of r: dense at both
-            ends like the grid, but few, since their residuals are dear: the integral is wrong by up to a few tenths of
-            a percent, the objective by up to 0.1 %.
-        criterion_weights: Their quadrature weights.
+        s: Phases, shape (K,); at s = 0 everything but the jerk is fixed by the boundary conditions.
+        bases: Bases on the grid, three orders of p and two of r, or four and three where the jerk is constrained.
+        time_basis: Basis of r at the nodes of the time integral, shape (Q, R).
+        time_weights: Quadrature weights of the time integral, shape (Q,).
+        cost_bases: Bases at the Gauss nodes of the cost term's integral, four orders of p and three of r. The nodes are
+            few, since their residuals are expensive. The error of the integral is up to a few tenths of a percent, that
+            of the objective up to 0.1 %.
+        cost_weights: Quadrature weights of the cost term's integral.
     """
 
     s: Array
     bases: Bases
-    gauss: Array
-    weights: Array
-    criterion: Bases
-    criterion_weights: Array
+    time_basis: Array
+    time_weights: Array
+    cost_bases: Bases
+    cost_weights: Array
 
     @cached_property
-    def midway(self) -> Array:
-        """What four points in a row say of the middle of the inner two, shape (K - 3, 4): Lagrange's weights."""
-        near = np.stack([self.s[k : len(self.s) - 3 + k] for k in range(4)], axis=1)
-        middle = (near[:, 1] + near[:, 2]) / 2
-        weights = np.ones_like(near)
+    def midpoint_weights(self) -> Array:
+        """Lagrange weights of four adjacent points for the midpoint of the inner two, shape (K - 3, 4)."""
+        points = np.stack([self.s[k : len(self.s) - 3 + k] for k in range(4)], axis=1)
+        midpoint = (points[:, 1] + points[:, 2]) / 2
+        weights = np.ones_like(points)
         for k, other in permutations(range(4), 2):
-            weights[:, k] *= (middle - near[:, other]) / (near[:, k] - near[:, other])
+            weights[:, k] *= (midpoint - points[:, other]) / (points[:, k] - points[:, other])
         return weights
 
 
 def make_grid(spec: TrajectorySpec, points: int, orders: int = 3) -> Grid:
     """Build the Chebyshev grid of ``points`` phases, with bases of so many orders of p."""
-    s = np.concatenate([[BEGINNING] * (orders > 3), chebyshev(points)[1:]])
+    s = np.concatenate([[FIRST_JERK_PHASE] * (orders > 3), chebyshev(points)[1:]])
     edges = graded_edges(spec.rate_control_points, spec.degree)
-    nodes, weights = np.polynomial.legendre.leggauss(NODES)
+    nodes, weights = np.polynomial.legendre.leggauss(NODES_PER_CELL)
     width = np.diff(edges)[:, None]
     q = (edges[:-1, None] + width * (nodes + 1) / 2).ravel()
-    few, few_weights = np.polynomial.legendre.leggauss(CRITERION_NODES)
+    cost_nodes, cost_weights = np.polynomial.legendre.leggauss(COST_NODES)
     return Grid(
         s,
         bases=_bases(spec, s, orders),
-        gauss=basis(q, spec.rate_control_points, spec.degree),
-        weights=(width * weights / 2).ravel(),
-        criterion=_bases(spec, (few + 1) / 2, 4),
-        criterion_weights=few_weights / 2,
+        time_basis=basis(q, spec.rate_control_points, spec.degree),
+        time_weights=(width * weights / 2).ravel(),
+        cost_bases=_bases(spec, (cost_nodes + 1) / 2, 4),
+        cost_weights=cost_weights / 2,
     )
 
 
@@ -119,6 +119,6 @@ def _bases(spec: TrajectorySpec, s: Array, orders: int) -> Bases:
 
 
 def _first(bases: Array, support: int) -> Indices:
-    """First control point that counts at every phase, shape (K,), so that none of the next ones is missing."""
-    found: Indices = np.minimum((bases != 0).any(axis=0).argmax(axis=1), bases.shape[2] - support)
-    return found
+    """Return the first control point of the support at every phase, shape (K,); all of the support exists."""
+    first: Indices = np.minimum((bases != 0).any(axis=0).argmax(axis=1), bases.shape[2] - support)
+    return first

@@ -1,8 +1,8 @@
-"""Clearances of the links' hulls: what passes hold in the place of capsules, where these leave no way.
+"""Clearances of the links' convex hulls, which some grid levels use in place of capsules.
 
-A capsule sticks out of its link by centimetres. Of pieces that are near each other Coal tells the distance, the points
-where they are nearest, and the direction in which they are apart; how fast the points move along it is the derivative
-of the distance, since to first order the motion of the points on the pieces, and of the direction, changes nothing.
+A capsule is some centimetres larger than its link. For parts that are close to each other Coal returns the distance,
+the closest points and the direction between them. The derivative of the distance treats the closest points and the
+direction as constant (envelope theorem): it is the velocity of the points along the direction.
 """
 
 from dataclasses import replace
@@ -14,147 +14,149 @@ from numpy.typing import NDArray
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.constraints.self_clearance import SelfClearance
 from cnpgen.refine.solver.grid import Grid
-from cnpgen.refine.solver.residuals import DISTANCE
-from cnpgen.refine.solver.transcription import Linearisation, ResidualKernels, Transcription, of_last
+from cnpgen.refine.solver.residuals import DISTANCE_SCALE_M
+from cnpgen.refine.solver.transcription import Linearization, ResidualKernels, Transcription, cache_last
 from cnpgen.robots.solid import solids_of
 from cnpgen.trajectory.boundary import Boundary
-from cnpgen.world.bodies import Bodies, Contacts
-from cnpgen.world.trace import Trace
+from cnpgen.world.forward_kinematics import ForwardKinematics
+from cnpgen.world.rigid_bodies import Contacts, RigidBodies
 
 if TYPE_CHECKING:
     from cnpgen.problems.problem import Problem
     from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
-NEAR = 0.04  # m beyond the distance that is asked for: what is further apart is not measured
+MEASURED_RANGE_M = 0.04  # above the required distance; larger distances are not measured
 
 
-def keeps_clear(problem: "Problem", robot: "Robot") -> bool:
-    """Whether a problem keeps its robot's links clear of anything."""
-    kept = any(isinstance(each, RobotClearance | SelfClearance) for each in problem.constraint)
-    return kept and robot.shape is not None
+def has_clearance_constraints(problem: "Problem", robot: "Robot") -> bool:
+    """Return whether a problem constrains clearances of a robot with link geometry."""
+    constraints = any(isinstance(item, RobotClearance | SelfClearance) for item in problem.constraint)
+    return constraints and robot.shape is not None
 
 
 class Hulls:
-    """The clearances of a robot's convex pieces at many states. One process, one thread: Coal's memory is reused.
+    """Clearances of a robot's convex parts at many states. Not thread-safe: Coal's memory is reused.
 
     Args:
         problem: The problem.
-        robot: Its robot; ``keeps_clear`` says that there is something to measure.
+        robot: Its robot; ``has_clearance_constraints`` must hold.
 
     Attributes:
-        least: What the distances must be at least [m], shape (m,): of two links, or of a link and an obstacle.
-        tolerance: How much may be missing of them in a valid motion [m].
+        min_distances: Required distances [m], shape (m,), of pairs of links or of a link and an obstacle.
+        tolerance: Accepted violation of them in a valid motion [m].
     """
 
     def __init__(self, problem: "Problem", robot: "Robot") -> None:
         assert robot.shape is not None
         self._model, self._obstacles, self._n = robot.model, problem.obstacle, robot.n
-        self._data, self._trace = self._model.createData(), Trace(self._model)
-        self._bodies = Bodies(robot.shape, len(problem.obstacle), robot.n)
-        kept = [each for each in problem.constraint if isinstance(each, RobotClearance | SelfClearance)]
-        links = [piece.link for piece in robot.shape.pieces]
+        self._data, self._kinematics = self._model.createData(), ForwardKinematics(self._model)
+        self._bodies = RigidBodies(robot.shape, len(problem.obstacle), robot.n)
+        constraints = [item for item in problem.constraint if isinstance(item, RobotClearance | SelfClearance)]
+        links = [part.link for part in robot.shape.convex_parts]
         names = [*links, *range(len(problem.obstacle))]
         columns: dict[Any, int] = {}
-        self._groups, self._unseen, least = [], [], dict[int, float]()
-        seen = {frozenset((pair.first, pair.second)) for pair in robot.shape.pairs if pair.for_solvers}
-        for constraint in kept:
-            around = isinstance(constraint, RobotClearance)
-            pairs = self._bodies.from_obstacles if around else self._bodies.among_links
-            which = [columns.setdefault((names[a], names[b]), len(columns)) for a, b in pairs.tolist()]
-            least |= {column: max(least.get(column, 0.0), constraint.distance) for column in which}
-            self._groups.append((pairs, np.array(which, np.intp), constraint.distance))
-            if not around:
-                unseen = [frozenset((names[a], names[b])) not in seen for a, b in pairs.tolist()]
-                self._unseen.append((pairs[np.array(unseen, bool)], which, constraint.distance))
-        self.least = np.array([least[column] for column in range(len(columns))])
-        self.tolerance = max(each.tolerance for each in kept)
-        supports = [list(each) for each in self._model.supports]
+        self._groups, self._uncovered, min_distances = [], [], dict[int, float]()
+        covered = {frozenset((pair.first, pair.second)) for pair in robot.shape.pairs if pair.for_solvers}
+        for constraint in constraints:
+            of_obstacles = isinstance(constraint, RobotClearance)
+            pairs = self._bodies.obstacle_pairs if of_obstacles else self._bodies.link_pairs
+            indices = [columns.setdefault((names[a], names[b]), len(columns)) for a, b in pairs.tolist()]
+            min_distances |= {column: max(min_distances.get(column, 0.0), constraint.distance) for column in indices}
+            self._groups.append((pairs, np.array(indices, np.intp), constraint.distance))
+            if not of_obstacles:
+                uncovered = [frozenset((names[a], names[b])) not in covered for a, b in pairs.tolist()]
+                self._uncovered.append((pairs[np.array(uncovered, bool)], indices, constraint.distance))
+        self.min_distances = np.array([min_distances[column] for column in range(len(columns))])
+        self.tolerance = max(constraint.tolerance for constraint in constraints)
+        supports = [list(joints) for joints in self._model.supports]
         self._moves = np.array([[joint in above for joint in range(1, robot.n + 1)] for above in supports])
 
-    def near(self, q: Array, tops: Array) -> tuple[Array, list[Contacts]]:
-        """Measure what is near.
+    def measure(self, q: Array, obstacle_poses: Array) -> tuple[Array, list[Contacts]]:
+        """Measure the distances of close parts.
 
         Args:
             q: Joint positions [rad], shape (n, K).
-            tops: The numbers of the obstacles, shape (numbers,).
+            obstacle_poses: Poses and sizes of the obstacles, shape (width,).
 
         Returns:
-            Distances [m], shape (K, m), ``NEAR`` beyond the least where they are larger; and all contacts, constraint
-            by constraint. Positions that are no numbers have no distances.
+            Distances [m], shape (K, m), at most ``MEASURED_RANGE_M`` above the required ones, nan if q is not finite;
+            and the contacts of every constraint.
         """
         if not np.isfinite(q).all():
-            return np.full((q.shape[1], len(self.least)), np.nan), []
-        self._place(q, tops)
-        distances = np.repeat((self.least + NEAR)[None], q.shape[1], axis=0)
-        found = [self._bodies.contacts(pairs, least + NEAR) for pairs, _, least in self._groups]
-        for contacts, (_, columns, _) in zip(found, self._groups, strict=True):
+            return np.full((q.shape[1], len(self.min_distances)), np.nan), []
+        self._place(q, obstacle_poses)
+        distances = np.repeat((self.min_distances + MEASURED_RANGE_M)[None], q.shape[1], axis=0)
+        groups = [self._bodies.contacts(pairs, required + MEASURED_RANGE_M) for pairs, _, required in self._groups]
+        for contacts, (_, columns, _) in zip(groups, self._groups, strict=True):
             np.minimum.at(distances, (contacts.k, columns[contacts.pair]), contacts.distance)
-        return distances, found
+        return distances, groups
 
-    def clear(self, q: Array, tops: Array, *, of_all: bool = True) -> NDArray[np.bool_]:
-        """Say at which of the states (n, K) distances are large enough, shape (K,).
+    def clear_states(self, q: Array, obstacle_poses: Array, *, uncovered_only: bool = False) -> NDArray[np.bool_]:
+        """Return a mask of the states with the required distances, shape (K,).
 
         Args:
             q: Joint positions [rad], shape (n, K).
-            tops: The numbers of the obstacles, shape (numbers,).
-            of_all: Whether of all that ``least`` is about, or only of links whose capsules nobody keeps apart.
+            obstacle_poses: Poses and sizes of the obstacles, shape (width,).
+            uncovered_only: Whether to check only pairs of links that the solver's capsules do not cover.
         """
-        self._place(q, tops)
-        met = np.ones(q.shape[1], bool)
-        for pairs, _, least in self._groups if of_all else self._unseen:
-            met &= self._bodies.between(pairs).clear(least)
-        return met
+        self._place(q, obstacle_poses)
+        clear = np.ones(q.shape[1], bool)
+        for pairs, _, required in self._uncovered if uncovered_only else self._groups:
+            clear &= self._bodies.pair_distances(pairs).clear_states(required)
+        return clear
 
-    def depth(self, q: Array, tops: Array) -> float:
-        """How much is missing of the distances at the worst of the states (n, K) [m]."""
-        return float((self.least - self.near(q, tops)[0]).max(initial=-NEAR))
+    def max_penetration(self, q: Array, obstacle_poses: Array) -> float:
+        """Return the largest violation of the required distances at states q (n, K) [m]."""
+        return float((self.min_distances - self.measure(q, obstacle_poses)[0]).max(initial=-MEASURED_RANGE_M))
 
-    def slopes(self, q: Array, distances: Array, found: list[Contacts]) -> Array:
-        """Differentiate what ``near`` measured with respect to q: shape (n, m, K), 0 where nothing is near."""
+    def gradients(self, q: Array, distances: Array, groups: list[Contacts]) -> Array:
+        """Differentiate the result of ``measure`` in q: shape (n, m, K), 0 for parts out of range."""
         import pinocchio as pin
 
-        slopes, model, data = np.zeros((q.shape[1], len(self.least), self._n)), self._model, self._data
+        gradients, model, data = np.zeros((q.shape[1], len(self.min_distances), self._n)), self._model, self._data
         J = np.array([pin.computeJointJacobians(model, data, state).reshape(6, -1) for state in q.T.copy()])
-        for contacts, (_, columns, _) in zip(found, self._groups, strict=True):
+        for contacts, (_, columns, _) in zip(groups, self._groups, strict=True):
             k, column = contacts.k, columns[contacts.pair]
-            away = np.repeat(contacts.away[:, None], 2, axis=1)
-            twist = np.concatenate([away, np.cross(contacts.points, away)], axis=2)  # times that of a body: its speed
-            speeds = np.einsum("cbi,cij,cbj->cbj", twist, J[k], self._moves[contacts.joints], optimize=True)
+            normals = np.repeat(contacts.normal[:, None], 2, axis=1)
+            wrenches = np.concatenate([normals, np.cross(contacts.points, normals)], axis=2)  # of a unit force
+            speeds = np.einsum("cbi,cij,cbj->cbj", wrenches, J[k], self._moves[contacts.joints], optimize=True)
             nearest = contacts.distance <= distances[k, column]
-            slopes[k[nearest], column[nearest]] = (speeds[:, 1] - speeds[:, 0])[nearest]
-        return slopes.transpose(2, 1, 0)
+            gradients[k[nearest], column[nearest]] = (speeds[:, 1] - speeds[:, 0])[nearest]
+        return gradients.transpose(2, 1, 0)
 
-    def _place(self, q: Array, tops: Array) -> None:
-        self._bodies.place(*self._trace.poses(q), solids_of(self._obstacles, tops))
+    def _place(self, q: Array, obstacle_poses: Array) -> None:
+        self._bodies.place(*self._kinematics.poses(q), solids_of(self._obstacles, obstacle_poses))
 
 
 class HullTranscription(Transcription):
     """One motion on one grid with the clearances of the links' hulls as further residuals, evaluated in NumPy.
 
     Args:
-        stage: The kernels.
+        kernels: Residual kernels.
         grid: The grid.
-        hulls: What measures.
-        boundary: As of ``Transcription``.
-        tops: Likewise.
+        hulls: Clearances of the hulls.
+        boundary: Boundary conditions of one motion.
+        obstacle_poses: Poses and sizes of its obstacles, shape (width,).
     """
 
-    def __init__(self, stage: ResidualKernels, grid: Grid, hulls: Hulls, *, boundary: Boundary, tops: Array) -> None:
-        super().__init__(replace(stage, steps=None), grid, boundary=boundary, tops=tops)
+    def __init__(
+        self, kernels: ResidualKernels, grid: Grid, hulls: Hulls, *, boundary: Boundary, obstacle_poses: Array
+    ) -> None:
+        super().__init__(replace(kernels, step_library=None), grid, boundary=boundary, obstacle_poses=obstacle_poses)
         self._hulls = hulls
-        self._near = of_last(lambda w: hulls.near(w[: self.n], tops))
+        self._measure = cache_last(lambda w: hulls.measure(w[: self.n], obstacle_poses))
 
     def measured(self, x: Array) -> tuple[float, Array]:
         """Evaluate the objective and residuals (K, m + columns)."""
         cost, g = super().measured(x)
-        return cost, np.hstack([g, self._near(self._at(x)[0])[0] / DISTANCE])
+        return cost, np.hstack([g, self._measure(self._at(x)[0])[0] / DISTANCE_SCALE_M])
 
-    def evaluate(self, x: Array) -> Linearisation:
+    def evaluate(self, x: Array) -> Linearization:
         """Evaluate objective and residuals with their derivatives."""
         at, (w, _, _) = super().evaluate(x), self._at(x)
-        distances, found = self._near(w)
-        slopes = np.zeros((len(w), len(self._hulls.least), w.shape[1]))
-        slopes[: self.n] = self._hulls.slopes(w[: self.n], distances, found) / DISTANCE
-        jacobian = np.concatenate([at.jacobian, slopes], axis=1)
-        return replace(at, g=np.hstack([at.g, distances / DISTANCE]), jacobian=jacobian)
+        distances, groups = self._measure(w)
+        gradients = np.zeros((len(w), len(self._hulls.min_distances), w.shape[1]))
+        gradients[: self.n] = self._hulls.gradients(w[: self.n], distances, groups) / DISTANCE_SCALE_M
+        jacobian = np.concatenate([at.jacobian, gradients], axis=1)
+        return replace(at, g=np.hstack([at.g, distances / DISTANCE_SCALE_M]), jacobian=jacobian)

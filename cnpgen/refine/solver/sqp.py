@@ -1,16 +1,16 @@
 """Sequential quadratic programming with a trust region, for one motion.
 
-Each step minimises a quadratic model of the objective subject to the linearised residuals. Violated residuals are
-relaxed by one elastic variable: the step may leave the fraction ``beta`` of every violation. The merit function is
-the objective plus a multiple of the worst violation. A proximal term on the step makes the model strictly convex
-where the objective is flat.
+Each step minimizes a quadratic model of the objective subject to the linearized residuals. One elastic variable relaxes
+violated residuals: the step may leave a fraction of every violation. The merit function is the objective plus a
+multiple of the largest violation. A proximal term makes the model strictly convex where the objective is flat.
 
-A merit function alone refuses good steps along a curved manifold, since they leave it by their square (Maratos). So a
-step is also taken for the objective's sake if it violates no more than the width of a funnel, which narrows each time.
+The merit function alone rejects good steps along a curved manifold, since they leave it by their square (the Maratos
+effect). A step that reduces the objective is therefore also accepted within a violation bound, which shrinks each time
+(Gould and Toint, Mathematical Programming 122, 2010).
 
-Along flat directions of the objective steps never become short, and every one of them breaks residuals by its square.
-Once a step has changed the objective by less than the tolerance, and promised no more, a heavy proximal term keeps the
-next ones to what makes the iterate feasible: it lands.
+Along flat directions of the objective steps never become short, and each violates residuals by its square. The
+objective has converged once a step changes it by less than the tolerance, and predicts no more. Then a heavy proximal
+term restricts further steps to the restoration of feasibility.
 """
 
 import time
@@ -20,238 +20,253 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.refine.solver.bounds import Bounds
-from cnpgen.refine.solver.compiled import CompiledSteps
+from cnpgen.refine.solver.compiled_backend import CompiledBackend
 from cnpgen.refine.solver.deadline import Deadline
-from cnpgen.refine.solver.quadratic import Mask, Model, Near, PlainSteps, Step, Steps, crests
+from cnpgen.refine.solver.qp_subproblem import (
+    Backend,
+    Mask,
+    NumpyBackend,
+    ResidualSelection,
+    Step,
+    Subproblem,
+    local_maxima,
+)
 from cnpgen.refine.solver.transcription import Transcription
 
 Array = NDArray[np.float64]
-RATE_SHARE = 1.5  # logarithms of the rate may change by so many trust radii
-LARGEST, SMALLEST = 1.0, 1e-5  # trust radii
-LEAP = 1.5  # the next step may be longer than the last one by this factor
-NEAR = ((0.2, 0.4), (0.05, 0.2), (-1.0, 0.1))  # see ``Settings.near``
-LANDING = 1.0  # weight of the proximal term once the objective has settled: what is left is to become feasible
-BRIEF = 0.2  # s: in shorter motions landing is heavier with the cube of how much; small steps change much in them
-STUCK = 0.9  # a step that leaves more than this fraction of the violations is computed again, with everything relaxed
-HEAVY = 3.0  # times the objective is what violations weigh where repairing them would not pay
-PATIENCE, PROGRESS = 8, 0.9  # an iteration ends where so many steps leave more than this fraction of the violation
-NEARLY = 0.02  # or lands first, where no more than this is violated
-NARROWER, WORTH = 0.7, 0.1  # what is left of the funnel's width each time; share of the promised gain
-LAST_STEPS = 3  # before a deadline land
-SHORTEST = 30.0  # weight of the proximal term in these: nothing but the shortest way to what is feasible counts
-LOOKS = 2  # between the points of the grid that may call for tighter bounds
-ENOUGH, GOOD, POOR = 0.05, 0.7, 0.3  # reduction over prediction from which a step is taken, or the trust radius changes
+RATE_RADIUS_FACTOR = 1.5  # trust radius of the logarithms of the rate, relative to that of the path
+MAX_RADIUS, MIN_RADIUS = 1.0, 1e-5  # of the trust region
+MAX_STEP_GROWTH = 1.5  # expected factor of the length of successive steps
+SELECTION_DISTANCES = ((0.2, 0.4), (0.05, 0.2), (-1.0, 0.1))  # see ``Settings.selection_distances``
+CONVERGED_PROXIMAL = 1.0  # weight of the proximal term once the objective has converged
+SHORT_MOTION_S = 0.2  # in shorter motions that weight grows with the cube of the ratio of durations
+MAX_REMAINING = 0.9  # a step that leaves a larger fraction of the violations is computed again with relaxed residuals
+PENALTY_FACTOR = 3.0  # times the objective: weight of violations where the penalty makes violations profitable
+STALL_STEPS, STALL_FRACTION = 8, 0.9  # stalled: a larger fraction of the violation is left after so many steps
+MAX_RESTORED_VIOLATION = 0.02  # a stalled iteration with a smaller violation restores feasibility before it ends
+BOUND_SHRINKAGE, MIN_GAIN_FRACTION = 0.7, 0.1  # of the violation bound; smallest fraction of the predicted gain
+LAST_STEPS = 3  # before a deadline restore feasibility
+DEADLINE_PROXIMAL = 30.0  # weight of the proximal term in these
+MAX_MIDPOINT_CORRECTIONS = 2  # tightenings of the bounds for violations between grid points
+ACCEPTED_RATIO, GOOD_RATIO, POOR_RATIO = 0.05, 0.7, 0.3  # of reduction to prediction: accept, enlarge, shrink
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How to iterate.
+    """Settings of the iteration.
 
     Attributes:
         max_iterations: Largest number of steps tried.
-        radius: First trust radius, infinity norm [rad and log].
+        radius: Initial trust radius, infinity norm [rad and log].
         proximal: Weight of the proximal term.
-        penalty: First weight of the worst violation in the merit function. To slow down by 1 % costs 1 % of the motion
-            time, so that a motion of more seconds than this gains by breaking its limits; where that holds it grows.
-        funnel: First width of the funnel, a violation.
-        far: A start that violates more is none.
-        cost_tolerance: Relative change of the objective, promised and reached, below which it has settled.
-        near: After steps longer than the first number of a pair, residuals as near as its second one are held.
-        violation_tolerance: Worst scaled violation of a feasible iterate.
-        thin: Of the inactive residuals, those at every thin-th grid point are kept in the model.
+        penalty: Initial weight of the largest violation in the merit function. A motion that is 1 % slower costs 1 % of
+            its duration. Violations are therefore profitable in motions of more seconds than this; there the weight
+            grows.
+        violation_bound: Initial violation up to which steps are accepted for their reduction of the objective.
+        max_initial_violation: Largest violation of a usable initial guess.
+        cost_tolerance: Relative change of the objective, predicted and actual, at which it has converged.
+        selection_distances: Pairs (step length, distance): after a step longer than the first, residuals within the
+            second of a bound are selected.
+        violation_tolerance: Largest scaled violation of a feasible iterate.
+        thinning: Interval of grid points at which inactive residuals are selected.
     """
 
     max_iterations: int = 40
     radius: float = 0.3
     proximal: float = 0.02
     penalty: float = 2.0
-    funnel: float = 0.3
-    far: float = np.inf
+    violation_bound: float = 0.3
+    max_initial_violation: float = np.inf
     cost_tolerance: float = 1e-3
-    near: tuple[tuple[float, float], ...] = NEAR
+    selection_distances: tuple[tuple[float, float], ...] = SELECTION_DISTANCES
     violation_tolerance: float = 6e-4
-    thin: int = 6
+    thinning: int = 6
 
 
-DEFAULT = Settings()
+DEFAULT_SETTINGS = Settings()
 
 
 @dataclass(frozen=True)
 class Result:
-    """Where the iteration ended.
+    """Result of an iteration.
 
     Attributes:
-        x: The last iterate that was accepted.
-        cost: Objective there.
-        violation: Worst scaled violation there.
-        iterations: Steps tried.
-        ended: Whether nothing was left to gain, rather than no step.
+        x: Last accepted iterate.
+        cost: Regularized objective there.
+        violation: Largest scaled violation there.
+        iterations: Number of steps tried.
+        converged: Whether the iteration ended before its limit of steps.
     """
 
     x: Array
     cost: float
     violation: float
     iterations: int
-    ended: bool
+    converged: bool
 
 
-def minimise(
+def minimize(
     motion: Transcription, bounds: Bounds, x: Array, settings: Settings, *, deadline: Deadline | None = None
 ) -> Result:
-    """Minimise from x.
+    """Minimize from x.
 
     Args:
         motion: The transcription.
         bounds: Bounds of its residuals.
-        x: First variables, shape (nx,).
-        settings: How to iterate.
-        deadline: When to be done: the last steps before it land on what is feasible.
+        x: Initial variables, shape (nx,).
+        settings: Settings of the iteration.
+        deadline: Deadline of the iteration; the last steps before it restore feasibility.
     """
-    descent = _Descent(motion, bounds, settings, x)
+    iterate = _Iterate(motion, bounds, settings, x)
     feasible: Result | None = None
     iteration = 0
-    while iteration < settings.max_iterations and not descent.ended and (deadline is None or deadline.allows(1)):
+    while iteration < settings.max_iterations and not iterate.converged and (deadline is None or deadline.allows(1)):
         begun = time.perf_counter()
-        descent.landing = deadline is not None and not deadline.allows(LAST_STEPS)
+        iterate.restoring = deadline is not None and not deadline.allows(LAST_STEPS)
         iteration += 1
-        descent.advance()
+        iterate.advance()
         if deadline is None:
             continue
         deadline.note(begun)
-        feasible = None if descent.tightened else feasible  # bounds hid what lies between the points of the grid
-        if descent.violation < settings.violation_tolerance:
-            feasible = _cheaper(feasible, descent.result(iteration))
-    last = descent.result(iteration)
-    return last if descent.ended or feasible is None else replace(feasible, iterations=iteration)
+        feasible = None if iterate.tightened else feasible  # earlier iterates met the wider bounds only
+        if iterate.violation < settings.violation_tolerance:
+            feasible = _cheaper(feasible, iterate.result(iteration))
+    last = iterate.result(iteration)
+    return last if iterate.converged or feasible is None else replace(feasible, iterations=iteration)
 
 
-def _cheaper(one: Result | None, other: Result) -> Result:
-    return other if one is None or other.cost < one.cost else one
+def _cheaper(best: Result | None, other: Result) -> Result:
+    return other if best is None or other.cost < best.cost else best
 
 
-def steps_of(motion: Transcription, bounds: Bounds, thin: int) -> Steps:
-    """Return the steps of a motion, compiled where its kernels are."""
-    return PlainSteps(motion, bounds, thin) if motion.stage.steps is None else CompiledSteps(motion, bounds, thin)
+def make_backend(motion: Transcription, bounds: Bounds, thinning: int) -> Backend:
+    """Return the backend of a motion: compiled if its kernels are, else NumPy."""
+    compiled = motion.kernels.step_library is not None
+    return CompiledBackend(motion, bounds, thinning) if compiled else NumpyBackend(motion, bounds, thinning)
 
 
-class _Descent:
-    """An iterate and what is known for the next step.
+class _Iterate:
+    """State of the iteration.
 
     Attributes:
-        x: The variables.
-        cost: Objective there.
-        violation: Worst violation there.
-        ended: Whether there is nothing more to gain.
-        landing: Whether all that is still wanted is to become feasible.
-        tightened: Whether the last step made bounds tighter, for residuals outside between the points of the grid.
+        x: Variables.
+        cost: Regularized objective.
+        violation: Largest violation.
+        converged: Whether the iteration has ended.
+        restoring: Whether steps only restore feasibility, before a deadline.
+        tightened: Whether the last step tightened the bounds for violations between grid points.
     """
 
-    landing = False
+    restoring = False
     tightened = False
 
     def __init__(self, motion: Transcription, bounds: Bounds, settings: Settings, x: Array) -> None:
-        self._steps, self._motion, self._looks = steps_of(motion, bounds, settings.thin), motion, LOOKS
+        self._backend, self._motion = make_backend(motion, bounds, settings.thinning), motion
+        self._corrections = MAX_MIDPOINT_CORRECTIONS
         self.x = self._start = x
-        self.cost, self._g, self.violation = self._steps.value(x)
-        self.ended = not self.violation < settings.far
-        # since the start was left, which may violate less than what it leads to, and is only told where it is feasible
+        self.cost, self._g, self.violation = self._backend.value(x)
+        self.converged = not self.violation < settings.max_initial_violation
+        # of iterates after the initial guess, which may violate less than its successors; it counts only if feasible
         self._violations = [self.violation] if self.violation <= settings.violation_tolerance else []
         self._bounds, self._settings = bounds, settings
         self._scale = np.ones(motion.nx)
-        self._scale[motion.split :] = RATE_SHARE
-        self._radius, self._funnel, self._penalty = settings.radius, settings.funnel, settings.penalty
-        self._length = LARGEST  # of the last step, in the same norm
+        self._scale[motion.split :] = RATE_RADIUS_FACTOR
+        self._radius, self._violation_bound, self._penalty = settings.radius, settings.violation_bound, settings.penalty
+        self._step_length = MAX_RADIUS  # of the last step, in the norm of the trust region
         self._multipliers: Array | None = None
-        self._settled = self._creeps = False  # the second: along its limits, which it does not come to meet
-        self._missed = np.zeros(self._g.shape, bool)  # residuals that a rejected step broke unseen
+        self._cost_converged = self._stalled = False
+        self._missed = np.zeros(self._g.shape, bool)  # residuals that a rejected step violated without their selection
 
     def result(self, iterations: int) -> Result:
-        """Return where the iteration is."""
-        return Result(self.x, self.cost, self.violation, iterations, self.ended and not self.landing)
+        """Return the current iterate as a result."""
+        return Result(self.x, self.cost, self.violation, iterations, self.converged and not self.restoring)
 
     def advance(self) -> None:
-        """Try a step: take it, or know better for the next one."""
+        """Try a step, and accept it or adapt the trust region and the selection."""
         settings, self.tightened = self._settings, False
-        proximal = self._landing_weight() if self.landing or self._settled or self._creeps else settings.proximal
-        near = next(near for length, near in settings.near if self._length > length)
-        where = Near(self.violation, near, LEAP * self._length, self._missed, self._multipliers)
-        model = self._steps.model(self.x, self._g, where, proximal=proximal, penalty=self._penalty)
-        step = self._propose(model)
+        restore = self.restoring or self._cost_converged or self._stalled
+        proximal = self._restoration_weight() if restore else settings.proximal
+        distance = next(distance for length, distance in settings.selection_distances if self._step_length > length)
+        change = MAX_STEP_GROWTH * self._step_length
+        selection = ResidualSelection(self.violation, distance, change, self._missed, self._multipliers)
+        subproblem = self._backend.subproblem(self.x, self._g, selection, proximal=proximal, penalty=self._penalty)
+        step = self._propose(subproblem)
         if step is None:
             self._radius *= 0.25
         else:
-            self._try(step, model.held)
+            self._try(step, subproblem.selected)
         if self.x is not self._start:
             self._violations.append(self.violation)
-        if self._is_stuck() and self._penalty < self.cost:  # breaking its limits may pay: it will not
-            self._penalty, self._violations = HEAVY * self.cost, [self.violation]
-        if self._is_stuck() and not self._creeps and self.violation < NEARLY:
-            self._creeps, self._violations = True, [self.violation]
-        self.ended |= self._radius < SMALLEST or self._is_stuck()
+        if self._is_stuck() and self._penalty < self.cost:  # violations may be profitable
+            self._penalty, self._violations = PENALTY_FACTOR * self.cost, [self.violation]
+        if self._is_stuck() and not self._stalled and self.violation < MAX_RESTORED_VIOLATION:
+            self._stalled, self._violations = True, [self.violation]
+        self.converged |= self._radius < MIN_RADIUS or self._is_stuck()
 
-    def _landing_weight(self) -> float:
-        brief = max(BRIEF / self._motion.duration(np.exp(self.x[self._motion.split :])), 1.0)
-        return (SHORTEST if self.landing else LANDING) * brief**3
+    def _restoration_weight(self) -> float:
+        ratio = max(SHORT_MOTION_S / self._motion.duration(np.exp(self.x[self._motion.split :])), 1.0)
+        return (DEADLINE_PROXIMAL if self.restoring else CONVERGED_PROXIMAL) * ratio**3
 
     def _is_stuck(self) -> bool:
-        """Whether it was never feasible, and the least violation hardly falls any more."""
-        before, recent = self._violations[:-PATIENCE], self._violations[-PATIENCE:]
-        least, enough = min(before, default=0.0), self._settings.violation_tolerance
-        return least > enough and min(recent) > max(PROGRESS * least, enough)
+        """Return whether no iterate was feasible and the smallest violation hardly decreases any more."""
+        before, recent = self._violations[:-STALL_STEPS], self._violations[-STALL_STEPS:]
+        smallest, tolerance = min(before, default=0.0), self._settings.violation_tolerance
+        return smallest > tolerance and min(recent) > max(STALL_FRACTION * smallest, tolerance)
 
-    def _propose(self, model: Model) -> Step | None:
-        """Solve the quadratic programme, again in other ways where that helps little."""
+    def _propose(self, subproblem: Subproblem) -> Step | None:
+        """Solve the subproblem; solve it again, relaxed or without warm start, if the step is of little use."""
         box = self._radius * self._scale
-        step = model.solve(box, warm=self._multipliers)
-        if self.violation > self._settings.violation_tolerance and (step is None or step.left > STUCK):
-            relaxed = model.solve(box, relax=True)
-            if relaxed is not None and relaxed.left > STUCK and self._penalty < self.cost:
-                self._penalty = HEAVY * self.cost
+        step = subproblem.solve(box, warm=self._multipliers)
+        if self.violation > self._settings.violation_tolerance and (step is None or step.remaining > MAX_REMAINING):
+            relaxed = subproblem.solve(box, relax=True)
+            if relaxed is not None and relaxed.remaining > MAX_REMAINING and self._penalty < self.cost:
+                self._penalty = PENALTY_FACTOR * self.cost
             return relaxed or step
         if step is None and self._multipliers is not None:
-            return model.solve(box)
+            return subproblem.solve(box)
         return step
 
-    def _try(self, step: Step, held: Mask) -> None:
-        """Take a step if it holds what it promised."""
+    def _try(self, step: Step, selected: Mask) -> None:
+        """Accept a step if its reduction agrees with the prediction."""
         settings = self._settings
         x = self.x + step.dx
-        cost, g, violation = self._steps.value(x)
+        cost, g, violation = self._backend.value(x)
         gain = step.gain
-        predicted = gain + self._penalty * self.violation * (1 - step.left)
+        predicted = gain + self._penalty * self.violation * (1 - step.remaining)
         reduction = self.cost - cost + self._penalty * (self.violation - violation)
-        cheaper = violation <= self._funnel and self.cost - cost > WORTH * gain > 0
+        within_bound = violation <= self._violation_bound and self.cost - cost > MIN_GAIN_FRACTION * gain > 0
         size = float(np.abs(step.dx / self._scale).max())
         self._multipliers = step.multipliers
-        if np.isfinite(reduction) and (cheaper or reduction > ENOUGH * predicted):
-            if reduction <= ENOUGH * predicted:
-                self._funnel *= NARROWER
-            if cheaper or reduction > GOOD * predicted:
-                self._radius = min(2.5 * self._radius, LARGEST) if size > 0.8 * self._radius else self._radius
-            elif reduction < POOR * predicted:
+        if np.isfinite(reduction) and (within_bound or reduction > ACCEPTED_RATIO * predicted):
+            if reduction <= ACCEPTED_RATIO * predicted:
+                self._violation_bound *= BOUND_SHRINKAGE
+            if within_bound or reduction > GOOD_RATIO * predicted:
+                self._radius = min(2.5 * self._radius, MAX_RADIUS) if size > 0.8 * self._radius else self._radius
+            elif reduction < POOR_RATIO * predicted:
                 self._radius *= 0.5
-            self._settled = max(abs(self.cost - cost), abs(gain)) < settings.cost_tolerance * cost
-            self.ended = (self._settled or self._creeps or self.landing) and violation < settings.violation_tolerance
-            self.x, self.cost, self._g, self.violation, self._length = x, cost, g, violation, size
+            self._cost_converged = max(abs(self.cost - cost), abs(gain)) < settings.cost_tolerance * cost
+            restored = self._cost_converged or self._stalled or self.restoring
+            self.converged = restored and violation < settings.violation_tolerance
+            self.x, self.cost, self._g, self.violation, self._step_length = x, cost, g, violation, size
             self._missed[:] = False
-            if self.ended and not self.landing and self._looks:
-                self._look_between()
+            if self.converged and not self.restoring and self._corrections:
+                self._check_midpoints()
         else:
-            self._learn(self._bounds.excess(g), held, size)
+            self._reject(self._bounds.violations(g), selected, size)
 
-    def _look_between(self) -> None:
-        """Go on within tighter bounds where residuals are too far outside between the points of the grid."""
-        tighter = self._bounds.tightened(self._g, self._motion.grid.midway)
+    def _check_midpoints(self) -> None:
+        """Continue within tighter bounds if residuals violate them between grid points."""
+        tighter = self._bounds.tightened(self._g, self._motion.grid.midpoint_weights)
         if tighter is None:
             return
-        self.ended, self.tightened, self._looks, self._bounds = False, True, self._looks - 1, tighter
-        self._steps = steps_of(self._motion, tighter, self._settings.thin)
-        self.violation = tighter.violation(self._g)
+        self.converged, self.tightened, self._corrections, self._bounds = False, True, self._corrections - 1, tighter
+        self._backend = make_backend(self._motion, tighter, self._settings.thinning)
+        self.violation = tighter.max_violation(self._g)
 
-    def _learn(self, excess: Array, held: Mask, size: float) -> None:
-        """Hold what a refused step broke unseen; make the next one shorter unless that was the worst of it."""
-        broken = excess > self._settings.violation_tolerance
-        unseen = crests(excess, thin=self._settings.thin) & broken & ~held
-        self._missed |= unseen
-        if not (unseen.any() and excess[unseen].max() >= excess.max()):
+    def _reject(self, violations: Array, selected: Mask, size: float) -> None:
+        """Select the residuals that a rejected step violated; shrink the radius unless they explain the rejection."""
+        violated = violations > self._settings.violation_tolerance
+        missed = local_maxima(violations, thinning=self._settings.thinning) & violated & ~selected
+        self._missed |= missed
+        if not (missed.any() and violations[missed].max() >= violations.max()):
             self._radius = 0.35 * min(self._radius, size)

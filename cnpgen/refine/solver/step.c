@@ -1,10 +1,10 @@
-/* One step of the sequential quadratic programme of one motion: what transcription.py and quadratic.py say in NumPy,
-over the same compiled kernels.
+/* One step of the sequential quadratic programming of one motion: the compiled form of transcription.py and
+qp_subproblem.py, over the same compiled kernels.
 
-Arrays are of doubles, the last index runs fastest. K grid points, m residuals, C path and R rate control points, n
-joints, nx variables; w = (p, p', ..., r, r', ...) of `width` components. nearest.c comes first. */
+Arrays are of doubles; the last index is contiguous. K grid points, m residuals, C path and R rate control points, n
+joints, nx variables; w = (p, p', ..., r, r', ...) of `width` components. Requires active_set.c. */
 
-#define TILE 8 /* grid points whose Jacobians are computed at a time: they stay in the fastest cache */
+#define TILE 8 /* grid points whose Jacobians are computed at once: they fit in the L1 cache */
 
 typedef void kernel(long, const double *const *, const long *, double *const *);
 
@@ -12,40 +12,41 @@ typedef struct { /* a spline basis at some phases: three or four orders of the p
   long orders, points;
   const double *path, *rate;         /* (orders, C, points), (orders - 1, R, points) */
   const double *path_at, *rate_at;   /* (points, C, orders), (points, orders - 1, R) */
-  const long *path_from, *rate_from; /* the first of the `support` control points that count at a phase, (points,) */
+  const long *path_from, *rate_from; /* first of the `support` control points of a phase, (points,) */
 } bases;
 
 typedef struct {
-  long n, path, rate, support, fixed, nx, stride, m, gauss, criteria, thin; /* stride: of rows of nx + 1, see below */
-  bases grid, nodes;
-  kernel *values, *jacobian, *criterion;
-  const double *start_q, *start_dq, *start_ddq, *goal_q, *goal_dq, *goal_ddq; /* (n,); goal_ddq may be missing */
-  const double *top;                    /* (numbers, K) */
-  const double *quadrature, *weights;   /* basis of r at the nodes of the time integral (gauss, R), their weights */
-  const double *criterion_weights;      /* (nodes.points,), times the criterion's weight */
-  const double *smooth;                 /* (R, R) */
-  const double *lower, *upper;          /* (m, K) */
-  const unsigned char *sharp;           /* (m, K) */
-  const unsigned char *accelerated;     /* (m,) */
-  double *control, *rates, *slope, *w;  /* (C, n), (R,), (6, padded n) with zeros, (width, K) */
-  double *gradient, *hessian, *factor;  /* (nx,); above and below the diagonal, (nx, stride) each */
+  long n, path, rate, support, fixed, nx, stride, m; /* stride: of rows of nx + 1 */
+  long n_time_nodes, n_cost_residuals, thinning;
+  bases grid, cost_bases;
+  kernel *values, *jacobian, *cost_residuals;
+  const double *start_q, *start_dq, *start_ddq, *goal_q, *goal_dq, *goal_ddq; /* (n,); goal_ddq may be NULL */
+  const double *obstacle_poses;             /* (width, K) */
+  const double *time_basis, *time_weights;  /* basis of r at the nodes of the time integral (nodes, R), their weights */
+  const double *cost_weights;               /* (cost_bases.points,), times the weight of the cost term */
+  const double *smoothing;                  /* (R, R) */
+  const double *lower, *upper;              /* (m, K) */
+  const unsigned char *nonsmooth;           /* (m, K) */
+  const unsigned char *accelerated;         /* (m,) */
+  double *control, *rates, *derivative, *w; /* (C, n), (R,), (6, padded n) with zeros, (width, K) */
+  double *gradient, *hessian, *factor;      /* (nx,); above and below the diagonal, (nx, stride) each */
   double *scratch;
-  int *where, *first; /* row nx + 1 + j is of residual i at point k: where[j] = i K + k; room for as many */
-  polyhedron programme; /* of the box, (nx,), the elastic variable, and the held residuals */
-  double eta, beta, rate_eta, rounded, violation, gain, left;
-  long point[6], variable[6], slopes, held;
+  int *index, *initial; /* row nx + 1 + j is of residual i at point k: index[j] = i K + k; memory for as many */
+  polyhedron program;   /* of the box, (nx,), the elastic variable, and the selected residuals */
+  double eta, beta, rate_eta, cost_smoothing, violation, gain, remaining;
+  long point[6], variable[6], n_derivatives, n_selected;
 } motion;
 
 /* ---- The motion of variables x: control points, states, objective (Transcription) ---- */
 
-/* The control points at an end, from its state, and how they move with the rate (trajectory/boundary.py, slopes.py). */
+/* Control points at an end, from its state, and their derivatives (trajectory/boundary.py, boundary_derivatives.py). */
 static void end(motion *s, const double *q, const double *dq, const double *ddq, double sign, long last, long step) {
   long inner = last + step, edge = step > 0 ? 0 : s->path - 1;
   double r = s->rates[last], eta = s->eta;
   double rise = ddq ? s->rate_eta * (s->rates[inner] - r) : 0;
   double *c = s->control + edge * s->n, *c1 = c + step * s->n, *c2 = c1 + step * s->n;
   long wide = padded(s->n);
-  double *d = s->slope + s->slopes * wide;
+  double *d = s->derivative + s->n_derivatives * wide;
   EACH(j, 0, s->n) {
     double v0 = sign * dq[j], first = v0 / r, d1 = -v0 / (r * r * eta);
     c[j] = q[j];
@@ -58,8 +59,8 @@ static void end(motion *s, const double *q, const double *dq, const double *ddq,
     }
   }
   EACH(i, 0, ddq ? 3 : 1) {
-    s->point[s->slopes] = edge + (i ? 2 : 1) * step;
-    s->variable[s->slopes++] = i == 2 ? inner : last;
+    s->point[s->n_derivatives] = edge + (i ? 2 : 1) * step;
+    s->variable[s->n_derivatives++] = i == 2 ? inner : last;
   }
 }
 
@@ -67,8 +68,8 @@ static void unpack(motion *s, const double *x) {
   long split = s->nx - s->rate;
   EACH(i, 0, s->rate) s->rates[i] = exp(x[split + i]);
   memcpy(s->control + 3 * s->n, x, split * sizeof(double));
-  s->slopes = 0;
-  memset(s->slope, 0, 6 * padded(s->n) * sizeof(double));
+  s->n_derivatives = 0;
+  memset(s->derivative, 0, 6 * padded(s->n) * sizeof(double));
   end(s, s->start_q, s->start_dq, s->start_ddq, 1, 0, 1);
   end(s, s->goal_q, s->goal_dq, s->goal_ddq, -1, s->rate - 1, -1);
 }
@@ -82,7 +83,7 @@ static void states(const motion *s, const bases *b, double *w) {
     add(w + (b->orders * n + o) * points, s->rates[c], b->rate + (o * s->rate + c) * points, points);
 }
 
-/* Take the gradient in w of residual i at phase k out of a Jacobian: joints (orders, padded n), then rates. */
+/* Gather the gradient in w of residual i at phase k from a Jacobian: joints (orders, padded n), then rates. */
 static void gather(const motion *s, long orders, const double *jacobian, long count, long i, long points, long k,
                    double *J) {
   long n = s->n, stride = padded(n);
@@ -94,8 +95,8 @@ I const double *rate_at(const motion *s, const bases *b, long k, long order) {
   return b->rate_at + (k * (b->orders - 1) + order) * s->rate;
 }
 
-/* Gradient in the variables of a function whose gradient in w, at phase k, is J, padded with zeros, so that what is
-written behind a control point is 0; `row` has room for W more. */
+/* Gradient in the variables of a function with gradient J in w at phase k. J is padded with zeros, so that numbers
+written after a control point are 0; `row` has memory for W more. */
 static void chain(const motion *s, const bases *b, long k, const double *J, double *restrict row) {
   long n = s->n, orders = b->orders, split = s->nx - s->rate, stride = padded(n);
   long first = b->path_from[k], behind = first + s->support, from = b->rate_from[k];
@@ -111,16 +112,16 @@ static void chain(const motion *s, const bases *b, long k, const double *J, doub
   }
   EACH(o, 0, orders - 1) add(row + split + from, J[orders * stride + o], rate_at(s, b, k, o) + from, s->support);
   EACH(i, from, from + s->support) row[split + i] *= s->rates[i];
-  EACH(e, 0, s->slopes) {
+  EACH(e, 0, s->n_derivatives) {
     long c = s->point[e] < 3 ? s->point[e] : s->point[e] - s->fixed + 3;
     if (s->point[e] < first || s->point[e] >= behind) continue;
     v x = K(0);
-    for (long j = 0; j < n; j += W) x += at(ends + c * stride + j) * at(s->slope + e * stride + j);
+    for (long j = 0; j < n; j += W) x += at(ends + c * stride + j) * at(s->derivative + e * stride + j);
     row[split + s->variable[e]] += sum(x) * s->rates[s->variable[e]];
   }
 }
 
-/* Add the products of rows with each other, of their first `size` numbers, to the upper triangle of a matrix. */
+/* Add the Gram matrix of the first `size` numbers of rows to the upper triangle of a matrix. */
 static void gram(const double *rows, long stride, long count, long size, double *matrix, long wide) {
   for (long j = 0; j < size; j += 4) for (long l = j / W * W; l < size; l += 2 * W) {
     v x[4] = {K(0), K(0), K(0), K(0)}, y[4] = {K(0), K(0), K(0), K(0)};
@@ -136,97 +137,100 @@ static void gram(const double *rows, long stride, long count, long size, double 
   }
 }
 
-/* The criterion's integral; its gradient and Gauss-Newton Hessian are added where they are wanted. */
-static double criterion(motion *s, int derivatives) {
-  const bases *b = &s->nodes;
-  long n = s->n, width = b->orders * n + b->orders - 1, count = s->criteria, points = b->points;
+/* Integral of the cost term; adds its gradient and Gauss-Newton Hessian if `derivatives`. */
+static double cost_term(motion *s, int derivatives) {
+  const bases *b = &s->cost_bases;
+  long n = s->n, width = b->orders * n + b->orders - 1, count = s->n_cost_residuals, points = b->points;
   long nx = s->nx, stride = s->stride;
   double *w = s->scratch, *e = w + width * points, *jacobian = e + count * points;
-  double *pull = jacobian + width * count * points, *rows = pull + count * points, *gradient = rows;
+  double *weighted = jacobian + width * count * points, *rows = weighted + count * points, *gradient = rows;
   double J[width + b->orders * W], cost = 0;
   memset(J, 0, sizeof J);
   states(s, b, w);
-  s->criterion(points, (const double *const[]){w}, &points, (double *const[]){e, jacobian});
+  s->cost_residuals(points, (const double *const[]){w}, &points, (double *const[]){e, jacobian});
   EACH(k, 0, points) {
-    double squares = 0, r = w[b->orders * n * points + k], share = s->criterion_weights[k] / r;
+    double squares = 0, r = w[b->orders * n * points + k], weight = s->cost_weights[k] / r;
     EACH(i, 0, count) squares += e[i * points + k] * e[i * points + k];
-    double size = sqrt(squares + s->rounded * s->rounded);
-    double rho = s->rounded > 0 ? size - s->rounded : squares, root = sqrt(share * (s->rounded > 0 ? 1 / size : 2));
-    cost += share * rho;
+    double size = sqrt(squares + s->cost_smoothing * s->cost_smoothing);
+    double rho = s->cost_smoothing > 0 ? size - s->cost_smoothing : squares;
+    double root = sqrt(weight * (s->cost_smoothing > 0 ? 1 / size : 2));
+    cost += weight * rho;
     if (!derivatives) continue;
     EACH(i, 0, s->rate)
-      s->gradient[nx - s->rate + i] -= share * rho / r * rate_at(s, b, k, 0)[i] * s->rates[i];
+      s->gradient[nx - s->rate + i] -= weight * rho / r * rate_at(s, b, k, 0)[i] * s->rates[i];
     EACH(i, 0, count) {
       gather(s, b->orders, jacobian, count, i, points, k, J);
       for (long j = 0; j < b->orders * padded(n) + b->orders - 1; j++) J[j] *= root;
       chain(s, b, k, J, gradient);
-      pull[k * count + i] = root * e[i * points + k];
+      weighted[k * count + i] = root * e[i * points + k];
       gradient += stride;
     }
   }
   if (!derivatives) return cost;
   gram(rows, stride, count * points, nx, s->hessian, stride);
-  combine(rows, stride, count * points, pull, nx, gradient);
+  combine(rows, stride, count * points, weighted, nx, gradient);
   add(s->gradient, 1, gradient, nx);
   return cost;
 }
 
-/* The time and what fixes the gauge; their gradient and curvature are set where they are wanted. */
+/* Duration and regularization; sets their gradient and curvature if `derivatives`. */
 static double duration(motion *s, const double *log, int derivatives) {
   long nx = s->nx, split = nx - s->rate, stride = s->stride, wide = padded(s->rate);
-  double cost = 0, *pull = s->scratch, *rows = pull + s->gauss, *gradient = rows + s->gauss * wide;
+  double cost = 0, *weighted = s->scratch, *rows = weighted + s->n_time_nodes;
+  double *gradient = rows + s->n_time_nodes * wide;
   EACH(i, 0, s->rate) {
-    double slope = dot(s->smooth + i * s->rate, log, s->rate);
-    cost += 0.5 * log[i] * slope;
+    double derivative = dot(s->smoothing + i * s->rate, log, s->rate);
+    cost += 0.5 * log[i] * derivative;
     if (!derivatives) continue;
-    s->gradient[split + i] = slope;
-    memcpy(s->hessian + (split + i) * stride + split, s->smooth + i * s->rate, s->rate * sizeof(double));
+    s->gradient[split + i] = derivative;
+    memcpy(s->hessian + (split + i) * stride + split, s->smoothing + i * s->rate, s->rate * sizeof(double));
   }
-  EACH(q, 0, s->gauss) {
-    const double *basis = s->quadrature + q * s->rate;
-    double inverse = 1 / dot(basis, s->rates, s->rate), weight = s->weights[q] * inverse;
+  EACH(q, 0, s->n_time_nodes) {
+    const double *basis = s->time_basis + q * s->rate;
+    double inverse = 1 / dot(basis, s->rates, s->rate), weight = s->time_weights[q] * inverse;
     cost += weight;
     if (!derivatives) continue;
     double root = inverse * sqrt(2 * weight);
     EACH(i, 0, s->rate) rows[q * wide + i] = root * basis[i] * s->rates[i];
-    pull[q] = -weight * inverse / root;
+    weighted[q] = -weight * inverse / root;
   }
   if (!derivatives) return cost;
-  gram(rows, wide, s->gauss, s->rate, s->hessian + split * stride + split, stride);
-  combine(rows, wide, s->gauss, pull, s->rate, gradient);
+  gram(rows, wide, s->n_time_nodes, s->rate, s->hessian + split * stride + split, stride);
+  combine(rows, wide, s->n_time_nodes, weighted, s->rate, gradient);
   add(s->gradient + split, 1, gradient, s->rate);
   return cost;
 }
 
-/* How far outside a residual is: number i of those at all points. */
-I double outside(const motion *s, const double *g, long i) {
+/* Violation by residual number i of those at all points. */
+I double residual_violation(const motion *s, const double *g, long i) {
   double over = g[i] - s->upper[i], under = s->lower[i] - g[i];
   return over > under ? over : under;
 }
 
-static double worst(const motion *s, const double *g) {
-  double found = 0;
+static double max_violation(const motion *s, const double *g) {
+  double worst = 0;
   EACH(i, 0, s->m * s->grid.points) {
-    double excess = outside(s, g, i);
-    if (excess != excess) return INFINITY;
-    if (excess > found) found = excess;
+    double violation = residual_violation(s, g, i);
+    if (violation != violation) return INFINITY;
+    if (violation > worst) worst = violation;
   }
-  return found;
+  return worst;
 }
 
-/* Residuals (m, K) and the objective of variables x; the worst violation is left in `violation`. */
-double look(motion *s, const double *x, double *g) {
+/* Residuals (m, K) and the objective of variables x; sets `violation` to the largest violation. */
+double evaluate(motion *s, const double *x, double *g) {
   unpack(s, x);
   states(s, &s->grid, s->w);
   long points = s->grid.points, ld[2] = {points, points};
-  s->values(points, (const double *const[]){s->w, s->top}, ld, (double *const[]){g});
-  s->violation = worst(s, g);
-  return duration(s, x + s->nx - s->rate, 0) + (s->criterion ? criterion(s, 0) : 0);
+  s->values(points, (const double *const[]){s->w, s->obstacle_poses}, ld, (double *const[]){g});
+  s->violation = max_violation(s, g);
+  return duration(s, x + s->nx - s->rate, 0) + (s->cost_residuals ? cost_term(s, 0) : 0);
 }
 
-/* ---- The quadratic model there (choose and QuadraticModel) ---- */
+/* ---- Quadratic subproblem (select_residuals and NumpySubproblem) ---- */
 
-/* Factor the Hessian with the proximal term, diagonal inverted: dividing rows by it gives variables where it is 1. */
+/* Factor the Hessian with the proximal term, with inverted diagonal. Rows divided by the factor are those of variables
+with unit Hessian. */
 static int factor(motion *s, double proximal) {
   long nx = s->nx, stride = s->stride;
   EACH(k, 0, nx) {
@@ -241,7 +245,7 @@ static int factor(motion *s, double proximal) {
   return 1;
 }
 
-/* Divide B rows side by side, (nx, B), by the factor; their first `from` entries are 0. */
+/* Divide a block of B rows, (nx, B), by the factor; their first `from` entries are 0. */
 static void whiten(const motion *s, double *block, long from) {
   for (long i = from; i < s->nx; i += 2) {
     const double *row = s->factor + i * s->stride, *other = row + (i + 1 < s->nx ? s->stride : 0);
@@ -260,152 +264,157 @@ static void whiten(const motion *s, double *block, long from) {
 }
 
 static double largest(const double *a, long n) {
-  double found = -INFINITY, lanes[W];
-  v most = K(-INFINITY);
+  double result = -INFINITY, lanes[W];
+  v maxima = K(-INFINITY);
   long i = 0;
-  for (; i + W <= n; i += W) most = vmax(most, at(a + i));
-  put(lanes, most);
-  for (; i < n; i++) found = a[i] > found ? a[i] : found;
-  EACH(l, 0, W) found = lanes[l] > found ? lanes[l] : found;
-  return found;
+  for (; i + W <= n; i += W) maxima = vmax(maxima, at(a + i));
+  put(lanes, maxima);
+  for (; i < n; i++) result = a[i] > result ? a[i] : result;
+  EACH(l, 0, W) result = lanes[l] > result ? lanes[l] : result;
+  return result;
 }
 
 static int any(const unsigned char *a, const unsigned char *b, long n) {
-  int found = 0;
-  EACH(i, 0, n) found |= a[i] | b[i];
-  return found;
+  int result = 0;
+  EACH(i, 0, n) result |= a[i] | b[i];
+  return result;
 }
 
-/* Mark crests along the motion, what is beside them, and the thin grid, where they are nearer than `near`. */
-static void crest(const motion *s, const double *excess, double near, unsigned char *wide) {
+/* Mark local maxima along the motion, their neighbors and the thinned grid, within `distance` of a bound. */
+static void mark_maxima(const motion *s, const double *violations, double distance, unsigned char *mask) {
   long points = s->grid.points;
   unsigned char peak[points + 2];
-  memset(wide, 0, points);
-  if (!(largest(excess, points) > -near)) return;
+  memset(mask, 0, points);
+  if (!(largest(violations, points) > -distance)) return;
   memset(peak, 1, points + 2);
-  EACH(k, 1, points) peak[k + 1] = excess[k] >= excess[k - 1];
-  EACH(k, 0, points - 1) peak[k + 1] &= excess[k] >= excess[k + 1];
+  EACH(k, 1, points) peak[k + 1] = violations[k] >= violations[k - 1];
+  EACH(k, 0, points - 1) peak[k + 1] &= violations[k] >= violations[k + 1];
   peak[0] = peak[points + 1] = 0;
-  EACH(k, 0, points) wide[k] = (peak[k] | peak[k + 1] | peak[k + 2]) & (excess[k] > -near);
-  for (long k = 0; k < points; k += s->thin) wide[k] = excess[k] > -near;
+  EACH(k, 0, points) mask[k] = (peak[k] | peak[k + 1] | peak[k + 2]) & (violations[k] > -distance);
+  for (long k = 0; k < points; k += s->thinning) mask[k] = violations[k] > -distance;
 }
 
-static double leap(const motion *s, long k, const double *J, double step) {
+static double linearization_error(const motion *s, long k, const double *J, double step) {
   const bases *b = &s->grid;
-  double reach = 0;
+  double error = 0;
   EACH(o, 1, b->orders - 1) {
     double change = 0;
     EACH(i, 0, s->rate) change += fabs(rate_at(s, b, k, o)[i]) * s->rates[i];
-    reach += fabs(J[b->orders * padded(s->n) + o]) * change * step;
+    error += fabs(J[b->orders * padded(s->n) + o]) * change * step;
   }
-  return reach;
+  return error;
 }
 
-/* Evaluate the motion at x, and gradient and factor of its objective. 0: the Hessian is not positive. */
+/* Evaluate the motion at x, and gradient and factor of its objective; return 0 if the Hessian is not positive. */
 static int objective(motion *s, const double *x, double proximal) {
   unpack(s, x);
   states(s, &s->grid, s->w);
   memset(s->gradient, 0, s->nx * sizeof(double));
   memset(s->hessian, 0, s->nx * s->stride * sizeof(double));
   duration(s, x + s->nx - s->rate, 1);
-  if (s->criterion) criterion(s, 1);
+  if (s->cost_residuals) cost_term(s, 1);
   return factor(s, proximal);
 }
 
-/* How many numbers of a row of the programme are certainly 0 before the first that may be another. */
-static long leading(const motion *s, long row) {
+/* Number of leading zeros of a row of the program. */
+static long leading_zeros(const motion *s, long row) {
   if (row <= s->nx) return row;
-  long zeros = (s->grid.path_from[s->where[row - s->nx - 1] % s->grid.points] - 3) * s->n;
+  long zeros = (s->grid.path_from[s->index[row - s->nx - 1] % s->grid.points] - 3) * s->n;
   return zeros > 0 ? zeros : 0;
 }
 
-/* Lay out the model at x, whose residuals are g: those are held that are nearer to a bound than `near`, or than
-`others` where no acceleration is in them and that is less, that may leap over it with a step of `step`, that were
-`missed`, or that had multipliers; `held` says which. */
-void model(motion *s, const double *x, const double *g, double proximal, double near, double others, double step,
-           const unsigned char *missed, const double *multipliers, unsigned char *held) {
+/* Build the subproblem at x with residuals g. Selected are the residuals within `distance` of a bound, or within
+`speed_distance` if it is smaller and they do not depend on accelerations; those that may cross a bound if no log r
+changes by more than `step`; those in `missed`, and those with multipliers. `selected` returns the mask. */
+void build_subproblem(motion *s, const double *x, const double *g, double proximal, double distance,
+                      double speed_distance, double step, const unsigned char *missed,
+                      const double *multipliers, unsigned char *selected) {
   long nx = s->nx, points = s->grid.points, width = s->grid.orders * s->n + s->grid.orders - 1, m = s->m;
-  polyhedron *p = &s->programme;
+  polyhedron *p = &s->program;
   if (!(p->count = objective(s, x, proximal))) return;
-  double *excess = s->scratch, *values = excess + m * points, *jacobian = values + m * TILE;
+  double *violations = s->scratch, *values = violations + m * points, *jacobian = values + m * TILE;
   double *row = jacobian + width * m * TILE, J[width + s->grid.orders * W];
   memset(J, 0, sizeof J);
-  EACH(i, 0, m * points) excess[i] = outside(s, g, i);
-  EACH(i, 0, m)
-    crest(s, excess + i * points, s->accelerated[i] || near < others ? near : others, held + i * points);
-  EACH(i, 0, m * points) held[i] |= missed[i];
-  if (multipliers) EACH(i, 0, m * points) held[i] |= multipliers[i] != 0;
+  EACH(i, 0, m * points) violations[i] = residual_violation(s, g, i);
+  EACH(i, 0, m) {
+    double limit = s->accelerated[i] || distance < speed_distance ? distance : speed_distance;
+    mark_maxima(s, violations + i * points, limit, selected + i * points);
+  }
+  EACH(i, 0, m * points) selected[i] |= missed[i];
+  if (multipliers) EACH(i, 0, m * points) selected[i] |= multipliers[i] != 0;
 
   long count = nx + 1;
   memset(p->rows, 0, (count + B) / B * count * B * sizeof(double));
   EACH(i, 0, nx) *entry(p, i, i) = 1;
   for (long first = 0; first < points; first += TILE) {
     long tile = points - first < TILE ? points - first : TILE, ld[2] = {points, points};
-    s->jacobian(tile, (const double *const[]){s->w + first, s->top + first}, ld, (double *const[]){values, jacobian});
-    EACH(i, 0, m) if (any(held + i * points + first, s->sharp + i * points + first, tile)) EACH(t, 0, tile) {
+    const double *const inputs[] = {s->w + first, s->obstacle_poses + first};
+    s->jacobian(tile, inputs, ld, (double *const[]){values, jacobian});
+    EACH(i, 0, m) if (any(selected + i * points + first, s->nonsmooth + i * points + first, tile)) EACH(t, 0, tile) {
       long k = first + t, number = i * points + k;
-      if (!held[number] && !s->sharp[number]) continue;
+      if (!selected[number] && !s->nonsmooth[number]) continue;
       gather(s, s->grid.orders, jacobian, m, i, tile, t, J);
-      if (!held[number] && !(excess[number] > -leap(s, k, J, step))) continue;
-      held[number] = 1;
-      s->where[count - nx - 1] = number;
+      if (!selected[number] && !(violations[number] > -linearization_error(s, k, J, step))) continue;
+      selected[number] = 1;
+      s->index[count - nx - 1] = number;
       chain(s, &s->grid, k, J, row);
       if (count % B == 0) memset(entry(p, count, 0), 0, (nx + 1) * B * sizeof(double));
       EACH(j, 0, nx) *entry(p, count, j) = row[j];
       count++;
     }
   }
-  s->held = count - nx - 1, p->count = count;
+  s->n_selected = count - nx - 1, p->count = count;
   for (long block = 0; block * B < count; block++) {
-    p->begin[block] = nx;
+    p->leading_zeros[block] = nx;
     EACH(row, block * B, (block + 1) * B < count ? (block + 1) * B : count) {
-      long begin = leading(s, row);
-      if (begin < p->begin[block]) p->begin[block] = begin;
+      long zeros = leading_zeros(s, row);
+      if (zeros < p->leading_zeros[block]) p->leading_zeros[block] = zeros;
     }
-    whiten(s, entry(p, block * B, 0), p->begin[block]);
+    whiten(s, entry(p, block * B, 0), p->leading_zeros[block]);
   }
 }
 
-/* How far the rows may go, and what the elastic variable adds to them. */
-static void bound(motion *s, const double *g, const double *box, double softness, int relax) {
+/* Bounds of the rows and their coefficients of the elastic variable. */
+static void bound(motion *s, const double *g, const double *box, double curvature_root, int relax) {
   long dim = s->nx + 1;
-  const polyhedron *p = &s->programme;
+  const polyhedron *p = &s->program;
   EACH(i, 0, s->nx) p->high[i] = box[i], p->low[i] = -box[i];
-  *entry(p, s->nx, s->nx) = 1 / softness, p->low[s->nx] = 0, p->high[s->nx] = 1;
-  EACH(i, 0, s->held) {
-    long at = s->where[i];
+  *entry(p, s->nx, s->nx) = 1 / curvature_root, p->low[s->nx] = 0, p->high[s->nx] = 1;
+  EACH(i, 0, s->n_selected) {
+    long at = s->index[i];
     double rise = s->upper[at] - g[at], fall = s->lower[at] - g[at], above = rise < 0, below = fall > 0, elastic;
     if (relax) above = rise < -fall, below = !above, elastic = above ? -s->violation : s->violation;
     else elastic = above ? rise : below ? fall : 0;
     p->high[dim + i] = below ? INFINITY : rise;
     p->low[dim + i] = above ? -INFINITY : fall;
-    *entry(p, dim + i, s->nx) = elastic / softness;
+    *entry(p, dim + i, s->nx) = elastic / curvature_root;
   }
 }
 
-/* Solve the programme that `model` has laid out; 0 where there is none, it has no solution, or not in so many changes.
+/* Solve the program of `build_subproblem`; return 0 without a solution within so many working-set changes.
 
-The step is within the box, (nx,), and costs `slope` times the share of the violations that it leaves, which all rows
-may use if `relax`. `before` are multipliers, (m, K), of rows to be active at first, if they are more than `least`;
-`multipliers` are those of the solution. */
-int solve(motion *s, const double *g, const double *box, double slope, double softness, int relax, const double *before,
-          double least, double feasible, int changes, double *dx, double *multipliers) {
+The step is within the box, (nx,), and costs `penalty` times the fraction of the violations that remains; all rows may
+use that fraction if `relax`. `before` are multipliers, (m, K); rows with larger ones than `threshold` are initially
+active. `multipliers` are those of the solution. */
+int solve_subproblem(motion *s, const double *g, const double *box, double penalty, double curvature_root, int relax,
+                     const double *before, double threshold, double feasible, int changes, double *dx,
+                     double *multipliers) {
   long nx = s->nx, dim = nx + 1, stride = s->stride, count = 0;
-  double f[dim], x[stride];
-  if (!s->programme.count) return 0;
-  bound(s, g, box, softness, relax);
-  EACH(i, 0, nx) f[i] = (s->gradient[i] - dot(s->factor + i * stride, f, i)) * s->factor[i * stride + i];
-  f[nx] = slope / softness;
-  if (before) EACH(i, 0, s->held) {
-    double was = before[s->where[i]];
-    if (fabs(was) > least) s->first[count++] = (int)(was > 0 ? dim + i + 1 : -(dim + i + 1));
+  double linear[dim], x[stride];
+  if (!s->program.count) return 0;
+  bound(s, g, box, curvature_root, relax);
+  EACH(i, 0, nx) linear[i] = (s->gradient[i] - dot(s->factor + i * stride, linear, i)) * s->factor[i * stride + i];
+  linear[nx] = penalty / curvature_root;
+  if (before) EACH(i, 0, s->n_selected) {
+    double was = before[s->index[i]];
+    if (fabs(was) > threshold) s->initial[count++] = (int)(was > 0 ? dim + i + 1 : -(dim + i + 1));
   }
-  working set;
-  if (!nearest(&s->programme, f, s->first, count, feasible, changes, x, &set)) return 0;
+  working_set set;
+  if (!solve_qp(&s->program, linear, s->initial, count, feasible, changes, x, &set)) return 0;
   EACH(i, 0, set.count) if (set.row[i] >= dim)
-    multipliers[s->where[set.row[i] - dim]] = set.sign[i] * set.multiplier[i];
-  s->gain = -dot(f, x, nx) - 0.5 * dot(x, x, nx);
-  s->left = x[nx] / softness;
+    multipliers[s->index[set.row[i] - dim]] = set.sign[i] * set.multiplier[i];
+  s->gain = -dot(linear, x, nx) - 0.5 * dot(x, x, nx);
+  s->remaining = x[nx] / curvature_root;
   memcpy(dx, x, nx * sizeof(double));
   for (long i = nx - 1; i >= 0; i--) {
     dx[i] *= s->factor[i * stride + i];

@@ -1,9 +1,8 @@
-"""The optimisation problem of one motion: variables, residuals on a Chebyshev grid, and their derivatives.
+"""Transcription of the optimization problem of one motion: variables, residuals on a Chebyshev grid, derivatives.
 
 Variables are the interior path control points and the logarithms of the rate control points. Boundary conditions hold
 by construction: the boundary control points are functions of the first and last rate control points (paper, Appendix
-A). Residuals are the problem's constraints, each divided by a natural size (``cnpgen.refine.solver.residuals``), so
-that a violation of 1e-3 means about the same everywhere.
+A). Residuals are the problem's constraints, each divided by its scale (``cnpgen.refine.solver.residuals``).
 """
 
 from collections.abc import Callable
@@ -16,26 +15,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.kernels.kernel import Kernel
-from cnpgen.refine.solver.criterion import Criterion
+from cnpgen.refine.solver.cost_term import CostTerm
 from cnpgen.refine.solver.grid import Bases, Grid
 from cnpgen.trajectory.boundary import Boundary, assemble
-from cnpgen.trajectory.slopes import boundary_slopes
-from cnpgen.trajectory.spec import TrajectorySpec
+from cnpgen.trajectory.boundary_derivatives import boundary_derivatives
+from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 T = TypeVar("T")
-SMOOTH_RATE = 1e-4  # weight of the squared second differences of log r: fixes the gauge between p and r
+RATE_SMOOTHING = 1e-4  # weight of the squared second differences of log r, which selects one of many parametrizations
 
 
 @dataclass(frozen=True)
-class Linearisation:
+class Linearization:
     """Objective and residuals at one x, with their derivatives.
 
     Attributes:
-        x: The variables.
+        x: Variables, shape (nx,).
         cost: Objective [s].
-        gradient: Its gradient, shape (nx,).
+        gradient: Gradient of the objective, shape (nx,).
         curvature: Positive semidefinite model of its Hessian, shape (nx, nx).
         g: Residuals, shape (K, m).
         jacobian: d(residuals)/d(w), shape (width of w, m, K).
@@ -53,49 +52,49 @@ class Linearisation:
 
 @dataclass(frozen=True)
 class ResidualKernels:
-    """The kernels of a problem.
+    """Kernels of a problem.
 
     Attributes:
         spec: Degree and numbers of control points.
         values: Kernel of ``cnpgen.refine.solver.residuals.stage_values``.
         jacobian: Kernel of ``cnpgen.refine.solver.residuals.stage_jacobian``.
-        criterion: What is minimised beside the time, or None.
-        residuals: Kernel of ``cnpgen.refine.solver.criterion.criterion_residuals``, or None.
-        steps: Library of ``cnpgen.refine.solver.compiled``, or None where steps are in NumPy and DAQP.
+        cost_term: Cost term in addition to the duration, or None.
+        cost_residuals: Kernel of ``cnpgen.refine.solver.cost_term.cost_term_residuals``, or None.
+        step_library: Library of ``cnpgen.refine.solver.compiled_backend``, or None for the NumPy backend.
     """
 
     spec: TrajectorySpec
     values: Kernel
     jacobian: Kernel
-    criterion: Criterion | None = None
-    residuals: Kernel | None = None
-    steps: CDLL | None = None
+    cost_term: CostTerm | None = None
+    cost_residuals: Kernel | None = None
+    step_library: CDLL | None = None
 
 
 class Transcription:
     """One motion on one grid.
 
     Args:
-        stage: The kernels.
+        kernels: Residual kernels.
         grid: The grid.
         boundary: Boundary conditions of one motion.
-        tops: Where its obstacles are, as ``obstacle_tops`` says, shape (numbers,).
+        obstacle_poses: Poses and sizes of its obstacles, shape (width,).
     """
 
-    def __init__(self, stage: ResidualKernels, grid: Grid, *, boundary: Boundary, tops: Array) -> None:
-        spec = stage.spec
-        self.stage, self.spec, self.grid, self.boundary = stage, spec, grid, boundary
+    def __init__(self, kernels: ResidualKernels, grid: Grid, *, boundary: Boundary, obstacle_poses: Array) -> None:
+        spec = kernels.spec
+        self.kernels, self.spec, self.grid, self.boundary = kernels, spec, grid, boundary
         self.n = boundary.start_q.shape[1]
-        self._fixed = spec.path_control_points - boundary.fixed_at_goal  # where the goal's control points begin
-        self.interior = self._fixed - 3
+        self._goal_points = spec.path_control_points - boundary.fixed_at_goal  # index of the goal's control points
+        self.interior = self._goal_points - 3
         self.split = self.interior * self.n
         self.nx = self.split + spec.rate_control_points
-        self.tops = tops
-        self.tops_along = np.repeat(tops[:, None], len(grid.s), axis=1)
-        self.smooth = _smoothing(spec.rate_control_points)
-        self._at = of_last(self._states)  # steps that are taken are evaluated again, with derivatives
-        self._residuals = of_last(self._criterion_residuals)
-        self._slopes = of_last(lambda rate: boundary_slopes(boundary, rate[None], spec))
+        self.obstacle_poses = obstacle_poses
+        self.poses_along = np.repeat(obstacle_poses[:, None], len(grid.s), axis=1)
+        self.smoothing = _smoothing(spec.rate_control_points)
+        self._at = cache_last(self._states)  # an accepted step is evaluated again, with derivatives
+        self._cost_residuals = cache_last(self._evaluate_cost_residuals)
+        self._boundary_derivatives = cache_last(lambda rate: boundary_derivatives(boundary, rate[None], spec))
 
     def unpack(self, x: Array) -> tuple[Array, Array]:
         """Return path control points (C, n) and rate control points (R,) of the variables."""
@@ -105,26 +104,26 @@ class Transcription:
 
     def pack(self, path: Array, rate: Array) -> Array:
         """Return the variables of a motion; its boundary control points are replaced by the exact ones."""
-        return np.concatenate([path[3 : self._fixed].ravel(), np.log(rate)])
+        return np.concatenate([path[3 : self._goal_points].ravel(), np.log(rate)])
 
     def positions(self, x: Array) -> Array:
         """Return joint positions on the grid [rad], shape (n, K)."""
         return self._at(x)[0][: self.n]
 
     def value(self, x: Array) -> tuple[float, Array]:
-        """Evaluate what is minimised, and residuals (K, m), without derivatives."""
+        """Evaluate the regularized objective and residuals (K, m), without derivatives."""
         cost, g = self.measured(x)
-        return cost + self.gauge(x), g
+        return cost + self.regularization(x), g
 
-    def gauge(self, x: Array) -> float:
-        """Return what is minimised beside the objective, since it fixes the gauge between p and r."""
+    def regularization(self, x: Array) -> float:
+        """Return the regularization of log r, which selects one of many equivalent parametrizations."""
         log = x[self.split :]
-        return float(0.5 * log @ self.smooth @ log)
+        return float(0.5 * log @ self.smoothing @ log)
 
     def measured(self, x: Array) -> tuple[float, Array]:
         """Evaluate ``objective`` and residuals (K, m)."""
         w, path, rate = self._at(x)
-        (g,) = self.stage.values(w, self.tops_along)
+        (g,) = self.kernels.values(w, self.poses_along)
         return self.objective(path, rate), g.T
 
     def end_residuals(self) -> Array:
@@ -135,125 +134,122 @@ class Transcription:
         goal_ddq, jerk = free if b.goal_ddq is None else b.goal_ddq[0], [free] * (orders - 3)
         start = np.concatenate([b.start_q[0], b.start_dq[0], b.start_ddq[0], *jerk, unit])
         goal = np.concatenate([b.goal_q[0], b.goal_dq[0], goal_ddq, *jerk, unit])
-        (g,) = self.stage.values(np.stack([start, goal], axis=1), self.tops_along[:, :2])
+        (g,) = self.kernels.values(np.stack([start, goal], axis=1), self.poses_along[:, :2])
         return np.asarray(g.T)
 
     def objective(self, path: Array, rate: Array) -> float:
-        """Return the objective of a motion [s]: its duration and the criterion, without what fixes the gauge.
+        """Return the objective of a motion [s]: its duration and the cost term, without the regularization.
 
         Args:
             path: Path control points [rad], shape (C, n).
             rate: Rate control points [1/s], shape (R,).
         """
-        return self.duration(rate) + (0.0 if self.stage.criterion is None else self._criterion(path, rate))
+        return self.duration(rate) + (0.0 if self.kernels.cost_term is None else self._cost(path, rate))
 
     def duration(self, rate: Array) -> float:
         """Return the motion time [s] of rate control points [1/s], shape (R,)."""
-        return float(self.grid.weights @ (1.0 / (self.grid.gauss @ rate)))
+        return float(self.grid.time_weights @ (1.0 / (self.grid.time_basis @ rate)))
 
-    def evaluate(self, x: Array) -> Linearisation:
+    def evaluate(self, x: Array) -> Linearization:
         """Evaluate objective and residuals with their derivatives."""
         w, path, rate = self._at(x)
-        g, jacobian = self.stage.jacobian(w, self.tops_along)
+        g, jacobian = self.kernels.jacobian(w, self.poses_along)
         log = x[self.split :]
-        slope = self.grid.gauss * rate
-        inverse = 1.0 / (self.grid.gauss @ rate)
-        cost = float(inverse @ self.grid.weights) + self.gauge(x)
+        log_rate_derivative = self.grid.time_basis * rate
+        inverse = 1.0 / (self.grid.time_basis @ rate)
+        cost = float(inverse @ self.grid.time_weights) + self.regularization(x)
         gradient = np.zeros(self.nx)
-        gradient[self.split :] = -((self.grid.weights * inverse**2) @ slope) + self.smooth @ log
+        gradient[self.split :] = -((self.grid.time_weights * inverse**2) @ log_rate_derivative) + self.smoothing @ log
         curvature = np.zeros((self.nx, self.nx))
-        half = slope * np.sqrt(2 * self.grid.weights * inverse**3)[:, None]
-        curvature[self.split :, self.split :] = half.T @ half + self.smooth
-        if self.stage.criterion is not None:
-            cost += self._add_criterion(path, rate, gradient, curvature)
-        return Linearisation(x, cost, gradient, curvature, g.T, jacobian.reshape(len(w), *g.shape), rate)
+        half = log_rate_derivative * np.sqrt(2 * self.grid.time_weights * inverse**3)[:, None]
+        curvature[self.split :, self.split :] = half.T @ half + self.smoothing
+        if self.kernels.cost_term is not None:
+            cost += self._add_cost_term(path, rate, gradient, curvature)
+        return Linearization(x, cost, gradient, curvature, g.T, jacobian.reshape(len(w), *g.shape), rate)
 
-    def rows(self, at: Linearisation, k: Indices, which: Indices) -> Array:
-        """Gradients of chosen residuals with respect to the variables.
+    def rows(self, at: Linearization, k: Indices, residual: Indices) -> Array:
+        """Return the gradients of chosen residuals with respect to the variables, shape (m, nx).
 
         Args:
-            at: Where.
+            at: Linearization of the motion.
             k: Grid point of every row, shape (m,).
-            which: Residual of every row, shape (m,).
-
-        Returns:
-            Shape (m, nx).
+            residual: Index of the residual of every row, shape (m,).
         """
-        return self._chain(at.jacobian[:, which, k].T, k, at.rate, self.grid.bases)
+        return self._chain(at.jacobian[:, residual, k].T, k, at.rate, self.grid.bases)
 
-    def leaps(self, at: Linearisation, step: float) -> Array:
-        """Bound how far derivatives of r can carry residuals when no log r changes by more than ``step``: (K, m)."""
-        orders, reach = len(self.grid.bases.path), np.zeros(at.g.shape)
+    def linearization_errors(self, at: Linearization, step: float) -> Array:
+        """Bound the change of residuals by derivatives of r if no log r changes by more than ``step``: (K, m)."""
+        orders, errors = len(self.grid.bases.path), np.zeros(at.g.shape)
         for order in range(1, orders - 1):
             change = np.abs(self.grid.bases.rate[order]) @ at.rate * step
-            reach += np.abs(at.jacobian[orders * self.n + order]).T * change[:, None]
-        return reach
+            errors += np.abs(at.jacobian[orders * self.n + order]).T * change[:, None]
+        return errors
 
     def _states(self, x: Array) -> tuple[Array, Array, Array]:
         """Return w = (p, p', p'', ..., r, r', ...) on the grid, shape (width, K), and the control points."""
         path, rate = self.unpack(x)
         return self.grid.bases.states(path, rate), path, rate
 
-    def _criterion_residuals(self, path: Array, rate: Array) -> tuple[Array, Array, Array]:
-        """Return the criterion's residuals (m, Q) at its nodes, their Jacobian (4 n + 3, m, Q) and weights (Q,)."""
-        assert self.stage.criterion is not None
-        assert self.stage.residuals is not None
-        w = self.grid.criterion.states(path, rate)
-        e, jacobian = self.stage.residuals(w)
-        share = self.stage.criterion.weight * self.grid.criterion_weights / w[4 * self.n]
-        return e, jacobian.reshape(len(w), *e.shape), share
+    def _evaluate_cost_residuals(self, path: Array, rate: Array) -> tuple[Array, Array, Array]:
+        """Return the cost term's residuals (m, Q), their Jacobian (4 n + 3, m, Q) and quadrature weights (Q,)."""
+        assert self.kernels.cost_term is not None
+        assert self.kernels.cost_residuals is not None
+        w = self.grid.cost_bases.states(path, rate)
+        e, jacobian = self.kernels.cost_residuals(w)
+        weights = self.kernels.cost_term.weight * self.grid.cost_weights / w[4 * self.n]
+        return e, jacobian.reshape(len(w), *e.shape), weights
 
-    def _criterion(self, path: Array, rate: Array) -> float:
-        """Return the criterion's cost."""
-        assert self.stage.criterion is not None
-        e, _, share = self._residuals(path, rate)
-        return float(share @ self.stage.criterion.rate(e)[0])
+    def _cost(self, path: Array, rate: Array) -> float:
+        """Return the value of the cost term."""
+        assert self.kernels.cost_term is not None
+        e, _, weights = self._cost_residuals(path, rate)
+        return float(weights @ self.kernels.cost_term.rate(e)[0])
 
-    def _add_criterion(self, path: Array, rate: Array, gradient: Array, curvature: Array) -> float:
-        """Add the criterion's gradient and its Gauss-Newton Hessian; return its cost."""
-        assert self.stage.criterion is not None
-        bases = self.grid.criterion
-        e, jacobian, share = self._residuals(path, rate)
-        rho, slope = self.stage.criterion.rate(e)
+    def _add_cost_term(self, path: Array, rate: Array, gradient: Array, curvature: Array) -> float:
+        """Add the cost term's gradient and its Gauss-Newton Hessian; return its value."""
+        assert self.kernels.cost_term is not None
+        bases = self.grid.cost_bases
+        e, jacobian, weights = self._cost_residuals(path, rate)
+        rho, rho_derivative = self.kernels.cost_term.rate(e)
         m, points = e.shape
-        k, which = np.repeat(np.arange(points), m), np.tile(np.arange(m), points)
-        rows = self._chain(jacobian[:, which, k].T, k, rate, bases)
-        pull = (share * slope)[k]
-        gradient += (pull * e[which, k]) @ rows
-        half = rows * np.sqrt(pull)[:, None]
-        gradient[self.split :] -= (share * rho / (bases.rate[0] @ rate)) @ bases.rate[0] * rate
-        curvature += half.T @ half  # of one matrix, which takes half as long
-        return float(share @ rho)
+        k, residual = np.repeat(np.arange(points), m), np.tile(np.arange(m), points)
+        rows = self._chain(jacobian[:, residual, k].T, k, rate, bases)
+        row_weights = (weights * rho_derivative)[k]
+        gradient += (row_weights * e[residual, k]) @ rows
+        half = rows * np.sqrt(row_weights)[:, None]
+        gradient[self.split :] -= (weights * rho / (bases.rate[0] @ rate)) @ bases.rate[0] * rate
+        curvature += half.T @ half  # a product of one matrix takes half the time
+        return float(weights @ rho)
 
-    def _chain(self, stage: Array, k: Indices, rate: Array, bases: Bases) -> Array:
-        """Turn derivatives in w at nodes k, shape (m, width of w), into derivatives in the variables, (m, nx)."""
+    def _chain(self, state_gradients: Array, k: Indices, rate: Array, bases: Bases) -> Array:
+        """Convert gradients in w at nodes k, shape (m, width of w), to gradients in the variables, (m, nx)."""
         n, m, orders = self.n, len(k), len(bases.path)
-        control = bases.path_at[k] @ stage[:, : orders * n].reshape(m, orders, n)
+        control = bases.path_at[k] @ state_gradients[:, : orders * n].reshape(m, orders, n)
         out = np.empty((m, self.nx))
-        out[:, : self.split] = control[:, 3 : self._fixed].reshape(m, self.split)
-        out[:, self.split :] = (stage[:, None, orders * n :] @ bases.rate_at[k])[:, 0] * rate
-        for each in self._slopes(rate):
-            out[:, self.split + each.variable] += control[:, each.point] @ (each.slope[0] * rate[each.variable])
+        out[:, : self.split] = control[:, 3 : self._goal_points].reshape(m, self.split)
+        out[:, self.split :] = (state_gradients[:, None, orders * n :] @ bases.rate_at[k])[:, 0] * rate
+        for item in self._boundary_derivatives(rate):
+            out[:, self.split + item.variable] += control[:, item.point] @ (item.derivative[0] * rate[item.variable])
         return out
 
 
 @cache
 def _smoothing(points: int) -> Array:
-    """Hessian of what fixes the gauge, shape (R, R)."""
+    """Return the Hessian of the regularization, shape (R, R)."""
     second = np.diff(np.eye(points), 2, axis=0)
-    return np.asarray(2 * SMOOTH_RATE * second.T @ second)
+    return np.asarray(2 * RATE_SMOOTHING * second.T @ second)
 
 
-def of_last(function: Callable[..., T]) -> Callable[..., T]:
-    """Keep what a function returned for the objects that it was last given; threads may share it."""
+def cache_last(function: Callable[..., T]) -> Callable[..., T]:
+    """Cache the last result of a function, keyed by the identity of its arguments; threads may share the cache."""
     last: list[tuple[tuple[Any, ...], T]] = []
 
-    def recall(*objects: Any) -> T:
-        for known, result in last:
-            if len(known) == len(objects) and all(a is b for a, b in zip(known, objects, strict=True)):
+    def cached(*objects: Any) -> T:
+        for arguments, result in last:
+            if len(arguments) == len(objects) and all(a is b for a, b in zip(arguments, objects, strict=True)):
                 return result
         result = function(*objects)
         last[:] = [(objects, result)]
         return result
 
-    return recall
+    return cached

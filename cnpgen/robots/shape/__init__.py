@@ -1,1 +1,1 @@
-"""The shape of a robot: the collision geometry of its URDF as convex pieces, their capsules, its pairs of links."""
+"""Shape of a robot: convex parts of its collision geometry, covering capsules, link pairs."""

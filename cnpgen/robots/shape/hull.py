@@ -1,4 +1,4 @@
-"""Convex hulls: the corners of one, and one as Coal takes it."""
+"""Convex hulls: corners, bounding planes and balls, and shapes of Coal."""
 
 import math
 from collections.abc import Sequence
@@ -13,16 +13,16 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-CUBE = np.array(list(product((-0.5, 0.5), repeat=3)))  # the corners of a cube of edge length 1 round the origin
-MOST_PLANES = 24  # that stand for the faces of a hull
-NEAR = math.cos(math.radians(3))  # of the angle between planes that are as good as one
-THINNEST = 1e-6  # m: points in a plane are taken for this much thicker on both sides, so that they have a hull
-MOST_CORNERS = 10_000  # of a body; what is finer takes minutes and proves nothing more
-FARTHEST = 1e4  # m: whatever is further off is no part of a robot
+CUBE = np.array(list(product((-0.5, 0.5), repeat=3)))  # corners of the unit cube centered at the origin
+MAX_PLANES = 24  # that approximate the faces of a hull
+SIMILAR_PLANES_COSINE = math.cos(math.radians(3))  # of the angle below which planes are equivalent
+MIN_THICKNESS_M = 1e-6  # coplanar points are extended by this on both sides, so that they have a hull
+MAX_CORNERS = 10_000  # of a body; finer meshes take minutes without benefit
+MAX_COORDINATE_M = 1e4  # larger coordinates are treated as mistakes of units
 
 
 def check_solid(corners: Array) -> None:
-    """Refuse corners that are in a plane or too few: ``hull_corners`` returns none such, but strangers may write them.
+    """Raise ValueError for coplanar or too few corners, which untrusted input may contain.
 
     Args:
         corners: The corners [m], shape (V, 3).
@@ -32,8 +32,8 @@ def check_solid(corners: Array) -> None:
     """
     from scipy.spatial import ConvexHull, QhullError
 
-    if len(corners) > MOST_CORNERS:
-        raise ValueError(f"it has {len(corners):,} corners, expected at most {MOST_CORNERS:,}")
+    if len(corners) > MAX_CORNERS:
+        raise ValueError(f"it has {len(corners):,} corners, expected at most {MAX_CORNERS:,}")
 
     try:
         ConvexHull(corners)
@@ -42,7 +42,7 @@ def check_solid(corners: Array) -> None:
 
 
 def hull_corners(points: Array) -> Array:
-    """Return the corners of the convex hull of points; it is made ``THINNEST`` thick where it is thinner.
+    """Return the corners of the convex hull of points, with a thickness of at least ``MIN_THICKNESS_M``.
 
     Args:
         points: The points [m], shape (N, 3).
@@ -55,16 +55,16 @@ def hull_corners(points: Array) -> Array:
     points = np.unique(points, axis=0)
     offsets = points - points.mean(axis=0)
     for axis in np.linalg.eigh(offsets.T @ offsets)[1].T:
-        if np.ptp(offsets @ axis) < THINNEST:
-            points = np.concatenate([points - THINNEST * axis, points + THINNEST * axis])
+        if np.ptp(offsets @ axis) < MIN_THICKNESS_M:
+            points = np.concatenate([points - MIN_THICKNESS_M * axis, points + MIN_THICKNESS_M * axis])
     corners: Array = points[np.sort(ConvexHull(points).vertices)]
     return corners
 
 
 def supporting_planes(corners: Array) -> Array:
-    """Return planes that a convex hull is behind, few but looking to all sides, shape (P, 4).
+    """Return a few bounding planes of a convex hull in all directions, shape (P, 4).
 
-    They are the hull's own faces, each time the one that looks furthest away from those taken before and from the axes.
+    They are faces of the hull. Each next face has the normal most distant from the previous normals and the axes.
 
     Args:
         corners: The corners of the hull [m], shape (V, 3).
@@ -77,7 +77,7 @@ def supporting_planes(corners: Array) -> Array:
     normals: Array = ConvexHull(corners).equations[:, :3]
     nearest = np.abs(normals).max(axis=1)  # cosine of the angle to the nearest axis
     taken: list[Array] = []
-    while len(taken) < MOST_PLANES and nearest.min() < NEAR:
+    while len(taken) < MAX_PLANES and nearest.min() < SIMILAR_PLANES_COSINE:
         taken.append(normals[np.argmin(nearest)])
         nearest = np.maximum(nearest, normals @ taken[-1])
     found = np.array(taken).reshape(-1, 3)
@@ -85,11 +85,11 @@ def supporting_planes(corners: Array) -> Array:
 
 
 def ball_round(corners: Array, radius: float) -> tuple[Array, float]:
-    """Return the centre of a ball that holds a convex body [m], shape (3,), and its radius [m].
+    """Return the center [m], shape (3,), and radius [m] of a ball that contains a convex body.
 
     Args:
         corners: Corners of the body's hull [m], shape (V, 3).
-        radius: How thick the hull is wrapped [m].
+        radius: Radius around the hull [m].
     """
     centre: Array = (corners.min(axis=0) + corners.max(axis=0)) / 2
     return centre, float(np.linalg.norm(corners - centre, axis=1).max()) + radius

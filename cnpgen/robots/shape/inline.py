@@ -1,6 +1,6 @@
-"""A URDF that needs no other file: its meshes as the corners of their convex hulls, in ``data:`` addresses.
+"""Self-contained URDFs: meshes are replaced by the corners of their convex hulls, in ``data:`` addresses.
 
-A plan, a dataset or a planner carries its problem as text; so the shape of the robot must be in the text, too.
+A plan, a dataset or a planner contains its problem as text, so the geometry of the robot must be in the text, too.
 """
 
 import base64
@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
-from cnpgen.robots.shape.files import find_named_file
-from cnpgen.robots.shape.hull import FARTHEST, MOST_CORNERS, hull_corners
-from cnpgen.robots.shape.parts import convex_parts
+from cnpgen.robots.shape.decomposition import convex_parts
+from cnpgen.robots.shape.hull import MAX_COORDINATE_M, MAX_CORNERS, hull_corners
+from cnpgen.robots.shape.mesh_files import find_named_file
 from cnpgen.robots.urdf import urdf_tree
 
 if TYPE_CHECKING:
@@ -26,29 +26,29 @@ Array = NDArray[np.float64]
 
 _INLINE = "data:application/octet-stream;base64,"  # followed by corners x, y, z [m] as little-endian float64
 _MESHES = (".stl", ".dae", ".obj")
-MOST_MESH_BYTES = 1 << 26  # of a file
-_CAPSULES = "1.2"  # the version of URDF that has capsules
+MAX_MESH_BYTES = 1 << 26  # of a mesh file
+_CAPSULES = "1.2"  # first version of URDF with capsules
 
 
 def with_inline_meshes(
     urdf: str, path: Path, packages: Sequence[Path] = (), *, most: int = 1, keep: Path | None = None
 ) -> str:
-    """Return a URDF with the hulls of its collision meshes in it; one that needs no change is returned as it is.
+    """Return a URDF with inline hulls of its collision meshes; a URDF without such meshes is returned unchanged.
 
     Args:
-        urdf: The text of the URDF.
-        path: Its file, from which the meshes' places are told.
-        packages: Folders in which packages are looked for.
-        most: Into how many convex parts a mesh may be taken apart; 1 for its hull.
-        keep: Folder in which parts are kept; None to keep nothing.
+        urdf: Text of the URDF.
+        path: File of the URDF, the base of relative mesh paths.
+        packages: Folders of packages.
+        most: Maximum number of convex parts of a mesh; 1 for its hull.
+        keep: Cache folder of convex parts; None for no cache.
 
     Raises:
-        RecipeError: A mesh is missing or cannot be read; with all of them.
-        MachineError: Meshes are to be taken apart, and CoACD is not installed.
+        RecipeError: Meshes are missing or cannot be read; the error lists all of them.
+        MachineError: A decomposition is requested, but CoACD is not installed.
     """
     try:
         tree = urdf_tree(urdf)
-    except ValueError:  # whoever reads the robot says so
+    except ValueError:  # the reader of the robot raises the error
         return urdf
     elements = [(link, element) for link in tree.iter("link") for element in link.findall("collision")]
     meshes = [(link, element, mesh) for link, element in elements if (mesh := _mesh_file(element)) is not None]
@@ -56,7 +56,7 @@ def with_inline_meshes(
     for link, element, mesh in meshes:
         try:
             file = find_named_file(mesh.get("filename", ""), path, packages)
-            addresses = [address_of(each) for each in _parts_of_file(file, scale_of(mesh), most, keep)]
+            addresses = [address_of(part) for part in _parts_of_file(file, scale_of(mesh), most, keep)]
         except RecipeError as error:
             mistakes += error.mistakes
         else:
@@ -65,13 +65,13 @@ def with_inline_meshes(
     if mistakes:
         raise RecipeError(list(dict.fromkeys(mistakes)))
     unversioned = tree.find(".//collision/geometry/capsule") is not None and tree.get("version", "1.0") < _CAPSULES
-    if unversioned:  # URDF's parser would complain on stderr about what it then leaves out
+    if unversioned:  # the URDF parser would ignore capsules, with warnings on stderr
         tree.set("version", _CAPSULES)
     return ElementTree.tostring(tree, encoding="unicode") if meshes or unversioned else urdf
 
 
 def _mesh_file(collision: ElementTree.Element) -> ElementTree.Element | None:
-    """Return the mesh of a <collision> element if it is one in a file."""
+    """Return the mesh of a <collision> element if it refers to a file, otherwise None."""
     mesh = collision.find("geometry/mesh")
     return None if mesh is None or is_inline(mesh.get("filename", "")) else mesh
 
@@ -79,7 +79,7 @@ def _mesh_file(collision: ElementTree.Element) -> ElementTree.Element | None:
 def _replace(
     link: ElementTree.Element, collision: ElementTree.Element, mesh: ElementTree.Element, addresses: list[str]
 ) -> None:
-    """Put convex parts, each in an element of its own, in the place of a mesh."""
+    """Replace a mesh by convex parts, one element each."""
     place = list(link).index(collision)
     link.remove(collision)
     for address in reversed(addresses):
@@ -88,10 +88,10 @@ def _replace(
 
 
 def mesh_files(urdf: str) -> list[str]:
-    """List the mesh files that the collision geometry of a URDF names; inline meshes are none.
+    """List the mesh files in the collision geometry of a URDF, without inline meshes.
 
     Raises:
-        ValueError: The text is no URDF.
+        ValueError: The text is not a URDF.
     """
     meshes = urdf_tree(urdf).iterfind(".//collision/geometry/mesh")
     names = dict.fromkeys(mesh.get("filename", "") for mesh in meshes)
@@ -102,7 +102,7 @@ def points_of(mesh: ElementTree.Element) -> Array:
     """Return the corners of an inline mesh [m], shape (V, 3).
 
     Raises:
-        ValueError: It is not inline.
+        ValueError: The mesh is not inline.
     """
     name = mesh.get("filename", "")
     if not is_inline(name):
@@ -114,11 +114,11 @@ def inline_mesh(path: Path, scale: Array) -> str:
     """Return the corners of the convex hull of a mesh file as a ``data:`` address.
 
     Args:
-        path: The file.
-        scale: Factors of x, y, z, shape (3,).
+        path: Path of the mesh file.
+        scale: Scale factors of x, y and z, shape (3,).
 
     Raises:
-        RecipeError: It cannot be read.
+        RecipeError: The file cannot be read.
     """
     return address_of(*_parts_of_file(path, scale, 1, None))
 
@@ -129,7 +129,7 @@ def address_of(corners: Array) -> str:
 
 
 def is_inline(address: str) -> bool:
-    """Whether a mesh is given by its corners, not by the name of a file."""
+    """Return whether a mesh is given by its corners and not by a file name."""
     return address.startswith(_INLINE)
 
 
@@ -137,7 +137,7 @@ def corners_of(address: str) -> Array:
     """Return the corners of an inline mesh [m], shape (V, 3).
 
     Raises:
-        ValueError: They are no finite numbers, three per corner.
+        ValueError: The corners are not triples of finite numbers.
     """
     corners = np.frombuffer(base64.b64decode(address.removeprefix(_INLINE)), "<f8").reshape(-1, 3).astype(float)
     if not len(corners) or not np.isfinite(corners).all():
@@ -146,13 +146,13 @@ def corners_of(address: str) -> Array:
 
 
 def scale_of(mesh: ElementTree.Element) -> Array:
-    """Return the factors of a mesh's x, y and z, shape (3,).
+    """Return the scale factors of x, y and z of a mesh, shape (3,).
 
     Raises:
-        RecipeError: They are none.
+        RecipeError: The scale is invalid.
     """
     try:
-        scale = np.array([float(each) for each in mesh.get("scale", "1 1 1").split()])
+        scale = np.array([float(factor) for factor in mesh.get("scale", "1 1 1").split()])
     except ValueError:
         scale = np.zeros(0)
     if scale.shape != (3,) or not (np.isfinite(scale).all() and (scale != 0).all()):
@@ -163,20 +163,20 @@ def scale_of(mesh: ElementTree.Element) -> Array:
 def _parts_of_file(path: Path, scale: Array, most: int, keep: Path | None) -> list[Array]:
     """Return the corners of a mesh's convex hull, or of its convex parts [m]."""
     points, mesh = read_mesh(path, scale)
-    if not len(points) or not (np.abs(points) <= FARTHEST).all():
-        raise RecipeError([f"{path}: the mesh has no points, or some further off than {FARTHEST:,.0f} m"])
+    if not len(points) or not (np.abs(points) <= MAX_COORDINATE_M).all():
+        raise RecipeError([f"{path}: the mesh has no points, or some further off than {MAX_COORDINATE_M:,.0f} m"])
     try:
         parts = [hull_corners(points)] if most == 1 else convex_parts(points, sides_of(mesh), most, keep)
     except RecipeError as error:
         raise RecipeError([f"{path}: {text}" for text in error.mistakes]) from error
-    if (corners := max(map(len, parts))) > MOST_CORNERS:
+    if (corners := max(map(len, parts))) > MAX_CORNERS:
         found = f"the mesh's hull has {corners:,} corners"
-        raise RecipeError([f"{path}: {found}, expected at most {MOST_CORNERS:,}: simplify the mesh"])
+        raise RecipeError([f"{path}: {found}, expected at most {MAX_CORNERS:,}: simplify the mesh"])
     return parts
 
 
 def sides_of(mesh: "coal.BVHModelBase") -> NDArray[np.int64]:
-    """Return the triangles of a mesh as numbers of its points, shape (T, 3)."""
+    """Return the triangles of a mesh as indices of its points, shape (T, 3)."""
     sides = [mesh.tri_indices(number) for number in range(mesh.num_tris)]
     return np.array([[side[0], side[1], side[2]] for side in sides], np.int64).reshape(-1, 3)
 
@@ -185,24 +185,24 @@ def read_mesh(path: Path, scale: Array) -> tuple[Array, "coal.BVHModelBase"]:
     """Read a mesh: STL, DAE or OBJ.
 
     Args:
-        path: The file.
-        scale: Factors of its x, y and z, shape (3,).
+        path: Path of the mesh file.
+        scale: Scale factors of x, y and z, shape (3,).
 
     Returns:
-        Its points [m], shape (N, 3), and the mesh as Coal has it.
+        Points of the mesh [m], shape (N, 3), and the mesh as an object of Coal.
 
     Raises:
-        RecipeError: It cannot be read.
+        RecipeError: The file cannot be read.
     """
     import coal
 
     if path.suffix.lower() not in _MESHES:
         raise RecipeError([f"{path}: not a mesh that can be read: expected one of {', '.join(_MESHES)}"])
-    if (size := path.stat().st_size) > MOST_MESH_BYTES:
-        raise RecipeError([f"{path}: has {size:,} bytes, expected a mesh of at most {MOST_MESH_BYTES:,}"])
+    if (size := path.stat().st_size) > MAX_MESH_BYTES:
+        raise RecipeError([f"{path}: has {size:,} bytes, expected a mesh of at most {MAX_MESH_BYTES:,}"])
     try:
         mesh = coal.MeshLoader().load(str(path), scale)
         return np.array(mesh.vertices(), float).reshape(-1, 3), mesh
     except (ValueError, RuntimeError, MemoryError) as error:
-        said = [line for line in str(error).splitlines() if not line.startswith("Hint:")]
-        raise RecipeError([f"{path}: not a mesh that can be read: {said[-1] if said else 'too large'}"]) from error
+        lines = [line for line in str(error).splitlines() if not line.startswith("Hint:")]
+        raise RecipeError([f"{path}: not a mesh that can be read: {lines[-1] if lines else 'too large'}"]) from error

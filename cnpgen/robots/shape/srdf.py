@@ -1,4 +1,4 @@
-"""Pairs of links that an SRDF disables: written into the text of the URDF, and read from there."""
+"""Disabled link pairs of an SRDF, stored in the text of the URDF."""
 
 from pathlib import Path
 from xml.etree import ElementTree
@@ -10,11 +10,11 @@ _TAG = "disable_collisions"
 
 
 def with_disabled_pairs(urdf: str, srdf: Path) -> str:
-    """Return a URDF with the pairs of links that an SRDF file disables.
+    """Return a URDF with the disabled link pairs of an SRDF file.
 
     Args:
-        urdf: The text of the URDF; readers of URDFs pass over elements that they do not know.
-        srdf: The SRDF file.
+        urdf: Text of the URDF; URDF parsers ignore unknown elements.
+        srdf: Path of the SRDF file.
 
     Raises:
         RecipeError: The SRDF cannot be read, or names links that the URDF does not have.
@@ -34,7 +34,7 @@ def with_disabled_pairs(urdf: str, srdf: Path) -> str:
 
 
 def disabled_pairs(urdf: str) -> frozenset[frozenset[str]] | None:
-    """Return the pairs of links that are disabled; None if no SRDF was given."""
+    """Return the disabled link pairs; None without an SRDF."""
     entries = list(urdf_tree(urdf).iter(_TAG))
     pairs = frozenset(frozenset((entry.get("link1", ""), entry.get("link2", ""))) for entry in entries)
     return pairs or None

@@ -1,1 +1,1 @@
-"""Whole files of any kind: written at once or not at all, documents, HDF5, sealed arrays."""
+"""Files of any kind: atomic writing, JSON documents, HDF5 and checksums."""

@@ -1,4 +1,4 @@
-"""Files that are whole or absent: written under a temporary name, flushed to the disk, then renamed."""
+"""Atomic writing of files: under a temporary name, flushed to the disk, then renamed."""
 
 import errno
 import hashlib
@@ -13,14 +13,14 @@ from cnpgen.store.files.leftovers import temporary_name
 
 _HINTS = {
     errno.ENOSPC: "free some space and try again",
-    errno.EDQUOT: "your quota is used up; free some space and try again",
+    errno.EDQUOT: "your disk quota is used up; free some space and try again",
     errno.EFBIG: "the file is larger than this system or session allows (see ulimit -f)",
     errno.EROFS: "choose another folder",
     errno.EACCES: "choose a folder that you may write to",
     errno.EPERM: "choose a folder that you may write to",
     errno.ENOTDIR: "a file is where a folder should be; choose another folder",
     errno.EEXIST: "a file is where a folder should be; choose another folder",
-    errno.ENOENT: "choose a folder that can be made",
+    errno.ENOENT: "choose a folder that can be created",
     errno.ENAMETOOLONG: "choose a shorter name",
     errno.ELOOP: "choose another folder",
     errno.EMFILE: "too many open files (see ulimit -n)",
@@ -28,12 +28,12 @@ _HINTS = {
 
 
 def machine_error(verb: str, path: Path, error: OSError) -> MachineError:
-    """Describe a failed system call: what could not be done to which path, why, and what helps.
+    """Convert an error of a system call to an error message with a hint.
 
     Args:
-        verb: "read", "write".
-        path: The file that was meant.
-        error: What the system said.
+        verb: The failed operation: "read", "write".
+        path: The file.
+        error: The error of the system call.
 
     Returns:
         The error to raise from ``error``.
@@ -44,19 +44,19 @@ def machine_error(verb: str, path: Path, error: OSError) -> MachineError:
 
 @contextmanager
 def committing(path: Path, work: Path | None = None) -> Iterator[Path]:
-    """Give the block a temporary path to write to; rename it to ``path`` when the block ends without an error.
+    """Yield a temporary path to write to, and rename it to ``path`` if the block ends without an error.
 
-    Any number of processes may write the same ``path`` at once: each has a temporary file and the last rename wins.
+    Several processes may write the same ``path`` at once: each has its own temporary file and the last rename wins.
 
     Args:
-        path: The file that is to appear; its folder is made.
-        work: Folder for the temporary file, on the same file system as ``path``; beside ``path`` by default.
+        path: The file to write; its folder is created.
+        work: Folder of the temporary file, on the same file system as ``path``; the folder of ``path`` by default.
 
     Yields:
         The temporary path; the block must create this file.
 
     Raises:
-        MachineError: The disk is full, read-only or otherwise unwilling. ``path`` is as it was; nothing is left behind.
+        MachineError: The file cannot be written. ``path`` is unchanged and the temporary file is removed.
     """
     folder = work or path.parent
     temporary = folder / temporary_name(path.name)
@@ -64,9 +64,9 @@ def committing(path: Path, work: Path | None = None) -> Iterator[Path]:
         folder.mkdir(parents=True, exist_ok=True)
         path.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
-        _synchronise(temporary)
+        _synchronize(temporary)
         temporary.replace(path)
-        _synchronise(path.parent)
+        _synchronize(path.parent)
     except OSError as error:
         raise machine_error("write", path, error) from error
     finally:
@@ -74,45 +74,45 @@ def committing(path: Path, work: Path | None = None) -> Iterator[Path]:
             temporary.unlink()
 
 
-def _synchronise(path: Path) -> None:
+def _synchronize(path: Path) -> None:
     """Flush a file or a folder's entries to the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
     except OSError as error:
-        if error.errno != errno.EINVAL:  # file systems that cannot flush a folder say EINVAL
+        if error.errno != errno.EINVAL:  # from file systems that cannot flush a folder
             raise
     finally:
         os.close(descriptor)
 
 
 def write_file(path: Path, content: bytes | str, *, work: Path | None = None) -> None:
-    """Write a whole file atomically; text as UTF-8.
+    """Write a whole file atomically; text is encoded as UTF-8.
 
     Raises:
-        MachineError: The disk is full, read-only or otherwise unwilling.
+        MachineError: The file cannot be written.
     """
     with committing(path, work) as temporary:
         temporary.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
-def read_file(path: Path, *, most: int | None = None) -> bytes:
+def read_file(path: Path, *, max_bytes: int | None = None) -> bytes:
     """Read a whole file.
 
     Args:
         path: The file.
-        most: Size that it may have [bytes]; as large as it is by default.
+        max_bytes: Maximum size of the file [bytes]; unlimited by default.
 
     Raises:
-        DatasetError: There is no such file, it is a device or a pipe, which has no end, or it is too large.
-        MachineError: The system would not let us read it.
+        DatasetError: The file is missing, too large, or a device or a pipe, whose size is unknown.
+        MachineError: The file cannot be read.
     """
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode) and not stat.S_ISDIR(status.st_mode):
             raise DatasetError(f"{path} is not a file")
-        if most is not None and status.st_size > most:
-            raise DatasetError(f"{path} has {status.st_size:,} bytes, expected at most {most:,}")
+        if max_bytes is not None and status.st_size > max_bytes:
+            raise DatasetError(f"{path} has {status.st_size:,} bytes, expected at most {max_bytes:,}")
         return path.read_bytes()
     except (FileNotFoundError, NotADirectoryError) as error:
         raise DatasetError(f"{path} is missing") from error
@@ -124,8 +124,8 @@ def file_sha256(path: Path) -> str:
     """Compute the sha256 of a file in constant memory, as 64 hexadecimal digits.
 
     Raises:
-        DatasetError: There is no such file.
-        MachineError: The system would not let us read it.
+        DatasetError: The file is missing.
+        MachineError: The file cannot be read.
     """
     try:
         with path.open("rb") as file:

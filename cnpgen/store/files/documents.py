@@ -1,6 +1,6 @@
-"""Sealed JSON documents: readable, identical from run to run, and any changed byte is noticed when they are read.
+"""JSON documents with a checksum: readable, reproducible, and protected against any changed byte.
 
-The last key of a document, ``self_sha256``, is the sha256 of the file's own text with 64 zeros in its place.
+The last key of a document, ``self_sha256``, is the sha256 of the text of the file with 64 zeros in place of the value.
 """
 
 import hashlib
@@ -16,22 +16,22 @@ import numpy as np
 
 from cnpgen.errors import DatasetError
 from cnpgen.store.files.atomic import read_file, write_file
-from cnpgen.store.files.forms import Form, check_form
-from cnpgen.store.files.limits import DOCUMENT_BYTES, DOCUMENT_DEPTH
+from cnpgen.store.files.document_structure import Structure, check_structure
+from cnpgen.store.files.size_limits import MAX_DOCUMENT_BYTES, MAX_DOCUMENT_DEPTH
 
-SHOWN = 80  # characters of two values that a message still shows
+MAX_SHOWN_CHARACTERS = 80  # longer pairs of values are left out of messages
 _BLANK = "0" * 64
-_SCALARS = frozenset({int, bool, str, type(None)})  # types that are JSON's own, whatever the value
+_SCALARS = frozenset({int, bool, str, type(None)})  # types that JSON has for every value
 _NESTED = frozenset({dict, list})
-_SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")  # of half a character, which needs another half
-_SEAL = re.compile(r'"self_sha256": "([0-9a-f]{64})"\n}\n\Z')
+_SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")  # half of a UTF-16 surrogate pair
+_CHECKSUM = re.compile(r'"self_sha256": "([0-9a-f]{64})"\n}\n\Z')
 
 
 def plain(value: Any) -> Any:
-    """Reduce a value to JSON's types: tuples and arrays become lists, infinities the strings ``float()`` reads.
+    """Convert a value to JSON types: tuples and arrays to lists, infinities to strings that ``float()`` reads.
 
     Raises:
-        TypeError: Something has no JSON form.
+        TypeError: A value cannot be converted.
     """
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
@@ -39,56 +39,58 @@ def plain(value: Any) -> Any:
         return plain(value.tolist())
     if isinstance(value, list | tuple):
         kinds = set(map(type, value))
-        return list(value) if kinds <= _SCALARS else [plain(item) for item in value]  # long lists of counts are common
+        return (
+            list(value) if kinds <= _SCALARS else [plain(item) for item in value]
+        )  # fast path for long lists of counts
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, Path):
         return str(value)
-    raise TypeError(f"no JSON form for {type(value).__name__} {value!r}")
+    raise TypeError(f"cannot convert {type(value).__name__} {value!r} to JSON")
 
 
 def canonical_sha256(value: Any) -> str:
-    """Compute the sha256 of a value's compact JSON with sorted keys: equal values, equal digits."""
+    """Compute the sha256 of the compact JSON of a value with sorted keys; equal values have equal digests."""
     text = json.dumps(plain(value), sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 @dataclass(frozen=True)
 class Difference:
-    """Where two JSON-able values differ; as text, the values only where they are short.
+    """A difference between two JSON-able values; its text contains the values if they are short.
 
     Attributes:
         key: Dotted key, ``"robot.name"``.
-        found: The value there in the first one, None where it is missing.
-        wanted: The value there in the second one, None where it is missing.
+        old: Value of the first one; None if it is missing.
+        new: Value of the second one; None if it is missing.
     """
 
     key: str
-    found: Any
-    wanted: Any
+    old: Any
+    new: Any
 
     @property
     def is_short(self) -> bool:
         """Whether the values are short enough for a message."""
-        return len(repr(self.found)) + len(repr(self.wanted)) < SHOWN
+        return len(repr(self.old)) + len(repr(self.new)) < MAX_SHOWN_CHARACTERS
 
     def __str__(self) -> str:
-        return f"{self.key} ({self.found!r}, now {self.wanted!r})" if self.is_short else self.key
+        return f"{self.key} ({self.old!r}, now {self.new!r})" if self.is_short else self.key
 
 
-def differences(found: Any, wanted: Any, key: str = "") -> Iterator[Difference]:
-    """List where two JSON-able values differ, table by table, in the order of the first one's keys."""
-    if isinstance(found, Mapping) and isinstance(wanted, Mapping):
-        for name in [*found, *(name for name in wanted if name not in found)]:
-            yield from differences(found.get(name), wanted.get(name), f"{key}.{name}" if key else name)
-    elif found != wanted:
-        yield Difference(key, found, wanted)
+def differences(old: Any, new: Any, key: str = "") -> Iterator[Difference]:
+    """Yield the differences between two JSON-able values, in the order of the keys of the first one."""
+    if isinstance(old, Mapping) and isinstance(new, Mapping):
+        for name in [*old, *(name for name in new if name not in old)]:
+            yield from differences(old.get(name), new.get(name), f"{key}.{name}" if key else name)
+    elif old != new:
+        yield Difference(key, old, new)
 
 
 def render(value: Any, indent: str = "") -> str:
-    """Lay out plain JSON with two spaces per level and lists of scalars on one line each."""
+    """Format plain JSON with two spaces per level and each list of scalars on one line."""
     inner = indent + "  "
     if isinstance(value, dict) and value:
         items = [f"{json.dumps(key, ensure_ascii=False)}: {render(item, inner)}" for key, item in value.items()]
@@ -99,61 +101,61 @@ def render(value: Any, indent: str = "") -> str:
 
 
 def save_document(path: Path, document: Mapping[str, Any], *, work: Path | None = None) -> None:
-    """Seal a document and write it atomically.
-
-    Args:
-        path: Where to.
-        document: JSON-able content with the keys "format" and "format_version" first.
-        work: Folder for the temporary file.
-
-    Raises:
-        MachineError: The disk is full, read-only or otherwise unwilling.
-    """
-    text = render(plain({**document, "self_sha256": _BLANK})) + "\n"
-    digest = hashlib.sha256(text.encode()).hexdigest()
-    write_file(path, _SEAL.sub(f'"self_sha256": "{digest}"\n}}\n', text), work=work)
-
-
-def load_document(path: Path, kind: str, *, version: int, form: Form) -> dict[str, Any]:
-    """Read a sealed document.
+    """Write a document with its checksum, atomically.
 
     Args:
         path: The file.
-        kind: The "format" that it must have.
-        version: The newest "format_version" that the caller understands.
-        form: What it must hold, see ``cnpgen.store.files.forms``.
-
-    Returns:
-        Its content without the seal.
+        document: JSON-able content; the keys "format" and "format_version" come first.
+        work: Folder of the temporary file.
 
     Raises:
-        DatasetError: It is missing, cut off, changed since it was written, too large, of another kind or form, or from
-            a newer cnpgen.
-        MachineError: The system would not let us read it.
+        MachineError: The file cannot be written.
+    """
+    text = render(plain({**document, "self_sha256": _BLANK})) + "\n"
+    digest = hashlib.sha256(text.encode()).hexdigest()
+    write_file(path, _CHECKSUM.sub(f'"self_sha256": "{digest}"\n}}\n', text), work=work)
+
+
+def load_document(path: Path, kind: str, *, version: int, structure: Structure) -> dict[str, Any]:
+    """Read a document and verify its checksum.
+
+    Args:
+        path: The file.
+        kind: The expected "format".
+        version: The expected "format_version".
+        structure: The expected structure, see ``cnpgen.store.files.document_structure``.
+
+    Returns:
+        The content without the checksum.
+
+    Raises:
+        DatasetError: The file is missing, too large, cut off or changed, or has another format, version or structure.
+        MachineError: The file cannot be read.
     """
     text, document = _parse(path)
     if document.get("format") != kind:
         raise DatasetError(f"{path} is not a {kind} file: its format is {document.get('format')!r}")
-    found = document.get("format_version")
-    if isinstance(found, int) and found > version:
-        raise DatasetError(f"{path} has format version {found}, this cnpgen reads up to {version}: upgrade cnpgen")
-    seal = _SEAL.search(text)
-    blank = _SEAL.sub(f'"self_sha256": "{_BLANK}"\n}}\n', text)
-    if found is None or seal is None or seal[1] != hashlib.sha256(blank.encode()).hexdigest():
+    actual = document.get("format_version")
+    if isinstance(actual, int) and actual != version:
+        remedy = "upgrade cnpgen" if actual > version else "make it again"
+        raise DatasetError(f"{path} has format version {actual}, this cnpgen reads version {version}: {remedy}")
+    checksum = _CHECKSUM.search(text)
+    blank = _CHECKSUM.sub(f'"self_sha256": "{_BLANK}"\n}}\n', text)
+    if actual is None or checksum is None or checksum[1] != hashlib.sha256(blank.encode()).hexdigest():
         raise DatasetError(f"{path} is damaged: it was changed after it was written")
     del document["self_sha256"]
     try:
-        check_form(document, form)
+        check_structure(document, structure)
     except ValueError as error:
         raise DatasetError(f"{path} is damaged: {error}") from error
     return document
 
 
 def parse_json(text: str) -> Any:
-    """Parse JSON that somebody else may have written.
+    """Parse untrusted JSON.
 
     Raises:
-        ValueError: It is none, is nested deeper than any document, or has texts that are no texts.
+        ValueError: The text is not JSON, is nested too deeply, or contains invalid Unicode.
     """
     try:
         value = json.loads(text)
@@ -161,28 +163,28 @@ def parse_json(text: str) -> Any:
         raise _too_deep() from error
     _check_depth(value)
     if _SURROGATE.search(text):
-        json.dumps(value, ensure_ascii=False).encode()  # half a character is a ValueError
+        json.dumps(value, ensure_ascii=False).encode()  # raises a ValueError for a single surrogate
     return value
 
 
 def _check_depth(value: Any) -> None:
     level: list[Any] = [value] if isinstance(value, dict | list) else []
-    for _ in range(DOCUMENT_DEPTH + 1):
+    for _ in range(MAX_DOCUMENT_DEPTH + 1):
         if not level:
             return
-        inside = (each.values() if isinstance(each, dict) else each for each in level)
+        inside = (value.values() if isinstance(value, dict) else value for value in level)
         level = [item for items in inside if not _NESTED.isdisjoint(map(type, items)) for item in items]
         level = [item for item in level if isinstance(item, dict | list)]
     raise _too_deep()
 
 
 def _too_deep() -> ValueError:
-    return ValueError(f"it has more than {DOCUMENT_DEPTH} tables and lists in one another")
+    return ValueError(f"it has more than {MAX_DOCUMENT_DEPTH} nested tables and lists")
 
 
 def _parse(path: Path) -> tuple[str, dict[str, Any]]:
-    """Return a JSON object's text and content."""
-    content = read_file(path, most=DOCUMENT_BYTES)
+    """Read a JSON object; return its text and content."""
+    content = read_file(path, max_bytes=MAX_DOCUMENT_BYTES)
     if not content:
         raise DatasetError(f"{path} is damaged: it is empty")
     try:
@@ -191,5 +193,5 @@ def _parse(path: Path) -> tuple[str, dict[str, Any]]:
     except ValueError as error:
         raise DatasetError(f"{path} is damaged: not JSON ({error})") from error
     if not isinstance(document, dict):
-        raise DatasetError(f"{path} is damaged: a JSON object was expected")
+        raise DatasetError(f"{path} is damaged: expected a JSON object")
     return text, document

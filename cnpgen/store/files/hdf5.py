@@ -1,8 +1,7 @@
-"""The one door through which HDF5 files are read: it gives plain numbers that are in the file itself, and short texts.
+"""The only entry point for reading HDF5 files: it returns plain numbers that are stored in the file itself.
 
-HDF5 can do more: datasets whose bytes are in other files, links to other files, references, texts of any number in
-other places, filters that are loaded as code. None of that is followed; whatever is asked for and is no plain dataset
-is refused by name.
+Other features of HDF5 are refused with an error that names the dataset. These are external storage, links to other
+files, references, variable-length texts and filters that are loaded as code.
 """
 
 import errno
@@ -21,23 +20,29 @@ from cnpgen.errors import DatasetError, MachineError
 from cnpgen.store.files.atomic import machine_error
 from cnpgen.store.files.attributes import Attributes, decoded
 from cnpgen.store.files.heaps import check_heaps
-from cnpgen.store.files.kind import seeming
-from cnpgen.store.files.limits import ALWAYS, EXPANSION, MOST_BYTES, MOST_DIMENSIONS, MOST_NAMES
+from cnpgen.store.files.kind import apparent_kind
+from cnpgen.store.files.size_limits import (
+    MAX_DIMENSIONS,
+    MAX_EXPANSION,
+    MAX_HDF5_BYTES,
+    MAX_NAMES,
+    MIN_EXPANSION_LIMIT_BYTES,
+)
 
-_DAMAGE = (OSError, KeyError, RuntimeError, ValueError, TypeError, AttributeError)  # what h5py raises on broken files
+_DAMAGE = (OSError, KeyError, RuntimeError, ValueError, TypeError, AttributeError)  # errors of h5py for damaged files
 _SYSTEM_ERRORS = {errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE, errno.EIO, errno.ENOMEM, errno.ESTALE}
-_FILTERS = {1: "gzip", 2: "shuffle", 3: "fletcher32", 32000: "lzf"}  # those that every h5py has in itself
+_FILTERS = {1: "gzip", 2: "shuffle", 3: "fletcher32", 32000: "lzf"}  # filters that are built into every h5py
 
 
 def create_hdf5(buffer: io.BytesIO, *, userblock: int = 0, alignment: int = 64) -> Any:
     """Create an HDF5 file in ``buffer``; wrap it in ``h5py.File``.
 
-    The file format is pinned. The root group stores no times, which ``h5py.File`` has only lately learnt to leave out.
+    The file format is pinned. The root group stores no times; older versions of ``h5py.File`` cannot switch them off.
 
     Args:
-        buffer: Where the file is made.
-        userblock: What is left free at its beginning [bytes].
-        alignment: Datasets start at multiples of it, so that they can be mapped into memory as aligned arrays [bytes].
+        buffer: Buffer of the file.
+        userblock: Size of the user block at the beginning [bytes].
+        alignment: Alignment of datasets, which allows to map them into memory as aligned arrays [bytes].
     """
     from h5py import h5f, h5fd, h5p
 
@@ -55,10 +60,10 @@ class Column:
     """A dataset of plain numbers.
 
     Attributes:
-        shape: Its shape.
-        dtype: Its stored type: integers or floats.
-        offset: Where its numbers begin in the file [bytes]; None if they are not there in one piece.
-        attributes: Texts and numbers that are attached to it.
+        shape: Shape of the dataset.
+        dtype: Stored type: integers or floats.
+        offset: Position of the first number in the file [bytes]; None if the storage is not contiguous.
+        attributes: Attributes of the dataset.
     """
 
     shape: tuple[int, ...]
@@ -69,11 +74,11 @@ class Column:
 
     @property
     def bytes(self) -> int:
-        """How much memory its numbers take."""
+        """Size of the numbers in memory [bytes]."""
         return math.prod(self.shape) * self.dtype.itemsize
 
     def read(self) -> NDArray[Any]:
-        """Return its numbers."""
+        """Return the numbers."""
         from h5py import Dataset
 
         return np.asarray(Dataset(self._dataset)[()])
@@ -81,22 +86,22 @@ class Column:
 
 @dataclass(eq=False)
 class Hdf5:
-    """An open file: a mapping from names at its root to datasets of plain numbers; groups are passed over.
+    """An open file: a mapping from names at its root to datasets of plain numbers; groups are skipped.
 
     Attributes:
-        path: Where it is, for messages.
-        attributes: Texts and numbers that are attached to the file.
+        path: Path of the file, for messages.
+        attributes: Attributes of the file.
     """
 
     path: Path
     attributes: Attributes
-    _root: Any  # an identifier of h5py's lower interface
+    _root: Any  # an identifier of the low-level API of h5py
     _size: int
-    _given: dict[str, Column] = field(default_factory=dict)
+    _columns: dict[str, Column] = field(default_factory=dict)
     _opened: dict[str, Any] = field(default_factory=dict)
 
     def __iter__(self) -> Iterator[str]:
-        """Yield the names of what is not a group, whether it can be given or not."""
+        """Yield the names of everything that is not a group, also of objects that cannot be read."""
         from h5py import h5g
 
         return (name for name in self.names() if not isinstance(self._open(name), h5g.GroupID))
@@ -108,25 +113,24 @@ class Hdf5:
         """Return a dataset without reading its numbers.
 
         Raises:
-            DatasetError: It is not stored in this file in a plain way, holds no numbers, or declares more of them than
-                can be true.
+            DatasetError: It is not a plain dataset of numbers in this file, or declares more numbers than possible.
         """
-        if name not in self._given:
-            self._given[name] = self._checked(name, self._open(name))
-        return self._given[name]
+        if name not in self._columns:
+            self._columns[name] = self._checked(name, self._open(name))
+        return self._columns[name]
 
     def names(self) -> list[str]:
-        """Return the names of all that is at the root, groups and links included."""
-        if (count := len(self._root)) > MOST_NAMES:
-            raise DatasetError(f"{self.path} has {count:,} datasets, expected at most {MOST_NAMES:,}")
+        """Return the names of all objects at the root, including groups and links."""
+        if (count := len(self._root)) > MAX_NAMES:
+            raise DatasetError(f"{self.path} has {count:,} datasets, expected at most {MAX_NAMES:,}")
         return [decoded(self.path, name) for name in self._root]
 
     def columns(self) -> Mapping[str, Column]:
-        """Return every dataset; see ``__getitem__``."""
+        """Return all datasets; see ``__getitem__``."""
         return {name: self[name] for name in self}
 
     def _open(self, name: str) -> Any:
-        """Open what is in the file under a name."""
+        """Open an object of the file."""
         from h5py import h5l, h5o
 
         if name not in self._opened:
@@ -136,14 +140,14 @@ class Hdf5:
         return self._opened[name]
 
     def _checked(self, name: str, dataset: Any) -> Column:
-        """Look at a dataset in an order in which nothing is believed, or opened, before it is known to be plain."""
+        """Check a dataset; every property is checked before an operation that relies on it."""
         from h5py import h5d, h5t
 
         if not isinstance(dataset, h5d.DatasetID):
             raise DatasetError(f"{self.path}: {name} must be a dataset, got a group or a type")
         layout = dataset.get_create_plist()
         if layout.get_layout() == h5d.VIRTUAL or layout.get_external_count():
-            raise DatasetError(f"{self.path}: the numbers of {name} are in another file, where they are not looked for")
+            raise DatasetError(f"{self.path}: the numbers of {name} are in another file, which is not read")
         if dataset.get_type().get_class() not in {h5t.INTEGER, h5t.FLOAT}:
             raise DatasetError(f"{self.path}: {name} must hold numbers, got {_type_text(dataset)}")
         filters = [layout.get_filter(index)[0] for index in range(layout.get_nfilters())]
@@ -151,27 +155,27 @@ class Hdf5:
             known = ", ".join(_FILTERS.values())
             raise DatasetError(f"{self.path}: {name} is packed with filter {filters}, expected {known} or none")
         shape = dataset.shape
-        if shape is None or len(shape) > MOST_DIMENSIONS:
-            raise DatasetError(f"{self.path}: {name} must have at most {MOST_DIMENSIONS} dimensions, got {shape}")
-        found = Column(shape, dataset.dtype, dataset.get_offset(), Attributes(self.path, dataset), dataset)
-        self._check_size(name, found, layout.get_chunk() if layout.get_layout() == h5d.CHUNKED else ())
-        return found
+        if shape is None or len(shape) > MAX_DIMENSIONS:
+            raise DatasetError(f"{self.path}: {name} must have at most {MAX_DIMENSIONS} dimensions, got {shape}")
+        column = Column(shape, dataset.dtype, dataset.get_offset(), Attributes(self.path, dataset), dataset)
+        self._check_size(name, column, layout.get_chunk() if layout.get_layout() == h5d.CHUNKED else ())
+        return column
 
-    def _check_size(self, name: str, found: Column, chunk: tuple[int, ...]) -> None:
-        """Refuse more numbers than a file of this size can honestly hold, together with those given before."""
-        before = sum(item.bytes for item in self._given.values())
-        declared = max(before + found.bytes, math.prod(chunk) * found.dtype.itemsize)
-        if declared > max(EXPANSION * self._size, ALWAYS):
+    def _check_size(self, name: str, column: Column, chunk: tuple[int, ...]) -> None:
+        """Raise an error if this and all previous columns are larger than a file of this size can contain."""
+        previous = sum(item.bytes for item in self._columns.values())
+        declared = max(previous + column.bytes, math.prod(chunk) * column.dtype.itemsize)
+        if declared > max(MAX_EXPANSION * self._size, MIN_EXPANSION_LIMIT_BYTES):
             raise DatasetError(
-                f"{self.path}: {name} declares the shape {found.shape}: unpacked, the file of {self._size:,} bytes"
-                f" would have {declared:,}, more than {EXPANSION} times as many"
+                f"{self.path}: {name} declares the shape {column.shape}: unpacked, the file of {self._size:,} bytes"
+                f" would have {declared:,}, more than {MAX_EXPANSION} times as many"
             )
-        if found.offset is not None and found.offset + found.bytes > self._size:
-            raise DatasetError(f"{self.path} is damaged or cut off: {name} reaches beyond its end")
+        if column.offset is not None and column.offset + column.bytes > self._size:
+            raise DatasetError(f"{self.path} is damaged or cut off: {name} reaches outside its end")
 
 
 def _type_text(dataset: Any) -> str:
-    """Say what type a dataset has; some have none in NumPy."""
+    """Return the name of the type of a dataset, which NumPy may not support."""
     try:
         return str(dataset.dtype)
     except (TypeError, ValueError, RuntimeError):
@@ -180,16 +184,16 @@ def _type_text(dataset: Any) -> str:
 
 @contextmanager
 def opened_hdf5(path: Path, content: bytes | None = None) -> Iterator[Hdf5]:
-    """Open an HDF5 file for reading, without handles that outlive the block and could be shared by processes.
+    """Open an HDF5 file for reading. All handles are closed at the end of the block, so processes cannot share them.
 
     Args:
         path: The file.
-        content: What is in it, if that was read already.
+        content: Content of the file, if it has been read already.
 
     Raises:
-        DatasetError: The file is missing, no HDF5 file, too large, damaged or cut off, as opening or the block finds
-            out.
-        MachineError: The system would not let us read it, or what is read is more than the memory holds.
+        DatasetError: The file is missing, not an HDF5 file, too large, damaged or cut off; also raised for errors
+            within the block.
+        MachineError: The file cannot be read, or does not fit into memory.
     """
     import h5py
 
@@ -201,36 +205,38 @@ def opened_hdf5(path: Path, content: bytes | None = None) -> Iterator[Hdf5]:
         with h5py.File(source, "r", locking="best-effort" if content is None else None) as file:
             yield Hdf5(path, Attributes(path, file.id), file.id, size)
     except MemoryError as error:
-        raise MachineError(f"cannot read {path}: what is in it does not fit into memory") from error
+        raise MachineError(f"cannot read {path}: its content does not fit into memory") from error
     except _DAMAGE as error:
         if isinstance(error, OSError) and error.errno in _SYSTEM_ERRORS:
             raise machine_error("read", path, error) from error
         if content is None and not h5py.is_hdf5(path):
-            raise DatasetError(f"{path} is not an HDF5 file, or its beginning is damaged{seeming(path)}") from error
+            raise DatasetError(
+                f"{path} is not an HDF5 file, or its beginning is damaged{apparent_kind(path)}"
+            ) from error
         raise DatasetError(f"{path} is damaged or cut off: {error}") from error
 
 
 def require_possible_size(path: Path) -> int:
-    """Return the size of a file [bytes]; a file of nothing but a size can be sent in a few bytes.
+    """Return the size of a file [bytes], and refuse huge sparse files.
 
     Raises:
-        DatasetError: It is larger than any of cnpgen's.
+        DatasetError: The file is larger than ``MAX_HDF5_BYTES``.
     """
-    if (size := path.stat().st_size) > MOST_BYTES:
-        raise DatasetError(f"{path} has {size:,} bytes, expected at most {MOST_BYTES:,}")
+    if (size := path.stat().st_size) > MAX_HDF5_BYTES:
+        raise DatasetError(f"{path} has {size:,} bytes, expected at most {MAX_HDF5_BYTES:,}")
     return size
 
 
 def _check_bytes(path: Path, content: bytes | None) -> int:
-    """Refuse damage on which HDF5 would hang; return the size of the file [bytes]."""
+    """Raise an error for damage that makes HDF5 hang; return the size of the file [bytes]."""
     if content is not None:
         check_heaps(path, np.frombuffer(content, np.uint8))
         return len(content)
-    if require_possible_size(path) == 0:  # what is empty cannot be mapped
+    if require_possible_size(path) == 0:  # an empty file cannot be mapped
         return 0
     try:
-        found: NDArray[np.uint8] = np.memmap(path, np.uint8, "r")
+        data: NDArray[np.uint8] = np.memmap(path, np.uint8, "r")
     except OSError:  # file systems without memory maps
-        found = np.fromfile(path, np.uint8)
-    check_heaps(path, found)
-    return len(found)
+        data = np.fromfile(path, np.uint8)
+    check_heaps(path, data)
+    return len(data)

@@ -1,10 +1,10 @@
-"""What a file seems to be, from its first bytes."""
+"""Detection of the kind of a file from its first bytes."""
 
 import re
 from pathlib import Path
 
 HDF5 = b"\x89HDF\r\n\x1a\n"
-_OURS = re.compile(rb"cnpgen[- ](plans|model|checkpoint|proposals|journal) [0-9]")
+_CNPGEN_HEADER = re.compile(rb"cnpgen[- ](plans|model|checkpoint|proposals|journal) [0-9]")
 _SIGNATURES = {
     HDF5: "an HDF5 file",
     b"PK\x03\x04": "a zip archive, as .npz files are",
@@ -14,36 +14,36 @@ _SIGNATURES = {
     b"\x80": "a pickle",
 }
 PLANS = "a file of plans"
-_HEAD = 256  # bytes that are looked at
-_BEGINNINGS = (0, 512, 1024, 2048)  # bytes, where HDF5 files of users begin
+_HEAD_BYTES = 256
+_SIGNATURE_OFFSETS = (0, 512, 1024, 2048)  # bytes; the offset is the size of the user block
 
 
 def own_kind(head: bytes) -> str:
-    """Say what a file of cnpgen's own formats is, from its first bytes: "a model of cnpgen"; else nothing."""
-    found = _OURS.match(head)
-    return kind_name(found[1].decode()) if found else ""
+    """Return the kind of a file in a format of cnpgen, "a model of cnpgen", from its first bytes; otherwise empty."""
+    match = _CNPGEN_HEADER.match(head)
+    return kind_name(match[1].decode()) if match else ""
 
 
 def kind_name(word: str) -> str:
-    """Name a kind of file by the word that its seal has for it: "a model of cnpgen", or "a file of plans"."""
+    """Return the name of a kind of file, "a model of cnpgen" or "a file of plans", from the word in its header."""
     return PLANS if word == "plans" else f"a {word} of cnpgen"
 
 
 def is_hdf5(path: Path) -> bool:
-    """Whether a file is HDF5, by its signature, which may follow a block that the format leaves to the user.
+    """Return whether a file has the signature of HDF5, possibly after a user block.
 
     Raises:
-        OSError: It cannot be read.
+        OSError: The file cannot be read.
     """
     with path.open("rb") as file:
-        return any(file.seek(place) == place and file.read(len(HDF5)) == HDF5 for place in _BEGINNINGS)
+        return any(file.seek(offset) == offset and file.read(len(HDF5)) == HDF5 for offset in _SIGNATURE_OFFSETS)
 
 
-def seeming(path: Path) -> str:
-    """Say what a file seems to be, for a message that ends with it: ": it seems to be a text file"; else nothing."""
+def apparent_kind(path: Path) -> str:
+    """Return the apparent kind of a file as the end of a message, ": it seems to be a text file"; otherwise empty."""
     try:
         with path.open("rb") as file:
-            head = file.read(_HEAD)
+            head = file.read(_HEAD_BYTES)
     except OSError:
         return ""
     if not head:
@@ -54,6 +54,6 @@ def seeming(path: Path) -> str:
 
 
 def _is_text(head: bytes) -> bool:
-    """Whether bytes are printable UTF-8, of which the last character may be cut off."""
+    """Return whether bytes are printable UTF-8, ignoring an incomplete last character."""
     text = head.decode(errors="replace").rstrip("\ufffd")
     return bool(text) and "\ufffd" not in text and all(letter.isprintable() or letter.isspace() for letter in text)

@@ -1,8 +1,8 @@
-"""What processes that were killed leave behind: temporary files, each of which says in its name whose it is.
+"""Temporary files and their removal after the process that wrote them was killed.
 
-Several machines may work in one folder, with clocks that differ by hours, so that the age of a file says nothing: a
-process sweeps only what processes of its own machine have left that are no more. What those of others have left goes
-when the dataset is finished.
+The name of a temporary file contains the machine and the process. Several machines with different clocks may use one
+folder, so the age of a file is no criterion. A process removes only files of dead processes on its own machine; all
+others are removed when the dataset is finished.
 """
 
 import glob
@@ -17,16 +17,15 @@ from pathlib import Path
 
 
 def temporary_name(name: str) -> str:
-    """Return the name of a temporary file for a file called ``name``: of this process, and no other one."""
+    """Return a unique name of a temporary file for the file ``name``; it contains machine and process."""
     return f".{name}.{_machine()}-{os.getpid()}.{uuid.uuid4().hex}.tmp"
 
 
-def sweep(work: Path) -> None:
-    """Remove what dead processes of this machine have left in the folder for temporary files.
+def remove_leftovers(work: Path) -> None:
+    """Remove temporary files of dead processes of this machine.
 
     Args:
-        work: The folder. What is not one of ours is kept, and all of it where the folder is a symbolic link: it may
-            lead anywhere.
+        work: Folder of temporary files. Other files are kept. A symbolic link is not followed.
     """
     for path in _temporary(work):
         if _is_dead(path.name.split(".")[-3]):
@@ -34,15 +33,15 @@ def sweep(work: Path) -> None:
                 path.unlink(missing_ok=True)
 
 
-def sweep_all(work: Path) -> None:
-    """Remove all temporary files from their folder, whoever writes to them: nobody needs them any more."""
+def remove_all_temporary(work: Path) -> None:
+    """Remove the temporary files of all processes from their folder."""
     for path in _temporary(work):
         with suppress(OSError):
             path.unlink(missing_ok=True)
 
 
-def sweep_file(path: Path) -> None:
-    """Remove what dead processes of this machine have left of writing a file beside it."""
+def remove_leftovers_of(path: Path) -> None:
+    """Remove temporary files for ``path`` of dead processes of this machine."""
     with suppress(OSError):
         for leftover in path.parent.glob(f".{glob.escape(path.name)}.*.tmp"):
             if _is_dead(leftover.name.split(".")[-3]):
@@ -56,7 +55,7 @@ def _temporary(work: Path) -> Iterator[Path]:
 
 
 def _is_dead(owner: str) -> bool:
-    """Whether a process was one of this machine and is no more; of others nobody here knows."""
+    """Return whether the owner of a file was a process of this machine that has ended."""
     machine, _, process = owner.partition("-")
     return machine == _machine() and process.isdigit() and not _is_alive(int(process))
 
@@ -73,10 +72,10 @@ def _is_alive(process: int) -> bool:
 
 @cache
 def _machine() -> str:
-    """Name what gives processes their numbers: a machine since it was started, and a container on it."""
+    """Return an identifier of the process id space: the boot of the machine and the PID namespace."""
     try:
         boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii")
-        space = str(Path("/proc/self/ns/pid").stat().st_ino)
+        namespace = str(Path("/proc/self/ns/pid").stat().st_ino)
     except OSError:  # no Linux
-        boot, space = platform.node(), str(uuid.getnode())
-    return hashlib.sha256(f"{boot} {space}".encode()).hexdigest()[:12]
+        boot, namespace = platform.node(), str(uuid.getnode())
+    return hashlib.sha256(f"{boot} {namespace}".encode()).hexdigest()[:12]

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cnpgen.benchmark.report import save_benchmark_report
-from cnpgen.benchmark.run import run_benchmark
+from cnpgen.benchmark.html_report import save_benchmark_report
+from cnpgen.benchmark.run_suite import run_benchmark
 from cnpgen.benchmark.simulator.challenge import challenge_plant
 from cnpgen.benchmark.simulator.simulate import execute_plan, simulate_plans
 from cnpgen.errors import MachineError, UsageError
-from cnpgen.make.boundary_problems import draw_boundary_problems
+from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.plans import Plans, save_plans
-from cnpgen.refine.plans import solve_plans
+from cnpgen.refine.refine_plans import solve_plans
 
 pytest.importorskip("mujoco")
 CLONE = Path(__file__).parents[2] / "examples" / "challenge"

@@ -11,10 +11,10 @@ from cnpgen.benchmark.simulator.plant import PLANTS, as_plant
 from cnpgen.benchmark.simulator.reference import TICK, Reference
 from cnpgen.benchmark.simulator.simulate import execute_plan, scene_of, simulate_plans
 from cnpgen.errors import UsageError
-from cnpgen.make.boundary_problems import draw_boundary_problems
+from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.plans import Plans, make_plans
 from cnpgen.plans.concatenate import concatenate
-from cnpgen.refine.plans import solve_plans
+from cnpgen.refine.refine_plans import solve_plans
 from cnpgen.schema.catalogue import list_recipes
 from tests.examples.plans import ROBOTS, load
 
@@ -119,7 +119,7 @@ def test_an_object_is_carried_without_collision(plant: str) -> None:
 
 def test_an_object_dragged_through_a_pedestal_collides() -> None:
     scene, reference, _ = execute_plan(stored("transport"), PLANTS["nominal"])
-    higher = replace(scene, tops=scene.tops + 0.1)
+    higher = replace(scene, obstacle_poses=scene.obstacle_poses + 0.1)
     executed = execute(higher, reference, stored("transport").columns["goal_xyz"][0]).executed
     assert executed.collided
     assert not executed.success
@@ -171,7 +171,7 @@ def test_where_a_torque_saturates_the_arm_is_still_held_up() -> None:
     scene, reference, _ = execute_plan(stored("transport"), PLANTS["nominal"])
     q = np.vstack([reference.q[-1:] - 0.1, np.repeat(reference.q[-1:], 2000, axis=0)])
     jump = Reference(q, np.zeros_like(q), np.zeros_like(q), 2.0)
-    away = replace(scene, tops=scene.tops - 2)
+    away = replace(scene, obstacle_poses=scene.obstacle_poses - 2)
     found = execute(away, jump, stored("transport").columns["goal_xyz"][0])
     assert found.executed.torque_use == pytest.approx(1)
     assert found.executed.finished

@@ -4,9 +4,9 @@ import mujoco
 import numpy as np
 
 from cnpgen.benchmark.simulator.plant import PLANTS
-from cnpgen.benchmark.simulator.scene import Scene, scene_xml
-from cnpgen.problems.load import load_problem
-from cnpgen.problems.robot import load_robot
+from cnpgen.benchmark.simulator.simulator_scene import Scene, scene_xml
+from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.problem_file import load_problem
 
 BASE = np.array([-1.51, 0.0, -0.1])
 STEPS = 4  # of MuJoCo in a tick

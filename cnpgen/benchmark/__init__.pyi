@@ -1,0 +1,16 @@
+from cnpgen.benchmark.benchmark_planner import BenchmarkPlanner as BenchmarkPlanner
+from cnpgen.benchmark.benchmark_planner import Setting as Setting
+from cnpgen.benchmark.html_report import save_benchmark_report as save_benchmark_report
+from cnpgen.benchmark.pucks import Pucks as Pucks
+from cnpgen.benchmark.replanning_scenario import Lead as Lead
+from cnpgen.benchmark.replanning_scenario import Turns as Turns
+from cnpgen.benchmark.run_suite import Benchmark as Benchmark
+from cnpgen.benchmark.run_suite import run_benchmark as run_benchmark
+from cnpgen.benchmark.simulator.executed import Executed as Executed
+from cnpgen.benchmark.simulator.plant import Plant as Plant
+from cnpgen.benchmark.simulator.simulate import Simulation as Simulation
+from cnpgen.benchmark.simulator.simulate import simulate_plans as simulate_plans
+from cnpgen.benchmark.suite import Draws as Draws
+from cnpgen.benchmark.suite import Suite as Suite
+from cnpgen.benchmark.suite import load_suite as load_suite
+from cnpgen.benchmark.trajectory import Trajectory as Trajectory

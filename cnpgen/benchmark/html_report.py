@@ -1,0 +1,178 @@
+"""A report of a benchmark as one HTML file: tables beside the paper's figures, box plots, pictures or films."""
+
+import base64
+import io
+import tempfile
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from cnpgen.benchmark.execution import Task, execution_of
+from cnpgen.benchmark.hypothesis_tests import FIGURES, FLAGS, compared_with, values_of
+from cnpgen.benchmark.run_suite import Benchmark
+from cnpgen.benchmark.simulator.plant import Plant
+from cnpgen.benchmark.simulator.rendering import save_film, save_picture
+from cnpgen.errors import CnpgenError, MachineError
+from cnpgen.store.files.atomic import write_file
+from cnpgen.store.files.figure_file import new_figure
+
+PRINTED: dict[str, dict[str, dict[str, str]]] = {  # suite -> planner -> figure -> what the paper's text says of it
+    "hits-81": {
+        "cnp-b": {"scored": "100 %", "planning_ms": "33", "z_error_mm_s": "< 5"},
+        "aqp": {"scored": "92.59 %", "planning_ms": "42"},
+        "trajopt": {"scored": "91.35 %", "planning_ms": "about 10,000"},
+    },
+    "heavy-100": {
+        "cnp-b": {"paper_finished": "100 %", "paper_valid": "95 %"},
+        "cbirrt": {"paper_finished": "88 %", "paper_valid": "74 %"},
+    },
+    "hits-110": {"cnp-b": {"scored": "78.2 % (real robot)"}, "aqp": {"scored": "52.7 % (real robot)"}},
+}
+FRAMES = 300  # of a film: some seconds of work, and less than 1 MB
+_STYLE = "body{font-family:sans-serif;max-width:75em;margin:2em auto}td,th{padding:.2em .8em;text-align:right}"
+_STYLE += "td:first-child,th:first-child{text-align:left}table{border-collapse:collapse}tr{border-top:1px solid #ccc}"
+_STYLE += "svg{max-width:100%;height:auto}figure{display:inline-block;width:46%;margin:1%}img,video{width:100%}"
+
+
+def save_benchmark_report(benchmark: Benchmark, path: str | Path, *, video: bool = False) -> Path:
+    """Write the report of a benchmark as one file that needs no others; a file that is there is replaced.
+
+    Args:
+        benchmark: What ``run_benchmark`` returned.
+        path: Where to, ``.html``.
+        video: Whether to film the first plan of every planner, which takes some seconds each, and not only draw its
+            end.
+
+    Raises:
+        MachineError: matplotlib is missing, or the file cannot be written.
+    """
+    suite, place = benchmark.suite, Path(path)
+    parts = [
+        f"<h1>{escape(suite.name)} {suite.version}</h1><p>{escape(suite.title)}: {len(benchmark.problems)} problems</p>"
+    ]
+    parts += [f"<p>{escape(trouble)}</p>" for trouble in troubles(benchmark)]
+    for plant in benchmark.executions:
+        title = f"executed by the {plant} plant" if plant else "planned"
+        parts.append(f"<h2>{title}</h2>{_table(benchmark, plant)}{_boxes(benchmark, plant)}")
+    parts += _motions(benchmark, video=video)
+    head = f"<!doctype html><meta charset='utf-8'><title>{escape(suite.name)}</title><style>{_STYLE}</style>"
+    write_file(place, "\n".join([head, *parts]))
+    return place
+
+
+def _table(benchmark: Benchmark, plant: str) -> str:
+    """Lay out what ``table_rows`` returns."""
+    head, *rows = table_rows(benchmark, plant)
+    lines = ["<table><tr>" + "".join(f"<th>{escape(cell)}</th>" for cell in head) + "</tr>"]
+    lines += ["<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows]
+    other = compared_with(benchmark.results)
+    note = f"Medians [quartiles]; p: the chance of as large a difference from {other}, where it is below 5 %."
+    return "\n".join([*lines, f"</table><p>{note}</p>"])
+
+
+def troubles(benchmark: Benchmark) -> list[str]:
+    """Say of every planner without a plan for some problems what came of those, and what it said first."""
+    found = []
+    for name, rows in benchmark.results.items():
+        without = [row for row in rows if row["answer"] is None]
+        for ending in dict.fromkeys(row["ending"] for row in without):
+            of_it = [row for row in without if row["ending"] == ending]
+            said = f", problem {of_it[0]['problem']}: {of_it[0]['error']}" if of_it[0]["error"] else ""
+            found.append(f"{name}: {len(of_it)} of {len(rows)} {ending}{said}")
+    return found
+
+
+def table_rows(benchmark: Benchmark, plant: str) -> list[tuple[str, ...]]:
+    """Put ratios and figures beside each other: a head, then a row for each, with what the paper prints.
+
+    Args:
+        benchmark: What ``run_benchmark`` returned.
+        plant: The plant whose executions count; none if it is empty.
+    """
+    summary = benchmark.summary(plant)
+    printed = PRINTED.get(benchmark.suite.name, {})
+    rows: list[tuple[str, ...]] = [(f"{plant} plant" if plant else "planned", *summary)]
+    for group, texts in (("ratios", FLAGS), ("figures", FIGURES)):
+        for key, text in texts.items():
+            cells = [cell_text(summary[name][group].get(key), printed.get(name, {}).get(key)) for name in summary]
+            if any(cells):
+                rows.append((text, *cells))
+    return rows
+
+
+def cell_text(found: dict[str, Any] | None, printed: str | None = None) -> str:
+    """Write a ratio or a figure in a few characters, with what the paper prints."""
+    if found is None:
+        return f"paper: {printed}" if printed else ""
+    if "share" in found:
+        text = f"{found['count']} of {found['of']}"
+    else:
+        text = f"{found['median']:.3g} [{found['q1']:.3g}, {found['q3']:.3g}]"
+    text += f", p {found['p']:.1g}" if found["p"] < 0.05 else ""
+    return text + (f" (paper: {printed})" if printed else "")
+
+
+def _boxes(benchmark: Benchmark, plant: str) -> str:
+    """Draw box plots of all figures."""
+    values = {name: [values_of(row, plant) for row in rows] for name, rows in benchmark.results.items()}
+    shown = [key for key in FIGURES if any(key in row for rows in values.values() for row in rows)]
+    figure = new_figure(4 * min(len(shown), 4), 3 * -(-len(shown) // 4), dpi=100)
+    for place, key in enumerate(shown, start=1):
+        axes = figure.add_subplot(-(-len(shown) // 4), min(len(shown), 4), place)
+        axes.boxplot([[row[key] for row in rows if key in row] for rows in values.values()])
+        axes.set_xticks(range(1, len(values) + 1), list(values), rotation=30, fontsize=7)
+        axes.set_title(FIGURES[key], fontsize=9)
+        if key.startswith("planning"):
+            axes.set_yscale("log")
+    picture = io.StringIO()
+    figure.savefig(picture, format="svg", metadata={"Date": None})
+    return picture.getvalue().partition("?>\n")[2]
+
+
+def _motions(benchmark: Benchmark, *, video: bool) -> list[str]:
+    """Show the first plan of each planner that could be executed, where this machine can draw."""
+    parts = []
+    for name, rows in benchmark.results.items() if benchmark.plants else ():
+        plant = benchmark.plants[0]
+        index = next((row["problem"] for row in rows if _was_executed(row, plant.name)), None)
+        if index is None:
+            continue
+        task = benchmark.problems[index], rows[index]["answer"], benchmark.lead and benchmark.lead[index]
+        what = f"{escape(name)}, problem {index}"
+        try:
+            shown, text = _shown(task, plant, video=video)
+        except MachineError as error:
+            return [f"<p>No pictures: {escape(str(error))}</p>"]
+        except CnpgenError as error:  # a line that was damaged since
+            parts.append(f"<p>{what}: no picture: {escape(str(error))}</p>")
+            continue
+        parts.append(f"<figure>{shown}<figcaption>{what}, {text}</figcaption></figure>")
+    return parts
+
+
+def _was_executed(row: dict[str, Any], plant: str) -> bool:
+    executed = row.get("executed", {}).get(plant)
+    return executed is not None and "failure" not in executed
+
+
+def _shown(task: Task, plant: Plant, *, video: bool) -> tuple[str, str]:
+    """Execute a plan; return what shows its end, or the whole of it, and what is to be said of that."""
+    scene, reference, execution = execution_of(task, plant)
+    with tempfile.TemporaryDirectory() as folder:
+        picture, film = Path(folder) / "end.png", Path(folder) / "plan.mp4"
+        save_picture(picture, scene, execution, reference.ticks)
+        still, text = _embedded(picture, "image/png"), "at the end of its plan"
+        if video:
+            try:
+                save_film(film, scene, execution, reference.ticks, most=FRAMES)
+            except MachineError as error:
+                text += f"; no film: {escape(str(error))}"
+                film.unlink(missing_ok=True)
+        if not film.exists():
+            return f"<img src='{still}'>", text
+        source = _embedded(film, "video/mp4")
+    return f"<video controls loop muted poster='{still}' src='{source}'></video>", "scaled in time"
+
+
+def _embedded(file: Path, kind: str) -> str:
+    return f"data:{kind};base64,{base64.b64encode(file.read_bytes()).decode()}"

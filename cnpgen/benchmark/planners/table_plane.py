@@ -1,0 +1,124 @@
+"""Paths of the mallet in the plane: two lines and the arc between them, run through with constant acceleration."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.benchmark.simulator.hockey import HOME, LENGTH, MALLET_RADIUS, WIDTH
+
+Array = NDArray[np.float64]
+
+MARGIN = 0.02  # m: between the mallet and a band
+LOW = np.array([HOME + MALLET_RADIUS + MARGIN, -WIDTH / 2 + MALLET_RADIUS + MARGIN])
+HIGH = np.array([HOME + LENGTH / 2 - MALLET_RADIUS, WIDTH / 2 - MALLET_RADIUS - MARGIN])
+FASTEST = 8.0  # m/s^2
+AFTER = np.array([0.1, 0.15])  # m: where the mallet stops, ahead of the hit and towards the centre
+STOP_HIGH = np.array([HOME + 0.9, 0.42085])  # m
+STRAIGHT = 1e-6  # rad: less of a bend is none
+
+
+@dataclass(frozen=True)
+class PlanePath:
+    """A path of the mallet, from rest to a hit or from there to rest.
+
+    Attributes:
+        start: Where it begins [m], shape (2,).
+        bend: Where the two lines would meet.
+        end: Where it ends.
+        speed: At the hit [m/s].
+        stops: Whether the hit is at its beginning.
+    """
+
+    start: Array
+    bend: Array
+    end: Array
+    speed: float
+    stops: bool = False
+
+    @property
+    def length(self) -> float:
+        """Length [m]."""
+        before, after = self._lines()
+        cut, radius, turn = self._arc()
+        return before + after - 2 * cut + radius * turn
+
+    @property
+    def duration(self) -> float:
+        """Time [s], with constant acceleration."""
+        return 2 * self.length / self.speed
+
+    def sampled(self, period: float) -> Iterator[Array]:
+        """Yield the positions at every period after the start, the last one at the end or within a period of it."""
+        duration, length = self.duration, self.length
+        for k in range(1, round(duration / period + 0.499) + 1):
+            t = min(k * period, duration)
+            run = t * t / (2 * duration)
+            yield self.at(min(self.speed * (t - run if self.stops else run), length))
+
+    def at(self, s: float) -> Array:
+        """Return the position at a length of the path [m], shape (2,)."""
+        before, _ = self._lines()
+        cut, radius, turn = self._arc()
+        one, other = _unit(self.bend - self.start), _unit(self.end - self.bend)
+        if s <= before - cut:
+            return np.asarray(self.start + s * one)
+        along = s - (before - cut)
+        if along >= radius * turn:
+            return np.asarray(self.bend + (cut + along - radius * turn) * other)
+        angle = along / radius
+        across = _unit(other - (other @ one) * one)
+        return np.asarray(self.bend - cut * one + radius * (np.sin(angle) * one + (1 - np.cos(angle)) * across))
+
+    def _lines(self) -> tuple[float, float]:
+        return float(np.linalg.norm(self.bend - self.start)), float(np.linalg.norm(self.end - self.bend))
+
+    def _arc(self) -> tuple[float, float, float]:
+        """How far from the bend the arc begins [m], its radius [m] and how far it turns [rad]."""
+        before, after = self._lines()
+        one, other = _unit(self.bend - self.start), _unit(self.end - self.bend)
+        turn = float(np.arccos(np.clip(one @ other, -1, 1)))
+        cut = min(before, after)
+        if turn < STRAIGHT or cut == 0:
+            return 0.0, 0.0, 0.0
+        return cut, cut / np.tan(turn / 2), turn
+
+
+def striking_path(start: Array, hit: Array, velocity: Array, speed: float) -> PlanePath:
+    """Plan a path from rest to a hit in a direction: it bends where the line of the hit leaves the box of both ends.
+
+    Args:
+        start: Where the mallet rests [m], shape (2,).
+        hit: Where it hits [m], shape (2,).
+        velocity: Direction of the hit, of any length, shape (2,).
+        speed: How fast it is to hit [m/s]; it is slower if that needs more than ``FASTEST``.
+    """
+    start, hit = np.clip(start, LOW, HIGH), np.clip(hit, LOW, HIGH)
+    low, high = np.array([min(start[0], hit[0]), LOW[1]]), np.array([max(start[0], hit[0]), HIGH[1]])
+    path = PlanePath(start, _leave(hit, -velocity, low, high), hit, speed)
+    duration = max(2 * path.length / speed, np.sqrt(2 * path.length / FASTEST))
+    return PlanePath(path.start, path.bend, hit, 2 * path.length / duration)
+
+
+def stopping_path(hit_path: PlanePath) -> PlanePath:
+    """Plan the way from a hit to rest, a little ahead and towards the centre of the table."""
+    hit = hit_path.end
+    aside = AFTER * np.array([1.0, -1.0 if hit[1] > 0 else 1.0])
+    end = np.clip(hit + aside, [-np.inf, -STOP_HIGH[1]], STOP_HIGH)
+    low, high = np.minimum(hit, end), np.maximum(hit, end)
+    forwards = hit_path.end - hit_path.bend
+    return PlanePath(hit, _leave(hit, forwards, low, high), end, hit_path.speed, stops=True)
+
+
+def _leave(point: Array, direction: Array, low: Array, high: Array) -> Array:
+    """Return where a ray from a point in a box leaves the box."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        reach = np.where(direction > 0, (high - point) / direction, (low - point) / direction)
+    reach = reach[np.isfinite(reach)]
+    return np.asarray(point + max(float(reach.min(initial=np.inf)), 0.0) * direction)
+
+
+def _unit(vector: Array) -> Array:
+    length = float(np.linalg.norm(vector))
+    return vector / length if length > 0 else vector

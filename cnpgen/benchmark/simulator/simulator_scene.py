@@ -1,0 +1,232 @@
+"""The simulated world as MuJoCo's own format: the arm from the problem's URDF, and what stands around it.
+
+Nothing collides unless it is named in a pair: the mallet with the puck, the puck with the bands, the held object and
+the arm's links with the obstacles. The table carries the puck, which moves in its plane only; it does not carry the
+mallet, so that every millimetre that the controller is off its height is seen.
+
+Joints and obstacles are called by their numbers: their own names are strangers' texts, and MJCF can name other files.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.benchmark.simulator import hockey
+from cnpgen.benchmark.simulator.plant import Plant, joint_friction
+from cnpgen.problems.constraints.clearance import ObjectContact
+from cnpgen.problems.constraints.table import Table
+from cnpgen.problems.problem import Problem
+from cnpgen.robots.chain import Joint
+from cnpgen.robots.obstacle import Obstacle
+from cnpgen.robots.robot import Robot
+from cnpgen.robots.solid import Box, Solid, solids_of
+
+Array = NDArray[np.float64]
+
+STEP = 2.5e-4  # s: four to a tick of the controller
+LINK_RADIUS = 0.07  # m: of the iiwa's links, about; plans keep twice as far away
+PUCK_INERTIA = 2.5e-6  # kg m^2; the puck does not turn
+SHORTEST = 1e-3  # m: links that are shorter have no shape; the first one, which only turns, collides with nothing
+DEEP = 5.0  # m: how far obstacles reach down that have no lower end
+_SOFT = 'condim="3" solref="0.004 1" solimp="0.95 0.99 0.001"'  # object and pedestals press, they do not bounce
+_RIMS = {  # the bands and the four halves of both goals' sides: centre and half sizes over the table [m]
+    "left": (hockey.HOME + hockey.LENGTH / 2, hockey.WIDTH / 2 + hockey.BAND, hockey.LENGTH / 2, hockey.BAND),
+    "right": (hockey.HOME + hockey.LENGTH / 2, -hockey.WIDTH / 2 - hockey.BAND, hockey.LENGTH / 2, hockey.BAND),
+    **{
+        f"{end} {side}": (x, sign * (hockey.GOAL_WIDTH + hockey.WIDTH) / 4, hockey.BAND, half)
+        for end, x in (("home", hockey.HOME - hockey.BAND), ("far", hockey.FAR + hockey.BAND))
+        for side, sign, half in (
+            ("left", 1, (hockey.WIDTH - hockey.GOAL_WIDTH) / 4),
+            ("right", -1, (hockey.WIDTH - hockey.GOAL_WIDTH) / 4),
+        )
+    },
+}
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What is simulated.
+
+    Attributes:
+        problem: The problem.
+        robot: Its robot.
+        plant: What is different from what the controller believes.
+        obstacle_poses: What says where the obstacles are, as ``cnpgen.problems.obstacles.obstacle_poses_of`` returns it.
+        puck: Where the puck lies [m], shape (2,), or None if there is none.
+    """
+
+    problem: Problem
+    robot: Robot
+    plant: Plant
+    obstacle_poses: Array
+    puck: Array | None = None
+
+    @property
+    def height(self) -> float | None:
+        """Height of the tip over the table [m]; None without a table."""
+        table = self.problem.first(Table)
+        return None if table is None else table.z
+
+
+def scene_xml(scene: Scene) -> str:
+    """Write the scene as MJCF."""
+    gravity = _numbers(scene.robot.chain.gravity)
+    return f"""<mujoco model="{scene.problem.name}">
+<compiler angle="radian" autolimits="true"/>
+<option timestep="{STEP}" gravity="{gravity}" integrator="implicitfast" cone="elliptic"/>
+<visual><global offwidth="1280" offheight="960"/><quality shadowsize="1024"/>
+<headlight ambient="0.4 0.4 0.4" diffuse="0.5 0.5 0.5"/></visual>
+<default><geom contype="0" conaffinity="0" mass="0"/></default>
+<asset>{"".join(_meshes(scene))}</asset>
+<worldbody>
+<light pos="0 0 4" dir="0 0 -1" diffuse="0.4 0.4 0.4"/>
+<geom type="plane" pos="0 0 -0.5" size="4 4 0.1" rgba="0.9 0.9 0.92 1"/>
+<geom type="cylinder" fromto="0 0 -0.5 0 0 0.1" size="0.1" rgba="0.4 0.4 0.4 1"/>
+{"".join(_arm(scene))}
+{"".join(_loaded_problem(scene))}
+</worldbody>
+<contact>
+{"".join(_pairs(scene))}
+</contact>
+</mujoco>"""
+
+
+def _arm(scene: Scene) -> Iterator[str]:
+    """Yield the nested bodies of the arm; the last one holds the tip and what is fixed to it."""
+    chain = scene.robot.chain
+    last = len(chain.joints) - 1
+    ends = [joint.translation for joint in chain.joints[1:]] + [chain.tip_translation]
+    for index, (joint, end, friction) in enumerate(
+        zip(chain.joints, ends, joint_friction(scene.problem, scene.robot), strict=True)
+    ):
+        kind = "slide" if joint.prismatic else "hinge"
+        place = f'pos="{_numbers(joint.translation)}" quat="{_quaternion(joint.rotation)}"'
+        yield f'<body name="link {index + 1}" {place}>{_inertial(joint, scene.plant.mass)}'
+        yield f'<joint name="joint {index + 1}" type="{kind}" axis="{_numbers(joint.axis)}"'
+        yield f' damping="{friction.viscous}" frictionloss="{friction.dry}"/>'
+        if np.linalg.norm(end) > SHORTEST:
+            rod = index == last
+            radius, colour = (0.012, "0.3 0.3 0.3 1") if rod else (LINK_RADIUS, "1 0.55 0.15 1")
+            yield f'<geom name="link {index + 1}" type="capsule" fromto="0 0 0 {_numbers(end)}" size="{radius}"'
+            yield f' rgba="{colour}"/>'
+    yield f'<body name="tip" pos="{_numbers(chain.tip_translation)}" quat="{_quaternion(chain.tip_rotation)}">'
+    yield '<site name="tip" size="0.001"/><geom name="mallet" type="sphere" size="0.001"/>'
+    if scene.problem.object_size is not None:
+        size = _numbers(np.array(scene.problem.object_size) / 2 - _legal_depth(scene.problem))
+        yield f'<geom name="object" type="box" size="{size}" rgba="0.2 0.4 0.8 1"/>'
+    yield "</body>" * (len(chain.joints) + 1)
+
+
+def _legal_depth(problem: Problem) -> float:
+    """Return how deep in an obstacle a valid plan may carry the object [m]: so much smaller is what collides."""
+    return max(
+        (each.depth + each.tolerance for each in problem.constraint if isinstance(each, ObjectContact)), default=0.0
+    )
+
+
+def _inertial(joint: Joint, mass: float) -> str:
+    """Write the inertia of a link about its centre of mass, in joint axes."""
+    tensor = mass * joint.inertia
+    rows = [tensor[0, 0], tensor[1, 1], tensor[2, 2], tensor[0, 1], tensor[0, 2], tensor[1, 2]]
+    numbers = _numbers(np.array(rows))
+    return f'<inertial pos="{_numbers(joint.com)}" mass="{mass * joint.mass!r}" fullinertia="{numbers}"/>'
+
+
+def _loaded_problem(scene: Scene) -> Iterator[str]:
+    """Yield the obstacles; with a table, the table and its puck."""
+    for name, obstacle, solid in _obstacles(scene):
+        yield f'<geom name="{name}" {_shape(name, obstacle, solid)} rgba="0.6 0.65 0.7 1"/>'
+    if scene.height is None:
+        return
+    surface = scene.height - hockey.MALLET_HEIGHT
+    middle = hockey.HOME + hockey.LENGTH / 2
+    yield f'<geom type="box" pos="{middle} 0 {surface - 0.02}" size="{hockey.LENGTH / 2} {hockey.WIDTH / 2} 0.02"'
+    yield ' rgba="0.97 0.97 1 1"/>'
+    for name, (x, y, half_x, half_y) in _RIMS.items():
+        yield f'<geom name="{name}" type="box" pos="{x} {y} {surface}" size="{half_x} {half_y} 0.015"'
+        yield ' rgba="0.5 0.5 0.5 1"/>'
+    if scene.puck is not None:
+        yield from _puck(surface, scene.height)
+    yield '<body name="shown mallet" mocap="true">'
+    yield f'<geom type="cylinder" size="{hockey.MALLET_RADIUS} 0.01" pos="0 0 0.01" rgba="0.15 0.15 0.15 1"/>'
+    yield f'<geom type="cylinder" size="0.015 {hockey.MALLET_HEIGHT / 2}" pos="0 0 {hockey.MALLET_HEIGHT / 2}"'
+    yield ' rgba="0.15 0.15 0.15 1"/></body>'
+
+
+def _shape(name: str, obstacle: Obstacle, solid: Solid) -> str:
+    """Write what an obstacle is and where."""
+    if isinstance(solid, Box):
+        low = solid.low if obstacle.height is not None else np.array([*solid.low[:2], solid.high[2] - DEEP])
+        return f'type="box" pos="{_numbers((low + solid.high) / 2)}" size="{_numbers((solid.high - low) / 2)}"'
+    if obstacle.kind == "sphere":
+        return f'type="sphere" pos="{_numbers(solid.position)}" size="{solid.radius!r}"'
+    if obstacle.kind == "capsule":
+        ends = _numbers(np.ravel(solid.position + solid.corners))
+        return f'type="capsule" fromto="{ends}" size="{solid.radius!r}"'
+    return f'type="mesh" mesh="{name}"'
+
+
+def _meshes(scene: Scene) -> Iterator[str]:
+    """Yield the hulls of obstacles that are neither boxes along the world's axes nor round."""
+    for name, _, solid in _obstacles(scene):
+        if not isinstance(solid, Box) and not solid.radius:
+            corners = _numbers(np.ravel(solid.position + solid.corners))
+            yield f'<mesh name="{name}" vertex="{corners}"/>'
+
+
+def _obstacles(scene: Scene) -> Iterator[tuple[str, Obstacle, Solid]]:
+    """Yield what obstacles are called here, and what they are."""
+    obstacles = scene.problem.obstacle
+    for number, both in enumerate(zip(obstacles, solids_of(obstacles, scene.obstacle_poses), strict=True), start=1):
+        yield f"obstacle {number}", *both
+
+
+def _puck(surface: float, height: float) -> Iterator[str]:
+    """Yield the puck: a disc that meets the bands, and one of both radii that the mallet meets.
+
+    Its coordinates are those of its centre in the world. The larger disc reaches up to where the mallet's lower face
+    passes over the puck, and far enough down.
+    """
+    inertia = f"{PUCK_INERTIA} {PUCK_INERTIA} {2 * PUCK_INERTIA}"
+    low, high = height - 0.05, height + hockey.PUCK_HEIGHT
+    yield f'<body name="puck" pos="0 0 {surface}">'
+    yield f'<inertial pos="0 0 0" mass="{hockey.PUCK_MASS}" diaginertia="{inertia}"/>'
+    yield f'<joint name="puck x" type="slide" axis="1 0 0" damping="{hockey.PUCK_DRAG}"/>'
+    yield f'<joint name="puck y" type="slide" axis="0 1 0" damping="{hockey.PUCK_DRAG}"/>'
+    yield f'<geom name="puck" type="sphere" size="{hockey.PUCK_RADIUS}" rgba="0 0 0 0"/>'
+    yield f'<geom type="cylinder" size="{hockey.PUCK_RADIUS} {hockey.PUCK_HEIGHT / 2}" rgba="0.85 0.1 0.1 1"'
+    yield f' pos="0 0 {hockey.PUCK_HEIGHT / 2}"/>'
+    radius = hockey.PUCK_RADIUS + hockey.MALLET_RADIUS - 0.001
+    yield f'<geom name="reach" type="cylinder" size="{radius} {(high - low) / 2}" rgba="0 0 0 0"'
+    yield f' pos="0 0 {(low + high) / 2 - surface}"/></body>'
+
+
+def _pairs(scene: Scene) -> Iterator[str]:
+    """Yield what can collide."""
+    if scene.puck is not None:
+        k, b = hockey.bounce()
+        bouncing = f'condim="1" solref="{-k} {-b}" solimp="0.9999 0.9999 0.001"'
+        yield f'<pair geom1="mallet" geom2="reach" {bouncing}/>'
+        for name in _RIMS:
+            yield f'<pair geom1="puck" geom2="{name}" {bouncing}/>'
+    chain = scene.robot.chain
+    lengths = [float(np.linalg.norm(joint.translation)) for joint in chain.joints[1:]]
+    names = [f"link {index}" for index, length in enumerate(lengths, start=1) if index > 1 and length > SHORTEST]
+    names += ["object"] if scene.problem.object_size is not None else []
+    for obstacle, _, _ in _obstacles(scene):
+        for name in names:
+            yield f'<pair geom1="{name}" geom2="{obstacle}" {_SOFT}/>'
+
+
+def _quaternion(rotation: Array) -> str:
+    """Write a rotation matrix as MuJoCo's quaternion, scalar first."""
+    from scipy.spatial.transform import Rotation
+
+    return _numbers(np.roll(Rotation.from_matrix(rotation).as_quat(), 1))
+
+
+def _numbers(values: Array) -> str:
+    """Write numbers so that they read back as the same float64."""
+    return " ".join(repr(value) for value in np.asarray(values, float).tolist())

@@ -1,0 +1,168 @@
+"""Bodies of a robot in a page: its visual meshes if they are found, else its collision geometry, as triangles."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import RecipeError
+from cnpgen.problems.problem import Problem
+from cnpgen.robots.chain import frame_of
+from cnpgen.robots.robot import Robot
+from cnpgen.robots.shape.convex_part import origin_of, convex_part_of
+from cnpgen.robots.shape.inline import read_mesh, scale_of, sides_of
+from cnpgen.robots.shape.mesh_files import find_named_file
+from cnpgen.robots.urdf import urdf_tree
+
+if TYPE_CHECKING:
+    import pinocchio as pin
+
+Array = NDArray[np.float64]
+
+LINE_ARM_RADIUS_M = 0.04  # radius of an arm without link geometry, if no constraint gives one
+MAX_TRIANGLES = 400_000  # of all visual meshes; larger pages open slowly
+BALL = 12  # directions per quarter of a circle in which round bodies have corners
+
+
+@dataclass(frozen=True)
+class Body:
+    """Triangles that a joint moves.
+
+    Attributes:
+        name: What it is.
+        joint: The joint, from 1 on; 0 for what stands still.
+        corners: Corners in the joint's frame [m], shape (V, 3).
+        triangles: Numbers of their corners, shape (F, 3).
+    """
+
+    name: str
+    joint: int
+    corners: Array
+    triangles: NDArray[np.integer[Any]]
+
+
+def robot_bodies(problem: Problem, robot: Robot, *, with_meshes: bool = True) -> tuple[list[Body], str]:
+    """Return the bodies of a robot, and what they are: "meshes", "pieces" or "line".
+
+    Args:
+        problem: The problem.
+        robot: Its robot.
+        with_meshes: Whether the visual meshes that its URDF names are read, if they are there; those that a file from
+            elsewhere names had better not be.
+    """
+    try:
+        visual = list(_visual_bodies(problem, robot)) if with_meshes else []
+    except (RecipeError, ValueError):  # a mesh is not there, or is none: judges do not need it
+        visual = []
+    if visual and sum(len(body.triangles) for body in visual) <= MAX_TRIANGLES:
+        return visual, "meshes"
+    if robot.shape is not None:
+        pieces = robot.shape.convex_parts
+        return [
+            wrapped(each.link, robot.shape.joints[each.link], each.vertices, each.radius) for each in pieces
+        ], "pieces"
+    return list(_line(robot, problem.arm_radius or LINE_ARM_RADIUS_M)), "line"
+
+
+def capsule_bodies(robot: Robot) -> list[Body]:
+    """Return the capsules round the links; none of a robot without a shape."""
+    found = robot.shape.capsules if robot.shape else ()
+    joints = robot.shape.joints if robot.shape else {}
+    return [wrapped(each.link, joints[each.link], np.array([each.first, each.second]), each.radius) for each in found]
+
+
+def wrapped(name: str, joint: int, corners: Array, radius: float) -> Body:
+    """Return the hull of points, inflated by a radius, as triangles that face outwards.
+
+    Args:
+        name: What it is.
+        joint: The joint that moves it.
+        corners: The points [m], shape (V, 3).
+        radius: How thick the hull is wrapped [m].
+    """
+    from scipy.spatial import ConvexHull
+
+    points = (corners[:, None] + radius * _ball()).reshape(-1, 3) if radius else corners
+    hull = ConvexHull(points)
+    triangles = hull.simplices.copy()
+    inwards = np.einsum("fi,fi->f", _normals(points, triangles), hull.equations[:, :3]) < 0
+    triangles[inwards] = triangles[inwards][:, ::-1]
+    used, numbers = np.unique(triangles, return_inverse=True)
+    return Body(name, joint, points[used], numbers.reshape(-1, 3))
+
+
+def tube(name: str, points: Array, radius: float) -> Body:
+    """Return a tube through points [m], shape (K, 3), as triangles."""
+    along = np.gradient(points, axis=0)
+    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
+    across = np.cross(along, [0.0, 0.0, 1.0])
+    level = np.linalg.norm(across, axis=1, keepdims=True)
+    across = np.where(level > 1e-3, across / np.maximum(level, 1e-12), [1.0, 0.0, 0.0])
+    angles = np.arange(6) * np.pi / 3
+    ring = np.cos(angles)[:, None] * across[:, None] + np.sin(angles)[:, None] * np.cross(along, across)[:, None]
+    first = [(6 * k + i, 6 * k + (i + 1) % 6, 6 * k + 6 + i) for k, i in product(range(len(points) - 1), range(6))]
+    second = [(b, b + 6, a + 6) for a, b, _ in first]
+    return Body(name, 0, (points[:, None] + radius * ring).reshape(-1, 3), np.array(first + second).reshape(-1, 3))
+
+
+def _normals(points: Array, triangles: NDArray[np.integer[Any]]) -> Array:
+    a, b, c = (points[triangles[:, i]] for i in range(3))
+    return np.asarray(np.cross(b - a, c - a))
+
+
+def _ball() -> Array:
+    """Unit vectors along meridians and parallels, shape (N, 3)."""
+    angles = np.linspace(0, np.pi, 2 * BALL + 1)
+    turns = np.arange(4 * BALL) * np.pi / (2 * BALL)
+    level, height = np.sin(angles)[:, None], np.broadcast_to(np.cos(angles)[:, None], (len(angles), len(turns)))
+    return np.unique(np.stack([level * np.cos(turns), level * np.sin(turns), height], axis=-1).reshape(-1, 3), axis=0)
+
+
+def _visual_bodies(problem: Problem, robot: Robot) -> Iterator[Body]:
+    """Read the visual elements of the URDF."""
+    packages = [problem.path.parent / each for each in problem.robot.packages]
+    for link in urdf_tree(robot.urdf_text).findall("link"):
+        name = link.get("name", "")
+        frame = robot.model.frames[frame_of(robot.model, name)]
+        for element in link.findall("visual"):
+            corners, triangles = _visual(name, element, robot.urdf, packages)
+            yield Body(name, int(frame.parentJoint), _placed(frame.placement, corners), triangles)
+
+
+def _visual(
+    link: str, element: ElementTree.Element, urdf: Path, packages: Sequence[Path]
+) -> tuple[Array, NDArray[np.integer[Any]]]:
+    """Return corners in the link's frame [m], and triangles, of one visual element."""
+    mesh = element.find("geometry/mesh")
+    if mesh is None:
+        piece = convex_part_of(link, element)
+        body = wrapped(link, 0, piece.vertices, piece.radius)
+        return body.corners, body.triangles
+    rotation, translation = origin_of(element.find("origin"))
+    points, loaded = read_mesh(find_named_file(mesh.get("filename", ""), urdf, packages), scale_of(mesh))
+    return points @ rotation.T + translation, sides_of(loaded)
+
+
+def _placed(placement: "pin.SE3", points: Array) -> Array:
+    return np.asarray(points @ placement.rotation.T + placement.translation)
+
+
+def _line(robot: Robot, radius: float) -> Iterator[Body]:
+    """Return the segments of an arm that is a line through its joints' origins, each moved by the joint at its end."""
+    import pinocchio as pin
+
+    model, data = robot.model, robot.model.createData()
+    pin.framesForwardKinematics(model, data, pin.neutral(model))
+    origins = [data.oMi[i].translation for i in range(1, model.njoints)]
+    origins.append(data.oMf[robot.tip_frame].translation)
+    foot = np.array([np.zeros(3), origins[robot.capsule_axes[0][0]]])
+    if np.ptp(foot, axis=0).any():
+        yield wrapped("foot", 0, foot, radius)
+    for a, b in robot.capsule_axes:
+        ends = np.array([data.oMi[b].actInv(origins[a]), data.oMi[b].actInv(origins[b])])
+        yield wrapped(f"segment {a}-{b}", b, ends, radius)

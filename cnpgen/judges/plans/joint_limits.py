@@ -1,0 +1,150 @@
+"""Joint limits over a whole motion, including all times between samples: proven, because the motion is a polynomial."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.judges.plans.bernstein import Maximum, PiecewisePolynomials, find_maximum
+from cnpgen.judges.plans.sampling import times
+from cnpgen.judges.plans.verdict import Margin
+from cnpgen.problems.constraints.constraint import Condition, Constraint
+from cnpgen.problems.constraints.joint import JointAcceleration, JointJerk, JointPosition, JointVelocity
+from cnpgen.problems.problem import Problem
+from cnpgen.store.joint_units import unit_of
+from cnpgen.world.path import PathWorld
+
+if TYPE_CHECKING:
+    from cnpgen.world.world import World
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+MIN_RELATIVE_SCALE = 1e-9  # of a bound: resolution of violations if the tolerance is 0
+EARLY_EXIT_PARTS = 8  # of a span per subdivision with early exit
+_QUANTITIES = {JointPosition: "q", JointVelocity: "dq", JointAcceleration: "ddq", JointJerk: "jerk"}
+
+
+def is_proven(constraint: Constraint) -> bool:
+    """Return whether a constraint is a joint limit that can be proven for the whole motion."""
+    return type(constraint) in _QUANTITIES
+
+
+@dataclass(frozen=True)
+class ProvenJointLimits:
+    """L limits of n joints that are proven to hold or to be violated.
+
+    Attributes:
+        constraints: Constraints of a problem that are proven.
+        conditions: Condition of each constraint, the same at all states.
+        joints: Names of the joints.
+        tolerance: Accepted violations, shape (L, n).
+        bounds: Lower bounds of all joints, then upper ones, shape (L, 2 n).
+        scale: Unit of relative violations: the tolerance, or a small value if it is 0; negative for lower bounds, shape
+            (L, 2 n).
+    """
+
+    constraints: tuple[Constraint, ...]
+    conditions: tuple[Condition, ...]
+    joints: tuple[str, ...]
+    tolerance: Array
+    bounds: Array
+    scale: Array
+
+    @cached_property
+    def tolerant(self) -> NDArray[np.bool_]:
+        """Mask of the limits with a tolerance at every joint, shape (L,); others depend on rounding."""
+        return np.asarray((self.tolerance > 0).all(axis=1))
+
+    def margins(
+        self, world: PathWorld, polynomials: PiecewisePolynomials, s: Array, table: Array, *, early_exit: bool
+    ) -> list[Margin]:
+        """Find where a motion comes closest to violating each limit, or violates it most.
+
+        Args:
+            world: The robot at the samples.
+            polynomials: The motion as polynomials.
+            s: Phases of the samples, shape (K,).
+            table: Times of the motion (``time_table``).
+            early_exit: Whether the margin at the samples is enough if a limit is proven to hold.
+        """
+        if not self.constraints:
+            return []
+        names = [_QUANTITIES[type(constraint)] for constraint in self.constraints]
+        functions = [getattr(polynomials, name) for name in names]
+        maxima = self._at_samples(np.array([getattr(world, name) for name in names]), s)
+        upper_bounds = self._upper_bounds(functions)
+        skippable = self.tolerant & early_exit
+        for limit in np.flatnonzero(~skippable | ~(upper_bounds.max(axis=1) <= 1)).tolist():
+            threshold = 1.0 if skippable[limit] else -np.inf
+            (rows,) = (~(upper_bounds[limit] <= threshold)).nonzero()
+            maxima[limit] = self._maximum(limit, rows, functions[limit], polynomials.edges, maxima[limit], threshold)
+        t = times(np.array([phase for *_, phase in maxima]), table).tolist()
+        return [self._margin(limit, maximum, t[limit]) for limit, maximum in enumerate(maxima)]
+
+    def _at_samples(self, values: Array, s: Array) -> list[Maximum]:
+        """Return the maximum relative violation of each limit by values of shape (L, n, K) at phases s."""
+        violations, maxima = self._relative_violations(values.min(axis=2), values.max(axis=2)), []
+        for limit, row in enumerate(violations.argmax(axis=1).tolist()):
+            below, joint = row < len(self.joints), row % len(self.joints)
+            series = values[limit, joint]
+            maxima.append((float(violations[limit, row]), row, float(s[series.argmin() if below else series.argmax()])))
+        return maxima
+
+    def _upper_bounds(self, functions: list[Array]) -> Array:
+        """Bound the relative violations by functions with Bernstein coefficients of shape (d + 1, S, n)."""
+        low = np.array([coefficients.min(axis=0).min(axis=0) for coefficients in functions])
+        high = np.array([coefficients.max(axis=0).max(axis=0) for coefficients in functions])
+        return self._relative_violations(low, high)
+
+    def _relative_violations(self, low: Array, high: Array) -> Array:
+        """Return the violations by minima and maxima, shape (L, n), in multiples of ``scale``, shape (L, 2 n)."""
+        return np.asarray((np.concatenate([low, high], axis=1) - self.bounds) / self.scale)
+
+    def _maximum(  # noqa: PLR0917 - the function, the bounds, and the known maximum
+        self, limit: int, rows: Indices, function: Array, edges: Array, known: Maximum, threshold: float
+    ) -> Maximum:
+        """Search for a larger violation than the known one at some of the bounds of a limit."""
+        values = function[..., rows % len(self.joints)]
+        violations = (values - self.bounds[limit, rows]) / self.scale[limit, rows]
+        parts = EARLY_EXIT_PARTS if threshold == 1 else 2
+        value, row, phase = find_maximum(violations, edges, (known[0], -1, known[2]), threshold=threshold, parts=parts)
+        return value, known[1] if row < 0 else int(rows[row]), phase
+
+    def _margin(self, limit: int, maximum: Maximum, time: float) -> Margin:
+        (relative, row, phase), condition = maximum, self.conditions[limit]
+        bound, offset, part = self.bounds[limit, row], relative * self.scale[limit, row], row % len(self.joints)
+        return Margin(
+            condition.name,
+            self.constraints[limit].reason,
+            unit_of(condition.unit, part),
+            self.joints[part],
+            value=float(bound + offset),
+            bound=float(bound),
+            violation=float(-offset if row < len(self.joints) else offset),
+            tolerance=float(self.tolerance[limit, part]),
+            time=time,
+            phase=phase,
+        )
+
+
+def joint_limits(problem: Problem, world: PathWorld) -> ProvenJointLimits:
+    """Return the joint limits of a problem that are proven.
+
+    Args:
+        problem: The problem.
+        world: Its robot at any state with a jerk; the bounds do not depend on the state.
+    """
+    constraints = tuple(constraint for constraint in problem.constraint if is_proven(constraint))
+    conditions = tuple(constraint.measured(cast("World", world))[0] for constraint in constraints)
+    shape = len(constraints), world.robot.n
+    lower, upper = (
+        np.array([getattr(condition, end) for condition in conditions]).reshape(shape) for end in ("lower", "upper")
+    )
+    pairs = zip(constraints, conditions, strict=True)
+    tolerance = np.array([constraint.allowed(condition) for constraint, condition in pairs]).reshape(shape)
+    scale = np.maximum(tolerance, MIN_RELATIVE_SCALE * np.maximum(np.abs(lower), np.abs(upper)))
+    both = np.concatenate([lower, upper], axis=1), np.concatenate([-scale, scale], axis=1)
+    return ProvenJointLimits(constraints, conditions, world.robot.joint_names, tolerance, *both)

@@ -1,0 +1,263 @@
+"""Plots of one plan: joints relative to their limits over time, the tip over the table or among the obstacles."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import UsageError
+from cnpgen.problems.constraints.table import Table
+from cnpgen.problems.obstacles import obstacle_poses_of
+from cnpgen.problems.problem import Problem
+from cnpgen.robots.robot import Robot
+from cnpgen.robots.solid import Solid, place_obstacles, solids_of
+from cnpgen.store.files.figure_file import new_figure, save_figure
+from cnpgen.trajectory.spline_motion import Motion
+from cnpgen.world.forward_kinematics import ForwardKinematics
+from cnpgen.world.path import PathWorld
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import SubFigure
+
+    from cnpgen.world.world import World
+
+Array = NDArray[np.float64]
+
+PLOT_SAMPLES = 1000  # in time
+DRAWN_STATES = 7  # at which the arm and the object are drawn
+MAX_LEGEND_CHARACTERS = 115  # that fit above the curves
+_START, _BETWEEN, _GOAL, _LIMIT, _BOX = "tab:blue", "0.55", "tab:red", "0.25", "0.85"
+
+
+def plot_plan(
+    problem: Problem,
+    robot: Robot,
+    motion: Motion,
+    index: int,
+    path: str | Path,
+    *,
+    obstacle_poses: Array | None = None,
+    note: str = "",
+) -> None:
+    """Draw one plan.
+
+    Args:
+        problem: The problem.
+        robot: Its robot.
+        motion: N motions.
+        index: Index of the motion.
+        path: Image file, ``.png``, ``.pdf`` or ``.svg``; overwritten if it exists.
+        obstacle_poses: Poses and sizes of the obstacles, shape (width,); by default from the ends of the motion.
+        note: Additional text of the title.
+
+    Raises:
+        UsageError: There is no such plan, or it cannot be evaluated.
+        MachineError: matplotlib is missing, or the file cannot be written.
+    """
+    if not 0 <= index < len(motion):
+        raise UsageError(f"there is no plan {index}, expected 0 to {len(motion) - 1}")
+    one = Motion(motion.path[index : index + 1], motion.rate[index : index + 1], motion.degree)
+    with np.errstate(all="ignore"):
+        world, s, t = along(problem, robot, one, index)
+    if obstacle_poses is None:
+        obstacle_poses = _default_poses(problem, world)
+    figure = new_figure(15, 9)
+    figure.suptitle(f"{problem.name}, plan {index}: {t[-1]:.3f} s" + (f"\n{note}" if note else ""))
+    joints, tip = figure.subfigures(1, 2, width_ratios=[1.15, 1.0], squeeze=False)[0]
+    _draw_joints(joints, world, t)
+    table = problem.first(Table)
+    if table is None:
+        _draw_views(tip, problem, world, obstacle_poses)
+    else:
+        _draw_over_table(tip, table, world, s, t)
+    named = {name: item for axis in tip.axes for item, name in zip(*axis.get_legend_handles_labels(), strict=True)}
+    tip.legend(named.values(), named.keys(), loc="outside lower center", ncols=len(named), fontsize=8)
+    save_figure(figure, Path(path))
+
+
+def _default_poses(problem: Problem, world: PathWorld) -> Array:
+    """Return the poses and sizes of the obstacles for the ends of the motion."""
+    return obstacle_poses_of(problem, world.tip_position[:, 0], world.tip_position[:, -1])
+
+
+def along(
+    problem: Problem, robot: Robot, motion: Motion, index: int, *, samples: int = PLOT_SAMPLES
+) -> tuple[PathWorld, Array, Array]:
+    """Place the robot at K times of one motion, uniformly spaced.
+
+    Args:
+        problem: The problem.
+        robot: Its robot.
+        motion: The motion.
+        index: Index of the plan in error messages.
+        samples: Number of times K.
+
+    Returns:
+        The world, phases, and times [s], shape (K,) each.
+
+    Raises:
+        UsageError: The rate is not positive, or values are not finite.
+    """
+    if not motion.runs_forward()[0]:
+        raise UsageError(f"plan {index} cannot be drawn: its rate ds/dt is not positive everywhere")
+    t = np.linspace(0, motion.duration()[0], samples)
+    s = motion.phase_at(t[None])[0]
+    states = motion.at(s)
+    q, dq, ddq = (values[0].T for values in (states.q, states.dq, states.ddq))
+    if not np.all(np.isfinite([q, dq, ddq])):
+        raise UsageError(f"plan {index} cannot be drawn: its values are not finite")
+    world = PathWorld(robot, problem.obstacle, problem.object_size)
+    jerk = states.jerk[0].T if problem.uses_jerk else None
+    world.set_path(q, dq, ddq, place_obstacles(problem.obstacle), jerk)
+    return world, s, t
+
+
+def shares_of_limits(world: PathWorld) -> dict[str, Array]:
+    """Return q, dq, ddq, torque and, if constrained, jerk as fractions of their limits, each of shape (n, K)."""
+    robot = world.robot
+    center, half = (robot.position_upper + robot.position_lower) / 2, (robot.position_upper - robot.position_lower) / 2
+    return {
+        "position": (world.q - center[:, None]) / half[:, None],
+        "velocity": world.dq / robot.velocity_limit[:, None],
+        "acceleration": world.ddq / robot.acceleration_limit[:, None],
+        **({} if world.jerk is None else {"jerk": world.jerk / robot.jerk_limit[:, None]}),
+        "torque": world.torque / robot.torque_limit[:, None],
+    }
+
+
+def _draw_joints(figure: "SubFigure", world: PathWorld, t: Array) -> None:
+    """Draw the quantities of ``shares_of_limits`` of every joint over time."""
+    robot, shares = world.robot, shares_of_limits(world)
+    axes = figure.subplots(len(shares), 1, sharex=True)
+    for axis, (name, share) in zip(axes, shares.items(), strict=True):
+        for values, joint in zip(share, robot.joint_names, strict=True):
+            axis.plot(t, 100 * values, linewidth=1.2, label=joint)
+        _draw_limits(axis, float(np.nanmax(np.abs(share), initial=0.0)))
+        axis.set_ylabel(f"{name} [% of limit]", fontsize=9)
+    axes[-1].set_xlabel("t [s]")
+    axes[-1].set_xlim(t[0], t[-1])
+    columns = max(1, MAX_LEGEND_CHARACTERS // (max(map(len, robot.joint_names)) + 8))  # with space between entries
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=min(robot.n, columns), fontsize=8)
+
+
+def _draw_limits(axis: "Axes", largest: float) -> None:
+    """Draw lines at the limits and shade the area outside them."""
+    height = 100 * min(max(1.15, 1.1 * largest), 10.0)
+    axis.set_ylim(-height, height)
+    for side in (-1, 1):
+        axis.axhline(100 * side, color=_LIMIT, linewidth=1, linestyle="--")
+        axis.axhspan(100 * side, height * side, color="tab:red", alpha=0.08, linewidth=0)
+    axis.axhline(0, color="0.8", linewidth=0.6, zorder=0)
+    axis.grid(axis="x", color="0.9", linewidth=0.6)
+
+
+def _draw_over_table(figure: "SubFigure", table: Table, world: PathWorld, s: Array, t: Array) -> None:
+    """Draw the tip from above in the rectangle, and its height over time in the valid band."""
+    above, beside = figure.subplots(2, 1, height_ratios=[1.5, 1.0])
+    x, y, z = world.tip_position
+    _draw_rectangle(above, (table.x.low, table.x.high), (table.y.low, table.y.high), fill=False)
+    _draw_tip_path(above, x, y)
+    above.set_aspect("equal")
+    above.margins(0.08)
+    above.set(xlabel="x [m]", ylabel="y [m]", title="tip over the table, one dot per 20 ms")
+    ticks = np.arange(0.0, t[-1], 0.02)
+    above.plot(np.interp(ticks, t, x), np.interp(ticks, t, y), ".", color="black", markersize=4)
+    height = table.measured(cast("World", world))[1]
+    band = 1e3 * (table.allowed(height) + table.bound_relaxation(height, s, world.tip_position[:, 0]))
+    beside.fill_between(t, -band, band, color="tab:green", alpha=0.12, linewidth=0, label="valid")
+    beside.plot(t, 1e3 * (z - table.z), color="black", linewidth=1.2)
+    beside.set(xlabel="t [s]", ylabel="z above the table [mm]", xlim=(t[0], t[-1]))
+    beside.grid(color="0.9", linewidth=0.6)
+
+
+def _draw_views(figure: "SubFigure", problem: Problem, world: PathWorld, obstacle_poses: Array) -> None:
+    """Draw arm, object and obstacles in two views: from the side with the largest tip motion, and from above."""
+    solids, corners = solids_of(problem.obstacle, obstacle_poses), world.object_corners() if problem.object else None
+    side = int(np.ptp(world.tip_position[1]) >= np.ptp(world.tip_position[0]))
+    colors = [_BETWEEN] * (DRAWN_STATES - 2) + [_START, _GOAL]
+    indices = np.linspace(0, world.q.shape[1] - 1, DRAWN_STATES).round().astype(int)
+    indices = np.concatenate([indices[1:-1], indices[[0, -1]]])  # the ends are drawn last, in front
+    links = [_links(problem, world, k) for k in indices]
+    for axis, (across, up), title in zip(figure.subplots(2, 1), ((side, 2), (1, 0)), ("side", "top"), strict=True):
+        for solid in solids:
+            _draw_solid(axis, solid, (across, up))
+        for k, points, color in zip(indices, links, colors, strict=True):
+            _draw_body(axis, points, None if corners is None else corners[..., k], (across, up), color)
+        _draw_tip_path(axis, world.tip_position[across], world.tip_position[up])
+        axis.set_aspect("equal")
+        axis.set(xlabel=f"{'xyz'[across]} [m]", ylabel=f"{'xyz'[up]} [m]", title=f"{title} view")
+        axis.set_ylim(bottom=max(axis.get_ylim()[0], -0.25))
+
+
+def _links(problem: Problem, world: PathWorld, k: int) -> list[tuple[Array, float]]:
+    """Return the links at one state: corners of a hull in the world [m], shape (V, 3), and its radius [m].
+
+    They are the parts of the robot's link geometry, or its segments with the radius of a constraint.
+    """
+    robot = world.robot
+    if robot.shape is None:
+        return [(segment, problem.arm_radius or 0.0) for segment in world.segments()[..., k]]
+    rotations, positions = ForwardKinematics(robot.model).poses(world.q[:, k : k + 1])
+    places = ((piece, robot.shape.joints[piece.link]) for piece in robot.shape.convex_parts)
+    return [
+        (piece.vertices @ rotations[joint, :, :, 0].T + positions[joint, :, 0], piece.radius) for piece, joint in places
+    ]
+
+
+def _draw_body(
+    axis: "Axes", links: list[tuple[Array, float]], corners: Array | None, plane: tuple[int, int], color: str
+) -> None:
+    """Draw the outlines of the arm's links and of the held object at one state."""
+    from matplotlib.collections import PolyCollection
+
+    between = color == _BETWEEN
+    style: dict[str, Any] = {"color": color, "linewidth": 0.5 if between else 1.2, "alpha": 0.5 if between else 0.9}
+    for points, radius in links:
+        outline = _outline(points[:, list(plane)], radius)
+        axis.plot(*outline.T, **style)
+        area = PolyCollection([outline], facecolors=color, alpha=0.03 if between else 0.12, linewidths=0)
+        axis.add_collection(area)
+    if corners is not None:
+        axis.plot(*_hull(corners[:, list(plane)]).T, **style | {"linewidth": 2 * style["linewidth"]})
+
+
+def _outline(points: Array, radius: float) -> Array:
+    """Compute the outline of the hull of points in the plane, extended by a radius, shape (V, 2) -> (m, 2)."""
+    if not radius:
+        return points if len(points) == 2 else _hull(points)
+    angles = np.linspace(0, 2 * np.pi, 32, endpoint=False)
+    circle = radius * np.column_stack([np.cos(angles), np.sin(angles)])
+    return _hull((points[:, None] + circle).reshape(-1, 2))
+
+
+def _hull(points: Array) -> Array:
+    """Compute the closed convex hull of points in the plane, shape (n, 2) -> (m, 2)."""
+    from scipy.spatial import ConvexHull
+
+    corners = points[ConvexHull(points).vertices]
+    return np.concatenate([corners, corners[:1]])
+
+
+def _draw_tip_path(axis: "Axes", a: Array, b: Array) -> None:
+    axis.plot(a, b, color="black", linewidth=1.4)
+    axis.plot(a[0], b[0], "o", color=_START, label="start")
+    axis.plot(a[-1], b[-1], "s", color=_GOAL, label="goal")
+
+
+def _draw_solid(axis: "Axes", solid: Solid, plane: tuple[int, int]) -> None:
+    """Draw the projection of an obstacle."""
+    from matplotlib.patches import Polygon
+
+    outline = _outline((solid.position + solid.corners)[:, list(plane)], solid.radius)
+    axis.add_patch(Polygon(outline, facecolor=_BOX, edgecolor=_LIMIT, zorder=0))
+    axis.update_datalim(outline)
+
+
+def _draw_rectangle(axis: "Axes", across: tuple[float, float], up: tuple[float, float], *, fill: bool) -> None:
+    from matplotlib.patches import Rectangle
+
+    corner, width, height = (across[0], up[0]), across[1] - across[0], up[1] - up[0]
+    axis.add_patch(Rectangle(corner, width, height, fill=fill, facecolor=_BOX, edgecolor=_LIMIT, zorder=0))

@@ -1,0 +1,54 @@
+"""Check of the plans in rows of a certified dataset: their verdicts and stored durations."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.judges.plans.judge import judge
+from cnpgen.problems.problem import Problem
+from cnpgen.robots.robot import Robot
+from cnpgen.trajectory.boundary import Boundary
+from cnpgen.trajectory.spline_motion import Motion
+
+
+@dataclass(frozen=True)
+class PlanCheck:
+    """Result of the check of plans in rows of a certified dataset.
+
+    Attributes:
+        judged: Number of plans.
+        valid: Number of valid plans.
+        problems: Error messages, one line each.
+    """
+
+    judged: int = 0
+    valid: int = 0
+    problems: tuple[str, ...] = ()
+
+
+def check_plans(problem: Problem, robot: Robot, columns: Mapping[str, NDArray[Any]]) -> PlanCheck:
+    """Judge the plans in rows of a certified dataset; rows of other datasets have none.
+
+    Args:
+        problem: The problem.
+        robot: Its robot.
+        columns: Field -> values, shape (rows, width) or (rows,).
+    """
+    if "path_control_points" not in columns:
+        return PlanCheck()
+    rows, spec = len(columns["start_q"]), problem.trajectory
+    path = columns["path_control_points"].reshape(rows, spec.path_control_points, robot.n)
+    motion = Motion(path, columns["rate_control_points"], spec.degree)
+    boundary = Boundary.from_batch(columns, None)
+    verdicts = judge(problem, robot, motion, boundary, columns["start_xyz"], columns["goal_xyz"])
+    invalid = [(row, verdict.reason) for row, verdict in enumerate(verdicts) if not verdict.valid]
+    problems = []
+    if invalid:
+        row, reason = invalid[0]
+        problems.append(f"{len(invalid)} of {rows} plans are not valid, the first one is that of row {row}: {reason}")
+    if not np.allclose(columns["duration"], motion.duration(), rtol=1e-9, atol=0):
+        problems.append("stored durations differ from those of the plans")
+    return PlanCheck(rows, rows - len(invalid), tuple(problems))

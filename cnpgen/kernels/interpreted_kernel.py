@@ -1,0 +1,218 @@
+"""Kernels without a compiler: NumPy runs the tape, one operation at a time on blocks of lanes."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from cnpgen.kernels.grid_kernel import GridKernel, check_grid
+from cnpgen.kernels.kernel import Array, Kernel, check_arguments
+from cnpgen.kernels.tape import NAMES, OPERATIONS, Loop, Tape
+
+POINTS_PER_BLOCK = 8192  # lanes or points; smaller blocks cost more interpreter time, larger ones exceed the cache
+
+
+def _if_else_zero(condition: Any, value: Any, out: Array) -> None:
+    out[...] = np.where(np.not_equal(condition, 0.0), value, 0.0)  # a product would turn 0 * inf into nan
+
+
+def _twice(x: Any, out: Array) -> None:
+    np.add(x, x, out=out)
+
+
+_APPLY: dict[str, Callable[..., Any]] = {
+    "ADD": np.add, "SUB": np.subtract, "MUL": np.multiply, "DIV": np.divide, "NEG": np.negative, "SQ": np.square,
+    "TWICE": _twice, "INV": np.reciprocal, "SQRT": np.sqrt, "FABS": np.abs, "SIGN": np.sign, "SIN": np.sin,
+    "COS": np.cos,
+    "EXP": np.exp, "FMIN": np.fmin, "FMAX": np.fmax, "LT": np.less, "LE": np.less_equal, "EQ": np.equal,
+    "NE": np.not_equal, "NOT": np.logical_not, "AND": np.logical_and, "OR": np.logical_or,
+    "IF_ELSE_ZERO": _if_else_zero,
+}  # fmt: skip
+
+
+Read = Callable[[int, int], Any]  # component of an argument, for the lanes of a block
+Write = Callable[[int, int, Any], None]  # stores a component of a result
+
+
+class _LaneBlock:
+    """The work rows of a block of lanes, with the functions that read and write its present lanes."""
+
+    def __init__(self, rows: list[Array]) -> None:
+        self.rows = rows
+        self._read: Read
+        self._write: Write
+
+    def run(self, steps: "list[Callable[[], Any]]", read: Read, write: Write) -> None:
+        """Run bound steps."""
+        self._read, self._write = read, write
+        for step in steps:
+            step()
+
+    def load(self, row: int, argument: int, component: int) -> None:
+        """Fill a row with a component of an argument."""
+        np.copyto(self.rows[row], self._read(argument, component))
+
+    def store(self, result: int, component: int, operand: "int | float") -> None:
+        """Store a row or a number as a component of a result."""
+        self._write(result, component, self.rows[operand] if isinstance(operand, int) else operand)
+
+
+Bind = Callable[[_LaneBlock], Callable[[], Any]]  # binding a step to its rows once halves its interpreter time
+
+
+class InterpretedKernel(Kernel):
+    """A tape evaluated by NumPy."""
+
+    def __init__(self, tape: Tape) -> None:
+        super().__init__(tape)
+        self._slots, self._program = _allocate(tape)
+
+    def __call__(self, *arguments: Array) -> list[Array]:
+        """Evaluate the batch; see ``Kernel``."""
+        n = check_arguments(self.tape, arguments)
+        with np.errstate(all="ignore"):
+            if self.tape.loop is not None:
+                return self._iterate(list(arguments), n, self.tape.loop)
+            return self._evaluate(arguments, n)
+
+    def _evaluate(self, arguments: Sequence[Array], n: int) -> list[Array]:
+        results = [np.empty((width, n)) for width in self.tape.outputs]
+        work = np.empty((self._slots, min(n, POINTS_PER_BLOCK)))
+        block, steps = _bind_all(self._program, list(work))
+        for start in range(0, n, POINTS_PER_BLOCK):
+            lanes = slice(start, min(start + POINTS_PER_BLOCK, n))
+            if lanes.stop - start < work.shape[1]:
+                block, steps = _bind_all(self._program, list(work[:, : lanes.stop - start]))
+            block.run(steps, *_lanes(arguments, results, lanes))
+        return results
+
+    def _iterate(self, arguments: list[Array], n: int, loop: Loop) -> list[Array]:
+        """Step all lanes until they have converged."""
+        state, parameters = arguments[0].copy(), arguments[1:]
+        error = np.full((1, n), np.nan)
+        active = np.arange(n)
+        for _ in range(loop.limit):
+            if len(active) == 0:
+                break
+            inputs = [state, *parameters]
+            if len(active) < n:
+                inputs = [np.ascontiguousarray(x[:, active]) for x in inputs]
+            next_state, next_error = self._evaluate(inputs, len(active))
+            state[:, active], error[:, active] = next_state, next_error
+            active = active[~(next_error[0] < loop.tolerance)]
+        return [state, error]
+
+
+class InterpretedGridKernel(GridKernel):
+    """A tape with a grid evaluated by NumPy, a few nodes at a time."""
+
+    def __init__(self, tape: Tape) -> None:
+        super().__init__(tape)
+        self._slots, self._program = _allocate(tape)
+
+    def __call__(self, *arguments: Array, out: Sequence[Array]) -> None:
+        """Evaluate the grid; see ``GridKernel``."""
+        k, n = check_grid(self.tape, self.grid, arguments, out)
+        count = max(POINTS_PER_BLOCK // max(n, 1), 1)
+        work = np.empty((self._slots, min(count, k), min(n, POINTS_PER_BLOCK)), self.tape.dtype)
+        with np.errstate(all="ignore"):
+            for node in range(0, k, count):
+                for lane in range(0, n, POINTS_PER_BLOCK):
+                    nodes, lanes = slice(node, min(node + count, k)), slice(lane, min(lane + POINTS_PER_BLOCK, n))
+                    block, steps = _bind_all(
+                        self._program, [row[: nodes.stop - node, : lanes.stop - lane] for row in work]
+                    )
+                    block.run(steps, *self._points(arguments, out, nodes, lanes))
+
+    def _points(
+        self, arguments: Sequence[Array], out: Sequence[Array], nodes: slice, lanes: slice
+    ) -> tuple[Read, Write]:
+        """Return the functions that read and write a block of points; rows have shape (nodes, lanes)."""
+        part: dict[str, Any] = {"point": (nodes, lanes), "lane": (None, lanes), "node": (nodes, None), "fixed": ()}
+
+        def read(argument: int, component: int) -> Any:
+            return arguments[argument][(component, *part[self.grid.arguments[argument]])]
+
+        def write(result: int, component: int, value: Any) -> None:
+            if self.grid.results[result] == "point":
+                out[result][component, nodes, lanes] = value
+            else:
+                shape = (nodes.stop - nodes.start, lanes.stop - lanes.start)
+                out[result][component, lanes] += np.broadcast_to(value, shape).sum(axis=0)
+
+        return read, write
+
+
+def _bind_all(program: list[Bind], rows: list[Array]) -> tuple[_LaneBlock, list[Callable[[], Any]]]:
+    block = _LaneBlock(rows)
+    return block, [bind(block) for bind in program]
+
+
+def _lanes(arguments: Sequence[Array], results: list[Array], lanes: slice) -> tuple[Read, Write]:
+    """Return the functions that read and write a block of lanes."""
+
+    def read(argument: int, component: int) -> Any:
+        return arguments[argument][component, lanes]
+
+    def write(result: int, component: int, value: Any) -> None:
+        results[result][component, lanes] = value
+
+    return read, write
+
+
+def _allocate(tape: Tape) -> tuple[int, list[Bind]]:
+    """Assign a work row to every value, reusing rows of dead values; bind instructions to their operands."""
+    last = np.zeros(len(tape), int)
+    names = [NAMES[code] for code in tape.operation]
+    for k, name in enumerate(names):
+        for operand in _operands(tape, k, name):
+            last[operand] = k
+    free: list[int] = []
+    place: dict[int, Any] = {}  # value -> row, or the constant itself
+    count = 0
+    program: list[Bind] = []
+    for k, name in enumerate(names):
+        if name == "CONST":
+            place[k] = float(tape.constant[k])  # a Python number does not promote float32
+            continue
+        operands = [place[operand] for operand in _operands(tape, k, name)]
+        dying = {operand for operand in _operands(tape, k, name) if last[operand] == k}
+        free.extend(place[operand] for operand in dying if isinstance(place[operand], int))
+        if name == "OUTPUT":
+            program.append(_bind_output(operands[0], int(tape.b[k]), int(tape.constant[k])))
+            continue
+        if free:
+            row = free.pop()
+        else:
+            row, count = count, count + 1
+        place[k] = row
+        program.append(
+            _bind_input(row, int(tape.a[k]), int(tape.b[k])) if name == "INPUT" else _bind(name, operands, row)
+        )
+        if last[k] == 0:
+            free.append(row)
+    return max(count, 1), program
+
+
+def _operands(tape: Tape, k: int, name: str) -> list[int]:
+    return [int(tape.a[k]), int(tape.b[k])][: OPERATIONS[name]]
+
+
+def _bind_input(row: int, argument: int, component: int) -> Bind:
+    return lambda block: partial(block.load, row, argument, component)
+
+
+def _bind_output(operand: int | float, result: int, component: int) -> Bind:
+    return lambda block: partial(block.store, result, component, operand)
+
+
+def _bind(name: str, operands: list[Any], row: int) -> Bind:
+    apply = _APPLY[name]
+
+    def bind(block: _LaneBlock) -> Callable[[], Any]:
+        rows = block.rows
+        values = (rows[operand] if isinstance(operand, int) else operand for operand in operands)
+        return partial(apply, *values, rows[row])
+
+    return bind

@@ -1,0 +1,70 @@
+"""Kernels that use CasADi's map: the reference in tests of the fast backends."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from cnpgen.kernels.grid_kernel import GridKernel, axis_names, check_grid
+from cnpgen.kernels.kernel import Array, Kernel, check_arguments
+from cnpgen.kernels.tape import Tape
+
+
+class MappedKernel(Kernel):
+    """An SX function evaluated lane by lane by CasADi's virtual machine."""
+
+    def __init__(self, tape: Tape, function: Any) -> None:
+        super().__init__(tape)
+        self._function = function
+
+    def __call__(self, *arguments: Array) -> list[Array]:
+        """Evaluate the batch; see ``Kernel``."""
+        n = check_arguments(self.tape, arguments)
+        if self.tape.loop is None:
+            return self._evaluate(list(arguments), n)
+        state, error, active = arguments[0].copy(), np.full((1, n), np.nan), np.arange(n)
+        for _ in range(self.tape.loop.limit):
+            if len(active) == 0:
+                break
+            next_state, next_error = self._evaluate([x[:, active] for x in (state, *arguments[1:])], len(active))
+            state[:, active], error[:, active] = next_state, next_error
+            active = active[~(next_error[0] < self.tape.loop.tolerance)]
+        return [state, error]
+
+    def _evaluate(self, arguments: list[Array], n: int) -> list[Array]:
+        return _map(self._function, arguments, n, self.tape.outputs)
+
+
+class MappedGridKernel(GridKernel):
+    """An SX function evaluated point by point by CasADi's virtual machine, always in float64."""
+
+    def __init__(self, tape: Tape, function: Any) -> None:
+        super().__init__(tape)
+        self._function = function
+
+    def __call__(self, *arguments: Array, out: Sequence[Array]) -> None:
+        """Evaluate the grid; see ``GridKernel``."""
+        nodes, lanes = check_grid(self.tape, self.grid, arguments, out)
+        points = []
+        for argument, axes in zip(arguments, self.grid.arguments, strict=True):
+            shape = (len(argument), nodes, lanes)
+            spread = np.broadcast_to(_with_all_axes(argument, axis_names(axes)), shape)
+            points.append(spread.reshape(len(argument), nodes * lanes))
+        results = _map(self._function, points, nodes * lanes, self.tape.outputs)
+        for result, values, axes in zip(out, results, self.grid.results, strict=True):
+            grid = values.reshape(len(values), nodes, lanes)
+            result[...] = grid if axes == "point" else result + grid.sum(axis=1)
+
+
+def _with_all_axes(array: Array, names: tuple[str, ...]) -> Array:
+    """Insert the axes that an argument lacks, with size 1."""
+    sizes = dict(zip(names, array.shape[1:], strict=True))
+    return array.reshape(len(array), sizes.get("nodes", 1), sizes.get("lanes", 1))
+
+
+def _map(function: Any, arguments: Sequence[Array], n: int, widths: Sequence[int]) -> list[Array]:
+    if n == 0:
+        return [np.empty((width, 0)) for width in widths]
+    results = function.map(n)(*arguments)
+    results = results if isinstance(results, tuple) else (results,)
+    return [np.ascontiguousarray(np.array(result)) for result in results]

@@ -1,0 +1,89 @@
+"""Parallel compilation of kernels, which are independent of each other."""
+
+import os
+from functools import cached_property
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING
+
+from cnpgen.kernels.compiled_kernel import CompiledKernel, compile_tape, find_compiled
+from cnpgen.kernels.kernel import Array, Kernel
+from cnpgen.kernels.tape import Tape
+
+if TYPE_CHECKING:
+    from concurrent.futures import Future, ThreadPoolExecutor
+
+MAX_COMPILERS = 8  # compilers at the same time: each takes some 100 MB
+
+
+class PendingKernel(Kernel):
+    """A kernel whose library is still being compiled; the first call waits for it."""
+
+    def __init__(self, tape: Tape, library: "Future[Path]", cache_folder: Path) -> None:
+        super().__init__(tape)
+        self._library, self._folder = library, cache_folder
+
+    @cached_property
+    def _compiled(self) -> CompiledKernel:
+        return CompiledKernel(self.tape, self._library.result(), self._folder)
+
+    def __call__(self, *arguments: Array) -> list[Array]:
+        """Evaluate every lane; see ``Kernel``."""
+        return self._compiled(*arguments)
+
+    @property
+    def address(self) -> int | None:
+        """Address of the machine code; waits for its compilation. See ``Kernel``."""
+        return self._compiled.address
+
+
+class CompilerPool:
+    """Threads that compile tapes, equal ones once; all are compiled at the end of the ``with`` block.
+
+    Args:
+        cache_folder: Folder of cached libraries.
+    """
+
+    def __init__(self, cache_folder: Path) -> None:
+        self._folder = cache_folder
+        self._pool: ThreadPoolExecutor | None = None
+        self._jobs: dict[bytes, Future[Path]] = {}
+
+    def kernel(self, tape: Tape) -> Kernel:
+        """Return the kernel of a tape; its compilation may still be pending.
+
+        Raises:
+            MachineError: There is no working compiler or the cache folder is unusable.
+        """
+        if library := find_compiled(tape, self._folder):
+            return CompiledKernel(tape, library, self._folder)
+        key = tape.to_bytes()
+        if key not in self._jobs:
+            self._jobs[key] = self._threads().submit(compile_tape, tape, self._folder)
+        return PendingKernel(tape, self._jobs[key], self._folder)
+
+    def _threads(self) -> "ThreadPoolExecutor":
+        from concurrent.futures import ThreadPoolExecutor
+
+        if self._pool is None:  # no thread is started if all kernels are cached
+            self._pool = ThreadPoolExecutor(min(os.cpu_count() or 1, MAX_COMPILERS))
+        return self._pool
+
+    def __enter__(self) -> "CompilerPool":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Wait for all compilations; after an error, cancel those that are not started.
+
+        Raises:
+            MachineError: A compiler failed.
+        """
+        try:
+            if kind is None:
+                for job in self._jobs.values():
+                    job.result()
+        finally:
+            if self._pool is not None:
+                self._pool.shutdown(cancel_futures=True)

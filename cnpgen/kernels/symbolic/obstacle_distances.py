@@ -1,0 +1,331 @@
+"""Signed distances of the robot's capsules and of the held object from obstacles, as SX: one class per kind.
+
+Sizes and poses are scalar inputs of kernels. All distances are exact or lower bounds: exact for segments and boxes,
+spheres and capsules, bisected for cylinders, and those of a box cut by planes for meshes. The depth of a segment inside
+an obstacle is that of one point: the deepest in a cylinder, the midpoint of the overlap in a box with a pose.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from cnpgen.kernels.symbolic.box_distances import (
+    UNBOUNDED_EXTENT_M,
+    Bounds,
+    cuboid_separation,
+    segment_box_distance,
+    segment_box_separation,
+    signed_segment_box_distance,
+    upright_box_separation,
+)
+from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, dot, scale, subtract, transposed_times
+from cnpgen.kernels.symbolic.segment_distance import SMOOTHING_M2, segment_distance
+from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
+from cnpgen.robots.shape.hull import supporting_planes
+from cnpgen.robots.shape.inline import corners_of
+from cnpgen.robots.solid import number_slices
+
+if TYPE_CHECKING:
+    from cnpgen.robots.obstacle import Obstacle
+
+Size = tuple[float, float, float]
+Freeze = Callable[[Scalar], Scalar]
+
+BISECTION_STEPS = 6  # of the parameter of a segment's point closest to a cylinder
+
+
+class SymbolicSolid(ABC):
+    """The shape of an obstacle as SX."""
+
+    @abstractmethod
+    def separation(self, first: Vec, second: Vec, freeze: Freeze) -> Scalar:
+        """Return the signed distance of a segment from the obstacle, or a lower bound [m].
+
+        Args:
+            first: First end of the segment [m].
+            second: Second end of the segment [m].
+            freeze: Function that makes a value constant for differentiation.
+        """
+
+    def smooth_separation(self, first: Vec, second: Vec, freeze: Freeze) -> Scalar:
+        """Return a signed distance of a segment that is smooth inside the obstacle, for descent methods [m]."""
+        return self.separation(first, second, freeze)
+
+    def distance(self, first: Vec, second: Vec) -> Scalar:
+        """Return the distance of a segment [m], possibly without a gradient."""
+        return self.separation(first, second, lambda value: value)
+
+    @abstractmethod
+    def cuboid_separation(self, center: Vec, rotation: list[Vec], size: Size) -> Scalar:
+        """Return the signed distance of a cuboid from the obstacle, or a lower bound [m].
+
+        Args:
+            center: Center of the cuboid [m].
+            rotation: Rows of its rotation matrix.
+            size: Edge lengths of the cuboid [m].
+        """
+
+
+@dataclass(frozen=True)
+class SymbolicUprightBox(SymbolicSolid):
+    """An axis-aligned box given by its bounds; distances are exact, those of cuboids if they are upright.
+
+    Attributes:
+        bounds: Bounds along x, y, z [m].
+    """
+
+    bounds: Bounds
+
+    def separation(self, first: Vec, second: Vec, freeze: Freeze) -> Scalar:  # noqa: ARG002
+        """Return the signed distance."""
+        return segment_box_separation(first, second, self.bounds)
+
+    def smooth_separation(self, first: Vec, second: Vec, freeze: Freeze) -> Scalar:
+        """Return the distance, or inside minus the depth of the overlap's midpoint."""
+        return signed_segment_box_distance(first, second, self.bounds, freeze=freeze)
+
+    def distance(self, first: Vec, second: Vec) -> Scalar:
+        """Return the distance, 0 if they overlap."""
+        return segment_box_distance(first, second, self.bounds)
+
+    def cuboid_separation(self, center: Vec, rotation: list[Vec], size: Size) -> Scalar:
+        """Return the largest separation along a face normal."""
+        return upright_box_separation(center, rotation, size, self.bounds)
+
+
+@dataclass(frozen=True)
+class SymbolicBox(SymbolicSolid):
+    """A box along the axes of a frame.
+
+    Attributes:
+        center: Center in the frame [m].
+        half: Half edge lengths [m].
+        origin: Origin of the frame [m].
+        rotation: Rows of the frame's rotation matrix, or None for the world's axes.
+    """
+
+    center: Vec
+    half: Vec
+    origin: Vec
+    rotation: list[Vec] | None
+
+    @property
+    def bounds(self) -> Bounds:
+        """Bounds in the frame [m]."""
+        return [(x - half, x + half) for x, half in zip(self.center, self.half, strict=True)]
+
+    def within(self, point: Vec) -> Vec:
+        """Return a point in the frame."""
+        from_origin = subtract(point, self.origin)
+        return from_origin if self.rotation is None else transposed_times(self.rotation, from_origin)
+
+    def axes_within(self, rotation: list[Vec]) -> list[Vec]:
+        """Return the columns of a rotation matrix in the frame."""
+        columns = [[row[i] for row in rotation] for i in range(3)]
+        return columns if self.rotation is None else [transposed_times(self.rotation, column) for column in columns]
+
+    def separation(self, first: Vec, second: Vec, freeze: Freeze) -> Scalar:
+        """Return the distance, or inside minus the depth of the overlap's midpoint."""
+        return signed_segment_box_distance(self.within(first), self.within(second), self.bounds, freeze=freeze)
+
+    def distance(self, first: Vec, second: Vec) -> Scalar:
+        """Return the distance, 0 if they overlap."""
+        return segment_box_distance(self.within(first), self.within(second), self.bounds)
+
+    def cuboid_separation(self, center: Vec, rotation: list[Vec], size: Size) -> Scalar:
+        """Return the largest separation along the 15 separating axes of two cuboids."""
+        position = subtract(self.within(center), self.center)
+        return cuboid_separation(position, self.axes_within(rotation), [edge / 2 for edge in size], self.half)
+
+
+@dataclass(frozen=True)
+class SymbolicHull(SymbolicBox):
+    """A convex hull: the intersection of a box and half-spaces in one frame.
+
+    Attributes:
+        planes: Outer unit normals and offsets [m] of the half-spaces, each of shape (4,).
+    """
+
+    planes: Sequence[Sequence[float]] = ()
+
+    def separation(self, first: Vec, second: Vec, freeze: Freeze) -> Scalar:
+        """Return the larger one of the distance from the box and the largest separation along a plane's normal."""
+        import casadi as ca
+
+        a, b = self.within(first), self.within(second)
+        best: Scalar = -UNBOUNDED_EXTENT_M
+        plane = [0.0] * 4
+        for *normal, offset in self.planes:
+            gap = ca.fmin(dot(normal, a), dot(normal, b)) - offset
+            better = gap > best
+            best = ca.fmax(best, gap)
+            plane = [ca.if_else(better, new, old) for new, old in zip((*normal, offset), plane, strict=True)]
+        *normal, offset = plane  # constant for differentiation
+        gap = ca.fmin(dot(normal, a), dot(normal, b)) - offset if self.planes else best
+        return ca.fmax(super().separation(first, second, freeze), gap)
+
+    def distance(self, first: Vec, second: Vec) -> Scalar:
+        """Return the separation."""
+        return self.separation(first, second, lambda value: value)
+
+    def cuboid_separation(self, center: Vec, rotation: list[Vec], size: Size) -> Scalar:
+        """Return the larger one of the separation from the box and the largest one along a plane's normal."""
+        import casadi as ca
+
+        best = super().cuboid_separation(center, rotation, size)
+        position, axes = self.within(center), self.axes_within(rotation)
+        for *normal, offset in self.planes:
+            reach = sum(edge / 2 * ca.fabs(dot(normal, axis)) for edge, axis in zip(size, axes, strict=True))
+            best = ca.fmax(best, dot(normal, position) - reach - offset)
+        return best
+
+
+@dataclass(frozen=True)
+class SymbolicCapsule(SymbolicSolid):
+    """A capsule, or a sphere if both ends coincide.
+
+    Attributes:
+        first: First end of the axis [m].
+        second: Second end of the axis [m].
+        radius: Radius [m].
+    """
+
+    first: Vec
+    second: Vec
+    radius: Scalar
+
+    def separation(self, first: Vec, second: Vec, freeze: Freeze) -> Scalar:
+        """Return the exact signed distance, or minus the radius for crossing segments."""
+        return segment_distance((first, second), (self.first, self.second), freeze=freeze) - self.radius
+
+    def cuboid_separation(self, center: Vec, rotation: list[Vec], size: Size) -> Scalar:
+        """Return the exact signed distance."""
+        first, second = (transposed_times(rotation, subtract(end, center)) for end in (self.first, self.second))
+        return segment_box_separation(first, second, [(-edge / 2, edge / 2) for edge in size]) - self.radius
+
+
+@dataclass(frozen=True)
+class SymbolicCylinder(SymbolicSolid):
+    """A cylinder.
+
+    Attributes:
+        center: Center [m].
+        half: Vector from the center to the center of an end [m].
+        radius: Radius [m].
+    """
+
+    center: Vec
+    half: Vec
+    radius: Scalar
+
+    def separation(self, first: Vec, second: Vec, freeze: Freeze) -> Scalar:
+        """Return a lower bound of the distance by bisection of the closest point's parameter.
+
+        The distance is convex along the segment. Its minimum is at least the value at the last bisection point minus
+        the remaining interval times the derivative there. The closest point is constant for differentiation.
+        """
+        import casadi as ca
+
+        extent = ca.sqrt(dot(self.half, self.half))
+        axis = scale(self.half, 1 / extent)
+        from_center, along = subtract(first, self.center), subtract(second, first)
+        height, axial = dot(from_center, axis), dot(along, axis)
+        radial, radial_along = subtract(from_center, scale(axis, height)), subtract(along, scale(axis, axial))
+        c0, c1, c2 = dot(radial, radial), dot(radial, radial_along), dot(radial_along, radial_along)
+
+        def gaps(t: Scalar) -> tuple[Scalar, Scalar, Scalar]:
+            """Return the distance of a point from the axis, and its distances from the lateral surface and the ends."""
+            from_axis = ca.sqrt(ca.fmax(c0 + t * (2 * c1 + t * c2), 0) + SMOOTHING_M2)
+            return from_axis, from_axis - self.radius, ca.fabs(height + t * axial) - extent
+
+        def derivative(t: Scalar) -> Scalar:
+            from_axis, side, end = gaps(t)
+            outside = ca.fmax(side, end) > 0
+            by_side = ca.if_else(outside, ca.fmax(side, 0), side >= end)
+            by_end = ca.if_else(outside, ca.fmax(end, 0), side < end)
+            weighted = by_side * (c1 + t * c2) / from_axis + by_end * ca.sign(height + t * axial) * axial
+            return weighted / ca.sqrt(by_side * by_side + by_end * by_end + SMOOTHING_M2)
+
+        t, width = ca.SX(0.5), 0.5
+        for _ in range(BISECTION_STEPS):
+            width /= 2
+            t = t + ca.if_else(derivative(t) < 0, width, -width)
+        t, error_bound = freeze(t), freeze(width * ca.fabs(derivative(t)))
+        _, side, end = gaps(t)
+        distance = ca.sqrt(ca.fmax(side, 0) ** 2 + ca.fmax(end, 0) ** 2 + SMOOTHING_M2)
+        return distance + ca.fmin(ca.fmax(side, end), 0) - error_bound
+
+    def cuboid_separation(self, center: Vec, rotation: list[Vec], size: Size) -> Scalar:
+        """Return the largest separation along the cylinder's axis, directions from it, and the face normals."""
+        import casadi as ca
+
+        position = transposed_times(rotation, subtract(self.center, center))
+        half, edges = transposed_times(rotation, self.half), [edge / 2 for edge in size]
+        extent = ca.sqrt(dot(half, half))
+        axis = scale(half, 1 / extent)
+        bounds: Bounds = [(-edge, edge) for edge in edges]
+        best = segment_box_separation(add(position, half), subtract(position, half), bounds) - self.radius
+        reach = sum(edge * ca.fabs(x) for edge, x in zip(edges, axis, strict=True))
+        best = ca.fmax(best, ca.fabs(dot(position, axis)) - extent - reach)
+        for x, edge, cosine, along in zip(position, edges, axis, half, strict=True):
+            extent_of_disk = self.radius * ca.sqrt(ca.fmax(1 - cosine * cosine, 0) + SMOOTHING_M2)
+            best = ca.fmax(best, ca.fabs(x) - edge - ca.fabs(along) - extent_of_disk)
+        return best
+
+
+def symbolic_solids(state: SymbolicState) -> list[SymbolicSolid]:
+    """Return the shapes of the obstacles around a robot."""
+    slices = number_slices(state.obstacles)
+    return [
+        _solid(obstacle, state.obstacle_poses[part]) for obstacle, part in zip(state.obstacles, slices, strict=True)
+    ]
+
+
+def _solid(obstacle: "Obstacle", values: Vec) -> SymbolicSolid:
+    """Return the shape of an obstacle with these values of its pose and size."""
+    if obstacle.upright:
+        return _upright(obstacle, values[0])
+    return _BUILDERS[obstacle.kind](obstacle, values[:3], values[3:])
+
+
+def _box(obstacle: "Obstacle", position: Vec, sizes: Vec) -> SymbolicBox:
+    return SymbolicBox([0.0] * 3, sizes[:3], position, _three_rows(sizes[3:]) if obstacle.is_turned else None)
+
+
+def _sphere(_: "Obstacle", position: Vec, sizes: Vec) -> SymbolicCapsule:
+    return SymbolicCapsule(position, position, sizes[0])
+
+
+def _capsule(_: "Obstacle", position: Vec, sizes: Vec) -> SymbolicCapsule:
+    return SymbolicCapsule(subtract(position, sizes[:3]), add(position, sizes[:3]), sizes[3])
+
+
+def _cylinder(_: "Obstacle", position: Vec, sizes: Vec) -> SymbolicCylinder:
+    return SymbolicCylinder(position, sizes[:3], sizes[3])
+
+
+def _mesh(obstacle: "Obstacle", position: Vec, rotation: Vec) -> SymbolicHull:
+    corners = corners_of(obstacle.mesh)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    center, half = ((low + high) / 2).tolist(), ((high - low) / 2).tolist()
+    return SymbolicHull(center, half, position, _three_rows(rotation), supporting_planes(corners).tolist())
+
+
+_BUILDERS: dict[str, Callable[["Obstacle", Vec, Vec], SymbolicSolid]] = {
+    "box": _box,
+    "sphere": _sphere,
+    "capsule": _capsule,
+    "cylinder": _cylinder,
+    "mesh": _mesh,
+}
+
+
+def _upright(obstacle: "Obstacle", top: Scalar) -> SymbolicUprightBox:
+    height, ranges = obstacle.height, [bounds for bounds in (obstacle.x, obstacle.y) if bounds is not None]
+    sides: Bounds = [(bounds.low, bounds.high) for bounds in ranges]
+    return SymbolicUprightBox([*sides, (None if height is None else top - height, top)])
+
+
+def _three_rows(values: Vec) -> list[Vec]:
+    return [values[0:3], values[3:6], values[6:9]]

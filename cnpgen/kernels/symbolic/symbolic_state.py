@@ -1,0 +1,146 @@
+"""Robot states as CasADi SX: lists of scalars in the world frame."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+from cnpgen.kernels.symbolic.dynamics import inverse_dynamics
+from cnpgen.kernels.symbolic.kinematics import Kinematics, bias_acceleration, forward_kinematics, tip_velocity
+from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, constants, cross, scale, times
+
+if TYPE_CHECKING:
+    from cnpgen.robots.obstacle import Obstacle
+    from cnpgen.robots.robot import Robot
+    from cnpgen.robots.shape.capsule import Capsule
+
+
+@dataclass(frozen=True)
+class SymbolicState:
+    """A robot state as SX with derived quantities, each built on first use.
+
+    Attributes:
+        robot: The robot.
+        q: Joint positions [rad], n scalars.
+        dq: Joint velocities [rad/s].
+        ddq: Joint accelerations [rad/s^2].
+        obstacle_poses: Poses and sizes of the obstacles (``cnpgen.robots.solid``), heights of upright boxes included.
+        obstacles: The obstacles.
+        object_size: Edge lengths of the held object [m], or None.
+        jerk: Joint jerks [rad/s^3], or None.
+    """
+
+    robot: "Robot"
+    q: Vec
+    dq: Vec
+    ddq: Vec
+    obstacle_poses: Vec
+    obstacles: "tuple[Obstacle, ...]"
+    object_size: tuple[float, float, float] | None
+    jerk: Vec | None = None
+
+    @cached_property
+    def kinematics(self) -> Kinematics:
+        """Positions and Jacobian at q."""
+        return forward_kinematics(self.robot.chain, self.q)
+
+    @cached_property
+    def torque(self) -> Vec:
+        """Inverse dynamics [N m]."""
+        return inverse_dynamics(self.robot.chain, self.q, self.dq, self.ddq)
+
+    @cached_property
+    def tip_velocity(self) -> Vec:
+        """Linear velocity of the tip [m/s]."""
+        return tip_velocity(self.kinematics, self.dq)
+
+    @cached_property
+    def tip_acceleration(self) -> Vec:
+        """Linear acceleration of the tip [m/s^2]."""
+        return add(tip_velocity(self.kinematics, self.ddq), bias_acceleration(self.kinematics, self.dq))
+
+    @cached_property
+    def tip_angular_velocity(self) -> Vec:
+        """Angular velocity of the tip [rad/s]."""
+        return self._tip_rotation_rates[0]
+
+    @cached_property
+    def tip_angular_acceleration(self) -> Vec:
+        """Angular acceleration of the tip [rad/s^2]."""
+        return self._tip_rotation_rates[1]
+
+    @cached_property
+    def _tip_rotation_rates(self) -> tuple[Vec, Vec]:
+        omega: Vec = [0.0, 0.0, 0.0]
+        alpha: Vec = [0.0, 0.0, 0.0]
+        kin = self.kinematics
+        for z, rate, rate2, turns in zip(kin.axes, self.dq, self.ddq, kin.turning, strict=True):
+            if turns:
+                alpha = add(alpha, add(scale(z, rate2), scale(cross(omega, z), rate)))
+                omega = add(omega, scale(z, rate))
+        return omega, alpha
+
+    @property
+    def segments(self) -> list[tuple[Vec, Vec]]:
+        """The moving capsule axes of the robot: pairs of points [m]."""
+        points = [*self.kinematics.origins, self.kinematics.tip]
+        return [(points[a], points[b]) for a, b in self.robot.capsule_axes]
+
+    @cached_property
+    def capsules(self) -> dict[str, tuple[Vec, Vec, float]]:
+        """Link -> ends [m] and radius [m] of its capsule; empty for a robot without link geometry."""
+        shape = self.robot.shape
+        if shape is None:
+            return {}
+        return {capsule.link: self._placed(capsule, shape.joints[capsule.link]) for capsule in shape.capsules}
+
+    def _placed(self, capsule: "Capsule", joint: int) -> tuple[Vec, Vec, float]:
+        first, second = constants(capsule.first), constants(capsule.second)
+        if joint == 0:
+            return first, second, capsule.radius
+        rotation, origin = self.kinematics.frames[joint - 1], self.kinematics.origins[joint - 1]
+        return add(origin, times(rotation, first)), add(origin, times(rotation, second)), capsule.radius
+
+    def freeze(self, value: Scalar) -> Scalar:
+        """Return a value that derivatives may treat as constant; here it is returned unchanged."""
+        return value
+
+
+@dataclass(frozen=True)
+class FrozenState(SymbolicState):
+    """A state whose frozen values are symbols until the derivatives are built.
+
+    Attributes:
+        frozen: Pairs of a symbol and its value.
+    """
+
+    frozen: list[tuple[Any, Any]] = field(default_factory=list)
+
+    def freeze(self, value: Scalar) -> Scalar:
+        """Return a symbol for a value, so that derivatives treat the value as constant."""
+        import casadi as ca
+
+        symbol = ca.SX.sym(f"frozen_{len(self.frozen)}")
+        self.frozen.append((symbol, value))
+        return symbol
+
+    def unfrozen(self, results: list[Any]) -> list[Any]:
+        """Replace the symbols of frozen values by the values."""
+        import casadi as ca
+
+        symbols, values = [symbol for symbol, _ in self.frozen], [value for _, value in self.frozen]
+        substituted: list[Any] = ca.substitute(results, symbols, values) if symbols else results
+        return substituted
+
+
+def jerk_along(path: Sequence[Vec], rate: Sequence[Scalar]) -> Vec | None:
+    """Return the jerk ``p''' r^3 + 3 p'' r' r^2 + p' (r'' r + r'^2) r``, or None without p'''.
+
+    Args:
+        path: p', p'' and p'''.
+        rate: r, r' and r''.
+    """
+    if len(path) < 3:
+        return None
+    (p1, p2, p3), (r, r1, r2) = path, rate
+    return [c * r**3 + 3 * b * r1 * r**2 + a * (r2 * r + r1**2) * r for a, b, c in zip(p1, p2, p3, strict=True)]

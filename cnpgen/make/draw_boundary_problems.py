@@ -1,0 +1,50 @@
+"""Fresh boundary problems of a recipe, disjoint from all datasets, as plans without motions."""
+
+from pathlib import Path
+
+import numpy as np
+
+from cnpgen.kernels.library import choose_backend
+from cnpgen.make.recipe import MAX_SEED, DatasetRecipe
+from cnpgen.make.recipe_file import as_dataset_recipe
+from cnpgen.plans.boundary_problems import plans_of_rows
+from cnpgen.plans.plans import Plans
+from cnpgen.problems.problem_record import record_problem
+from cnpgen.schema.arguments import integer
+
+SPLIT = "(fresh draws)"  # an invalid name of a split: no dataset contains these rows
+
+
+def draw_boundary_problems(recipe: str | Path | DatasetRecipe, n: int, *, seed: int | None = None) -> Plans:
+    """Draw fresh boundary problems of a recipe, as plans without motions for ``solve_plans``.
+
+    Args:
+        recipe: Name of a shipped dataset or pipeline, path of a recipe file, or a loaded recipe.
+        n: Number of boundary problems.
+        seed: Root seed; by default the recipe's. Equal seeds give equal problems.
+
+    Raises:
+        RecipeError: The recipe has mistakes.
+        UsageError: ``n`` is not a positive integer, ``seed`` is not an integer from 0 to 2^63 - 1, or ``recipe`` is
+            not a recipe.
+        MachineError: No backend works.
+    """
+    from cnpgen.pipelines.prepared import PreparedPipeline
+
+    n = integer("n", n, least=1)
+    root = None if seed is None else integer("seed", seed, least=0, most=MAX_SEED)
+    loaded = as_dataset_recipe(recipe)
+    backend, cache_folder = choose_backend(None)
+    prepared = PreparedPipeline(loaded.pipeline, backend=backend, cache_folder=cache_folder, dtype="float64")
+    rows = prepared.block_rows
+    root = loaded.seed if root is None else root
+    parts = [
+        prepared.block(root, SPLIT, index, first=0, stop=min(n - index * rows, rows)).columns
+        for index in range(-(-n // rows))
+    ]
+    columns = {}
+    for field in prepared.fields:
+        values = np.concatenate([part[field.name] for part in parts], axis=1).T
+        columns[field.name] = np.ascontiguousarray(values if field.width else values[:, 0])
+    source = f"fresh draws of {loaded.name}, seed {root}"
+    return plans_of_rows(record_problem(loaded.pipeline.problem), columns, source=source)

@@ -1,0 +1,191 @@
+"""Generation of shards: blocks, spot check by Pinocchio and Coal, commit."""
+
+import platform
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import MachineError
+from cnpgen.kernels.library import Backend, choose_backend
+from cnpgen.machine.versions import versions
+from cnpgen.make.recipe_file import makes_its_rows, restored
+from cnpgen.pipelines.block_chunk import Block
+from cnpgen.pipelines.pipeline import Pipeline
+from cnpgen.pipelines.prepared import PreparedPipeline
+from cnpgen.store.dataset_spec import DatasetSpec, ShardTask
+from cnpgen.store.field import Field
+from cnpgen.store.sampling_statistics import SamplingStatistics, merge_sampling
+from cnpgen.store.shard import storage_dtype
+from cnpgen.store.shard_record import commit_shard
+from cnpgen.store.workspace import require_dataset_spec
+
+MAX_SPOT_CHECK_ROWS = 32  # per shard, recomputed by Pinocchio and Coal before the commit
+
+
+@dataclass(frozen=True)
+class Job:
+    """Picklable input of a worker.
+
+    Attributes:
+        folder: Folder of the dataset.
+        spec: Specification of the dataset.
+        pipeline: Pipeline of the dataset; None to rebuild it from the specification, for workers without its files.
+        backend: Backend of the kernels.
+        cache_folder: Folder of compiled kernels; None for the default folder of the worker's machine.
+    """
+
+    folder: Path
+    spec: DatasetSpec
+    pipeline: Pipeline | None
+    backend: Backend
+    cache_folder: Path | None
+
+
+def prepare(job: Job) -> PreparedPipeline:
+    """Prepare the pipeline of a job.
+
+    Raises:
+        MachineError: The backend does not work on this machine, or this version of cnpgen generates other rows.
+    """
+    cache_folder = choose_backend(job.backend)[1] if job.cache_folder is None else job.cache_folder
+    load = partial(PreparedPipeline, backend=job.backend, cache_folder=cache_folder, dtype=job.spec.dtype)
+    if job.pipeline is not None:
+        return load(job.pipeline)
+    with restored(job.spec) as recipe:
+        if not makes_its_rows(recipe, job.spec):
+            raise MachineError(
+                f"{platform.node()} has another version of cnpgen, or of a plug-in, which generates other rows:"
+                " install the same ones on all machines"
+            )
+        return load(recipe.pipeline)
+
+
+def make_shards(job: Job, tasks: Sequence[ShardTask]) -> Iterator[tuple[int, SamplingStatistics]]:
+    """Generate, check and commit shards of one split; the operation is idempotent.
+
+    Args:
+        job: Job of the dataset.
+        tasks: Shards, in order; shared blocks are computed once.
+
+    Yields:
+        Number of rows and sampling statistics of every committed shard.
+
+    Raises:
+        RecipeError: The accepted fraction of the candidates is too small.
+        MachineError: The disk or the backend fails.
+        UsageError: Another dataset replaced this one in the folder.
+    """
+    started, clock = datetime.now(UTC).isoformat(timespec="seconds"), time.perf_counter()
+    prepared = _prepared(job)
+    for task, (columns, sampling) in zip(tasks, shard_columns(prepared, job.spec, tasks), strict=True):
+        checked = replace(sampling, verification=spot_check(prepared, columns, job.spec, task))
+        require_dataset_spec(job.folder, job.spec)
+        seconds = round(time.perf_counter() - clock, 3)
+        commit_shard(
+            job.folder,
+            job.spec,
+            task,
+            columns=columns,
+            sampling=checked,
+            started=started,
+            seconds=seconds,
+            versions=versions(),
+        )
+        started, clock = datetime.now(UTC).isoformat(timespec="seconds"), time.perf_counter()
+        yield task.rows, checked
+
+
+def shard_columns(
+    prepared: PreparedPipeline, spec: DatasetSpec, tasks: Sequence[ShardTask]
+) -> Iterator[tuple[dict[str, NDArray[Any]], SamplingStatistics]]:
+    """Compute the rows of shards of one split; every block is computed once.
+
+    Args:
+        prepared: Prepared pipeline.
+        spec: Specification of the dataset.
+        tasks: Shards, in order.
+
+    Yields:
+        ``(columns, sampling)`` of every shard: field name -> values as stored, shape (rows, width) or (rows,), and the
+        sampling statistics.
+    """
+    chunks = _chunks(prepared, spec.seed, tasks)
+    for task in tasks:
+        parts: list[Block] = []
+        while sum(part.columns["sample_id"].shape[1] for part in parts) < task.rows:
+            parts.append(next(chunks))
+        columns = {
+            field.name: _stored([part.columns[field.name] for part in parts], field, spec) for field in spec.fields
+        }
+        yield columns, merge_sampling([part.sampling for part in parts])
+
+
+def _chunks(prepared: PreparedPipeline, seed: int, tasks: Sequence[ShardTask]) -> Iterator[Block]:
+    """Compute the blocks of shards in chunks of one shard each."""
+    size = prepared.block_rows
+    blocks = {index for task in tasks for index in blocks_of(task, size)}
+    for index in sorted(blocks):
+        begin = index * size
+        ranges = [
+            (max(task.first_row - begin, 0), min(task.first_row + task.rows - begin, size))
+            for task in tasks
+            if index in blocks_of(task, size)
+        ]
+        yield from prepared.chunks(seed, tasks[0].split, index, ranges)
+
+
+def blocks_of(task: ShardTask, size: int) -> range:
+    """Return the indices of the blocks of ``size`` rows that overlap a shard."""
+    return range(task.first_row // size, (task.first_row + task.rows - 1) // size + 1)
+
+
+def _stored(parts: list[NDArray[Any]], field: Field, spec: DatasetSpec) -> NDArray[Any]:
+    """Concatenate chunks of shape (width, rows) to the stored values of a field, shape (rows, width) or (rows,)."""
+    rows = np.concatenate(parts, axis=1).T
+    return np.ascontiguousarray(rows if field.width else rows[:, 0], storage_dtype(field, spec.dtype))
+
+
+def spot_check(
+    prepared: PreparedPipeline, columns: dict[str, NDArray[Any]], spec: DatasetSpec, task: ShardTask
+) -> dict[str, float]:
+    """Recompute some rows with Pinocchio and Coal, to detect errors of the compiler or backend.
+
+    Returns:
+        Largest violation of every check, in its unit.
+
+    Raises:
+        MachineError: A row fails a check.
+    """
+    from cnpgen.judges.rows.verify import verify_rows
+
+    rows = np.unique(np.linspace(0, task.rows - 1, MAX_SPOT_CHECK_ROWS).astype(int))
+    some = {name: values[rows] for name, values in columns.items()}
+    report = verify_rows(prepared.context.problem, prepared.context.robot, some, dtype=spec.dtype)
+    if len(report.failed_rows):
+        wrong = ", ".join(f"{check.name} {check.worst:.3g} {check.unit}" for check in report.failed)
+        raise MachineError(
+            f"row {task.first_row + rows[report.failed_rows[0]]} of split {task.split!r} fails Pinocchio's check"
+            f" ({wrong}):"
+            f" the {spec.backend!r} backend computes wrong numbers on this machine; try another {{backend}}",
+            remedies={"backend": None},
+        )
+    return {check.name: check.worst for check in report.checks}
+
+
+_PREPARED: dict[str, PreparedPipeline] = {}
+
+
+def _prepared(job: Job) -> PreparedPipeline:
+    """Prepare the pipeline of a job once per process."""
+    key = f"{job.spec.fingerprint} {job.cache_folder}"
+    if key not in _PREPARED:
+        _PREPARED.clear()
+        _PREPARED[key] = prepare(job)
+    return _PREPARED[key]

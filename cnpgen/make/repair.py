@@ -1,0 +1,81 @@
+"""Repair of datasets: find existing shards, find damaged ones, and delete them."""
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+
+from cnpgen.errors import DatasetError
+from cnpgen.store.dataset_spec import DatasetSpec, ShardTask
+from cnpgen.store.files.atomic import machine_error
+from cnpgen.store.layout import MANIFEST
+from cnpgen.store.shard_record import check_committed
+
+MAX_THREADS = 8
+
+
+def existing_shards(folder: Path, tasks: Sequence[ShardTask]) -> list[ShardTask]:
+    """List the existing shards: all of a finished dataset, otherwise those with a sidecar.
+
+    Without a manifest, a shard without sidecar is unfinished, not lost: an interrupted run may leave it.
+    """
+    finished = (folder / MANIFEST).exists()
+    return [task for task in tasks if finished or (folder / task.sidecar).exists()]
+
+
+def find_damaged(
+    folder: Path,
+    spec: DatasetSpec,
+    tasks: Sequence[ShardTask],
+    *,
+    progress: Callable[[ShardTask], None] | None = None,
+) -> dict[ShardTask, str]:
+    """Compare the bytes of shards with their sidecars.
+
+    Args:
+        folder: Folder of the dataset.
+        spec: Specification of the dataset.
+        tasks: Existing shards.
+        progress: Called with every compared shard.
+
+    Returns:
+        Damaged shard -> description of the damage, in order.
+
+    Raises:
+        MachineError: A file cannot be read.
+    """
+    damaged = {}
+    pool = ThreadPoolExecutor(min(os.cpu_count() or 1, MAX_THREADS))  # sha256 releases the GIL
+    try:
+        for task, problem in zip(tasks, pool.map(partial(_problem, folder, spec), tasks), strict=True):
+            if problem:
+                damaged[task] = problem
+            if progress is not None:
+                progress(task)
+    finally:
+        pool.shutdown(cancel_futures=True)
+    return damaged
+
+
+def _problem(folder: Path, spec: DatasetSpec, task: ShardTask) -> str:
+    """Return a description of the damage of a shard; empty for an intact shard."""
+    try:
+        check_committed(folder, spec, task)
+    except DatasetError as error:
+        return str(error)
+    return ""
+
+
+def delete_shards(folder: Path, tasks: Sequence[ShardTask]) -> None:
+    """Delete shards of a dataset, which is unfinished from then on.
+
+    Raises:
+        MachineError: A file cannot be deleted.
+    """
+    names = [MANIFEST, *(name for task in tasks for name in (task.sidecar, task.file))] if tasks else []
+    for name in names:  # first the manifest and the sidecars, which mark data as complete
+        try:
+            (folder / name).unlink(missing_ok=True)
+        except OSError as error:
+            raise machine_error("delete", folder / name, error) from error

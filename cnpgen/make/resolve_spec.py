@@ -1,0 +1,145 @@
+"""Resolution of the specification of a dataset: everything that determines its bytes."""
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cnpgen.errors import UsageError
+from cnpgen.kernels.library import choose_backend
+from cnpgen.machine.versions import versions
+from cnpgen.make.make_shards import Job
+from cnpgen.make.recipe import MAX_SEED, DatasetRecipe, recipe_digest, split_rows
+from cnpgen.pipelines.prepared import PreparedPipeline
+from cnpgen.problems.problem import resolved
+from cnpgen.schema.arguments import integer
+from cnpgen.store.dataset_spec import DatasetSpec, default_shard_size
+from cnpgen.store.workspace import Workspace
+
+MAX_ROWS = 10**12
+
+
+def dataset_folder(recipe: DatasetRecipe, out: str | Path | None) -> Path:
+    """Return the folder of a dataset, by default ``NAME-vMAJOR`` in the current folder.
+
+    A path with ".." after a missing folder is resolved, since creating that folder could change its target.
+
+    Raises:
+        UsageError: The path is empty.
+    """
+    if out is None:
+        return Path(f"{recipe.name}-v{recipe.version.split('.')[0]}")
+    if not isinstance(out, str | Path) or not str(out).strip():
+        raise UsageError(f"must name a folder, got {str(out) if isinstance(out, Path) else out!r}", argument="out")
+    folder = Path(out)
+    return folder.resolve() if ".." in folder.parts and not folder.parent.exists() else folder
+
+
+def draw_up(
+    recipe: DatasetRecipe,
+    workspace: Workspace,
+    *,
+    n: int | None = None,
+    seed: int | None = None,
+    shard_size: int | None = None,
+    dtype: str = "float64",
+    backend: str | None = None,
+    force: bool = False,
+) -> Job:
+    """Resolve the job of ``make_dataset``: build its kernels but write no file of the dataset.
+
+    Args:
+        recipe: Recipe of the dataset.
+        workspace: Folder of the dataset. If it holds an unfinished dataset of the recipe, that one determines the
+            default backend and shard size.
+        n: Number of rows over all splits; default the recipe's.
+        seed: Root seed; default the recipe's.
+        shard_size: Rows per shard.
+        dtype: Float type of stored rows.
+        backend: Backend of the kernels; default the fastest working one.
+        force: Whether the present content of the folder will be deleted.
+
+    Raises:
+        RecipeError: The recipe has mistakes.
+        UsageError: An argument is invalid.
+        MachineError: No backend works.
+    """
+    total, root, shard_size = _check(recipe, n, seed, shard_size)
+    digest, begun = recipe_digest(recipe), workspace.spec
+    if begun is not None and (begun.recipe_sha256 != digest or force):
+        begun = None  # another dataset, or one that will be deleted
+    if begun is not None:
+        backend = begun.backend if backend is None else backend
+        shard_size = begun.shard_size if shard_size is None else shard_size
+    chosen, cache_folder = choose_backend(backend)
+    prepared = PreparedPipeline(recipe.pipeline, backend=chosen, cache_folder=cache_folder, dtype=dtype)
+    if prepared.tasks is not None:
+        total = _solved_tasks(prepared, recipe, root, n)
+    splits = split_rows(recipe, total)
+    spec = DatasetSpec(
+        name=recipe.name,
+        version=recipe.version,
+        title=recipe.title,
+        license=recipe.license,
+        recipe_sha256=digest,
+        recipe=resolved(recipe),
+        seed=root,
+        splits=splits,
+        shard_size=shard_size or default_shard_size(total, prepared.block_rows),
+        block_rows=prepared.block_rows,
+        dtype=dtype,
+        backend=chosen,
+        fields=prepared.fields,
+        robot=_robot_record(prepared),
+        versions=versions(),
+        previous_splits=begun.previous_splits if begun is not None and begun.splits == splits else (),
+    )
+    return Job(workspace.folder, spec, recipe.pipeline, chosen, cache_folder)
+
+
+def _check(
+    recipe: DatasetRecipe, n: int | None, seed: int | None, shard_size: int | None
+) -> tuple[int, int, int | None]:
+    """Return rows, seed and shard size; raise UsageError for values that only recipes built in Python can have."""
+    for split, rows in recipe.splits.items():
+        integer(f"the rows of split {split!r}", rows, least=1)
+    if not recipe.splits:
+        raise UsageError(f"{recipe.name} has no splits: expected rows of at least one, such as {{'train': 1000}}")
+    total = integer("n", sum(recipe.splits.values()) if n is None else n, least=1, most=MAX_ROWS)
+    root = integer("seed", recipe.seed if seed is None else seed, least=0, most=MAX_SEED)
+    return total, root, None if shard_size is None else integer("shard_size", shard_size, least=1)
+
+
+def _solved_tasks(prepared: PreparedPipeline, recipe: DatasetRecipe, seed: int, n: int | None) -> int:
+    """Return the number of rows of a dataset of listed tasks: at most one per solved task.
+
+    Raises:
+        UsageError: More rows are requested, no task is solved, or the recipe has several splits.
+    """
+    if len(recipe.splits) > 1:
+        splits = ", ".join(recipe.splits)
+        raise UsageError(f"{recipe.name} lists its tasks: they would be the same in its splits {splits}, expected one")
+    tasks, requested = prepared.complete_listed_tasks(seed), sum(recipe.splits.values()) if n is None else n
+    rows = len(tasks.alive)
+    if not rows or (n is not None and n > rows):
+        counts = zip(tasks.reasons, np.bincount(tasks.outcome, minlength=1 + len(tasks.reasons))[1:], strict=True)
+        why = ", ".join(f"{count} {reason}" for reason, count in counts if count) or "it lists no more"
+        raise UsageError(f"{recipe.name} has {rows} rows, of {prepared.tasks} tasks ({why}): got n = {requested}")
+    return min(rows, requested)
+
+
+def _robot_record(prepared: PreparedPipeline) -> dict[str, Any]:
+    robot = prepared.context.robot
+    limits = {
+        name: [float(x) for x in getattr(robot, name)]
+        for name in ("position_lower", "position_upper", "velocity_limit", "acceleration_limit", "torque_limit")
+    }
+    return {
+        "name": robot.urdf.stem,
+        "urdf_sha256": hashlib.sha256(robot.urdf_text.encode()).hexdigest(),
+        "urdf": robot.urdf_text,
+        "tip": robot.tip,
+        "joint_names": list(robot.joint_names),
+        "limits": limits,
+    }

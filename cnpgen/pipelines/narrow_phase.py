@@ -1,0 +1,113 @@
+"""Narrow phase: exact checks with Pinocchio and Coal of boundary states that conservative conditions cannot accept.
+
+A capsule contains its link: if the capsule has clearance, so has the link. Otherwise the convex parts of the link are
+checked.
+"""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.kernels.symbolic.linalg import Scalar, symbols
+from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
+from cnpgen.pipelines.context import Context
+from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES, Condition, Constraint, End
+from cnpgen.problems.problem import Problem
+from cnpgen.robots.solid import pose_width
+from cnpgen.world.path import PathWorld
+from cnpgen.world.world import World
+
+if TYPE_CHECKING:
+    from cnpgen.robots.robot import Robot
+
+Array = NDArray[np.float64]
+Decide = Callable[[tuple[Array, Array, Array], Array, NDArray[np.bool_]], NDArray[np.bool_]]
+
+
+def narrow_phase_of(context: Context, end: End, *, exact: bool = True) -> Decide | None:
+    """Prepare the narrow phase of one end; return None if the problem never needs it.
+
+    Args:
+        context: Loaded problem.
+        end: End of the motion.
+        exact: Whether the tolerances of boundary states apply; otherwise those of motions apply.
+
+    Returns:
+        A function of states ``(q, dq, ddq)``, shape (n, N) each, obstacle poses, shape (width, N), and a mask of the
+        states to check, shape (N,). It returns a mask of the violated constraints, shape (constraints, N).
+    """
+    problem, robot = context.problem, context.robot
+    if robot.shape is None and all(obstacle.upright for obstacle in problem.obstacle):
+        return None
+    kernel = context.kernels.load(narrow_phase, end=end, dtype=context.dtype)
+    world = World(robot, problem.obstacle, problem.object_size)
+    path = PathWorld(robot, problem.obstacle, problem.object_size)
+
+    def decide_states(
+        state: tuple[Array, Array, Array], obstacle_poses: Array, mask: NDArray[np.bool_]
+    ) -> NDArray[np.bool_]:
+        (unmet_counts,) = kernel(*state, obstacle_poses)
+        remaining, violated = (unmet_counts > 0) & mask, np.zeros(unmet_counts.shape, bool)
+        for row in np.flatnonzero(remaining.any(axis=1)) if np.all(obstacle_poses == obstacle_poses[:, :1]) else ():
+            candidates = np.flatnonzero(remaining[row])
+            tolerance = _tolerance(problem.constraint[row], context.dtype, exact=exact)
+            q, dq, ddq = (np.ascontiguousarray(values[:, candidates], float) for values in state)
+            path.set_path(q, dq, ddq, obstacle_poses[:, 0])
+            met = problem.constraint[row].met(path, tolerance)
+            if met is not None:
+                remaining[row, candidates], violated[row, candidates] = False, ~met
+        for candidate in np.flatnonzero(remaining.any(axis=0)):
+            q, dq, ddq = (np.ascontiguousarray(values[:, candidate]) for values in state)
+            world.set_state(q, dq, ddq, obstacle_poses[:, candidate])
+            for row in np.flatnonzero(remaining[:, candidate]):
+                violated[row, candidate] = _violates(problem.constraint[row], world, end, context.dtype, exact=exact)
+        return violated
+
+    return decide_states
+
+
+def _tolerance(constraint: Constraint, dtype: str, *, exact: bool) -> float:
+    """Return the tolerance of a boundary state for conditions in units of length [m]."""
+    tolerance = BOUNDARY_TOLERANCES[dtype]["position"]
+    return tolerance if exact else max(tolerance, constraint.tolerance)
+
+
+def _violates(constraint: Constraint, world: World, end: End, dtype: str, *, exact: bool) -> bool:
+    """Return whether the measured form of a constraint is violated by more than the tolerance of a boundary state."""
+    for condition in constraint.measured_at(world, end):
+        g, tolerance = np.array(condition.g, float), condition.tolerance(dtype)
+        tolerance = tolerance if exact else np.maximum(tolerance, constraint.allowed(condition))
+        if not ((g >= condition.lower - tolerance) & (g <= condition.upper + tolerance)).all():
+            return True
+    return False
+
+
+def narrow_phase(robot: "Robot", problem: Problem, *, end: End, dtype: str) -> Any:
+    """Build ``(q, dq, ddq, obstacle_poses) -> unmet``: number of unmet conservative values of every constraint."""
+    import casadi as ca
+
+    columns = [symbols(name, robot.n) for name in ("q", "dq", "ddq")] + [
+        symbols("obstacle_poses", pose_width(problem.obstacle))
+    ]
+    (q, dq, ddq, obstacle_poses), size = [scalars for _, scalars in columns], problem.object_size
+    state = SymbolicState(robot, q, dq, ddq, obstacle_poses, problem.obstacle, size)
+    rows: list[Scalar] = []
+    for constraint in problem.constraint:
+        conditions = [condition for condition in constraint.symbolic_at(state, end) if condition.sufficient]
+        rows.append(sum((unmet(condition, condition.tolerance(dtype)) for condition in conditions), ca.SX(0)))
+    return ca.Function(f"narrow_phase_{end}", [column for column, _ in columns], [ca.vertcat(*rows)])
+
+
+def unmet(condition: Condition, tolerance: Array) -> Scalar:
+    """Count the values of a condition that violate its bounds by more than a tolerance; nan counts as a violation."""
+    import casadi as ca
+
+    count: Scalar = ca.SX(0)
+    for value, low, high, allowed in zip(condition.g, condition.lower, condition.upper, tolerance, strict=True):
+        if np.isfinite(low):
+            count = count + ca.logic_not(value >= float(low - allowed))
+        if np.isfinite(high):
+            count = count + ca.logic_not(value <= float(high + allowed))
+    return count

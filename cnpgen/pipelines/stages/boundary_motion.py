@@ -1,0 +1,285 @@
+"""Stages: boundary velocities and accelerations, zero or random, exactly on the table manifold."""
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from cnpgen.kernels.symbolic.dynamics import inverse_dynamics
+from cnpgen.kernels.symbolic.kinematics import bias_acceleration, forward_kinematics, tip_velocity
+from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, dot, scale, subtract, symbols
+from cnpgen.pipelines.context import Context
+from cnpgen.pipelines.stages.stage import CandidateBatch, Stage, StageFunction
+from cnpgen.problems.constraints.table import Table
+from cnpgen.schema.keys import field
+from cnpgen.store.field import Field
+
+if TYPE_CHECKING:
+    from cnpgen.robots.robot import Robot
+
+PROJECTION_STEPS = 3  # Newton steps from a millimetre to rounding error
+MAX_VELOCITY_RATIO = 1.005  # largest ratio of a plan's velocity to its limit
+AT_REST_TOLERANCE = 1e-9  # rad/s and rad/s^2: rounding error of a velocity or acceleration that is zero
+
+
+def _motion_fields(context: Context, end: str) -> tuple[Field, Field]:
+    role = "input" if end == "start" else "target"
+    return (
+        context.joint_field(f"{end}_dq", "rad/s", f"joint velocities at the {end}", role),
+        context.joint_field(f"{end}_ddq", "rad/s^2", f"joint accelerations at the {end}", role),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class AtRest(Stage):
+    """Stage: zero velocity and acceleration at one end; the goal acceleration is prescribed only if requested."""
+
+    end: str = field("end that is at rest", choices=("start", "goal"))
+    acceleration: str = field(
+        'whether motions must end with an acceleration of "zero", which is stored then, or are "free" to stop with any;'
+        " they always start with zero",
+        choices=("free", "zero"),
+        default="free",
+        since_version=2,
+    )
+
+    def describe(self) -> str:
+        """Describe the stage in one sentence."""
+        kept = ", which motions must end with" if self.end == "goal" and self.acceleration == "zero" else ""
+        return f"set velocity and acceleration of the {self.end} to zero{kept}"
+
+    def outputs(self, context: Context) -> tuple[Field, ...]:
+        """List the fields of the velocity and of a prescribed acceleration."""
+        fields = _motion_fields(context, self.end)
+        return fields if self.end == "start" or self.acceleration == "zero" else fields[:1]
+
+    def writes(self, context: Context) -> tuple[str, ...]:
+        """List velocity and acceleration; the checks use an acceleration that is not stored, too."""
+        del context
+        return f"{self.end}_dq", f"{self.end}_ddq"
+
+    def prepare(self, context: Context) -> StageFunction:
+        """Return the stage function."""
+        n = context.robot.n
+
+        def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
+            for name in (f"{self.end}_dq", f"{self.end}_ddq"):
+                candidates[name] = np.zeros((n, len(candidates.alive)))
+
+        return work
+
+    def complete(self, context: Context, given: Collection[str]) -> StageFunction:
+        """Reject tasks with a non-zero given velocity or acceleration."""
+        rest, names = self.prepare(context), [name for name in self.writes(context) if name in given]
+
+        def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
+            for name in names:
+                candidates.reject(
+                    (np.abs(candidates[name]) <= AT_REST_TOLERANCE).all(0), f"not at rest at the {self.end}"
+                )
+            rest(candidates, random)
+
+        return work
+
+
+@dataclass(frozen=True, kw_only=True)
+class TableVelocity(Stage):
+    """Stage: random start velocity with ``J_z dq = 0``: a direction in the box of the limits, with uniform length."""
+
+    inputs = ("start_q",)
+    at_rest: float = field("fraction of the starts at rest", low=0.0, high=1.0, default=0.0)
+
+    def describe(self) -> str:
+        """Describe the stage in one sentence."""
+        return (
+            "draw a start velocity: direction uniform in the box of the limits, projected on the table manifold, length"
+            f" uniform between 0 and the first limit that it meets; zero in {100 * self.at_rest:.4g} % of the cases"
+        )
+
+    def outputs(self, context: Context) -> tuple[Field, ...]:
+        """List the field of the velocity."""
+        return _motion_fields(context, "start")[:1]
+
+    def writes(self, context: Context) -> tuple[str, ...]:
+        """List the outputs and the velocity of the tip."""
+        del context
+        return "start_dq", "start_tip_velocity"
+
+    def prepare(self, context: Context) -> StageFunction:
+        """Load the kernel."""
+        context.constraint(Table)
+        kernel, n = context.kernels.load(table_velocity), context.robot.n
+
+        def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
+            direction, length, choice = (
+                2 * candidates.draw(random, n) - 1,
+                candidates.draw(random, 1),
+                candidates.draw(random, 1),
+            )
+            length[choice < self.at_rest] = 0.0
+            candidates["start_dq"], candidates["start_tip_velocity"] = kernel(candidates["start_q"], direction, length)
+            candidates.reject(np.isfinite(candidates["start_dq"]).all(0), "no velocity on the manifold")
+
+        return work
+
+    def complete(self, context: Context, given: Collection[str]) -> StageFunction:
+        """Load the kernel of the tip velocity; a start without a given velocity is at rest."""
+        kernel, n = context.kernels.load(velocity_of_tip), context.robot.n
+
+        def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
+            if "start_dq" not in given:
+                candidates["start_dq"] = np.zeros((n, len(candidates.alive)))
+            (candidates["start_tip_velocity"],) = kernel(candidates["start_q"], candidates["start_dq"])
+
+        return work
+
+
+@dataclass(frozen=True, kw_only=True)
+class TableAcceleration(Stage):
+    """Stage: random acceleration with ``J_z ddq + dJ_z dq = 0`` at one end, within acceleration and torque limits."""
+
+    end: str = field("end whose acceleration is sampled", choices=("start", "goal"), default="start")
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Position and velocity of that end."""
+        return f"{self.end}_q", f"{self.end}_dq"
+
+    def describe(self) -> str:
+        """Describe the stage in one sentence."""
+        return (
+            f"draw an acceleration of the {self.end} on the table manifold, uniform between the acceleration and torque"
+            " limits that it meets along a random direction"
+        )
+
+    def outputs(self, context: Context) -> tuple[Field, ...]:
+        """List the field of the acceleration."""
+        return _motion_fields(context, self.end)[1:]
+
+    def prepare(self, context: Context) -> StageFunction:
+        """Load the kernel."""
+        context.constraint(Table)
+        kernel, n = context.kernels.load(table_acceleration), context.robot.n
+
+        def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
+            direction, length = 2 * candidates.draw(random, n) - 1, candidates.draw(random, 1)
+            acceleration, interval_length = kernel(
+                candidates[f"{self.end}_q"], candidates[f"{self.end}_dq"], direction, length
+            )
+            candidates[f"{self.end}_ddq"] = acceleration
+            candidates.reject(interval_length[0] >= 0, f"no acceleration within the limits at the {self.end}")
+
+        return work
+
+
+def velocity_of_tip(robot: "Robot") -> Any:
+    """Build ``(q, dq) -> velocity of the tip`` [m/s]."""
+    import casadi as ca
+
+    (q_sx, q), (dq_sx, dq) = symbols("q", robot.n), symbols("dq", robot.n)
+    velocity = tip_velocity(forward_kinematics(robot.chain, q), dq)
+    return ca.Function("velocity_of_tip", [q_sx, dq_sx], [ca.vertcat(*velocity)])
+
+
+def onto_table(robot: "Robot", *, height: float) -> Any:
+    """Build the projection ``(q, dq, ddq) -> (q, dq, ddq)`` onto states whose tip moves and accelerates on the table.
+
+    Use it for deviations as small as those of plans: three Newton steps for q, then two projections. Velocities
+    slightly above their limits are scaled to the limits.
+
+    Args:
+        robot: Robot.
+        height: Height of the table [m].
+    """
+    import casadi as ca
+
+    (q_sx, q), (dq_sx, dq), (ddq_sx, ddq) = (symbols(name, robot.n) for name in ("q", "dq", "ddq"))
+    limit = [float(x) for x in robot.velocity_limit]
+    for _ in range(PROJECTION_STEPS):
+        kin = forward_kinematics(robot.chain, q)
+        q = _project(q, [c[2] for c in kin.jacobian], limit, rest=kin.tip[2] - height, at=q)
+    kin = forward_kinematics(robot.chain, q)
+    row = [c[2] for c in kin.jacobian]
+    dq = _project(dq, row, limit)
+    over = ca.mmax(ca.vertcat(*[ca.fabs(x) / bound for x, bound in zip(dq, limit, strict=True)]))
+    dq = scale(dq, 1.0 / ca.if_else(over <= MAX_VELOCITY_RATIO, ca.fmax(over, 1.0), 1.0))
+    ddq = _project(ddq, row, [float(x) for x in robot.acceleration_limit], rest=bias_acceleration(kin, dq)[2])
+    return ca.Function("onto_table", [q_sx, dq_sx, ddq_sx], [ca.vertcat(*values) for values in (q, dq, ddq)])
+
+
+def table_velocity(robot: "Robot") -> Any:
+    """Build ``(q, direction, length) -> (dq, tip velocity)`` with ``J_z dq = 0``.
+
+    The direction, in units of the limits, is projected onto the manifold in the metric of the limits. It is scaled
+    until the first joint meets its limit, and multiplied by the length in [0, 1).
+
+    Args:
+        robot: The robot.
+    """
+    import casadi as ca
+
+    (q_sx, q), (u_sx, u), (s_sx, s) = symbols("q", robot.n), symbols("u", robot.n), symbols("s", 1)
+    kin = forward_kinematics(robot.chain, q)
+    limit = [float(x) for x in robot.velocity_limit]
+    on_manifold = _project([x * bound for x, bound in zip(u, limit, strict=True)], [c[2] for c in kin.jacobian], limit)
+    largest: Scalar = ca.SX(0)
+    for x, bound in zip(on_manifold, limit, strict=True):
+        largest = ca.fmax(largest, ca.fabs(x) / bound)
+    dq = scale(on_manifold, s[0] / largest)
+    return ca.Function("table_velocity", [q_sx, u_sx, s_sx], [ca.vertcat(*dq), ca.vertcat(*tip_velocity(kin, dq))])
+
+
+def table_acceleration(robot: "Robot") -> Any:
+    """Build ``(q, dq, direction, length) -> (ddq, interval_length)`` with ``J_z ddq + dJ_z dq = 0``.
+
+    ``ddq = particular + t * projected direction`` with the particular solution of minimum weighted maximum norm. Torque
+    is affine in t (two inverse dynamics), so every limit is an interval of t, and t is uniform in their intersection.
+    ``interval_length`` is the length of the intersection, negative if the particular solution violates a limit.
+
+    Args:
+        robot: The robot.
+    """
+    import casadi as ca
+
+    (q_sx, q), (dq_sx, dq), (u_sx, u), (s_sx, s) = (
+        symbols(name, width) for name, width in (("q", robot.n), ("dq", robot.n), ("u", robot.n), ("s", 1))
+    )
+    kin = forward_kinematics(robot.chain, q)
+    limit = [float(x) for x in robot.acceleration_limit]
+    row = [column[2] for column in kin.jacobian]
+    size: Scalar = 0.0
+    for bound, x in zip(limit, row, strict=True):
+        size = size + bound * ca.fabs(x)
+    share = -bias_acceleration(kin, dq)[2] / size
+    particular = [share * bound * ca.sign(x) for bound, x in zip(limit, row, strict=True)]
+    direction = _project([x * bound for x, bound in zip(u, limit, strict=True)], row, limit)
+    torque = inverse_dynamics(robot.chain, q, dq, particular)
+    shifted = inverse_dynamics(robot.chain, q, dq, add(particular, direction))
+    change = [b - a for a, b in zip(torque, shifted, strict=True)]
+    bounds = [*limit, *(float(x) for x in robot.torque_limit)]
+    low, high = _interval([*particular, *torque], [*direction, *change], bounds)
+    t = low + s[0] * (high - low)
+    ddq = add(particular, scale(direction, t))
+    admissible = ca.logic_and(low <= 0, high >= 0)
+    interval_length = ca.if_else(admissible, high - low, -1.0)
+    return ca.Function("table_acceleration", [q_sx, dq_sx, u_sx, s_sx], [ca.vertcat(*ddq), interval_length])
+
+
+def _project(x: Vec, row: Vec, weight: list[float], *, rest: Scalar = 0.0, at: Vec | None = None) -> Vec:
+    """Project x onto ``{row . (x - at) + rest = 0}`` in the metric ``diag(weight)^-2``; ``at`` is zero by default."""
+    spread = [bound * bound * r for bound, r in zip(weight, row, strict=True)]
+    miss = (dot(row, x if at is None else subtract(x, at)) + rest) / dot(row, spread)
+    return [value - s * miss for value, s in zip(x, spread, strict=True)]
+
+
+def _interval(at_zero: Vec, gradient: Vec, bounds: list[float]) -> tuple[Scalar, Scalar]:
+    """Return the interval of t with ``|at_zero + t gradient| <= bounds`` in every component."""
+    import casadi as ca
+
+    low, high = ca.SX(-1e9), ca.SX(1e9)
+    for value, rate, bound in zip(at_zero, gradient, bounds, strict=True):
+        inverse = 1.0 / rate
+        one, two = (bound - value) * inverse, (-bound - value) * inverse
+        low, high = ca.fmax(low, ca.fmin(one, two)), ca.fmin(high, ca.fmax(one, two))
+    return low, high

@@ -1,0 +1,242 @@
+"""The paper's Omega block of one problem, for networks of any framework.
+
+It combines boundary conditions, line, expected time and network outputs on the CPU, in float64.
+"""
+
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cnpgen.errors import UsageError
+from cnpgen.kernels.library import Backend, choose_backend, problem_kernels
+from cnpgen.machine.threads import one_thread
+from cnpgen.planner import control_points
+from cnpgen.planner.control_points import ControlPoints
+from cnpgen.planner.projection import Projection, make_projection
+from cnpgen.planner.task_preprocessor import TaskPreprocessor, make_task_preprocessor
+from cnpgen.planner.tasks import EXPECTED_TIMES, Tasks
+from cnpgen.plans.plans import Plans, make_plans
+from cnpgen.plans.plausible import warn_of_far_joints
+from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.obstacles import obstacle_poses_of
+from cnpgen.problems.problem import Problem
+from cnpgen.problems.problem_record import as_problem
+from cnpgen.schema.arguments import integer, number, numbers
+from cnpgen.store.dataset_spec import StoredProblem
+from cnpgen.trajectory.boundary import Boundary
+
+Array = NDArray[np.float64]
+
+FIXED_AT_GOAL = {"free": 2, "given": 3}  # number of path control points that the goal fixes
+
+
+class BoundaryLayer:
+    """The paper's Omega block: control points that meet boundary conditions exactly, from network outputs.
+
+    Interior path control points are those of the line from start to goal plus ``path_scale`` times the network's
+    ``phi``. Rates are ``exp(log_rate)`` over the expected time. The boundary control points follow (paper, Appendix A).
+    If a problem has equalities, line and path are projected onto them; the paper uses zero steps.
+
+    Args:
+        problem: The problem, its record (``plans.problem``, ``dataset.problem``), or the name or the file of a problem,
+            a pipeline or a dataset.
+        path_scale: Factor of phi [rad]; pi in the paper.
+        line_projection_steps: Number of Gauss-Newton steps that project the line.
+        projection_steps: Number of Gauss-Newton steps that project the path.
+        expected_time: Unit of durations: "distance" as in the paper, or "reach" (``ModelConfig``).
+        goal_acceleration: "free", or "given" if boundary conditions include goal accelerations, as in panda-cup.
+        backend: Backend of the kernels; by default the fastest available.
+        cache_folder: Folder of compiled kernels; by default the shared cache.
+
+    Attributes:
+        problem: The problem.
+        goal_acceleration: "free" or "given".
+        path_outputs: Width of phi: interior control points times joints.
+        rate_outputs: Width of log_rate: control points of the rate.
+
+    Raises:
+        UsageError: An argument is invalid.
+        MachineError: The backend is not available on this machine.
+    """
+
+    def __init__(
+        self,
+        problem: Problem | StoredProblem | str | Path,
+        *,
+        path_scale: float = 0.5,
+        line_projection_steps: int = 1,
+        projection_steps: int = 1,
+        expected_time: str = "distance",
+        goal_acceleration: str = "free",
+        backend: Backend | None = None,
+        cache_folder: str | Path | None = None,
+    ) -> None:
+        self.problem, self._path_scale = as_problem(problem), number("path_scale", path_scale)
+        self._line_projection_steps = integer("line_projection_steps", line_projection_steps, least=0)
+        self._projection_steps = integer("projection_steps", projection_steps, least=0)
+        if expected_time not in EXPECTED_TIMES:
+            raise UsageError(
+                f"must be one of {', '.join(EXPECTED_TIMES)}, got {expected_time!r}", argument="expected_time"
+            )
+        if goal_acceleration not in FIXED_AT_GOAL:
+            raise UsageError(
+                f"must be one of {', '.join(FIXED_AT_GOAL)}, got {goal_acceleration!r}", argument="goal_acceleration"
+            )
+        self._expected_time, self.goal_acceleration = expected_time, goal_acceleration
+        self._fixed_at_goal = FIXED_AT_GOAL[goal_acceleration]
+        spec = self.problem.trajectory
+        self.path_outputs = (spec.path_control_points - 3 - self._fixed_at_goal) * len(self.problem.robot.joints)
+        self.rate_outputs = spec.rate_control_points
+        chosen_backend, folder = choose_backend(backend)
+        folder = folder if cache_folder is None else Path(cache_folder)
+        self._kernels = problem_kernels(self.problem, load_robot(self.problem), chosen_backend, folder)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Omit the loaded kernels, which are loaded again on first use."""
+        return {name: part for name, part in vars(self).items() if name != "_preprocessor_and_projection"}
+
+    @cached_property
+    def _preprocessor_and_projection(self) -> tuple[TaskPreprocessor, Projection | None]:
+        robot, problem, kernels = self._kernels.arguments["robot"], self.problem, self._kernels
+        with kernels.compile_in_parallel():
+            prepare = make_task_preprocessor(
+                problem,
+                robot,
+                kernels,
+                line_projection_steps=self._line_projection_steps,
+                expected_time=self._expected_time,
+                fixed_at_goal=self._fixed_at_goal,
+            )
+            return prepare, make_projection(
+                problem, kernels, steps=self._projection_steps, fixed_at_goal=self._fixed_at_goal
+            )
+
+    @one_thread()
+    def tasks(self, boundary: Boundary) -> Tasks:
+        """Prepare N tasks: compute everything that the network needs from boundary conditions.
+
+        Args:
+            boundary: Boundary conditions, shape (N, n) each: arrays, or tensors on the CPU.
+
+        Raises:
+            UsageError: A shape is wrong, a value is no real number, or the presence of goal accelerations does not
+                match ``goal_acceleration``.
+        """
+        if boundary.fixed_at_goal > self._fixed_at_goal:
+            raise UsageError('goal_acceleration is "free", so goal_ddq must be None; pass goal_acceleration="given"')
+        if boundary.fixed_at_goal < self._fixed_at_goal:
+            raise UsageError('goal_ddq is missing: goal_acceleration is "given"')
+        arrays = {name: numbers(name, values, differentiable=True) for name, values in boundary.conditions().items()}
+        shape = (len(np.atleast_1d(arrays["start_q"])), len(self.problem.robot.joints))
+        for name, array in arrays.items():
+            if array.shape != shape:
+                raise UsageError(f"{name} must have shape (N, {shape[1]}), N = {shape[0]}, got {array.shape}")
+        checked = Boundary(**arrays)
+        warn_of_far_joints(self._kernels.arguments["robot"], checked)
+        return self._preprocessor_and_projection[0](checked)
+
+    def obstacle_poses(self, tasks: Tasks) -> Array:
+        """Return poses and sizes of the obstacles, shape (N, width): ``obstacle_poses`` of the loss."""
+        return obstacle_poses_of(self.problem, tasks.start_xyz, tasks.goal_xyz)
+
+    @one_thread()
+    def __call__(self, tasks: Tasks, phi: ArrayLike, log_rate: ArrayLike) -> ControlPoints:
+        """Compute control points, in float64.
+
+        Args:
+            tasks: N tasks.
+            phi: Output of the configuration head, shape (N, path_outputs); shipped networks end in tanh.
+            log_rate: Output of the time head, shape (N, rate_outputs).
+
+        Raises:
+            UsageError: A shape is wrong, or a value is no real number.
+        """
+        points, projection = self._before_projection(tasks, phi, log_rate), self._preprocessor_and_projection[1]
+        if projection is None:
+            return points
+        with np.errstate(all="ignore"):  # an overflow affects its own row only
+            return replace(points, path=projection.project(points.path, self.obstacle_poses(tasks)))
+
+    @one_thread()
+    def vjp(
+        self, tasks: Tasks, phi: ArrayLike, log_rate: ArrayLike, *, path_gradient: Array, rate_gradient: Array
+    ) -> tuple[Array, Array]:
+        """Convert gradients with respect to control points to gradients with respect to the network's outputs.
+
+        If control points overflowed, the gradient of that plan is 0; other plans are not affected.
+
+        Args:
+            tasks: N tasks.
+            phi: Output of the configuration head, shape (N, path_outputs).
+            log_rate: Output of the time head, shape (N, rate_outputs).
+            path_gradient: Gradient with respect to the path control points, shape (N, C, n).
+            rate_gradient: Gradient with respect to the rate control points, shape (N, R).
+
+        Returns:
+            Gradients with respect to phi and log_rate.
+        """
+        points, projection = self._before_projection(tasks, phi, log_rate), self._preprocessor_and_projection[1]
+        with np.errstate(all="ignore"):
+            by_path = (
+                projection.vjp(points.path, self.obstacle_poses(tasks), path_gradient) if projection else path_gradient
+            )
+            spec = self.problem.trajectory
+            gradients = control_points.vjp(
+                tasks, points, path_gradient=by_path, rate_gradient=rate_gradient, scale=self._path_scale, spec=spec
+            )
+        overflowed = _finite(path_gradient, rate_gradient) & ~_finite(*gradients)
+        for gradient in gradients:
+            gradient[overflowed] = 0
+        return gradients
+
+    def plans(self, tasks: Tasks, phi: ArrayLike, log_rate: ArrayLike, *, sample_id: ArrayLike | None = None) -> Plans:
+        """Make plans from network outputs, to be evaluated, refined or saved.
+
+        Args:
+            tasks: N tasks.
+            phi: Output of the configuration head, shape (N, path_outputs).
+            log_rate: Output of the time head, shape (N, rate_outputs).
+            sample_id: Dataset rows of the tasks, shape (N,), such as ``batch["sample_id"]``, also after shuffling;
+                0, 1, ... by default.
+
+        Raises:
+            UsageError: A shape is wrong, or a value is no real number.
+        """
+        points = self(tasks, phi, log_rate)
+        return make_plans(
+            self.problem,
+            tasks.boundary,
+            path_control_points=points.path,
+            rate_control_points=points.rate,
+            columns={"start_xyz": tasks.start_xyz, "goal_xyz": tasks.goal_xyz},
+            sample_id=sample_id,
+        )
+
+    def check_shapes(self, tasks: Tasks, phi: tuple[int, ...], log_rate: tuple[int, ...]) -> None:
+        """Check the shapes of network outputs.
+
+        Raises:
+            UsageError: A shape is wrong.
+        """
+        for name, shape, width in (("phi", phi, self.path_outputs), ("log_rate", log_rate, self.rate_outputs)):
+            if shape != (len(tasks), width):
+                raise UsageError(f"{name} must have shape ({len(tasks)}, {width}), got {shape}")
+
+    def _before_projection(self, tasks: Tasks, phi: ArrayLike, log_rate: ArrayLike) -> ControlPoints:
+        phi = numbers("phi", phi, differentiable=True)
+        log_rate = numbers("log_rate", log_rate, differentiable=True)
+        self.check_shapes(tasks, phi.shape, log_rate.shape)
+        with np.errstate(all="ignore"):
+            return control_points.control_points(
+                tasks, phi, log_rate, scale=self._path_scale, spec=self.problem.trajectory
+            )
+
+
+def _finite(*arrays: NDArray[Any]) -> NDArray[np.bool_]:
+    """Return a mask of the rows whose values are all finite, shape (N,)."""
+    masks = [np.isfinite(array).all(axis=tuple(range(1, array.ndim))) for array in arrays]
+    return np.asarray(np.all(masks, axis=0))

@@ -1,0 +1,176 @@
+"""Build control points as CasADi SX functions: the projected line, and whole paths projected onto the manifold.
+
+The straight line in joint space is far off the manifold: a heavy object tilts by about 10 degrees. One Gauss-Newton
+step removes most of this error before the network runs, and another step the error that the network adds. The planner
+uses ``line_change`` and ``projected_path``, which take less time for one plan than a few NumPy operations. Training
+uses ``control_points``, in float32 and with gradients, followed by ``path_change``. Boundary conditions are one column:
+start_q, start_dq, start_ddq, goal_q, goal_dq, and goal_ddq if the goal fixes three control points.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+from cnpgen.kernels.symbolic.kinematics import forward_kinematics
+from cnpgen.kernels.symbolic.linalg import Vec, symbols
+from cnpgen.planner.gauss_newton import projection_change
+from cnpgen.problems.problem import Problem
+from cnpgen.robots.solid import pose_width
+from cnpgen.trajectory.spline import end_derivatives
+
+if TYPE_CHECKING:
+    from cnpgen.robots.robot import Robot
+    from cnpgen.trajectory.trajectory_spec import TrajectorySpec
+
+
+def tips_at_ends(robot: "Robot", *, fixed_at_goal: int) -> Any:
+    """Build ``ends -> (start position, goal position)`` of the tip [m]."""
+    import casadi as ca
+
+    ends_sx, ends = symbols("ends", (3 + fixed_at_goal) * robot.n)
+    q, _, _, goal_q, *_ = _split(ends, robot.n)
+    tips = [ca.vertcat(*forward_kinematics(robot.chain, position).tip) for position in (q, goal_q)]
+    return ca.Function("tips_at_ends", [ends_sx], tips)
+
+
+def line_change(robot: "Robot", problem: Problem, *, steps: int, fixed_at_goal: int, within_limits: bool) -> Any:
+    """Build ``(ends, rate, obstacle_poses) -> change`` of the line's interior points at a constant rate [1/s]."""
+    import casadi as ca
+
+    ends_sx, rate, points = _line(robot, problem, fixed_at_goal)
+    poses_sx, obstacle_poses = symbols("obstacle_poses", pose_width(problem.obstacle))
+    change = projection_change(
+        robot, problem, points, obstacle_poses, steps=steps, fixed_at_goal=fixed_at_goal, within_limits=within_limits
+    )
+    return ca.Function("line_change", [ends_sx, rate, poses_sx], [ca.cse(_column(change))])
+
+
+def via_line_change(robot: "Robot", problem: Problem, *, steps: int, fixed_at_goal: int, within_limits: bool) -> Any:
+    """Build ``(ends, offsets, rate, obstacle_poses) -> offsets + change`` of a line with offsets [rad]."""
+    import casadi as ca
+
+    ends_sx, rate, points = _line(robot, problem, fixed_at_goal)
+    poses_sx, obstacle_poses = symbols("obstacle_poses", pose_width(problem.obstacle))
+    interior = slice(3, -fixed_at_goal)
+    offsets_sx, offsets = symbols("offsets", len(points[interior]) * robot.n)
+    shifts = _split(offsets, robot.n)
+    points[interior] = _sums(points[interior], shifts)
+    change = projection_change(
+        robot, problem, points, obstacle_poses, steps=steps, fixed_at_goal=fixed_at_goal, within_limits=within_limits
+    )
+    return ca.Function(
+        "via_line_change", [ends_sx, offsets_sx, rate, poses_sx], [ca.cse(_column(_sums(shifts, change)))]
+    )
+
+
+def _line(robot: "Robot", problem: Problem, fixed_at_goal: int) -> tuple[Any, Any, list[Vec]]:
+    """Return symbols of boundary conditions and of a constant rate, and the control points of the line between them."""
+    import casadi as ca
+
+    (ends_sx, ends), rate = symbols("ends", (3 + fixed_at_goal) * robot.n), ca.SX.sym("rate")
+    spec = problem.trajectory
+    return ends_sx, rate, _points(_split(ends, robot.n), [rate] * spec.rate_control_points, spec)
+
+
+def projected_path(robot: "Robot", problem: Problem, *, steps: int, fixed_at_goal: int, within_limits: bool) -> Any:
+    """Build ``(ends, offsets, rates, obstacle_poses) -> path``: line plus offsets [rad], projected."""
+    import casadi as ca
+
+    spec, n = problem.trajectory, robot.n
+    (ends_sx, ends), (poses_sx, obstacle_poses) = (
+        symbols("ends", (3 + fixed_at_goal) * n),
+        symbols("obstacle_poses", pose_width(problem.obstacle)),
+    )
+    rates_sx, rates = symbols("rates", spec.rate_control_points)
+    offsets_sx, offsets = symbols("offsets", (spec.path_control_points - 3 - fixed_at_goal) * n)
+    points, interior = _points(_split(ends, n), rates, spec), slice(3, -fixed_at_goal)
+    points[interior] = _sums(points[interior], _split(offsets, n))
+    if steps:
+        change = projection_change(
+            robot,
+            problem,
+            points,
+            obstacle_poses,
+            steps=steps,
+            fixed_at_goal=fixed_at_goal,
+            within_limits=within_limits,
+        )
+        points[interior] = _sums(points[interior], change)
+    return ca.Function("projected_path", [ends_sx, offsets_sx, rates_sx, poses_sx], [ca.cse(_column(points))])
+
+
+def path_change(robot: "Robot", problem: Problem, *, steps: int, fixed_at_goal: int, within_limits: bool) -> Any:
+    """Build ``(path, obstacle_poses) -> change`` of the interior control points."""
+    import casadi as ca
+
+    path, obstacle_poses, change = _path_change(robot, problem, steps, fixed_at_goal, within_limits)
+    return ca.Function("path_change", [path, obstacle_poses], [ca.cse(change)])
+
+
+def path_change_adjoint(
+    robot: "Robot", problem: Problem, *, steps: int, fixed_at_goal: int, within_limits: bool
+) -> Any:
+    """Build ``(path, obstacle_poses, seed) -> gradient`` of ``seed . change`` by the path, in reverse mode."""
+    import casadi as ca
+
+    path, obstacle_poses, change = _path_change(robot, problem, steps, fixed_at_goal, within_limits)
+    seed = ca.SX.sym("seed", change.numel())
+    gradient = ca.densify(ca.jtimes(change, path, seed, True))
+    return ca.Function("path_change_adjoint", [path, obstacle_poses, seed], [ca.cse(gradient)])
+
+
+def _path_change(
+    robot: "Robot", problem: Problem, steps: int, fixed_at_goal: int, within_limits: bool
+) -> tuple[Any, Any, Any]:
+    points = problem.trajectory.path_control_points
+    (path_sx, path), (poses_sx, obstacle_poses) = (
+        symbols("path", points * robot.n),
+        symbols("obstacle_poses", pose_width(problem.obstacle)),
+    )
+    change = projection_change(
+        robot,
+        problem,
+        _split(path, robot.n),
+        obstacle_poses,
+        steps=steps,
+        fixed_at_goal=fixed_at_goal,
+        within_limits=within_limits,
+    )
+    return path_sx, poses_sx, _column(change)
+
+
+def _points(ends: list[Vec], rates: Vec, spec: "TrajectorySpec") -> list[Vec]:
+    """Return all control points of the line (paper, Appendix A; ``trajectory.boundary``)."""
+    q, dq, ddq, goal_q, goal_dq, *goal_ddq = ends
+    first = _end_points(q, dq, ddq, rates[:2], spec)
+    arrival = [-v for v in goal_dq]  # in reversed phase r' and p' change sign: the goal is a start with -dq
+    last = _end_points(goal_q, arrival, goal_ddq[0] if goal_ddq else None, rates[:-3:-1], spec)[::-1]
+    count = spec.path_control_points - len(first) - len(last)
+    along = [i / max(count - 1, 1) for i in range(count)]
+    line = [[a + (b - a) * t for a, b in zip(first[-1], last[0], strict=True)] for t in along]
+    return [*first, *line, *last]
+
+
+def _end_points(q: Vec, dq: Vec, ddq: Vec | None, rates: Vec, spec: "TrajectorySpec") -> list[Vec]:
+    """Return the control points that an end fixes, from the outermost one: two if its acceleration is free."""
+    path = end_derivatives(spec.path_control_points, spec.degree)
+    gradient = end_derivatives(spec.rate_control_points, spec.degree).eta * (rates[1] - rates[0])
+    first = [v / rates[0] for v in dq]
+    c1 = [x + v / path.eta for x, v in zip(q, first, strict=True)]
+    if ddq is None:
+        return [q, c1]
+    second = [(a - v * gradient * rates[0]) / rates[0] ** 2 for a, v in zip(ddq, first, strict=True)]
+    c2 = [a / path.beta - 2 * x + 3 * c for a, x, c in zip(second, q, c1, strict=True)]
+    return [q, c1, c2]
+
+
+def _split(values: Vec, n: int) -> list[Vec]:
+    return [values[i : i + n] for i in range(0, len(values), n)]
+
+
+def _sums(points: list[Vec], others: list[Vec]) -> list[Vec]:
+    return [[x + y for x, y in zip(*pair, strict=True)] for pair in zip(points, others, strict=True)]
+
+
+def _column(points: list[Vec]) -> Any:
+    import casadi as ca
+
+    return ca.vertcat(*[value for point in points for value in point])

@@ -1,0 +1,210 @@
+"""Run the steps before and after the network: prepare tasks, project paths and fit rates to the limits."""
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.kernels.kernel import Kernel
+from cnpgen.kernels.library import KernelLibrary, choose_backend, problem_kernels
+from cnpgen.planner.control_point_functions import projected_path
+from cnpgen.planner.expressions import effective_steps
+from cnpgen.planner.model import Model, ModelConfig
+from cnpgen.planner.phase_grid import MOTIONS_PER_BLOCK
+from cnpgen.planner.task_preprocessor import TaskPreprocessor, ends_of, lanes, make_task_preprocessor, rows
+from cnpgen.planner.tasks import Tasks
+from cnpgen.planner.time_parametrization import TimeParametrization, make_time_parametrization
+from cnpgen.planner.time_scaling import TimeScaling, make_time_scaling
+from cnpgen.planner.via_points import ViaPoints, make_via_points
+from cnpgen.plans.plans import Plans
+from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.problem import Problem
+from cnpgen.problems.problem_record import ProblemRecord
+from cnpgen.trajectory.boundary import Boundary
+from cnpgen.trajectory.spline_motion import Motion
+
+if TYPE_CHECKING:
+    from cnpgen.robots.robot import Robot
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class LoadedProblem:
+    """A problem loaded from its record.
+
+    Attributes:
+        record: Text of the problem and its URDF.
+        problem: The problem; its URDF file exists only inside ``loaded_problem``.
+        robot: Its robot.
+        kernels: Library of its kernels.
+    """
+
+    record: ProblemRecord
+    problem: Problem
+    robot: "Robot"
+    kernels: KernelLibrary
+
+
+@contextmanager
+def loaded_problem(record: ProblemRecord, backend: str | None = None) -> Iterator[LoadedProblem]:
+    """Load a problem from its record; its URDF file exists until the context is left.
+
+    Args:
+        record: Text of the problem and its URDF.
+        backend: Backend of the kernels; by default the fastest available.
+
+    Raises:
+        CnpgenError: The record does not fit this version of cnpgen, or a dependency is missing.
+    """
+    chosen, folder = choose_backend(backend)
+    with record.restored() as problem:
+        robot = load_robot(problem)
+        yield LoadedProblem(record, problem, robot, problem_kernels(problem, robot, chosen, folder))
+
+
+@dataclass(frozen=True)
+class InferencePipeline:
+    """Steps that make plans from network outputs, for one problem.
+
+    Attributes:
+        prepare: Preprocessor of tasks.
+        path: Kernel of ``control_point_functions.projected_path``.
+        time_scaling: Uniform time scaling of motions from rest to rest; None for other models.
+        time_parametrization: Fit of rates to the limits; None if disabled.
+        via_points: Search of lines through via points for plans with violations; None if the model has no via points.
+    """
+
+    prepare: TaskPreprocessor
+    path: Kernel
+    time_scaling: TimeScaling | None
+    time_parametrization: TimeParametrization | None = None
+    via_points: ViaPoints | None = None
+
+    def plan(
+        self,
+        model: Model,
+        boundary: Boundary,
+        *,
+        sample_id: NDArray[np.int64] | None = None,
+        columns: Mapping[str, Array] | None = None,
+    ) -> Plans:
+        """Plan N motions.
+
+        Args:
+            model: A model of the same problem.
+            boundary: Boundary conditions, shape (N, n) each, float64 and finite.
+            sample_id: Dataset samples of the tasks, shape (N,); 0, 1, ... by default.
+            columns: Further columns of the tasks, as ``Plans.columns``.
+        """
+        tasks, motion = self.planned(model, boundary)
+        return Plans(
+            problem=model.problem,
+            boundary=boundary,
+            path_control_points=motion.path,
+            rate_control_points=motion.rate,
+            degree=motion.degree,
+            columns={**(columns or {}), "start_xyz": tasks.start_xyz, "goal_xyz": tasks.goal_xyz},
+            sample_id=np.arange(len(boundary)) if sample_id is None else sample_id,
+            status=np.zeros(len(boundary), np.uint8),  # unknown
+        )
+
+    def planned(self, model: Model, boundary: Boundary) -> tuple[Tasks, Motion]:
+        """Plan N motions; return the tasks with the selected lines, and the motions."""
+        ends = ends_of(boundary)
+        tasks = self.prepare(boundary, ends=ends)
+        obstacle_poses = self.prepare.obstacle_poses(tasks.start_xyz, tasks.goal_xyz)
+        motion = self._fitted(self._projected(model, tasks, ends, obstacle_poses), obstacle_poses)
+        return (
+            (tasks, motion)
+            if self.via_points is None
+            else self._with_via_points(self.via_points, model, tasks, motion, obstacle_poses)
+        )
+
+    def motion(self, model: Model, tasks: Tasks, obstacle_poses: Array) -> Motion:
+        """Evaluate the network, project its paths onto the equalities, and fit the rates to the limits.
+
+        Args:
+            model: A model of the same problem.
+            tasks: N tasks from ``prepare``.
+            obstacle_poses: Poses and sizes of the obstacles, shape (N, width).
+        """
+        return self._fitted(self._projected(model, tasks, ends_of(tasks.boundary), obstacle_poses), obstacle_poses)
+
+    def _projected(self, model: Model, tasks: Tasks, ends: Array, obstacle_poses: Array) -> Motion:
+        outputs = model.outputs(tasks)
+        (path,) = self.path(ends, lanes(outputs.offsets), lanes(outputs.rate), lanes(obstacle_poses))
+        return Motion(rows(path, tasks.boundary.start_q.shape[1]), outputs.rate, model.problem.trajectory.degree)
+
+    def _fitted(self, motion: Motion, obstacle_poses: Array) -> Motion:
+        if self.time_parametrization is not None:
+            motion = self.time_parametrization.parametrize(motion, obstacle_poses)
+        if self.time_scaling is not None:
+            factor = self.time_scaling.factor(motion, obstacle_poses)
+            motion = motion if factor.max(initial=1.0) <= 1 else motion.time_scaled(factor)
+        return motion
+
+    def _with_via_points(
+        self, via_points: ViaPoints, model: Model, tasks: Tasks, motion: Motion, obstacle_poses: Array
+    ) -> tuple[Tasks, Motion]:
+        """Replace motions that violate static conditions by ones through via points with a smaller violation."""
+        path, rate, before = motion.path.copy(), motion.rate.copy(), via_points.violation(motion, obstacle_poses)
+        correction = np.zeros_like(path[:, 3 : path.shape[1] - tasks.boundary.fixed_at_goal])
+        correction += 0.0 if tasks.correction is None else tasks.correction
+        violating, count = np.flatnonzero(before > 1), len(via_points.via_points)
+        for some in (
+            violating[first : first + MOTIONS_PER_BLOCK] for first in range(0, len(violating), MOTIONS_PER_BLOCK)
+        ):
+            repeated = np.repeat(some, count)
+            alternatives = self.prepare(tasks.boundary[repeated], np.tile(via_points.via_points, (len(some), 1)))
+            assert alternatives.correction is not None
+            ends, poses = ends_of(alternatives.boundary), obstacle_poses[repeated]
+            motions = self._projected(model, alternatives, ends, poses)
+            after = via_points.violation(motions, poses)
+            candidates = via_points.candidates(after)
+            fitted, time = self._fitted(motions[candidates], poses[candidates]), np.full(len(repeated), np.inf)
+            time[candidates] = fitted.duration()
+            fastest = time.reshape(len(some), -1).argmin(axis=1) + count * np.arange(len(some))
+            better = after[fastest] < before[some]
+            replaced, sources = some[better], np.searchsorted(candidates, fastest[better])
+            path[replaced], rate[replaced] = fitted.path[sources], fitted.rate[sources]
+            correction[replaced] = alternatives.correction[fastest[better]]
+        return replace(tasks, correction=correction), replace(motion, path=path, rate=rate)
+
+
+def make_inference_pipeline(
+    loaded: LoadedProblem, config: ModelConfig, *, scale_time: bool, fixed_at_goal: int = 2
+) -> InferencePipeline:
+    """Load the inference pipeline of a problem.
+
+    Args:
+        loaded: The problem.
+        config: Configuration of the model.
+        scale_time: Whether to scale motions in time; only for motions from rest to rest.
+        fixed_at_goal: Number of control points that the goal fixes (``Boundary.fixed_at_goal``).
+    """
+    problem, robot, kernels = loaded.problem, loaded.robot, loaded.kernels
+    with kernels.compile_in_parallel():
+        prepare = make_task_preprocessor(
+            problem,
+            robot,
+            kernels,
+            line_projection_steps=config.line_projection_steps,
+            expected_time=config.expected_time,
+            fixed_at_goal=fixed_at_goal,
+            within_limits=config.within_limits,
+            via_lines=bool(config.via_points),
+        )
+        path = kernels.load(
+            projected_path,
+            steps=effective_steps(kernels, config.projection_steps),
+            fixed_at_goal=fixed_at_goal,
+            within_limits=config.within_limits,
+        )
+        time_scaling = make_time_scaling(problem, robot, kernels) if scale_time else None
+        time_parametrization = make_time_parametrization(problem, robot, kernels) if config.time_parametrized else None
+        via_points = make_via_points(problem, kernels, np.array(config.via_points)) if config.via_points else None
+    return InferencePipeline(prepare, path, time_scaling, time_parametrization, via_points)

@@ -1,0 +1,161 @@
+"""Read planning tasks from datasets and HDF5 files, and check them against a model."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import DatasetError, UsageError
+from cnpgen.planner.model import Model
+from cnpgen.plans.boundary_file import ASKED, CONTEXT, BoundaryFile, boundary_in, read_boundary_file
+from cnpgen.plans.boundary_problems import chosen_rows
+from cnpgen.problems.problem_record import ProblemRecord, as_record
+from cnpgen.store.dataset_spec import DatasetSpec
+from cnpgen.store.files.documents import canonical_sha256
+from cnpgen.store.reader import open_dataset
+from cnpgen.trajectory.boundary import Boundary
+
+Array = NDArray[np.float64]
+
+CERTIFIED_STAGE = "certified-plan"  # the stage that plans every sample
+
+
+@dataclass(frozen=True)
+class Requests:
+    """N planning tasks.
+
+    Attributes:
+        boundary: Boundary conditions.
+        sample_id: Dataset rows of the tasks, shape (N,).
+        columns: Further columns of the tasks.
+    """
+
+    boundary: Boundary
+    sample_id: NDArray[np.int64]
+    columns: Mapping[str, Array] = field(default_factory=dict)
+
+
+def read_rows(
+    folder: Path, model: Model, *, split: str = "validation", first: int = 0, n: int | None = None, other: bool = False
+) -> Requests:
+    """Read rows of a dataset.
+
+    Args:
+        folder: The dataset.
+        model: The model that will plan.
+        split: Name of the split.
+        first: Index of the first row.
+        n: Number of rows; by default all that follow.
+        other: Whether to accept rows drawn by another recipe than the training rows.
+
+    Raises:
+        DatasetError: The dataset is damaged, of another problem, or drawn by another recipe.
+        UsageError: There are no such rows.
+    """
+    dataset = open_dataset(folder)
+    check_drawing(str(folder), dataset.spec, model, other=other)
+    rows = chosen_rows(folder, dataset.spec, split=split, start=first, n=n)
+    stored = {column.name for column in dataset.spec.fields}
+    names = [name for name in ASKED if name in stored]
+    arrays = dataset.read(split, fields=names, start=rows.start, stop=rows.stop)
+    columns = {name: np.asarray(arrays[name], np.float64) for name in CONTEXT if name in arrays}
+    boundary = checked_boundary(str(folder), arrays, model)
+    return Requests(boundary, arrays.get("sample_id", np.array(rows)), columns)
+
+
+def read_file(path: Path, model: Model, *, other: bool = False) -> Requests:
+    """Read boundary conditions from an HDF5 file: a shard, a plan file, or boundary conditions alone.
+
+    Args:
+        path: The file, as read by ``read_boundary_file``.
+        model: The model that will plan.
+        other: Whether to accept rows of a shard drawn by another recipe than the training rows.
+
+    Raises:
+        UsageError: There is no such file, or ``other`` is set and the file is no shard.
+        DatasetError: The file is damaged, incomplete, of another problem, of a shard of other rows, or prescribes goal
+            accelerations that the model leaves free.
+    """
+    file = read_boundary_file(path)
+    if file.is_shard:
+        _check_shard(file, model, other=other)
+    elif other:
+        raise UsageError(
+            f"{{other}} needs rows of a dataset, and {path} does not record how its rows were drawn",
+            remedies={"other": True},
+        )
+    else:
+        _check_recorded_problem(file, model)
+    boundary = checked_boundary(str(path), file.columns, model)
+    columns = {name: np.asarray(file.columns[name], np.float64) for name in CONTEXT if name in file.columns}
+    return Requests(boundary, file.sample_id(len(boundary)), columns)
+
+
+def _check_shard(file: BoundaryFile, model: Model, *, other: bool) -> None:
+    """Check a shard by its dataset's specification, or by its recipe's digest if it lies outside its dataset."""
+    spec = file.spec()
+    if spec is not None:
+        check_drawing(str(file.path), spec, model, other=other)
+    elif not other and file.text("recipe_sha256") != model.training.get("dataset", {}).get("recipe_sha256", ""):
+        raise DatasetError(
+            f"{file.path} is a shard outside its dataset, drawn by another recipe than the model's training rows;"
+            " pass {other} to plan for it",
+            remedies={"other": True},
+        )
+
+
+def _check_recorded_problem(file: BoundaryFile, model: Model) -> None:
+    """Raise an error if a file records another problem than the model's; a file without a record is accepted."""
+    record = file.problem()
+    if record is not None:
+        check_problem(str(file.path), record, model)
+    elif file.text("problem_sha256") not in {"", model.problem.comparable_sha256}:
+        raise DatasetError(f"{file.path} is of another problem than the model, which plans for {model.problem.name!r}")
+
+
+def checked_boundary(where: str, columns: Mapping[str, NDArray[Any]], model: Model) -> Boundary:
+    """Return the boundary conditions among named columns; missing ones are zero.
+
+    Raises:
+        DatasetError: A shape is wrong, a value is not finite, or goal accelerations are prescribed that the model
+            leaves free.
+    """
+    if "goal_ddq" in columns and model.fixed_at_goal == 2:
+        raise DatasetError(f"{where} prescribes goal accelerations (goal_ddq), and the model leaves them free")
+    return boundary_in(where, columns, len(model.problem.joint_names))
+
+
+def check_problem(where: str, record: ProblemRecord, model: Model) -> None:
+    """Raise an error if a record is of another problem than the model's."""
+    if record.comparable_sha256 != model.problem.comparable_sha256:
+        differs = ", ".join(record.differences(model.problem)[:4])
+        raise DatasetError(
+            f"the model plans for {model.problem.name!r}, but {where} is of {record.name!r}: they differ in {differs}"
+        )
+
+
+def drawing_stages(stages: Iterable[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """Return the stages that draw rows: all but the stage that certifies them."""
+    return [stage for stage in stages if stage.get("use") != CERTIFIED_STAGE]
+
+
+def check_drawing(where: str, spec: DatasetSpec, model: Model, *, other: bool) -> None:
+    """Raise an error for rows of another problem, and unless ``other`` for rows drawn by another recipe."""
+    check_problem(where, as_record(spec.problem), model)
+    stages = model.training.get("stages")
+    if other or stages is None or _stages_sha256(stages) == _stages_sha256(spec.stages):
+        return
+    name = model.training.get("dataset", {}).get("name", "another dataset")
+    raise DatasetError(
+        f"the rows of {where} are drawn in another way than those of {name!r} that the model was trained on: the"
+        " recipe has changed since, or is another one; pass {other} to plan for them",
+        remedies={"other": True},
+    )
+
+
+def _stages_sha256(stages: Iterable[Mapping[str, Any]]) -> str:
+    """Return the digest of the stages that draw rows."""
+    return canonical_sha256(drawing_stages(stages))

@@ -1,0 +1,123 @@
+"""Prepare tasks from boundary conditions: tip positions, obstacles, expected time, projected line."""
+
+import math
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.kernels.kernel import Kernel
+from cnpgen.kernels.library import KernelLibrary
+from cnpgen.planner.control_point_functions import line_change, tips_at_ends, via_line_change
+from cnpgen.planner.control_points import along_line
+from cnpgen.planner.expressions import effective_steps
+from cnpgen.planner.tasks import Tasks, expected_time, reaching_time
+from cnpgen.problems.obstacles import obstacle_poses_of
+from cnpgen.problems.problem import Problem
+from cnpgen.trajectory.boundary import Boundary
+
+if TYPE_CHECKING:
+    from cnpgen.robots.robot import Robot
+
+Array = NDArray[np.float64]
+
+
+def lanes(values: NDArray[Any]) -> Array:
+    """Reshape (N, ...) to (width, N), float64."""
+    return np.ascontiguousarray(values.reshape(len(values), math.prod(values.shape[1:])).T, np.float64)
+
+
+def rows(values: Array, n: int) -> Array:
+    """Reshape (points n, N) to (N, points, n)."""
+    return np.ascontiguousarray(values.T).reshape(values.shape[1], values.shape[0] // n, n)
+
+
+def ends_of(boundary: Boundary) -> Array:
+    """Return boundary conditions of N motions, shape (5 n, N), or (6 n, N) with goal_ddq."""
+    return np.ascontiguousarray(np.concatenate(list(boundary.conditions().values()), axis=1).T)
+
+
+@dataclass(frozen=True)
+class TaskPreprocessor:
+    """Preprocessor of one problem's tasks; made by ``make_task_preprocessor``.
+
+    Attributes:
+        problem: The problem.
+        velocity_limit: Planning limits [rad/s], shape (n,).
+        tips: Kernel of ``control_point_functions.tips_at_ends``.
+        line: Kernel of ``control_point_functions.line_change``; None if the line is not projected.
+        reaching_time: Kernel of ``tasks.reaching_time``; None if the expected time is that of the distance.
+        via_line: Kernel of ``control_point_functions.via_line_change``; None if there are no via points, or no
+            projection.
+    """
+
+    problem: Problem
+    velocity_limit: Array
+    tips: Kernel
+    line: Kernel | None
+    reaching_time: Kernel | None = None
+    via_line: Kernel | None = None
+
+    def __call__(self, boundary: Boundary, via_point: Array | None = None, *, ends: Array | None = None) -> Tasks:
+        """Prepare N tasks, in float64.
+
+        Args:
+            boundary: Boundary conditions, shape (N, n) each.
+            via_point: Via points of the lines at half their length before projection [rad], shape (N, n); none by
+                default.
+            ends: Result of ``ends_of``, if already computed.
+        """
+        ends = ends_of(boundary) if ends is None else ends
+        start_xyz, goal_xyz = (tip.T for tip in self.tips(ends))
+        reaching = self.reaching_time
+        time = expected_time(boundary, self.velocity_limit) if reaching is None else reaching(ends)[0][0]
+        correction = None if via_point is None else self._via_offsets(boundary, via_point)
+        kernel, offsets = (self.line, []) if correction is None else (self.via_line, [lanes(correction)])
+        if kernel is not None:
+            (change,) = kernel(ends, *offsets, 1 / time[None], lanes(self.obstacle_poses(start_xyz, goal_xyz)))
+            correction = rows(change, boundary.start_q.shape[1])
+        return Tasks(boundary, start_xyz, goal_xyz, time, correction)
+
+    def _via_offsets(self, boundary: Boundary, via_point: Array) -> Array:
+        """Return offsets of lines through via points from straight ones at interior points [rad], shape (N, m, n)."""
+        along = along_line(self.problem.trajectory.path_control_points - 3 - boundary.fixed_at_goal)
+        offset = via_point - (boundary.start_q + boundary.goal_q) / 2
+        return np.asarray((1 - np.abs(2 * along - 1)) * offset[:, None])
+
+    def obstacle_poses(self, start_xyz: Array, goal_xyz: Array) -> Array:
+        """Return poses and sizes of the obstacles (``obstacle_poses_of``), shape (N, width)."""
+        return obstacle_poses_of(self.problem, start_xyz, goal_xyz)
+
+
+def make_task_preprocessor(
+    problem: Problem,
+    robot: "Robot",
+    kernels: KernelLibrary,
+    *,
+    line_projection_steps: int,
+    expected_time: str = "distance",
+    fixed_at_goal: int = 2,
+    within_limits: bool = False,
+    via_lines: bool = False,
+) -> TaskPreprocessor:
+    """Load the preprocessor of a problem's tasks.
+
+    Args:
+        problem: The problem.
+        robot: Its robot.
+        kernels: Library of kernels.
+        line_projection_steps: Gauss-Newton steps that project the line; it stays straight if there are no equalities.
+        expected_time: One of ``EXPECTED_TIMES``.
+        fixed_at_goal: Number of control points that the goal fixes (``Boundary.fixed_at_goal``).
+        within_limits: Whether control points are clipped to the joint limits (``ModelConfig``).
+        via_lines: Whether to load the kernel of lines through via points.
+    """
+    steps = effective_steps(kernels, line_projection_steps)
+    load = partial(kernels.load, steps=steps, fixed_at_goal=fixed_at_goal, within_limits=within_limits)
+    line = load(line_change) if steps else None
+    tips = kernels.load(tips_at_ends, fixed_at_goal=fixed_at_goal)
+    time = kernels.load(reaching_time, fixed_at_goal=fixed_at_goal) if expected_time == "reach" else None
+    via_line = load(via_line_change) if steps and via_lines else None
+    return TaskPreprocessor(problem, robot.velocity_limit, tips, line, time, via_line)

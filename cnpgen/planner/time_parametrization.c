@@ -1,0 +1,181 @@
+/* Fit rates to limits, as in time_parametrization.py; vectors.h precedes this file. All bounded values are
+g = constant + square r^2 + mixed r r', with coefficients of every row at every phase. */
+
+#define EACH(i, from, to) for (long i = (from); i < (to); i++)
+
+I v at(const double *p) { return *(const vu *)p; }
+I void put(double *p, v x) { *(vu *)p = x; }
+
+typedef void kernel(long n, const double *const *in, const long *distances, double *const *out);
+
+typedef struct {
+  long joints, pose_width, path_points, points; /* numbers; control points of p and of r */
+  long phases, rows, first, last, moves;        /* phases in full vectors; movable control points */
+  const double *path, *rate;                    /* bases of p and r, (orders, control points, phases) */
+  const double *lower, *upper;                  /* (rows,) */
+  const long *path_span, *span;                 /* phases where a point is active, (control points, 2) */
+  const long *order;                            /* control points of r in the order of their moves */
+  const double *step_fractions;                 /* fractions of the steps up, (moves,) */
+  kernel *coefficients, *violation;             /* of the column made by lay_out */
+  double max_increase, max_decrease, tolerance; /* of a control point, relative; tolerance of the violation */
+} parametrization;
+
+/* Buffers of one motion; K is the number of phases. */
+typedef struct {
+  double *column, *r, *r1;      /* p, p', p'', r, r', obstacle poses, (width, K); r and r' are views of it */
+  double *coefficients;         /* constant, square, mixed, (3, rows, K) */
+  double *b, *b1;               /* direction of r and r', (K,) */
+  double *violations, *before;  /* (K,); control points of r, (points,) */
+  double *critical;             /* (rows, W) */
+} workspace;
+
+/* The smallest x > 0 with q x^2 + l x = margin; infinite if there is none. */
+I v smallest(v margin, v l, v q) {
+  v below = l + vsqrt(l * l + 4 * q * margin);
+  return pick(below > K(0), 2 * margin / below, K(INFINITY));
+}
+
+I double largest(v x) {
+  double values[W];
+  put(values, x);
+  for (int half = W / 2; half; half /= 2)
+    EACH(i, 0, half) values[i] = values[i] > values[i + half] ? values[i] : values[i + half];
+  return values[0];
+}
+
+/* r^2 and r r' at W phases as quadratics of the step of r along b. */
+typedef struct { v square[3], mixed[3]; } direction;
+
+I direction direction_at(const workspace *m, long k) {
+  v r = at(m->r + k), r1 = at(m->r1 + k), b = at(m->b + k), b1 = at(m->b1 + k);
+  return (direction){{r * r, 2 * r * b, b * b}, {r * r1, r * b1 + r1 * b, b * b1}};
+}
+
+/* A row at W phases as a quadratic of the step: g + l x + q x^2. */
+typedef struct { v g, l, q; } quadratic;
+
+I quadratic along(direction d, const double *a, long size) {
+  v constant = at(a), square = at(a + size), mixed = at(a + 2 * size);
+  return (quadratic){
+    constant + square * d.square[0] + mixed * d.mixed[0],
+    square * d.square[1] + mixed * d.mixed[1],
+    square * d.square[2] + mixed * d.mixed[2]};
+}
+
+/* Largest allowed and smallest required step per lane, and mask of the violated lanes. */
+typedef struct { v up, back; vi violated; } limits;
+
+I limits with_bound(limits found, v margin, v l, v q) {
+  vi violated = margin < K(0);
+  v step = smallest(vabs(margin), l, pick(violated, -q, q));
+  found.up = lesser(pick(violated, K(INFINITY), step), found.up);
+  found.back = larger(pick(violated & (step < K(INFINITY)), step, K(0)), found.back);
+  found.violated |= violated & ((l != K(0)) | (q != K(0)));
+  return found;
+}
+
+/* Largest step of r along b within the bounds, or the required step back: `advance` of time_parametrization.py. */
+static double advance(const parametrization *p, const workspace *m, long from, long to) {
+  const double *restrict lower = p->lower, *restrict upper = p->upper, *restrict coefficients = m->coefficients;
+  double *restrict critical = m->critical, up = p->max_increase;
+  long rows = p->rows, phases = p->phases, size = rows * phases, steps = (to - from) / W;
+  limits found = {K(up), K(0), K(0) != K(0)};
+  EACH(i, 0, steps) { /* from the centre outwards: outer phases rarely limit the step further */
+    long k = from + (steps / 2 + (i % 2 ? -(i + 1) / 2 : i / 2)) * W;
+    direction d = direction_at(m, k);
+    v worst = K(-1);
+    EACH(row, 0, rows) { /* upper bound of the violation at a step of `up` */
+      quadratic f = along(d, coefficients + row * phases + k, size);
+      v violation = larger(f.g - upper[row], lower[row] - f.g) + up * (vabs(f.l) + up * vabs(f.q));
+      put(critical + row * W, violation);
+      worst = larger(violation, worst);
+    }
+    if (!(largest(worst) > 0)) continue;
+    EACH(row, 0, rows) if (largest(at(critical + row * W)) > 0) {
+      quadratic f = along(d, coefficients + row * phases + k, size);
+      found = with_bound(with_bound(found, upper[row] - f.g, f.l, f.q), f.g - lower[row], -f.l, -f.q);
+    }
+    up = -largest(-found.up);
+  }
+  if (!(largest(flag(found.violated)) > 0)) return up;
+  double back = -largest(found.back);
+  return back > p->max_decrease ? back : p->max_decrease;
+}
+
+static void add(double *out, double x, const double *b, long from, long to) {
+  for (long k = from; k < to; k += W) put(out + k, at(out + k) + x * at(b + k));
+}
+
+/* out = c[first] basis[first] + ...; `stride` is the distance between control points. */
+static void combine(const double *basis, const long *span, long phases, const double *c, long stride, long first, long last,
+                    double *out) {
+  EACH(k, 0, phases) out[k] = 0;
+  EACH(j, first, last) add(out, c[j * stride], basis + j * phases, span[2 * j], span[2 * j + 1]);
+}
+
+static void combine_rates(const parametrization *p, const double *c, long first, long last, double *r, double *r1) {
+  combine(p->rate, p->span, p->phases, c, 1, first, last, r);
+  combine(p->rate + p->points * p->phases, p->span, p->phases, c, 1, first, last, r1);
+}
+
+static void lay_out(const parametrization *p, const double *path, const double *obstacle_poses, const workspace *m) {
+  EACH(order, 0, 3) EACH(i, 0, p->joints) {
+    const double *basis = p->path + order * p->path_points * p->phases;
+    double *out = m->column + (order * p->joints + i) * p->phases;
+    combine(basis, p->path_span, p->phases, path + i, p->joints, 0, p->path_points, out);
+  }
+  EACH(i, 0, p->pose_width) EACH(k, 0, p->phases) m->r1[(1 + i) * p->phases + k] = obstacle_poses[i];
+}
+
+static void run(kernel *function, const parametrization *p, const workspace *m, double *const *out) {
+  function(p->phases, (const double *const[]){m->column}, &p->phases, out);
+}
+
+/* Largest violation at the phases; NaN if a value is NaN. */
+static double max_violation(const parametrization *p, const workspace *m, const double *c) {
+  combine_rates(p, c, 0, p->points, m->r, m->r1);
+  run(p->violation, p, m, (double *const[]){m->violations});
+  double worst = m->violations[0];
+  EACH(k, 1, p->phases) if (!(m->violations[k] <= worst) && worst == worst) worst = m->violations[k];
+  return worst;
+}
+
+static void parametrize_motion(const parametrization *p, double *c, const workspace *m) {
+  double *r = m->r, *r1 = m->r1, *b = m->b, *b1 = m->b1, *a = m->coefficients;
+  long size = p->rows * p->phases;
+  run(p->coefficients, p, m, (double *const[]){a, a + size, a + 2 * size});
+  combine_rates(p, c, 0, p->points, r, r1);
+  EACH(move, 0, p->moves) {
+    long j = p->order[move];
+    const double *basis = p->rate + j * p->phases, *derivative = basis + p->points * p->phases;
+    long from = p->span[2 * j], to = p->span[2 * j + 1];
+    for (long k = from; k < to; k += W) put(b + k, c[j] * at(basis + k)), put(b1 + k, c[j] * at(derivative + k));
+    double x = advance(p, m, from, to);
+    if (x > 0) x *= p->step_fractions[move];
+    add(r, x, b, from, to), add(r1, x, b1, from, to);
+    c[j] += x * c[j];
+  }
+  combine_rates(p, c, p->first, p->last, b, b1);
+  double x = advance(p, m, 0, p->phases);
+  EACH(j, p->first, p->last) c[j] += x * c[j];
+}
+
+/* Fit the rates of motions, (count, points), in place. */
+void parametrize_rates(const parametrization *p, long count, const double *path, const double *obstacle_poses,
+                       double *rate, double *memory) {
+  long phases = p->phases, numbers = 3 * p->joints;
+  memory += -((size_t)memory / sizeof(double)) % W;
+  workspace m = {.column = memory, .r = memory + numbers * phases};
+  m.r1 = m.r + phases, m.coefficients = m.r1 + (1 + p->pose_width) * phases;
+  m.b = m.coefficients + 3 * p->rows * phases, m.b1 = m.b + phases, m.violations = m.b1 + phases;
+  m.critical = m.violations + phases, m.before = m.critical + p->rows * W;
+  EACH(motion, 0, count) {
+    double *c = rate + motion * p->points;
+    memcpy(m.before, c, p->points * sizeof(double));
+    lay_out(p, path + motion * p->path_points * p->joints, obstacle_poses + motion * p->pose_width, &m);
+    parametrize_motion(p, c, &m);
+    double worst = max_violation(p, &m, c);
+    if (!(worst <= p->tolerance) && !(worst <= max_violation(p, &m, m.before)))
+      memcpy(c, m.before, p->points * sizeof(double));
+  }
+}

@@ -1,0 +1,241 @@
+"""Fit the rates after the network to the limits: as large as allowed, and smaller if limits are violated.
+
+The path stays, and so do the two control points of the rate at either end, which determine the boundary conditions. On
+a fixed path a bounded value is ``g = constant + square r^2 + mixed r r'`` with coefficients that depend on the phase
+alone: squares of velocities, accelerations and torques, as in time-optimal path parametrization (Bobrow, Dubowsky and
+Gibson, 1985). So it is a quadratic of each control point of the rate, or of a factor of them all, and the largest step
+up to the first bound follows in closed form. Every second control point takes a fraction of its step, one after the
+other, then those between them a larger fraction; finally all of them are scaled together.
+"""
+
+import ctypes
+from ctypes import c_double, c_long, c_void_p
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import UsageError
+from cnpgen.kernels.compiled_kernel import address_of, aligned_array
+from cnpgen.kernels.kernel import Kernel
+from cnpgen.kernels.library import KernelLibrary
+from cnpgen.planner.expressions import coefficient_bounds, speed_bounds, speed_coefficients
+from cnpgen.planner.phase_grid import MOTIONS_PER_BLOCK, PhaseGrid, make_phase_grid
+from cnpgen.problems.problem import Problem
+from cnpgen.trajectory.spline_motion import Motion
+
+if TYPE_CHECKING:
+    from cnpgen.robots.robot import Robot
+
+Array = NDArray[np.float64]
+
+SOURCE = Path(__file__).with_name("time_parametrization.c")
+PARAMETRIZATION_INTERVALS = 79  # between phases; the 80 phases fill vectors of any width
+FIXED_RATE_POINTS = 2  # at either end
+STEP_FRACTIONS = 0.65, 0.9  # of the step to the first bound: of every second control point, then of those between
+MAX_RATE_INCREASE, MAX_RATE_DECREASE = 1.0, -0.3  # of a control point in one step, relative
+BOUND_ROUNDING = 1e-9  # fraction of a limit by which boundary conditions may exceed it
+MAX_VECTOR_WIDTH = 8  # float64 values
+
+
+class _TimeParametrization(ctypes.Structure):
+    """``parametrization`` of time_parametrization.c."""
+
+    _fields_ = (
+        *((name, c_long) for name in ("joints", "pose_width", "path_points", "points")),
+        *((name, c_long) for name in ("phases", "rows", "first", "last", "moves")),
+        *(
+            (name, c_void_p)
+            for name in ("path", "rate", "lower", "upper", "path_span", "span", "order", "step_fractions")
+        ),
+        *((name, c_void_p) for name in ("coefficients", "violation")),
+        *((name, c_double) for name in ("max_increase", "max_decrease", "tolerance")),
+    )
+
+
+@dataclass(frozen=True)
+class TimeParametrization(PhaseGrid):
+    """Time parametrization of one problem's motions; made by ``make_time_parametrization``.
+
+    Attributes:
+        coefficients: Kernel of ``expressions.speed_coefficients``.
+        lower: Lower bounds of its rows, shape (m,).
+        upper: Upper bounds of its rows, shape (m,).
+        joints: Number of joints.
+        library: Library of time_parametrization.c; None if kernels are not compiled.
+    """
+
+    coefficients: Kernel
+    lower: Array
+    upper: Array
+    joints: int
+    library: ctypes.CDLL | None
+
+    def parametrize(self, motion: Motion, obstacle_poses: Array) -> Motion:
+        """Return N motions along the same paths, between the same ends, whose rates meet the limits.
+
+        A motion stays as it is if its largest violation would grow, because its bounded values are not such
+        quadratics. For the same reason motions may be slower than necessary.
+
+        Args:
+            motion: N motions, with the problem's numbers of control points.
+            obstacle_poses: Poses and sizes of the obstacles, shape (N, width).
+        """
+        rate = np.array(motion.rate, np.float64, order="C")
+        if self.library is not None:
+            self._parametrize_compiled(motion.path, obstacle_poses, rate)
+        else:
+            for block in (
+                slice(first, first + MOTIONS_PER_BLOCK) for first in range(0, len(motion), MOTIONS_PER_BLOCK)
+            ):
+                rate[block] = self._parametrize_interpreted(motion[block], obstacle_poses[block])
+        return Motion(motion.path, rate, motion.degree)
+
+    def _parametrize_interpreted(self, motion: Motion, obstacle_poses: Array) -> Array:
+        rate, column = motion.rate.copy(), self.column(motion, obstacle_poses)
+        parametrize_rates(rate, self.coefficients(column), self._bounds, self.rate)
+        new_column = self.column(Motion(motion.path, rate, motion.degree), obstacle_poses)
+        before, after = (
+            self.violation(states)[0].reshape(len(motion), -1).max(axis=1) for states in (column, new_column)
+        )
+        better = after <= np.maximum(before, self._tolerance)
+        return np.where(better[:, None], rate, motion.rate)
+
+    @cached_property
+    def _bounds(self) -> tuple[Array, Array]:
+        """Lower and upper bounds, relaxed by rounding errors."""
+        return self.lower - BOUND_ROUNDING * np.abs(self.lower), self.upper + BOUND_ROUNDING * np.abs(self.upper)
+
+    @cached_property
+    def _tolerance(self) -> float:
+        """Tolerance of the violation [SI units of the largest bound]."""
+        bounds = np.abs(np.concatenate([self.lower, self.upper]))
+        return 10 * BOUND_ROUNDING * float(bounds[np.isfinite(bounds)].max(initial=0.0))
+
+    @cached_property
+    def _c_arguments(self) -> tuple[_TimeParametrization, list[NDArray[Any]]]:
+        """Arguments of time_parametrization.c for the problem, and the arrays that they point to."""
+        lower, upper, order, fractions = *self._bounds, *moves_of(self.rate.shape[2])
+        tables, spans = [[of(self.path), of(self.rate)] for of in (by_point, span_of)]
+        arrays = [*tables, lower, upper, *spans, order, fractions]
+        (phases, path_points), points = self.path.shape[1:], self.rate.shape[2]
+        counts = self.joints, self.coefficients.tape.inputs[0] - 3 * self.joints - 2, path_points, points
+        moves = phases, len(lower), FIXED_RATE_POINTS, points - FIXED_RATE_POINTS, len(order)
+        addresses = *map(address_of, arrays), self.coefficients.address, self.violation.address
+        bounds = MAX_RATE_INCREASE, MAX_RATE_DECREASE, self._tolerance
+        return _TimeParametrization(*counts, *moves, *addresses, *bounds), arrays
+
+    def _parametrize_compiled(self, path: Array, obstacle_poses: Array, rate: Array) -> None:
+        assert self.library is not None
+        rows, phases = self.coefficients.tape.inputs[0] + 3 * len(self.lower) + 3, self.path.shape[1]
+        memory = np.empty(MAX_VECTOR_WIDTH * (1 + len(self.lower)) + rows * phases + rate.shape[1])
+        inputs = [np.ascontiguousarray(array, np.float64) if array.size else None for array in (path, obstacle_poses)]
+        addresses = (None if array is None else address_of(array) for array in (*inputs, rate, memory))
+        self.library.parametrize_rates(ctypes.byref(self._c_arguments[0]), len(rate), *addresses)
+
+
+def make_time_parametrization(problem: Problem, robot: "Robot", kernels: KernelLibrary) -> TimeParametrization:
+    """Load the time parametrization of one problem.
+
+    Args:
+        problem: The problem.
+        robot: Its robot.
+        kernels: Library of kernels.
+
+    Raises:
+        UsageError: The problem bounds the jerk, which is no quadratic of the rate.
+    """
+    if problem.path_orders > 3:
+        raise UsageError(f"plans of {problem.name!r} cannot be time-parametrized: it bounds the jerk")
+    library, speeds = kernels.load_source(SOURCE), make_phase_grid(problem, kernels, PARAMETRIZATION_INTERVALS)
+    if library is not None:
+        function = library.parametrize_rates
+        function.argtypes, function.restype = (c_void_p, c_long, *[c_void_p] * 4), None
+    rows = kernels.load(speed_coefficients), *coefficient_bounds(speed_bounds(robot, problem))
+    return TimeParametrization(speeds.violation, speeds.path, speeds.rate, *rows, joints=robot.n, library=library)
+
+
+def span_of(table: Array) -> NDArray[np.int64]:
+    """Return the range of phases at which each control point has an effect, rounded to whole vectors.
+
+    Args:
+        table: Basis of a spline and its derivatives, shape (orders, K, points).
+
+    Returns:
+        First phase and the one after the last, shape (points, 2).
+    """
+    nonzero = (table != 0).any(axis=0)
+    first, last = nonzero.argmax(axis=0), len(nonzero) - nonzero[::-1].argmax(axis=0)
+    return np.stack([first - first % MAX_VECTOR_WIDTH, last + -last % MAX_VECTOR_WIDTH], axis=1).astype(np.int64)
+
+
+def by_point(table: Array) -> Array:
+    """Return a basis in the layout of time_parametrization.c, shape (orders, points, K), aligned to vectors."""
+    aligned = aligned_array(table.size)
+    aligned.reshape(table.swapaxes(1, 2).shape)[:] = table.swapaxes(1, 2)
+    return aligned
+
+
+def moves_of(points: int) -> tuple[NDArray[np.int64], Array]:
+    """Return the order in which control points of the rate move, and the fractions of their steps."""
+    movable = np.arange(FIXED_RATE_POINTS, points - FIXED_RATE_POINTS)
+    first, second = movable[1::2], movable[::2]
+    return np.concatenate([first, second]), np.repeat(STEP_FRACTIONS, [len(first), len(second)])
+
+
+def parametrize_rates(rate: Array, coefficients: list[Array], bounds: tuple[Array, Array], table: Array) -> None:
+    """Fit the rates of N motions as time_parametrization.c does.
+
+    Args:
+        rate: Control points of the rate, shape (N, R), changed in place.
+        coefficients: Constant, square and mixed, shape (m, N K) each.
+        bounds: Lower and upper bounds, shape (m,) each.
+        table: Basis of r and r', shape (2, K, R).
+    """
+    shaped = [coefficient.reshape(len(coefficient), len(rate), -1) for coefficient in coefficients]
+    movable = slice(FIXED_RATE_POINTS, rate.shape[1] - FIXED_RATE_POINTS)
+    for point, fraction in zip(*moves_of(rate.shape[1]), strict=True):
+        along = rate[:, point, None] * table[:, None, :, point]
+        x = advance(shaped, bounds, rate @ table.swapaxes(1, 2), along)
+        rate[:, point] *= 1 + np.where(x > 0, fraction * x, x)
+    along = rate[:, movable] @ table[:, :, movable].swapaxes(1, 2)
+    rate[:, movable] *= 1 + advance(shaped, bounds, rate @ table.swapaxes(1, 2), along)[:, None]
+
+
+def advance(coefficients: list[Array], bounds: tuple[Array, Array], rates: Array, along: Array) -> Array:
+    """Return the largest step of the rates within the bounds, or the required step back if one is violated.
+
+    Args:
+        coefficients: Constant, square and mixed, shape (m, N, K) each.
+        bounds: Lower and upper bounds, shape (m,) each.
+        rates: r and r', shape (2, N, K).
+        along: Direction of r and r', shape (2, N, K).
+
+    Returns:
+        Steps, shape (N,).
+    """
+    (constant, square, mixed), (r, r1), (b, b1) = coefficients, rates, along
+    value = constant + (square * r + mixed * r1) * r
+    first = (2 * square * r + mixed * r1) * b + mixed * r * b1
+    second = (square * b + mixed * b1) * b
+    low, high = (bound[:, None, None] for bound in bounds)
+    margin = np.stack([high - value, value - low])
+    first, second = np.stack([first, -first]), np.stack([second, -second])
+    violated, depends = margin < 0, (first != 0) | (second != 0)
+    distance = smallest(np.abs(margin), first, np.where(violated, -second, second))
+    forwards = np.where(violated, np.inf, distance).min(axis=(0, 1, 3))
+    back = np.where(violated & np.isfinite(distance), distance, 0.0).max(axis=(0, 1, 3))
+    goes_back = (violated & depends).any(axis=(0, 1, 3))
+    step: Array = np.where(goes_back, np.maximum(-back, MAX_RATE_DECREASE), np.minimum(forwards, MAX_RATE_INCREASE))
+    return step
+
+
+def smallest(margin: Array, linear: Array, square: Array) -> Array:
+    """Return the smallest x > 0 with ``square x^2 + linear x = margin``, elementwise; infinite if there is none."""
+    with np.errstate(all="ignore"):
+        below = linear + np.sqrt(linear**2 + 4 * square * margin)
+        x: Array = np.where(below > 0, 2 * margin / below, np.inf)
+    return x

@@ -1,0 +1,114 @@
+"""Scale motions from rest to rest uniformly in time until the limits hold; the path stays the same.
+
+At ``r / k`` velocities are 1/k and accelerations 1/k^2 of their values at r. A bounded value g(q, dq, ddq) is then
+``g0 + b / k + c / k^2``, exactly so for velocities, accelerations and torques. Values of g at k = 1, at k = 2 and at
+rest determine b and c, and the smallest k at which all g are within their bounds follows in closed form. Values that
+depend on the jerk are ``g0 + d / k^3``.
+"""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.kernels.kernel import Kernel
+from cnpgen.kernels.library import KernelLibrary
+from cnpgen.planner.expressions import SpeedBounds, speed_bounds, speed_residuals
+from cnpgen.planner.phase_grid import MOTIONS_PER_BLOCK, PhaseGrid, make_phase_grid
+from cnpgen.problems.problem import Problem
+from cnpgen.trajectory.spline_motion import Motion
+
+if TYPE_CHECKING:
+    from cnpgen.robots.robot import Robot
+
+Array = NDArray[np.float64]
+
+MAX_TIME_SCALE = 3.0  # motions that need more are not usable plans
+SCALING_INTERVALS = 128  # between phases
+TIME_SCALE_MARGIN = 2e-4  # relative; limits may be exceeded by about this between two phases
+
+
+@dataclass(frozen=True)
+class TimeScaling(PhaseGrid):
+    """Uniform time scaling of one problem's motions; made by ``make_time_scaling``.
+
+    Attributes:
+        residuals: Kernel of ``expressions.speed_residuals``.
+        bounds: Bounds of the residuals.
+    """
+
+    residuals: Kernel
+    bounds: SpeedBounds
+
+    def factor(self, motion: Motion, obstacle_poses: Array) -> Array:
+        """Return the smallest time scale, at least 1, at which each of N motions from rest to rest meets its limits.
+
+        Violations that do not depend on time are ignored, such as a torque exceeded by gravity alone.
+
+        Args:
+            motion: N motions, with the problem's numbers of control points.
+            obstacle_poses: Poses and sizes of the obstacles, shape (N, width).
+
+        Returns:
+            Shape (N,).
+        """
+        factor, phases = np.ones(len(motion)), self.path.shape[1]
+        for block in (slice(first, first + MOTIONS_PER_BLOCK) for first in range(0, len(motion), MOTIONS_PER_BLOCK)):
+            column = self.column(motion[block], obstacle_poses[block])
+            (violation,) = self.violation(column)
+            violating = np.flatnonzero(violation[0] > 0)  # empty for most motions
+            if len(violating):
+                required = self._required_scale(column.take(violating, axis=1))
+                np.maximum.at(factor[block], violating // phases, required)
+        return np.where(factor > 1, np.minimum(factor * (1 + TIME_SCALE_MARGIN), MAX_TIME_SCALE), 1.0)
+
+    def _required_scale(self, column: Array) -> Array:
+        """Return the smallest time scales of L columns, shape (L,)."""
+        n, orders = self.residuals.tape.inputs[0], len(self.path)
+        p, p1, p2, *third = column[: orders * n].reshape(orders, n, -1)
+        (r, r1, *second), obstacle_poses = column[orders * n :][: orders - 1], column[orders * n + orders - 1 :]
+        moving = [p1 * r, (p2 * r + p1 * r1) * r]
+        moving += [((third[0] * r + 3 * p2 * r1) * r + p1 * (second[0] * r + r1**2)) * r] if third else []
+        fast, slow, static = (
+            self.residuals(p, *(term / k**order for order, term in enumerate(moving, 1)), obstacle_poses)[0]
+            for k in (1.0, 2.0, np.inf)
+        )
+        quadratic = 2 * (fast - 2 * slow + static)  # c, from g(1) = static + b + c and g(2) = static + b / 2 + c / 4
+        linear = fast - static - quadratic
+        above, below = self.bounds.upper[:, None] - static, static - self.bounds.lower[:, None]
+        needed = np.maximum(_smallest_scale(above, linear, quadratic), _smallest_scale(below, -linear, -quadratic))
+        cubic = self.bounds.cubic
+        change = (fast - static)[cubic]
+        needed[cubic] = np.maximum(
+            _smallest_scale_cubic(above[cubic], change), _smallest_scale_cubic(below[cubic], -change)
+        )
+        return np.asarray(needed.max(axis=0, initial=1.0))
+
+
+def make_time_scaling(problem: Problem, robot: "Robot", kernels: KernelLibrary) -> TimeScaling:
+    """Load the time scaling of one problem.
+
+    Args:
+        problem: The problem.
+        robot: Its robot.
+        kernels: Library of kernels.
+    """
+    speeds, residuals = make_phase_grid(problem, kernels, SCALING_INTERVALS), kernels.load(speed_residuals)
+    return TimeScaling(speeds.violation, speeds.path, speeds.rate, residuals, speed_bounds(robot, problem))
+
+
+def _smallest_scale(margin: Array, linear: Array, quadratic: Array) -> Array:
+    """Return the smallest k >= 1 with ``linear / k + quadratic / k^2 <= margin``; 1 if there is no margin at rest."""
+    with np.errstate(all="ignore"):
+        root = np.sqrt(np.maximum(linear**2 + 4 * quadratic * margin, 0.0))
+        k = (linear + root) / (2 * margin)  # of margin k^2 - linear k - quadratic = 0
+    violated = (linear + quadratic > margin) & (margin > 0) & np.isfinite(k)
+    return np.where(violated, np.maximum(k, 1.0), 1.0)
+
+
+def _smallest_scale_cubic(margin: Array, change: Array) -> Array:
+    """Return the smallest k >= 1 with ``change / k^3 <= margin``; 1 if there is no margin at rest."""
+    with np.errstate(all="ignore"):
+        k = np.cbrt(change / margin)
+    return np.where((change > margin) & (margin > 0) & np.isfinite(k), k, 1.0)

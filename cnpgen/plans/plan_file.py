@@ -1,0 +1,230 @@
+"""Reader of plan files: names, shapes and types are checked, values are not."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import DatasetError, RecipeError, UsageError, nearest
+from cnpgen.plans.format import (
+    ATTRIBUTES,
+    CONDITIONS,
+    FLOATS,
+    FORMAT,
+    INTEGERS,
+    KNOWN,
+    NOTES,
+    PLAN_FILE_VERSION,
+    REQUIRED,
+    refuse_misspelt,
+)
+from cnpgen.plans.plans import Plans, make_plans
+from cnpgen.plans.status import PlanStatus
+from cnpgen.plans.tips import correct_tips
+from cnpgen.problems.problem import Problem
+from cnpgen.problems.problem_file import load_problem
+from cnpgen.problems.problem_record import ProblemRecord, as_record, record_problem
+from cnpgen.store.dataset_spec import StoredProblem
+from cnpgen.store.files.checksum_file import verify_checksum
+from cnpgen.store.files.hdf5 import Column, Hdf5, opened_hdf5
+from cnpgen.store.paths import file_kind, require_file
+from cnpgen.trajectory.boundary import Boundary
+
+Array = NDArray[np.float64]
+
+
+def load_plans(path: str | Path, *, problem: Problem | StoredProblem | str | Path | None = None) -> Plans:
+    """Read plans from a file of cnpgen or of other software.
+
+    Names, shapes and types must be correct. Values are not checked; the verdict judges every plan later. The checksum
+    of files of cnpgen is verified; other files have none, and ``has_checksum`` of the plans is False.
+
+    Args:
+        path: Path of the file.
+        problem: Required problem: a problem, a record, or the name or path of a problem, pipeline or dataset. Its
+            tolerances replace those in the file.
+
+    Raises:
+        UsageError: The file does not exist.
+        DatasetError: The file is damaged, not a plan file, or of another problem.
+        RecipeError: ``problem`` has mistakes, or a required plug-in is not installed.
+        MachineError: The file cannot be read.
+    """
+    path = Path(path)
+    wanted = None if problem is None else as_record(problem)
+    require_file(path, "a file of plans", of_dataset="'cnpgen solve' and 'cnpgen plan' make plans for its rows")
+    if (kind := file_kind(path)).endswith(" of cnpgen"):  # models are HDF5, too
+        raise DatasetError(f"{path} is {kind}, not a file of plans")
+    has_checksum = verify_checksum(path, kind=FORMAT, version=PLAN_FILE_VERSION)
+    with opened_hdf5(path) as file:
+        attributes = file.attributes.some((*ATTRIBUTES, *NOTES))
+        _check_format(path, attributes)
+        columns = _columns(path, file)
+    if not has_checksum:
+        refuse_misspelt(path, columns, CONDITIONS)
+    record = agreed_problem(path, stored_problem(path, attributes), wanted, content="plans", command="evaluate")
+    try:
+        plans = _assembled(path, record, columns, attributes)
+    except UsageError as error:
+        raise DatasetError(f"{path}: {error}") from error
+    return correct_tips(replace(plans, has_checksum=has_checksum), where=f"{path}: ")
+
+
+def _columns(path: Path, file: Hdf5) -> dict[str, NDArray[Any]]:
+    """Read the datasets of a file."""
+    columns = {name: _read(path, name, item) for name, item in file.columns().items()}
+    missing = [name + nearest(name, columns.keys() - KNOWN) for name in REQUIRED if name not in columns]
+    if missing:
+        raise DatasetError(f"{path} lacks {', '.join(missing)}: plans need {', '.join(REQUIRED)}")
+    if "status" in columns:
+        named = file["status"].attributes.some(("flag_values", "flag_meanings"))
+        columns["status"] = _statuses(path, columns["status"], named)
+    return columns
+
+
+def _read(path: Path, name: str, dataset: Column) -> NDArray[Any]:
+    """Read a dataset in its required type."""
+    what, kinds = ("integers", "iu") if name in INTEGERS else ("floats", "f") if name in FLOATS else ("numbers", "fiu")
+    if dataset.dtype.kind not in kinds:
+        raise DatasetError(f"{path}: {name} must hold {what}, got {dataset.dtype}")
+    values = dataset.read()
+    if name not in INTEGERS:
+        return np.asarray(values, np.float64)
+    if values.size and values.max() > np.iinfo(np.int64).max:
+        raise DatasetError(f"{path}: {name} must hold integers below 2^63, got {values.max()}")
+    return np.asarray(values, np.int64)
+
+
+def _check_format(path: Path, attributes: Mapping[str, Any]) -> None:
+    """Raise DatasetError for files of another kind."""
+    if "format" in attributes and _text(path, attributes, "format") != FORMAT:
+        raise DatasetError(f"{path} is a {_text(path, attributes, 'format')} file, not one of plans ({FORMAT})")
+    version = _number(path, attributes, "format_version", PLAN_FILE_VERSION)
+    if version > PLAN_FILE_VERSION:
+        raise DatasetError(
+            f"{path} has format version {version}, this cnpgen reads {PLAN_FILE_VERSION}: upgrade cnpgen"
+        )
+
+
+def _text(path: Path, attributes: Mapping[str, Any], name: str) -> str:
+    value = attributes[name]
+    if isinstance(value, bytes):
+        try:
+            return value.decode()
+        except UnicodeDecodeError as error:
+            raise DatasetError(f"{path} is damaged: its attribute {name!r} is no text") from error
+    if not isinstance(value, str):
+        raise DatasetError(f"{path}: the attribute {name!r} must be a text, got {value!r}")
+    return value
+
+
+def _number(path: Path, attributes: Mapping[str, Any], name: str, default: int) -> int:
+    value = attributes.get(name, default)
+    if np.ndim(value) or not np.issubdtype(np.asarray(value).dtype, np.integer):
+        raise DatasetError(f"{path}: the attribute {name!r} must be an integer, got {value!r}")
+    return int(value)
+
+
+def agreed_problem(
+    path: Path, stored: ProblemRecord | None, wanted: ProblemRecord | None, *, content: str, command: str
+) -> ProblemRecord:
+    """Return the problem of a file: the required one if it is consistent, or the file's own.
+
+    Args:
+        path: Path of the file.
+        stored: Problem in the file, or None.
+        wanted: Required problem, None for any.
+        content: Content of the file, for messages: "plans".
+        command: Command with the option ``--problem``, for messages.
+
+    Raises:
+        DatasetError: The file is of another problem, or there is no problem.
+    """
+    found = stored or wanted
+    if found is None:
+        help_ = f"set its attribute 'problem' to a name or a file, or pass {{problem}} ('cnpgen {command}' takes it)"
+        raise DatasetError(f"{path} does not name its problem: {help_}", remedies={"problem": None})
+    if wanted is not None and found.comparable_sha256 != wanted.comparable_sha256:
+        where = ", ".join(found.differences(wanted)[:4])
+        raise DatasetError(
+            f"{path} has {content} of problem {found.name!r}, not of {wanted.name!r}: they differ in {where}"
+        )
+    return wanted or found
+
+
+def stored_problem(path: Path, attributes: Mapping[str, Any]) -> ProblemRecord | None:
+    """Return the problem named by a file; None if it names none.
+
+    Args:
+        path: Path of the file.
+        attributes: Attributes of the file: ``problem``, ``problem_recipe``, ``problem_urdf`` and ``problem_sha256``.
+
+    Raises:
+        DatasetError: The named problem is damaged or cannot be found.
+    """
+    if "problem_recipe" in attributes:
+        return _stored_record(path, attributes)
+    if "problem" not in attributes:
+        return None
+    name = _text(path, attributes, "problem")
+    try:
+        record = record_problem(load_problem(name, relative_to=path.parent))
+    except RecipeError as error:
+        raise DatasetError(f"{path}: the attribute 'problem': {error}") from error
+    if "problem_sha256" in attributes and _text(path, attributes, "problem_sha256") != record.comparable_sha256:
+        ours = record.comparable_sha256
+        raise DatasetError(f"{path} is of another {name!r}: its problem_sha256 is not this one's, {ours}")
+    return record
+
+
+def _stored_record(path: Path, attributes: Mapping[str, Any]) -> ProblemRecord:
+    """Return the problem stored as text in the file."""
+    missing = [name for name in ("problem_urdf", "problem_sha256") if name not in attributes]
+    if missing:
+        raise DatasetError(f"{path} has an attribute 'problem_recipe' but no {' and no '.join(missing)}")
+    record = ProblemRecord(_text(path, attributes, "problem_recipe"), _text(path, attributes, "problem_urdf"))
+    try:
+        same = record.comparable_sha256 == _text(path, attributes, "problem_sha256") and record.trajectory.degree > 0
+    except RecipeError as error:
+        raise DatasetError(f"{path} is damaged: its {error}") from error
+    if not same:
+        raise DatasetError(f"{path} is damaged: its problem was changed after it was written")
+    return record
+
+
+def _assembled(
+    path: Path, record: ProblemRecord, columns: dict[str, NDArray[Any]], attributes: Mapping[str, Any]
+) -> Plans:
+    """Build the plans from the contents of the file."""
+    boundary = [columns.pop(name, None) for name in CONDITIONS]
+    points = columns.pop("path_control_points")
+    duration = columns.pop("duration", None)  # redundant; r determines it
+    plans = make_plans(
+        record,
+        Boundary(*boundary),  # type: ignore[arg-type]
+        path_control_points=points,
+        rate_control_points=columns.pop("rate_control_points"),
+        degree=_number(path, attributes, "degree", record.trajectory.degree),
+        sample_id=columns.pop("sample_id", None),
+        status=columns.pop("status", None),
+        columns=columns,
+    )
+    if duration is not None and duration.shape != (len(plans),):
+        raise UsageError(f"must have shape {(len(plans),)}, got {duration.shape}", argument="duration")
+    source, options = (_text(path, attributes, name) if name in attributes else "" for name in NOTES)
+    return replace(plans, source=source, refined_with=options)
+
+
+def _statuses(path: Path, stored: NDArray[np.int64], attributes: Mapping[str, Any]) -> NDArray[np.uint8]:
+    """Translate status values by their names in the file; unknown names become UNKNOWN."""
+    known = {int(status): status for status in PlanStatus}
+    if "flag_values" in attributes and "flag_meanings" in attributes:
+        names = {status.name.lower(): status for status in PlanStatus}
+        words = _text(path, attributes, "flag_meanings").split()
+        values = np.ravel(attributes["flag_values"]).tolist()
+        known = {value: names.get(word, PlanStatus.UNKNOWN) for value, word in zip(values, words, strict=False)}
+    found = [known.get(value, PlanStatus.UNKNOWN) for value in stored.ravel().tolist()]
+    return np.array(found, np.uint8).reshape(stored.shape)

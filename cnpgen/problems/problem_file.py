@@ -1,0 +1,175 @@
+"""Problem files, loaded by name or path, and problems restored from records."""
+
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cnpgen.errors import PluginError, RecipeError
+from cnpgen.problems.checks import problem_mistakes, tables
+from cnpgen.problems.constraints.constraint import Constraint
+from cnpgen.problems.geometry import chosen_geometry, geometry_mistakes
+from cnpgen.problems.problem import FILES, Problem
+from cnpgen.robots.obstacle import Obstacle
+from cnpgen.robots.shape.inline import inline_mesh, is_inline, mesh_files
+from cnpgen.robots.shape.mesh_files import find_named_file
+from cnpgen.schema import registry
+from cnpgen.schema.catalogue import load_recipe, read_kind, reference
+from cnpgen.schema.keys import RecipeLocation
+from cnpgen.schema.parsing import Reader, parse
+from cnpgen.schema.toml import Kind, read_table
+from cnpgen.schema.units import show
+
+
+def load_problem(name_or_path: str | Path, *, relative_to: Path | None = None) -> Problem:
+    """Load a problem.
+
+    Args:
+        name_or_path: Name of a shipped problem, or path of a problem file.
+        relative_to: Base folder of a relative path; by default the working directory.
+
+    Raises:
+        RecipeError: The file has mistakes; the error lists all of them.
+    """
+    return load_recipe(("problem",), name_or_path, relative_to, read_problem)
+
+
+def load_problem_behind(name_or_path: str | Path) -> Problem:
+    """Load the problem of a problem, pipeline or dataset recipe.
+
+    Args:
+        name_or_path: Name of a shipped problem, pipeline or dataset, or path of such a file.
+
+    Raises:
+        RecipeError: There is no such recipe, or the problem file has mistakes.
+    """
+    return load_recipe(("problem", "pipeline", "dataset"), name_or_path, None, _read_behind)
+
+
+def _read_behind(path: Path, mistakes: list[str]) -> Problem | None:
+    """Follow the references of a recipe file to its problem and read it."""
+    table = read_table(path, ("problem", "pipeline", "dataset"), mistakes)
+    if table is None:
+        return None
+    kinds: tuple[Kind, ...] = ("pipeline", "problem")
+    key = next((kind for kind in kinds if kind in table), None)
+    if key is None:
+        return read_problem(path, mistakes)
+    where = RecipeLocation(str(path)) / key
+    try:
+        found: Problem | None = reference(key, _read_behind, path.parent)(table[key], where, mistakes)
+    except ValueError as error:
+        mistakes.append(where.message(str(error)))
+        return None
+    return found
+
+
+def read_problem(path: Path, mistakes: list[str]) -> Problem | None:
+    """Read a problem file and append its mistakes to ``mistakes``; return None if it is unusable."""
+    table = read_table(path, ("problem",), mistakes)
+    if table is None:
+        return None
+    where = RecipeLocation(str(path))
+    readers: dict[type, Reader] = {Constraint: partial(read_kind, registry.CONSTRAINTS)}
+    problem = parse(Problem, table, where=where, mistakes=mistakes, readers=readers)
+    before = len(mistakes)
+    mistakes.extend(problem_mistakes(table, where, path.parent))
+    mistakes.extend(geometry_mistakes(table, where, path.parent))
+    obstacles = () if problem is None else _with_meshes(problem, path, where, mistakes)
+    if problem is None or len(mistakes) > before:
+        return None
+    spec = replace(problem.robot, geometry=chosen_geometry(table, path.parent))
+    return replace(problem, path=path.absolute(), robot=spec, obstacle=obstacles)
+
+
+def _with_meshes(problem: Problem, path: Path, where: RecipeLocation, mistakes: list[str]) -> tuple[Obstacle, ...]:
+    """Return the obstacles with inline hulls of their mesh files."""
+    packages = [path.parent / each for each in problem.robot.packages]
+    found = []
+    for index, each in enumerate(problem.obstacle):
+        obstacle = each
+        if each.mesh and not is_inline(each.mesh):
+            try:
+                mesh = inline_mesh(find_named_file(each.mesh, path, packages), np.array(each.scale))
+                obstacle = replace(each, mesh=mesh, scale=Obstacle.scale)
+            except RecipeError as error:
+                mistakes += [(where / "obstacle" / index / "mesh").message(text) for text in error.mistakes]
+        found.append(obstacle)
+    return tuple(found)
+
+
+def without_defaults(value: Any) -> Any:
+    """Remove nulls, empty arrays and records of plug-ins, which recipes do not contain."""
+    if isinstance(value, dict):
+        said = {key: entry for key, entry in value.items() if entry is not None and entry != []}
+        if "use" in said:
+            said.pop("source", None)
+            said.pop("package", None)
+        return {key: without_defaults(entry) for key, entry in said.items()}
+    return [without_defaults(entry) for entry in value] if isinstance(value, list) else value
+
+
+def restore_problem(content: dict[str, Any], urdf: str, folder: Path) -> Problem:
+    """Rebuild a problem from its resolved form.
+
+    Args:
+        content: Resolved problem.
+        urdf: Text of the robot's URDF file.
+        folder: Folder for the URDF file.
+
+    Raises:
+        RecipeError: This version of cnpgen does not support the content.
+        PluginError: A required package is not installed.
+    """
+    if missing := missing_kinds(registry.CONSTRAINTS, tables(content, "constraint")):
+        raise PluginError(missing)
+    path, mistakes = folder / "recipe.toml", list[str]()
+    problem: Problem | None = restoring_reader(urdf, path)(
+        without_defaults(content), RecipeLocation(str(path)), mistakes
+    )
+    if problem is None or mistakes:
+        raise RecipeError(mistakes)
+    return problem
+
+
+def restoring_reader(urdf: str, path: Path) -> Reader:
+    """Return a reader of a resolved problem without defaults, as if stored at ``path``; write its URDF there.
+
+    The content may be untrusted: it is self-contained, and no other file is read.
+    """
+    (path.parent / "robot.urdf").write_text(urdf, encoding="utf-8")
+
+    def read(value: Any, where: RecipeLocation, mistakes: list[str]) -> Problem | None:
+        if not isinstance(value, dict) or not isinstance(value.get("robot"), dict):
+            raise ValueError("expected the table of a problem, with a robot")  # noqa: TRY004 - as of other mistakes
+        robot = {key: entry for key, entry in value["robot"].items() if key not in FILES}
+        value = {**value, "robot": robot | {"urdf": "robot.urdf"}}
+        readers: dict[type, Reader] = {Constraint: partial(read_kind, registry.CONSTRAINTS)}
+        made = parse(Problem, value, where=where, mistakes=mistakes, readers=readers)
+        if made is None or (named := list(_meshes_on_disk(made, urdf, where))):
+            mistakes.extend(() if made is None else named)
+            return None
+        return replace(made, path=path)
+
+    return read
+
+
+def _meshes_on_disk(problem: Problem, urdf: str, where: RecipeLocation) -> Iterator[str]:
+    """Yield error messages for meshes that are not inline."""
+    text = "names the mesh {}, expected its corners in the text"
+    with suppress(ValueError):  # loading the robot raises the error
+        for name in mesh_files(urdf)[:1] if problem.robot.geometry == "urdf" else ():
+            yield (where / "robot" / "urdf").message(text.format(show(name)))
+    for index, each in enumerate(problem.obstacle):
+        if each.mesh and not is_inline(each.mesh):
+            yield (where / "obstacle" / index / "mesh").message(text.format(show(each.mesh)))
+
+
+def missing_kinds(group: str, entries: list[tuple[int, dict[str, Any]]]) -> list[str]:
+    """Return the missing packages of resolved stage or constraint tables."""
+    found = (registry.why_missing(group, str(each.get("use")), str(each.get("package", ""))) for _, each in entries)
+    return list(dict.fromkeys(text for text in found if text))

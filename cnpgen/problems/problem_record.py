@@ -1,0 +1,220 @@
+"""Problem records: problems as text, so that plan files are self-contained."""
+
+import hashlib
+import json
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import RecipeError, UsageError
+from cnpgen.problems.problem import FILES, Problem, resolved
+from cnpgen.problems.problem_file import load_problem_behind, restore_problem
+from cnpgen.robots.urdf import urdf_tree
+from cnpgen.schema.keys import RecipeLocation
+from cnpgen.schema.parsing import parse
+from cnpgen.store.dataset_spec import StoredProblem
+from cnpgen.store.files.document_structure import ANY_KEY, NUMBER, TEXT, WHOLE, check_structure
+from cnpgen.store.files.documents import canonical_sha256, differences, parse_json, plain
+from cnpgen.trajectory.trajectory_spec import TrajectorySpec
+
+if TYPE_CHECKING:
+    from cnpgen.robots.robot import Robot
+
+Array = NDArray[np.float64]
+
+_MOVING = ("revolute", "continuous", "prismatic")
+_SCALES = ("position_scale", "velocity_scale", "acceleration_rate", "acceleration_cap", "torque_scale")
+_FORM = {
+    "name": TEXT,
+    "robot": {"urdf": TEXT, "joints": [TEXT], "tip": TEXT, "base": [NUMBER]},
+    "limits": dict.fromkeys(_SCALES, NUMBER),
+    "constraint": [{"use": TEXT}],
+    "trajectory": {ANY_KEY: WHOLE},
+}
+_JUDGED_BY = ("tolerance", "budget", "weight")  # strictness of the verdict, not part of the problem's definition
+
+
+@dataclass(frozen=True, repr=False)
+class ProblemRecord(StoredProblem):
+    """Problem as text, with the properties derived from it."""
+
+    def __repr__(self) -> str:
+        return f"<ProblemRecord of {self.name!r}: {len(self.joint_names)} joints>"
+
+    @cached_property
+    def content(self) -> dict[str, Any]:
+        """The resolved problem, as ``cnpgen.problems.problem.resolved`` returns it.
+
+        Raises:
+            RecipeError: The text is not the JSON of a problem.
+        """
+        try:
+            content: dict[str, Any] = parse_json(self.recipe)
+            check_structure(content, _FORM)
+        except ValueError as error:
+            raise RecipeError([f"problem_recipe is not that of a problem: {error}"]) from error
+        return content
+
+    @property
+    def name(self) -> str:
+        """Name of the problem."""
+        return str(self.content["name"])
+
+    @cached_property
+    def joint_names(self) -> tuple[str, ...]:
+        """The n planned joints."""
+        return tuple(self.content["robot"]["joints"])
+
+    @cached_property
+    def sliding_joints(self) -> tuple[bool, ...]:
+        """Whether each planned joint is prismatic."""
+        joints = urdf_tree(self.urdf).iter("joint")
+        sliding = {joint.get("name") for joint in joints if joint.get("type") == "prismatic"}
+        return tuple(name in sliding for name in self.joint_names)
+
+    @property
+    def held_joints(self) -> dict[str, float]:
+        """Unplanned movable joints of the URDF -> constant position [rad or m], zero."""
+        joints = urdf_tree(self.urdf).iter("joint")
+        moving = (joint.get("name", "") for joint in joints if joint.get("type") in _MOVING)
+        return dict.fromkeys((name for name in moving if name not in self.joint_names), 0.0)
+
+    @cached_property
+    def trajectory(self) -> TrajectorySpec:
+        """Parametrization suggested by the problem.
+
+        Raises:
+            RecipeError: There is no such parametrization.
+        """
+        mistakes: list[str] = []
+        where = RecipeLocation("problem_recipe", "trajectory")
+        spec = parse(TrajectorySpec, self.content["trajectory"], where=where, mistakes=mistakes)
+        if spec is None:
+            raise RecipeError(mistakes)
+        return spec
+
+    @cached_property
+    def comparable_sha256(self) -> str:
+        """Hash (sha256) of the part that problems with comparable plans share: ``problem_sha256`` in files.
+
+        Excluded are name and title, base configuration, suggested parametrization, objective, and tolerances of
+        constraints. It does not identify a problem; caches must use ``Problem.identity``.
+        """
+        return canonical_sha256(_comparable(self))
+
+    def differences(self, other: "ProblemRecord") -> list[str]:
+        """Return the keys in which two problems differ, such as ``"limits.velocity_scale"``."""
+        return [each.key for each in differences(_comparable(self), _comparable(other))]
+
+    @contextmanager
+    def restored(self) -> Iterator[Problem]:
+        """Rebuild the problem; its URDF is in a temporary folder, which is deleted at the end of the block.
+
+        Raises:
+            RecipeError: The problem needs another version of cnpgen, or a plug-in that is not installed.
+        """
+        with tempfile.TemporaryDirectory(prefix="cnpgen-") as folder:
+            yield restore_problem(self.content, self.urdf, Path(folder))
+
+    def tip_positions(self, q: Array) -> Array:
+        """Compute tip positions with Pinocchio.
+
+        Args:
+            q: Joint positions [rad], shape (N, n).
+
+        Returns:
+            Tip positions in the world frame [m], shape (N, 3).
+        """
+        import pinocchio as pin
+
+        _, robot = open_problem(self)
+        model = robot.model
+        data, frame = model.createData(), robot.tip_frame
+        found = np.empty((len(q), 3))
+        for row, configuration in enumerate(q):
+            pin.forwardKinematics(model, data, configuration)
+            found[row] = pin.updateFramePlacement(model, data, frame).translation
+        return found
+
+
+def record_problem(problem: Problem) -> ProblemRecord:
+    """Return the record of a problem and its URDF."""
+    recipe = json.dumps(plain(resolved(problem)), ensure_ascii=False, allow_nan=False)
+    return ProblemRecord(recipe, problem.urdf_text)
+
+
+def as_problem(problem: object) -> Problem:
+    """Return a problem from a problem, a record, a name or a path.
+
+    Args:
+        problem: A problem, its record, or the name or the file of a problem, a pipeline or a dataset.
+
+    Raises:
+        UsageError: The argument has another type.
+        RecipeError: There is no such recipe, or the problem file has mistakes.
+    """
+    if isinstance(problem, Problem):
+        return problem
+    if isinstance(problem, StoredProblem):
+        return _rebuilt(as_record(problem))
+    if isinstance(problem, str | Path):
+        return load_problem_behind(problem)
+    expected = "a Problem, a ProblemRecord, or the name or the file of a problem, a pipeline or a dataset"
+    raise UsageError(f"must be {expected}, got {problem!r:.60}", argument="problem")
+
+
+def as_record(problem: object) -> ProblemRecord:
+    """Return the record of a problem from any argument of ``as_problem``.
+
+    Raises:
+        UsageError: The argument has another type.
+        RecipeError: There is no such recipe, or the problem file has mistakes.
+    """
+    if isinstance(problem, ProblemRecord):
+        return problem
+    if isinstance(problem, StoredProblem):
+        return ProblemRecord(problem.recipe, problem.urdf)
+    return record_problem(as_problem(problem))
+
+
+@lru_cache(maxsize=8)
+def _rebuilt(record: ProblemRecord) -> Problem:
+    """Rebuild a problem in a folder that exists until this process ends, since its URDF is read lazily."""
+    from cnpgen.kernels.cache import temporary_folder
+
+    return restore_problem(record.content, record.urdf, temporary_folder())
+
+
+@lru_cache(maxsize=8)
+def open_problem(record: ProblemRecord) -> "tuple[Problem, Robot]":
+    """Rebuild a problem and its robot, which both contain the URDF; the files are deleted afterwards.
+
+    Raises:
+        RecipeError: The problem needs another version of cnpgen, or a plug-in that is not installed.
+    """
+    from cnpgen.problems.load_robot import load_robot
+
+    with record.restored() as problem:
+        return problem, load_robot(problem)
+
+
+def _comparable(record: ProblemRecord) -> dict[str, Any]:
+    """Reduce a resolved problem to the part that problems with comparable plans share."""
+    kept = {
+        key: value for key, value in record.content.items() if key not in {"name", "title", "trajectory", "objective"}
+    }
+    robot = {key: value for key, value in kept["robot"].items() if key not in {*FILES, "base"}}
+    robot["urdf"] = hashlib.sha256(record.urdf.encode()).hexdigest()
+    constraints: dict[str, Any] = {}
+    for kind in kept["constraint"]:
+        count = sum(name.split()[0] == kind["use"] for name in constraints)
+        name = f"{kind['use']} {count + 1}" if count else kind["use"]
+        constraints[name] = {key: value for key, value in kind.items() if key not in _JUDGED_BY}
+    return kept | {"robot": robot, "constraint": constraints}

@@ -1,0 +1,334 @@
+"""The robot of a problem for planner authors: limits, batched kinematics, dynamics, collisions and constraint values."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cnpgen.errors import UsageError
+from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.problem import Problem
+from cnpgen.problems.problem_record import as_problem
+from cnpgen.robots.scene import Scene
+from cnpgen.robots.solid import place_obstacles, pose_width
+from cnpgen.schema.arguments import numbers
+from cnpgen.store.dataset_spec import StoredProblem
+
+if TYPE_CHECKING:
+    from cnpgen.kernels.kernel import Kernel
+    from cnpgen.kernels.library import KernelLibrary
+    from cnpgen.kernels.symbolic.symbolic_state import FrozenState
+    from cnpgen.problems.constraints.constraint import Condition, Constraint
+    from cnpgen.robots.robot import Robot
+    from cnpgen.world.world import World
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class ConstraintValues:
+    """Values of all conditions of a problem at N states, with derivatives.
+
+    A state is valid if ``lower - tolerance <= g <= upper + tolerance``. Derivatives are those of the symbolic form, with
+    closest points of distances treated as constant (envelope theorem).
+
+    Attributes:
+        names: Name of the constraint of each value, length m.
+        g: Values in SI units, shape (N, m).
+        lower: Lower bounds, shape (m,); -inf without a bound.
+        upper: Upper bounds, shape (m,); inf without a bound.
+        tolerance: Accepted violation of each value, shape (m,).
+        jacobian_q: Derivatives with respect to joint positions, shape (N, m, n).
+        jacobian_dq: Derivatives with respect to joint velocities, shape (N, m, n).
+        jacobian_ddq: Derivatives with respect to joint accelerations, shape (N, m, n).
+    """
+
+    names: tuple[str, ...]
+    g: Array
+    lower: Array
+    upper: Array
+    tolerance: Array
+    jacobian_q: Array
+    jacobian_dq: Array
+    jacobian_ddq: Array
+
+    @property
+    def violation(self) -> Array:
+        """Distance of each value from its bounds, 0 inside, shape (N, m)."""
+        return np.maximum(np.maximum(self.lower - self.g, self.g - self.upper), 0.0)
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """Whether each state satisfies every condition up to its tolerance, shape (N,)."""
+        return np.asarray((self.violation <= self.tolerance).all(axis=1))
+
+
+class RobotModel:
+    """The robot of a problem: limits, batched forward kinematics, Jacobians, dynamics, collisions and constraints.
+
+    Positions, velocities and accelerations have shape (N, n) or (n,), in rad, rad/s and rad/s^2 (m for sliding joints).
+    Results have the first axis N. Vectors are in the world frame. Kernels are compiled on first use. Distances are
+    measured by Coal; all other results use the kernels of the solvers. Use an object in one thread only.
+
+    Args:
+        problem: The problem, its record, or the name or file of a problem, a pipeline or a dataset.
+        backend: "compiled", "numpy" or "casadi"; by default the fastest available.
+
+    Attributes:
+        problem: The problem.
+        joint_names: Names of the n planned joints.
+        tip: Name of the tip frame.
+        base: Base configuration [rad], shape (n,).
+        position_lower: Planning limits of joint positions [rad], shape (n,).
+        position_upper: Planning limits of joint positions [rad], shape (n,).
+        velocity_limit: Planning limits of joint velocities [rad/s], shape (n,).
+        acceleration_limit: Planning limits of joint accelerations [rad/s^2], shape (n,).
+        jerk_limit: Planning limits of joint jerks [rad/s^3], shape (n,).
+        torque_limit: Planning limits of joint torques [N m], shape (n,).
+
+    Raises:
+        UsageError: ``problem`` is no problem, or ``backend`` is unknown.
+        RecipeError: The recipe has mistakes.
+        MachineError: The backend is not available.
+    """
+
+    def __init__(self, problem: Problem | StoredProblem | str | Path, *, backend: str | None = None) -> None:
+        from cnpgen.kernels.library import choose_backend, problem_kernels
+
+        self.problem = as_problem(problem)
+        self._robot: Robot = load_robot(self.problem)
+        robot = self._robot
+        self.joint_names, self.tip, self.base = robot.joint_names, robot.tip, robot.base
+        self.position_lower, self.position_upper = robot.position_lower, robot.position_upper
+        self.velocity_limit, self.acceleration_limit = robot.velocity_limit, robot.acceleration_limit
+        self.jerk_limit, self.torque_limit = robot.jerk_limit, robot.torque_limit
+        self._kernels: KernelLibrary = problem_kernels(self.problem, robot, *choose_backend(backend))
+        self._loaded: dict[str, Kernel] = {}
+        self._world: World | None = None
+
+    def __repr__(self) -> str:
+        return f"<RobotModel of {self.problem.name!r}: {len(self.joint_names)} joints, tip {self.tip!r}>"
+
+    def forward_kinematics(self, q: ArrayLike) -> tuple[Array, Array]:
+        """Compute the pose of the tip.
+
+        Args:
+            q: Joint positions [rad], shape (N, n) or (n,).
+
+        Returns:
+            Positions [m], shape (N, 3), and rotation matrices, shape (N, 3, 3).
+        """
+        position, rotation, _ = self._run("tip_pose", self._states("q", q))
+        return position.T.copy(), rotation.T.reshape(-1, 3, 3)
+
+    def jacobian(self, q: ArrayLike) -> Array:
+        """Compute the geometric Jacobian of the tip in world axes, linear rows first.
+
+        Args:
+            q: Joint positions [rad], shape (N, n) or (n,).
+
+        Returns:
+            Shape (N, 6, n): m/rad in the first three rows, 1 in the others.
+        """
+        _, _, jacobian = self._run("tip_pose", self._states("q", q))
+        return jacobian.T.reshape(-1, 6, len(self.joint_names))
+
+    def inverse_dynamics(self, q: ArrayLike, dq: ArrayLike | None = None, ddq: ArrayLike | None = None) -> Array:
+        """Compute joint torques, payload included.
+
+        Args:
+            q: Joint positions [rad], shape (N, n) or (n,).
+            dq: Joint velocities [rad/s]; zero by default.
+            ddq: Joint accelerations [rad/s^2]; zero by default.
+
+        Returns:
+            Torques [N m], shape (N, n).
+        """
+        (torque,) = self._run("inverse_dynamics_of", *self._motion(q, dq, ddq))
+        return torque.T.copy()
+
+    def scene(self, start_xyz: ArrayLike, goal_xyz: ArrayLike) -> Scene:
+        """Place the obstacles of N samples; some stand below the object at the start or at the goal.
+
+        Args:
+            start_xyz: Tip positions at the start [m], shape (N, 3) or (3,).
+            goal_xyz: Tip positions at the goal [m], shape (N, 3) or (3,).
+        """
+        from cnpgen.problems.obstacles import scene_of
+
+        start, goal = (
+            np.atleast_2d(numbers(name, xyz)) for name, xyz in (("start_xyz", start_xyz), ("goal_xyz", goal_xyz))
+        )
+        return scene_of(self.problem, start, goal)
+
+    def constraint_values(
+        self,
+        q: ArrayLike,
+        dq: ArrayLike | None = None,
+        ddq: ArrayLike | None = None,
+        *,
+        scene: Scene | None = None,
+    ) -> ConstraintValues:
+        """Evaluate every condition of the problem with its derivatives; conditions of jerks are left out.
+
+        Args:
+            q: Joint positions [rad], shape (N, n) or (n,).
+            dq: Joint velocities [rad/s]; zero by default.
+            ddq: Joint accelerations [rad/s^2]; zero by default.
+            scene: Obstacles of N samples, or of one for all states; by default where the problem places them.
+        """
+        states = self._motion(q, dq, ddq)
+        lanes = self._lanes(scene, states[0].shape[1])
+        g, *jacobians = self._run("constraint_values_of", *states, lanes)
+        names, lower, upper, tolerance = self._conditions()
+        shape = (len(self.joint_names), len(names))
+        return ConstraintValues(
+            names,
+            g.T.copy(),
+            lower,
+            upper,
+            tolerance,
+            *(part.T.reshape(-1, *shape).swapaxes(1, 2) for part in jacobians),
+        )
+
+    def min_distance(self, q: ArrayLike, *, scene: Scene | None = None) -> Array:
+        """Measure the smallest distance with Coal: links and held object from obstacles, and links from each other.
+
+        Args:
+            q: Joint positions [rad], shape (N, n) or (n,).
+            scene: Obstacles of N samples, or of one for all states; by default where the problem places them.
+
+        Returns:
+            Signed distances [m], negative for penetration, shape (N,); inf without obstacles and collision pairs. With the
+            paper's capsule model, the distance of the capsule axes less the radius of ``robot-clearance``.
+        """
+        states = self._states("q", q)
+        poses = self._lanes(scene, states.shape[1])
+        return np.array([self._distance_at(states[:, k], poses[:, k]) for k in range(states.shape[1])])
+
+    def is_collision_free(self, q: ArrayLike, *, scene: Scene | None = None) -> NDArray[np.bool_]:
+        """Return whether nothing penetrates at each state, shape (N,); arguments as of ``min_distance``."""
+        return np.asarray(self.min_distance(q, scene=scene) >= 0)
+
+    def _distance_at(self, q: Array, poses: Array) -> float:
+        from cnpgen.world.world import World
+
+        problem, robot = self.problem, self._robot
+        if self._world is None:
+            self._world = World(robot, problem.obstacle, problem.object_size)
+        world, rest = self._world, np.zeros(robot.n)
+        world.set_state(q, rest, rest, poses)
+        distances: list[float] = []
+        if robot.shape is not None:
+            distances += [*world.self_distances(), *(world.shape_distances() if problem.obstacle else ())]
+        elif problem.obstacle:
+            radii = [float(getattr(item, "radius", 0.0) or 0.0) for item in problem.constraint]
+            distances += [distance - max(radii, default=0.0) for distance in world.segment_distances()]
+        if problem.obstacle and problem.object_size is not None:
+            distances += world.object_distances()
+        return min(distances, default=np.inf)
+
+    def _lanes(self, scene: Scene | None, n: int) -> Array:
+        """Return poses of obstacles for n states, shape (width, n)."""
+        if scene is None:
+            return np.repeat(place_obstacles(self.problem.obstacle)[:, None], n, axis=1)
+        if len(scene) not in {1, n}:
+            raise UsageError(f"must have one sample or {n}, got {len(scene)}", argument="scene")
+        return scene.lanes if len(scene) == n else np.repeat(scene.lanes, n, axis=1)
+
+    def _states(self, name: str, values: ArrayLike) -> Array:
+        """Return states as kernels take them, shape (n, N)."""
+        array, n = np.atleast_2d(numbers(name, values)), len(self.joint_names)
+        if array.ndim != 2 or array.shape[1] != n or not len(array):
+            raise UsageError(f"{name} must have shape (N, {n}) or ({n},), got {np.shape(values)}")
+        if not np.isfinite(array).all():
+            raise UsageError(f"{name} must be finite")
+        return np.ascontiguousarray(array.T)
+
+    def _motion(self, q: ArrayLike, dq: ArrayLike | None, ddq: ArrayLike | None) -> tuple[Array, Array, Array]:
+        states = self._states("q", q)
+        rates = [
+            np.zeros_like(states) if x is None else self._states(name, x) for name, x in (("dq", dq), ("ddq", ddq))
+        ]
+        for name, rate in zip(("dq", "ddq"), rates, strict=True):
+            if rate.shape != states.shape:
+                raise UsageError(f"{name} must have as many rows as q, {states.shape[1]}, got {rate.shape[1]}")
+        return states, rates[0], rates[1]
+
+    def _run(self, builder: str, *arguments: Array) -> list[Array]:
+        if builder not in self._loaded:
+            self._loaded[builder] = self._kernels.load(globals()[builder])
+        return self._loaded[builder](*arguments)
+
+    def _conditions(self) -> tuple[tuple[str, ...], Array, Array, Array]:
+        """Return name, bounds and tolerance of every value that ``constraint_values_of`` computes."""
+        _, pairs = _symbolic_conditions(self._robot, self.problem)
+        names = tuple(condition.name for _, condition in pairs for _ in condition.g)
+        empty = [np.zeros(0)]
+        lower = np.concatenate([condition.lower for _, condition in pairs] or empty)
+        upper = np.concatenate([condition.upper for _, condition in pairs] or empty)
+        tolerance = np.concatenate([constraint.allowed(condition) for constraint, condition in pairs] or empty)
+        return names, lower, upper, tolerance
+
+
+def load_robot_model(problem: Problem | StoredProblem | str | Path, *, backend: str | None = None) -> RobotModel:
+    """Load the robot of a problem; see ``RobotModel`` for arguments and errors."""
+    return RobotModel(problem, backend=backend)
+
+
+def tip_pose(robot: "Robot") -> Any:
+    """Build ``q -> (p, R, J)``: position, rotation row by row, and geometric Jacobian row by row of the tip."""
+    import casadi as ca
+
+    from cnpgen.kernels.symbolic.kinematics import forward_kinematics
+    from cnpgen.kernels.symbolic.linalg import symbols
+
+    q_sx, q = symbols("q", robot.n)
+    kin = forward_kinematics(robot.chain, q)
+    angular = [axis if turns else [0.0, 0.0, 0.0] for axis, turns in zip(kin.axes, kin.turning, strict=True)]
+    jacobian = [column[row] for columns in (kin.jacobian, angular) for row in range(3) for column in columns]
+    rotation = [value for row in kin.rotation for value in row]
+    outputs = [ca.densify(ca.vertcat(*map(ca.SX, values))) for values in (kin.tip, rotation, jacobian)]
+    return ca.Function("tip_pose", [q_sx], ca.cse(outputs))
+
+
+def inverse_dynamics_of(robot: "Robot") -> Any:
+    """Build ``(q, dq, ddq) -> tau``, recursive Newton-Euler."""
+    import casadi as ca
+
+    from cnpgen.kernels.symbolic.dynamics import inverse_dynamics
+    from cnpgen.kernels.symbolic.linalg import symbols
+
+    pairs = [symbols(name, robot.n) for name in ("q", "dq", "ddq")]
+    torque = inverse_dynamics(robot.chain, *(values for _, values in pairs))
+    return ca.Function("inverse_dynamics_of", [sx for sx, _ in pairs], [ca.cse(ca.densify(ca.vertcat(*torque)))])
+
+
+def constraint_values_of(robot: "Robot", problem: Problem) -> Any:
+    """Build ``(q, dq, ddq, obstacle poses) -> (g, dg/dq, dg/d(dq), dg/d(ddq))``, Jacobians column by column."""
+    import casadi as ca
+
+    state, pairs = _symbolic_conditions(robot, problem)
+    inputs = [ca.vertcat(*values) for values in (state.q, state.dq, state.ddq, state.obstacle_poses)]
+    g = ca.vertcat(*(value for _, condition in pairs for value in condition.g))
+    jacobians = [ca.vec(ca.densify(ca.jacobian(g, x))) for x in inputs[:3]]
+    outputs = ca.cse(state.unfrozen([ca.densify(g), *jacobians]))
+    return ca.Function("constraint_values_of", inputs, outputs)
+
+
+def _symbolic_conditions(robot: "Robot", problem: Problem) -> "tuple[FrozenState, list[tuple[Constraint, Condition]]]":
+    from cnpgen.kernels.symbolic.linalg import symbols
+    from cnpgen.kernels.symbolic.symbolic_state import FrozenState
+
+    widths = {"q": robot.n, "dq": robot.n, "ddq": robot.n, "poses": pose_width(problem.obstacle)}
+    q, dq, ddq, poses = (symbols(name, width)[1] for name, width in widths.items())
+    state = FrozenState(robot, q, dq, ddq, poses, problem.obstacle, problem.object_size)
+    pairs = [
+        (constraint, condition)
+        for constraint in problem.constraint
+        if not constraint.uses_jerk
+        for condition in constraint.symbolic(state)
+    ]
+    return state, pairs

@@ -1,0 +1,177 @@
+"""Residuals on a grid finer than the solver's, and uniform time scaling of motions that violate their limits."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.problems.problem import Problem
+from cnpgen.refine.solver.bounds import NO_TIGHTENING, BoundsTemplate
+from cnpgen.refine.solver.grid import make_grid
+from cnpgen.refine.solver.transcription import ResidualKernels, Transcription, cache_last
+from cnpgen.refine.task import RefinementTask
+from cnpgen.robots.solid import pose_width
+
+if TYPE_CHECKING:
+    from cnpgen.world.world import World
+
+Array = NDArray[np.float64]
+FINE_POINTS = 600
+MAX_SCALINGS = 6  # of one motion, each by the factor that its largest violation requires
+MIN_RESIDUAL_TOLERANCE = 1e-12  # of scaled residuals: below rounding errors
+MIN_END_VIOLATION = 1.5  # tolerances: the bounds near an end differ slightly from those at it
+MAX_SCALING = 1.25  # a motion that must be slower by more is left to the solver, which finds a better one
+
+
+@dataclass(frozen=True)
+class GridViolation:
+    """Largest violation of the bounds on the fine grid.
+
+    Attributes:
+        worst: Largest violation as a multiple of its tolerance; inf where a residual is not finite.
+        position: Whether a condition on q alone violates its tolerance.
+        time_scale: Factor of the duration, at least 1, that removes the worst violations of velocity, acceleration,
+            torque and jerk. These scale with the rate, its square and its cube.
+    """
+
+    worst: float
+    position: bool
+    time_scale: float
+
+
+@dataclass(frozen=True)
+class RestBounds:
+    """Bounds of the residuals of a robot at rest halfway along the motion, shape (m,) each.
+
+    Attributes:
+        lower: Lower bounds.
+        upper: Upper bounds.
+        capsules: Mask of the clearances of capsules.
+        equal: Mask of the equalities of positions.
+    """
+
+    lower: Array
+    upper: Array
+    capsules: NDArray[np.bool_]
+    equal: NDArray[np.bool_]
+
+
+class FineCheck:
+    """Evaluation of motions of one problem on the fine grid.
+
+    Args:
+        problem: The problem.
+        world: World of the problem.
+        kernels: Residual kernels.
+
+    Attributes:
+        equalities: Names of the equality conditions.
+    """
+
+    def __init__(self, problem: Problem, world: "World", kernels: ResidualKernels) -> None:
+        self._grid = make_grid(kernels.spec, FINE_POINTS, problem.path_orders)
+        self._last = cache_last(
+            lambda task: Transcription(kernels, self._grid, boundary=task.boundary, obstacle_poses=task.obstacle_poses)
+        )
+        self._bounds = BoundsTemplate(problem, world, self._grid.s, NO_TIGHTENING)
+        conditions = self._bounds.conditions
+        self.equalities = {condition.name for condition in conditions if condition.is_equality}
+        limits = np.repeat(
+            [condition.tolerance_kind == "limit" for condition in conditions],
+            [len(condition.g) for condition in conditions],
+        )
+        self._speeds = np.flatnonzero((self._bounds.orders == 1) & ~limits)  # bounded speeds other than those of joints
+        self._powers = _powers_of_rate(problem, world, kernels)[self._speeds] if len(self._speeds) else np.empty(0)
+
+    def transcription(self, task: RefinementTask) -> Transcription:
+        """Return the transcription on the fine grid; the last one is cached."""
+        return self._last(task)
+
+    def measure(self, task: RefinementTask, x: Array) -> tuple[float, GridViolation]:
+        """Return the objective [s] and the largest violation of a motion with variables x, shape (nx,)."""
+        motion = self.transcription(task)
+        cost, g = motion.measured(x)
+        bounds = self._bounds.bounds_for(task.start_xyz)
+        with np.errstate(invalid="ignore"):
+            ratio = bounds.violations(g) / np.maximum(self._bounds.tolerances, MIN_RESIDUAL_TOLERANCE)
+        worst = float(ratio.max())
+        if not np.isfinite(worst):
+            return cost, GridViolation(np.inf, True, np.inf)
+        if worst <= 1:
+            return cost, GridViolation(worst, False, 1.0)
+        violated = ratio > 1
+        with np.errstate(divide="ignore", invalid="ignore"):
+            size = np.where(violated, g / np.where(g > bounds.upper, bounds.upper, bounds.lower), 0.0).max(axis=0)
+            size[self._speeds] **= 1 / self._powers
+        speed, strength, jerk = (size[self._bounds.orders == order].max(initial=1.0) for order in (1, 2, 3))
+        time_scale = max(speed, float(np.sqrt(strength)), float(np.cbrt(jerk)))
+        return cost, GridViolation(worst, bool(violated[:, self._bounds.orders == 0].any()), time_scale)
+
+    def rest_bounds(self, task: RefinementTask) -> RestBounds:
+        """Return the bounds halfway along the motion, relaxed by their tolerances except for clearances of capsules."""
+        bounds, half, capsules = self._bounds.bounds_for(task.start_xyz), FINE_POINTS // 2, self._bounds.capsules
+        tolerances = np.where(capsules, 0.0, self._bounds.tolerances)
+        equal = self._bounds.equal & (self._bounds.orders == 0)
+        return RestBounds(bounds.lower[half] - tolerances, bounds.upper[half] + tolerances, capsules, equal)
+
+    def speed_ratio(self, task: RefinementTask, x: Array) -> float:
+        """Return the factor by which a motion exceeds bounds of speeds other than those of joints, at least 1.
+
+        Initial guesses respect the velocity limits of the joints only, not those of the tip or of a plug-in.
+        """
+        if not len(self._speeds):
+            return 1.0
+        g, upper = self.transcription(task).measured(x)[1], self._bounds.bounds_for(task.start_xyz).upper
+        with np.errstate(divide="ignore", invalid="ignore"):
+            over = np.nanmax(g[:, self._speeds] / upper[:, self._speeds], axis=0)
+        return max(float(np.max(np.maximum(over, 0.0) ** (1 / self._powers))), 1.0)
+
+    def ends_are_invalid(self, task: RefinementTask) -> bool:
+        """Return whether the boundary conditions alone violate a bound by more than its tolerance."""
+        return bool(np.nanmax(self._end_violations(task)) > MIN_END_VIOLATION)
+
+    def end_equality_error(self, task: RefinementTask) -> float:
+        """Return the largest error of the boundary conditions in an equality, as a multiple of its tolerance."""
+        return float(np.fmax.reduce(self._end_violations(task)[:, self._bounds.equal], axis=None, initial=0.0))
+
+    def _end_violations(self, task: RefinementTask) -> Array:
+        bounds, motion = self._bounds.bounds_for(task.start_xyz), self.transcription(task)
+        violations = bounds.end_violations(motion.end_residuals())
+        return np.asarray(violations / np.maximum(self._bounds.tolerances, MIN_RESIDUAL_TOLERANCE))
+
+    def scale_time(
+        self, task: RefinementTask, motion: Transcription, x: Array, *, unlimited: bool = False
+    ) -> tuple[Array, float, GridViolation]:
+        """Scale a motion from rest to rest uniformly in time until it meets its limits.
+
+        The path is unchanged; the rate is divided by one factor. This does not reduce violations of positions or of
+        torques that gravity causes. Motions with such violations are scaled only if ``unlimited``.
+
+        Returns:
+            ``(variables, objective, violation)`` of the scaled motion, or of the last one tried.
+        """
+        total = 1.0
+        cost, violation = self.measure(task, x)
+        for _ in range(MAX_SCALINGS):
+            if violation.worst <= 1 or violation.time_scale <= 1 or not np.isfinite(violation.time_scale):
+                break
+            if not unlimited and (violation.position or total * violation.time_scale > MAX_SCALING):
+                break
+            total *= violation.time_scale * (1 + 1e-9)
+            x = x.copy()
+            x[motion.split :] -= np.log(violation.time_scale * (1 + 1e-9))
+            cost, violation = self.measure(task, x)
+        return x, cost, violation
+
+
+def _powers_of_rate(problem: Problem, world: "World", kernels: ResidualKernels) -> Array:
+    """Return the power of the rate with which every residual of velocities grows, at least 1, shape (m,)."""
+    n, orders, random = world.robot.n, problem.path_orders, np.random.default_rng(0)
+    w = np.zeros((orders * n + orders - 1, 2))
+    w[: 2 * n] = random.uniform(0.1, 1.0, (2 * n, 1))
+    w[orders * n] = 1.0, 2.0
+    (g,) = kernels.values(w, np.zeros((pose_width(problem.obstacle), 2)))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        powers = np.log2(g[:, 1] / g[:, 0]).round()
+    return np.asarray(np.maximum(np.nan_to_num(powers, nan=1.0, posinf=1.0), 1.0))

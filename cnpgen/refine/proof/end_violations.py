@@ -1,0 +1,103 @@
+"""Violations of constraints by the boundary states themselves, measured by Pinocchio and Coal."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.problems.constraints.constraint import Condition, Constraint
+from cnpgen.problems.constraints.joint import JointTorque
+from cnpgen.problems.constraints.needs import measured_needs
+from cnpgen.problems.obstacles import obstacle_poses_of
+from cnpgen.problems.problem import Problem
+from cnpgen.refine.proof.reachable_positions import joint_limits
+from cnpgen.robots.robot import Robot
+from cnpgen.store.joint_units import unit_of
+from cnpgen.trajectory.boundary import Boundary
+from cnpgen.world.world import World
+
+Array = NDArray[np.float64]
+# Relative to the bound, or absolute, by the derivative on which a condition depends: more than the condition changes
+# within the verdict's tolerances of boundary conditions, 1e-6 rad, 1e-6 rad/s and 1e-4 rad/s^2.
+BOUNDARY_MARGIN = (1e-5, 1e-5, 1e-3)
+
+
+def end_violations(
+    problem: Problem, robot: Robot, boundary: Boundary, *, start_xyz: Array, goal_xyz: Array
+) -> Iterator[str]:
+    """Describe the constraints that an end of one motion violates by more than their tolerance.
+
+    If the boundary conditions leave the acceleration at the goal free, there must be one within its limits whose
+    torques are within theirs.
+
+    Args:
+        problem: The problem.
+        robot: Its robot.
+        boundary: Boundary conditions of one motion.
+        start_xyz: Position of the tip at the start [m], shape (3,).
+        goal_xyz: Position of the tip at the goal [m], shape (3,).
+    """
+    world = World(robot, problem.obstacle, problem.object_size)
+    obstacle_poses = obstacle_poses_of(problem, start_xyz, goal_xyz)
+    goal_ddq = np.zeros(robot.n) if boundary.goal_ddq is None else boundary.goal_ddq[0]
+    ends = {
+        "start": (boundary.start_q[0], boundary.start_dq[0], boundary.start_ddq[0]),
+        "goal": (boundary.goal_q[0], boundary.goal_dq[0], goal_ddq),
+    }
+    orders = measured_needs([constraint.measured for constraint in problem.constraint], world)
+    world.set_state(*ends["start"], obstacle_poses)
+    tip = world.tip_position
+    for end, state in ends.items():
+        world.set_state(*state, obstacle_poses)
+        free = end == "goal" and boundary.goal_ddq is None
+        pairs = [
+            (constraint, condition) for constraint in problem.constraint for condition in constraint.measured(world)
+        ]
+        for (constraint, condition), order in zip(pairs, orders, strict=True):
+            if not (free and order == 2):
+                yield from _violation(constraint, condition, tip, end, BOUNDARY_MARGIN[order])
+    if boundary.goal_ddq is None and not _has_acceleration(problem, robot, *ends["goal"][:2]):
+        yield "at the goal there is no acceleration within its limits whose torques are within theirs"
+
+
+def _violation(
+    constraint: Constraint, condition: Condition, start_tip: Array, end: str, margin: float
+) -> Iterator[str]:
+    """Describe a violation of a measured condition by more than tolerance and margin, see ``BOUNDARY_MARGIN``."""
+    g = np.array(condition.g, float)
+    phase = np.array([0.0 if end == "start" else 1.0])
+    relaxation = float(constraint.bound_relaxation(condition, phase, start_tip)[0])
+    bound = np.where(g < condition.lower, condition.lower - relaxation, condition.upper + relaxation)
+    violation = np.maximum(condition.lower - g, g - condition.upper) - relaxation
+    tolerance = constraint.allowed(condition)
+    worst = int(np.argmax(violation - tolerance))
+    if violation[worst] > tolerance[worst] + margin * max(1.0, abs(bound[worst])):
+        unit = "" if condition.unit == "1" else f" {unit_of(condition.unit, worst)}"
+        yield (
+            f"at the {end} {condition.name} is {g[worst]:.6g}{unit}, expected {bound[worst]:.6g}{unit}"
+            f" with a tolerance of {tolerance[worst]:.2g}{unit}"
+        )
+
+
+def _has_acceleration(problem: Problem, robot: Robot, q: Array, dq: Array) -> bool:
+    """Return whether an acceleration within its limits, tolerances included, has torques within theirs."""
+    import pinocchio as pin
+    from scipy.optimize import linprog
+
+    torque = [constraint for constraint in problem.constraint if isinstance(constraint, JointTorque)]
+    if not torque:
+        return True
+    acceleration = joint_limits(problem, robot, tolerances=1.0).acceleration
+    tolerance = min(constraint.tolerance for constraint in torque)
+    limit = robot.torque_limit * (1 + tolerance + BOUNDARY_MARGIN[2]) + BOUNDARY_MARGIN[2]
+    data = robot.model.createData()
+    bias = np.array(pin.rnea(robot.model, data, q, dq, np.zeros(robot.n)))
+    inertia = np.array([pin.rnea(robot.model, data, q, dq, unit) - bias for unit in np.eye(robot.n)]).T
+    solved = linprog(
+        np.zeros(robot.n),
+        A_ub=np.vstack([inertia, -inertia]),
+        b_ub=np.concatenate([limit - bias, limit + bias]),
+        bounds=[(-value, value) for value in acceleration],
+        method="highs",
+    )
+    return bool(solved.status != 2)  # 2: infeasible

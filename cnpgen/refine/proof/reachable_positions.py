@@ -1,0 +1,102 @@
+"""Joint positions that any motion within its limits can reach some time after the start, or before the goal."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.problems.constraints.joint import JointAcceleration, JointPosition, JointVelocity
+from cnpgen.problems.problem import Problem
+from cnpgen.robots.robot import Robot
+from cnpgen.trajectory.boundary import Boundary
+
+Array = NDArray[np.float64]
+NO_LIMIT = 1e6  # replaces a limit that the problem does not set
+DURATION_STEP_S = 1e-3  # of the search for the minimum duration
+SAMPLED_STEPS = np.arange(10, 151, 10)  # from an end; later, intervals are too wide to prove anything
+
+
+@dataclass(frozen=True)
+class JointLimits:
+    """Limits of positions, velocities and accelerations, shape (n,) each; the last two are symmetric."""
+
+    lower: Array
+    upper: Array
+    velocity: Array
+    acceleration: Array
+
+
+def joint_limits(problem: Problem, robot: Robot, *, tolerances: float) -> JointLimits:
+    """Return the limits of a problem's constraints.
+
+    Args:
+        problem: The problem.
+        robot: Its robot.
+        tolerances: Fraction of the constraints' tolerances by which the limits are relaxed, from 0 to 1.
+    """
+    lower, upper, velocity, acceleration = (sign * np.full(robot.n, NO_LIMIT) for sign in (-1, 1, 1, 1))
+    for constraint in problem.constraint:
+        tolerance = tolerances * constraint.tolerance
+        if isinstance(constraint, JointPosition):
+            lower, upper = robot.position_lower - tolerance, robot.position_upper + tolerance
+        elif isinstance(constraint, JointVelocity):
+            velocity = robot.velocity_limit * (1 + tolerance)
+        elif isinstance(constraint, JointAcceleration):
+            acceleration = robot.acceleration_limit * (1 + tolerance)
+    return JointLimits(lower, upper, velocity, acceleration)
+
+
+@dataclass(frozen=True)
+class EndState:
+    """State at the start of a motion, or at its goal with reversed time.
+
+    Attributes:
+        q: Joint positions [rad], shape (n,).
+        dq: Joint velocities [rad/s], shape (n,); at the goal the opposite of the motion's.
+    """
+
+    q: Array
+    dq: Array
+
+    def box(self, time: float, limits: JointLimits) -> tuple[Array, Array]:
+        """Bound each joint's position ``time`` [s] later: (lower, upper), shape (n,); empty where lower > upper."""
+        upper = _max_position(self.q, self.dq, time, limits)
+        lower = -_max_position(-self.q, -self.dq, time, limits)
+        return np.maximum(lower, limits.lower), np.minimum(upper, limits.upper)
+
+
+def end_states(boundary: Boundary) -> dict[str, EndState]:
+    """Return both end states of one motion."""
+    return {
+        "start": EndState(boundary.start_q[0], boundary.start_dq[0]),
+        "goal": EndState(boundary.goal_q[0], -boundary.goal_dq[0]),
+    }
+
+
+def sample_times(boundary: Boundary, limits: JointLimits) -> Array:
+    """Return times from either end [s] that are shorter than any motion between the two ends."""
+    start, goal = end_states(boundary).values()
+    pairs = (start, goal), (goal, start)
+    min_steps = next(
+        (
+            k
+            for k in range(1, SAMPLED_STEPS[-1] + 1)
+            if all(_reaches(state, other.q, k * DURATION_STEP_S, limits) for state, other in pairs)
+        ),
+        SAMPLED_STEPS[-1] + 1,
+    )
+    return np.asarray(DURATION_STEP_S * SAMPLED_STEPS[min_steps > SAMPLED_STEPS])
+
+
+def _reaches(state: EndState, q: Array, time: float, limits: JointLimits) -> bool:
+    """Return whether q may be reached within one step before ``time``."""
+    lower, upper = state.box(time, limits)
+    change = DURATION_STEP_S * np.maximum(limits.velocity, np.abs(state.dq))
+    return bool(((lower - change <= q) & (q <= upper + change)).all())
+
+
+def _max_position(q: Array, dq: Array, time: float, limits: JointLimits) -> Array:
+    """Return the positions after full acceleration to the velocity limit, and constant velocity from there."""
+    ramp = np.clip((limits.velocity - dq) / limits.acceleration, 0.0, time)
+    cruise = np.maximum(limits.velocity, dq) * (time - ramp)
+    return np.asarray(q + dq * ramp + limits.acceleration * ramp**2 / 2 + cruise)

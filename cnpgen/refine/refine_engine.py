@@ -1,0 +1,166 @@
+"""Refiners of problems with their kernels, and the refinement of plans in one process."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import lru_cache
+from threading import get_ident
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.kernels.library import KernelLibrary, choose_backend, problem_kernels
+from cnpgen.plans.plans import Plans
+from cnpgen.problems.obstacles import obstacle_poses_of
+from cnpgen.problems.problem_record import ProblemRecord, open_problem
+from cnpgen.refine.grid_levels import GridLevels
+from cnpgen.refine.options import DEFAULT_OPTIONS, RefineOptions
+from cnpgen.refine.refiner import Refiner
+from cnpgen.refine.solver.cost_term import choose_cost_term
+from cnpgen.refine.solver.sqp import Settings
+from cnpgen.refine.strategy import PlanChecker, refine_task, refine_task_until
+from cnpgen.refine.task import Attempt, RefinementTask
+from cnpgen.trajectory.boundary import Boundary
+from cnpgen.trajectory.remaining_trajectory import is_finer
+from cnpgen.trajectory.spline_motion import Motion
+from cnpgen.trajectory.trajectory_spec import TrajectorySpec
+
+if TYPE_CHECKING:
+    from cnpgen.problems.problem import Problem
+    from cnpgen.robots.robot import Robot
+
+Array = NDArray[np.float64]
+
+
+class Solver(Protocol):
+    """Function that ``load_solver`` returns."""
+
+    def __call__(
+        self, columns: Mapping[str, Array], initial_guess: Motion | None = None
+    ) -> tuple[Motion, NDArray[np.bool_]]:
+        """Return N motions and the mask of the valid ones."""
+
+
+def refine_serially(plans: Plans, options: RefineOptions) -> list[Attempt]:
+    """Refine plans one by one; results do not depend on the other plans or their order.
+
+    Args:
+        plans: Plans; where control points are not finite or rates not positive, the input plan is not used.
+        options: Options of the refiner.
+    """
+    refiner = prepare(plans, options)
+    checker = _checker(plans.problem, plans.degree, get_ident())
+    if options.deadline is not None:
+        return [refine_task_until(refiner, checker, task, options.deadline) for task in tasks_of(plans)]
+    return [refine_task(refiner, checker, task) for task in tasks_of(plans)]
+
+
+def prepare(plans: Plans, options: RefineOptions) -> Refiner:
+    """Return the refiner for plans; kernels that are not in the cache are compiled."""
+    spec = TrajectorySpec(
+        degree=plans.degree,
+        path_control_points=plans.path_control_points.shape[1],
+        rate_control_points=plans.rate_control_points.shape[1],
+    )
+    return _refiner(plans.problem, spec, replace(options, deadline=None))
+
+
+def tasks_of(plans: Plans) -> list[RefinementTask]:
+    """Return the boundary problem of every plan, with the plan as input plan."""
+    problem, _ = open_problem(plans.problem)
+    tasks = _tasks(problem, plans.boundary, plans.columns["start_xyz"], plans.columns["goal_xyz"])
+    control_points = zip(plans.path_control_points, plans.rate_control_points, strict=True)
+    return [replace(task, path=path, rate=rate) for task, (path, rate) in zip(tasks, control_points, strict=True)]
+
+
+def load_solver(problem: "Problem", robot: "Robot", kernels: KernelLibrary) -> Solver:
+    """Load a function that plans rows of a dataset with the problem's own objective, in one thread.
+
+    Args:
+        problem: The problem.
+        robot: Its robot.
+        kernels: Library of kernels.
+
+    Returns:
+        A function of the columns of N rows, shape (N, width) each, and of N motions as initial guesses, or None. It
+        returns N motions and the mask of those that the verdict accepts, shape (N,).
+    """
+    refiner = load_refiner(problem, robot, kernels=kernels)
+    checker, spec = PlanChecker(problem, robot, degree=refiner.spec.degree), refiner.spec
+
+    def solve(columns: Mapping[str, Array], initial_guess: Motion | None = None) -> tuple[Motion, NDArray[np.bool_]]:
+        tasks = _tasks(problem, Boundary.from_batch(columns, None), columns["start_xyz"], columns["goal_xyz"])
+        if initial_guess is not None:
+            tasks = [
+                replace(task, path=initial_guess.path[i], rate=initial_guess.rate[i]) for i, task in enumerate(tasks)
+            ]
+        results = [refine_task(refiner, checker, task) for task in tasks]
+        path = np.array([result.path for result in results])
+        rate = np.array([result.rate for result in results])
+        motion = Motion(
+            path.reshape(len(results), spec.path_control_points, robot.n),
+            rate.reshape(len(results), spec.rate_control_points),
+            spec.degree,
+        )
+        return motion, np.array([result.valid for result in results], bool)
+
+    return solve
+
+
+def _tasks(problem: "Problem", boundary: Boundary, start_xyz: Array, goal_xyz: Array) -> list[RefinementTask]:
+    obstacle_poses = obstacle_poses_of(problem, start_xyz, goal_xyz)
+    return [
+        RefinementTask(boundary[i : i + 1], obstacle_poses[i], start_xyz[i], goal_xyz[i]) for i in range(len(boundary))
+    ]
+
+
+@lru_cache(maxsize=8)
+def _checker(record: ProblemRecord, degree: int, _thread: int) -> PlanChecker:
+    """Return the plan checker of a thread: Pinocchio's and Coal's memory must not be shared."""
+    return PlanChecker(*open_problem(record), degree=degree)
+
+
+@lru_cache(maxsize=8)
+def _refiner(record: ProblemRecord, spec: TrajectorySpec, options: RefineOptions) -> Refiner:
+    problem, robot = open_problem(record)
+    coarser = _refiner(record, problem.trajectory, options) if is_finer(spec, problem.trajectory) else None
+    return load_refiner(problem, robot, spec=spec, options=options, coarser=coarser)
+
+
+def load_refiner(
+    problem: "Problem",
+    robot: "Robot",
+    *,
+    spec: TrajectorySpec | None = None,
+    options: RefineOptions = DEFAULT_OPTIONS,
+    kernels: KernelLibrary | None = None,
+    levels: GridLevels | None = None,
+    coarser: Refiner | None = None,
+) -> Refiner:
+    """Build the refiner of a problem.
+
+    Args:
+        problem: The problem.
+        robot: Its robot.
+        spec: Degree and numbers of control points; the problem's by default.
+        options: Options of the refiner.
+        kernels: Library of kernels; by default the fastest backend of this machine.
+        levels: Grid levels, see ``Refiner``.
+        coarser: Refiner with the problem's own control points, see ``Refiner``.
+    """
+    from cnpgen.world.world import World
+
+    if kernels is None:
+        kernels = problem_kernels(problem, robot, *choose_backend(None))
+    settings = Settings(cost_tolerance=options.tolerance, max_iterations=options.max_iterations)
+    return Refiner(
+        problem,
+        robot,
+        kernels=kernels,
+        world=World(robot, problem.obstacle, problem.object_size),
+        spec=spec,
+        cost_term=choose_cost_term(problem, options.objective, options.weight),
+        settings=settings,
+        levels=levels,
+        coarser=coarser,
+    )

@@ -1,0 +1,285 @@
+"""Refinement of sets of plans in several processes, with a journal for interrupted runs."""
+
+import hashlib
+import json
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import counted
+from cnpgen.machine.engine import Engine, assembled
+from cnpgen.machine.threads import one_thread
+from cnpgen.machine.times import NO_TIME, Stopwatch, Times
+from cnpgen.machine.versions import __version__
+from cnpgen.plans.plans import Plans, check_plans_type, screen
+from cnpgen.plans.status import PlanStatus
+from cnpgen.plans.tips import correct_tips
+from cnpgen.refine.options import DEFAULT_OPTIONS, RefineOptions
+from cnpgen.refine.refine_engine import prepare, refine_serially
+from cnpgen.refine.refinement_journal import Journal, open_journal
+from cnpgen.refine.task import Attempt, Outcome
+
+REFINEMENT_FORMAT = "cnpgen-refinement"
+REFINEMENT_VERSION = 1
+MAX_SERIAL_PLANS = 60  # up to which the start of a second process takes longer than the plans
+PLANS_PER_TASK = 4  # of one of several processes: the transfer of a task takes a twentieth of a plan's time
+
+Array = NDArray[np.float64]
+Progress = Callable[[int, int], None]  # called with plans finished and valid since the last call
+
+
+@dataclass(frozen=True, eq=False)
+class Refinement:
+    """Result of refining N plans.
+
+    Attributes:
+        input_plans: Input plans, with the tip positions of their boundary conditions.
+        plans: Refined plans, in the same order.
+        results: Best attempt at every plan with its verdict, outcome, iterations and cost.
+        times: Times of the run; plans from a journal took none.
+    """
+
+    input_plans: Plans
+    plans: Plans
+    results: tuple[Attempt, ...]
+    times: Times = NO_TIME
+
+    def __repr__(self) -> str:
+        outcomes = _counted(result.outcome.name.lower() for result in self.results)
+        counts = ", ".join(f"{count:,} {name}" for name, count in outcomes.items())
+        plans = f"{counted(len(self.results), 'plan')} of {self.plans.problem.name!r}"
+        return f"<{plans} refined, {int(self.valid.sum()):,} valid{counts and ': '}{counts}>"
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """Mask of the plans that the independent verdict accepts, shape (N,)."""
+        return np.array([result.valid for result in self.results], bool)
+
+    def summary(self) -> dict[str, Any]:
+        """Return a summary of all plans for JSON."""
+        durations = self.plans.duration[self.valid]
+        iterations = [result.iterations for result in self.results]
+        return {
+            "format": REFINEMENT_FORMAT,
+            "format_version": REFINEMENT_VERSION,
+            "checksum": self.input_plans.checksum,
+            "plans": len(self.results),
+            "valid": int(self.valid.sum()),
+            "outcomes": _counted(result.outcome.name.lower() for result in self.results),
+            "reasons": _counted(str(result.reason) for result in self.results if not result.valid),
+            "mean_duration_s": float(durations.mean()) if len(durations) else None,
+            "median_iterations": float(np.median(iterations)) if iterations else None,
+            "seconds": self.times.rounded(),
+            "not_valid": [
+                {
+                    "plan": index,
+                    "sample_id": int(sample),
+                    "reason": str(result.reason),
+                    "outcome": result.outcome.text,
+                }
+                for index, (sample, result) in enumerate(zip(self.plans.sample_id, self.results, strict=True))
+                if not result.valid
+            ],
+        }
+
+
+def solve_plans(
+    problems: Plans,
+    *,
+    options: RefineOptions = DEFAULT_OPTIONS,
+    workers: int | None = None,
+    engine: str | None = None,
+    address: str | None = None,
+    journal: str | Path | None = None,
+    discard: bool = False,
+    begin: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
+) -> Refinement:
+    """Plan boundary problems without initial guesses; existing plans are ignored.
+
+    Args:
+        problems: Boundary problems of ``draw_boundary_problems`` or ``load_boundary_problems``.
+        options: See ``refine_plans``.
+        workers: See ``refine_plans``.
+        engine: See ``refine_plans``.
+        address: See ``refine_plans``.
+        journal: See ``refine_plans``.
+        discard: See ``refine_plans``.
+        begin: See ``refine_plans``.
+        progress: See ``refine_plans``.
+
+    Raises:
+        UsageError: See ``refine_plans``.
+        RecipeError: See ``refine_plans``.
+        MachineError: See ``refine_plans``.
+    """
+    check_plans_type(problems)
+    without_plans = replace(
+        problems,
+        path_control_points=np.full_like(problems.path_control_points, np.nan),
+        rate_control_points=np.full_like(problems.rate_control_points, np.nan),
+    )
+    return refine_plans(
+        without_plans,
+        options=options,
+        workers=workers,
+        engine=engine,
+        address=address,
+        journal=journal,
+        discard=discard,
+        begin=begin,
+        progress=progress,
+    )
+
+
+def refine_plans(
+    plans: Plans,
+    *,
+    options: RefineOptions = DEFAULT_OPTIONS,
+    workers: int | None = None,
+    engine: str | None = None,
+    address: str | None = None,
+    journal: str | Path | None = None,
+    discard: bool = False,
+    begin: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
+) -> Refinement:
+    """Refine plans, or plan where their control points are nan.
+
+    Results do not depend on the other plans or the number of processes. The result is never worse than the input: it
+    replaces the input only if the independent verdict finds a smaller violation, or none and a lower cost.
+
+    Args:
+        plans: The plans.
+        options: Options of the refiner.
+        workers: Number of processes; default one per available core, or one for few plans.
+        engine: "loky": processes of this machine; "dask" or "ray": a cluster. By default loky, or the backend that
+            ``joblib.parallel_config`` names.
+        address: Address of the cluster's scheduler or head; by default a cluster on this machine, for this call.
+        journal: File for finished plans, from which an interrupted run resumes.
+        discard: Whether to discard finished plans of another run in the journal.
+        begin: Function that is called once with the number of plans and of those in the journal.
+        progress: Function that is called with the numbers of plans finished and valid since the last call.
+
+    Raises:
+        UsageError: An option is invalid, there is less than one worker, or the journal is another run's.
+        RecipeError: The problem needs a plug-in that is not installed.
+        MachineError: A worker died, or the journal cannot be written.
+    """
+    check_plans_type(plans)
+    watch, where = Stopwatch(), Engine(engine, address, workers)
+    plans = correct_tips(plans)
+    file = None if journal is None else open_journal(Path(journal), _identity(plans, options), discard=discard)
+    finished: dict[int, Attempt] = {} if file is None else dict(file.finished)
+    if begin is not None:
+        begin(len(plans), len(finished))
+    try:
+        waiting = [i for i in range(len(plans)) if i not in finished]
+        for results in _run(plans, waiting, options, where, journal=file, watch=watch):
+            finished |= results
+            if progress is not None:
+                progress(len(results), sum(result.valid for result in results.values()))
+    finally:
+        if file is not None:
+            file.close()
+    refinement = _refinement(plans, [finished[i] for i in range(len(plans))], options)
+    return replace(refinement, times=watch.times())
+
+
+def _run(
+    plans: Plans,
+    waiting: list[int],
+    options: RefineOptions,
+    engine: Engine,
+    *,
+    journal: Journal | None,
+    watch: Stopwatch,
+) -> Iterator[dict[int, Attempt]]:
+    if not waiting:
+        return
+    prepare(plans, options)  # kernels are compiled once, not by every worker
+    watch.prepared()
+    hint = (
+        ""
+        if journal is None
+        else f": {journal.path} has the finished plans; the same call with the same arguments resumes"
+    )
+    with assembled(engine, -(-len(waiting) // PLANS_PER_TASK), quick=len(waiting) <= MAX_SERIAL_PLANS) as pool:
+        count = pool.size
+        size = PLANS_PER_TASK if count > 1 else 1
+        parts = (waiting[first : first + size] for first in range(0, len(waiting), size))
+        tasks = ((part, plans[np.array(part)]) for part in parts)
+        with closing(pool.distribute(partial(_refine, options=options), tasks, hint=hint)) as results:
+            for part, attempts, seconds in results:
+                watch.computing += seconds / count
+                if journal is not None:
+                    journal.append(part, attempts)
+                yield dict(zip(part, attempts, strict=True))
+
+
+def _refine(task: tuple[list[int], Plans], *, options: RefineOptions) -> tuple[list[int], list[Attempt], float]:
+    """Refine some of the plans; return their indices, the results and the CPU time [s]."""
+    (part, plans), begun = task, time.thread_time()
+    with one_thread():
+        return part, refine_serially(plans, options), time.thread_time() - begun
+
+
+def _refinement(plans: Plans, results: list[Attempt], options: RefineOptions) -> Refinement:
+    """Return the refined plans with the columns of their results."""
+    if not results:
+        return Refinement(plans, plans, ())
+    refined = replace(
+        plans,
+        path_control_points=np.stack([result.path for result in results]),
+        rate_control_points=np.stack([result.rate for result in results]),
+        columns={**plans.columns, **_columns(results)},
+        refined_with=json.dumps({"cnpgen": __version__, **options.document()}),
+        has_checksum=False,
+    )
+    status = _status(refined, np.array([result.valid for result in results]))
+    return Refinement(plans, replace(refined, status=status), tuple(results))
+
+
+def _status(plans: Plans, valid: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    status = np.full(len(plans), PlanStatus.VALID, np.uint8)
+    if not valid.all():
+        screened = screen(plans[~valid])
+        status[~valid] = np.where(screened == PlanStatus.UNKNOWN, PlanStatus.INVALID, screened)
+    return status
+
+
+def _columns(results: list[Attempt]) -> Mapping[str, Array]:
+    return {
+        "refine_outcome": np.array([result.outcome for result in results], float),
+        "refine_iterations": np.array([result.iterations for result in results], float),
+        "refine_objective": np.array([result.cost for result in results], float),
+    }
+
+
+def _counted(words: Iterator[str]) -> dict[str, int]:
+    return {str(word): count for word, count in Counter(words).most_common()}
+
+
+def _identity(plans: Plans, options: RefineOptions) -> str:
+    """Return the JSON text that identifies a run: version, options and a checksum of the plans."""
+    digest = hashlib.sha256(plans.problem.recipe.encode() + plans.problem.urdf.encode())
+    boundary = [values for values in vars(plans.boundary).values() if values is not None]
+    ends = [plans.columns["start_xyz"], plans.columns["goal_xyz"]]
+    for values in (*boundary, *ends, plans.path_control_points, plans.rate_control_points):
+        digest.update(str(values.shape).encode() + np.ascontiguousarray(values).tobytes())
+    return json.dumps(
+        {"version": __version__, "options": options.document(), "degree": plans.degree, "plans": digest.hexdigest()}
+    )
+
+
+def outcome_text(name: str) -> str:
+    """Return the description of an outcome by its lower-case name."""
+    return Outcome[name.upper()].text

@@ -1,0 +1,138 @@
+"""Journal of finished plans, from which an interrupted run resumes."""
+
+import io
+import json
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import DatasetError, UsageError, counted
+from cnpgen.refine.task import Attempt, Outcome
+from cnpgen.store.files.documents import differences, parse_json
+from cnpgen.store.files.journal import JournalFile, open_journal_file
+
+JOURNAL_MAGIC = b"cnpgen journal 1\n"
+# Errors of NumPy and Python for a record with a valid checksum that cnpgen has not written.
+_RECORD_ERRORS = (
+    ValueError, KeyError, TypeError, IndexError, EOFError, RuntimeError, MemoryError, OverflowError, zipfile.BadZipFile,
+)  # fmt: skip
+
+
+@dataclass
+class Journal:
+    """Finished plans of a run in an append-only file; the first record identifies the run.
+
+    Attributes:
+        path: Path of the file.
+        finished: Results of earlier runs, index of the plan -> judged attempt.
+    """
+
+    path: Path
+    finished: dict[int, Attempt]
+    _file: JournalFile
+
+    def append(self, indices: Sequence[int], results: Sequence[Attempt]) -> None:
+        """Append finished plans.
+
+        Raises:
+            MachineError: The file cannot be written.
+        """
+        self._file.append(_pack(indices, results))
+
+    def close(self) -> None:
+        """Close and unlock the file."""
+        self._file.close()
+
+
+def open_journal(path: Path, identity: str, *, discard: bool = False) -> Journal:
+    """Open the journal of a run with the results of earlier runs of the same identity.
+
+    Args:
+        path: Path of the file; it is created if it is missing.
+        identity: JSON text that identifies the run: plans, options, version.
+        discard: Whether to discard finished plans of another run.
+
+    Raises:
+        UsageError: The file is no journal, holds another run's plans, or is in use.
+        MachineError: The file cannot be opened.
+    """
+    try:
+        file = open_journal_file(path, JOURNAL_MAGIC)
+    except DatasetError as error:
+        raise UsageError(f"{path} is not a journal of cnpgen: remove it, or choose another output") from error
+    try:
+        return _resume(path, file, identity, discard=discard)
+    except BaseException:
+        file.close()
+        raise
+
+
+def _resume(path: Path, file: JournalFile, identity: str, *, discard: bool) -> Journal:
+    """Read the finished plans; start a new run if there are none of this identity."""
+    journal = Journal(path, {}, file)
+    for record in file.records[1:]:
+        try:
+            journal.finished |= _unpack(record)
+        except _RECORD_ERRORS as error:
+            raise UsageError(f"{path} is not a journal that cnpgen has written: {error}") from error
+    if file.records and file.records[0] == identity.encode():
+        return journal
+    if journal.finished and not discard:
+        raise UsageError(
+            f"{path} holds {counted(len(journal.finished), 'finished plan')} of another run"
+            f" ({', '.join(_changed(file.records[0], identity))}): {{discard}} discards them,"
+            " another output keeps them",
+            remedies={"discard": True},
+        )
+    journal.finished.clear()
+    file.clear()
+    file.append(identity.encode())
+    return journal
+
+
+def _changed(old: bytes, new: str) -> list[str]:
+    """List the differences of two runs, with short values; those of plans are checksums."""
+    try:
+        changed = differences(parse_json(old.decode()), json.loads(new))
+    except ValueError:
+        return ["another version"]
+    return [f"{item.key} {item.old}, now {item.new}" if item.is_short else f"other {item.key}" for item in changed]
+
+
+def _pack(indices: Sequence[int], results: Sequence[Attempt]) -> bytes:
+    arrays: dict[str, NDArray[Any]] = {
+        "path": np.stack([result.path for result in results]),
+        "rate": np.stack([result.rate for result in results]),
+        "cost": np.array([result.cost for result in results]),
+    }
+    numbers = [
+        [int(index), int(result.outcome), result.iterations] for index, result in zip(indices, results, strict=True)
+    ]
+    words = json.dumps([numbers, [str(result.reason) for result in results]]).encode()
+    buffer = io.BytesIO()
+    np.savez(buffer, allow_pickle=False, words=np.frombuffer(words, np.uint8), **arrays)
+    return buffer.getvalue()
+
+
+def _unpack(record: bytes) -> dict[int, Attempt]:
+    with np.load(io.BytesIO(record), allow_pickle=False) as arrays:
+        if any(member.compress_type != zipfile.ZIP_STORED for member in arrays.zip.infolist()):
+            raise ValueError("its arrays are compressed")  # a few bytes could expand to gigabytes
+        numbers, reasons = parse_json(arrays["words"].tobytes().decode())
+        path, rate, cost = (arrays[name] for name in ("path", "rate", "cost"))
+    return {
+        index: Attempt(
+            path=path[i],
+            rate=rate[i],
+            cost=float(cost[i]),
+            outcome=Outcome(outcome),
+            iterations=iterations,
+            reason=reasons[i],
+        )
+        for i, (index, outcome, iterations) in enumerate(numbers)
+    }

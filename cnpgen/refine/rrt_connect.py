@@ -1,0 +1,231 @@
+"""Joint-space paths between two configurations by RRT-Connect (Kuffner and LaValle 2000).
+
+Kernels check many states of an edge at once against capsules; Coal's hulls decide where only a capsule collides. Where
+there are equalities, the states of an edge are first projected onto the manifold by Gauss-Newton steps within the joint
+limits (CBiRRT, Berenson et al. 2009). Random numbers are the same for every task. The refiner adds velocities and
+accelerations.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.refine.fine_check import RestBounds
+from cnpgen.refine.solver.hulls import Hulls
+from cnpgen.refine.solver.transcription import ResidualKernels
+
+if TYPE_CHECKING:
+    from cnpgen.robots.robot import Robot
+
+Array = NDArray[np.float64]
+Follow = Callable[[Array], Array]  # states (n, K) of an edge -> the leading valid ones, projected, (n, k)
+
+STATE_SPACING = 0.04  # rad or m, between checked states
+MAX_STATE_SPACING = 0.12  # rad or m, between projected states of one edge
+MAX_TURN = 2 * np.pi  # rad or m, of random configurations from the range between both ends
+MAX_EXTENSION = 1.0  # rad or m, of a tree towards a random configuration
+STATES_PER_CHECK = 24
+MAX_EXTENSIONS = 1000  # of the trees
+SHORTCUTS = 150  # attempted on a path
+MAX_PATHS = 5
+MAX_PROJECTIONS = 5  # Gauss-Newton steps onto the equalities
+MAX_PROJECTION_STEP = 0.5  # rad or m, of any joint
+RELATIVE_DAMPING = 1e-6  # of these steps, in scaled units
+PROJECTED_FRACTION = 0.05  # of its tolerance, at which an equality is met
+
+
+@dataclass(frozen=True)
+class RestSpace:
+    """Valid states of a robot at rest for one task.
+
+    Attributes:
+        kernels: Residual kernels.
+        robot: The robot.
+        bounds: Bounds of the residuals of a state.
+        obstacle_poses: Poses and sizes of the obstacles, shape (width,).
+        hulls: Hulls that decide where capsules collide; None where the links are capsules.
+    """
+
+    kernels: ResidualKernels
+    robot: "Robot"
+    bounds: RestBounds
+    obstacle_poses: Array
+    hulls: Hulls | None = None
+
+    def follow(self, q: Array) -> Array:
+        """Project K states, shape (n, K), onto the equalities; return the leading valid ones."""
+        q = self.projected(q) if self.bounds.equal.any() else q
+        return q[:, : self._count_valid(q)]
+
+    def _count_valid(self, q: Array) -> int:
+        """Return the number of leading valid states."""
+        (g,) = self.kernels.values(*self._arguments(q))
+        met = (g >= self.bounds.lower[:, None]) & (g <= self.bounds.upper[:, None])
+        if self.hulls is None:
+            return _first(~np.logical_and.reduce(met))
+        first = _first(~np.logical_and.reduce(met[~self.bounds.capsules]))
+        if first:
+            first = _first(~self.hulls.clear_states(q[:, :first], self.obstacle_poses, uncovered_only=True))
+        unresolved = np.flatnonzero(~np.logical_and.reduce(met[self.bounds.capsules])[:first])
+        if not len(unresolved):
+            return first
+        collision = _first(~self.hulls.clear_states(q[:, unresolved], self.obstacle_poses))
+        return first if collision == len(unresolved) else int(unresolved[collision])
+
+    def projected(self, q: Array) -> Array:
+        """Project K states onto the equalities; joints that reach a limit stay there."""
+        low, high = self._limits
+        q, rows = np.clip(q, low, high), self.bounds.equal
+        lower, upper = self.bounds.lower[rows, None], self.bounds.upper[rows, None]
+        for _ in range(MAX_PROJECTIONS):
+            g, columns = self.kernels.jacobian(*self._arguments(q))
+            error = g[rows] - (lower + upper) / 2
+            if (np.abs(error) <= PROJECTED_FRACTION * (upper - lower) / 2).all():
+                break
+            J = columns.reshape(-1, len(rows), q.shape[1])[: len(q), rows] * ((q > low) & (q < high))[:, None]
+            square = np.einsum("iak,ibk->kab", J, J)
+            damping = RELATIVE_DAMPING * (1 + np.trace(square, axis1=1, axis2=2))[:, None, None] * np.eye(len(error))
+            force = np.linalg.solve(square + damping, error.T[..., None])[..., 0]
+            step = np.clip(np.einsum("iak,ka->ik", J, force), -MAX_PROJECTION_STEP, MAX_PROJECTION_STEP)
+            q = np.clip(q - step, low, high)
+        return q
+
+    @cached_property
+    def _limits(self) -> tuple[Array, Array]:
+        return self.robot.position_lower[:, None], self.robot.position_upper[:, None]
+
+    def _arguments(self, q: Array) -> tuple[Array, Array]:
+        """Return the kernel arguments of K states at rest."""
+        (n, count), width = q.shape, self.kernels.values.tape.inputs[0]
+        w, orders = np.zeros((width, count)), (width + 1) // (n + 1)
+        w[:n], w[orders * n] = q, 1.0  # positions and the rate
+        return w, np.repeat(self.obstacle_poses[:, None], count, axis=1)
+
+
+def _first(mask: NDArray[np.bool_]) -> int:
+    """Return the index of the first true element, or the length if none is true."""
+    return int(np.argmax(mask)) if mask.any() else len(mask)
+
+
+@dataclass
+class _Tree:
+    """Tree of configurations that are connected with one end.
+
+    Attributes:
+        nodes: Configurations, shape (n,) each.
+        parents: Index of the parent of every node.
+        states: States on the edge from the parent, shape (k, n) each.
+    """
+
+    nodes: list[Array]
+    parents: list[int] = field(default_factory=lambda: [-1])
+    states: list[Array] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.states = [self.nodes[0][None]]
+
+    def grow(self, target: Array, follow: Follow, max_extension: float) -> bool:
+        """Extend the nearest node towards a configuration while states are valid; return whether it is reached."""
+        nearest = int(np.argmin(np.square(np.array(self.nodes) - target).sum(axis=1)))
+        begin = self.nodes[nearest]
+        distance = float(np.linalg.norm(target - begin))
+        end = target if distance <= max_extension else begin + (target - begin) * (max_extension / distance)
+        states, reached = follow_line(begin, end, follow)
+        if len(states):
+            self.nodes.append(states[-1])
+            self.parents.append(nearest)
+            self.states.append(states)
+        return reached and distance <= max_extension
+
+    def path(self) -> Array:
+        """Return the states from the root to the last node, shape (K, n)."""
+        edges, index = list[Array](), len(self.nodes) - 1
+        while index >= 0:
+            edges.append(self.states[index])
+            index = self.parents[index]
+        return np.concatenate(edges[::-1])
+
+
+def follow_line(begin: Array, end: Array, follow: Follow) -> tuple[Array, bool]:
+    """Return the states of a straight line up to the first invalid one.
+
+    Args:
+        begin: Start of the line, shape (n,); not among the states.
+        end: End of the line, shape (n,).
+        follow: Function that returns the leading valid states, see ``RestSpace.follow``.
+
+    Returns:
+        ``(states, reached)``: states, shape (k, n), and whether the last one is the end.
+    """
+    count = max(int(np.ceil(np.abs(end - begin).max() / STATE_SPACING)), 1)
+    fractions, states = np.arange(1, count + 1) / count, begin[:, None]
+    for first in range(0, count, STATES_PER_CHECK):
+        block = fractions[first : first + STATES_PER_CHECK]
+        valid = follow(begin[:, None] + (end - begin)[:, None] * block)
+        spacing = np.abs(np.diff(np.hstack([states[:, -1:], valid]))).max(axis=0, initial=0.0)
+        states = np.hstack([states, valid[:, : _first(spacing > MAX_STATE_SPACING)]])
+        if states.shape[1] < 1 + first + len(block):
+            break
+    return states[:, 1:].T, states.shape[1] == 1 + count
+
+
+def find_paths(start: Array, goal: Array, robot: "Robot", follow: Follow) -> Iterator[Array]:
+    """Yield valid paths between two configurations: the line, if it is valid, or several paths of the trees.
+
+    Args:
+        start: First configuration, shape (n,).
+        goal: Last configuration, shape (n,).
+        robot: The robot; random configurations are within its limits and at most a turn away from both ends.
+        follow: Function that returns the leading valid states, see ``RestSpace.follow``.
+
+    Yields:
+        States of a path, shape (K, n). The search ends with the first trees that do not connect.
+    """
+    states, reached = follow_line(start, goal, follow)
+    if reached:
+        yield np.vstack([start, states])
+        return
+    for seed in range(MAX_PATHS):
+        path = find_path(start, goal, robot, follow, seed=seed)
+        if path is None:
+            return
+        yield path
+
+
+def find_path(start: Array, goal: Array, robot: "Robot", follow: Follow, *, seed: int) -> Array | None:
+    """Search for one path by RRT-Connect.
+
+    Args:
+        start: First configuration, shape (n,).
+        goal: Last configuration, shape (n,).
+        robot: The robot, see ``find_paths``.
+        follow: Function that returns the leading valid states, see ``RestSpace.follow``.
+        seed: Seed of the random numbers.
+
+    Returns:
+        States of the path, shape (K, n), or None if the trees do not connect.
+    """
+    random, trees = np.random.default_rng(seed), (_Tree([start]), _Tree([goal]))
+    lower = np.maximum(robot.position_lower, np.minimum(start, goal) - MAX_TURN)
+    upper = np.minimum(robot.position_upper, np.maximum(start, goal) + MAX_TURN)
+    for extension in range(MAX_EXTENSIONS):
+        tree, other = trees[extension % 2], trees[1 - extension % 2]
+        before = len(tree.nodes)
+        tree.grow(random.uniform(lower, upper), follow, MAX_EXTENSION)
+        if len(tree.nodes) > before and other.grow(tree.nodes[-1], follow, np.inf):
+            return _shortened(np.vstack([trees[0].path(), trees[1].path()[::-1]]), follow, random)
+    return None
+
+
+def _shortened(path: Array, follow: Follow, random: np.random.Generator) -> Array:
+    """Replace sections of a path by valid straight lines with fewer states."""
+    for _ in range(SHORTCUTS):
+        first, last = np.sort(random.integers(len(path), size=2))
+        states, reached = follow_line(path[first], path[last], follow)
+        if reached and len(states) < last - first:
+            path = np.vstack([path[: first + 1], states, path[last + 1 :]])
+    return path

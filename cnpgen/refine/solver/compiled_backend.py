@@ -1,0 +1,276 @@
+"""Backend in compiled code, ``step.c`` and ``active_set.c``: equal to the NumPy backend up to rounding, and faster."""
+
+import ctypes
+from collections.abc import Callable, Sequence
+from ctypes import c_double, c_int, c_long, c_void_p
+from dataclasses import dataclass
+from functools import partial
+from itertools import accumulate
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.kernels.compiled_kernel import CACHE_LINE_DOUBLES, address_of, aligned_array
+from cnpgen.kernels.library import KernelLibrary
+from cnpgen.refine.solver.bounds import Bounds
+from cnpgen.refine.solver.cost_term import ACCELERATION_SMOOTHING_M_S2
+from cnpgen.refine.solver.grid import Bases
+from cnpgen.refine.solver.qp_subproblem import (
+    ELASTIC_CURVATURE_ROOT,
+    ELASTIC_GRADIENT,
+    MAX_SPEED_DISTANCE,
+    MAX_WORKING_SET_CHANGES,
+    MIN_MULTIPLIER,
+    QP_TOLERANCE,
+    Mask,
+    NumpyBackend,
+    ResidualSelection,
+    Step,
+    Subproblem,
+)
+from cnpgen.refine.solver.transcription import Transcription
+from cnpgen.trajectory.spline import end_derivatives
+
+Array = NDArray[np.float64]
+
+SOURCES = [Path(__file__).with_name(name) for name in ("active_set.c", "step.c")]
+MAX_LANES, ROWS_PER_BLOCK, TILE_POINTS = 8, 32, 8  # upper bounds of W, B and TILE in C
+
+
+class _Bases(ctypes.Structure):
+    """``bases`` of step.c."""
+
+    _fields_ = (
+        *((name, c_long) for name in ("orders", "points")),
+        *((name, c_void_p) for name in ("path", "rate", "path_at", "rate_at", "path_from", "rate_from")),
+    )
+
+
+class _Polyhedron(ctypes.Structure):
+    """``polyhedron`` of active_set.c."""
+
+    _fields_ = (
+        *((name, c_long) for name in ("dim", "stride", "count")),
+        *((name, c_void_p) for name in ("rows", "low", "high", "norm", "scratch", "active", "leading_zeros")),
+    )
+
+
+class _Motion(ctypes.Structure):
+    """``motion`` of step.c."""
+
+    _fields_ = (
+        *((name, c_long) for name in ("n", "path", "rate", "support", "fixed", "nx", "stride", "m")),
+        *((name, c_long) for name in ("n_time_nodes", "n_cost_residuals", "thinning")),
+        *((name, _Bases) for name in ("grid", "cost_bases")),
+        *((name, c_void_p) for name in ("values", "jacobian", "cost_residuals")),
+        *((name, c_void_p) for name in ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq", "goal_ddq")),
+        *((name, c_void_p) for name in ("obstacle_poses", "time_basis", "time_weights", "cost_weights", "smoothing")),
+        *((name, c_void_p) for name in ("lower", "upper", "nonsmooth", "accelerated")),
+        *((name, c_void_p) for name in ("control", "rates", "derivative", "w")),
+        *((name, c_void_p) for name in ("gradient", "hessian", "factor", "scratch")),
+        *((name, c_void_p) for name in ("index", "initial")),
+        ("program", _Polyhedron),
+        *((name, c_double) for name in ("eta", "beta", "rate_eta", "cost_smoothing")),
+        *((name, c_double) for name in ("violation", "gain", "remaining")),
+        *((name, c_long * 6) for name in ("point", "variable")),
+        *((name, c_long) for name in ("n_derivatives", "n_selected")),
+    )
+
+
+def load_step_library(kernels: KernelLibrary) -> ctypes.CDLL | None:
+    """Return the library of step.c, or None where kernels are not compiled."""
+    library = kernels.load_source(*SOURCES)
+    if library is not None:
+        library.evaluate.argtypes, library.evaluate.restype = (c_void_p,) * 3, c_double
+        build = (*(c_void_p,) * 3, *(c_double,) * 4, *(c_void_p,) * 3)
+        library.build_subproblem.restype, library.build_subproblem.argtypes = None, build
+        solve = (*(c_void_p,) * 3, c_double, c_double, c_int, c_void_p, c_double, c_double, c_int, c_void_p, c_void_p)
+        library.solve_subproblem.argtypes = solve
+    return library
+
+
+class CompiledBackend:
+    """Backend of step.c; see ``Backend``.
+
+    Args:
+        motion: The transcription.
+        bounds: Bounds of its residuals.
+        thinning: Interval of the thinned grid, see ``select_residuals``.
+    """
+
+    def __init__(self, motion: Transcription, bounds: Bounds, thinning: int) -> None:
+        library = motion.kernels.step_library
+        assert library is not None
+        self._evaluate, self._build, self._solve = library.evaluate, library.build_subproblem, library.solve_subproblem
+        self._arrays: list[Any] = []  # keeps the memory of step.c alive
+        self._points, self._m, self._nx = len(motion.grid.s), motion.kernels.values.tape.outputs[0], motion.nx
+        self._motion = self._describe(motion, bounds, thinning)
+        self._address = ctypes.addressof(self._motion)
+        self._fallback = NumpyBackend(motion, bounds, thinning)
+
+    def value(self, x: Array) -> tuple[float, Array, float]:
+        """Evaluate a motion; see ``Backend``."""
+        g = np.empty((self._m, self._points))
+        cost = self._evaluate(self._address, address_of(x), address_of(g))
+        return cost, g.T, self._motion.violation
+
+    def subproblem(
+        self, x: Array, g: Array, selection: ResidualSelection, *, proximal: float, penalty: float
+    ) -> "CompiledSubproblem":
+        """Build the subproblem; see ``Backend``."""
+        selected = np.zeros((self._m, self._points), bool)
+        missed = np.ascontiguousarray(selection.missed.T)
+        before = None if selection.multipliers is None else np.ascontiguousarray(selection.multipliers.T)
+        addresses = address_of(missed), None if before is None else address_of(before), address_of(selected)
+        self._motion.violation = selection.violation
+        self._build(
+            self._address,
+            address_of(x),
+            address_of(g.T),
+            proximal,
+            selection.max_distance,
+            MAX_SPEED_DISTANCE,
+            selection.max_log_rate_change,
+            *addresses,
+        )
+        fallback = partial(self._fallback.subproblem, x, g, selection, proximal=proximal, penalty=penalty)
+        return CompiledSubproblem(self, fallback, g, selected.T, penalty * selection.violation + ELASTIC_GRADIENT)
+
+    def solve(self, subproblem: "CompiledSubproblem", box: Array, warm: Array | None, *, relax: bool) -> Step | None:
+        """Solve the program of the last subproblem; return None without a solution."""
+        dx, multipliers = np.empty(self._nx), np.zeros((self._m, self._points))
+        before = None if warm is None else np.ascontiguousarray(warm.T)
+        warm_start = None if before is None else address_of(before), MIN_MULTIPLIER
+        limits, results = (QP_TOLERANCE, MAX_WORKING_SET_CHANGES), (address_of(dx), address_of(multipliers))
+        cost = subproblem.elastic_gradient, ELASTIC_CURVATURE_ROOT
+        inputs = address_of(subproblem.g.T), address_of(box)
+        if not self._solve(self._address, *inputs, *cost, relax, *warm_start, *limits, *results):
+            return None
+        state = self._motion
+        return Step(dx, state.remaining, multipliers.T, state.gain) if np.isfinite(dx).all() else None
+
+    def _describe(self, motion: Transcription, bounds: Bounds, thinning: int) -> _Motion:
+        spec, stride = motion.spec, motion.nx + 2 + -(motion.nx + 2) % MAX_LANES
+        path = end_derivatives(spec.path_control_points, spec.degree)
+        rate = end_derivatives(spec.rate_control_points, spec.degree)
+        return _Motion(
+            n=motion.n,
+            path=spec.path_control_points,
+            rate=spec.rate_control_points,
+            support=motion.grid.bases.support,
+            fixed=3 + motion.interior,
+            nx=motion.nx,
+            stride=stride,
+            m=self._m,
+            thinning=thinning,
+            eta=path.eta,
+            beta=path.beta,
+            rate_eta=rate.eta,
+            program=self._program(stride),
+            **self._constants(motion, bounds),
+            **self._kernel_addresses(motion),
+            **self._work_arrays(motion, stride),
+        )
+
+    def _constants(self, motion: Transcription, bounds: Bounds) -> dict[str, Any]:
+        """Return the arrays that no step changes."""
+        grid, weight = motion.grid, 0.0 if motion.kernels.cost_term is None else motion.kernels.cost_term.weight
+        arrays = {
+            **vars(motion.boundary),
+            "obstacle_poses": motion.poses_along,
+            "time_basis": grid.time_basis,
+            "time_weights": grid.time_weights,
+            "cost_weights": weight * grid.cost_weights,
+            "smoothing": motion.smoothing,
+            "lower": bounds.lower.T,
+            "upper": bounds.upper.T,
+            "nonsmooth": bounds.nonsmooth.T,
+            "accelerated": bounds.accelerated,
+        }
+        fields: dict[str, Any] = {name: None if array is None else self._keep(array) for name, array in arrays.items()}
+        fields |= {"grid": self._bases(grid.bases), "cost_bases": self._bases(grid.cost_bases)}
+        return {**fields, "n_time_nodes": len(grid.time_weights)}
+
+    def _kernel_addresses(self, motion: Transcription) -> dict[str, Any]:
+        """Return the addresses of the compiled kernels and the constants of the cost term."""
+        kernels = motion.kernels
+        fields = {"values": kernels.values.address, "jacobian": kernels.jacobian.address}
+        if kernels.cost_term is None or kernels.cost_residuals is None:
+            return fields
+        smoothing = ACCELERATION_SMOOTHING_M_S2 if kernels.cost_term.kind == "centrifugal" else 0.0
+        count, address = kernels.cost_residuals.tape.outputs[0], kernels.cost_residuals.address
+        return {**fields, "cost_residuals": address, "n_cost_residuals": count, "cost_smoothing": smoothing}
+
+    def _work_arrays(self, motion: Transcription, stride: int) -> dict[str, int]:
+        """Allocate the work arrays with the sizes of step.c."""
+        spec, n, nx, size = motion.spec, motion.n, motion.nx, self._m * self._points
+        width, nodes = motion.kernels.values.tape.inputs[0], len(motion.grid.cost_weights)
+        count = 0 if motion.kernels.cost_residuals is None else motion.kernels.cost_residuals.tape.outputs[0]
+        cost_term = nodes * ((4 * n + 3) * (count + 1) + (2 + stride) * count) + stride
+        duration = len(motion.grid.time_weights) * (spec.rate_control_points + MAX_LANES) + stride
+        subproblem = size + (width + 1) * self._m * TILE_POINTS + stride
+        sizes = {
+            "control": spec.path_control_points * n,
+            "rates": spec.rate_control_points,
+            "derivative": 6 * (n + MAX_LANES),
+            "w": width * self._points,
+            "gradient": nx,
+            "hessian": nx * stride + ROWS_PER_BLOCK,
+            "factor": nx * stride,
+            "scratch": max(subproblem, cost_term, duration) + ROWS_PER_BLOCK,
+            "index": size,
+            "initial": size,
+        }
+        return dict(zip(sizes, self._allocate(list(sizes.values())), strict=True))
+
+    def _program(self, stride: int) -> _Polyhedron:
+        dim = self._nx + 1
+        rows = dim + self._m * self._points + ROWS_PER_BLOCK
+        scratch = (2 * dim + ROWS_PER_BLOCK) * stride + 8 * (stride + ROWS_PER_BLOCK)
+        blocks = rows  # an upper bound: blocks have 8 rows or more
+        sizes = (rows * dim, rows, rows, rows, scratch, dim, blocks)  # in the order of _Polyhedron
+        return _Polyhedron(dim, stride, 0, *self._allocate(sizes))
+
+    def _allocate(self, sizes: Sequence[int]) -> list[int]:
+        """Return the addresses of arrays of so many numbers, aligned to cache lines."""
+        lines = [size + -size % CACHE_LINE_DOUBLES for size in sizes]
+        array = aligned_array(sum(lines))
+        self._arrays.append(array)
+        begin = address_of(array)
+        return [begin + array.itemsize * before for before in accumulate(lines, initial=0)][:-1]
+
+    def _bases(self, bases: Bases) -> _Bases:
+        orders, points, _ = bases.path.shape
+        arrays = (*bases.phases_last, bases.path_at, bases.rate_at, *bases.first_support)
+        return _Bases(orders, points, *map(self._keep, arrays))
+
+    def _keep(self, array: NDArray[Any]) -> int:
+        array = np.ascontiguousarray(array)
+        self._arrays.append(array)
+        return address_of(array)
+
+
+@dataclass(frozen=True)
+class CompiledSubproblem:
+    """Subproblem of step.c; see ``Subproblem``.
+
+    Attributes:
+        backend: Backend that built it.
+        fallback: Function that builds the same subproblem in NumPy.
+        g: Residuals at the iterate, shape (K, m).
+        selected: Mask of the residuals in the program, shape (K, m).
+        elastic_gradient: Gradient of the elastic variable's cost.
+    """
+
+    backend: CompiledBackend
+    fallback: Callable[[], Subproblem]
+    g: Array
+    selected: Mask
+    elastic_gradient: float
+
+    def solve(self, box: Array, *, warm: Array | None = None, relax: bool = False) -> Step | None:
+        """Return the best step within the box; see ``Subproblem``. DAQP solves it if active_set.c does not."""
+        step = self.backend.solve(self, box, warm, relax=relax)
+        return self.fallback().solve(box, warm=warm, relax=relax) if step is None else step

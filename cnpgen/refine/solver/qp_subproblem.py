@@ -1,0 +1,259 @@
+"""Quadratic programming subproblem of one SQP step: selection of its residuals, and its solution by DAQP.
+
+DAQP gets variables in which the Hessian is the identity. It would transform the program itself, but takes twice as long
+as BLAS.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.refine.solver.bounds import Bounds
+from cnpgen.refine.solver.transcription import Linearization, Transcription, cache_last
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+
+DAQP_INFINITY = 1e30  # DAQP's value of no bound
+ELASTIC_CURVATURE_ROOT = 0.1  # of the elastic variable's cost; far smaller ones triple the working-set changes
+ELASTIC_GRADIENT = 1e-3  # of the elastic variable's cost where nothing is violated
+MIN_MULTIPLIER = 1e-9  # smaller multipliers belong to inactive residuals
+QP_TOLERANCE = 1e-6  # primal tolerance of DAQP and of active_set.c
+MAX_WORKING_SET_CHANGES = 3000
+MAX_SPEED_DISTANCE = 0.4  # selection distance without accelerations, which grow with the square of the rate
+DAQP_LOWER, DAQP_UPPER = 3, 1  # DAQP's codes of initially active bounds
+
+
+@dataclass(frozen=True)
+class Step:
+    """Solution of a subproblem.
+
+    Attributes:
+        dx: Step of the variables, shape (nx,).
+        remaining: Fraction of the violations that remains after the step.
+        multipliers: Multipliers of all residuals, shape (K, m); 0 for those that are not selected.
+        gain: Predicted reduction of the objective.
+    """
+
+    dx: Array
+    remaining: float
+    multipliers: Array
+    gain: float
+
+
+@dataclass(frozen=True)
+class ResidualSelection:
+    """Rule that selects the residuals of a subproblem.
+
+    Attributes:
+        violation: Largest violation at the current iterate.
+        max_distance: Residuals are selected at local maxima within this distance of a bound.
+        max_log_rate_change: Bound of the change of log r; nonsmooth residuals that it could move over a bound are
+            selected.
+        missed: Mask of residuals that are selected in any case, shape (K, m).
+        multipliers: Multipliers of the last step, shape (K, m), or None; residuals with one are selected.
+    """
+
+    violation: float
+    max_distance: float
+    max_log_rate_change: float
+    missed: Mask
+    multipliers: Array | None
+
+
+class Subproblem(Protocol):
+    """Quadratic programs at one iterate."""
+
+    @property
+    def selected(self) -> Mask:
+        """Mask of the residuals in the programs, shape (K, m)."""
+
+    def solve(self, box: Array, *, warm: Array | None = None, relax: bool = False) -> "Step | None":
+        """Return the best step within the box, or None without a solution.
+
+        Args:
+            box: Largest change of every variable, shape (nx,).
+            warm: Multipliers, shape (K, m), of the residuals in the initial working set, or None.
+            relax: Whether satisfied residuals may be violated, too, up to the remaining largest violation.
+        """
+
+
+class Backend(Protocol):
+    """Evaluations and subproblems of a motion within its bounds."""
+
+    def value(self, x: Array) -> tuple[float, Array, float]:
+        """Evaluate the regularized objective, residuals (K, m) and their largest violation."""
+
+    def subproblem(
+        self, x: Array, g: Array, selection: ResidualSelection, *, proximal: float, penalty: float
+    ) -> Subproblem:
+        """Build the subproblem at x with residuals g; it is valid until the next one is built."""
+
+
+class NumpyBackend:
+    """Backend in NumPy and DAQP.
+
+    Args:
+        motion: The transcription.
+        bounds: Bounds of its residuals.
+        thinning: Interval of the thinned grid, see ``select_residuals``.
+    """
+
+    def __init__(self, motion: Transcription, bounds: Bounds, thinning: int) -> None:
+        self._motion, self._bounds, self._thinning = motion, bounds, thinning
+        self._evaluate = cache_last(motion.evaluate)  # after a rejected step the iterate is the same
+
+    def value(self, x: Array) -> tuple[float, Array, float]:
+        """Evaluate a motion; see ``Backend``."""
+        cost, g = self._motion.value(x)
+        return cost, g, self._bounds.max_violation(g)
+
+    def subproblem(
+        self, x: Array, g: Array, selection: ResidualSelection, *, proximal: float, penalty: float
+    ) -> "NumpySubproblem":
+        """Build the subproblem; see ``Backend``."""
+        at = self._evaluate(x)
+        errors = self._motion.linearization_errors(at, selection.max_log_rate_change)
+        distance = selection.max_distance
+        selected = select_residuals(
+            g, self._bounds, thinning=self._thinning, max_distance=distance, linearization_errors=errors
+        )
+        selected |= selection.missed
+        if selection.multipliers is not None:
+            selected |= selection.multipliers != 0
+        return NumpySubproblem(self._motion, at, self._bounds, selected, selection.violation, proximal, penalty)
+
+
+@dataclass(frozen=True)
+class NumpySubproblem:
+    """Quadratic model of the objective and linear model of the residuals, solved by DAQP.
+
+    Attributes:
+        motion: The transcription.
+        at: Linearization at the iterate.
+        bounds: Bounds of the residuals.
+        selected: Mask of the residuals in the program, shape (K, m).
+        violation: Largest violation at the iterate.
+        proximal: Weight of the proximal term.
+        penalty: Cost of the largest violation.
+    """
+
+    motion: Transcription
+    at: Linearization
+    bounds: Bounds
+    selected: Mask
+    violation: float
+    proximal: float
+    penalty: float
+
+    def cost(self, dx: Array) -> float:
+        """Return the predicted change of the objective by a step."""
+        return float(self.at.gradient @ dx + 0.5 * dx @ self.at.curvature @ dx + 0.5 * self.proximal * dx @ dx)
+
+    def solve(self, box: Array, *, warm: Array | None = None, relax: bool = False) -> Step | None:
+        """Return the best step within the box; see ``Subproblem``."""
+        import daqp
+
+        nx, unwhiten = self.motion.nx, self._unwhiten
+        if unwhiten is None:
+            return None
+        k, residual = np.nonzero(self.selected)
+        rows, low, high = self._rows(k, residual, unwhiten, relax=relax)
+        sense = np.zeros(nx + 1 + len(k), np.int32)
+        if warm is not None:
+            before = warm[k, residual]
+            sense[nx + 1 :] = DAQP_UPPER * (before > MIN_MULTIPLIER) + DAQP_LOWER * (before < -MIN_MULTIPLIER)
+        elastic_cost = self.penalty * self.violation + ELASTIC_GRADIENT
+        solution, _, flag, info = daqp.solve(
+            np.eye(nx + 1),
+            np.append(self.at.gradient @ unwhiten, elastic_cost / ELASTIC_CURVATURE_ROOT),
+            rows,
+            np.concatenate([box, [1.0], np.minimum(high, DAQP_INFINITY)]),
+            np.concatenate([-box, [0.0], np.maximum(low, -DAQP_INFINITY)]),
+            sense,
+            primal_tol=QP_TOLERANCE,
+            iter_limit=MAX_WORKING_SET_CHANGES,
+        )
+        dx = unwhiten @ solution[:-1]
+        if flag < 1 or not np.isfinite(dx).all():
+            return None
+        multipliers = np.zeros(self.at.g.shape)
+        multipliers[k, residual] = info["lam"][nx + 1 :]
+        return Step(dx, float(solution[-1]) / ELASTIC_CURVATURE_ROOT, multipliers, -self.cost(dx))
+
+    @cached_property
+    def _unwhiten(self) -> Array | None:
+        """Matrix from variables with unit Hessian to steps, shape (nx, nx); None if the Hessian is not positive."""
+        from scipy.linalg.lapack import dpotrf, dtrtri
+
+        hessian = self.at.curvature.copy()
+        hessian.flat[:: len(hessian) + 1] += self.proximal
+        factor, failed = dpotrf(hessian, lower=True)
+        return None if failed else np.asarray(dtrtri(factor, lower=True)[0].T)
+
+    def _rows(self, k: Indices, residual: Indices, unwhiten: Array, *, relax: bool) -> tuple[Array, Array, Array]:
+        """Lay out the rows of the program with their bounds.
+
+        Returns:
+            ``(rows, low, high)``: gradients of the box, the elastic variable and m selected residuals, shape
+            (nx + 1 + m, nx + 1), and the largest decrease and increase of the residuals, shape (m,) each.
+        """
+        g, lower, upper = self.at.g[k, residual], self.bounds.lower[k, residual], self.bounds.upper[k, residual]
+        nx = self.motion.nx
+        rows = np.zeros((nx + 1 + len(k), nx + 1))
+        rows[:nx, :-1] = unwhiten
+        np.matmul(self.motion.rows(self.at, k, residual), unwhiten, out=rows[nx + 1 :, :-1])
+        rows[nx, -1] = 1 / ELASTIC_CURVATURE_ROOT
+        elastic = rows[nx + 1 :, -1]
+        if relax:
+            upper_is_closer = upper - g < g - lower
+            elastic[:] = np.where(upper_is_closer, -self.violation, self.violation) / ELASTIC_CURVATURE_ROOT
+            low, high = (
+                np.where(upper_is_closer, -DAQP_INFINITY, lower - g),
+                np.where(upper_is_closer, upper - g, DAQP_INFINITY),
+            )
+            return rows, low, high
+        above, below = np.maximum(g - upper, 0), np.maximum(lower - g, 0)
+        elastic[:] = (below - above) / ELASTIC_CURVATURE_ROOT
+        return rows, np.where(above > 0, -DAQP_INFINITY, lower - g), np.where(below > 0, DAQP_INFINITY, upper - g)
+
+
+def select_residuals(
+    g: Array, bounds: Bounds, *, thinning: int, max_distance: float, linearization_errors: Array
+) -> Mask:
+    """Select the residuals close to a bound at a local maximum, and nonsmooth ones that may cross it: (K, m).
+
+    Args:
+        g: Residuals, shape (K, m).
+        bounds: Bounds of the residuals.
+        thinning: Interval of grid points at which residuals are selected without being a local maximum.
+        max_distance: Largest distance from a bound; at most ``MAX_SPEED_DISTANCE`` without accelerations.
+        linearization_errors: Possible change of nonsmooth residuals, shape (K, m).
+    """
+    violations = bounds.violations(g)
+    distances = np.where(bounds.accelerated, max_distance, min(max_distance, MAX_SPEED_DISTANCE))
+    selected: Mask = (local_maxima(violations, thinning=thinning) & (violations > -distances)) | (
+        bounds.nonsmooth & (violations > -linearization_errors)
+    )
+    return selected
+
+
+def local_maxima(violations: Array, *, thinning: int) -> Mask:
+    """Return a mask of local maxima along the motion, their neighbors and the thinned grid, shape (K, m).
+
+    Args:
+        violations: Violations of residuals, shape (K, m).
+        thinning: Interval of the thinned grid in grid points.
+    """
+    peak = np.zeros(violations.shape, bool, order="F")
+    peak[1:-1] = (violations[1:-1] >= violations[:-2]) & (violations[1:-1] >= violations[2:])
+    peak[0], peak[-1] = violations[0] >= violations[1], violations[-1] >= violations[-2]
+    mask = peak.copy("F")
+    mask[1:] |= peak[:-1]
+    mask[:-1] |= peak[1:]
+    mask[::thinning] = True
+    return mask

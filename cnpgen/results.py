@@ -1,0 +1,91 @@
+"""Classes that public functions return, and the parts of these classes."""
+
+from cnpgen.judges.plans.verdict import Margin, Metrics, PaperRule, Reason, Verdict
+from cnpgen.judges.rows.row_report import Check, RowReport
+from cnpgen.loader.batch import Batch
+from cnpgen.loader.batches import Batches
+from cnpgen.loader.gather import RowError
+from cnpgen.loader.normalization import Normalization
+from cnpgen.loader.split import Split
+from cnpgen.machine.times import Times
+from cnpgen.make.complete import Completed
+from cnpgen.make.dataset import MadeDataset
+from cnpgen.planner.control_points import ControlPoints
+from cnpgen.planner.model import ModelConfig, Outputs
+from cnpgen.planner.network.architecture import Architecture, Layer
+from cnpgen.planner.network.features import Features
+from cnpgen.planner.plan_hits import PlannedHits
+from cnpgen.planner.tasks import Tasks
+from cnpgen.plans.evaluate import Evaluation
+from cnpgen.plans.export import Exported
+from cnpgen.plans.join import JoinedPlans
+from cnpgen.plans.plans import PlanIndexError
+from cnpgen.plans.status import PlanStatus
+from cnpgen.problems.robot_model import ConstraintValues
+from cnpgen.refine.proof.explain import Explanation, Feasibility
+from cnpgen.refine.refine_plans import Refinement
+from cnpgen.refine.task import Attempt, Outcome
+from cnpgen.store.check import Finding
+from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, StoredProblem
+from cnpgen.store.dataset_summary import DatasetSummary
+from cnpgen.store.inspection import Inspection
+from cnpgen.store.sampling_statistics import DensityMap, SamplingStatistics
+from cnpgen.store.shard_record import ShardRecord
+from cnpgen.store.statistics import FieldStatistics
+from cnpgen.training.train import Trained
+from cnpgen.trajectory.joined import JoinedMotion
+from cnpgen.trajectory.spline_motion import States
+from cnpgen.validate.machine import MachineReport
+from cnpgen.validate.validate_dataset import ValidationReport
+
+__all__ = [
+    "Architecture",
+    "Attempt",
+    "Batch",
+    "Batches",
+    "Check",
+    "Completed",
+    "ConstraintValues",
+    "ControlPoints",
+    "DatasetSpec",
+    "DatasetSummary",
+    "DensityMap",
+    "Evaluation",
+    "Explanation",
+    "Exported",
+    "Feasibility",
+    "Features",
+    "FieldStatistics",
+    "Finding",
+    "Inspection",
+    "JoinedMotion",
+    "JoinedPlans",
+    "Layer",
+    "MachineReport",
+    "MadeDataset",
+    "Margin",
+    "Metrics",
+    "ModelConfig",
+    "Normalization",
+    "Outcome",
+    "Outputs",
+    "PaperRule",
+    "PlanIndexError",
+    "PlanStatus",
+    "PlannedHits",
+    "Reason",
+    "Refinement",
+    "RowError",
+    "RowReport",
+    "SamplingStatistics",
+    "ShardRecord",
+    "ShardTask",
+    "Split",
+    "States",
+    "StoredProblem",
+    "Tasks",
+    "Times",
+    "Trained",
+    "ValidationReport",
+    "Verdict",
+]

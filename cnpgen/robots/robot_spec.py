@@ -1,0 +1,140 @@
+"""Robot specification in a problem file: URDF, joints, limits, held object and payload."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from cnpgen.schema.keys import PerJoint, Range, field
+
+GEOMETRIES = ("urdf", "paper-capsules")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotSpec:
+    """Robot of a problem: URDF file, planned joints and tip frame."""
+
+    urdf: str = field("URDF file, relative to the problem file")
+    joints: tuple[str, ...] = field("planned joints, in order; all other joints stay at zero")
+    tip: str = field("name of the tip frame (URDF link)")
+    base: tuple[float, ...] = field("base configuration of the planned joints", unit="rad")
+    tip_offset: tuple[float, float, float] = field(
+        "offset of the tip in the frame 'tip': x, y, z", unit="m", default=(0.0, 0.0, 0.0), since_version=2
+    )
+    tip_rotation: tuple[float, float, float] = field(
+        "rotation of the tip in the frame 'tip': roll, pitch and yaw about fixed axes",
+        unit="rad",
+        default=(0.0, 0.0, 0.0),
+        since_version=2,
+    )
+    geometry: str = field(
+        'its shape: "urdf", the URDF\'s <collision> elements, or "paper-capsules", a line through the joints\' origins'
+        ' that is one radius thick; by default "urdf" where there are obstacles and such elements',
+        choices=GEOMETRIES,
+        default="paper-capsules",
+        since_version=2,
+    )
+    packages: tuple[str, ...] = field(
+        "folders, relative to the problem file, that are searched for package:// of the URDF",
+        default=(),
+        since_version=2,
+    )
+    convex_parts: int = field(
+        "maximum number of convex parts of a collision mesh; 1 for its convex hull",
+        default=1,
+        low=1,
+        high=64,
+        since_version=2,
+    )
+    srdf: str = field(
+        "SRDF file, relative to the problem file, whose disabled pairs of links are not kept apart; without it they are"
+        " found by sampling",
+        default="",
+        since_version=2,
+    )
+
+    def find_mistakes(self) -> Iterator[tuple[str, str]]:
+        """Yield (key, mistake) pairs."""
+        twice = sorted({name for name in self.joints if self.joints.count(name) > 1})
+        if twice:
+            yield "joints", f"each joint can be planned once, got {', '.join(twice)} more than once"
+        if len(self.base) != len(self.joints):
+            yield "base", f"expected {len(self.joints)} numbers, one per planned joint, got {len(self.base)}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class LimitSpec:
+    """Planning limits as fractions of the URDF's limits or of given limits."""
+
+    position_scale: float = field("planning limit / URDF limit of joint positions", default=1.0, low=1e-3, high=1.0)
+    velocity_scale: float = field("planning limit / URDF limit of joint velocities", default=1.0, low=1e-3, high=1.0)
+    acceleration_rate: float = field("acceleration limit / velocity limit", unit="1/s", default=10.0, low=1e-3)
+    acceleration_cap: float = field("maximum of the acceleration limits", unit="rad/s^2", default=20.0, low=1e-3)
+    torque_scale: float = field("planning limit / URDF limit of joint torques", default=1.0, low=1e-3, high=1.0)
+    position: tuple[Range, ...] | None = field(
+        "limits of joint positions in place of the URDF's, one range per planned joint; required for continuous joints",
+        unit="rad",
+        default=None,
+        since_version=2,
+    )
+    velocity: PerJoint | None = field(
+        "limits of joint velocities in place of the URDF's", unit="rad/s", default=None, low=1e-6, since_version=2
+    )
+    acceleration: PerJoint | None = field(
+        "planning limits of joint accelerations in place of rate and cap",
+        unit="rad/s^2",
+        default=None,
+        low=1e-6,
+        since_version=2,
+    )
+    jerk: PerJoint | None = field(
+        "planning limits of joint jerks; default 5/s times those of the accelerations",
+        unit="rad/s^3",
+        default=None,
+        low=1e-6,
+        since_version=2,
+    )
+    torque: PerJoint | None = field(
+        "limits of joint torques in place of the URDF's", unit="N m", default=None, low=1e-6, since_version=2
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Payload:
+    """Rigid body carried at the tip frame; a point mass without inertia and size."""
+
+    mass: float = field("mass", unit="kg", low=1e-9)
+    centre: tuple[float, float, float] = field("centre of mass in the tip frame", unit="m", default=(0.0, 0.0, 0.0))
+    inertia: tuple[float, float, float, float, float, float] | None = field(
+        "inertia about the centre of mass along the tip frame's axes: xx, yy, zz, xy, xz, yz",
+        unit="kg m^2",
+        default=None,
+    )
+    size: tuple[float, float, float] | None = field(
+        "edge lengths of a box of uniform density, in place of the inertia", unit="m", default=None, low=1e-6
+    )
+
+    def find_mistakes(self) -> Iterator[tuple[str, str]]:
+        """Yield (key, mistake) pairs."""
+        if self.inertia is not None and self.size is not None:
+            yield "size", "the payload has both an 'inertia' and a 'size', expected one of them"
+        principal = np.linalg.eigvalsh(self.times)
+        if principal[0] < 0 or principal[2] > (principal[0] + principal[1]) * (1 + 1e-9):
+            text = ", ".join(f"{each:g}" for each in principal)
+            yield "inertia", f"no body has the principal times {text} kg m^2: none is above the sum of the others"
+
+    @property
+    def times(self) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+        """Inertia about the center of mass [kg m^2], shape (3, 3)."""
+        if self.inertia is not None:
+            xx, yy, zz, xy, xz, yz = self.inertia
+            return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        squares = np.square(self.size or (0.0, 0.0, 0.0))
+        return np.diag(self.mass / 12 * (squares.sum() - squares))
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeldObject:
+    """Upright cuboid held rigidly with its center at the tip frame."""
+
+    size: tuple[float, float, float] = field("edge lengths along the tip frame's x, y, z", unit="m", low=1e-6)

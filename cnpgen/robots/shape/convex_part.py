@@ -1,0 +1,149 @@
+"""Convex parts of links: convex hulls of points with a radius, read from the geometry elements of a URDF."""
+
+import math
+from dataclasses import dataclass
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import RecipeError
+from cnpgen.robots.shape.hull import CUBE, MAX_COORDINATE_M, check_solid
+from cnpgen.robots.shape.inline import points_of
+from cnpgen.robots.urdf import urdf_tree
+
+Array = NDArray[np.float64]
+
+PRISM_SIDES = 64  # of the prism that contains a cylinder; its corners exceed the radius by 0.12 %
+
+
+@dataclass(frozen=True)
+class ConvexPart:
+    """A convex part of a link: all points within ``radius`` of the convex hull of ``vertices``.
+
+    Attributes:
+        link: Name of the link.
+        vertices: Corners of the hull [m], shape (V, 3); one for a sphere, two for a capsule.
+        radius: Radius around the hull [m]; 0 for boxes, cylinders and meshes.
+    """
+
+    link: str
+    vertices: Array
+    radius: float = 0.0
+
+    def moved(self, rotation: Array, translation: Array) -> "ConvexPart":
+        """Return the part in another frame.
+
+        Args:
+            rotation: Rotation of the present frame in the other one, shape (3, 3).
+            translation: Origin of the present frame in the other one [m], shape (3,).
+        """
+        return ConvexPart(self.link, self.vertices @ rotation.T + translation, self.radius)
+
+
+def link_convex_parts(urdf: str) -> list[ConvexPart]:
+    """Read the collision geometry of a URDF whose meshes are inline (``cnpgen.robots.shape.inline``).
+
+    A cylinder becomes a prism of ``PRISM_SIDES`` sides that contains it; all other geometry is exact.
+
+    Args:
+        urdf: Text of the URDF.
+
+    Returns:
+        The convex parts in the frames of their links, in the order of the URDF.
+
+    Raises:
+        RecipeError: A collision element is invalid.
+    """
+    found, mistakes = list[ConvexPart](), list[str]()
+    for link in urdf_tree(urdf).iter("link"):
+        for element in link.iter("collision"):
+            name = link.get("name", "")
+            try:
+                found.append(convex_part_of(name, element))
+            except (ValueError, TypeError) as error:
+                mistakes.append(f"the collision geometry of link {name!r} cannot be read: {error}")
+    if mistakes:
+        raise RecipeError(mistakes)
+    return found
+
+
+def convex_part_of(link: str, element: ElementTree.Element) -> ConvexPart:
+    """Read the geometry of an element of a link, in the frame of the link.
+
+    Raises:
+        ValueError: The element has no geometry, an invalid number, or a mesh that is not inline.
+    """
+    shape = element.find("geometry/*")
+    if shape is None:
+        raise ValueError("it has no <geometry>")
+    part = ConvexPart(link, *_core(shape)).moved(*origin_of(element.find("origin")))
+    if not np.isfinite(part.vertices).all():
+        raise ValueError("it has numbers that are not finite")
+    if max(np.abs(part.vertices).max(initial=0.0), part.radius) > MAX_COORDINATE_M:
+        raise ValueError(f"it reaches further than {MAX_COORDINATE_M:,.0f} m: are its numbers in m?")
+    if shape.tag == "mesh":
+        check_solid(part.vertices)
+    return part
+
+
+def _core(shape: ElementTree.Element) -> tuple[Array, float]:
+    """Return the corners [m] and the thickness [m] of a geometry, in its own frame."""
+    if shape.tag == "mesh":
+        return points_of(shape), 0.0
+    if shape.tag == "box":
+        return CUBE * [_positive(each) for each in _numbers(shape, "size", 3)], 0.0
+    if shape.tag not in ("sphere", "cylinder", "capsule"):
+        raise ValueError(f"<{shape.tag}> is not a box, sphere, cylinder, capsule or mesh")
+    radius = _positive(_numbers(shape, "radius", 1)[0])
+    if shape.tag == "sphere":
+        return np.zeros((1, 3)), radius
+    half = _positive(_numbers(shape, "length", 1)[0]) / 2
+    if shape.tag == "capsule":
+        return np.array([[0.0, 0.0, -half], [0.0, 0.0, half]]), radius
+    return prism(radius / math.cos(math.pi / PRISM_SIDES), half), 0.0
+
+
+def prism(outer: float, half: float) -> Array:
+    """Return the corners of a prism of ``PRISM_SIDES`` sides along z [m], shape (2 PRISM_SIDES, 3).
+
+    Args:
+        outer: Distance of the corners from the axis [m].
+        half: Half the length of the prism [m].
+    """
+    circle = [(outer * math.cos(a), outer * math.sin(a)) for a in np.arange(PRISM_SIDES) * (2 * math.pi / PRISM_SIDES)]
+    return np.array([[x, y, z] for z in (-half, half) for x, y in circle])
+
+
+def origin_of(element: ElementTree.Element | None) -> tuple[Array, Array]:
+    """Return rotation and translation [m] of a geometry in its link: roll, pitch and yaw about fixed axes."""
+    if element is None:
+        return np.eye(3), np.zeros(3)
+    place = np.array(_numbers(element, "xyz", 3) if element.get("xyz") else np.zeros(3))
+    return turned(*(_numbers(element, "rpy", 3) if element.get("rpy") else (0.0, 0.0, 0.0))), place
+
+
+def turned(roll: float, pitch: float, yaw: float) -> Array:
+    """Return the rotation by roll about x, then pitch about y, then yaw about z, fixed axes [rad], shape (3, 3)."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+
+
+def _numbers(element: ElementTree.Element, key: str, count: int) -> list[float]:
+    text = element.get(key, "")
+    values = [float(each) for each in text.split()]
+    if len(values) != count:
+        raise ValueError(f"<{element.tag}> needs {count} numbers as {key!r}, got {text!r}")
+    return values
+
+
+def _positive(value: float) -> float:
+    if not 0 < value < math.inf:
+        raise ValueError(f"lengths must be positive and finite, got {value:g} m")
+    return value

@@ -1,0 +1,161 @@
+"""Link pairs that can collide, determined by sampling as in MoveIt's setup assistant, or read from an SRDF."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations, product
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.robots.shape.capsule import Capsule
+from cnpgen.robots.shape.convex_part import ConvexPart
+from cnpgen.robots.shape.hull import ball_round, coal_hull
+
+if TYPE_CHECKING:
+    import pinocchio as pin
+
+Array = NDArray[np.float64]
+Names = frozenset[str]
+
+SAMPLED_STATES = 10_000  # ten times as many gave the same pairs for a Franka Panda
+ALWAYS_FRACTION = 0.95  # links that overlap in a larger fraction of the states are treated as connected
+MAX_CAPSULE_ERROR_FRACTION = (
+    0.05  # maximum fraction of collision-free states in which the capsules of a usable pair overlap
+)
+
+
+@dataclass(frozen=True)
+class LinkPair:
+    """Two links that move relative to each other.
+
+    Attributes:
+        first: Link nearer to the base.
+        second: Other link.
+        left_out: Reason to ignore the pair, "adjacent", "always" (in contact) or "disabled" (by an SRDF); or empty.
+        colliding: Fraction of sampled states in which the links overlap; nan for adjacent links.
+        mistaken: Fraction of the other states in which the capsules overlap.
+    """
+
+    first: str
+    second: str
+    left_out: str
+    colliding: float
+    mistaken: float
+
+    @property
+    def for_solvers(self) -> bool:
+        """Whether solvers use the capsules of the pair; judges check every pair that is not left out."""
+        return not self.left_out and self.colliding > 0 and self.mistaken <= MAX_CAPSULE_ERROR_FRACTION
+
+
+def find_pairs(
+    model: "pin.Model",
+    convex_parts: Sequence[ConvexPart],
+    capsules: Mapping[str, Capsule],
+    *,
+    joints: Mapping[str, int],
+    adjacent: frozenset[Names],
+    disabled: frozenset[Names] | None,
+) -> tuple[LinkPair, ...]:
+    """Determine the link pairs that can collide.
+
+    Args:
+        model: Pinocchio model, reduced to the planned joints; states are sampled within its position limits.
+        convex_parts: Convex parts of the links, in the frames of the joints that move them.
+        capsules: Link -> covering capsule, in the same frames.
+        joints: Link -> index in the model of the joint that moves it; 0 for fixed links.
+        adjacent: Pairs of links with only links without a shape between them.
+        disabled: Disabled pairs of an SRDF, None without an SRDF.
+    """
+    rotations, positions = _poses(model)
+    contact = _Contact(rotations, positions, convex_parts, joints)
+    found = []
+    for first, second in combinations(capsules, 2):
+        if joints[first] == joints[second]:
+            continue
+        names = frozenset((first, second))
+        if names in adjacent:
+            found.append(LinkPair(first, second, "adjacent", np.nan, np.nan))
+            continue
+        hit = contact.of(first, second)
+        ends = [_ends(capsules[link], rotations[joints[link]], positions[joints[link]]) for link in (first, second)]
+        near = segment_distances(*ends[0], *ends[1]) < capsules[first].radius + capsules[second].radius
+        colliding = float(hit.mean())
+        left_out = "disabled" if disabled and names in disabled else "always" if colliding > ALWAYS_FRACTION else ""
+        mistaken = float(near[~hit].mean()) if not hit.all() else 1.0
+        found.append(LinkPair(first, second, left_out, colliding, mistaken))
+    return tuple(found)
+
+
+def _poses(model: "pin.Model") -> tuple[Array, Array]:
+    """Return rotations (joints, K, 3, 3) and positions [m] (joints, K, 3) of all joints in random states."""
+    import pinocchio as pin
+
+    data, random = model.createData(), np.random.default_rng(0)
+    states = random.uniform(model.lowerPositionLimit, model.upperPositionLimit, (SAMPLED_STATES, model.nq))
+    found = np.empty((model.njoints, SAMPLED_STATES, 4, 3))
+    for k, q in enumerate(states):
+        pin.forwardKinematics(model, data, q)
+        for joint, pose in enumerate(data.oMi):
+            found[joint, k, :3], found[joint, k, 3] = pose.rotation, pose.translation
+    return found[:, :, :3], found[:, :, 3]
+
+
+class _Contact:
+    """Collision checks of links with Coal."""
+
+    def __init__(
+        self, rotations: Array, positions: Array, convex_parts: Sequence[ConvexPart], joints: Mapping[str, int]
+    ) -> None:
+        import coal
+
+        self._rotations, self._positions, self._joints = rotations, positions, joints
+        self._of_link: dict[str, list[tuple[Array, float, Any]]] = {}
+        for part in convex_parts:
+            shape = coal_hull(part.vertices)
+            shape.setSweptSphereRadius(part.radius)
+            self._of_link.setdefault(part.link, []).append((*ball_round(part.vertices, part.radius), shape))
+        self._request, self._places = coal.CollisionRequest(), (coal.Transform3s(), coal.Transform3s())
+
+    def of(self, first: str, second: str) -> NDArray[np.bool_]:
+        """Return a mask of the states in which two links overlap, shape (K,)."""
+        hit = np.zeros(self._positions.shape[1], bool)
+        for one, other in product(self._of_link[first], self._of_link[second]):
+            spheres = [
+                self._rotations[self._joints[link]] @ centre + self._positions[self._joints[link]]
+                for link, (centre, _, _) in ((first, one), (second, other))
+            ]
+            near = np.linalg.norm(spheres[0] - spheres[1], axis=1) < one[1] + other[1]
+            for k in np.flatnonzero(near & ~hit):
+                hit[k] = self._touch(first, one[2], second, other[2], int(k))
+        return hit
+
+    def _touch(self, first: str, one: Any, second: str, other: Any, k: int) -> bool:
+        import coal
+
+        for link, place in zip((first, second), self._places, strict=True):
+            place.setRotation(self._rotations[self._joints[link], k])
+            place.setTranslation(self._positions[self._joints[link], k])
+        result = coal.CollisionResult()
+        coal.collide(one, self._places[0], other, self._places[1], self._request, result)
+        return bool(result.isCollision())
+
+
+def _ends(capsule: Capsule, rotations: Array, positions: Array) -> tuple[Array, Array]:
+    """Return both ends of a capsule in the world at K states [m], each of shape (K, 3)."""
+    return rotations @ capsule.first + positions, rotations @ capsule.second + positions
+
+
+def segment_distances(a: Array, b: Array, c: Array, d: Array) -> Array:
+    """Return the distances between segments a to b and c to d [m], shape (K,), for ends of shape (K, 3).
+
+    The closest points of the lines are clamped to one segment after the other (Ericson 2005, section 5.1.9).
+    """
+    one, other, between = b - a, d - c, a - c
+    aa, bb, ab = (np.einsum("ki,ki->k", x, y) for x, y in ((one, one), (other, other), (one, other)))
+    ar, br = (np.einsum("ki,ki->k", x, between) for x in (one, other))
+    s = np.clip((ab * br - ar * bb) / np.maximum(aa * bb - ab**2, 1e-18), 0, 1)
+    t = np.clip((ab * s + br) / np.maximum(bb, 1e-18), 0, 1)
+    s = np.clip((ab * t - ar) / np.maximum(aa, 1e-18), 0, 1)
+    return np.asarray(np.linalg.norm(between + s[:, None] * one - t[:, None] * other, axis=1))

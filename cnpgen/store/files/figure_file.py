@@ -1,0 +1,35 @@
+"""Figures of matplotlib, which is an optional dependency: creating and saving them."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cnpgen.errors import MachineError
+from cnpgen.store.files.atomic import machine_error
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def new_figure(width: float, height: float, dpi: int = 110) -> "Figure":
+    """Return an empty figure with a size [inch] and automatic layout.
+
+    Raises:
+        MachineError: matplotlib is missing.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise MachineError(f"matplotlib cannot be imported ({error}): pip install 'cnpgen[plot]'") from error
+    return Figure(figsize=(width, height), layout="constrained", dpi=dpi)
+
+
+def save_figure(figure: "Figure", path: Path) -> None:
+    """Write a figure in the format of the suffix.
+
+    Raises:
+        MachineError: The file cannot be written.
+    """
+    try:
+        figure.savefig(path)
+    except OSError as error:
+        raise machine_error("write", path, error) from error

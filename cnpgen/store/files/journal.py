@@ -1,0 +1,139 @@
+"""An append-only journal: records with checksums, which survive a crash except for an incomplete last record.
+
+The file starts with a line that names its format. Every record has its length (8 bytes, little endian), its sha256 and
+its bytes. A reader stops at the first incomplete or damaged record; the next writer overwrites it.
+"""
+
+import hashlib
+import os
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+
+from cnpgen.errors import DatasetError, UsageError
+from cnpgen.store.files.atomic import machine_error
+
+MAX_RECORD_BYTES = 1 << 30
+_LENGTH_BYTES = 8
+_DIGEST_BYTES = hashlib.sha256().digest_size
+_MODE = os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0)  # the file is not truncated before it is locked
+
+
+@dataclass
+class JournalFile:
+    """An open journal, locked for this process.
+
+    Attributes:
+        path: Path of the file.
+        records: Valid records of the file, in order.
+    """
+
+    path: Path
+    records: list[bytes]
+    _file: IO[bytes]
+    _magic: bytes
+
+    def append(self, record: bytes) -> None:
+        """Append a record and flush it to the disk.
+
+        Raises:
+            MachineError: The file cannot be written.
+        """
+        length = len(record).to_bytes(_LENGTH_BYTES, "little")
+        try:
+            self._file.write(length + hashlib.sha256(record).digest() + record)
+            self._file.flush()
+            os.fsync(self._file.fileno())
+        except OSError as error:
+            raise machine_error("write", self.path, error) from error
+        self.records.append(record)
+
+    def clear(self) -> None:
+        """Remove all records.
+
+        Raises:
+            MachineError: The file cannot be written.
+        """
+        try:
+            self._file.seek(0)
+            self._file.truncate()
+            self._file.write(self._magic)
+            self._file.flush()
+        except OSError as error:
+            raise machine_error("write", self.path, error) from error
+        self.records.clear()
+
+    def close(self) -> None:
+        """Close and unlock the file."""
+        with suppress(OSError):  # of an incomplete record after a failed append
+            self._file.close()
+
+
+def open_journal_file(path: Path, magic: bytes) -> JournalFile:
+    """Open a journal for reading and appending, and remove an incomplete last record.
+
+    Args:
+        path: Path of the file; it is created if it is missing.
+        magic: First line of the file, with format name and version, in ASCII with its newline.
+
+    Raises:
+        DatasetError: The file does not start with ``magic``.
+        UsageError: Another process has locked the file.
+        MachineError: The file cannot be opened.
+    """
+    try:
+        file = os.fdopen(os.open(path, _MODE, 0o666), "r+b")
+    except OSError as error:
+        raise machine_error("write", path, error) from error
+    try:
+        return _recover(path, file, magic)
+    except OSError as error:
+        file.close()
+        raise machine_error("write", path, error) from error
+    except BaseException:
+        file.close()
+        raise
+
+
+def _recover(path: Path, file: IO[bytes], magic: bytes) -> JournalFile:
+    """Lock the file, read its records and remove what follows them."""
+    _lock(path, file)
+    head = file.read(len(magic))
+    if not magic.startswith(head):
+        raise DatasetError(f"{path} does not start with {magic!r}")
+    journal = JournalFile(path, [], file, magic)
+    if head == magic:
+        journal.records = _read_records(file)
+        file.truncate()
+    else:  # a new file, or one that ended within its first line
+        journal.clear()
+    return journal
+
+
+def _read_records(file: IO[bytes]) -> list[bytes]:
+    """Return the valid records from the current position, and seek to their end."""
+    records, end = [], file.tell()
+    header_bytes = _LENGTH_BYTES + _DIGEST_BYTES
+    while len(header := file.read(header_bytes)) == header_bytes:
+        record = file.read(min(int.from_bytes(header[:_LENGTH_BYTES], "little"), MAX_RECORD_BYTES))
+        if hashlib.sha256(record).digest() != header[_LENGTH_BYTES:]:
+            break
+        records.append(record)
+        end = file.tell()
+    file.seek(end)
+    return records
+
+
+def _lock(path: Path, file: IO[bytes]) -> None:
+    """Lock the file for this process, if the system supports it."""
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        return
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise UsageError(f"{path} is in use by another process") from error
+    except OSError:  # file systems without locks
+        return

@@ -1,0 +1,26 @@
+"""Size limits of untrusted files, checked before memory is allocated.
+
+The limits of recipes are in ``cnpgen.schema.toml``, those of URDFs in ``cnpgen.robots.urdf``.
+"""
+
+# HDF5
+MAX_HDF5_BYTES = 1 << 36  # of a file
+MAX_CHECKSUM_FILE_BYTES = 1 << 30  # of a model or a checkpoint, which are read at once
+MAX_EXPANSION = 100  # maximum ratio of the unpacked numbers to the size of the file, ...
+MIN_EXPANSION_LIMIT_BYTES = 1 << 24  # ... unless the unpacked numbers are smaller than this
+MAX_DIMENSIONS = 4  # of a dataset
+MAX_NAMES = 10_000  # of datasets in a file, or of attributes
+MAX_ATTRIBUTE_BYTES = 1 << 24  # of an attribute; the largest ones are URDFs
+
+# CSV
+MAX_TABLE_BYTES = 1 << 28
+MAX_TABLE_COLUMNS = 1_000
+
+# JSON
+MAX_DOCUMENT_BYTES = 1 << 25  # a manifest of 50,000 shards has 21 MB
+MAX_DOCUMENT_DEPTH = 32  # nested tables and lists
+
+# datasets
+MAX_SHARDS = 50_000
+MAX_FIELDS = 1_000
+MAX_COLUMNS = 100_000  # of a field

@@ -1,0 +1,247 @@
+"""The sidecar of a shard: its commit record, written after the shard has been flushed to the disk."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+from cnpgen.errors import CnpgenError, DatasetError
+from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, shard_attributes, shards
+from cnpgen.store.files.atomic import file_sha256
+from cnpgen.store.files.document_structure import ANY_KEY, NUMBER, TEXT, WHOLE, check_structure
+from cnpgen.store.files.documents import load_document, save_document
+from cnpgen.store.layout import WORK
+from cnpgen.store.sampling_statistics import SAMPLING_STRUCTURE, SamplingStatistics, sampling_from_json
+from cnpgen.store.shard import write_shard
+from cnpgen.store.statistics import STATISTICS_STRUCTURE, FieldStatistics, column_statistics, statistics_from_json
+
+SHARD_RECORD_FORMAT = "cnpgen-shard-record"
+SHARD_RECORD_VERSION = 2
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ShardRecord:
+    """The record of a finished shard and of how it was made.
+
+    Attributes:
+        file: Path of the shard, relative to the folder of the dataset.
+        bytes: Size of the file [bytes].
+        sha256: sha256 of the file.
+        rows: Number of rows.
+        first_sample_id: Index of its first row within the split.
+        specification_fingerprint: Fingerprint of the specification of the shard.
+        statistics: Field name -> statistics of its columns.
+        sampling: Sampling statistics of the shard.
+        started: Start time of the computation, ISO 8601 in UTC.
+        seconds: Computing time [s].
+        versions: Versions of cnpgen, Python and libraries that made the shard.
+    """
+
+    file: str
+    bytes: int
+    sha256: str
+    rows: int
+    first_sample_id: int
+    specification_fingerprint: str
+    statistics: Mapping[str, FieldStatistics]
+    sampling: SamplingStatistics
+    started: str = ""
+    seconds: float = 0.0
+    versions: Mapping[str, str] = field(default_factory=dict)
+
+
+_RECORD_STRUCTURE = {
+    **dict.fromkeys(("file", "sha256", "specification_fingerprint", "started"), TEXT),
+    **dict.fromkeys(("bytes", "rows", "first_sample_id"), WHOLE),
+    "seconds": NUMBER,
+    "versions": {ANY_KEY: TEXT},
+    "sampling": SAMPLING_STRUCTURE,
+    "statistics": {ANY_KEY: STATISTICS_STRUCTURE},
+}
+_PLAIN = (
+    "file",
+    "bytes",
+    "sha256",
+    "rows",
+    "first_sample_id",
+    "specification_fingerprint",
+    "started",
+    "seconds",
+    "versions",
+)
+
+
+def record_to_json(record: ShardRecord) -> dict[str, Any]:
+    """Return a record as a JSON-able dict."""
+    return {
+        **{name: getattr(record, name) for name in _PLAIN},
+        "sampling": record.sampling.to_json(),
+        "statistics": {name: item.to_json() for name, item in record.statistics.items()},
+    }
+
+
+def record_from_json(content: Mapping[str, Any]) -> ShardRecord:
+    """Rebuild a record from the result of :func:`record_to_json`.
+
+    Raises:
+        DatasetError: A key is missing or has the wrong type.
+    """
+    try:
+        check_structure(content, _RECORD_STRUCTURE)
+        statistics = {name: statistics_from_json(item) for name, item in content["statistics"].items()}
+        sampling = sampling_from_json(content["sampling"])
+        return ShardRecord(**{name: content[name] for name in _PLAIN}, statistics=statistics, sampling=sampling)
+    except ValueError as error:
+        raise DatasetError(f"the shard's record is damaged: {error}") from error
+
+
+def save_record(folder: Path, task: ShardTask, record: ShardRecord) -> None:
+    """Write a shard's sidecar; from now on the shard counts as made.
+
+    Raises:
+        MachineError: A file cannot be written.
+    """
+    document = {"format": SHARD_RECORD_FORMAT, "format_version": SHARD_RECORD_VERSION, **record_to_json(record)}
+    save_document(folder / task.sidecar, document, work=folder / WORK)
+
+
+def load_record(folder: Path, task: ShardTask) -> ShardRecord:
+    """Read the sidecar of a shard.
+
+    Raises:
+        DatasetError: It is missing, damaged, of another format version or of another shard.
+        MachineError: A file cannot be read.
+    """
+    path = folder / task.sidecar
+    record = record_from_json(load_document(path, SHARD_RECORD_FORMAT, version=SHARD_RECORD_VERSION, structure={}))
+    if (record.file, record.rows, record.first_sample_id) != (task.file, task.rows, task.first_row):
+        shard = f"{record.file}, {record.rows} rows from row {record.first_sample_id}"
+        raise DatasetError(f"{path} is the record of another shard: {shard}")
+    return record
+
+
+def commit_shard(
+    folder: Path,
+    spec: DatasetSpec,
+    task: ShardTask,
+    *,
+    columns: Mapping[str, NDArray[Any]],
+    sampling: SamplingStatistics,
+    started: str = "",
+    seconds: float = 0.0,
+    versions: Mapping[str, str] | None = None,
+) -> ShardRecord:
+    """Write a shard and then its sidecar; a committed shard is not written again.
+
+    Args:
+        folder: Folder of the dataset.
+        spec: Specification of the dataset.
+        task: The shard.
+        columns: Field name -> values in their stored type, shape (rows, width) or (rows,).
+        sampling: Sampling statistics of the shard.
+        started: Start time of the computation, ISO 8601 in UTC.
+        seconds: Computing time [s].
+        versions: Versions of cnpgen, Python and libraries that made the shard.
+
+    Returns:
+        The record of the shard.
+
+    Raises:
+        DatasetError: The columns do not fit the specification, or are not finite.
+        MachineError: A file cannot be written.
+    """
+    if is_committed(folder, spec, task):  # another process made the same shard
+        return load_record(folder, task)
+    about = {"sampling": sampling, "started": started, "seconds": seconds, "versions": versions or {}}
+    try:
+        return _write(folder, spec, task, columns, about)
+    except CnpgenError:
+        # Another process may have committed the shard, finished the dataset and removed all temporary files.
+        if is_committed(folder, spec, task):
+            return load_record(folder, task)
+        raise
+
+
+def _write(
+    folder: Path,
+    spec: DatasetSpec,
+    task: ShardTask,
+    columns: Mapping[str, NDArray[Any]],
+    about: Mapping[str, Any],
+) -> ShardRecord:
+    """Write a shard and then its sidecar, unless another process has committed the shard in the meantime."""
+    path = folder / task.file
+    size = write_shard(path, columns, spec.fields, shard_attributes(spec, task), dtype=spec.dtype, work=folder / WORK)
+    record = ShardRecord(
+        file=task.file,
+        bytes=size,
+        sha256=file_sha256(path),
+        rows=task.rows,
+        first_sample_id=task.first_row,
+        specification_fingerprint=spec.version_with(task).fingerprint,
+        statistics=column_statistics(columns, spec.fields),
+        **about,
+    )
+    if is_committed(folder, spec, task):  # another process may already have summarized its own record
+        return load_record(folder, task)
+    save_record(folder, task, record)
+    return record
+
+
+def load_committed(folder: Path, spec: DatasetSpec, task: ShardTask) -> ShardRecord:
+    """Read the sidecar of a shard and check that it belongs to this specification; the shard itself is not read.
+
+    Args:
+        folder: Folder of the dataset.
+        spec: Specification of the dataset.
+        task: The shard.
+
+    Raises:
+        DatasetError: The sidecar is missing, damaged or of another specification, or the shard is missing or has
+            another size.
+        MachineError: A file cannot be read.
+    """
+    record = load_record(folder, task)
+    if record.specification_fingerprint != spec.version_with(task).fingerprint:
+        raise DatasetError(
+            f"{folder / task.sidecar} belongs to another specification ({record.specification_fingerprint[:12]}...)"
+        )
+    path = folder / task.file
+    size = path.stat().st_size if path.is_file() else None
+    if size != record.bytes:
+        problem = "it is missing" if size is None else f"it has {size} bytes instead of {record.bytes}"
+        raise DatasetError(f"{path} is not the recorded file: {problem}")
+    return record
+
+
+def check_committed(folder: Path, spec: DatasetSpec, task: ShardTask) -> None:
+    """Check that a shard is the recorded one, by its sha256.
+
+    Args:
+        folder: Folder of the dataset.
+        spec: Specification of the dataset.
+        task: The shard.
+
+    Raises:
+        DatasetError: As for :func:`load_committed`, or the shard was changed.
+        MachineError: A file cannot be read.
+    """
+    record = load_committed(folder, spec, task)
+    if file_sha256(folder / task.file) != record.sha256:
+        raise DatasetError(f"{folder / task.file} was changed: its sha256 is not the recorded one")
+
+
+def is_committed(folder: Path, spec: DatasetSpec, task: ShardTask) -> bool:
+    """Return whether the sidecar of a shard is valid and of this specification, and its file has the recorded size."""
+    try:
+        load_committed(folder, spec, task)
+    except DatasetError:
+        return False
+    return True
+
+
+def pending(folder: Path, spec: DatasetSpec) -> list[ShardTask]:
+    """List the shards that are not committed, in order."""
+    return [task for task in shards(spec) if not is_committed(folder, spec, task)]

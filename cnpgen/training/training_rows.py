@@ -1,0 +1,126 @@
+"""Training rows in memory: tasks, features and obstacle poses."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.loader.order import Order
+from cnpgen.planner.control_points import ControlPoints
+from cnpgen.planner.network.features import Features, fit_features, usual_blocks
+from cnpgen.planner.task_preprocessor import TaskPreprocessor
+from cnpgen.planner.tasks import Tasks
+from cnpgen.plans.format import BOUNDARY, CONDITIONS
+from cnpgen.trajectory.boundary import Boundary
+
+Array = NDArray[Any]
+PREPARED_ROWS_PER_BLOCK = 8192
+
+
+@dataclass(frozen=True)
+class Rows:
+    """N training rows.
+
+    Attributes:
+        tasks: The tasks.
+        features: The network's inputs, shape (N, F).
+        obstacle_poses: Poses and sizes of the obstacles, shape (N, width).
+        target: Control points of demonstrations; None if there are none.
+    """
+
+    tasks: Tasks
+    features: Array
+    obstacle_poses: Array
+    target: ControlPoints | None = None
+
+    def __len__(self) -> int:
+        return len(self.features)
+
+    def take(self, which: NDArray[np.intp]) -> "Rows":
+        """Return a subset of the rows."""
+        target = None if self.target is None else ControlPoints(self.target.path[which], self.target.rate[which])
+        return Rows(self.tasks.take(which), self.features[which], self.obstacle_poses[which], target)
+
+
+def boundary_columns(columns: dict[str, Array]) -> Boundary:
+    """Return the boundary conditions among the columns of a dataset; missing ones are zero, goal accelerations free."""
+    zero = np.zeros_like(columns["start_q"], np.float64)
+    named = {name: columns.get(name, zero) for name in CONDITIONS if name in columns or name in BOUNDARY}
+    return Boundary(**{name: np.asarray(values, np.float64) for name, values in named.items()})
+
+
+def prepare_rows(
+    boundary: Boundary,
+    prepare: TaskPreprocessor,
+    *,
+    features: Features | None = None,
+    lines: Callable[[Boundary], Tasks] | None = None,
+    dtype: str = "float32",
+) -> tuple[Rows, Features]:
+    """Prepare rows in blocks, because temporary arrays take four times the memory of the result.
+
+    Args:
+        boundary: Boundary conditions of N rows.
+        prepare: Preprocessor of the problem's tasks.
+        features: Standardization of the features; by these rows if None.
+        lines: Preprocessor of tasks along other lines; ``prepare`` if None.
+        dtype: Float type of the rows.
+
+    Returns:
+        The rows, and the standardization of their features.
+    """
+    blocks = [
+        slice(first, first + PREPARED_ROWS_PER_BLOCK)
+        for first in range(0, max(len(boundary), 1), PREPARED_ROWS_PER_BLOCK)
+    ]
+    straight = replace(prepare, line=None)  # features do not depend on the projected line, which takes most of the time
+    definition = features or fit_features((straight(boundary[block]) for block in blocks), usual_blocks(boundary))
+    arrays: dict[str, Array] = {}
+    for block in blocks:
+        for name, values in _arrays((lines or prepare)(boundary[block]), prepare, definition, dtype).items():
+            if name not in arrays:
+                arrays[name] = np.empty((len(boundary), *values.shape[1:]), dtype)
+            arrays[name][block] = values
+    ends = Boundary(**{name: arrays.pop(name) for name in boundary.conditions()})
+    row_features, obstacle_poses = arrays.pop("features"), arrays.pop("obstacle_poses")
+    return Rows(features=row_features, obstacle_poses=obstacle_poses, tasks=Tasks(ends, **arrays)), definition
+
+
+def _arrays(tasks: Tasks, prepare: TaskPreprocessor, features: Features, dtype: str) -> dict[str, Array]:
+    """Return all arrays of a block of rows with one entry per task, by name."""
+    arrays = tasks.boundary.conditions()
+    arrays |= {name: values for name, values in vars(tasks).items() if name != "boundary" and values is not None}
+    return arrays | {
+        "features": features.of(tasks, dtype),
+        "obstacle_poses": prepare.obstacle_poses(tasks.start_xyz, tasks.goal_xyz),
+    }
+
+
+def zero_conditions(boundary: Boundary) -> tuple[str, ...]:
+    """Return the names of the boundary conditions that are zero in all rows."""
+    return tuple(name for name, values in boundary.conditions().items() if name.endswith("dq") and not np.any(values))
+
+
+class StepRows:
+    """Batches of shuffled rows; every epoch has another order, and rows that do not fill a batch are omitted.
+
+    Args:
+        rows: Number of rows.
+        batch_size: Rows per batch.
+        seed: Seed.
+    """
+
+    def __init__(self, rows: int, batch_size: int, seed: int) -> None:
+        self.batch_size = min(batch_size, rows)
+        self.batches = rows // self.batch_size
+        self._rows, self._seed, self._epoch = rows, seed, -1
+        self._order: NDArray[np.int64] = np.empty(0, np.int64)
+
+    def batch(self, step: int) -> NDArray[np.int64]:
+        """Return the rows of the batch of one step, shape (batch_size,)."""
+        epoch, index = divmod(step, self.batches)
+        if epoch != self._epoch:
+            self._epoch, self._order = epoch, Order("train", (self._rows,), self._seed, epoch).rows_of(0)
+        return self._order[index * self.batch_size : (index + 1) * self.batch_size]

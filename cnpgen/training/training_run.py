@@ -1,0 +1,198 @@
+"""A training run: steps, log, validation, checkpoints, and selection of the best model."""
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import MachineError
+from cnpgen.losses.metric import Metric
+from cnpgen.losses.quadrature import rotating_shift
+from cnpgen.machine.signals import signals_deferred
+from cnpgen.planner.model import Model, ModelConfig
+from cnpgen.planner.network.features import Features
+from cnpgen.problems.problem_record import ProblemRecord
+from cnpgen.training.adam import learning_rate
+from cnpgen.training.checkpoint import Checkpoints
+from cnpgen.training.log import TrainingLog
+from cnpgen.training.step import Learner
+from cnpgen.training.training_rows import Rows, StepRows
+from cnpgen.training.training_state import Best, State, Sums
+
+Array = NDArray[Any]
+Watcher = Callable[[Mapping[str, Any]], None]
+Validate = Callable[[Model], Mapping[str, Any]]
+
+LOG_LINES, VALIDATIONS = 100, 10  # per run
+SHIFT_STRIDE = 7  # between the shifts of successive steps; coprime to the number of shifts
+
+
+@dataclass
+class Run:
+    """One run.
+
+    Attributes:
+        learner: Architecture, loss, settings.
+        names: Names of the loss's terms.
+        budgets: Term -> its acceptable value, from the problem file.
+        rows: The training rows.
+        features: Definition of the features.
+        metric: Weights of the constraint terms.
+        problem: The problem.
+        config: Definition of the network's outputs.
+        validate: Function that scores a model: a record for the log with a ``score``, the larger the better.
+        zero_conditions: Boundary conditions that are zero in all training rows.
+        initial_parameters: Parameters to start from; None for random ones.
+        training: Metadata recorded in the model.
+        order: Order of the rows.
+    """
+
+    learner: Learner
+    names: tuple[str, ...]
+    budgets: Mapping[str, float]
+    rows: Rows
+    features: Features
+    metric: Metric
+    problem: ProblemRecord
+    config: ModelConfig
+    validate: Validate
+    zero_conditions: tuple[str, ...] = ()
+    initial_parameters: Array | None = None
+    training: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        settings = self.learner.settings
+        self.order = StepRows(len(self.rows), settings.batch_size, settings.seed)
+
+    def train(self, state: State, checkpoints: Checkpoints, journal: TrainingLog, watch: Watcher | None = None) -> None:
+        """Train until the last step.
+
+        Args:
+            state: State of the run; changed in place.
+            checkpoints: Checkpoints, written at intervals.
+            journal: The log.
+            watch: Called with every line of the log.
+
+        Raises:
+            MachineError: The loss is not finite any more, or the disk is full.
+        """
+        if state.metric:
+            self.metric.load_state(state.metric)
+        gradient = np.empty_like(state.adam.parameters)
+        while state.adam.step < state.steps:
+            with signals_deferred() as waiting:
+                while state.adam.step < state.steps and not waiting.came:
+                    self._train_step(state, gradient, journal, watch)
+                    checkpoints.save_if_due(state)
+                if waiting.came:
+                    checkpoints.save(state)
+
+    def _train_step(self, state: State, gradient: Array, journal: TrainingLog, watch: Watcher | None) -> None:
+        """Take a step, and write the records that are due after it."""
+        started = time.process_time()
+        self.step(state, gradient)
+        state.seconds += time.process_time() - started
+        for record in self._due(state):
+            journal.write(record)
+            if watch is not None:
+                watch(record)
+
+    def model(self, parameters: Array) -> Model:
+        """Return a model with these parameters."""
+        return Model(
+            problem=self.problem,
+            architecture=self.learner.architecture,
+            parameters=parameters.astype(np.float32),
+            features=self.features,
+            config=self.config,
+            zero_conditions=self.zero_conditions,
+            training=self.training,
+        )
+
+    def step(self, state: State, gradient: Array) -> None:
+        """Take one step; ``gradient`` is a buffer of shape (n_parameters,)."""
+        adam, step = state.adam, state.adam.step
+        rows = self.rows.take(self.order.batch(step))
+        if step < state.imitating:
+            distances = self.learner.imitation_gradient(adam.parameters, rows, clipping=state.clipping, out=gradient)
+            state.sums.add_distances(distances)
+        else:
+            self._gradient(state, rows, gradient)
+        self.learner.update(adam, state.clipping, gradient, rate=self._rate(state, step))
+
+    def _gradient(self, state: State, rows: Rows, gradient: Array) -> None:
+        """Write the gradient of the loss, and pass the terms of the batch to the metric."""
+        progress = state.progress(state.adam.step)
+        terms = self.learner.gradient(
+            state.adam.parameters,
+            rows,
+            self.metric.weights(progress),
+            shift=rotating_shift(state.adam.step * SHIFT_STRIDE, self.learner.settings.shifts),
+            clipping=state.clipping,
+            out=gradient,
+        )
+        self.metric.observe(terms, progress)
+        if (state.adam.step + 1) % self.order.batches == 0:
+            self.metric.end_epoch(progress)
+        state.metric = self.metric.state()
+        state.sums.add(terms)
+
+    def _rate(self, state: State, step: int) -> float:
+        settings = self.learner.settings
+        return learning_rate(
+            step, state.steps, peak=settings.learning_rate, final=settings.final_rate, warm_up=settings.warm_up
+        )
+
+    def _due(self, state: State) -> list[dict[str, Any]]:
+        """Return the records of the log that are due after this step."""
+        step, records = state.adam.step, []
+        if _is_due(step, state.steps, LOG_LINES):
+            records.append(self._progress(state))
+        if _is_due(step, state.steps, VALIDATIONS):
+            records.append(self._check(state))
+        return records
+
+    def _progress(self, state: State) -> dict[str, Any]:
+        """Return the means of the terms since the last line."""
+        sums, step = state.sums, state.adam.step
+        state.sums = Sums(np.zeros_like(sums.terms))
+        if sums.lost > sums.steps * self.order.batch_size // 2:
+            raise MachineError(
+                f"the loss of most plans is not finite at step {step}: try a smaller {{learning_rate}}",
+                remedies={"learning_rate": None},
+            )
+        return {
+            "step": step,
+            "epoch": round(step / self.order.batches, 3),
+            "learning_rate": self._rate(state, step - 1),
+            "seconds": round(state.seconds, 2),
+            **({"imitation": sums.distance / sums.imitating} if sums.imitating else {}),
+            **(self._means(state, sums) if sums.steps else {}),
+            "lost": sums.lost,
+        }
+
+    def _means(self, state: State, sums: Sums) -> dict[str, Any]:
+        means, weights = sums.terms / sums.steps, self.metric.weights(state.progress(state.adam.step - 1))
+        return {
+            "loss": float(means[0] + means[1:] @ weights),
+            "terms": dict(zip(self.names, means.tolist(), strict=True)),
+            "weights": dict(zip(self.names[1:], weights.tolist(), strict=True)),
+            "budgets": dict(self.budgets),
+        }
+
+    def _check(self, state: State) -> dict[str, Any]:
+        """Validate the averaged parameters; keep them if they are the best so far."""
+        started, step = time.process_time(), state.adam.step
+        record = self.validate(self.model(state.adam.average))
+        if record["score"] >= state.best.score:
+            state.best = Best(record["score"], step, state.adam.average.copy())
+        state.checking += time.process_time() - started
+        return {"step": step, "seconds": round(state.seconds, 2), "validation": dict(record)}
+
+
+def _is_due(step: int, steps: int, times: int) -> bool:
+    """Return whether an event that happens ``times`` times per run is due after this step."""
+    return step * times // steps > (step - 1) * times // steps

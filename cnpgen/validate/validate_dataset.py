@@ -1,0 +1,166 @@
+"""Validation of a dataset: its files, every row with Pinocchio and Coal, and regenerated random blocks."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from cnpgen.errors import DatasetError, counted
+from cnpgen.judges.rows.row_report import RowReport
+from cnpgen.machine.engine import Engine
+from cnpgen.make.recipe_file import restored
+from cnpgen.schema.arguments import integer
+from cnpgen.store.check import Finding, check_dataset
+from cnpgen.store.dataset_spec import DatasetSpec, load_dataset_spec, shards
+from cnpgen.store.layout import SPECIFICATION
+from cnpgen.store.paths import require_folder
+from cnpgen.store.shard_record import is_committed
+from cnpgen.store.workspace import is_dataset
+from cnpgen.validate.blocks import Regeneration, backend_of, regenerate_blocks
+from cnpgen.validate.validate_documents import check_recipe, check_statistics
+from cnpgen.validate.validate_rows import DeepCheck, check_rows
+
+
+@dataclass(frozen=True)
+class ValidationReport:
+    """Result of a validation.
+
+    Attributes:
+        folder: Folder of the dataset.
+        rows: Number of rows of the existing shards.
+        findings: Problems and notes, by file.
+        deep: Report of the recomputation of every row with Pinocchio and Coal; None without a deep check.
+        plans: Numbers of judged and of valid plans; None without a deep check or without plans.
+        wanted: Number of blocks that were requested to be regenerated.
+        blocks: Number of blocks of the dataset.
+        regenerated: Number of regenerated blocks.
+        identical: Number of regenerated blocks that are bitwise identical.
+    """
+
+    folder: Path
+    rows: int
+    findings: tuple[Finding, ...]
+    deep: RowReport | None = None
+    plans: tuple[int, int] | None = None
+    wanted: int = 0
+    blocks: int = 0
+    regenerated: int = 0
+    identical: int = 0
+
+    @property
+    def ok(self) -> bool:
+        """Whether there are no findings except for notes."""
+        return all(finding.note for finding in self.findings)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the report for JSON."""
+        return {
+            "folder": str(self.folder),
+            "ok": self.ok,
+            "rows": self.rows,
+            "findings": [
+                {"file": item.file, "problem": item.problem, "note": item.note, "hint": item.hint}
+                for item in self.findings
+            ],
+            "deep": self.deep.to_dict() if self.deep else None,
+            "plans": dict(zip(("judged", "valid"), self.plans, strict=True)) if self.plans else None,
+            "blocks": self.blocks,
+            "regenerated": self.regenerated,
+            "identical": self.identical,
+        }
+
+    def summary(self) -> str:
+        """Return a summary in a few lines."""
+        n_problems = sum(not finding.note for finding in self.findings)
+        findings = counted(n_problems, "finding") if n_problems else "no findings"
+        lines = [f"{self.folder}: {counted(self.rows, 'row')}, {findings}"]
+        if self.deep:
+            failed = f"{len(self.deep.failed_rows):,} out"
+            lines.append(f"  recomputed with Pinocchio and Coal: {counted(self.deep.rows, 'row')}, {failed}")
+            lines += [
+                f"    {check.name:<22} worst {check.worst:9.2e} of {check.tolerance:9.2e} {check.unit:<8}"
+                f" {counted(check.n_failed, 'row')} out"
+                for check in self.deep.checks
+            ]
+        if self.plans:
+            lines.append(f"  judged at all times: {counted(self.plans[0], 'plan')}, {self.plans[1]:,} valid")
+        if self.wanted:
+            lines.append(f"  made again: {self._blocks_text()}, {self.identical:,} identical to the bit")
+        hints = dict.fromkeys(finding.hint for finding in self.findings if finding.hint and not finding.note)
+        return "\n".join([*lines, *(f"  hint: {text}" for text in hints)])
+
+    def _blocks_text(self) -> str:
+        """Describe the number of regenerated blocks."""
+        text = f"{self.regenerated:,} of {counted(self.blocks, 'block')}"
+        return f"{text} ({self.wanted:,} were requested)" if self.wanted > self.blocks else text
+
+
+def validate_dataset(
+    folder: str | Path,
+    *,
+    deep: bool = False,
+    regenerate: int = 0,
+    workers: int | None = None,
+    engine: str | None = None,
+    address: str | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> ValidationReport:
+    """Validate a dataset.
+
+    Checksums, counts, schema and provenance are always checked; every row and some regenerated blocks optionally.
+
+    Args:
+        folder: Folder of the dataset.
+        deep: Whether to recompute kinematics, limits, torques, manifold and collisions of every row with Pinocchio and
+            Coal.
+        regenerate: Number of random blocks to regenerate and compare.
+        workers: Number of processes for the deep check; by default one per available core.
+        engine: Engine of the processes, as in ``make_dataset``.
+        address: Address of the engine, as in ``make_dataset``.
+        progress: Called with the number of rows of every recomputed shard.
+
+    Raises:
+        UsageError: The folder does not exist, or an argument is invalid.
+        DatasetError: The folder contains no dataset.
+        RecipeError: The recipe in the specification does not fit this version of cnpgen.
+        PluginError: The recipe needs packages that are not installed.
+        MachineError: A file cannot be read, or blocks are to be regenerated and the backend of the dataset does not
+            work on this machine.
+    """
+    folder, regenerate = Path(folder), integer("regenerate", regenerate, least=0)
+    machine_engine = Engine(engine, address, workers)
+    require_folder(folder)
+    if not is_dataset(folder):
+        raise DatasetError(f"{folder} is not a dataset of cnpgen: it has no {SPECIFICATION}")
+    findings = check_dataset(folder)
+    try:
+        spec = load_dataset_spec(folder)
+    except DatasetError:
+        return ValidationReport(folder, 0, tuple(findings))
+    _check_requirements(folder, spec, deep=deep, regenerate=regenerate)
+    existing = [task for task in shards(spec) if is_committed(folder, spec, task)]
+    damaged = {finding.file for finding in findings if not finding.note}
+    undamaged = [task for task in existing if task.file not in damaged]
+    findings += check_recipe(spec) + (check_statistics(folder, spec) if deep else [])
+    checked = check_rows(folder, spec, undamaged, machine_engine, progress) if deep else DeepCheck()
+    again = regenerate_blocks(folder, spec, undamaged, regenerate) if regenerate else Regeneration()
+    return ValidationReport(
+        folder,
+        sum(task.rows for task in existing),
+        (*findings, *checked.findings, *again.findings),
+        deep=checked.rows,
+        plans=(checked.judged, checked.valid) if checked.judged else None,
+        wanted=regenerate,
+        blocks=again.blocks,
+        regenerated=again.made,
+        identical=again.identical,
+    )
+
+
+def _check_requirements(folder: Path, spec: DatasetSpec, *, deep: bool, regenerate: int) -> None:
+    """Raise an error for missing packages or backends before the expensive checks."""
+    if regenerate:
+        backend_of(folder, spec)
+    if deep or regenerate:
+        with restored(spec):
+            pass

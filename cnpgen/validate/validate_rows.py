@@ -1,0 +1,145 @@
+"""Deep check of a dataset: recomputation of every row with Pinocchio and Coal, and detection of duplicate rows."""
+
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import CnpgenError, counted
+from cnpgen.judges.rows.certified_plans import PlanCheck, check_plans
+from cnpgen.judges.rows.hits import hit_rule, repeated_fraction, speed_fractions
+from cnpgen.judges.rows.row_report import RowReport, merge
+from cnpgen.judges.rows.verify import verify_rows
+from cnpgen.machine.engine import Engine, assembled
+from cnpgen.make.recipe_file import restored
+from cnpgen.problems.load_robot import load_robot
+from cnpgen.store.check import DELETE_HINT, Finding
+from cnpgen.store.dataset_spec import DatasetSpec, ShardTask
+from cnpgen.store.shard import read_shard
+from cnpgen.store.shard_record import load_record
+from cnpgen.validate.numbers import check_numbers
+
+_ODD_MULTIPLIERS = np.random.default_rng(0).integers(0, 2**63, 64, dtype=np.uint64) * np.uint64(2) + np.uint64(1)
+
+
+@dataclass(frozen=True)
+class DeepCheck:
+    """Result of the deep check of a dataset.
+
+    Attributes:
+        rows: Report of Pinocchio and Coal on all rows; None if none could be read.
+        judged: Number of judged plans; 0 unless the dataset is certified.
+        valid: Number of valid plans.
+        findings: Problems, by file.
+    """
+
+    rows: RowReport | None = None
+    judged: int = 0
+    valid: int = 0
+    findings: tuple[Finding, ...] = ()
+
+
+def check_rows(
+    folder: Path, spec: DatasetSpec, tasks: list[ShardTask], engine: Engine, progress: Callable[[int], None] | None
+) -> DeepCheck:
+    """Recompute every row, shard by shard, and judge every plan.
+
+    Args:
+        folder: Folder of the dataset.
+        spec: Specification of the dataset.
+        tasks: The shards to read.
+        engine: Engine of the worker processes.
+        progress: Called with the number of rows of every shard that was read.
+    """
+    checks, findings = [], []
+    with assembled(engine, len(tasks)) as pool:
+        verify = partial(_verify_shard, folder.absolute() if pool.is_remote else folder, spec)
+        with closing(pool.distribute(verify, tasks, ordered=True)) as results:
+            for task, result in zip(tasks, results, strict=True):
+                findings += [Finding(task.file, problem, hint=DELETE_HINT) for problem in result.problems]
+                checks.append(result)
+                if progress is not None:
+                    progress(task.rows)
+    keys = np.concatenate([np.empty(0, np.uint64), *(check.keys for check in checks)])
+    n_duplicates = len(keys) - len(np.unique(keys))
+    if n_duplicates:
+        findings.append(Finding("(all splits)", f"{counted(n_duplicates, 'duplicate row')}"))
+    findings += [Finding("(all splits)", text) for text in _check_speed_fractions(spec, checks)]
+    reports = [check.report for check in checks if check.report is not None]
+    judged = sum(check.plans.judged for check in checks)
+    valid = sum(check.plans.valid for check in checks)
+    return DeepCheck(merge(reports) if reports else None, judged, valid, tuple(findings))
+
+
+@dataclass(frozen=True)
+class _ShardCheck:
+    """Result of the deep check of one shard.
+
+    Attributes:
+        report: Report of Pinocchio and Coal; None if the shard cannot be read.
+        problems: Problems of the shard.
+        keys: Hash of the boundary states of every row, shape (rows,).
+        plans: Numbers of judged and valid plans, and their problems.
+        fractions: Hit speeds as fractions of the maximum hit speed, shape (rows,); empty if the rows are no hits.
+        goals: Hash of the goal of each of these hits.
+    """
+
+    report: RowReport | None
+    problems: list[str]
+    keys: NDArray[np.uint64]
+    plans: PlanCheck
+    fractions: NDArray[np.float64]
+    goals: NDArray[np.uint64]
+
+
+def _verify_shard(folder: Path, spec: DatasetSpec, task: ShardTask) -> _ShardCheck:
+    """Verify one shard; a shard that cannot be read is a finding, not an exception."""
+    try:
+        columns = read_shard(folder / task.file)
+        record = load_record(folder, task)
+    except CnpgenError as error:
+        return _ShardCheck(None, [str(error)], np.empty(0, np.uint64), PlanCheck(), np.empty(0), np.empty(0, np.uint64))
+    with restored(spec) as recipe:
+        problem = recipe.pipeline.problem
+        robot = load_robot(problem)
+        report = verify_rows(problem, robot, columns, dtype=spec.dtype, rule=hit_rule(spec.stages))
+        plans = check_plans(problem, robot, columns)
+    problems = [*plans.problems, *check_numbers(spec, task, columns, record)]
+    problems += [
+        f"{check.name}: {counted(check.n_failed, 'row')} out, worst {check.worst:.3g} {check.unit}"
+        f" (allowed {check.tolerance:.3g}) in row {task.first_row + check.worst_row}"
+        for check in report.failed
+    ]
+    ends = [columns[name] for name in ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq") if name in columns]
+    fractions = speed_fractions(columns) if {"hit_speed", "hit_speed_max"} <= columns.keys() else np.empty(0)
+    goals = row_keys(columns["goal_q"])[: len(fractions)]
+    return _ShardCheck(report, problems, row_keys(np.concatenate(ends, axis=1)), plans, fractions, goals)
+
+
+def _check_speed_fractions(spec: DatasetSpec, checks: list[_ShardCheck]) -> list[str]:
+    """Describe hits with equal fractions of their maximum speed, if there are more than random numbers explain."""
+    if hit_rule(spec.stages).full_speed is None or not checks:
+        return []
+    fractions, goals = (np.concatenate([getattr(check, name) for check in checks]) for name in ("fractions", "goals"))
+    _, unique = np.unique(goals, return_index=True)  # several starts may have the same goal
+    count, fraction = repeated_fraction(fractions[unique], spec.dtype)
+    text = f"{counted(count, 'hit')} with the same fraction of their maximum speed, {fraction:.6g}"
+    return [f"{text}; fractions are random, so these hits were scaled in time afterwards"] if count else []
+
+
+def row_keys(values: NDArray[Any]) -> NDArray[np.uint64]:
+    """Hash every row of numbers to 64 bits; equal rows have equal keys.
+
+    Args:
+        values: Shape (rows, width).
+    """
+    bits = np.ascontiguousarray(values, np.float64).view(np.uint64)
+    bits = bits ^ (bits >> np.uint64(32))  # float32 values have zero low bits, which products would not mix
+    bits *= np.resize(_ODD_MULTIPLIERS, bits.shape[1])
+    bits ^= bits >> np.uint64(29)
+    return np.asarray((bits * np.resize(_ODD_MULTIPLIERS[::-1], bits.shape[1])).sum(axis=1, dtype=np.uint64))

@@ -1,0 +1,172 @@
+"""Signed distances of pairs of convex bodies along a path: at its states, and over the intervals between them.
+
+The signed distance of two convex bodies is the maximum over unit vectors of their separation along it
+(``cnpgen.world.separation``). Every direction therefore bounds the distances at all states from below.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+Measure = Callable[[int, int], tuple[float, Array]]  # (pair, state) -> signed distance, separating direction
+
+RESOLUTION = 1e-9  # m: tolerance of the smallest distance
+
+
+class SeparationBound(Protocol):
+    """Computes the separation of a pair along a direction: lower bounds of its distances [m]."""
+
+    def __call__(self, pair: int, direction: Array, states: slice | Indices = slice(None), /) -> Array:
+        """Return one lower bound per state."""
+
+
+def smallest_distances(bounds: Array, measure: Measure, separation: Callable[[int, Array], Array]) -> Array:
+    """Find the smallest signed distance of M pairs of convex bodies along K states by best-first search.
+
+    The state with the smallest bound is measured, and its separating direction raises the bounds of the same pair at
+    the other states. The search ends when no bound is below the smallest measured distance, so no state is missed.
+
+    Args:
+        bounds: Initial lower bounds of the distances [m], shape (M, K).
+        measure: Returns the signed distance of a pair at a state [m] and the unit vector, shape (3,), along which the
+            bodies have this distance, or a vector of nan. Distances are never below their bounds.
+        separation: Returns lower bounds of the distances of a pair [m], shape (K,), along a unit vector.
+
+    Returns:
+        Distances [m], shape (M, K). The smallest one is exact up to ``RESOLUTION`` and stands where it was measured;
+        values that were not measured are lower bounds above it. A state that cannot be measured is nan and ends the
+        search.
+    """
+    distances, best = bounds.copy(), np.inf
+    measured: dict[tuple[int, int], float] = {}
+    while distances.size:
+        pair, k = divmod(int(distances.argmin()), distances.shape[1])
+        if distances[pair, k] >= best - RESOLUTION:
+            break
+        distance, direction = measure(pair, k)
+        measured[pair, k] = distance
+        if math.isnan(distance):
+            break
+        if np.isfinite(direction).all():
+            np.maximum(distances[pair], separation(pair, direction), out=distances[pair])
+        distances[pair, k], best = distance, min(best, distance)
+    np.maximum(distances, math.nextafter(best, math.inf), out=distances)
+    for index, distance in measured.items():
+        distances[index] = distance
+    return distances
+
+
+def clear_states(
+    bounds: Array, min_distance: float, measure: Measure, separation: Callable[[int, Array, Indices], Array]
+) -> NDArray[np.bool_]:
+    """Find the states at which the signed distances of all M pairs of convex bodies reach a minimum.
+
+    A state whose bound is too small is measured. Its separating direction also bounds the distances at the other
+    unresolved states and usually resolves most of them.
+
+    Args:
+        bounds: Initial lower bounds of the distances [m], shape (M, K).
+        min_distance: Required distance [m].
+        measure: Measures a pair at a state, as of ``smallest_distances``.
+        separation: Returns lower bounds of the distances of a pair [m] along a unit vector at J states, shape (J,).
+
+    Returns:
+        Mask of the states, shape (K,); False where a distance cannot be measured.
+    """
+    clear = np.ones(bounds.shape[1], bool)
+    proven = bounds >= min_distance
+    for pair in np.flatnonzero(~proven.all(axis=1)).tolist():
+        unresolved = np.flatnonzero(clear & ~proven[pair])
+        while len(unresolved):
+            k, unresolved = int(unresolved[0]), unresolved[1:]
+            distance, direction = measure(pair, k)
+            clear[k] = distance >= min_distance
+            if len(unresolved) and np.isfinite(direction).all():
+                unresolved = unresolved[~(separation(pair, direction, unresolved) >= min_distance)]
+    return clear
+
+
+@dataclass(frozen=True)
+class PairDistances:
+    """Signed distances of M pairs of convex bodies at K states.
+
+    Attributes:
+        bounds: Lower bounds of the distances [m], shape (M, K).
+        measure: Measures a pair at a state, as of ``smallest_distances``.
+        separation: Bounds the distances of a pair along a direction.
+        directions: Separating directions of every pair, collected from its measurements.
+    """
+
+    bounds: Array
+    measure: Measure
+    separation: SeparationBound
+    directions: dict[int, list[Array]] = field(default_factory=dict)
+
+    def smallest(self) -> list[Array]:
+        """Measure distances [m]: arrays of shape (K,), of which the smallest value is exact."""
+        return self._searched(list(range(len(self.bounds))))
+
+    def smallest_of_each(self) -> list[Array]:
+        """Measure distances [m]: arrays of shape (K,), of each of which the smallest value is exact."""
+        return [self._searched([pair])[0] for pair in range(len(self.bounds))]
+
+    def _searched(self, pairs: list[int]) -> list[Array]:
+        def measure(index: int, k: int) -> tuple[float, Array]:
+            return self._measured(pairs[index], k)
+
+        def separation(index: int, direction: Array) -> Array:
+            pair = pairs[index]  # a single state has been measured when its direction is known
+            return self.bounds[pair] if self.bounds.shape[1] == 1 else self.separation(pair, direction)
+
+        return list(smallest_distances(self.bounds[pairs], measure, separation))
+
+    def _measured(self, pair: int, k: int) -> tuple[float, Array]:
+        """Measure a pair at a state and store the direction."""
+        distance, direction = self.measure(pair, k)
+        self.directions.setdefault(pair, []).append(direction)
+        return distance, direction
+
+    def clear_states(self, min_distance: float) -> NDArray[np.bool_]:
+        """Return a mask of the states at which all pairs reach a minimum distance [m], shape (K,)."""
+        return clear_states(self.bounds, min_distance, self.measure, self.separation)
+
+    def interval_bounds(self, min_distances: Array, displacements: Array, deviations: Array) -> Array:
+        """Bound by how much the distances exceed a minimum between neighboring states.
+
+        Every point of a body stays within a bounded deviation from the chord between its two positions. Bodies that
+        are separated along a direction at both states are therefore separated between them, up to that deviation.
+
+        Args:
+            min_distances: Required distance of every pair [m], shape (M,).
+            displacements: Maximum displacement of a point of one body in the frame of the other [m], shape (K - 1,).
+            deviations: Maximum deviation of its path from the chord [m], shape (K - 1,).
+
+        Returns:
+            Lower bounds over all pairs [m], shape (K - 1,). They are only tightened until they reach 0.
+        """
+        margins = self.bounds - min_distances[:, None]
+        intervals = (margins[:, 1:] + margins[:, :-1] - displacements) / 2 - deviations
+        for pair in np.flatnonzero(~(intervals >= 0).all(axis=1)).tolist():
+            for direction in list(self.directions.get(pair, [])):
+                self._raise(intervals[pair], pair, direction, min_distances[pair] + deviations)
+            for k in np.flatnonzero(~(intervals[pair] >= 0)).tolist():
+                for end in (k, k + 1):
+                    if not intervals[pair, k] >= 0:
+                        direction = self._measured(pair, end)[1]
+                        self._raise(intervals[pair], pair, direction, min_distances[pair] + deviations)
+        lowest: Array = np.where(np.isnan(intervals), -np.inf, intervals).min(axis=0, initial=np.inf)
+        return lowest
+
+    def _raise(self, bounds: Array, pair: int, direction: Array, required: Array) -> None:
+        """Raise the negative interval bounds of a pair, shape (K - 1,), by its separation along a direction."""
+        unresolved = np.flatnonzero(~(bounds >= 0))
+        if len(unresolved):
+            states = np.concatenate([unresolved, unresolved + 1])
+            separations = self.separation(pair, direction, states).reshape(2, -1)
+            bounds[unresolved] = np.fmax(bounds[unresolved], separations.min(axis=0) - required[unresolved])

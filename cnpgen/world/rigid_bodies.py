@@ -1,0 +1,178 @@
+"""Distances of the convex parts of a robot's links from obstacles and from each other."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.robots.shape.hull import ball_round
+from cnpgen.robots.shape.shape import Shape
+from cnpgen.robots.solid import Solid, same_shape
+from cnpgen.world.certified import CertifiedDistance, convex_body
+from cnpgen.world.pair_distances import PairDistances
+
+Array = NDArray[np.float64]
+Pairs = NDArray[np.intp]
+
+NO_SHAPE = 'a constraint needs the link geometry of the robot, which has none: set geometry = "urdf" in [robot]'
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """C pairs of bodies that are close to each other at a state.
+
+    Attributes:
+        pair: Indices of the pairs, shape (C,).
+        k: Indices of the states, shape (C,).
+        distance: Signed distances [m], shape (C,).
+        normal: Unit vectors from the first body to the second in the world frame, shape (C, 3).
+        points: Closest points of the hulls of the first and the second body, without their radii, in the world frame
+            [m], shape (C, 2, 3).
+        joints: Indices of the joints that move the bodies, shape (C, 2); 0 for fixed bodies.
+    """
+
+    pair: NDArray[np.intp]
+    k: NDArray[np.intp]
+    distance: Array
+    normal: Array
+    points: Array
+    joints: NDArray[np.intp]
+
+
+class RigidBodies:
+    """The convex parts of a robot's links and the obstacles, placed in the world at K states.
+
+    It reuses Coal's memory: use it in one process and one thread only.
+
+    Args:
+        shape: Link geometry of the robot.
+        n_obstacles: Number of obstacles.
+        n_joints: Number of the robot's planned joints.
+
+    Attributes:
+        obstacle_pairs: Pairs (obstacle, moving part), part by part, shape (M, 2).
+        link_pairs: Pairs of parts of links that must not touch, the one nearer to the base first, shape (M, 2).
+    """
+
+    def __init__(self, shape: Shape, n_obstacles: int, n_joints: int) -> None:
+        parts, n_parts = shape.convex_parts, len(shape.convex_parts)
+        self._bodies, self._solids = [convex_body(part.vertices, part.radius) for part in parts], list[Solid]()
+        self._frames = [shape.joints[part.link] for part in parts] + [n_joints + 1 + i for i in range(n_obstacles)]
+        self._balls = [(*ball_round(part.vertices, part.radius), np.zeros(3)) for part in parts]
+        moving = [index for index, frame in enumerate(self._frames[:n_parts]) if frame]
+        obstacles = range(n_parts, n_parts + n_obstacles)
+        self.obstacle_pairs = _pairs((obstacle, part) for part in moving for obstacle in obstacles)
+        self.link_pairs = _pairs(sorted(pair, key=self._frames.__getitem__) for pair in shape.apart)
+        self._certified = CertifiedDistance()
+        self._set_obstacles([])
+
+    def place(self, rotations: Array, positions: Array, solids: Sequence[Solid]) -> None:
+        """Move to K states.
+
+        Args:
+            rotations: Rotation matrices of the joints' frames, that of the base first, shape (n + 1, 3, 3, K).
+            positions: Origins of the joints' frames [m], shape (n + 1, 3, K).
+            solids: Solids of the obstacles.
+        """
+        count = rotations.shape[-1]
+        if len(solids) != len(self._solids) or not all(map(same_shape, solids, self._solids)):
+            self._set_obstacles(solids)
+        self._solids = list(solids)
+        fixed = np.broadcast_to(np.eye(3)[..., None], (len(solids), 3, 3, count))
+        self._rotations = np.concatenate([rotations, fixed])
+        centers = np.array([solid.position for solid in solids]).reshape(-1, 3, 1)
+        self._positions = np.concatenate([positions, np.broadcast_to(centers, (len(solids), 3, count))])
+
+    def _set_obstacles(self, solids: Sequence[Solid]) -> None:
+        """Make bodies of the obstacles. Obstacles are bounded by boxes, parts of links by balls."""
+        n_parts = len(self._balls)
+        self._bodies = self._bodies[:n_parts] + [convex_body(solid.corners, solid.radius) for solid in solids]
+        extents = [(solid.corners.min(axis=0), solid.corners.max(axis=0), solid.radius) for solid in solids]
+        boxes = [((low + high) / 2, 0.0, (high - low) / 2 + radius) for low, high, radius in extents]
+        self._centers, self._radii, self._half_sizes = map(np.array, zip(*self._balls, *boxes, strict=True))
+
+    def pair_distances(self, pairs: Pairs) -> PairDistances:
+        """Return the signed distances of pairs of bodies; minus the penetration depth if they overlap.
+
+        Args:
+            pairs: ``obstacle_pairs`` or ``link_pairs``.
+        """
+        bodies = [(int(a), int(b)) for a, b in pairs]
+
+        def measure(pair: int, k: int) -> tuple[float, Array]:
+            return self._measure(*bodies[pair], k)
+
+        def separation(pair: int, direction: Array, states: "slice | Pairs" = slice(None), /) -> Array:
+            return self._separation(*bodies[pair], direction, states)
+
+        return PairDistances(self._bounds(pairs), measure, separation)
+
+    def contacts(self, pairs: Pairs, within: float) -> Contacts:
+        """Measure all pairs of bodies at states where their signed distance is below ``within`` [m].
+
+        The separating direction of a pair that is farther at one state also excludes most of the other states.
+
+        Args:
+            pairs: ``obstacle_pairs`` or ``link_pairs``.
+            within: Distance below which a pair is returned [m].
+        """
+        near, contacts = ~(self._bounds(pairs) >= within), list[Any]()
+        for pair in np.flatnonzero(near.any(axis=1)).tolist():
+            (a, b), unresolved = pairs[pair].tolist(), np.flatnonzero(near[pair])
+            while len(unresolved):
+                k, unresolved = int(unresolved[0]), unresolved[1:]
+                distance, direction = self._measure(a, b, k)
+                if distance < within:
+                    contacts.append((pair, k, distance, direction, self._certified.witnesses()))
+                elif len(unresolved) and np.isfinite(direction).all():
+                    unresolved = unresolved[~(self._separation(a, b, direction, unresolved) >= within)]
+        return self._gathered(pairs, [contact for contact in contacts if np.isfinite(contact[3]).all()])
+
+    def _gathered(self, pairs: Pairs, contacts: list[Any]) -> Contacts:
+        """Gather tuples of pair, state, distance, direction in the frame of the first body, and points."""
+        columns = zip(*contacts, strict=True) if contacts else [()] * 5
+        pair, k, distance, direction, points = (np.array(column) for column in columns)
+        pair, k = pair.astype(np.intp), k.astype(np.intp)
+        frames = np.array(self._frames, np.intp)[pairs[pair]]
+        normal = np.einsum("cij,cj->ci", self._rotations[frames[:, 0], ..., k], direction.reshape(-1, 3))
+        joints = np.where(frames < len(self._rotations) - len(self._solids), frames, 0)
+        return Contacts(pair, k, distance, normal, points.reshape(-1, 2, 3), joints)
+
+    def extent(self, joint: int) -> float:
+        """Return the largest distance of a point that is fixed to a joint's frame from its origin [m]."""
+        balls = [ball for frame, ball in zip(self._frames, self._balls, strict=False) if frame == joint]
+        return max((float(np.linalg.norm(center) + radius) for center, radius, _ in balls), default=0.0)
+
+    def _bounds(self, pairs: Pairs) -> Array:
+        """Bound distances from below by bounding balls of the bodies and bounding boxes of obstacles, shape (M, K)."""
+        first, second = pairs.T
+        turned = np.einsum("bijk,bj->bik", self._rotations[self._frames], self._centers)
+        centers = turned + self._positions[self._frames]
+        gaps = np.abs(centers[second] - centers[first]) - self._half_sizes[first, :, None]
+        outside = np.linalg.norm(np.maximum(gaps, 0), axis=1)
+        distance = np.where(outside > 0, outside, gaps.max(axis=1))
+        return np.asarray(distance - (self._radii[first] + self._radii[second])[:, None])
+
+    def _measure(self, a: int, b: int, k: int) -> tuple[float, Array]:
+        """Measure a pair at a state; the direction points from a to b, in the frame of a."""
+        pose_a, pose_b = (
+            (self._rotations[frame, ..., k].copy(), self._positions[frame, :, k].copy())
+            for frame in (self._frames[a], self._frames[b])
+        )
+        distance, normal = self._certified.between(self._bodies[a], pose_a, self._bodies[b], pose_b)
+        return distance, normal @ pose_a[0]
+
+    def _separation(self, a: int, b: int, direction: Array, states: "slice | Pairs" = slice(None)) -> Array:
+        """Compute the separation of b from a along a direction in the frame of a, at some states [m], shape (K,)."""
+        (first, second), (frame, other) = (self._bodies[a], self._bodies[b]), (self._frames[a], self._frames[b])
+        along = np.einsum("ijk,j->ik", self._rotations[frame][..., states], direction)
+        in_b = np.einsum("ijk,ik->jk", self._rotations[other][..., states], along)
+        between = self._positions[other][:, states] - self._positions[frame][:, states]
+        reach = float((first.corners @ direction).max()) + first.radius + second.radius
+        return np.asarray((second.corners @ in_b).min(axis=0) + np.einsum("ik,ik->k", along, between) - reach)
+
+
+def _pairs(pairs: Any) -> Pairs:
+    return np.array(list(pairs), np.intp).reshape(-1, 2)

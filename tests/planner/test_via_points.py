@@ -1,0 +1,98 @@
+"""Other lines: what the look at plans finds, which line is taken, and that plans which break nothing stay."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cnpgen.make.draw_boundary_problems import draw_boundary_problems
+from cnpgen.planner.inference_pipeline import loaded_problem
+from cnpgen.planner.model import Model
+from cnpgen.planner.model_file import load_model
+from cnpgen.planner.planner import Planner
+from cnpgen.planner.via_points import ViaPoints, make_via_points
+from cnpgen.plans.evaluate import evaluate_plans
+from cnpgen.problems.obstacles import obstacle_poses_of
+from cnpgen.trajectory.boundary import Boundary
+from cnpgen.world.world import World
+from tests.conftest import needs_compiler
+from tests.examples.models import quickest
+from tests.examples.plans import PROBLEMS, ROBOTS, load
+
+RETRACTED = (-0.3, -0.6, 0.2, -1.9, 0.6, 0.3, 1.2)  # rad: far from both pedestals
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    found = load_model("heavy-object-anywhere")
+    return replace(found, config=replace(found.config, via_points=(RETRACTED,)))
+
+
+@pytest.fixture(scope="module")
+def problems() -> Boundary:
+    return draw_boundary_problems("heavy-object-anywhere", 400, seed=20).boundary
+
+
+def test_static_violations_agree_with_pinocchio_and_coal() -> None:
+    problem, robot, plan = PROBLEMS["heavy-object"], ROBOTS["heavy-object"], load("transport")
+    world, random = World(robot, problem.obstacle, problem.object_size), np.random.default_rng(0)
+    obstacle_poses = obstacle_poses_of(problem, plan.start_xyz, plan.goal_xyz)[0]
+    on_way = plan.motion.at(np.linspace(0, 1, 6)).q[0]
+    states = np.concatenate([random.uniform(robot.position_lower, robot.position_upper, (6, robot.n)), on_way])
+    via_points = make_via_points(problem, quickest("heavy-object").kernels, np.empty((0, robot.n)))
+    (found,) = via_points.static_violation(
+        np.ascontiguousarray(states.T), np.repeat(obstacle_poses[:, None], len(states), axis=1)
+    )
+    for q, violation in zip(states, found[0], strict=True):
+        world.set_state(q, 0 * q, 0 * q, obstacle_poses)
+        worst = max(
+            float((np.maximum(each.lower - each.g, each.g - each.upper) / constraint.allowed(each)).max())
+            for constraint in problem.constraint
+            for each in constraint.measured(world)
+        )
+        assert violation == pytest.approx(worst, rel=1e-6, abs=1e-4)
+    assert (found[0, :6] > 1).all()
+    assert (found[0, 6:] <= 1).all()
+
+
+def test_candidates_are_lines_without_violation_or_else_the_one_with_the_smallest() -> None:
+    via_points = ViaPoints(np.zeros((3, 7)), None, None)  # type: ignore[arg-type]
+    violation = np.array([0.5, 2.0, 0.9, 7.0, 3.0, 5.0, np.inf, np.inf, 4.0])
+    np.testing.assert_array_equal(via_points.candidates(violation), [0, 2, 4, 8])
+
+
+@pytest.mark.slow  # it compiles for a minute
+@needs_compiler
+def test_via_points_repair_plans_and_keep_those_without_violation(model: Model, problems: Boundary) -> None:
+    straight = Planner(replace(model, config=replace(model.config, via_points=()))).plan_batch(problems)
+    planner = Planner(model)
+    found, inference = planner.plan_batch(problems), planner._inference
+    assert inference.via_points is not None
+    obstacle_poses = inference.prepare.obstacle_poses(found.columns["start_xyz"], found.columns["goal_xyz"])
+    before, after = (inference.via_points.violation(plans.motion, obstacle_poses) for plans in (straight, found))
+    same = (found.path_control_points == straight.path_control_points).all(axis=(1, 2))
+    assert same[before <= 1].all()
+    assert (after[~same] < before[~same]).all()
+    repaired = np.flatnonzero((before > 1) & (after <= 1))
+    assert len(repaired) >= 3
+    assert evaluate_plans(found[repaired], workers=1).valid.mean() > 0.5
+    assert not evaluate_plans(straight[repaired], workers=1).valid.any()
+
+
+@needs_compiler
+@pytest.mark.slow  # it compiles for a minute
+def test_a_line_through_a_via_point_passes_near_it_and_keeps_its_ends(model: Model, problems: Boundary) -> None:
+    with loaded_problem(model.problem) as loaded:
+        prepare = Planner(model)._inference.prepare
+        lower, upper = loaded.robot.position_lower, loaded.robot.position_upper
+    some, via_point = problems[:20], np.tile(RETRACTED, (20, 1))
+    straight, projected = prepare(some), prepare(some, via_point)
+    assert straight.correction is not None
+    assert projected.correction is not None
+    half = (some.start_q + some.goal_q) / 2
+    before, after = (np.abs(half + each.correction[:, 4:6].mean(axis=1) - via_point) for each in (straight, projected))
+    assert np.median(after.max(axis=1)) < 0.6 * np.median(before.max(axis=1))
+    ends = np.linspace(0, 1, 10)[:, None]
+    line = some.start_q[:, None] + (some.goal_q - some.start_q)[:, None] * ends + projected.correction
+    assert (line >= lower - 1e-9).all()
+    assert (line <= upper + 1e-9).all()

@@ -1,0 +1,162 @@
+"""The journal of finished plans: complete records count, damaged ones and those of other runs do not."""
+
+import hashlib
+import io
+import os
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cnpgen.errors import MachineError, UsageError
+from cnpgen.refine.refinement_journal import JOURNAL_MAGIC, open_journal
+from cnpgen.refine.task import Attempt, Outcome
+
+IDENTITY = '{"run": "one"}'
+
+
+def random_attempt(seed: int) -> Attempt:
+    random = np.random.default_rng(seed)
+    path, rate = random.normal(size=(15, 6)), random.uniform(1, 2, 20)
+    return Attempt(
+        path=path,
+        rate=rate,
+        cost=float(seed),
+        outcome=Outcome.SOLVED_FINE,
+        iterations=seed,
+        reason="joint velocity limit" if seed % 2 else "ok",
+    )
+
+
+def finished_plans(path: Path, identity: str = IDENTITY) -> dict[int, Attempt]:
+    journal = open_journal(path, identity)
+    journal.close()
+    return journal.finished
+
+
+def write_journal(path: Path, count: int = 3) -> None:
+    journal = open_journal(path, IDENTITY)
+    for first in range(0, 2 * count, 2):
+        journal.append([first, first + 1], [random_attempt(first), random_attempt(first + 1)])
+    journal.close()
+
+
+def test_appended_results_are_read_bit_by_bit(tmp_path: Path) -> None:
+    write_journal(tmp_path / "part")
+    found = finished_plans(tmp_path / "part")
+    assert sorted(found) == list(range(6))
+    for plan, result in found.items():
+        expected = random_attempt(plan)
+        np.testing.assert_array_equal(result.path, expected.path)
+        np.testing.assert_array_equal(result.rate, expected.rate)
+        assert (result.outcome, result.reason, result.iterations, result.cost) == (
+            expected.outcome,
+            expected.reason,
+            expected.iterations,
+            expected.cost,
+        )
+
+
+@pytest.mark.parametrize("lost", [1, 30, 500])
+def test_an_incomplete_record_is_removed_and_later_ones_follow_the_complete_ones(tmp_path: Path, lost: int) -> None:
+    path = tmp_path / "part"
+    write_journal(path)
+    path.write_bytes(path.read_bytes()[:-lost])
+    journal = open_journal(path, IDENTITY)
+    assert sorted(journal.finished) == [0, 1, 2, 3]
+    journal.append([4], [random_attempt(4)])
+    journal.close()
+    assert sorted(finished_plans(path)) == [0, 1, 2, 3, 4]
+
+
+def test_records_from_a_flipped_bit_on_do_not_count(tmp_path: Path) -> None:
+    path = tmp_path / "part"
+    write_journal(path)
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    assert set(finished_plans(path)) < set(range(6))
+
+
+@pytest.mark.parametrize("length", [0, 7, len(JOURNAL_MAGIC), len(JOURNAL_MAGIC) + 20])
+def test_a_journal_that_ends_in_its_first_line_starts_again(tmp_path: Path, length: int) -> None:
+    path = tmp_path / "part"
+    write_journal(path, 0)
+    path.write_bytes(path.read_bytes()[:length])
+    journal = open_journal(path, IDENTITY)
+    assert journal.finished == {}
+    journal.append([0], [random_attempt(0)])
+    journal.close()
+    assert list(finished_plans(path)) == [0]
+
+
+def test_the_journal_of_another_run_is_kept_without_discard(tmp_path: Path) -> None:
+    path = tmp_path / "part"
+    write_journal(path)
+    with pytest.raises(
+        UsageError, match=r"part holds 6 finished plans of another run \(run one, now two\): discard=True"
+    ):
+        open_journal(path, '{"run": "two"}')
+    assert len(finished_plans(path)) == 6
+    open_journal(path, '{"run": "two"}', discard=True).close()
+    assert finished_plans(path, '{"run": "two"}') == {}
+
+
+@pytest.mark.parametrize("content", [b"precious", b"\0" * 4000])
+def test_a_file_of_another_format_is_unchanged(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "part"
+    path.write_bytes(content)
+    with pytest.raises(UsageError, match="part is not a journal of cnpgen"):
+        open_journal(path, IDENTITY, discard=True)
+    assert path.read_bytes() == content
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there are no locks")
+def test_two_processes_do_not_share_a_journal(tmp_path: Path) -> None:
+    first = open_journal(tmp_path / "part", IDENTITY)
+    with pytest.raises(UsageError, match="part is in use"):
+        open_journal(tmp_path / "part", IDENTITY)
+    first.close()
+    assert finished_plans(tmp_path / "part") == {}
+
+
+def test_a_folder_without_write_access_is_named(tmp_path: Path) -> None:
+    with pytest.raises(MachineError, match=r"cannot write .*nowhere.part: .*; choose a folder that can be created"):
+        open_journal(tmp_path / "nowhere" / "part", IDENTITY)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there are no locks")
+def test_a_journal_that_another_process_creates_meanwhile_is_not_truncated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, begun, really = tmp_path / "part", [], os.open
+
+    def late(name: str, flags: int, *mode: int) -> int:
+        if not begun:
+            begun.append(True)
+            begun[0] = open_journal(path, IDENTITY)
+            begun[0].append([0], [random_attempt(0)])
+        return really(name, flags, *mode)
+
+    monkeypatch.setattr(os, "open", late)
+    with pytest.raises(UsageError, match="is in use"):
+        open_journal(path, IDENTITY)
+    begun[0].close()
+    assert sorted(finished_plans(path)) == [0]
+
+
+@pytest.mark.parametrize(
+    "record", [b"", b"PK\x03\x04", b"no archive", "compressed"], ids=["empty", "cut", "text", "compressed"]
+)
+def test_a_record_that_cnpgen_has_not_written_is_refused(tmp_path, record):
+    path = tmp_path / "plans.part"
+    open_journal(path, "{}").close()
+    if record == "compressed":
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, words=np.zeros(10**6, np.uint8))
+        record = buffer.getvalue()
+    with path.open("ab") as file:
+        file.write(len(record).to_bytes(8, "little") + hashlib.sha256(record).digest() + record)
+    with pytest.raises(UsageError, match=r"plans\.part is not a journal that cnpgen has written"):
+        open_journal(path, "{}")
