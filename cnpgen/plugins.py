@@ -1,4 +1,4 @@
-"""What packages with stages and constraints of their own import: these names stay here, wherever their modules are."""
+"""Stable import location for plug-ins: contracts of stages, constraints and planners, and the classes they use."""
 
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
 from cnpgen.pipelines.context import Context
@@ -9,13 +9,13 @@ from cnpgen.store.field import Field
 from cnpgen.world.world import World
 
 __all__ = [
+    "CandidateBatch",
     "Condition",
     "Constraint",
     "Context",
     "Field",
     "PerJoint",
     "Range",
-    "CandidateBatch",
     "Stage",
     "SymbolicState",
     "World",

@@ -25,6 +25,7 @@ from cnpgen.problems.robot_model import ConstraintValues
 from cnpgen.refine.proof.explain import Explanation, Feasibility
 from cnpgen.refine.refine_plans import Refinement
 from cnpgen.refine.task import Attempt, Outcome
+from cnpgen.robots.solid import Solid
 from cnpgen.store.check import Finding
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, StoredProblem
 from cnpgen.store.dataset_summary import DatasetSummary
@@ -80,6 +81,7 @@ __all__ = [
     "SamplingStatistics",
     "ShardRecord",
     "ShardTask",
+    "Solid",
     "Split",
     "States",
     "StoredProblem",

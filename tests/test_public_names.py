@@ -19,18 +19,22 @@ import cnpgen
 import cnpgen.plugins
 
 SPECIAL = {"__init__", "__call__", "__getitem__", "__iter__"}
-INNER = {  # classes that public signatures name, but that nobody is meant to make or take apart
-    "Run": "train_model hands it to its hook `begin`, for the progress that the command line shows",
-    "State": "likewise",
-    "Columns": "how a Batch finds its fields, which are asked for by name",
-    "BatchPartition": "made by Dataset.batches",
-    "RowFormat": "made by Dataset.batches",
-    "Position": "made by Dataset.batches",
-    "Scaling": "what Boundary.from_batch needs of a Normalization",
-    "Shard": "what Dataset reads rows from",
-    "ShardReader": "likewise",
-    "SplitShards": "likewise",
-    "Missing": "stands for an argument that was not given",
+INNER = {  # classes in public signatures that users neither construct nor annotate
+    "Run": "argument of the hook `begin` of train_model",
+    "State": "argument of the hook `begin` of train_model",
+    "Columns": "layout of a Batch, used through the names of its fields",
+    "BatchPartition": "constructed by Dataset.batches",
+    "RowFormat": "constructed by Dataset.batches",
+    "Position": "constructed by Dataset.batches",
+    "Scaling": "protocol that Normalization satisfies",
+    "Shard": "constructed by load_dataset",
+    "ShardReader": "constructed by load_dataset",
+    "SplitShards": "constructed by load_dataset",
+    "Missing": "stands for an omitted argument",
+    "Robot": "argument of kernels and worlds of plug-ins; RobotModel is the public robot",
+    "Kinematics": "attribute of SymbolicState, used through its fields",
+    "KernelLibrary": "attribute of Context, used through its method load",
+    "PathWorld": "argument of Constraint.met, with the fields of World for many states",
 }
 
 
@@ -44,6 +48,8 @@ def names_in(module: str) -> dict[str, Any]:
                 if isinstance(line, ast.ImportFrom) and line.module:
                     home = importlib.import_module(line.module)
                     found |= {alias.asname or alias.name: getattr(home, alias.name) for alias in line.names}
+                elif isinstance(line, ast.Import):
+                    found |= {alias.asname or alias.name: importlib.import_module(alias.name) for alias in line.names}
     return found
 
 

@@ -48,6 +48,6 @@ def test_mistakes_are_said_in_a_line(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert main(["benchmark"]) == 2
     assert "the argument SUITE is missing" in capsys.readouterr().err
     assert main(["benchmark", "hits-81", "--plant", "heavier", "-o", str(tmp_path)]) == 2
-    assert "goes with --simulate only" in capsys.readouterr().err
+    assert "--plant needs --simulate" in capsys.readouterr().err
     assert main(["benchmark", "hits-81", "--video", "-o", str(tmp_path)]) == 2
     assert "--video needs --simulate" in capsys.readouterr().err

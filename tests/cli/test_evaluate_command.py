@@ -157,7 +157,7 @@ def test_the_goal_is_where_the_joints_put_the_tip_whatever_a_column_says(
 
 
 def test_processes_change_not_a_byte(run: Run, saved: Callable[[Plans], Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("cnpgen.plans.evaluate.PLANS_PER_TASK", 4)
+    monkeypatch.setattr("cnpgen.plans.evaluate.PLANS_PER_VERDICT_TASK", 4)
     file = saved(plans_of(*(plan for plan, _ in garbage().values())))
     assert run(file, "--json", "--workers", 1) == run(file, "--json", "--workers", 2)
 

@@ -372,7 +372,7 @@ def test_options_of_rows_are_not_taken_for_a_file(trained, tmp_path, capsys):
     words = ["plan", str(tmp_path / "p.h5"), "--model", str(trained), "-o", str(tmp_path / "o.h5"), "--split", "train"]
     code, text = failing(capsys, words)
     assert code == 2
-    assert "for the folder of a dataset" in text
+    assert "need the folder of a dataset" in text
 
 
 def test_a_file_without_goals_or_of_another_problem_is_an_error(trained, tmp_path, capsys):

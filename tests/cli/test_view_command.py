@@ -217,7 +217,7 @@ def test_a_line_is_a_tube_round_its_points():
     [
         (["airhockey", "--row", "1"], "--row needs plans or the folder of a dataset, got airhockey"),
         (["airhockey", "--split", "train"], "--split needs plans or the folder of a dataset, got airhockey"),
-        (["airhockey", "--problem", "airhockey"], "--problem is for plans and for the folder of a dataset"),
+        (["airhockey", "--problem", "airhockey"], "--problem needs plans or the folder of a dataset"),
         (["airhockey", "-o", "page.png"], "expected a file that ends in .html, got 'page.png'"),
         (["airhockey", "--serve", "65536"], "expected a port, 0 to 65535, got '65536'"),
         (["airhockey", "--serve", "-o", "page.html"], "not allowed with"),

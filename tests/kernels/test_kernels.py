@@ -326,10 +326,10 @@ def test_solvers_give_the_same_bits_in_any_order_of_lanes(prepare: Prepare, back
     p = random.uniform([0.6, -0.45, 0.16], [1.3, 0.45, 0.16], (203, 3)).T.copy()
     angle = random.uniform(-np.pi, np.pi, 203)
     if kind == "inverse kinematics":
-        kernel = kernels.load(ik.ik_step, Loop(ik.TOLERANCE, ik.MAX_STEPS), vertical=False, max_step=0.4)
+        kernel = kernels.load(ik.ik_step, Loop(ik.IK_TOLERANCE, ik.MAX_IK_STEPS), vertical=False, max_step=0.4)
         arguments = [q, p]
     else:
-        loop = Loop(hitting_newton.TOLERANCE, hitting_newton.MAX_STEPS)
+        loop = Loop(hitting_newton.NEWTON_TOLERANCE_RAD, hitting_newton.MAX_NEWTON_STEPS)
         kernel = kernels.load(hitting_newton.newton_step, loop)
         arguments = [q, p, np.stack([np.cos(angle), np.sin(angle)]), np.repeat(robot.base[:, None], 203, axis=1)]
     whole = kernel(*arguments)
@@ -433,7 +433,7 @@ def test_the_emitted_c_compiles_for_every_vector_width_and_gives_the_same_number
     p = random.uniform([0.6, -0.45, 0.16], [1.3, 0.45, 0.16], (n, 3)).T.copy()
     dq, u = random.uniform(-1, 1, (2, 6, n))
     cases = [
-        ((ik.ik_step, Loop(ik.TOLERANCE, ik.MAX_STEPS)), {"vertical": False, "max_step": 0.4}, [q, p]),
+        ((ik.ik_step, Loop(ik.IK_TOLERANCE, ik.MAX_IK_STEPS)), {"vertical": False, "max_step": 0.4}, [q, p]),
         ((motion.table_acceleration,), {}, [q, dq, u, random.random((1, n))]),
     ]
     for builder, parameters, arguments in cases:

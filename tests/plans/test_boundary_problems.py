@@ -153,7 +153,7 @@ def test_solve_makes_plans_for_a_file_of_boundary_conditions(rows, write, tmp_pa
     ("words", "line"),
     [
         (["tasks.h5"], "tasks.h5 does not name its problem: set its attribute 'problem' to a name or a file, or pass"),
-        (["tasks.h5", "--n", "2"], "--split, --first and --n are for the folder of a dataset, got a file"),
+        (["tasks.h5", "--n", "2"], "--split, --first and --n need the folder of a dataset, got a file"),
         (["tasks.csv", "--n", "2"], "tasks.csv is a table, expected a recipe: 'cnpgen complete NAME tasks.csv -o"),
         (["pucks.h5"], "pucks.h5 lacks start_q and goal_q: boundary conditions are needed to plan; of tasks in the"),
         (["tasks.h5", "--seed", "2"], "--seed is for fresh draws of a recipe, got a file of boundary conditions"),
