@@ -1,11 +1,11 @@
-"""What test modules share: one BLAS thread, prepared pipelines, rounds of draws, one small dataset per recipe."""
+"""Shared parts of tests: one BLAS thread, prepared pipelines, candidate batches, one small dataset per recipe."""
 
 # ruff: noqa: E402 - the environment comes first
 import os
 
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"):
     os.environ[_variable] = "1"  # before NumPy is imported: its result must not depend on the machine's load
-os.environ["LOKY_MAX_CPU_COUNT"] = "1"  # the tests run side by side already: workers only where a test asks for them
+os.environ["LOKY_MAX_CPU_COUNT"] = "1"  # the tests run side by side already: workers only where a test requests them
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # hundreds of processes would compile the whole package each
 
 import shutil
@@ -35,7 +35,7 @@ from cnpgen.store.layout import MANIFEST
 SHIPPED = ("airhockey-hit", "airhockey-replan", "heavy-object")
 TINY_ROWS = 660  # 600 + 60: three shards of training and one of validation
 TINY_SHARD = 250
-HANGING = 1800  # [s] what takes longer hangs, on the slowest machine, too
+HANGING = 1800  # [s] a longer run hangs on any machine
 
 
 def some(values: Iterable[Any], kept: int = 1, mark: str = "extended") -> list[Any]:

@@ -1,4 +1,4 @@
-"""What is installed: only cnpgen, with its recipes; complete public names; one version everywhere."""
+"""Installed files: only cnpgen, with its recipes; complete public names; one version everywhere."""
 
 import ast
 import importlib

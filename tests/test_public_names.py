@@ -73,7 +73,7 @@ def functions_of(kind: type) -> Iterator[FunctionType]:
 
 
 def annotated(public: Any) -> Iterator[tuple[str, Any]]:
-    """What is annotated in the signature of a function, or in the fields, methods and properties of a class."""
+    """Annotations in the signature of a function, or in the fields, methods and properties of a class."""
     if inspect.isfunction(public):
         yield from typing.get_type_hints(public, names_in(public.__module__)).items()
     elif inspect.isclass(public):
@@ -145,7 +145,7 @@ def test_public_modules_begin_with_one_sentence() -> None:
         assert summary.endswith("."), name
 
 
-def test_importing_the_package_loads_none_of_its_rooms() -> None:
+def test_importing_the_package_loads_none_of_its_packages() -> None:
     code = "import sys, cnpgen; print(*sorted(name for name in sys.modules if name.startswith(('cnpgen', 'numpy'))))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["cnpgen"]

@@ -66,7 +66,7 @@ def test_every_block_says_what_it_is() -> None:
 
 @pytest.fixture(scope="session")
 def needed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What blocks that are marked so find in their folder: some hits."""
+    """Prepare the files that a marked block needs: a small dataset of hits."""
     return make_dataset("airhockey-hit", tmp_path_factory.mktemp("needed") / "hits", n=400, workers=1).folder
 
 

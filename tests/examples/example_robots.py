@@ -1,4 +1,4 @@
-"""Where the robots of the package example-robot-data are, if it is installed; and a Panda among obstacles."""
+"""Robots of the package example-robot-data, if it is installed, and a Panda among obstacles."""
 
 from collections.abc import Iterable
 from importlib import metadata

@@ -21,7 +21,7 @@ class Meshes:
 
     Args:
         problem: The problem, just read from its file.
-        robot: Its robot; of its shape only the pairs are used that nobody looks at.
+        robot: Its robot; of its shape only the excluded pairs are used.
         packages: Where ``package://`` begins.
     """
 
@@ -70,12 +70,12 @@ class Meshes:
         return min(found[: self.with_obstacles], default=np.inf), min(found[self.with_obstacles :], default=np.inf)
 
     def touches(self, q: np.ndarray) -> bool:
-        """Whether anything touches at a state."""
+        """Return whether any pair collides at a state."""
         return bool(pin.computeCollisions(self.model, self.data, self.geometry, self.results, q, True))
 
 
 def states(plans: Plans, index: int, step: float = 1e-3) -> np.ndarray:
-    """Joint positions of a plan at times ``step`` apart [rad], shape (K, n), by SciPy's splines."""
+    """Joint positions of a plan every ``step`` seconds [rad], shape (K, n), by SciPy's splines."""
     path, rate, degree = plans.path_control_points[index], plans.rate_control_points[index], plans.degree
     p, r = (
         BSpline(np.concatenate([[0] * degree, np.linspace(0, 1, len(c) - degree + 1), [1] * degree]), c, degree)

@@ -40,8 +40,8 @@ def coal_obstacle(obstacle: Obstacle) -> tuple[Any, Any]:
     """Shape and place of an obstacle as its keys say, with SciPy's rotations."""
     if obstacle.upright:
         x, y, top, height = obstacle.x, obstacle.y, obstacle.top, obstacle.height
-        middle = np.array([(x.low + x.high) / 2, (y.low + y.high) / 2, top - height / 2])
-        return coal.Box(x.high - x.low, y.high - y.low, height), coal.Transform3s(np.eye(3), middle)
+        center = np.array([(x.low + x.high) / 2, (y.low + y.high) / 2, top - height / 2])
+        return coal.Box(x.high - x.low, y.high - y.low, height), coal.Transform3s(np.eye(3), center)
     turn = Rotation.from_euler("xyz", obstacle.rotation).as_matrix()  # about fixed axes
     return _shape(obstacle), coal.Transform3s(turn, np.array(obstacle.position))
 

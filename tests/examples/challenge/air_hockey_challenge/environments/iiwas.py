@@ -27,7 +27,7 @@ def model() -> mujoco.MjModel:
 
 
 class AirHockeySingle:
-    """Steps of 20 ms, observations that nobody needs here, data by name."""
+    """Steps of 20 ms, unused observations, data by name."""
 
     def __init__(self) -> None:
         self._model = model()
