@@ -22,7 +22,7 @@ from common import arguments, median, progress, report, table, verdict
 from cnpgen.machine.threads import one_thread
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.planner.plan_hits import CONTACT_DISTANCE_M, hit_tasks, load_completion, plan_hits
-from cnpgen.planner.planner import Planner, states_at
+from cnpgen.planner.planner import Planner
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.plans import Plans
 from cnpgen.refine.options import RefineOptions
@@ -40,7 +40,7 @@ DEADLINES = (None, 10e-3, 20e-3, 40e-3, 60e-3, 80e-3)  # s
 def hits(planner: Planner, repeat: int) -> dict[str, Any]:
     """Milliseconds per hit, and of its halves."""
     old = planner.plan_batch(draw_boundary_problems(NAME, BATCH, seed=5).boundary)
-    states, random = states_at(old, 0.4 * old.duration), np.random.default_rng(0)
+    states, random = old.states_at(0.4 * old.duration), np.random.default_rng(0)
     pucks = np.stack([random.uniform(0.8, 1.2, BATCH), random.uniform(-0.3, 0.3, BATCH)], axis=1)
     completion, found = load_completion(planner.model, None), {}
     for size in (1, BATCH):

@@ -32,7 +32,7 @@ from cnpgen.make.complete import complete
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.make.recipe_file import load_dataset_recipe
 from cnpgen.pipelines.stages.hitting_velocity import HittingVelocity
-from cnpgen.planner.planner import Planner, states_at
+from cnpgen.planner.planner import Planner
 from cnpgen.plans.concatenate import concatenate
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.plans import Plans
@@ -97,7 +97,7 @@ def times_of(plans: Plans, random: np.random.Generator) -> NDArray[np.float64]:
 
 def states_of(plans: Plans, random: np.random.Generator) -> State:
     """Where every plan is at a random time."""
-    return states_at(plans, times_of(plans, random))
+    return plans.states_at(times_of(plans, random))
 
 
 def to_new_pucks(state: State, problem: ProblemRecord, random: np.random.Generator) -> Boundary:
@@ -121,7 +121,7 @@ def to_goals(state: State, goals: Boundary) -> Boundary:
 def to_same_goals(plans: Plans, random: np.random.Generator) -> Problems:
     """Problems from times of plans to their own goals."""
     time = times_of(plans, random)
-    return Problems(to_goals(states_at(plans, time), plans.boundary), plans, time)
+    return Problems(to_goals(plans.states_at(time), plans.boundary), plans, time)
 
 
 def full_speed_hits(count: int, seed: int) -> Boundary:

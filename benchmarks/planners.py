@@ -23,7 +23,7 @@ from refiner_problems import PUCKS, make_each
 from cnpgen.machine.threads import one_thread
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.planner.model_file import shipped_models
-from cnpgen.planner.planner import Planner, states_at
+from cnpgen.planner.planner import Planner
 from cnpgen.plans import Plans
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.refine.options import DEFAULT_OPTIONS
@@ -140,7 +140,7 @@ def replan(name: str, seed: int, planned: int, refined: int) -> list[dict[str, A
     for goal, ends in (("same", plans.boundary), ("another", plans.boundary[others])):
         for when in WHEN:
             progress(f"{name}: {len(plans)} plans replanned at {when:g} T to {goal} goal")
-            q, dq, ddq = states_at(plans, when * plans.duration)
+            q, dq, ddq = plans.states_at(when * plans.duration)
             new = planner.plan(q, ends.goal_q, start_dq=dq, start_ddq=ddq, goal_dq=ends.goal_dq)
             facts = {"goal": goal, "at": when, "plans": len(new), "valid": float(evaluate_plans(new).valid.mean())}
             facts["refined valid"] = float(refine_plans(new[:refined]).valid.mean())

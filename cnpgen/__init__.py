@@ -17,8 +17,9 @@ Functions:
     ``validate_dataset``.
     Problems: ``load_problem``, ``load_boundary_problems``, ``draw_boundary_problems``, ``complete``.
     Plans: ``make_plans``, ``load_plans``, ``save_plans``, ``join_plans``, ``fit_motion``, ``solve_plans``,
-    ``refine_plans``, ``explain_plans``, ``evaluate_plans``, ``export_plans``, ``simulate_plans``, ``run_benchmark``.
-    Models: ``train_model``, ``load_model``, ``save_model``.
+    ``refine_plans``, ``explain_plans``, ``evaluate_plans``, ``export_plans``.
+    Models: ``train_model``, ``load_model``, ``save_model``, ``plan_hits``.
+    Machine: ``check_machine``.
 
 Classes:
     ``Dataset``, ``Problem``, ``Scene``, ``RobotModel``, ``Boundary``, ``Motion``, ``Plans``, ``Planner``, ``Model``,
@@ -31,7 +32,7 @@ Classes:
 * ``cnpgen.results``: classes that functions return.
 * ``cnpgen.errors``: the exceptions.
 * ``cnpgen.plugins``: contracts of stages, constraints, planners and exporters.
-* ``cnpgen.benchmark``: suites, planners and the simulator.
+* ``cnpgen.benchmark``: comparison of planners, and simulation of plans.
 
 Names load on first use, so that importing the package is cheap. ``__init__.pyi`` lists them for type checkers (SPEC 1).
 """

@@ -1,5 +1,3 @@
-from cnpgen.benchmark.run_suite import run_benchmark as run_benchmark
-from cnpgen.benchmark.simulator.simulate import simulate_plans as simulate_plans
 from cnpgen.errors import CnpgenError as CnpgenError
 from cnpgen.loader.dataset import Dataset as Dataset
 from cnpgen.loader.load import load_dataset as load_dataset
@@ -14,6 +12,7 @@ from cnpgen.planner.boundary_layer import BoundaryLayer as BoundaryLayer
 from cnpgen.planner.model import Model as Model
 from cnpgen.planner.model_file import load_model as load_model
 from cnpgen.planner.model_file import save_model as save_model
+from cnpgen.planner.plan_hits import plan_hits as plan_hits
 from cnpgen.planner.planner import Planner as Planner
 from cnpgen.plans.boundary_problems import load_boundary_problems as load_boundary_problems
 from cnpgen.plans.evaluate import evaluate_plans as evaluate_plans
@@ -37,4 +36,5 @@ from cnpgen.training.train import train_model as train_model
 from cnpgen.trajectory.boundary import Boundary as Boundary
 from cnpgen.trajectory.fit import fit_motion as fit_motion
 from cnpgen.trajectory.spline_motion import Motion as Motion
+from cnpgen.validate.machine import check_machine as check_machine
 from cnpgen.validate.validate_dataset import validate_dataset as validate_dataset

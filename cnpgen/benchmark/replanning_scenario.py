@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from cnpgen.benchmark.pucks import Pucks, hits_from, hits_of
 from cnpgen.errors import RecipeError
-from cnpgen.planner.planner import states_at
 from cnpgen.plans.concatenate import concatenate
 from cnpgen.plans.plans import Plans
 from cnpgen.refine.refine_plans import solve_plans
@@ -71,7 +70,7 @@ def turns_of(turns: Turns) -> tuple[Plans, Lead]:
             raise RecipeError(
                 [f"turns.when: a first motion is over after {min_duration:.3f} s, the turn is at {when:g} s"]
             )
-        problems.append(hits_from(turns.pucks, opposite, states_at(first, when)))
+        problems.append(hits_from(turns.pucks, opposite, first.states_at(when)))
     joined, lead = concatenate(problems), concatenate([first] * len(problems)).motion
     until = np.repeat(turns.when, len(first))
     return replace(joined, sample_id=np.arange(len(joined))), Lead(lead, until)

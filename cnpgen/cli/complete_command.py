@@ -44,14 +44,14 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     from cnpgen.cli.recipe_names import check_recipe, check_there
     from cnpgen.cli.refine_options import check_place
-    from cnpgen.make.complete import complete_table
+    from cnpgen.make.complete import complete
     from cnpgen.plans import save_plans
 
     check_there(arguments.pipeline)
     check_recipe(arguments.pipeline)
     check_suffix(arguments.out)
     check_place(arguments.out, force=arguments.force)
-    found = complete_table(arguments.pipeline, arguments.tasks)
+    found = complete(arguments.pipeline, arguments.tasks)
     if len(found.plans):
         save_plans(arguments.out, found.plans)
     if not arguments.quiet:

@@ -48,7 +48,9 @@ class Completed:
         return dict(Counter(reason for reason in self.reasons if reason).most_common())
 
 
-def complete(recipe: str | Path | Pipeline | DatasetRecipe, /, **columns: ArrayLike) -> Completed:
+def complete(
+    recipe: str | Path | Pipeline | DatasetRecipe, table: str | Path | None = None, /, **columns: ArrayLike
+) -> Completed:
     """Complete tasks: compute their missing columns with the stages of a pipeline, without random sampling.
 
     A start is given by ``start_q``, for moving starts with ``start_dq`` and ``start_ddq``, or by the tip position
@@ -60,16 +62,29 @@ def complete(recipe: str | Path | Pipeline | DatasetRecipe, /, **columns: ArrayL
 
     Args:
         recipe: Name of a shipped pipeline or dataset, path of a recipe file, or a loaded recipe.
+        table: Path of a table of tasks, CSV or HDF5, in place of the columns; see docs/tasks.md.
         columns: Name of a dataset column -> values in SI units, shape (w,) for one task or (N, w); scalars have shape
             () or (N,). The value of one task applies to all.
 
     Raises:
-        UsageError: A column is unknown, has the wrong shape or is not finite, or a goal is missing.
+        UsageError: A column is unknown, has the wrong shape or is not finite, a goal is missing, there is no such
+            table, or table and columns are both given.
+        DatasetError: The table is damaged, lacks a goal, or has unknown or contradictory columns.
         RecipeError: The recipe has mistakes.
-        MachineError: No backend works.
+        MachineError: No backend works, or the table cannot be read.
     """
-    pipeline = _pipeline(recipe)
-    return _completed(pipeline, load_context(pipeline.problem, *choose_backend(None)), columns)
+    pipeline = recipe if isinstance(recipe, Pipeline) else as_dataset_recipe(recipe).pipeline
+    context = load_context(pipeline.problem, *choose_backend(None))
+    if table is None:
+        return _completed(pipeline, context, columns)
+    if columns:
+        raise UsageError(f"give a table or columns, got the table {table} and {', '.join(columns)}", argument="table")
+    fields, flat = given_fields(steps_of(pipeline), context), table_height(context) is not None
+    tasks = read_tasks(Path(table), fields, flat=flat)
+    try:
+        return _completed(pipeline, context, tasks)
+    except UsageError as error:
+        raise DatasetError(f"{table}: {error}") from error
 
 
 def _completed(pipeline: Pipeline, context: Context, columns: Mapping[str, ArrayLike]) -> Completed:
@@ -84,33 +99,6 @@ def _completed(pipeline: Pipeline, context: Context, columns: Mapping[str, Array
     rows = {**completion.rows(tasks), "sample_id": tasks.alive.astype(np.int64)}
     problem, source = record_problem(pipeline.problem), f"tasks completed by {pipeline.name}"
     return Completed(plans_of_rows(problem, rows, source=source), tasks.why())
-
-
-def complete_table(recipe: str | Path | Pipeline | DatasetRecipe, path: str | Path) -> Completed:
-    """Complete the tasks of a table, CSV or HDF5; see ``complete`` and docs/tasks.md.
-
-    Args:
-        recipe: Recipe of the tasks, as for ``complete``.
-        path: Path of the table.
-
-    Raises:
-        UsageError: There is no such file.
-        DatasetError: The table is damaged, lacks a goal, or has unknown or contradictory columns.
-        RecipeError: The recipe has mistakes.
-        MachineError: No backend works, or the file cannot be read.
-    """
-    pipeline = _pipeline(recipe)
-    context = load_context(pipeline.problem, *choose_backend(None))
-    fields, flat = given_fields(steps_of(pipeline), context), table_height(context) is not None
-    tasks = read_tasks(Path(path), fields, flat=flat)
-    try:
-        return _completed(pipeline, context, tasks)
-    except UsageError as error:
-        raise DatasetError(f"{path}: {error}") from error
-
-
-def _pipeline(recipe: str | Path | Pipeline | DatasetRecipe) -> Pipeline:
-    return recipe if isinstance(recipe, Pipeline) else as_dataset_recipe(recipe).pipeline
 
 
 def _rows(field: Field, values: ArrayLike, *, flat: bool) -> Array:

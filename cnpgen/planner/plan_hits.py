@@ -31,7 +31,7 @@ CONTACT_DISTANCE_M = 0.07  # from the centre of the paper's puck to that of its 
 HIT_COLUMNS = ("start_q", "start_dq", "start_ddq", "goal_xyz", "hit_angle", SPEED_SHARE_COLUMN)
 
 State = tuple[ArrayLike, ArrayLike, ArrayLike]
-"""Positions [rad], velocities [rad/s] and accelerations [rad/s^2], shape (n,) or (N, n) each; see ``states_at``."""
+"""Positions [rad], velocities [rad/s] and accelerations [rad/s^2], shape (n,) or (N, n) each; see ``Plans.states_at``."""
 
 _COMPLETIONS: WeakKeyDictionary[Planner, Completion] = WeakKeyDictionary()
 
@@ -70,7 +70,7 @@ def plan_hits(
     Args:
         planner: A planner whose model was trained on hits.
         state: Positions [rad], velocities [rad/s] and accelerations [rad/s^2] of the arm, shape (n,) or (N, n) each,
-            as returned by ``states_at``; the distance to the table must be within the tolerance of plans.
+            as returned by ``Plans.states_at``; the distance to the table must be within the tolerance of plans.
         puck: Position of the puck's centre, x and y [m], shape (2,) or (N, 2); x, y and z for problems without table.
         target: Position to hit the puck towards, x and y [m], shape (2,) or (N, 2).
         contact_distance: Distance from the puck's centre to the mallet's at contact [m].

@@ -22,7 +22,6 @@ from cnpgen.schema.arguments import numbers
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.boundary_arguments import boundary_of
-from cnpgen.trajectory.spline_motion import states_at_times
 
 Array = NDArray[np.float64]
 
@@ -170,7 +169,7 @@ class Planner:
         check_plans_type(plans)
         if plans.problem.joint_names != self.model.problem.joint_names:
             raise UsageError(f"the planner is of {self.model.problem.name!r}, the plans are of {plans.problem.name!r}")
-        q, dq, ddq = states_at(plans, time)
+        q, dq, ddq = plans.states_at(time)
         new = self.plan(q, goal_q, start_dq=dq, start_ddq=ddq, goal_dq=goal_dq, goal_ddq=goal_ddq)
         times = np.broadcast_to(numbers("time", time), (len(plans),))
         if len(plans) == 1:
@@ -201,32 +200,3 @@ class Planner:
         if boundary.goal_ddq is not None:
             raise UsageError("the model leaves goal accelerations free, so goal_ddq must be None")
         return replace(boundary, goal_ddq=np.zeros_like(boundary.goal_q))
-
-
-def states_at(plans: Plans, time: ArrayLike) -> tuple[Array, Array, Array]:
-    """Evaluate each of N plans at one time.
-
-    Args:
-        plans: N plans.
-        time: Time since the start of each plan [s], one number or shape (N,).
-
-    Returns:
-        Positions [rad], velocities [rad/s] and accelerations [rad/s^2], shape (N, n) each.
-
-    Raises:
-        UsageError: The number of times differs from that of plans, a time is outside its plan, or a plan is missing.
-    """
-    try:
-        times = np.broadcast_to(numbers("time", time), (len(plans),))
-    except (UsageError, ValueError) as error:
-        raise UsageError(
-            f"must be one number or one for each of {len(plans)} plans, got {time!r}", argument="time"
-        ) from error
-    outside = ~((times >= 0) & (times <= plans.duration))
-    if outside.any():
-        row = int(outside.argmax())
-        check_made(plans)
-        raise UsageError(
-            f"plan {row} lasts from 0 to {plans.duration[row]:.9g} s, it cannot be evaluated at {times[row]:.9g} s"
-        )
-    return states_at_times(plans.motion, times)

@@ -19,7 +19,7 @@ from cnpgen.problems.problem_record import ProblemRecord, as_record, open_proble
 from cnpgen.schema.arguments import integer, numbers
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.trajectory.boundary import Boundary
-from cnpgen.trajectory.spline_motion import Motion
+from cnpgen.trajectory.spline_motion import Motion, states_at_times
 from cnpgen.trajectory.trajectory_spec import MAX_CONTROL_POINTS, MAX_DEGREE
 
 Array = NDArray[np.float64]
@@ -87,6 +87,33 @@ class Plans:
     def duration(self) -> Array:
         """Duration of every plan [s], shape (N,); inf or nan if undefined."""
         return self.motion.duration()
+
+    def states_at(self, time: ArrayLike) -> tuple[Array, Array, Array]:
+        """Evaluate each plan at one time.
+
+        Args:
+            time: Time since the start of each plan [s], one number or shape (N,).
+
+        Returns:
+            Positions [rad], velocities [rad/s] and accelerations [rad/s^2], shape (N, n) each.
+
+        Raises:
+            UsageError: The number of times differs from that of plans, a time is outside its plan, or a plan is missing.
+        """
+        try:
+            times = np.broadcast_to(numbers("time", time), (len(self),))
+        except (UsageError, ValueError) as error:
+            raise UsageError(
+                f"must be one number or one for each of {len(self)} plans, got {time!r}", argument="time"
+            ) from error
+        outside = ~((times >= 0) & (times <= self.duration))
+        if outside.any():
+            row = int(outside.argmax())
+            check_made(self)
+            raise UsageError(
+                f"plan {row} lasts from 0 to {self.duration[row]:.9g} s, it cannot be evaluated at {times[row]:.9g} s"
+            )
+        return states_at_times(self.motion, times)
 
     def __getitem__(self, which: int | slice | Sequence[int] | NDArray[Any]) -> "Plans":
         """Return a selection of the plans, as Plans also for a single plan.

@@ -10,7 +10,7 @@ import pytest
 import cnpgen
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.kernels.library import choose_backend
-from cnpgen.make.complete import complete, complete_table
+from cnpgen.make.complete import complete
 
 GOALS = [[1.0, 0.1], [3.0, 0.0], [1.1, -0.2]]  # m; the second is out of reach
 ANGLES = [0.0, 0.1, 0.2]  # rad
@@ -81,7 +81,7 @@ def test_a_table_of_csv_and_one_of_hdf5_give_what_python_gives(found, tmp_path):
     with h5py.File(tmp_path / "behind.h5", "w", userblock_size=512) as file:  # the format leaves users a first block
         file["goal_xyz"], file["hit_angle"] = np.array([[*goal, 0.16] for goal in GOALS]), ANGLES
     for name in ("tasks.csv", "tasks.h5", "parts.h5", "behind.h5"):
-        again = complete_table("airhockey-replan", tmp_path / name)
+        again = complete("airhockey-replan", tmp_path / name)
         assert again.reasons == found.reasons
         np.testing.assert_array_equal(again.plans.boundary.goal_dq, found.plans.boundary.goal_dq)
 
@@ -110,14 +110,14 @@ def test_a_table_with_a_mistake_is_refused_with_the_place(tmp_path, text, messag
     path = tmp_path / "tasks.csv"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(DatasetError) as error:
-        complete_table("airhockey-replan", path)
+        complete("airhockey-replan", path)
     assert message in str(error.value)
 
 
 def test_a_machine_without_a_compiler_is_warned_of_once(tmp_path, monkeypatch):
     monkeypatch.setattr("cnpgen.make.complete.choose_backend", once := Mock(side_effect=choose_backend))
     (tmp_path / "tasks.csv").write_text("goal_xyz.x,goal_xyz.y\n1,0\n", encoding="utf-8")
-    complete_table("airhockey-replan", tmp_path / "tasks.csv")
+    complete("airhockey-replan", tmp_path / "tasks.csv")
     once.assert_called_once()
 
 
@@ -125,13 +125,13 @@ def test_a_table_of_nothing_but_a_size_is_refused(tmp_path):
     (tmp_path / "tasks.csv").write_text("goal_xyz.x,goal_xyz.y\n1,2\n", encoding="utf-8")
     os.truncate(tmp_path / "tasks.csv", 1 << 40)
     with pytest.raises(DatasetError, match="has 1,099,511,627,776 bytes, expected a table of at most"):
-        complete_table("airhockey-replan", tmp_path / "tasks.csv")
+        complete("airhockey-replan", tmp_path / "tasks.csv")
 
 
 def test_a_table_without_heights_is_refused_where_no_table_gives_them(tmp_path):
     (tmp_path / "tasks.csv").write_text("goal_xyz.x,goal_xyz.y\n1,0\n", encoding="utf-8")
     with pytest.raises(DatasetError, match=r"tasks\.csv lacks goal_xyz\.z beside goal_xyz\.x, goal_xyz\.y"):
-        complete_table("heavy-object", tmp_path / "tasks.csv")
+        complete("heavy-object", tmp_path / "tasks.csv")
 
 
 def test_hdf5_with_columns_of_different_lengths_or_no_numbers_is_refused(tmp_path):
@@ -144,4 +144,4 @@ def test_hdf5_with_columns_of_different_lengths_or_no_numbers_is_refused(tmp_pat
         ("text", "goal_xyz must hold numbers, got object"),
     ):
         with pytest.raises(DatasetError, match=message):
-            complete_table("airhockey-replan", tmp_path / f"{name}.h5")
+            complete("airhockey-replan", tmp_path / f"{name}.h5")

@@ -16,7 +16,7 @@ from cnpgen.pipelines.completion import Completion
 from cnpgen.pipelines.context import load_context
 from cnpgen.pipelines.prepared import random_generator
 from cnpgen.pipelines.stages.stage import CandidateBatch
-from cnpgen.planner.planner import Planner, states_at
+from cnpgen.planner.planner import Planner
 from cnpgen.schema.keys import Range
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.validate.validate_dataset import validate_dataset
@@ -54,7 +54,7 @@ def test_starts_are_where_the_motions_are_and_exactly_on_the_table(first) -> Non
     prepared, candidates = first
     found = moved(first, STILL)
     plans = Planner(MODEL).plan_batch(boundary_of(candidates))
-    expected, arm = states_at(plans, 0.4 * plans.duration), Arm(prepared.context.robot)
+    expected, arm = plans.states_at(0.4 * plans.duration), Arm(prepared.context.robot)
     for name, values, off in zip(("start_q", "start_dq", "start_ddq"), expected, OFF.values(), strict=True):
         assert np.median(np.abs(found[name].T - values).max(axis=1)) < off / 4
         assert (np.abs(found[name].T - values).max(axis=1) < off).mean() > 0.95

@@ -17,7 +17,7 @@ from cnpgen.planner.model_file import load_model
 from cnpgen.planner.plan_hits import boundary_of_tasks
 from cnpgen.planner.plan_requests import read_file, read_rows
 from cnpgen.planner.plan_reuse import reuse_previous_plan
-from cnpgen.planner.planner import Planner, states_at
+from cnpgen.planner.planner import Planner
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.training.train import train_model
 from tests.conftest import columns_of, tiny_recipe
@@ -55,7 +55,7 @@ def test_plans_end_with_the_goal_acceleration_of_the_rows(planner: Planner, rows
     asked = read_rows(rows, planner.model, n=20).boundary
     plans = planner.plan_batch(asked)
     np.testing.assert_array_equal(plans.boundary.goal_ddq, asked.goal_ddq)
-    arrived = states_at(plans, plans.duration)
+    arrived = plans.states_at(plans.duration)
     for found, wanted, exact in zip(
         arrived, (asked.goal_q, asked.goal_dq, asked.goal_ddq), (1e-9, 1e-8, 1e-5), strict=True
     ):
@@ -103,7 +103,7 @@ def test_a_remaining_trajectory_is_reused_only_if_it_ends_with_the_requested_acc
     goal = {"goal_q": asked.goal_q, "goal_dq": asked.goal_dq}
     same = planner.replan(old, when, **goal, goal_ddq=asked.goal_ddq)
     np.testing.assert_allclose(same.duration, 0.1 * old.duration)
-    np.testing.assert_allclose(states_at(same, same.duration)[2], asked.goal_ddq, atol=1e-4)
+    np.testing.assert_allclose(same.states_at(same.duration)[2], asked.goal_ddq, atol=1e-4)
     other = planner.replan(old, when, **goal, goal_ddq=asked.goal_ddq + 1e-3)
     assert (other.duration > 0.11 * old.duration).all()
     free = replace(old, boundary=replace(old.boundary, goal_ddq=None))

@@ -10,7 +10,7 @@ from cnpgen.errors import UsageError
 from cnpgen.make.complete import complete
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.planner.plan_hits import plan_hits
-from cnpgen.planner.planner import Planner, states_at
+from cnpgen.planner.planner import Planner
 from cnpgen.problems.problem_record import open_problem
 from tests.conftest import Arm
 
@@ -28,7 +28,7 @@ def state(planner) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """States on plans that are being executed: moving, and off the table by the error of the network."""
     given = draw_boundary_problems("airhockey-replan", 4, seed=11).boundary
     plans = planner.plan_batch(given)
-    return states_at(plans, 0.4 * plans.duration)
+    return plans.states_at(0.4 * plans.duration)
 
 
 def test_a_hit_equals_pipeline_completion_and_planning(planner, state):

@@ -9,7 +9,7 @@ import pytest
 
 from cnpgen.errors import UsageError
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
-from cnpgen.planner.planner import Planner, states_at
+from cnpgen.planner.planner import Planner
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.join import join_plans
 from cnpgen.plans.status import PlanStatus
@@ -57,7 +57,7 @@ def test_missing_velocities_and_accelerations_are_zero(planner, rows):
     given = planner.plan(rows.start_q[0], rows.goal_q[0])
     np.testing.assert_array_equal(given.boundary.start_dq, 0)
     np.testing.assert_array_equal(given.boundary.goal_dq, 0)
-    q, dq, ddq = states_at(given, 0.0)
+    q, dq, ddq = given.states_at(0.0)
     np.testing.assert_allclose(q[0], rows.start_q[0], atol=1e-12)
     np.testing.assert_allclose(dq[0], 0, atol=1e-12)
     np.testing.assert_allclose(ddq[0], 0, atol=1e-9)
@@ -119,12 +119,12 @@ def test_replanning_is_continuous_in_position_velocity_and_acceleration(planner,
     old = planned(planner, rows)
     when = 0.4 * old.duration
     new = planner.replan(old, when, goal_q=rows.goal_q[::-1], goal_dq=rows.goal_dq[::-1])
-    before, after = states_at(old, when), states_at(new, 0.0)
+    before, after = old.states_at(when), new.states_at(0.0)
     for found, expected, scale in zip(after, before, (1, 1, 100), strict=True):
         np.testing.assert_allclose(found, expected, atol=1e-11 * scale)
     assert (np.abs(before[1]).max(axis=1) > 0.05).all()  # it was moving
     np.testing.assert_array_equal(new.boundary.goal_q, rows.goal_q[::-1])
-    arrived = states_at(new, new.duration)
+    arrived = new.states_at(new.duration)
     np.testing.assert_allclose(arrived[0], rows.goal_q[::-1], atol=1e-9)
     np.testing.assert_allclose(arrived[1], rows.goal_dq[::-1], atol=1e-8)
 
@@ -137,8 +137,8 @@ def test_a_replanned_hit_continues_the_first_motion(planner, rows):
     h = 1e-6
     for old, new in ((first, second), (second, hit)):
         switch = 0.5 * old.duration[0]
-        q0, dq0, ddq0 = states_at(old, switch - h)
-        q1, dq1, ddq1 = states_at(new, h)
+        q0, dq0, ddq0 = old.states_at(switch - h)
+        q1, dq1, ddq1 = new.states_at(h)
         np.testing.assert_allclose((q1 - q0) / (2 * h), (dq0 + dq1) / 2, atol=1e-4)
         np.testing.assert_allclose((dq1 - dq0) / (2 * h), (ddq0 + ddq1) / 2, atol=1e-2)
 
@@ -157,7 +157,7 @@ def test_rounding_errors_count_as_rest_so_that_rest_to_rest_plans_can_be_replann
     rest = boundary_of_columns(columns_of(tiny("heavy-object")), 20)
     planner = Planner(untrained_model("heavy-object", rest), backend="numpy")
     plans = planned(planner, rest)
-    assert np.abs(states_at(plans, 0.0)[2]).max() > 0
+    assert np.abs(plans.states_at(0.0)[2]).max() > 0
     again = planner.replan(plans, 0.0, goal_q=rest.goal_q)
     np.testing.assert_array_equal(again.boundary.start_ddq, 0.0)
     np.testing.assert_allclose(again.path_control_points, plans.path_control_points, atol=1e-5)
@@ -165,7 +165,7 @@ def test_rounding_errors_count_as_rest_so_that_rest_to_rest_plans_can_be_replann
     planner.plan(rest.start_q, rest.goal_q, start_dq=0.9e-9 * limit)
     with pytest.raises(UsageError, match="start_dq was zero"):
         planner.plan(rest.start_q, rest.goal_q, start_dq=1.1e-9 * limit)
-    q, dq, _ = states_at(plans, plans.duration)
+    q, dq, _ = plans.states_at(plans.duration)
     np.testing.assert_allclose(planner.plan(q, rest.start_q, start_dq=dq).boundary.start_dq, 0.0, atol=0)
 
 
@@ -204,7 +204,7 @@ def test_a_time_outside_of_the_plan_raises_an_error(planner, rows):
     with pytest.raises(UsageError, match=r"plan 0 lasts from 0 to .* cannot be evaluated at -0.1 s"):
         planner.replan(plans, -0.1, goal_q=rows.goal_q)
     with pytest.raises(UsageError, match="cannot be evaluated at 100 s"):
-        states_at(plans, 100.0)
+        plans.states_at(100.0)
     path, rate = plans.path_control_points * np.nan, plans.rate_control_points * np.nan
     unsolved = replace(plans, path_control_points=path, rate_control_points=rate)
     with pytest.raises(UsageError, match="plan 0 has no control points yet"):

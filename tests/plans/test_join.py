@@ -10,7 +10,7 @@ import pytest
 from cnpgen.cli.main import main
 from cnpgen.errors import UsageError
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
-from cnpgen.planner.planner import Planner, states_at
+from cnpgen.planner.planner import Planner
 from cnpgen.plans.export import export_plans
 from cnpgen.plans.join import join_plans
 from cnpgen.plans.plans import Plans
@@ -48,7 +48,7 @@ def test_what_is_joined_is_each_plan_in_its_time_and_nowhere_jumps(three):
         (0.5 * (switch + later), second, 0.5 * (later - switch)),
     ):
         states = joined.motion.at_times(time[:, None])
-        for name, expected in zip(("q", "dq", "ddq"), states_at(plans, own), strict=True):
+        for name, expected in zip(("q", "dq", "ddq"), plans.states_at(own), strict=True):
             np.testing.assert_allclose(getattr(states, name)[:, 0], expected, atol=1e-9)
     around = np.stack([switch - 1e-9, switch + 1e-9, later - 1e-9, later + 1e-9], axis=1)
     states = joined.motion.at_times(around)
@@ -61,7 +61,7 @@ def test_what_follows_a_whole_plan_begins_at_its_end(planner):
     aside = planner.robot.base.copy()
     aside[0] += 0.1
     first = planner.plan(planner.robot.base, aside)
-    end = states_at(first, first.duration)
+    end = first.states_at(first.duration)
     second = planner.plan(end[0], planner.robot.base, start_dq=end[1], start_ddq=end[2])
     np.testing.assert_allclose(join_plans(first, second).duration, first.duration + second.duration)
 

@@ -8,7 +8,7 @@ import pytest
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.judges.plans import judge
 from cnpgen.make.complete import complete
-from cnpgen.planner.planner import Planner, states_at
+from cnpgen.planner.planner import Planner
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.export import export_plans
 from cnpgen.plans.join import join_plans
@@ -32,7 +32,7 @@ def none(planner: Planner) -> Plans:
 
 
 def test_nothing_is_planned_refined_judged_saved_and_joined(planner: Planner, none: Plans, tmp_path: Path) -> None:
-    assert [len(values) for values in states_at(none, 0.1)] == [0, 0, 0]
+    assert [len(values) for values in none.states_at(0.1)] == [0, 0, 0]
     assert len(planner.replan(none, 0.1, goal_q=none.boundary.goal_q)) == 0
     for found in (refine_plans(none), solve_plans(none), refine_plans(none, workers=2, journal=tmp_path / "journal")):
         assert (len(found.plans), found.summary()["valid"]) == (0, 0)

@@ -10,7 +10,7 @@ import pytest
 
 from cnpgen.planner.inference_pipeline import loaded_problem
 from cnpgen.planner.model import Model, ModelConfig
-from cnpgen.planner.planner import Planner, states_at
+from cnpgen.planner.planner import Planner
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import load_problem
@@ -147,7 +147,7 @@ def test_kernels_of_a_problem_are_not_those_of_one_with_another_trajectory(
     problem = replace(shipped, trajectory=replace(shipped.trajectory, **change))
     plans = Planner(model_of(problem, model, outputs), backend="numpy").plan_batch(wanted)
     assert plans.path_control_points.shape == (2, problem.trajectory.path_control_points, 6)
-    q, dq, ddq = states_at(plans, 0.0)
+    q, dq, ddq = plans.states_at(0.0)
     np.testing.assert_allclose(q, wanted.start_q, atol=1e-12)
     np.testing.assert_allclose(dq, 0.3, atol=1e-12)
     np.testing.assert_allclose(ddq, 0.1, atol=1e-9)
