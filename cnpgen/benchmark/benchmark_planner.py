@@ -1,4 +1,4 @@
-"""What a planner is to the benchmark: boundary problems in, one by one; a plan or a trajectory out."""
+"""Contract of the planners of the benchmark: one boundary problem in, a plan or a sampled trajectory out."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -9,7 +9,7 @@ from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import ProblemRecord
 
 Answer = Plans | Trajectory | None
-"""One plan, a trajectory that is sampled in time, or None where none was found."""
+"""One plan, a trajectory sampled in time, or None if the planner found no plan."""
 
 Plan = Callable[[Plans], Answer]
 """A function of one boundary problem: ``Plans`` of length 1 whose control points are nan."""
@@ -17,13 +17,13 @@ Plan = Callable[[Plans], Answer]
 
 @dataclass(frozen=True)
 class Setting:
-    """What a planner is told before the first problem.
+    """Information for a planner before the first problem.
 
     Attributes:
-        problem: What a valid motion is.
+        problem: Record of the problem.
         model: Name of the shipped model for problems of this kind, or empty.
-        time_limit: How long it may take for a problem [s]; who takes much longer is stopped.
-        seed: For planners that draw random numbers.
+        time_limit: Planning time per problem [s]; a planner that takes much longer is stopped.
+        seed: Seed of random planners.
     """
 
     problem: ProblemRecord
@@ -33,26 +33,25 @@ class Setting:
 
 
 class BenchmarkPlanner(ABC):
-    """A planner that can be compared; a frozen dataclass whose fields are declared with ``cnpgen.plugins.field``.
+    """Planner of the benchmark: a frozen dataclass whose fields are declared with ``cnpgen.plugins.field``.
 
-    Packages register theirs under the entry point ``cnpgen.planners``. Each runs in a process of its own: what it
-    breaks, it breaks for itself.
+    Packages register planners under the entry point ``cnpgen.planners``. Each planner runs in its own process.
     """
 
     def describe(self) -> str:
-        """Say in a line what it does."""
+        """Return a description of one line."""
         return (type(self).__doc__ or "").strip().partition("\n")[0]
 
     @abstractmethod
     def prepare(self, setting: Setting) -> Plan:
-        """Load what is loaded once; the time that this takes does not count.
+        """Load kernels and models; the time is not measured.
 
         Args:
-            setting: The problem, and what it may take.
+            setting: The problem and the time limit.
 
         Returns:
-            What plans: called with one boundary problem at a time, its time counts.
+            Function that plans for one boundary problem; its time is measured.
 
         Raises:
-            UsageError: It cannot plan for problems of this kind.
+            UsageError: The planner does not support problems of this kind.
         """

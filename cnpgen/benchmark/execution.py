@@ -1,29 +1,29 @@
-"""What planners return, executed: plans and sampled trajectories alike, in the scene of their boundary problem."""
+"""Execution of the results of planners, plans and sampled trajectories, in the scene of their boundary problem."""
 
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.benchmark.replanning_scenario import Lead
-from cnpgen.benchmark.results import answer_from_dict
+from cnpgen.benchmark.replanning_scenario import ExecutedPrefix
+from cnpgen.benchmark.results_file import answer_from_dict
 from cnpgen.benchmark.simulator.execute import Execution
 from cnpgen.benchmark.simulator.executed import Executed
 from cnpgen.benchmark.simulator.plant import Plant
 from cnpgen.benchmark.simulator.reference import Reference, StatesAt, states_of
 from cnpgen.benchmark.simulator.simulate import execute_states
-from cnpgen.benchmark.simulator.simulator_scene import Scene
+from cnpgen.benchmark.simulator.simulator_scene import SimulatorScene
 from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.errors import UsageError
 from cnpgen.plans.plans import Plans
 
 Array = NDArray[np.float64]
-Task = tuple[Plans, dict[str, Any], Lead | None]
-"""One boundary problem, the answer as results keep it, and of a turn the first motion."""
+Task = tuple[Plans, dict[str, Any], ExecutedPrefix | None]
+"""One boundary problem, the stored answer, and the executed prefix of a replanning scenario."""
 
 
 def execute_answer(task: Task, *, plant: Plant) -> Executed:
-    """Execute what a planner returned; what cannot be executed is said in ``failure``.
+    """Execute an answer; if this is impossible, ``failure`` has the reason.
 
     Args:
         task: The problem and the answer.
@@ -35,36 +35,36 @@ def execute_answer(task: Task, *, plant: Plant) -> Executed:
         return Executed(failure=str(error))
 
 
-def execution_of(task: Task, plant: Plant) -> tuple[Scene, Reference, Execution]:
-    """Execute what a planner returned.
+def execution_of(task: Task, plant: Plant) -> tuple[SimulatorScene, Reference, Execution]:
+    """Execute an answer.
 
     Args:
-        task: The problem and the answer; of a turn, the first motion is executed up to the turn.
+        task: The problem and the answer; of a replanning scenario, the first motion is executed up to the switch.
         plant: The robot.
 
     Returns:
-        The world, what the controller followed, and what happened.
+        The simulated world, the reference of the controller, and the execution.
 
     Raises:
-        UsageError: It cannot be executed, or is no answer.
+        UsageError: The answer is invalid or cannot be executed.
         RecipeError: MuJoCo cannot simulate the robot.
         MachineError: MuJoCo is missing.
     """
-    problem, content, lead = task
+    problem, content, prefix = task
     states, duration = _timed(answer_from_dict(problem, content))
-    if lead is None:
+    if prefix is None:
         return execute_states(problem, states, duration, plant, problem.boundary.start_dq[0])
-    return execute_states(problem, joined(lead, states), float(lead.until[0]) + duration, plant)
+    return execute_states(problem, joined(prefix, states), float(prefix.until[0]) + duration, plant)
 
 
-def joined(lead: Lead, states: StatesAt) -> StatesAt:
-    """Join the first part of a motion with what follows at the turn.
+def joined(prefix: ExecutedPrefix, states: StatesAt) -> StatesAt:
+    """Join the first part of a motion with its continuation.
 
     Args:
-        lead: One first motion.
-        states: What follows, from time 0 on.
+        prefix: Prefix of one motion.
+        states: The continuation, from time 0.
     """
-    first, until = states_of(lead.motion), float(lead.until[0])
+    first, until = states_of(prefix.motion), float(prefix.until[0])
 
     def at(t: Array) -> tuple[Array, Array, Array]:
         before, after = first(np.minimum(t, until)), states(np.maximum(t - until, 0.0))

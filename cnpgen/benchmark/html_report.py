@@ -1,4 +1,4 @@
-"""A report of a benchmark as one HTML file: tables beside the paper's figures, box plots, pictures or films."""
+"""Report of a benchmark as one HTML file: tables beside the paper's figures, box plots, images or films."""
 
 import base64
 import io
@@ -16,7 +16,7 @@ from cnpgen.errors import CnpgenError, MachineError
 from cnpgen.store.files.atomic import write_file
 from cnpgen.store.files.figure_file import new_figure
 
-PRINTED: dict[str, dict[str, dict[str, str]]] = {  # suite -> planner -> figure -> what the paper's text says of it
+PRINTED: dict[str, dict[str, dict[str, str]]] = {  # suite -> planner -> figure -> value in the paper's text
     "hits-81": {
         "cnp-b": {"scored": "100 %", "planning_ms": "33", "z_error_mm_s": "< 5"},
         "aqp": {"scored": "92.59 %", "planning_ms": "42"},
@@ -28,20 +28,19 @@ PRINTED: dict[str, dict[str, dict[str, str]]] = {  # suite -> planner -> figure 
     },
     "hits-110": {"cnp-b": {"scored": "78.2 % (real robot)"}, "aqp": {"scored": "52.7 % (real robot)"}},
 }
-FRAMES = 300  # of a film: some seconds of work, and less than 1 MB
+MAX_FILM_FRAMES = 300  # some seconds of work, and less than 1 MB
 _STYLE = "body{font-family:sans-serif;max-width:75em;margin:2em auto}td,th{padding:.2em .8em;text-align:right}"
 _STYLE += "td:first-child,th:first-child{text-align:left}table{border-collapse:collapse}tr{border-top:1px solid #ccc}"
 _STYLE += "svg{max-width:100%;height:auto}figure{display:inline-block;width:46%;margin:1%}img,video{width:100%}"
 
 
 def save_benchmark_report(benchmark: Benchmark, path: str | Path, *, video: bool = False) -> Path:
-    """Write the report of a benchmark as one file that needs no others; a file that is there is replaced.
+    """Write the report of a benchmark as one self-contained file; an existing file is replaced.
 
     Args:
-        benchmark: What ``run_benchmark`` returned.
-        path: Where to, ``.html``.
-        video: Whether to film the first plan of every planner, which takes some seconds each, and not only draw its
-            end.
+        benchmark: Result of ``run_benchmark``.
+        path: Output file, ``.html``.
+        video: Whether to film the first plan of every planner, instead of an image; takes some seconds each.
 
     Raises:
         MachineError: matplotlib is missing, or the file cannot be written.
@@ -61,17 +60,17 @@ def save_benchmark_report(benchmark: Benchmark, path: str | Path, *, video: bool
 
 
 def _table(benchmark: Benchmark, plant: str) -> str:
-    """Lay out what ``table_rows`` returns."""
+    """Format the rows of ``table_rows``."""
     head, *rows = table_rows(benchmark, plant)
     lines = ["<table><tr>" + "".join(f"<th>{escape(cell)}</th>" for cell in head) + "</tr>"]
     lines += ["<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows]
     other = compared_with(benchmark.results)
-    note = f"Medians [quartiles]; p: the chance of as large a difference from {other}, where it is below 5 %."
+    note = f"Medians [quartiles]; p: p-value of the difference from {other}, if below 5 %."
     return "\n".join([*lines, f"</table><p>{note}</p>"])
 
 
 def troubles(benchmark: Benchmark) -> list[str]:
-    """Say of every planner without a plan for some problems what came of those, and what it said first."""
+    """Report the outcomes and the first error of every planner without a plan for some problems."""
     found = []
     for name, rows in benchmark.results.items():
         without = [row for row in rows if row["answer"] is None]
@@ -83,11 +82,11 @@ def troubles(benchmark: Benchmark) -> list[str]:
 
 
 def table_rows(benchmark: Benchmark, plant: str) -> list[tuple[str, ...]]:
-    """Put ratios and figures beside each other: a head, then a row for each, with what the paper prints.
+    """Return the rows of the comparison: a head, then one row per ratio and figure, with the paper's values.
 
     Args:
-        benchmark: What ``run_benchmark`` returned.
-        plant: The plant whose executions count; none if it is empty.
+        benchmark: Result of ``run_benchmark``.
+        plant: Name of the plant; empty for plans only.
     """
     summary = benchmark.summary(plant)
     printed = PRINTED.get(benchmark.suite.name, {})
@@ -101,7 +100,7 @@ def table_rows(benchmark: Benchmark, plant: str) -> list[tuple[str, ...]]:
 
 
 def cell_text(found: dict[str, Any] | None, printed: str | None = None) -> str:
-    """Write a ratio or a figure in a few characters, with what the paper prints."""
+    """Format a ratio or a figure with the paper's value."""
     if found is None:
         return f"paper: {printed}" if printed else ""
     if "share" in found:
@@ -130,21 +129,21 @@ def _boxes(benchmark: Benchmark, plant: str) -> str:
 
 
 def _motions(benchmark: Benchmark, *, video: bool) -> list[str]:
-    """Show the first plan of each planner that could be executed, where this machine can draw."""
+    """Render the first executable plan of each planner, if this machine can render."""
     parts = []
     for name, rows in benchmark.results.items() if benchmark.plants else ():
         plant = benchmark.plants[0]
         index = next((row["problem"] for row in rows if _was_executed(row, plant.name)), None)
         if index is None:
             continue
-        task = benchmark.problems[index], rows[index]["answer"], benchmark.lead and benchmark.lead[index]
+        task = benchmark.problems[index], rows[index]["answer"], benchmark.prefix and benchmark.prefix[index]
         what = f"{escape(name)}, problem {index}"
         try:
             shown, text = _shown(task, plant, video=video)
         except MachineError as error:
-            return [f"<p>No pictures: {escape(str(error))}</p>"]
-        except CnpgenError as error:  # a line that was damaged since
-            parts.append(f"<p>{what}: no picture: {escape(str(error))}</p>")
+            return [f"<p>No images: {escape(str(error))}</p>"]
+        except CnpgenError as error:  # a line that has been damaged since
+            parts.append(f"<p>{what}: no image: {escape(str(error))}</p>")
             continue
         parts.append(f"<figure>{shown}<figcaption>{what}, {text}</figcaption></figure>")
     return parts
@@ -156,7 +155,7 @@ def _was_executed(row: dict[str, Any], plant: str) -> bool:
 
 
 def _shown(task: Task, plant: Plant, *, video: bool) -> tuple[str, str]:
-    """Execute a plan; return what shows its end, or the whole of it, and what is to be said of that."""
+    """Execute a plan; return an image or a film, and its caption."""
     scene, reference, execution = execution_of(task, plant)
     with tempfile.TemporaryDirectory() as folder:
         picture, film = Path(folder) / "end.png", Path(folder) / "plan.mp4"
@@ -164,7 +163,7 @@ def _shown(task: Task, plant: Plant, *, video: bool) -> tuple[str, str]:
         still, text = _embedded(picture, "image/png"), "at the end of its plan"
         if video:
             try:
-                save_film(film, scene, execution, reference.ticks, most=FRAMES)
+                save_film(film, scene, execution, reference.ticks, max_frames=MAX_FILM_FRAMES)
             except MachineError as error:
                 text += f"; no film: {escape(str(error))}"
                 film.unlink(missing_ok=True)

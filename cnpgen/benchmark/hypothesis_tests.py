@@ -1,11 +1,11 @@
-"""What the results of a benchmark amount to: ratios, medians, quartiles, and whether differences are chance."""
+"""Statistics of benchmark results: ratios, medians, quartiles, and significance of differences."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-FLAGS = {  # of a row; those of the plant are as executed
+FLAGS = {  # of a row; the last ones are those of the execution
     "planned": "a plan was found",
     "valid": "valid by the verdict",
     "paper_valid": "valid by the paper's rules",
@@ -28,18 +28,18 @@ FIGURES = {
     "planned_vertical_error_rad_s": "vertical error, planned [rad s]",
     "vertical_error_rad_s": "vertical error, executed [rad s]",
     "tracking_error_rad_s": "tracking error [rad s]",
-    "acceleration_use": "largest acceleration / limit",
-    "torque_use": "largest torque / rated, executed",
+    "acceleration_use": "maximum acceleration / limit",
+    "torque_use": "maximum torque / rated, executed",
 }
-REFERENCE = "cnp-b+refine"  # what others are compared with, if it is there
+REFERENCE = "cnp-b+refine"  # reference of the comparison, if present
 
 
 def values_of(row: Mapping[str, Any], plant: str = "") -> dict[str, bool | float]:
-    """Return what is counted and measured of one problem: names of ``FLAGS`` and ``FIGURES``, without what is unknown.
+    """Return the known flags and figures of one problem, by the names of ``FLAGS`` and ``FIGURES``.
 
     Args:
         row: A row of results.
-        plant: The plant whose execution counts; none by default.
+        plant: Name of the plant; empty for plans only.
     """
     found: dict[str, bool | float] = {"planned": row["answer"] is not None}
     found |= {"planning_ms": 1e3 * row["planning_s"], "planning_cpu_ms": 1e3 * row["planning_cpu_s"]}
@@ -60,20 +60,19 @@ def values_of(row: Mapping[str, Any], plant: str = "") -> dict[str, bool | float
     return found
 
 
-def summarise_results(
+def summarize_results(
     results: Mapping[str, Sequence[Mapping[str, Any]]], plant: str = ""
 ) -> dict[str, dict[str, dict[str, dict[str, Any]]]]:
-    """Summarise the results of all planners.
+    """Summarize the results of all planners.
 
     Args:
-        results: Planner -> rows, of the same problems in the same order.
-        plant: The plant whose executions count; none by default.
+        results: Planner -> rows of the same problems in the same order.
+        plant: Name of the plant; empty for plans only.
 
     Returns:
-        Planner -> ``{"ratios": ..., "figures": ...}``. A ratio has ``count``, ``of`` and ``share``; a figure has
-        ``median``, ``q1``, ``q3`` and ``of``, of how many problems it is known. Both have ``p``, the probability of
-        as large a difference from the planner ``compared_with`` by chance: by McNemar's exact test, and by Wilcoxon's
-        signed ranks over the problems that both have a figure of.
+        Planner -> ``{"ratios": ..., "figures": ...}``. A ratio has ``count``, ``of`` and ``share``. A figure has
+        ``median``, ``q1``, ``q3`` and ``of``, its number of values. Both have ``p``, the p-value of the difference from
+        the reference planner: McNemar's exact test for ratios, Wilcoxon's signed-rank test for figures.
     """
     values = {name: [values_of(row, plant) for row in rows] for name, rows in results.items()}
     reference = compared_with(values)
@@ -92,7 +91,7 @@ def summarise_results(
 
 
 def compared_with(planners: Iterable[str]) -> str:
-    """Return the planner that others are compared with: the first one, unless the reference is among them."""
+    """Return the reference planner: ``REFERENCE`` if present, otherwise the first one."""
     names = list(planners)
     return REFERENCE if REFERENCE in names else next(iter(names), "")
 
@@ -117,11 +116,11 @@ def _figure(key: str, rows: Sequence[Mapping[str, Any]], others: Sequence[Mappin
 
 
 def mcnemar(mine: Any, theirs: Any) -> float:
-    """McNemar's exact test: how likely so uneven a split of the problems that only one of two did is by chance.
+    """Return the p-value of McNemar's exact test.
 
     Args:
-        mine: Whether one planner did each problem, shape (N,).
-        theirs: Whether the other one did.
+        mine: Whether one planner solved each problem, shape (N,).
+        theirs: Whether the other planner solved it, shape (N,).
     """
     from scipy.stats import binomtest
 
@@ -131,7 +130,7 @@ def mcnemar(mine: Any, theirs: Any) -> float:
 
 
 def wilcoxon(pairs: Any) -> float:
-    """Wilcoxon's signed-rank test of pairs of figures, shape (N, 2): how likely such differences are by chance."""
+    """Return the p-value of Wilcoxon's signed-rank test of pairs of figures, shape (N, 2)."""
     from scipy.stats import wilcoxon as signed_ranks
 
     if len(pairs) == 0 or not np.any(pairs[:, 0] != pairs[:, 1]):

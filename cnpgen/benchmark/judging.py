@@ -1,8 +1,8 @@
-"""What planners return, judged: plans as ``cnpgen evaluate`` does it, sampled trajectories by the same constraints.
+"""Verdicts on the results of planners: plans as by ``cnpgen evaluate``, sampled trajectories by the same constraints.
 
-A sampled trajectory is looked at every millisecond, as the controller that executes it does. No spline is fitted to it:
-a fit would smooth away what it exceeds. What jumps between two pieces counts as it is seen over a millisecond: the
-acceleration is the velocity's change where pieces are linear, the jerk is the acceleration's where they are cubic, too.
+A sampled trajectory is evaluated every millisecond, at the rate of the controller. No spline is fitted, because a fit
+would smooth violations. Jumps between spans count as their difference quotient over a millisecond: accelerations of
+linear spans are differences of velocities, jerks of linear and cubic spans are differences of accelerations.
 """
 
 from functools import lru_cache
@@ -25,22 +25,22 @@ from cnpgen.world.path import PathWorld
 
 Array = NDArray[np.float64]
 
-STEP = 1e-3  # s
-LONGEST = 60.0  # s: motion time
+JUDGING_STEP_S = 1e-3
+MAX_JUDGED_DURATION_S = 60.0
 
 
 def judge_answer(problem: Plans, answer: Plans | Trajectory) -> Verdict:
-    """Judge what a planner returned for a boundary problem.
+    """Judge the answer of a planner.
 
     Args:
-        problem: One boundary problem, as plans that are still to be made.
+        problem: One boundary problem, as a plan without motion.
         answer: One plan or a trajectory.
     """
     if isinstance(answer, Plans):
         return evaluate_plans(answer, workers=1).verdicts[0]
-    if answer.duration > LONGEST:
+    if answer.duration > MAX_JUDGED_DURATION_S:
         return Verdict(Reason.TOO_LONG)
-    t = np.linspace(0, answer.duration, int(np.ceil(answer.duration / STEP)) + 1)
+    t = np.linspace(0, answer.duration, int(np.ceil(answer.duration / JUDGING_STEP_S)) + 1)
     with np.errstate(all="ignore"):
         return _judge(problem, Samples(t / answer.duration, t), answer)
 
@@ -55,7 +55,7 @@ def _judge(problem: Plans, samples: Samples, answer: Trajectory) -> Verdict:
     start_tip = world.tip_position[:, 0]
     margins = boundary_margins(states, problem.boundary, samples, robot)
     for constraint in loaded.constraint:
-        margins += [each.margin(loaded, samples) for each in measure(constraint, world, samples.s, start_tip)]
+        margins += [condition.margin(loaded, samples) for condition in measure(constraint, world, samples.s, start_tip)]
     unknown = np.full_like(states.q, np.nan)
     metrics = metrics_of(loaded, world, samples, unknown if states.jerk is None else states.jerk)
     paper = paper_rule(loaded, world, obstacle_poses, goal_xyz)
@@ -67,10 +67,10 @@ def _trajectory(answer: Trajectory, t: Array, *, jerk: bool) -> EvaluatedTraject
     q, dq, ddq = answer.states(t)
     if answer.dq is None:
         ddq = np.gradient(dq, t, axis=0)
-    found = [q, dq, ddq]
+    derivatives = [q, dq, ddq]
     if jerk:
-        found.append(np.gradient(ddq, t, axis=0) if answer.ddq is None else answer.jerks(t))
-    return EvaluatedTrajectory(*(np.ascontiguousarray(values.T) for values in found))
+        derivatives.append(np.gradient(ddq, t, axis=0) if answer.ddq is None else answer.jerks(t))
+    return EvaluatedTrajectory(*(np.ascontiguousarray(values.T) for values in derivatives))
 
 
 @lru_cache(maxsize=2)

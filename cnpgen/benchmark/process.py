@@ -1,4 +1,4 @@
-"""A planner in a process of its own: what crashes, hangs or leaks there costs the problem that it happened at."""
+"""Planner in its own process: a crash or a hang affects only the problem at which it happens."""
 
 import multiprocessing
 import signal
@@ -12,21 +12,21 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from cnpgen.benchmark.benchmark_planner import Plan, Setting
-from cnpgen.benchmark.results import answer_from_dict, answer_to_dict
+from cnpgen.benchmark.results_file import answer_from_dict, answer_to_dict
 from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.errors import CnpgenError, MachineError, UsageError
 from cnpgen.machine.threads import one_thread
 from cnpgen.plans.plans import Plans
 from cnpgen.schema import registry
 
-GRACE = 2.0  # times the limit, and
-SPARE = 10.0  # s: a planner that has not answered after this is stopped
-STARTING = 300.0  # s: to load what is loaded once, kernels compiled
+# A planner is stopped after STOP_FACTOR times its time limit plus STOP_MARGIN_S.
+STOP_FACTOR, STOP_MARGIN_S = 2.0, 10.0
+MAX_PREPARATION_TIME_S = 300.0  # including the compilation of kernels
 STDERR = 2  # the file descriptor
 
 
 class Ending(StrEnum):
-    """How planning ended."""
+    """Outcome of planning for one problem."""
 
     PLANNED = "planned"
     NO_PLAN = "no plan"
@@ -36,15 +36,15 @@ class Ending(StrEnum):
 
 
 @dataclass(frozen=True)
-class Attempt:
-    """What became of one problem.
+class PlanningOutcome:
+    """Result of planning for one problem.
 
     Attributes:
-        ending: How it ended.
-        answer: The plan or the trajectory as results keep it, if there is one: nothing of the planner's own is in it.
+        ending: Outcome.
+        answer: The plan or the trajectory in its stored form, if there is one.
         seconds: Wall time of planning [s].
         cpu_seconds: CPU time of planning [s].
-        error: What the planner said, or empty.
+        error: Error message of the planner, or empty.
     """
 
     ending: Ending
@@ -55,25 +55,25 @@ class Attempt:
 
 
 class PlannerProcess:
-    """Plans in another process, which is started anew after it died or was stopped.
+    """Planner in another process, which is restarted after it died or was stopped.
 
     Args:
         name: Name of the planner.
-        setting: What it is told.
+        setting: Its problem and limits.
     """
 
     def __init__(self, name: str, setting: Setting) -> None:
         self._name, self._setting = name, setting
         self._process: subprocess.Popen[bytes] | None = None
         self._pipe: Connection | None = None
-        self._unprepared: Attempt | None = None
+        self._unprepared: PlanningOutcome | None = None
 
-    def plan(self, problem: Plans) -> Attempt:
-        """Let it plan for one problem.
+    def plan(self, problem: Plans) -> PlanningOutcome:
+        """Plan for one problem.
 
         Raises:
-            UsageError: It says that it cannot plan for problems of this kind.
-            MachineError: It says what this machine lacks.
+            UsageError: The planner does not support problems of this kind.
+            MachineError: This machine lacks a requirement of the planner.
         """
         if self._unprepared is None and self._pipe is None:
             self._unprepared = self._start()
@@ -83,14 +83,14 @@ class PlannerProcess:
         try:
             assert self._pipe is not None
             self._pipe.send(problem)
-            if self._pipe.poll(GRACE * self._setting.time_limit + SPARE):
-                found: Attempt = self._pipe.recv()
-                return found
+            if self._pipe.poll(STOP_FACTOR * self._setting.time_limit + STOP_MARGIN_S):
+                outcome: PlanningOutcome = self._pipe.recv()
+                return outcome
         except (EOFError, OSError):
             self.stop()
-            return Attempt(Ending.CRASHED, seconds=time.perf_counter() - began, error="its process ended")
+            return PlanningOutcome(Ending.CRASHED, seconds=time.perf_counter() - began, error="its process ended")
         self.stop()
-        return Attempt(Ending.OUT_OF_TIME, seconds=time.perf_counter() - began, error="stopped: it did not answer")
+        return PlanningOutcome(Ending.OUT_OF_TIME, seconds=time.perf_counter() - began, error="stopped: no answer")
 
     def stop(self) -> None:
         """End the process."""
@@ -101,50 +101,52 @@ class PlannerProcess:
             self._pipe.close()
         self._process = self._pipe = None
 
-    def _start(self) -> Attempt | None:
-        """Start the process; return what becomes of all problems if the planner does not get ready."""
+    def _start(self) -> PlanningOutcome | None:
+        """Start the process; return the outcome of all problems if the planner cannot be prepared."""
         began = time.perf_counter()
         self._pipe, theirs = multiprocessing.Pipe()
-        with theirs:  # no multiprocessing.Process: workers of dask may not start one, and it runs the caller's script
+        with theirs:  # multiprocessing.Process would run the caller's script and is forbidden in dask workers
             program = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import serve; serve({theirs.fileno()})"
             command = [sys.executable, "-c", program]
-            self._process = subprocess.Popen(  # what planners print is no data
+            self._process = subprocess.Popen(  # output of planners is not data
                 command, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, stdout=STDERR
             )
-        refusal, said = None, "its process ended, or it did not get ready"
+        refusal, message = None, "its process ended or was not ready in time"
         with suppress(EOFError, OSError):
             self._pipe.send((self._name, self._setting))
-            if self._pipe.poll(STARTING):
-                refusal, said = self._pipe.recv()
-        if not said:
+            if self._pipe.poll(MAX_PREPARATION_TIME_S):
+                refusal, message = self._pipe.recv()
+        if not message:
             return None
         self.stop()
         if refusal is not None:
-            raise refusal(f"planner {self._name!r} cannot plan here: {said}")
-        return Attempt(Ending.CRASHED, seconds=time.perf_counter() - began, error=f"before the first problem: {said}")
+            raise refusal(f"planner {self._name!r} cannot plan here: {message}")
+        return PlanningOutcome(
+            Ending.CRASHED, seconds=time.perf_counter() - began, error=f"before the first problem: {message}"
+        )
 
 
 def serve(descriptor: int) -> None:
-    """Prepare the planner that is named through a pipe, and plan for what comes next, until it is closed.
+    """Prepare the planner whose name arrives on a pipe, then plan until the pipe is closed.
 
     Args:
-        descriptor: Of the pipe.
+        descriptor: File descriptor of the pipe.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all; the parent decides
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all processes; the parent decides
     with Connection(descriptor) as pipe, suppress(EOFError, OSError):
         name, setting = pipe.recv()
         try:
             plan = registry.load(registry.PLANNERS, name)().prepare(setting)
-        except Exception as error:  # noqa: BLE001 - somebody else's code may raise anything
-            pipe.send((_refusal(error), _said(error)))
+        except Exception as error:  # noqa: BLE001 - a plug-in may raise any exception
+            pipe.send((_refusal(error), _message(error)))
             return
         pipe.send((None, ""))
         while True:
             pipe.send(_attempt(plan, pipe.recv()))
 
 
-def _attempt(plan: Plan, problem: Plans) -> Attempt:
-    """Plan for one problem and take the time."""
+def _attempt(plan: Plan, problem: Plans) -> PlanningOutcome:
+    """Plan for one problem and measure the time."""
     began, cpu = time.perf_counter(), time.process_time()
     try:
         try:
@@ -153,13 +155,13 @@ def _attempt(plan: Plan, problem: Plans) -> Attempt:
         finally:
             seconds, cpu = time.perf_counter() - began, time.process_time() - cpu
         content = _content(answer, problem)
-    except Exception as error:  # noqa: BLE001 - likewise
-        return Attempt(Ending.FAILED, None, seconds, cpu, _said(error))
-    return Attempt(Ending.NO_PLAN if content is None else Ending.PLANNED, content, seconds, cpu)
+    except Exception as error:  # noqa: BLE001 - a plug-in may raise any exception
+        return PlanningOutcome(Ending.FAILED, None, seconds, cpu, _message(error))
+    return PlanningOutcome(Ending.NO_PLAN if content is None else Ending.PLANNED, content, seconds, cpu)
 
 
 def _content(answer: Any, problem: Plans) -> dict[str, Any] | None:
-    """Return an answer as results keep it, if it is one that can be read back."""
+    """Return the stored form of an answer after checking that it can be read."""
     if answer is None:
         return None
     if not isinstance(answer, Plans | Trajectory) or (isinstance(answer, Plans) and len(answer) != 1):
@@ -170,12 +172,12 @@ def _content(answer: Any, problem: Plans) -> dict[str, Any] | None:
 
 
 def _refusal(error: Exception) -> type[CnpgenError] | None:
-    """Return what the user gets who asked for a planner that says that it cannot plan; None if it just failed."""
+    """Return the error class for a planner that refuses the problem; None if it failed."""
     if not isinstance(error, CnpgenError):
         return None
     return MachineError if isinstance(error, MachineError) else UsageError
 
 
-def _said(error: Exception) -> str:
+def _message(error: Exception) -> str:
     text = " ".join(str(error).split())
     return text if text and isinstance(error, CnpgenError) else f"{type(error).__name__}: {text}"

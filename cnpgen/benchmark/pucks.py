@@ -40,7 +40,7 @@ class Pucks:
     behind: float = field("distance of the tip behind the puck's centre at the hit", unit="m", low=0.0)
 
     def find_mistakes(self) -> Iterator[tuple[str, str]]:
-        """Yield (key, what is wrong with it)."""
+        """Yield (key, mistake) pairs."""
         if (count := self.columns * self.rows) > MAX_TASKS:
             yield "columns", f"a grid of {count:,} pucks is too large, expected at most {MAX_TASKS:,}"
 
@@ -63,15 +63,15 @@ def hits_of(pucks: Pucks) -> Plans:
 
 
 def hits_from(pucks: Pucks, puck: Array, start: State) -> Plans:
-    """Return the boundary problems of hitting N pucks, each from a state of its own.
+    """Return the boundary problems of hitting N pucks, each from its own state.
 
-    The goal configuration is the one from which the tip can move fastest along the hit, near the configuration of the
-    start, and the goal velocity is the fastest one (docs/references.md, 2).
+    The goal configuration maximizes the speed of the tip along the hit, near the configuration of the start. The goal
+    velocity has the maximum speed (docs/references.md, 2).
 
     Args:
-        pucks: The problem, and what is asked of hits.
-        puck: Where the pucks lie [m], shape (2, N).
-        start: Where the arm is at the start, and how it moves.
+        pucks: The problem and the target.
+        puck: Positions of the pucks [m], shape (2, N).
+        start: States of the arm at the start.
 
     Raises:
         RecipeError: The problem has no table, or a puck cannot be hit.
@@ -80,8 +80,8 @@ def hits_from(pucks: Pucks, puck: Array, start: State) -> Plans:
     table = problem.first(Table)
     if table is None:
         raise RecipeError([f"pucks.problem: {problem.name} has no table to put pucks on"])
-    way = np.array(pucks.goal)[:, None] - puck
-    goal_xy = behind(puck, np.arctan2(way[1:], way[:1]), pucks.behind).T
+    direction = np.array(pucks.goal)[:, None] - puck
+    goal_xy = behind(puck, np.arctan2(direction[1:], direction[:1]), pucks.behind).T
     stages = (
         GivenPositions(goal=tuple((x, y, table.z) for x, y in goal_xy.tolist())),
         TableVelocity(),
@@ -92,7 +92,7 @@ def hits_from(pucks: Pucks, puck: Array, start: State) -> Plans:
     )
     pipeline = Pipeline(name="pucks", problem=problem, stage=stages, path=Path("pucks"))
     columns = dict(zip(("start_q", "start_dq", "start_ddq"), start, strict=True))
-    found = complete(pipeline, goal_xyz=goal_xy, **columns)
-    if refused := sum(found.rejections.values()):
-        raise RecipeError([f"pucks: {refused} of {len(found.reasons)} cannot be hit"])
-    return replace(found.plans, source="pucks on a grid")
+    completed = complete(pipeline, goal_xyz=goal_xy, **columns)
+    if refused := sum(completed.rejections.values()):
+        raise RecipeError([f"pucks: {refused} of {len(completed.reasons)} cannot be hit"])
+    return replace(completed.plans, source="pucks on a grid")

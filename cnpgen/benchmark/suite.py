@@ -1,11 +1,11 @@
-"""Suites: fixed, versioned sets of boundary problems that planners are compared on, read from recipes."""
+"""Suites: fixed, versioned sets of boundary problems for the comparison of planners, read from recipes."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from cnpgen.benchmark.pucks import Pucks, hits_of
-from cnpgen.benchmark.replanning_scenario import Lead, Turns, turns_of
+from cnpgen.benchmark.replanning_scenario import ExecutedPrefix, ReplanningScenario, scenario_problems
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.make.recipe_file import load_dataset_recipe
 from cnpgen.pipelines.stages.given_positions import MAX_TASKS
@@ -17,59 +17,59 @@ from cnpgen.schema.keys import NAME, RecipeLocation, field
 from cnpgen.schema.parsing import Reader, parse
 from cnpgen.schema.toml import is_kind, read_table
 
-RANDOM = 100  # problems of a dataset, where nothing else is said
+DEFAULT_SAMPLES = 100
 
 
 @dataclass(frozen=True, kw_only=True)
-class Draws:
-    """Fresh draws of a dataset's recipe: none of its rows is among them."""
+class SampledProblems:
+    """New samples of a dataset's recipe; none is in the dataset."""
 
     recipe: str = field("name or path of a dataset or a pipeline")
-    n: int = field("number of problems", default=RANDOM, low=1, high=MAX_TASKS)
+    n: int = field("number of problems", default=DEFAULT_SAMPLES, low=1, high=MAX_TASKS)
     seed: int = field("root seed of the problems", default=987_654_321, low=0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Suite:
-    """Boundary problems to compare planners on: pucks on a grid, or draws of a dataset."""
+    """Boundary problems for the comparison of planners: pucks on a grid, or samples of a dataset."""
 
     name: str = field("name of the suite: lower-case letters, digits and hyphens", pattern=NAME)
     version: str = field("semantic version; other problems need another version", pattern=r"^\d+\.\d+\.\d+$")
     title: str = field("title in one line", default="")
     model: str = field("shipped model for these problems", default="")
     pucks: Pucks | None = field("grid of pucks to hit from rest", default=None)
-    turns: Turns | None = field("pucks to hit by online replanning", default=None)
-    draws: Draws | None = field("random problems of a dataset", default=None)
+    replanning: ReplanningScenario | None = field("pucks to hit by online replanning", default=None)
+    samples: SampledProblems | None = field("random problems of a dataset", default=None)
 
     def find_mistakes(self) -> Iterator[tuple[str, str]]:
-        """Yield (key, what is wrong with it)."""
-        if sum(part is not None for part in (self.pucks, self.turns, self.draws)) != 1:
-            yield "pucks", "expected exactly one of [pucks], [turns] and [draws]"
+        """Yield (key, mistake) pairs."""
+        if sum(part is not None for part in (self.pucks, self.replanning, self.samples)) != 1:
+            yield "pucks", "expected exactly one of [pucks], [replanning] and [samples]"
 
-    def problems(self, n: int | None = None) -> tuple[Plans, Lead | None]:
-        """Return the boundary problems, as plans that are still to be made.
+    def problems(self, n: int | None = None) -> tuple[Plans, ExecutedPrefix | None]:
+        """Return the boundary problems, as plans without motions.
 
         Args:
-            n: The first so many; of draws it may be more than the recipe says.
+            n: Number of problems, the first ones; random suites may have more than the recipe.
 
         Returns:
-            The problems and, of turns, the first motions that lead to them.
+            The problems and, of replanning scenarios, the prefixes of the first motions.
 
         Raises:
-            RecipeError: A recipe that it names has mistakes.
-            UsageError: ``n`` is no positive number.
+            RecipeError: A recipe has mistakes.
+            UsageError: ``n`` is not positive.
         """
-        if self.draws is not None:
-            return draw_boundary_problems(self.draws.recipe, n or self.draws.n, seed=self.draws.seed), None
-        if self.turns is not None:
-            found, lead = turns_of(self.turns)
-            return found[:n], lead
+        if self.samples is not None:
+            return draw_boundary_problems(self.samples.recipe, n or self.samples.n, seed=self.samples.seed), None
+        if self.replanning is not None:
+            found, prefix = scenario_problems(self.replanning)
+            return found[:n], prefix
         assert self.pucks is not None
         return hits_of(self.pucks)[:n], None
 
 
 def load_suite(name_or_path: str | Path) -> Suite:
-    """Load a suite; a dataset or a pipeline becomes one of random draws of it.
+    """Load a suite; a dataset or a pipeline becomes a suite of its samples.
 
     Args:
         name_or_path: Name of a shipped suite, dataset or pipeline, or path of such a file.
@@ -94,13 +94,13 @@ def _read(path: Path, mistakes: list[str]) -> Suite | None:
         return Suite(
             name=recipe.name,
             version=recipe.version,
-            title=f"random draws of {recipe.name}",
+            title=f"samples of {recipe.name}",
             model=recipe.name if recipe.name in list_recipes("dataset") else "",
-            draws=Draws(recipe=str(path)),
+            samples=SampledProblems(recipe=str(path)),
         )
     readers: dict[type, Reader] = {Problem: reference("problem", read_problem, path.parent)}
     suite = parse(Suite, table, where=RecipeLocation(str(path)), mistakes=mistakes, readers=readers)
-    if suite is None or suite.draws is None:
+    if suite is None or suite.samples is None:
         return suite
-    beside = path.parent / suite.draws.recipe
-    return replace(suite, draws=replace(suite.draws, recipe=str(beside))) if beside.is_file() else suite
+    beside = path.parent / suite.samples.recipe
+    return replace(suite, samples=replace(suite.samples, recipe=str(beside))) if beside.is_file() else suite

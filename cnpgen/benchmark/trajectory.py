@@ -1,4 +1,4 @@
-"""Trajectories that are sampled in time, as most planners return them, and what lies between two samples."""
+"""Trajectories sampled in time, as most planners return them, and their interpolation."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,10 +15,9 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """A motion given by samples; between them it is what a controller makes of it.
+    """Motion given by samples and interpolated as ROS's joint trajectory controllers do.
 
-    With positions alone it is linear between two samples, with velocities a cubic, with accelerations as well a
-    polynomial of the fifth degree: as ROS's joint trajectory controllers do it.
+    The interpolation is linear for positions alone, cubic with velocities, and quintic with accelerations.
 
     Attributes:
         t: Times [s], shape (K,), increasing from 0.
@@ -27,7 +26,7 @@ class Trajectory:
         ddq: Joint accelerations [rad/s^2], shape (K, n), or None.
 
     Raises:
-        UsageError: A shape is wrong, the times do not increase from 0, or something is not finite.
+        UsageError: A shape is wrong, the times do not increase from 0, or a value is not finite.
     """
 
     t: Array
@@ -43,7 +42,7 @@ class Trajectory:
                 raise UsageError("a trajectory with accelerations needs velocities, too")
             ddq = checked_samples(t, q, self.ddq)[2]
         for name, values in (("t", t), ("q", q), ("dq", dq), ("ddq", ddq)):
-            object.__setattr__(self, name, values)  # lists are as good as arrays
+            object.__setattr__(self, name, values)  # lists become arrays
         if self.t[0] != 0:
             raise UsageError(f"a trajectory begins at t = 0, got {self.t[0]} s")
 
@@ -53,21 +52,21 @@ class Trajectory:
         return float(self.t[-1])
 
     def states(self, t: Array) -> tuple[Array, Array, Array]:
-        """Evaluate it.
+        """Evaluate the trajectory.
 
         Args:
             t: Times [s], shape (K,).
 
         Returns:
             Positions [rad], velocities [rad/s] and accelerations [rad/s^2], shape (K, n) each.
-            Accelerations of linear pieces are 0: the jumps of their velocities are not in them.
+            Accelerations of linear spans are 0; they do not include jumps of the velocity.
         """
         t = np.clip(t, 0, self.duration)
         q, dq, ddq = (np.asarray(self._piecewise(t, order)) for order in range(3))
         return q, dq, ddq
 
     def jerks(self, t: Array) -> Array:
-        """Evaluate the jerks within its pieces [rad/s^3] at times [s] of shape (K,), shape (K, n)."""
+        """Evaluate the jerks within spans [rad/s^3] at times [s] of shape (K,), shape (K, n)."""
         return np.asarray(self._piecewise(np.clip(t, 0, self.duration), 3))
 
     @cached_property

@@ -107,7 +107,7 @@ def _run(arguments: argparse.Namespace, folder: Path) -> "Benchmark":
 
 def _facts(found: "Benchmark", folder: Path) -> dict[str, Any]:
     """Return the results of all planners for JSON."""
-    from cnpgen.benchmark.results import FORMAT, RESULTS_VERSION
+    from cnpgen.benchmark.results_file import FORMAT, RESULTS_VERSION
 
     return {
         "format": FORMAT,

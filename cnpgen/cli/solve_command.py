@@ -87,7 +87,7 @@ def _conditions(arguments: argparse.Namespace) -> "Plans":
     from cnpgen.errors import DatasetError
     from cnpgen.plans.boundary_problems import load_boundary_problems
 
-    _refuse(arguments, ["split", "first", "n"], "--split, --first and --n are for the folder of a dataset, got a file")
+    _refuse(arguments, ["split", "first", "n"], "--split, --first and --n need the folder of a dataset, got a file")
     _refuse(arguments, ["seed"], "--seed is for fresh draws of a recipe, got a file of boundary conditions")
     problems = load_boundary_problems(arguments.what, problem=arguments.problem)
     if not len(problems):
@@ -102,7 +102,7 @@ def _draws(arguments: argparse.Namespace) -> "Plans":
 
     check_there(arguments.what)
     check_recipe(arguments.what)
-    of_rows = "--split and --first are for the folder of a dataset; fresh draws of a recipe have --seed"
+    of_rows = "--split and --first need the folder of a dataset; samples drawn from a recipe have --seed"
     _refuse(arguments, ["split", "first"], of_rows)
     _refuse(arguments, ["problem"], "--problem is for boundary conditions in HDF5; a recipe contains its problem")
     if arguments.n is None:

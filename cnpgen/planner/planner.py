@@ -15,7 +15,7 @@ from cnpgen.planner.inference_pipeline import loaded_problem, make_inference_pip
 from cnpgen.planner.model import Model
 from cnpgen.planner.model_file import load_model, model_for
 from cnpgen.planner.plan_reuse import reuse_previous_plan
-from cnpgen.plans.plans import Plans, check_made, check_plans_type
+from cnpgen.plans.plans import Plans, check_plans_type
 from cnpgen.plans.plausible import warn_of_far_joints
 from cnpgen.problems.problem import Problem
 from cnpgen.schema.arguments import numbers

@@ -98,7 +98,7 @@ class Plans:
             Positions [rad], velocities [rad/s] and accelerations [rad/s^2], shape (N, n) each.
 
         Raises:
-            UsageError: The number of times differs from that of plans, a time is outside its plan, or a plan is missing.
+            UsageError: The number of times differs from that of plans, or a time is outside its plan.
         """
         try:
             times = np.broadcast_to(numbers("time", time), (len(self),))

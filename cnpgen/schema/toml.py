@@ -13,7 +13,7 @@ MARKS: dict[Kind, set[str]] = {
     "problem": {"robot", "constraint", "limits"},
     "pipeline": {"stage", "problem"},
     "dataset": {"splits", "pipeline"},
-    "suite": {"pucks", "turns", "draws"},
+    "suite": {"pucks", "replanning", "samples"},
 }
 """Top-level keys that are specific to a kind."""
 

@@ -56,8 +56,8 @@ def test_heavy_100(tmp_path: Path) -> None:
 
 
 @pytest.mark.extended
-@pytest.mark.parametrize("suite", ["replan", "feint"])
-def test_turns(suite: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("suite", ["replan", "online"])
+def test_replanning_scenarios(suite: str, tmp_path: Path) -> None:
     found = run_benchmark(suite, tmp_path, planners=["cnp-b+refine"], plants=["nominal"])
     assert all_of(found, "cnp-b+refine", "nominal", "success").sum() >= 23
 

@@ -15,9 +15,9 @@ from cnpgen.benchmark.planners.knots import knot_constraints
 from cnpgen.benchmark.planners.obstacle_boxes import boxes_of
 from cnpgen.benchmark.planners.table_plane import HIGH, LOW, PlanePath, stopping_path, striking_path
 from cnpgen.benchmark.planners.tip import Tip
-from cnpgen.benchmark.planners.trajopt import TrajOpt, Transcription
+from cnpgen.benchmark.planners.trajopt import TrajOpt, TrajOptTranscription
 from cnpgen.benchmark.process import PlannerProcess
-from cnpgen.benchmark.results import answer_from_dict
+from cnpgen.benchmark.results_file import answer_from_dict
 from cnpgen.benchmark.suite import load_suite
 from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.errors import UsageError
@@ -30,10 +30,10 @@ def one_of(suite: str, index: int = 0) -> Plans:
     return load_suite(suite).problems(index + 1)[0][index]
 
 
-def transcription(task: Plans) -> Transcription:
+def transcription(task: Plans) -> TrajOptTranscription:
     problem, robot = open_problem(task.problem)
     at_knots = knot_constraints(problem, robot, task.columns["start_xyz"][0], task.columns["goal_xyz"][0])
-    return Transcription(robot, task.boundary, at_knots)
+    return TrajOptTranscription(robot, task.boundary, at_knots)
 
 
 @pytest.mark.parametrize("suite", some(["hits-81", "heavy-100"], 1, "slow"))
@@ -176,5 +176,5 @@ def test_planners_know_the_tip_if_a_joint_has_its_name() -> None:
 def test_baselines_know_upright_boxes_only() -> None:
     problem, _ = open_problem(one_of("heavy-100").problem)
     ball = Obstacle(name="ball", kind="sphere", position=(0.4, 0.1, 0.5), radius=0.1)
-    with pytest.raises(UsageError, match="it knows upright boxes only, and 'heavy-object' has ball"):
+    with pytest.raises(UsageError, match="supported are upright boxes only, 'heavy-object' has ball"):
         boxes_of(replace(problem, obstacle=(*problem.obstacle, ball)), np.zeros(3), np.zeros(3))

@@ -6,7 +6,7 @@ from math import comb
 import numpy as np
 import pytest
 
-from cnpgen.benchmark.hypothesis_tests import mcnemar, summarise_results, values_of, wilcoxon
+from cnpgen.benchmark.hypothesis_tests import mcnemar, summarize_results, values_of, wilcoxon
 
 
 def row(planned: bool = True, valid: bool = True, seconds: float = 0.1, scored: bool = True) -> dict:
@@ -35,7 +35,7 @@ def test_planned_and_executed_errors_are_told_apart() -> None:
 
 def test_a_summary_counts_and_has_quartiles() -> None:
     rows = [row(seconds=seconds, scored=seconds < 0.4) for seconds in (0.1, 0.2, 0.3, 0.4, 0.5)]
-    found = summarise_results({"a": rows, "b": [row(planned=False)] * 5}, "nominal")
+    found = summarize_results({"a": rows, "b": [row(planned=False)] * 5}, "nominal")
     assert found["a"]["ratios"]["scored"]["count"] == 3
     assert found["a"]["figures"]["planning_ms"]["median"] == pytest.approx(300)
     assert found["a"]["figures"]["planning_ms"]["q1"] == pytest.approx(200)

@@ -1,4 +1,4 @@
-"""Turns: motions that are left for others go on without a jump, and score."""
+"""ReplanningScenario: motions that are left for others go on without a jump, and score."""
 
 from pathlib import Path
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cnpgen.benchmark.execution import execution_of, joined
-from cnpgen.benchmark.results import answer_to_dict
+from cnpgen.benchmark.results_file import answer_to_dict
 from cnpgen.benchmark.simulator.plant import PLANTS
 from cnpgen.benchmark.simulator.reference import states_of
 from cnpgen.benchmark.suite import list_suites, load_suite
@@ -16,35 +16,35 @@ from cnpgen.refine.refine_plans import refine_plans
 from tests.conftest import some
 
 
-@pytest.mark.parametrize("name", some(["replan", "feint"], 1, "slow"))
+@pytest.mark.parametrize("name", some(["replan", "online"], 1, "slow"))
 def test_a_turn_goes_on_in_position_velocity_and_acceleration(name: str) -> None:
     suite = load_suite(name)
-    problems, lead = suite.problems()
-    assert lead is not None
+    problems, prefix = suite.problems()
+    assert prefix is not None
     assert len(problems) == 24
     plans = refine_plans(Planner(suite.model).plan_batch(problems.boundary)[::8], workers=1).plans
     for plan, index in zip(plans, range(0, 24, 8), strict=True):
-        first, until = states_of(lead[index].motion), float(lead.until[index])
+        first, until = states_of(prefix[index].motion), float(prefix.until[index])
         before, after = first(np.array([until])), states_of(plan.motion)(np.array([0.0]))
         for one, other in zip(before, after, strict=True):
             assert np.abs(one - other).max() < 1e-9
-        around = joined(lead[index], states_of(plan.motion))(until + np.array([-1e-7, 1e-7]))
+        around = joined(prefix[index], states_of(plan.motion))(until + np.array([-1e-7, 1e-7]))
         assert np.abs(np.diff(around[0], axis=0)).max() < 1e-6
         assert np.array_equal(
-            joined(lead[index], states_of(plan.motion))(np.array([0.1]))[0], first(np.array([0.1]))[0]
+            joined(prefix[index], states_of(plan.motion))(np.array([0.1]))[0], first(np.array([0.1]))[0]
         )
 
 
 @pytest.mark.slow
 def test_the_opposite_puck_is_hit_and_the_first_one_left_alone() -> None:
     pytest.importorskip("mujoco")
-    suite = load_suite("feint")
-    problems, lead = suite.problems(1)
-    assert lead is not None
+    suite = load_suite("online")
+    problems, prefix = suite.problems(1)
+    assert prefix is not None
     plan = refine_plans(Planner(suite.model).plan_batch(problems.boundary, columns=problems.columns), workers=1).plans
-    scene, reference, execution = execution_of((problems, answer_to_dict(plan), lead[0]), PLANTS["nominal"])
-    assert suite.turns is not None
-    np.testing.assert_allclose(scene.puck, suite.turns.pucks.positions()[:, -1], atol=1e-6)
+    scene, reference, execution = execution_of((problems, answer_to_dict(plan), prefix[0]), PLANTS["nominal"])
+    assert suite.replanning is not None
+    np.testing.assert_allclose(scene.puck, suite.replanning.pucks.positions()[:, -1], atol=1e-6)
     assert reference.duration == pytest.approx(0.15 + plan.duration[0])
     assert np.abs(reference.dq[0]).max() < 1e-9  # the first motion begins at rest
     assert execution.executed.success
@@ -52,14 +52,14 @@ def test_the_opposite_puck_is_hit_and_the_first_one_left_alone() -> None:
 
 
 def test_a_turn_after_the_end_of_the_first_motion_is_refused(tmp_path: Path) -> None:
-    text = list_suites()["feint"].read_text(encoding="utf-8").replace("250 ms", "400 ms")
+    text = list_suites()["online"].read_text(encoding="utf-8").replace("250 ms", "400 ms")
     (tmp_path / "late.toml").write_text(text, encoding="utf-8")
-    with pytest.raises(RecipeError, match=r"a first motion is over after 0\.3\d+ s, the turn is at 0\.4 s"):
+    with pytest.raises(RecipeError, match=r"a first motion ends after 0\.3\d+ s, the switch is at 0\.4 s"):
         load_suite(tmp_path / "late.toml").problems()
 
 
-def test_a_grid_with_a_middle_has_no_opposites(tmp_path: Path) -> None:
-    text = list_suites()["feint"].read_text(encoding="utf-8").replace("rows = 4", "rows = 3")
+def test_a_grid_with_a_center_puck_is_refused(tmp_path: Path) -> None:
+    text = list_suites()["online"].read_text(encoding="utf-8").replace("rows = 4", "rows = 3")
     (tmp_path / "odd.toml").write_text(text, encoding="utf-8")
     with pytest.raises(RecipeError, match="an even number of pucks"):
         load_suite(tmp_path / "odd.toml")

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from cnpgen.benchmark.html_report import save_benchmark_report, troubles
-from cnpgen.benchmark.results import answer_from_dict, answer_to_dict, open_results
+from cnpgen.benchmark.results_file import answer_from_dict, answer_to_dict, open_results
 from cnpgen.benchmark.run_suite import run_benchmark
 from cnpgen.benchmark.suite import load_suite
 from cnpgen.benchmark.trajectory import Trajectory
@@ -63,7 +63,7 @@ def moody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
 def test_whatever_a_planner_does_costs_its_own_row_only(
     moody: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("cnpgen.benchmark.process.SPARE", 0.5)
+    monkeypatch.setattr("cnpgen.benchmark.process.STOP_MARGIN_S", 0.5)
     found = run_benchmark("hits-81", tmp_path / "results", planners=[moody], n=13, time_limit=0.2)
     rows = found.results[moody]
     endings = [row["ending"] for row in rows]
@@ -90,7 +90,7 @@ def test_a_planner_that_cannot_even_be_prepared_costs_its_own_rows_only(moody: s
     found = run_benchmark("hits-81", tmp_path / "results", planners=[moody, "cnp-b"], n=2)
     assert [row["ending"] for row in found.results[moody]] == ["crashed"] * 2
     assert [row["ending"] for row in found.results["cnp-b"]] == ["planned"] * 2
-    said = {"1 / 0": "ZeroDivisionError: division by zero", "os._exit(1)": "its process ended, or it did not get ready"}
+    said = {"1 / 0": "ZeroDivisionError: division by zero", "os._exit(1)": "its process ended or was not ready in time"}
     assert troubles(found) == [f"moody: 2 of 2 crashed, problem 0: before the first problem: {said[way]}"]
 
 
@@ -233,7 +233,7 @@ def test_mistakes_are_found_before_any_work(tmp_path: Path) -> None:
 
 
 def test_a_planner_for_other_problems_is_refused_with_its_reason(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="planner 'aqp' cannot plan here: it plans hits on a table"):
+    with pytest.raises(UsageError, match="planner 'aqp' cannot plan here: aqp plans hits on a table"):
         run_benchmark("heavy-100", tmp_path, planners=["aqp"], n=1)
 
 

@@ -1,4 +1,4 @@
-"""Suites: pucks on grids, draws of datasets, mistakes in the file."""
+"""Suites: pucks on grids, samples of datasets, mistakes in the file."""
 
 from pathlib import Path
 
@@ -34,7 +34,7 @@ def test_the_81_hits_meet_every_puck_of_the_grid_towards_the_goal() -> None:
     assert np.isnan(problems.path_control_points).all()
 
 
-def test_a_suite_of_draws_is_the_same_every_time_and_of_any_size() -> None:
+def test_a_suite_of_samples_is_the_same_every_time_and_of_any_size() -> None:
     suite = load_suite("heavy-100")
     few, more = suite.problems(2)[0], suite.problems(3)[0]
     assert np.array_equal(few.boundary.goal_q, more.boundary.goal_q[:2])
@@ -43,8 +43,8 @@ def test_a_suite_of_draws_is_the_same_every_time_and_of_any_size() -> None:
 
 MISTAKES = {
     'name = "a"\nversion = "1.0.0"\n[pucks]\nrows = 0\n': "rows: 0 is too small",
-    'name = "a"\nversion = "1.0.0"\n[draws]\nrecipe = "heavy-object"\nseed = -1\n': "seed: -1 is too small",
-    'name = "a"\nversion = "1"\n[draws]\nrecipe = "heavy-object"\n': "version: '1' does not match",
+    'name = "a"\nversion = "1.0.0"\n[samples]\nrecipe = "heavy-object"\nseed = -1\n': "seed: -1 is too small",
+    'name = "a"\nversion = "1"\n[samples]\nrecipe = "heavy-object"\n': "version: '1' does not match",
 }
 
 
@@ -56,9 +56,9 @@ def test_mistakes_in_a_suite_are_named(text: str, tmp_path: Path) -> None:
     assert MISTAKES[text].replace("'", '"') in str(caught.value).replace("'", '"')
 
 
-def test_a_suite_has_pucks_or_draws_and_not_both(tmp_path: Path) -> None:
+def test_a_suite_has_pucks_or_samples_and_not_both(tmp_path: Path) -> None:
     text = (list_suites()["hits-81"]).read_text(encoding="utf-8")
-    (tmp_path / "both.toml").write_text(text + '\n[draws]\nrecipe = "heavy-object"\n', encoding="utf-8")
+    (tmp_path / "both.toml").write_text(text + '\n[samples]\nrecipe = "heavy-object"\n', encoding="utf-8")
     with pytest.raises(RecipeError, match="expected exactly one"):
         load_suite(tmp_path / "both.toml")
 
@@ -75,7 +75,7 @@ def test_problems_without_end_are_refused_before_any_is_drawn(tmp_path: Path) ->
     draws = list_suites()["heavy-100"].read_text(encoding="utf-8")
     for text, message in (
         (draws.replace("n = 100", f"n = {10**15}"), "is too large, expected at most 100000"),
-        (turns.replace('["350 ms"]', str([0.1] * 500)), "when: 12,000 turns are too many, expected at most 10,000"),
+        (turns.replace('["350 ms"]', str([0.1] * 500)), "when: 12,000 switches are too many, expected at most 10,000"),
     ):
         (tmp_path / "large.toml").write_text(text, encoding="utf-8")
         with pytest.raises(RecipeError, match=message):

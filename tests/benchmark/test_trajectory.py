@@ -5,7 +5,7 @@ import pytest
 
 from cnpgen.benchmark.execution import execute_answer
 from cnpgen.benchmark.judging import judge_answer
-from cnpgen.benchmark.results import answer_to_dict
+from cnpgen.benchmark.results_file import answer_to_dict
 from cnpgen.benchmark.simulator.plant import PLANTS
 from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.errors import UsageError

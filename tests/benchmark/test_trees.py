@@ -13,7 +13,7 @@ from cnpgen.benchmark.planners import steering
 from cnpgen.benchmark.planners.cbirrt import Search
 from cnpgen.benchmark.planners.mpc_mpnet import MPCMPNet, ProposedExtension
 from cnpgen.benchmark.planners.proposals import (
-    LEAST,
+    MIN_DEVIATION,
     Proposals,
     likelihood_gradient,
     load_proposals,
@@ -21,8 +21,8 @@ from cnpgen.benchmark.planners.proposals import (
     shipped_proposals,
     train_proposals,
 )
-from cnpgen.benchmark.planners.sst import STEP, RandomExtension
-from cnpgen.benchmark.planners.state_check import TABLE, UPRIGHT, StateCheck
+from cnpgen.benchmark.planners.sst import CONTROL_STEP_S, RandomExtension
+from cnpgen.benchmark.planners.state_check import MAX_TIP_HEIGHT_ERROR_M, MAX_UPRIGHT_ERROR, StateCheck
 from cnpgen.benchmark.planners.steering import Steering
 from cnpgen.benchmark.planners.tree import HIT, Tree
 from cnpgen.benchmark.suite import load_suite
@@ -62,7 +62,7 @@ def test_states_are_allowed_as_pinocchio_and_the_search_in_joint_space_have_it(s
         torque = pin.rnea(robot.model, data, *state)
         limits = np.abs([state[1] / robot.velocity_limit, torque / robot.torque_limit]).max() <= 1
         inside = np.all((state[0] >= robot.position_lower) & (state[0] <= robot.position_upper))
-        on = abs(search.residual(state[0])[0]) <= (TABLE if suite == "hits-81" else UPRIGHT)
+        on = abs(search.residual(state[0])[0]) <= (MAX_TIP_HEIGHT_ERROR_M if suite == "hits-81" else MAX_UPRIGHT_ERROR)
         expected.append(bool(limits and inside and on and search.is_valid(state[0])))
     np.testing.assert_array_equal(allowed, expected)
     assert 5 < allowed.sum() < 180
@@ -89,11 +89,11 @@ def test_a_tree_of_sst_keeps_its_limits_and_comes_nearer_to_the_goal() -> None:
     problem, robot = open_problem(task.problem)
     start_xyz, goal = task.columns["start_xyz"][0], task.columns["goal_xyz"][0]
     check = StateCheck(problem, robot)
-    tree = Tree(np.concatenate([task.boundary.start_q[0], task.boundary.start_dq[0]]), start_xyz, HIT, STEP)
+    tree = Tree(np.concatenate([task.boundary.start_q[0], task.boundary.start_dq[0]]), start_xyz, HIT, CONTROL_STEP_S)
     extend = RandomExtension(tree, robot, check, poses_of(check, task), goal, np.random.default_rng(0))
     found = tree.grow(extend, goal, time_limit=60, most=3000)
     assert found is not None
-    ways(found, STEP, robot.acceleration_limit)
+    ways(found, CONTROL_STEP_S, robot.acceleration_limit)
     tip = task.problem.tip_positions(found.q)
     assert np.linalg.norm(tip[-1] - goal) < np.linalg.norm(tip[0] - goal) - 0.01
     assert np.abs(tip[:, 2] - 0.16).max() <= 0.01
@@ -111,7 +111,7 @@ def test_a_tree_keeps_the_cheapest_node_of_every_witness_and_extends_the_cheapes
     assert tree.add(0, slow, np.array([1.04, 0, 0])) == 3
     assert tree.selected(np.array([1.04, 0, 0])) == 2  # the nearest one took longer
     assert tree.selected(np.array([1.2, 0, 0])) == 3  # none is near: the nearest one
-    np.testing.assert_array_equal(tree.way_to(2).q[:, 0], [0, 1, 1])
+    np.testing.assert_array_equal(tree.path_to(2).q[:, 0], [0, 1, 1])
 
 
 def steering_of(task: Plans, seed: int = 0) -> Steering:
@@ -129,12 +129,12 @@ def test_controls_are_followed_as_pinocchio_integrates_and_only_as_far_as_states
     paths, tips, lengths = steer.followed(state, controls)
     for path, tip, length, control in zip(paths, tips, lengths, controls, strict=True):
         q, dq = np.split(state, 2)
-        assert length <= round(control[-1] / steering.STEP)
+        assert length <= round(control[-1] / steering.STEERING_STEP_S)
         for reached, place in zip(path[:length], tip, strict=False):
-            dq, old = dq + steering.STEP * control[:-1], dq
-            q = pin.integrate(robot.model, q, steering.STEP * (dq + old) / 2)
+            dq, old = dq + steering.STEERING_STEP_S * control[:-1], dq
+            q = pin.integrate(robot.model, q, steering.STEERING_STEP_S * (dq + old) / 2)
             np.testing.assert_allclose(reached, np.concatenate([q, dq]), atol=1e-12)
-            assert abs(place[2] - 0.16) <= TABLE
+            assert abs(place[2] - 0.16) <= MAX_TIP_HEIGHT_ERROR_M
     assert lengths[0] == 5
     assert 5 < lengths[2] < 50  # cut off where it leaves the table
 
@@ -167,7 +167,7 @@ def test_the_gradient_of_the_likelihood_is_that_of_its_differences_and_the_likel
         difference = (value(parameters + 1e-6 * direction) - value(parameters - 1e-6 * direction)) / 2e-6
         assert gradient @ direction == pytest.approx(difference, rel=1e-6)
     given = forward(architecture.split(parameters), features)
-    logs = scipy.stats.norm.logpdf(targets, given.path, LEAST + np.exp(given.log_rate)) + np.log(2 * np.pi) / 2
+    logs = scipy.stats.norm.logpdf(targets, given.path, MIN_DEVIATION + np.exp(given.log_rate)) + np.log(2 * np.pi) / 2
     assert found == pytest.approx(-logs.sum(axis=1).mean())
 
 
@@ -224,7 +224,7 @@ def test_mpc_mpnet_keeps_its_limits_and_gets_away_from_the_start(suite: str) -> 
     robot = open_problem(task.problem)[1]
     found = MPCMPNet().prepare(Setting(task.problem, time_limit=1.5))(task)
     assert isinstance(found, Trajectory)
-    ways(found, steering.STEP, robot.acceleration_limit)
+    ways(found, steering.STEERING_STEP_S, robot.acceleration_limit)
     tip, goal = task.problem.tip_positions(found.q), task.columns["goal_xyz"][0]
     assert np.linalg.norm(tip[-1] - goal) < np.linalg.norm(tip[0] - goal) - 0.01
     assert np.all(np.abs(found.dq) <= robot.velocity_limit)
@@ -241,7 +241,7 @@ def test_mpc_mpnet_goes_on_elsewhere_after_a_step_that_led_nowhere() -> None:
     task = one_of("hits-81", 40)
     steer = steering_of(task)
     start = np.concatenate([task.boundary.start_q[0], task.boundary.start_dq[0]])
-    tree = Tree(start, task.columns["start_xyz"][0], HIT, steering.STEP)
+    tree = Tree(start, task.columns["start_xyz"][0], HIT, steering.STEERING_STEP_S)
     upwards = np.concatenate([start[:6], [0, -1.0, 0, 0, 0, 0]])  # the tip leaves the table at once
     stuck = tree.add(0, upwards[None], np.array([1.5, 0, 0.16]))
     extend = ProposedExtension(tree, load_proposals(shipped_proposals("airhockey")), steer, start[:6], node=stuck)

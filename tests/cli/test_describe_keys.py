@@ -70,7 +70,7 @@ def test_every_key_of_every_table_is_on_the_page_with_a_sentence():
             assert f"| `{key.name}` |" in page
     for _, name in KINDS:
         assert f"#### `{name}`" in page
-    for part in ("[robot]", "[limits]", "[payload]", "[[obstacle]]", "[[stage]]", "[turns.pucks]"):
+    for part in ("[robot]", "[limits]", "[payload]", "[[obstacle]]", "[[stage]]", "[replanning.pucks]"):
         assert f"### `{part}`" in page
 
 

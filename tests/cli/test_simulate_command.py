@@ -68,7 +68,7 @@ def test_pictures_are_drawn_or_the_reason_is_said_after_the_results(
 def test_without_ffmpeg_there_is_no_film_and_the_reason_is_said(
     carried: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("cnpgen.benchmark.simulator.rendering.AFTER", -0.99)
+    monkeypatch.setattr("cnpgen.benchmark.simulator.rendering.FILM_TAIL_S", -0.99)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     monkeypatch.setitem(sys.modules, "av", None)
     assert main(["simulate", str(carried), "--workers", "1", "--video", str(tmp_path / "film.mp4")]) == 3

@@ -1,8 +1,8 @@
-"""Anchored quadratic programming (docs/references.md, 2), which the authors of the paper compare hits with.
+"""Anchored quadratic programming (docs/references.md, 2), a baseline of the paper for hits.
 
-First a path of the tip in the plane, two lines and an arc, with constant acceleration up to the hit; then, sample by
-sample, the joint velocity that follows it, by a quadratic program in the null space of the tip's Jacobian that draws
-the arm towards the hitting configuration. It knows limits of positions and velocities, and none of accelerations.
+The planner first computes a path of the tip in the plane, two lines and an arc, with constant acceleration up to the
+hit. At each sample, a quadratic program in the null space of the tip's Jacobian then computes the joint velocity that
+follows the path and moves the arm towards the hitting configuration. It has limits of position and velocity only.
 """
 
 from dataclasses import dataclass
@@ -22,11 +22,11 @@ from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
 
-PERIOD = 0.01  # s: of the samples, shortened so that the last one before the stop is the hit
-WEIGHTS = (1.0, 1.0, 5.0, 1.0, 10.0, 10.0, 0.01)  # of the joints
-PULL = 0.5  # s: in which the anchor draws the arm to itself
-ROOM = 0.95  # of the joint limits
-SLOWER, TRIES = 0.9, 10  # hit speed after a failure, and how often
+SAMPLE_PERIOD_S = 0.01  # reduced so that a sample is the hit
+JOINT_WEIGHTS = (1.0, 1.0, 5.0, 1.0, 10.0, 10.0, 0.01)
+ANCHOR_TIME_S = 0.5  # time constant of the motion towards the anchor
+JOINT_LIMIT_FRACTION = 0.95
+SPEED_REDUCTION, MAX_TRIES = 0.9, 10  # after a failure
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,8 @@ class AQP(BenchmarkPlanner):
         """Check that there is a table to plan on."""
         problem, robot = open_problem(setting.problem)
         table = problem.first(Table)
-        if table is None or robot.n > len(WEIGHTS):
-            raise UsageError(f"it plans hits on a table with up to 7 joints, {problem.name!r} is none")
+        if table is None or robot.n > len(JOINT_WEIGHTS):
+            raise UsageError(f"aqp plans hits on a table with up to 7 joints, {problem.name!r} is another problem")
 
         def plan(task: Plans) -> Answer:
             return _Follower(robot, task).plan(table.z)
@@ -47,35 +47,35 @@ class AQP(BenchmarkPlanner):
 
 
 class _Follower:
-    """Follows a path in the plane with the joints."""
+    """Joint motion that follows a path in the plane."""
 
     def __init__(self, robot: Robot, task: Plans) -> None:
         self._robot, self._boundary = robot, task.boundary
         self._tip = Tip(robot)
         self._goal = task.columns["goal_xyz"][0]
-        self._weights = np.array(WEIGHTS[: robot.n])
+        self._weights = np.array(JOINT_WEIGHTS[: robot.n])
 
     def plan(self, height: float) -> Trajectory | None:
-        """Plan as fast a hit as can be followed, down to a third of the speed that was asked for."""
+        """Plan the fastest hit that can be followed, down to a third of the required speed."""
         start, _, _ = self._tip.at(self._boundary.start_q[0])
         velocity = self._tip.at(self._boundary.goal_q[0])[2][:3] @ self._boundary.goal_dq[0]
         speed = float(np.linalg.norm(velocity[:2]))
         if speed == 0:
-            raise UsageError("it plans hits, and this motion ends at rest")
-        for _ in range(TRIES):
+            raise UsageError("aqp plans hits, this motion ends at rest")
+        for _ in range(MAX_TRIES):
             hit = striking_path(start[:2], self._goal[:2], velocity[:2], speed)
             stop = stopping_path(hit)
             found = self._follow(hit, stop, height)
             if found is not None:
                 return found
-            speed *= SLOWER
+            speed *= SPEED_REDUCTION
         return None
 
     def _follow(self, hit: PlanePath, stop: PlanePath, height: float) -> Trajectory | None:
-        """Follow both parts; None where a quadratic program has no solution."""
+        """Follow both parts; return None if a quadratic program has no solution."""
         from scipy.interpolate import CubicSpline
 
-        count = max(int(np.ceil(hit.duration / PERIOD)), 2)
+        count = max(int(np.ceil(hit.duration / SAMPLE_PERIOD_S)), 2)
         period = hit.duration / count
         samples = np.array([*hit.sampled(period), *stop.sampled(period)])
         t = period * np.arange(len(samples) + 1.0)
@@ -83,7 +83,7 @@ class _Follower:
         dq = self._boundary.start_dq[0]
         for sample, now in zip(samples, t[1:], strict=True):
             following = self._velocity(
-                q[-1], np.append(sample, height), period, self._towards(q[-1], now, t[count], t[-1])
+                q[-1], np.append(sample, height), period, self._anchor_velocity(q[-1], now, t[count], t[-1])
             )
             if following is None:
                 return None
@@ -93,37 +93,37 @@ class _Follower:
         until = slice(0, count + 1)
         return Trajectory(t[until], np.array(q)[until], np.asarray(spline(t, 1))[until])
 
-    def _towards(self, q: Array, now: float, hit: float, end: float) -> Array:
-        """Return the velocity towards the anchor: the more, the nearer the hit, and less and less after it."""
-        pull = (self._boundary.goal_q[0] - q) / PULL
+    def _anchor_velocity(self, q: Array, now: float, hit: float, end: float) -> Array:
+        """Return the velocity towards the anchor, which increases up to the hit and then decreases."""
+        pull = (self._boundary.goal_q[0] - q) / ANCHOR_TIME_S
         if now > hit:
             return np.asarray((end - now) / (end - hit) * pull)
         share = now / hit
         return np.asarray(share * pull + np.clip(1 - share, 0, 1) * self._boundary.start_dq[0])
 
     def _velocity(self, q: Array, wanted: Array, period: float, towards: Array) -> Array | None:
-        """Solve for the joint velocity that brings the tip to where it is wanted, nearest to the anchor's."""
+        """Return the joint velocity that moves the tip to the sample, closest to the velocity of the anchor."""
         robot, (tip, _, J) = self._robot, self._tip.at(q)
         J = J[:3]
         least = J.T @ np.linalg.solve(J @ J.T, (wanted - tip) / period)
         null = np.linalg.svd(J)[2][3:].T
-        low = np.maximum(-robot.velocity_limit, (ROOM * robot.position_lower - q) / period)
-        high = np.minimum(robot.velocity_limit, (ROOM * robot.position_upper - q) / period)
+        low = np.maximum(-robot.velocity_limit, (JOINT_LIMIT_FRACTION * robot.position_lower - q) / period)
+        high = np.minimum(robot.velocity_limit, (JOINT_LIMIT_FRACTION * robot.position_upper - q) / period)
         along = nearest_in_null_space(null, self._weights, least - towards, (low - least, high - least))
         return None if along is None else np.asarray(least + null @ along)
 
 
 def nearest_in_null_space(null: Array, weights: Array, ahead: Array, bounds: tuple[Array, Array]) -> Array | None:
-    """Minimise ``a^T N^T W N a / 2 + ahead^T W N a`` with ``low <= N a <= high``, by DAQP.
+    """Minimize ``a^T N^T W N a / 2 + ahead^T W N a`` with ``low <= N a <= high``, by DAQP.
 
     Args:
         null: N, shape (n, k).
         weights: Diagonal of W, shape (n,).
-        ahead: By how much the velocity without ``a`` is ahead of the wanted one [rad/s], shape (n,).
+        ahead: Velocity without ``a`` minus the desired one [rad/s], shape (n,).
         bounds: ``(low, high)`` [rad/s], shape (n,) each.
 
     Returns:
-        a, shape (k,), or None where nothing is within the bounds.
+        a, shape (k,), or None if the bounds are infeasible.
     """
     import daqp
 

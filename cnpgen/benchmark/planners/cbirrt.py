@@ -1,8 +1,7 @@
-"""Constrained bidirectional rapidly exploring trees: OMPL's RRTConnect on a projected state space.
+"""CBiRRT: OMPL's RRTConnect on a projected state space.
 
-Its constraint, one-dimensional, is the height of the tip or the tilt of the object, to 0.01; it knows neither
-velocities nor accelerations. The path is timed by the velocity limits alone and followed linearly, as the paper's
-authors did it.
+The constraint has one dimension: the height of the tip or the tilt of the object, to 0.01. The planner ignores
+velocities and accelerations. The path is timed by the velocity limits and followed linearly, as in the paper.
 """
 
 from collections.abc import Callable
@@ -13,7 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.benchmark.benchmark_planner import Answer, BenchmarkPlanner, Plan, Setting
-from cnpgen.benchmark.planners.obstacle_boxes import APART, DEEP, boxes_of, depth, distance
+from cnpgen.benchmark.planners.obstacle_boxes import (
+    MAX_CORNER_PENETRATION_M,
+    MIN_OBJECT_DISTANCE_M,
+    boxes_of,
+    depth,
+    distance,
+)
 from cnpgen.benchmark.planners.tip import Tip
 from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.errors import MachineError
@@ -26,9 +31,10 @@ from cnpgen.robots.shape.hull import CUBE
 
 Array = NDArray[np.float64]
 
-TOLERANCE, PROJECTIONS, DELTA, LAMBDA = 0.01, 50, 0.05, 2.0  # of the manifold; the last three are OMPL's own
-GOAL = 0.01  # rad: how far from the goal a path may end
-PAUSE = 1e-4  # s: added to the time of every step
+MANIFOLD_TOLERANCE = 0.01
+MAX_PROJECTIONS, DELTA, LAMBDA = 50, 0.05, 2.0  # defaults of OMPL
+MAX_GOAL_ERROR_RAD = 0.01
+STEP_PAUSE_S = 1e-4  # added to the time of every step
 
 
 @dataclass(frozen=True)
@@ -61,18 +67,18 @@ def _ompl() -> Any:
 
 
 def timed(path: Array, velocity_limit: Array) -> Trajectory:
-    """Time a path so that in every step one joint is at its velocity limit.
+    """Time a path so that one joint is at its velocity limit in every step.
 
     Args:
         path: Joint positions [rad], shape (K, n).
         velocity_limit: Planning limits [rad/s], shape (n,).
     """
-    steps = np.max(np.abs(np.diff(path, axis=0)) / velocity_limit, axis=1) + PAUSE
+    steps = np.max(np.abs(np.diff(path, axis=0)) / velocity_limit, axis=1) + STEP_PAUSE_S
     return Trajectory(np.append(0.0, np.cumsum(steps)), path)
 
 
 class Search:
-    """What is asked of states of one boundary problem.
+    """Search for a path of one boundary problem.
 
     Args:
         problem: The problem.
@@ -90,14 +96,14 @@ class Search:
             self._size, self._boxes = boxes_of(problem, *ends)
 
     def residual(self, q: Array) -> tuple[float, Array]:
-        """Return by how much q is off the manifold [m, or 1], and the derivative of that, shape (n,)."""
+        """Return the residual of the manifold at q [m or 1] and its gradient, shape (n,)."""
         position, rotation, J = self._tip.at(q)
         if self._table is not None:
             return float(position[2] - self._table.z), J[2]
         return float(rotation[2, 2] - 1.0), np.cross(J[3:].T, rotation[:, 2])[:, 2]
 
     def is_valid(self, q: Array) -> bool:
-        """Whether the tip is over the table; or the object apart from the pedestals and the arm strong enough."""
+        """Return whether the tip is over the table, or the object is clear and the torques are within limits."""
         import pinocchio as pin
 
         position, rotation, _ = self._tip.at(q)
@@ -109,7 +115,8 @@ class Search:
             return False
         corners = position + (CUBE * self._size) @ rotation.T
         return all(
-            distance(position, box)[0] > APART and all(depth(corner, box)[0] < DEEP for corner in corners)
+            distance(position, box)[0] > MIN_OBJECT_DISTANCE_M
+            and all(depth(corner, box)[0] < MAX_CORNER_PENETRATION_M for corner in corners)
             for box in self._boxes
         )
 
@@ -128,7 +135,7 @@ class Search:
         ends = [manifold.allocState() for _ in self._ends]
         for state, q in zip(ends, self._ends, strict=True):
             state.copy(q.tolist())
-        setup.setStartAndGoalStates(*ends, GOAL)
+        setup.setStartAndGoalStates(*ends, MAX_GOAL_ERROR_RAD)
         setup.setPlanner(ompl.geometric.RRTConnect(about))
         setup.setup()
         setup.solve(time_limit)
@@ -155,7 +162,7 @@ def _constraint(base: Any, n: int, residual: Callable[[Array], tuple[float, Arra
 
     class Manifold(base.Constraint):  # type: ignore[misc]
         def __init__(self) -> None:
-            super().__init__(n, 1, TOLERANCE)
+            super().__init__(n, 1, MANIFOLD_TOLERANCE)
 
         def function(self, x: Any, out: Any) -> None:
             out[0] = residual(np.array(x))[0]
@@ -164,5 +171,5 @@ def _constraint(base: Any, n: int, residual: Callable[[Array], tuple[float, Arra
             out[0, :] = residual(np.array(x))[1]
 
     found = Manifold()
-    found.setMaxIterations(PROJECTIONS)
+    found.setMaxIterations(MAX_PROJECTIONS)
     return found

@@ -1,4 +1,4 @@
-"""The constraints of TrajOpt at its knots, with Pinocchio and by their analytic derivatives (docs/benchmark.md)."""
+"""Constraints of TrajOpt at its knots, with analytic derivatives by Pinocchio (docs/benchmark.md)."""
 
 from collections.abc import Callable
 
@@ -14,11 +14,11 @@ from cnpgen.robots.shape.hull import CUBE
 
 Array = NDArray[np.float64]
 KnotConstraints = Callable[[Array, Array, Array], tuple[Array, tuple[Array, Array, Array]]]
-"""Of positions, velocities and accelerations at K knots, shape (K, n) each: values that must not be negative, shape
-(K, m), and their derivatives in the three, shape (K, m, n) each."""
+"""Function of positions, velocities and accelerations at K knots, shape (K, n) each. It returns values that must not be
+negative, shape (K, m), and their three derivatives, shape (K, m, n) each."""
 
-TABLE = 0.01  # m: how far from its height the tip may be
-APART = 0.15  # m: of the object's centre from the pedestals
+MAX_HEIGHT_ERROR_M = 0.01
+MIN_CENTER_DISTANCE_M = 0.15  # of the object from the pedestals
 
 
 def knot_constraints(problem: Problem, robot: Robot, start_xyz: Array, goal_xyz: Array) -> KnotConstraints:
@@ -27,8 +27,8 @@ def knot_constraints(problem: Problem, robot: Robot, start_xyz: Array, goal_xyz:
     Args:
         problem: The problem.
         robot: Its robot.
-        start_xyz: Where the tip begins [m], shape (3,).
-        goal_xyz: Where it ends [m], shape (3,).
+        start_xyz: Tip position at the start [m], shape (3,).
+        goal_xyz: Tip position at the goal [m], shape (3,).
 
     Raises:
         UsageError: The problem has neither a table nor a held object.
@@ -40,22 +40,24 @@ def knot_constraints(problem: Problem, robot: Robot, start_xyz: Array, goal_xyz:
 
 
 def _on_table(table: Table, robot: Robot) -> KnotConstraints:
-    """The tip over the table and at most 1 cm from its height; |y| and |z| as two inequalities each."""
+    """Bound the tip: over the table and at most 1 cm from its height; |y| and |z| are two inequalities each."""
     signs = np.array([[1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
-    bound = np.array([-table.x.low, -table.y.low, table.y.high, TABLE - table.z, TABLE + table.z])
+    bound = np.array(
+        [-table.x.low, -table.y.low, table.y.high, MAX_HEIGHT_ERROR_M - table.z, MAX_HEIGHT_ERROR_M + table.z]
+    )
     tip = Tip(robot)
 
     def at(q: Array, _dq: Array, _ddq: Array) -> tuple[Array, tuple[Array, Array, Array]]:
-        found = [tip.at(each) for each in q]
-        g = np.array([signs @ position + bound for position, _, _ in found])
-        J = np.array([signs @ jacobian[:3] for _, _, jacobian in found])
+        poses = [tip.at(position) for position in q]
+        g = np.array([signs @ position + bound for position, _, _ in poses])
+        J = np.array([signs @ jacobian[:3] for _, _, jacobian in poses])
         return g, (J, np.zeros_like(J), np.zeros_like(J))
 
     return at
 
 
 def _carrying(robot: Robot, size: Array, boxes: list[Box]) -> KnotConstraints:
-    """The object upright, away from the boxes with its centre and outside with its corners; torques within limits."""
+    """Constrain the object: upright, centre away from the boxes, corners outside; torques within limits."""
     import pinocchio as pin
 
     tip, model, data, limit = Tip(robot), robot.model, robot.model.createData(), robot.torque_limit
@@ -65,9 +67,9 @@ def _carrying(robot: Robot, size: Array, boxes: list[Box]) -> KnotConstraints:
         turning = J[3:]
         values, gradients = [rotation[2, 2] - 1.0], [np.cross(turning.T, rotation[:, 2])[:, 2]]
         for box in boxes:
-            apart, out = distance(position, box)
-            values.append(min(apart - APART, 0.0))
-            gradients.append(out @ J[:3] * (apart < APART))
+            separation, out = distance(position, box)
+            values.append(min(separation - MIN_CENTER_DISTANCE_M, 0.0))
+            gradients.append(out @ J[:3] * (separation < MIN_CENTER_DISTANCE_M))
             for corner in (CUBE * size) @ rotation.T:
                 deep, out = depth(position + corner, box)
                 values.append(-deep)

@@ -1,4 +1,4 @@
-"""The paper's planner as cnpgen ships it: a network's plan, and the same plan refined."""
+"""Shipped models as planners: the plan of the network, and the refined plan."""
 
 from dataclasses import dataclass
 
@@ -12,25 +12,25 @@ from cnpgen.refine.refine_plans import refine_plans
 
 @dataclass(frozen=True)
 class CNPB(BenchmarkPlanner):
-    """The shipped model's plan, as the network gives it."""
+    """Plan of the shipped model without refining."""
 
     def prepare(self, setting: Setting) -> Plan:
         """Load the model."""
         if not setting.model:
-            raise UsageError(f"no shipped model plans for these problems of {setting.problem.name!r}")
+            raise UsageError(f"cnpgen ships no model for these problems of {setting.problem.name!r}")
         planner = Planner(setting.model)
 
         def plan(problem: Plans) -> Plans:
             return planner.plan_batch(problem.boundary, sample_id=problem.sample_id, columns=problem.columns)
 
         base = planner.robot.base
-        planner.plan(base, base)  # what is loaded at the first plan
+        planner.plan(base, base)  # load kernels before planning is timed
         return plan
 
 
 @dataclass(frozen=True)
 class RefinedCNPB(BenchmarkPlanner):
-    """The shipped model's plan, refined."""
+    """Refined plan of the shipped model."""
 
     def prepare(self, setting: Setting) -> Plan:
         """Load the model and the refiner."""

@@ -1,9 +1,8 @@
-"""MPC-MPNet (Li et al., 2021), its variant that follows one path: a tree that is steered to what a network proposes.
+"""MPC-MPNet (Li et al., 2021), the variant with one path: a tree that is steered towards proposals of a network.
 
-From the state that it has just reached, a network proposes where to be next, now and then it is the goal, and the
-cross-entropy method steers there. Where that fails, or after many steps, it goes on from a node near a random place.
-Controls are accelerations within the torque limits, as those of SST are here; how nodes are
-kept, distances and the goal, a place of the tip alone, are those of SST, too.
+From the last state, a network proposes the next configuration, or the goal is chosen, and the cross-entropy method
+steers there. After a failure or many steps, the search continues from a node near a random position. Controls, pruning
+of nodes, distances and the goal are those of ``sst.py``.
 """
 
 from dataclasses import dataclass
@@ -23,9 +22,9 @@ from cnpgen.problems.problem_record import open_problem
 
 Array = NDArray[np.float64]
 
-ITERATIONS = 300_000
-BIAS = 0.05  # of the targets, which are the goal
-MOST_STEPS = 100  # steps in a row before it goes on elsewhere
+MAX_PROPOSALS = 300_000
+GOAL_FRACTION = 0.05  # of the targets
+MAX_STEPS_IN_A_ROW = 100  # before it continues from another node
 
 
 @dataclass(frozen=True)
@@ -39,7 +38,7 @@ class MPCMPNet(BenchmarkPlanner):
         network = load_proposals(shipped_proposals(problem.name))
         if network.architecture.inputs != 4 * robot.n + len(problem.obstacle):
             raise UsageError(
-                f"the network that proposes configurations for {problem.name!r} is of another arm or world"
+                f"the network that proposes configurations for {problem.name!r} is trained for another arm or scene"
             )
         spread = steering.HIT if problem.object_size is None else steering.TRANSPORT
         random = np.random.default_rng(setting.seed)
@@ -48,25 +47,25 @@ class MPCMPNet(BenchmarkPlanner):
             boundary = task.boundary
             start_xyz, goal_xyz = task.columns["start_xyz"][0], task.columns["goal_xyz"][0]
             start = np.concatenate([boundary.start_q[0], boundary.start_dq[0]])
-            tree = Tree(start, start_xyz, radii_of(problem), steering.STEP)
+            tree = Tree(start, start_xyz, radii_of(problem), steering.STEERING_STEP_S)
             steer = Steering(check, check.obstacle_poses(start_xyz, goal_xyz), robot.acceleration_limit, spread, random)
             extend = ProposedExtension(tree, network, steer, boundary.goal_q[0])
-            return tree.grow(extend, goal_xyz, time_limit=setting.time_limit, most=ITERATIONS)
+            return tree.grow(extend, goal_xyz, time_limit=setting.time_limit, max_iterations=MAX_PROPOSALS)
 
         return plan
 
 
 @dataclass
 class ProposedExtension:
-    """Extends a tree towards what a network proposes, from one node to the next.
+    """Extension of a tree towards proposals of a network, from one node to the next.
 
     Attributes:
         tree: The tree.
-        network: What proposes.
-        steer: What steers there.
-        goal_q: Where the arm is to be in the end [rad], shape (n,).
-        node: Where it goes on.
-        steps: Steps in a row.
+        network: Network of the proposals.
+        steer: Steering.
+        goal_q: Goal configuration [rad], shape (n,).
+        node: Node of the next step.
+        steps: Consecutive steps.
     """
 
     tree: Tree
@@ -77,14 +76,14 @@ class ProposedExtension:
     steps: int = 0
 
     def __call__(self) -> int:
-        """Take one step; return the node that it led to, 0 if it led nowhere."""
+        """Take one step; return the new node, or 0 after a failure."""
         state, target, random = self.tree.state(self.node), self.goal_q, self.steer.random
-        if random.random() >= BIAS:
+        if random.random() >= GOAL_FRACTION:
             target = self.network.propose(state, self.goal_q, self.steer.obstacle_poses, random)
         found = self.steer(state, target)
         reached = 0 if found is None else self.tree.add(self.node, *found)
         self.node, self.steps = reached, self.steps + 1
-        if found is None or self.steps > MOST_STEPS:
+        if found is None or self.steps > MAX_STEPS_IN_A_ROW:
             self.node, self.steps = (
                 self.tree.selected(self.steer.check.random_place(self.steer.obstacle_poses, random)),
                 0,

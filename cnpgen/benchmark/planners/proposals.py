@@ -1,9 +1,9 @@
-"""Which configuration is next on the way to a goal: a network that has seen certified plans (Li et al., 2021).
+"""Network that proposes the next configuration on the way to a goal, trained on certified plans (Li et al., 2021).
 
-From a state, the goal and the obstacles it tells the change of every joint within a time, as a normal distribution:
-the mean from the configuration head, which cannot leave what the joint's velocity limit allows, and the deviation
-from the linear head. Proposals are drawn from it, as those of the authors' network are by dropout. It is trained to
-find what came next on plans likely; datasets/proposals/README.md has the commands.
+From a state, the goal and the obstacles, it predicts the change of every joint within a time as a normal distribution.
+The configuration head predicts the mean, within the velocity limits, and the linear head the deviation. Proposals are
+samples of it; the authors sample by dropout. Training maximizes the likelihood of the next configuration on plans;
+datasets/proposals/README.md has the commands.
 """
 
 from collections.abc import Mapping
@@ -29,8 +29,8 @@ from cnpgen.training.adam import learning_rate, start_adam
 Array = NDArray[Any]
 
 KIND, VERSION = "cnpgen-proposals", 1
-LEAST = 0.02  # of the reach: the network is no more certain than that
-MOMENTS = 40  # states of every plan
+MIN_DEVIATION = 0.02  # fraction of the reach
+STATES_PER_PLAN = 40
 HIDDEN, LAYERS, BATCH, STEPS, RATE = 128, 3, 256, 12_000, 2e-3
 
 
@@ -41,11 +41,11 @@ class Proposals:
     Attributes:
         architecture: The network's architecture; both heads have n outputs.
         parameters: All of its numbers, float32.
-        mean: Of every input over the training rows, shape (F,).
-        scale: One over its standard deviation; 0 where it was constant, shape (F,).
-        reach: The farthest a joint can get within the time [rad], shape (n,).
+        mean: Mean of every input over the training rows, shape (F,).
+        scale: Reciprocal of its standard deviation; 0 for constant inputs, shape (F,).
+        reach: Maximum change of a joint within the time [rad], shape (n,).
         ahead: The time [s].
-        training: How it was made, as text.
+        training: Data of its training, as text.
     """
 
     architecture: Architecture
@@ -57,17 +57,17 @@ class Proposals:
     training: Mapping[str, str] = field(default_factory=dict)
 
     def propose(self, state: Array, goal_q: Array, obstacle_poses: Array, random: np.random.Generator) -> Array:
-        """Draw a configuration that may be next [rad], shape (n,).
+        """Sample a next configuration [rad], shape (n,).
 
         Args:
-            state: Where the arm is and how it moves, shape (2 n,).
-            goal_q: Where it is to be in the end [rad], shape (n,).
+            state: Positions [rad] and velocities [rad/s], shape (2 n,).
+            goal_q: Goal configuration [rad], shape (n,).
             obstacle_poses: Heights of the obstacles' upper faces [m], shape (obstacles,).
-            random: Where random numbers come from.
+            random: Random generator.
         """
-        inputs = standardised(inputs_of(state[None], goal_q[None], obstacle_poses[None]), self.mean, self.scale)
+        inputs = standardize(inputs_of(state[None], goal_q[None], obstacle_poses[None]), self.mean, self.scale)
         given = forward(self._weights, inputs)
-        drawn = random.normal(given.path[0], LEAST + np.exp(given.log_rate[0]))
+        drawn = random.normal(given.path[0], MIN_DEVIATION + np.exp(given.log_rate[0]))
         return np.asarray(state[: len(goal_q)] + self.reach * drawn)
 
     @cached_property
@@ -76,12 +76,12 @@ class Proposals:
 
 
 def inputs_of(states: Array, goal_q: Array, obstacle_poses: Array) -> Array:
-    """Put inputs beside each other: states (N, 2 n), goals (N, n), how far they are, and obstacles (N, m)."""
+    """Concatenate inputs: states (N, 2 n), goals (N, n), their differences, and obstacles (N, m)."""
     return np.concatenate([states, goal_q, goal_q - states[:, : goal_q.shape[1]], obstacle_poses], axis=1)
 
 
-def standardised(inputs: Array, mean: Array, scale: Array) -> Array:
-    """Standardise inputs, shape (N, F), for the network."""
+def standardize(inputs: Array, mean: Array, scale: Array) -> Array:
+    """Standardize inputs, shape (N, F), for the network."""
     return ((inputs - mean) * scale).astype(np.float32)
 
 
@@ -89,7 +89,7 @@ def save_proposals(path: str | Path, proposals: Proposals) -> None:
     """Write a network to a file, atomically; equal networks give equal bytes.
 
     Raises:
-        MachineError: The disk is full, read-only or otherwise unwilling.
+        MachineError: The file cannot be written.
     """
     arrays = {name: getattr(proposals, name) for name in ("parameters", "mean", "scale", "reach")}
     arrays["ahead"] = np.array([proposals.ahead])
@@ -101,8 +101,8 @@ def load_proposals(path: str | Path) -> Proposals:
     """Read a network.
 
     Raises:
-        DatasetError: The file is damaged, or none of these.
-        MachineError: The system would not let us read it.
+        DatasetError: The file is damaged or of another kind.
+        MachineError: The file cannot be read.
     """
     content = read_with_checksum(Path(path), kind=KIND, version=VERSION)
     arrays = dict(content.arrays)
@@ -119,7 +119,7 @@ def shipped_proposals(problem: str) -> Path:
     """Find the network that cnpgen ships for a problem.
 
     Raises:
-        UsageError: There is none.
+        UsageError: cnpgen ships none for this problem.
     """
     folder = recipes_root() / "datasets" / "proposals"
     path = folder / f"{problem}.h5"
@@ -130,11 +130,11 @@ def shipped_proposals(problem: str) -> Path:
 
 
 def train_proposals(plans: Plans, *, ahead: float, steps: int = STEPS, seed: int = 0) -> Proposals:
-    """Train a network to tell what comes next on plans.
+    """Train a network to predict the next configuration on plans.
 
     Args:
-        plans: Valid plans of one problem: rows of a certified dataset, for example.
-        ahead: What "next" is: so much later [s].
+        plans: Valid plans of one problem, for example samples of a certified dataset.
+        ahead: Time until the next configuration [s].
         steps: Steps of training.
         seed: Seed of parameters, times and batches.
 
@@ -154,23 +154,25 @@ def train_proposals(plans: Plans, *, ahead: float, steps: int = STEPS, seed: int
     parameters = initial_parameters(architecture, seed=seed, head_scale=0.1, rate_bias=-1.0)
     made = {"made": f"{len(plans)} plans of {plans.problem.name}, {steps} steps, seed {seed}, cnpgen {__version__}"}
     network = Proposals(architecture, parameters, inputs.mean(axis=0), scale, reach, ahead, made)
-    features, targets = standardised(inputs, network.mean, scale), (moved / reach).astype(np.float32)
+    features, targets = standardize(inputs, network.mean, scale), (moved / reach).astype(np.float32)
     return replace(network, parameters=_fitted(network, features, targets, steps, random))
 
 
 def _rows(plans: Plans, ahead: float, random: np.random.Generator) -> tuple[Array, Array]:
-    """Return inputs and what the joints moved by afterwards [rad], at random times of all plans."""
-    first = random.uniform(0, 1, (len(plans), MOMENTS)) * plans.duration[:, None]
+    """Return inputs and the following changes of the joints [rad], at random times of all plans."""
+    first = random.uniform(0, 1, (len(plans), STATES_PER_PLAN)) * plans.duration[:, None]
     now = plans.motion.at_times(first)
     later = plans.motion.at_times(np.minimum(first + ahead, plans.duration[:, None]))
     obstacle_poses = obstacle_poses_of(plans.problem, plans.columns["start_xyz"], plans.columns["goal_xyz"])
-    goal_q, obstacle_poses = (np.repeat(each, MOMENTS, axis=0) for each in (plans.boundary.goal_q, obstacle_poses))
+    goal_q, obstacle_poses = (
+        np.repeat(each, STATES_PER_PLAN, axis=0) for each in (plans.boundary.goal_q, obstacle_poses)
+    )
     states = np.concatenate([now.q, now.dq], axis=2).reshape(len(goal_q), -1)
     return inputs_of(states, goal_q, obstacle_poses), (later.q - now.q).reshape(len(goal_q), -1)
 
 
 def _fitted(network: Proposals, features: Array, targets: Array, steps: int, random: np.random.Generator) -> Array:
-    """Take all steps; return the average of the last parameters."""
+    """Run all training steps; return the average of the last parameters."""
     adam, gradient = start_adam(network.parameters.copy()), np.empty_like(network.parameters)
     split = network.architecture.split
     for step in range(steps):
@@ -185,7 +187,7 @@ def likelihood_gradient(weights: Weights, features: Array, targets: Array, *, ou
 
     Args:
         weights: Of the network.
-        features: Its standardised inputs, shape (N, F).
+        features: Its standardize inputs, shape (N, F).
         targets: What the joints moved by, as shares of their reach, shape (N, n).
         out: Where to, as ``weights``.
 
@@ -193,9 +195,9 @@ def likelihood_gradient(weights: Weights, features: Array, targets: Array, *, ou
         What it is the gradient of.
     """
     given = forward(weights, features)
-    deviation = np.exp(given.log_rate) + LEAST
+    deviation = np.exp(given.log_rate) + MIN_DEVIATION
     off = (given.path - targets) / deviation
-    gradient = (1 - off * off) / deviation * (deviation - LEAST)
+    gradient = (1 - off * off) / deviation * (deviation - MIN_DEVIATION)
     backward(
         weights,
         given,

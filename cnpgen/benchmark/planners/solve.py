@@ -1,4 +1,4 @@
-"""cnpgen's own optimisation from nothing."""
+"""Optimization from a straight line, without input plan."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ from cnpgen.refine.refine_plans import solve_plans
 
 @dataclass(frozen=True)
 class Solve(BenchmarkPlanner):
-    """Sequential quadratic programming from a straight line, as ``cnpgen solve`` does it."""
+    """Sequential quadratic programming from a straight line, as ``cnpgen solve``."""
 
     def prepare(self, setting: Setting) -> Plan:
         """Load the kernels."""
@@ -26,7 +26,7 @@ class Solve(BenchmarkPlanner):
 
 
 def near_base(record: ProblemRecord) -> Plans:
-    """Return a boundary problem to warm up with: a little turn of the first joint, from the base configuration."""
+    """Return a boundary problem for warming up: a small rotation of the first joint from the base configuration."""
     base = open_problem(record)[1].base
     goal, still = base.copy(), np.zeros((1, len(base)))
     goal[0] += 0.1

@@ -1,9 +1,9 @@
-"""Stable sparse trees (Li, Littlefield, Bekris, 2016) over the arm's states, with random accelerations.
+"""Stable sparse trees (SST; Li, Littlefield, Bekris, 2016) over the arm's states, with random accelerations.
 
-Our own: the wheels of OMPL have no constructor of its SST for Python. A state is (q, dq), a control an acceleration
-that is held for 1 to 20 steps of 5 ms and must be within the torque limits, the distance the tip's in the workspace,
-and the cost time; the goal is a place of the tip alone, as the paper's authors simplified it. Where no state comes near
-enough to the goal, what comes nearest counts. Random torques were tried: they break a velocity limit within 5 ms.
+This implementation exists because the Python wheels of OMPL cannot construct its SST. A state is (q, dq). A control is
+an acceleration, constant for 1 to 20 steps of 5 ms and within the torque limits. The distance is that of the tip in the
+workspace, and the cost is time. The goal is a position of the tip, as in the paper. If no state reaches the goal, the
+nearest state is the result. Random torques would exceed a velocity limit within 5 ms.
 """
 
 from dataclasses import dataclass
@@ -20,9 +20,9 @@ from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
 
-STEP, MOST_STEPS = 5e-3, 20  # s, and how many of them a control is held at most
-ITERATIONS = 300_000
-BIAS = 0.05  # of the samples, which are the goal
+CONTROL_STEP_S, MAX_CONTROL_STEPS = 5e-3, 20
+MAX_TREE_ITERATIONS = 300_000
+GOAL_BIAS = 0.05  # fraction of the samples
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class SST(BenchmarkPlanner):
         def plan(task: Plans) -> Answer:
             boundary = task.boundary
             start_xyz, goal_xyz = task.columns["start_xyz"][0], task.columns["goal_xyz"][0]
-            tree = Tree(np.concatenate([boundary.start_q[0], boundary.start_dq[0]]), start_xyz, radii, STEP)
+            tree = Tree(np.concatenate([boundary.start_q[0], boundary.start_dq[0]]), start_xyz, radii, CONTROL_STEP_S)
             extend = RandomExtension(
                 tree,
                 robot,
@@ -46,22 +46,22 @@ class SST(BenchmarkPlanner):
                 goal=goal_xyz,
                 random=random,
             )
-            return tree.grow(extend, goal_xyz, time_limit=setting.time_limit, most=ITERATIONS)
+            return tree.grow(extend, goal_xyz, time_limit=setting.time_limit, max_iterations=MAX_TREE_ITERATIONS)
 
         return plan
 
 
 @dataclass(frozen=True)
 class RandomExtension:
-    """Extends a tree by random accelerations, from nodes that are near random places.
+    """Extension of a tree by random accelerations, from nodes near random positions.
 
     Attributes:
         tree: The tree.
         robot: The robot.
-        check: What allows states.
+        check: Check of states.
         obstacle_poses: Heights of the obstacles' upper faces [m], shape (obstacles,).
-        goal: Where the tip is to be [m], shape (3,).
-        random: Where random numbers come from.
+        goal: Goal position of the tip [m], shape (3,).
+        random: Random generator.
     """
 
     tree: Tree
@@ -72,13 +72,15 @@ class RandomExtension:
     random: np.random.Generator
 
     def __call__(self) -> int:
-        """Hold a random acceleration for a random time; return the node that this leads to, 0 if it is not allowed."""
-        to_goal = self.random.random() < BIAS
+        """Apply a random acceleration for a random time; return the new node, or 0 if a state is invalid."""
+        to_goal = self.random.random() < GOAL_BIAS
         parent = self.tree.selected(self.goal if to_goal else self.check.random_place(self.obstacle_poses, self.random))
         q, dq = np.split(self.tree.state(parent), 2)
         limit = self.robot.acceleration_limit
-        ddq = self.random.uniform(-limit, limit) * self.random.random()  # small ones, too: 12 kg need much torque
-        t = STEP * np.arange(1.0, self.random.integers(1, MOST_STEPS + 1) + 1)[:, None]
+        ddq = (
+            self.random.uniform(-limit, limit) * self.random.random()
+        )  # also small accelerations: 12 kg need much torque
+        t = CONTROL_STEP_S * np.arange(1.0, self.random.integers(1, MAX_CONTROL_STEPS + 1) + 1)[:, None]
         path_q, path_dq = q + t * (dq + t / 2 * ddq), dq + t * ddq
         tips, allowed = self.check(path_q, path_dq, np.broadcast_to(ddq, path_q.shape), self.obstacle_poses)
         return self.tree.add(parent, np.concatenate([path_q, path_dq], axis=1), tips[-1]) if allowed.all() else 0

@@ -1,11 +1,11 @@
-"""Which states a tree of motions may contain, and where the tip is there: many states at once, by a kernel."""
+"""Validity of states and positions of the tip for tree planners, by a kernel over many states."""
 
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.benchmark.planners.obstacle_boxes import APART, DEEP, require_transport
+from cnpgen.benchmark.planners.obstacle_boxes import MAX_CORNER_PENETRATION_M, MIN_OBJECT_DISTANCE_M, require_transport
 from cnpgen.kernels.library import choose_backend, problem_kernels
 from cnpgen.kernels.symbolic.linalg import Scalar, Vec, dot, symbols
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
@@ -20,76 +20,78 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-UPRIGHT = 0.05  # of 1 - R_22: how far an object may tilt
-TABLE = 0.01  # m: how far from its height the tip may be
+MAX_UPRIGHT_ERROR = 0.05  # of 1 - R_22
+MAX_TIP_HEIGHT_ERROR_M = 0.01
 
 
 class StateCheck:
-    """Checks states of one boundary problem: limits of joints and torques, the manifold, the loaded problem.
+    """Check of states: limits of joints and torques, the manifold, the obstacles.
 
     Args:
         problem: The problem.
         robot: Its robot.
 
     Raises:
-        UsageError: There is neither a table nor a held object, or an obstacle is no upright box.
+        UsageError: There is neither a table nor a held object, or an obstacle is not an upright box.
     """
 
     def __init__(self, problem: Problem, robot: "Robot") -> None:
         if problem.first(Table) is None:
             require_transport(problem)
         self._problem, self._robot = problem, robot
-        self._kernel = problem_kernels(problem, robot, *choose_backend(None)).load(tip_and_excess)
+        self._kernel = problem_kernels(problem, robot, *choose_backend(None)).load(tip_and_violation)
 
     def obstacle_poses(self, start_xyz: Array, goal_xyz: Array) -> Array:
         """Return the heights of the obstacles' upper faces [m], shape (obstacles,), from the ends of a motion."""
         return obstacle_poses_of(self._problem, start_xyz, goal_xyz)
 
     def __call__(self, q: Array, dq: Array, ddq: Array, obstacle_poses: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Look at N states.
+        """Check N states.
 
         Args:
             q: Joint positions [rad], shape (N, n).
             dq: Joint velocities [rad/s], shape (N, n).
             ddq: Joint accelerations [rad/s^2], shape (N, n).
-            obstacle_poses: What ``obstacle_poses`` returned.
+            obstacle_poses: Result of ``obstacle_poses``.
 
         Returns:
-            Where the tip is [m], shape (N, 3), and whether the state is allowed, shape (N,).
+            Positions of the tip [m], shape (N, 3), and a mask of the valid states, shape (N,).
         """
         lanes = [np.ascontiguousarray(values.T) for values in (q, dq, ddq)]
-        tip, excess = self._kernel(
+        tip, violation = self._kernel(
             *lanes, np.ascontiguousarray(np.broadcast_to(obstacle_poses[:, None], (len(obstacle_poses), len(q))))
         )
-        return np.ascontiguousarray(tip.T), excess[0] <= 0
+        return np.ascontiguousarray(tip.T), violation[0] <= 0
 
     def random_place(self, obstacle_poses: Array, random: np.random.Generator) -> Array:
-        """Draw a place: where a random configuration has the tip [m], shape (3,)."""
+        """Return the tip position of a random configuration [m], shape (3,)."""
         q = random.uniform(self._robot.position_lower, self._robot.position_upper)[None]
         still = np.zeros_like(q)
         return np.asarray(self(q, still, still, obstacle_poses)[0][0])
 
 
-def tip_and_excess(robot: "Robot", problem: Problem) -> Any:
-    """Build ``(q, dq, ddq, obstacle_poses) -> (tip, excess)``: by how much the worst bound is exceeded, in its own unit."""
+def tip_and_violation(robot: "Robot", problem: Problem) -> Any:
+    """Build ``(q, dq, ddq, obstacle_poses) -> (tip, violation)`` with the largest violation, in its own unit."""
     import casadi as ca
 
     names = (("q", robot.n), ("dq", robot.n), ("ddq", robot.n), ("obstacle_poses", pose_width(problem.obstacle)))
     (q_sx, q), (dq_sx, dq), (ddq_sx, ddq), (poses_sx, obstacle_poses) = (symbols(name, width) for name, width in names)
     state = SymbolicState(robot, q, dq, ddq, obstacle_poses, problem.obstacle, problem.object_size)
     tip, table = state.kinematics.tip, problem.first(Table)
-    excess = [ca.fabs(value) - limit for value, limit in zip(dq, robot.velocity_limit.tolist(), strict=True)]
-    excess += [ca.fabs(value) - limit for value, limit in zip(state.torque, robot.torque_limit.tolist(), strict=True)]
-    excess += [low - value for value, low in zip(q, robot.position_lower.tolist(), strict=True)]
-    excess += [value - high for value, high in zip(q, robot.position_upper.tolist(), strict=True)]
-    excess += _off_the_table(table, tip) if table is not None else _off_the_way(state, obstacle_poses)
-    worst: Scalar = excess[0]
-    for each in excess[1:]:
+    violation = [ca.fabs(value) - limit for value, limit in zip(dq, robot.velocity_limit.tolist(), strict=True)]
+    violation += [
+        ca.fabs(value) - limit for value, limit in zip(state.torque, robot.torque_limit.tolist(), strict=True)
+    ]
+    violation += [low - value for value, low in zip(q, robot.position_lower.tolist(), strict=True)]
+    violation += [value - high for value, high in zip(q, robot.position_upper.tolist(), strict=True)]
+    violation += _table_violations(table, tip) if table is not None else _obstacle_violations(state, obstacle_poses)
+    worst: Scalar = violation[0]
+    for each in violation[1:]:
         worst = ca.fmax(worst, each)
-    return ca.Function("tip_and_excess", [q_sx, dq_sx, ddq_sx, poses_sx], [ca.vertcat(*tip), worst])
+    return ca.Function("tip_and_violation", [q_sx, dq_sx, ddq_sx, poses_sx], [ca.vertcat(*tip), worst])
 
 
-def _off_the_table(table: Table, tip: Vec) -> list[Scalar]:
+def _table_violations(table: Table, tip: Vec) -> list[Scalar]:
     import casadi as ca
 
     sides = [
@@ -97,11 +99,11 @@ def _off_the_table(table: Table, tip: Vec) -> list[Scalar]:
         for place, span in zip(tip, (table.x, table.y), strict=False)
         for side in (span.low - place, place - span.high)
     ]
-    return [ca.fabs(tip[2] - table.z) - TABLE, *sides]
+    return [ca.fabs(tip[2] - table.z) - MAX_TIP_HEIGHT_ERROR_M, *sides]
 
 
-def _off_the_way(state: SymbolicState, obstacle_poses: Vec) -> list[Scalar]:
-    """Tilt of the object, its centre near a pedestal, and a corner in one, which reaches down without end."""
+def _obstacle_violations(state: SymbolicState, obstacle_poses: Vec) -> list[Scalar]:
+    """Return violations of the tilt, of the distance to pedestals, and of the penetration of corners."""
     import casadi as ca
 
     rotation, tip = state.kinematics.rotation, state.kinematics.tip
@@ -109,15 +111,15 @@ def _off_the_way(state: SymbolicState, obstacle_poses: Vec) -> list[Scalar]:
         [place + dot(row, corner) for place, row in zip(tip, rotation, strict=True)]
         for corner in (CUBE * np.array(state.object_size)).tolist()
     ]
-    excess: list[Scalar] = [1.0 - rotation[2][2] - UPRIGHT]
+    violation: list[Scalar] = [1.0 - rotation[2][2] - MAX_UPRIGHT_ERROR]
     for box, top in zip(state.obstacles, obstacle_poses, strict=True):
         spans = [(span.low, span.high) for span in (box.x, box.y) if span is not None]
         sides = (*spans, (-np.inf, top))
         outside = [
             ca.fmax(ca.fmax(low - place, place - high), 0) for place, (low, high) in zip(tip, sides, strict=True)
         ]
-        excess.append(APART - ca.sqrt(dot(outside, outside)))
+        violation.append(MIN_OBJECT_DISTANCE_M - ca.sqrt(dot(outside, outside)))
         for corner in corners:
-            rooms = [ca.fmin(place - low, high - place) for place, (low, high) in zip(corner, sides, strict=True)]
-            excess.append(ca.fmin(ca.fmin(rooms[0], rooms[1]), rooms[2]) - DEEP)
-    return excess
+            depths = [ca.fmin(place - low, high - place) for place, (low, high) in zip(corner, sides, strict=True)]
+            violation.append(ca.fmin(ca.fmin(depths[0], depths[1]), depths[2]) - MAX_CORNER_PENETRATION_M)
+    return violation

@@ -1,4 +1,4 @@
-"""Paths of the mallet in the plane: two lines and the arc between them, run through with constant acceleration."""
+"""Paths of the mallet in the plane: two lines joined by an arc, with constant acceleration."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,10 +13,10 @@ Array = NDArray[np.float64]
 MARGIN = 0.02  # m: between the mallet and a band
 LOW = np.array([HOME + MALLET_RADIUS + MARGIN, -WIDTH / 2 + MALLET_RADIUS + MARGIN])
 HIGH = np.array([HOME + LENGTH / 2 - MALLET_RADIUS, WIDTH / 2 - MALLET_RADIUS - MARGIN])
-FASTEST = 8.0  # m/s^2
-AFTER = np.array([0.1, 0.15])  # m: where the mallet stops, ahead of the hit and towards the centre
+MAX_PLANE_ACCELERATION_M_S2 = 8.0
+STOP_OFFSET_M = np.array([0.1, 0.15])  # ahead of the hit and towards the centre
 STOP_HIGH = np.array([HOME + 0.9, 0.42085])  # m
-STRAIGHT = 1e-6  # rad: less of a bend is none
+MIN_BEND_RAD = 1e-6
 
 
 @dataclass(frozen=True)
@@ -24,11 +24,11 @@ class PlanePath:
     """A path of the mallet, from rest to a hit or from there to rest.
 
     Attributes:
-        start: Where it begins [m], shape (2,).
-        bend: Where the two lines would meet.
-        end: Where it ends.
+        start: First position [m], shape (2,).
+        bend: Intersection of the two lines [m], shape (2,).
+        end: Last position [m], shape (2,).
         speed: At the hit [m/s].
-        stops: Whether the hit is at its beginning.
+        stops: Whether the path begins with the hit.
     """
 
     start: Array
@@ -75,12 +75,12 @@ class PlanePath:
         return float(np.linalg.norm(self.bend - self.start)), float(np.linalg.norm(self.end - self.bend))
 
     def _arc(self) -> tuple[float, float, float]:
-        """How far from the bend the arc begins [m], its radius [m] and how far it turns [rad]."""
+        """Return the distance of the arc's ends from the bend [m], its radius [m] and its angle [rad]."""
         before, after = self._lines()
         one, other = _unit(self.bend - self.start), _unit(self.end - self.bend)
         turn = float(np.arccos(np.clip(one @ other, -1, 1)))
         cut = min(before, after)
-        if turn < STRAIGHT or cut == 0:
+        if turn < MIN_BEND_RAD or cut == 0:
             return 0.0, 0.0, 0.0
         return cut, cut / np.tan(turn / 2), turn
 
@@ -89,22 +89,22 @@ def striking_path(start: Array, hit: Array, velocity: Array, speed: float) -> Pl
     """Plan a path from rest to a hit in a direction: it bends where the line of the hit leaves the box of both ends.
 
     Args:
-        start: Where the mallet rests [m], shape (2,).
-        hit: Where it hits [m], shape (2,).
+        start: Position at rest [m], shape (2,).
+        hit: Position of the hit [m], shape (2,).
         velocity: Direction of the hit, of any length, shape (2,).
-        speed: How fast it is to hit [m/s]; it is slower if that needs more than ``FASTEST``.
+        speed: Speed of the hit [m/s], reduced if it needs more than ``MAX_PLANE_ACCELERATION_M_S2``.
     """
     start, hit = np.clip(start, LOW, HIGH), np.clip(hit, LOW, HIGH)
     low, high = np.array([min(start[0], hit[0]), LOW[1]]), np.array([max(start[0], hit[0]), HIGH[1]])
     path = PlanePath(start, _leave(hit, -velocity, low, high), hit, speed)
-    duration = max(2 * path.length / speed, np.sqrt(2 * path.length / FASTEST))
+    duration = max(2 * path.length / speed, np.sqrt(2 * path.length / MAX_PLANE_ACCELERATION_M_S2))
     return PlanePath(path.start, path.bend, hit, 2 * path.length / duration)
 
 
 def stopping_path(hit_path: PlanePath) -> PlanePath:
-    """Plan the way from a hit to rest, a little ahead and towards the centre of the table."""
+    """Plan the path from a hit to rest, ahead and towards the centre of the table."""
     hit = hit_path.end
-    aside = AFTER * np.array([1.0, -1.0 if hit[1] > 0 else 1.0])
+    aside = STOP_OFFSET_M * np.array([1.0, -1.0 if hit[1] > 0 else 1.0])
     end = np.clip(hit + aside, [-np.inf, -STOP_HIGH[1]], STOP_HIGH)
     low, high = np.minimum(hit, end), np.maximum(hit, end)
     forwards = hit_path.end - hit_path.bend
@@ -112,7 +112,7 @@ def stopping_path(hit_path: PlanePath) -> PlanePath:
 
 
 def _leave(point: Array, direction: Array, low: Array, high: Array) -> Array:
-    """Return where a ray from a point in a box leaves the box."""
+    """Return the point at which a ray leaves a box."""
     with np.errstate(divide="ignore", invalid="ignore"):
         reach = np.where(direction > 0, (high - point) / direction, (low - point) / direction)
     reach = reach[np.isfinite(reach)]

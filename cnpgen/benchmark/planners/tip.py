@@ -1,4 +1,4 @@
-"""Where the tip is and how it moves with the joints, with Pinocchio."""
+"""Position, orientation and Jacobian of the tip, with Pinocchio."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +9,7 @@ Array = NDArray[np.float64]
 
 
 class Tip:
-    """The tip of a robot; it reuses Pinocchio's memory, so it belongs to one thread.
+    """Kinematics of the tip; not thread-safe, because Pinocchio's data are reused.
 
     Args:
         robot: The robot.
@@ -20,7 +20,7 @@ class Tip:
         self._frame = robot.tip_frame
 
     def at(self, q: Array) -> tuple[Array, Array, Array]:
-        """Return where it is at joint positions q [rad], shape (n,).
+        """Evaluate the tip at joint positions q [rad], shape (n,).
 
         Returns:
             Its position [m], shape (3,), its rotation, shape (3, 3), and its Jacobian in world axes, shape (6, n),

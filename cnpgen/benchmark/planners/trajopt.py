@@ -21,7 +21,7 @@ from cnpgen.trajectory.boundary import Boundary
 Array = NDArray[np.float64]
 
 KNOTS = 15
-SHORTEST = 0.1  # s
+MIN_DURATION_S = 0.1
 
 
 @dataclass(frozen=True)
@@ -34,12 +34,12 @@ class TrajOpt(BenchmarkPlanner):
 
         def plan(task: Plans) -> Answer:
             at_knots = knot_constraints(problem, robot, task.columns["start_xyz"][0], task.columns["goal_xyz"][0])
-            return Transcription(robot, task.boundary, at_knots).solve()
+            return TrajOptTranscription(robot, task.boundary, at_knots).solve()
 
         return plan
 
 
-class Transcription:
+class TrajOptTranscription:
     """One boundary problem as a nonlinear program.
 
     Its variables are positions, velocities and accelerations at the knots where these are free, and T, in this order:
@@ -63,7 +63,7 @@ class Transcription:
         self._size = int(self._ends[-1]) + 1
 
     def solve(self, iterations: int = 100) -> Trajectory | None:
-        """Minimise T and return the knots; None where they are not finite."""
+        """Minimize T and return the knots; None if they are not finite."""
         from scipy.optimize import Bounds, minimize
 
         first = self.start()
@@ -97,14 +97,14 @@ class Transcription:
         return np.vstack([b.start_q, q, b.goal_q]), np.vstack([b.start_dq, dq, b.goal_dq]), ddq, float(x[-1])
 
     def start(self) -> Array:
-        """Return the cubic that the search begins with; its derivatives are those in its parameter."""
+        """Return the initial guess, a cubic; its derivatives are those in its parameter."""
         b = self._boundary
         a = np.vstack([b.start_q, b.start_dq + 3 * b.start_q, 3 * b.goal_q - b.goal_dq, b.goal_q])
         s = np.linspace(0, 1, KNOTS)
         shape = np.polynomial.Polynomial
         up, down = shape([0, 1]), shape([1, -1])
-        pieces = [down**3, down**2 * up, down * up**2, up**3]
-        q, dq, ddq = (np.array([piece.deriv(order)(s) for piece in pieces]).T @ a for order in range(3))
+        basis = [down**3, down**2 * up, down * up**2, up**3]
+        q, dq, ddq = (np.array([polynomial.deriv(order)(s) for polynomial in basis]).T @ a for order in range(3))
         robot = self._robot
         time = np.max(np.abs(dq) / robot.velocity_limit), np.sqrt(np.max(np.abs(ddq) / robot.acceleration_limit))
         parts = [q[1:-1].ravel(), dq[1:-1].ravel(), ddq[self._free_ddq].ravel(), np.array([max(time)])]
@@ -118,12 +118,12 @@ class Transcription:
         low = [np.tile(robot.position_lower, inner), -high[1]]
         acceleration = np.tile(robot.acceleration_limit, free)
         return (
-            np.concatenate([*low, -acceleration, [SHORTEST]]),
+            np.concatenate([*low, -acceleration, [MIN_DURATION_S]]),
             np.concatenate([*high, acceleration, [np.inf]]),
         )
 
     def defects(self, x: Array) -> Array:
-        """Return what explicit Euler steps miss the next knot by, shape (2 (KNOTS - 1) n,)."""
+        """Return the defects of explicit Euler steps between knots, shape (2 (KNOTS - 1) n,)."""
         q, dq, ddq, duration = self.unpack(x)
         step = duration / KNOTS
         return np.concatenate(
@@ -148,7 +148,7 @@ class Transcription:
         return J
 
     def margins(self, x: Array) -> Array:
-        """Return the constraints at the inner knots, not negative where they are met."""
+        """Return the constraints at the inner knots, nonnegative if satisfied."""
         q, dq, ddq, _ = self.unpack(x)
         return np.asarray(self._at_knots(q[1:-1], dq[1:-1], ddq[1:-1])[0].ravel())
 

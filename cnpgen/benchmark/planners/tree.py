@@ -1,4 +1,7 @@
-"""Trees of states that grow from a start, sparse as those of SST (Li, Littlefield, Bekris, 2016)."""
+"""Sparse trees of states that grow from a start, as in SST (Li, Littlefield, Bekris, 2016).
+
+The tree of ``refine/rrt_connect.py`` has other nodes and no pruning, so the two share no code.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,9 +21,9 @@ class Radii:
     """Distances of the tip [m].
 
     Attributes:
-        select: Among nodes so near a place, the one of least cost is extended.
-        witness: Of nodes so near a witness, the one of least cost is kept.
-        goal: So near the goal a motion has arrived.
+        select: Radius around a sampled position in which the node of least cost is extended.
+        witness: Radius around a witness in which only the node of least cost is kept.
+        goal: Maximum distance from the goal.
     """
 
     select: float
@@ -29,7 +32,7 @@ class Radii:
 
 
 HIT = Radii(0.05, 0.02, 0.02)
-TRANSPORT = Radii(0.2, 0.02, 0.2)  # the paper has 0.1 for witnesses, which no state from rest gets away from
+TRANSPORT = Radii(0.2, 0.02, 0.2)  # the paper has 0.1 for witnesses, which a state from rest cannot leave
 
 
 def radii_of(problem: Problem) -> Radii:
@@ -38,15 +41,15 @@ def radii_of(problem: Problem) -> Radii:
 
 
 class Tree:
-    """States, from each the way to it from another one.
+    """Tree of states; each node has the path from its parent.
 
-    A state is (q, dq), a distance the tip's in the workspace, the cost of a node the time from the start.
+    A state is (q, dq), distances are those of the tip in the workspace, the cost of a node is the time from the start.
 
     Args:
-        start: The state that it grows from, shape (2 n,).
-        tip: Where the tip is there [m], shape (3,).
+        start: The root, shape (2 n,).
+        tip: Tip position of the root [m], shape (3,).
         radii: The distances.
-        step: Time between two states on a way [s].
+        step: Time between two states of a path [s].
     """
 
     def __init__(self, start: Array, tip: Array, radii: Radii, step: float) -> None:
@@ -62,26 +65,26 @@ class Tree:
         return np.asarray(self._paths[node][-1])
 
     def tip(self, node: int) -> Array:
-        """Return where the tip is at a node [m], shape (3,)."""
+        """Return the tip position of a node [m], shape (3,)."""
         return np.asarray(self._tips.rows[node])
 
     def selected(self, place: Array) -> int:
-        """Choose the node of least cost among those that are kept near a place, or the nearest one."""
+        """Return the active node of least cost near a position, or the nearest one."""
         kept = self._holders.rows.astype(int)
         away = np.linalg.norm(self._tips.rows[kept] - place, axis=1)
         near = kept[away < self._radii.select]
         return int(near[np.argmin(self._cost.rows[near])]) if len(near) else int(kept[np.argmin(away)])
 
     def add(self, parent: int, path: Array, tip: Array) -> int:
-        """Add a node unless there is a cheaper one near the same witness.
+        """Add a node unless a cheaper one exists near the same witness.
 
         Args:
-            parent: The node that it was reached from.
-            path: The states on the way, shape (K, 2 n).
-            tip: Where the tip is at its end [m], shape (3,).
+            parent: Parent of the node.
+            path: States from the parent, shape (K, 2 n).
+            tip: Tip position of the node [m], shape (3,).
 
         Returns:
-            The node that is kept there: the new one, or the cheaper one.
+            The active node near the witness: the new one or the cheaper one.
         """
         node, cost = len(self._paths), self._cost.rows[parent] + self._step * len(path)
         away = np.linalg.norm(self._witnesses.rows - tip, axis=1)
@@ -99,8 +102,8 @@ class Tree:
         self._cost.append(cost)
         return node
 
-    def way_to(self, node: int) -> Trajectory:
-        """Return the way from the start to a node."""
+    def path_to(self, node: int) -> Trajectory:
+        """Return the trajectory from the start to a node."""
         parts = []
         while node >= 0:
             parts.append(self._paths[node])
@@ -109,28 +112,30 @@ class Tree:
         n = states.shape[1] // 2
         return Trajectory(self._step * np.arange(float(len(states))), states[:, :n], states[:, n:])
 
-    def grow(self, extend: Callable[[], int], goal: Array, *, time_limit: float, most: int) -> Trajectory | None:
-        """Grow until a node is near enough to the goal.
+    def grow(
+        self, extend: Callable[[], int], goal: Array, *, time_limit: float, max_iterations: int
+    ) -> Trajectory | None:
+        """Grow until a node is within the goal radius.
 
         Args:
-            extend: What tries to get further from a node, and returns the node that it got to; the start is 0.
-            goal: Where the tip is to be [m], shape (3,).
-            time_limit: How long it may take [s].
-            most: How often it may be tried.
+            extend: Function that extends the tree and returns the active node; 0 is the root.
+            goal: Goal position of the tip [m], shape (3,).
+            time_limit: Maximum time [s].
+            max_iterations: Maximum number of extensions.
 
         Returns:
-            The way to the node that is nearest to the goal; None if it is the start.
+            The trajectory to the node nearest to the goal; None if it is the root.
         """
         until = perf_counter() + time_limit
         best, nearest = 0, float(np.linalg.norm(self.tip(0) - goal))
-        for _ in range(most):
+        for _ in range(max_iterations):
             if nearest <= self._radii.goal or perf_counter() > until:
                 break
             node = extend()
             away = float(np.linalg.norm(self.tip(node) - goal))
             if away < nearest:
                 best, nearest = node, away
-        return self.way_to(best) if best else None
+        return self.path_to(best) if best else None
 
 
 class _Rows:
@@ -145,7 +150,7 @@ class _Rows:
         return self._all[: self._count]
 
     def append(self, row: Array | float) -> None:
-        """Add one."""
+        """Add a row."""
         if self._count == len(self._all):
             self._all = np.concatenate([self._all, np.empty_like(self._all)])
         self._all[self._count] = row

@@ -1,1 +1,1 @@
-"""Plans executed: the arm, the table and the puck or the pedestals in MuJoCo, under a controller that knows less."""
+"""Execution of plans in MuJoCo: the arm, its environment, and a controller with a nominal model."""

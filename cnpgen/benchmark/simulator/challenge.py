@@ -1,7 +1,7 @@
-"""Execution in a user's clone of the Air Hockey Challenge's environment (2023): another arm, table and controller.
+"""Execution in a clone of the Air Hockey Challenge's environment (2023), with its own arm, table and controller.
 
-What is used of it are its classes for one iiwa at the table and for its controller of positions at 1 kHz, which takes
-20 ticks of positions, velocities and accelerations at a time.
+Two of its classes are used: the environment of one iiwa at the table, and the position controller at 1 kHz, which
+receives 20 ticks of positions, velocities and accelerations at a time.
 """
 
 import importlib
@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.benchmark.simulator.outcome import Seen, puck_is_done
+from cnpgen.benchmark.simulator.outcome import TickRecord, puck_is_done
 from cnpgen.benchmark.simulator.plant import Plant, rated_torque
 from cnpgen.benchmark.simulator.reference import Reference
-from cnpgen.benchmark.simulator.simulator_scene import Scene
+from cnpgen.benchmark.simulator.simulator_scene import SimulatorScene
 from cnpgen.errors import MachineError, UsageError
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem
@@ -26,17 +26,17 @@ Array = NDArray[np.float64]
 
 MODULE = "air_hockey_challenge.environments.position_control_wrapper"
 JOINTS = tuple(f"joint_{number}" for number in range(1, 8))
-TICKS = 20  # of the controller in one step of the environment
+TICKS_PER_STEP = 20  # of the controller in one step of the environment
 
 
 def challenge_plant(folder: str | Path) -> Plant:
-    """Return the plant that executes in a clone of the environment.
+    """Return the plant of a clone of the environment.
 
     Args:
-        folder: The clone: the folder that holds the package ``air_hockey_challenge``.
+        folder: The clone, which contains the package ``air_hockey_challenge``.
 
     Raises:
-        UsageError: It is no such folder.
+        UsageError: The folder is not a clone.
         MachineError: The environment cannot be imported or is of another version.
     """
     place = Path(folder).resolve()
@@ -49,7 +49,7 @@ def challenge_plant(folder: str | Path) -> Plant:
 
 
 def check_challenge(problem: Problem, robot: Robot) -> None:
-    """Refuse problems that are not for an iiwa at the air-hockey table.
+    """Check that a problem is for an iiwa at the air-hockey table.
 
     Raises:
         UsageError: The problem is another one.
@@ -60,17 +60,17 @@ def check_challenge(problem: Problem, robot: Robot) -> None:
         raise UsageError(f"the Air Hockey Challenge has {needed}, {problem.name!r} is another problem")
 
 
-def execute_in_challenge(scene: Scene, reference: Reference, start_dq: Array) -> Seen:
-    """Execute one plan there.
+def execute_in_challenge(scene: SimulatorScene, reference: Reference, start_dq: Array) -> TickRecord:
+    """Execute one plan in the environment.
 
     Args:
-        scene: The world; of it the puck, and which joints are planned.
-        reference: What the controller is to follow; the robot begins at its first position.
+        scene: The world: its puck and the planned joints are used.
+        reference: Reference of the controller; the robot starts at its first position.
         start_dq: The robot's velocities at the start [rad/s], shape (n,).
 
     Raises:
-        UsageError: The environment gave up.
-        MachineError: It cannot be imported or is of another version.
+        UsageError: The environment aborted.
+        MachineError: The environment cannot be imported or has another version.
     """
     environment = _environment(scene.plant.environment)
     try:
@@ -78,34 +78,34 @@ def execute_in_challenge(scene: Scene, reference: Reference, start_dq: Array) ->
         tick, done = 0, False
         while not done:
             done = environment.advance(_action(scene, reference, tick))
-            tick += TICKS
+            tick += TICKS_PER_STEP
             done = tick >= reference.ticks and (done or puck_is_done(reference, tick, *environment.puck_state()))
         environment.record(np.zeros(len(JOINTS)))
-    except RuntimeError as error:  # so it ends where MuJoCo warns of something
-        raise UsageError(f"the Air Hockey Challenge's environment gave up: {error}") from error
+    except RuntimeError as error:  # the environment turns warnings of MuJoCo into errors
+        raise UsageError(f"the Air Hockey Challenge's environment aborted: {error}") from error
     except (AttributeError, KeyError, TypeError) as error:
-        raise MachineError(f"{scene.plant.environment} is of another version than cnpgen knows: {error}") from error
+        raise MachineError(f"{scene.plant.environment} has a version that cnpgen does not support: {error}") from error
     return _seen(scene, reference, environment)
 
 
-def _all_joints(scene: Scene, values: Array) -> Array:
-    """Fill joints that are not planned with zeros, shape (K, 7)."""
+def _all_joints(scene: SimulatorScene, values: Array) -> Array:
+    """Set joints without plan to zero, shape (K, 7)."""
     found = np.zeros((len(values), len(JOINTS)))
     found[:, [JOINTS.index(name) for name in scene.robot.joint_names]] = values
     return found
 
 
-def _action(scene: Scene, reference: Reference, tick: int) -> Array:
-    """Return the next 20 positions, velocities and accelerations, shape (20, 3, 7); after the last it holds still."""
-    wanted = np.arange(tick, tick + TICKS)
+def _action(scene: SimulatorScene, reference: Reference, tick: int) -> Array:
+    """Return the next 20 positions, velocities and accelerations, shape (20, 3, 7); then it stands still."""
+    wanted = np.arange(tick, tick + TICKS_PER_STEP)
     last = len(reference.q) - 1
     moving, at = (wanted <= last)[:, None], np.minimum(wanted, last)
     parts = (reference.q[at], reference.dq[at] * moving, reference.ddq[at] * moving)
     return np.stack([_all_joints(scene, part) for part in parts], axis=1)
 
 
-def _seen(scene: Scene, reference: Reference, environment: Any) -> Seen:
-    """Put together what the environment's recorder saw, in the robot's frame."""
+def _seen(scene: SimulatorScene, reference: Reference, environment: Any) -> TickRecord:
+    """Return the recorded states in the robot's frame."""
     import pinocchio as pin
 
     robot, planned = scene.robot, [JOINTS.index(name) for name in scene.robot.joint_names]
@@ -117,36 +117,36 @@ def _seen(scene: Scene, reference: Reference, environment: Any) -> Seen:
     wanted = reference.q[np.minimum(np.arange(len(q)), len(reference.q) - 1)]
     use = torque[:, planned] / rated_torque(scene.problem, robot)
     tip, rotation = np.array([tip.translation for tip in tips]), np.array([tip.rotation for tip in tips])
-    return Seen(q, tip, rotation, wanted, use, puck, velocity)
+    return TickRecord(q, tip, rotation, wanted, use, puck, velocity)
 
 
 @lru_cache(maxsize=1)
 def _environment(folder: str) -> Any:
-    """Import the environment and make one that starts where it is told and records what it does."""
+    """Import the environment and construct one with a given start and a recorder."""
     if folder not in sys.path:
         sys.path.insert(0, folder)
     try:
         control = importlib.import_module(MODULE)
         iiwas = importlib.import_module("air_hockey_challenge.environments.iiwas")
     except (ImportError, OSError, SyntaxError) as error:
-        raise MachineError(f"{folder} cannot be imported ({error}): install what its README asks for") from error
+        raise MachineError(f"{folder} cannot be imported ({error}): install the requirements in its README") from error
     if not Path(str(control.__file__)).resolve().is_relative_to(folder):
-        raise MachineError(f"{folder} is hidden by another one that is installed: {control.__file__}")
+        raise MachineError(f"{folder} is hidden by an installed copy: {control.__file__}")
     try:
         kind = type("Recorded", (_Recorder, control.PositionControlIIWA, iiwas.AirHockeySingle), {})
         return kind(interpolation_order=None)
     except (AttributeError, KeyError, TypeError) as error:
-        raise MachineError(f"{folder} is of another version than cnpgen knows: {error}") from error
+        raise MachineError(f"{folder} has a version that cnpgen does not support: {error}") from error
 
 
 class _Recorder:
-    """What is laid over the environment's own classes: where it starts, and what was seen at every tick."""
+    """Mix-in for the environment's classes: sets the start and records every tick."""
 
     seen: list[tuple[Array, ...]]
     _start: Array
 
     def begin(self: Any, q: Array, dq: Array, puck: Array) -> None:
-        """Begin anew: positions and velocities of the arm, shape (7,), and a puck that lies still [m], shape (2,)."""
+        """Reset to positions and velocities of the arm, shape (7,), and a resting puck [m], shape (2,)."""
         self.seen, self._start = [], dq
         self._frame = np.array(self.env_info["robot"]["base_frame"][0])
         self._puck = (self._frame @ [*puck, 0.0, 1.0])[:2]
@@ -154,7 +154,7 @@ class _Recorder:
         self.reset()
 
     def setup(self: Any, obs: Any) -> None:
-        """As the environment calls it in ``reset``."""
+        """Set puck and velocities; called by the environment in ``reset``."""
         for axis, value in zip("xy", self._puck.tolist(), strict=True):
             self._write_data(f"puck_{axis}_pos", value)
         for name, speed in zip(JOINTS, self._start.tolist(), strict=True):
@@ -162,27 +162,27 @@ class _Recorder:
         super().setup(obs)  # type: ignore[misc]
 
     def advance(self: Any, action: Array) -> bool:
-        """Take one step; return whether the environment says that it is over."""
+        """Take one step; return whether the episode is over."""
         _, _, over, _ = self.step(action)
         return bool(over)
 
     def reward(self, *_: Any) -> float:
-        """Nothing is rewarded."""
+        """Return 0; rewards are unused."""
         return 0.0
 
     def puck_state(self: Any) -> tuple[float, float]:
-        """Return where the puck is along the table [m] and how fast it is [m/s]."""
+        """Return the position of the puck along the table [m] and its speed [m/s]."""
         puck, velocity = self._puck_seen()
         return float(puck[0]), float(np.linalg.norm(velocity))
 
     def _compute_action(self: Any, obs: Any, action: Any) -> Any:
-        """As the environment calls it at every tick."""
+        """Record the torque; called by the environment at every tick."""
         torque = super()._compute_action(obs, action)  # type: ignore[misc]
         self.record(np.array(torque))
         return torque
 
     def record(self: Any, torque: Array) -> None:
-        """Record what there is, and the torques that take effect now [N m], shape (7,)."""
+        """Record the state and the torques that take effect [N m], shape (7,)."""
         q = np.array([float(np.squeeze(self._data.joint(f"iiwa_1/{name}").qpos)) for name in JOINTS])
         self.seen.append((q, torque, *self._puck_seen()))
 

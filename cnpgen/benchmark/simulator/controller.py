@@ -1,4 +1,4 @@
-"""The controller: inverse dynamics of the robot as the URDF has it, and gains on what is left of the error."""
+"""Controller: inverse dynamics of the URDF's robot (computed torque) with feedback of the error."""
 
 from collections import deque
 
@@ -11,19 +11,19 @@ from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
 
-GAIN = 80.0  # rad/s: where an error that is left alone would be gone after 1/80 s
+GAIN_RAD_S = 80.0  # natural frequency of the closed loop; an error decays within about 1/80 s
 
 
 class Controller:
     """Computed torque, within the rated torques: ``M(q) (ddq* + w^2 (q* - q) + 2 w (dq* - dq)) + h(q, dq)``.
 
-    w is ``GAIN``. Where a torque would be outside its limits, the acceleration is made smaller and keeps its direction:
-    what holds the arm up comes first. It knows neither friction nor damping, nor what a plant has besides.
+    w is ``GAIN_RAD_S``. If a torque would exceed its limit, the acceleration is scaled down in its direction, and the
+    holding torque keeps priority. The controller models no friction, no damping and no other deviation of a plant.
 
     Args:
-        problem: What the torques are rated at.
-        robot: The robot as the controller believes it to be.
-        plant: The robot as it is: how late torques take effect.
+        problem: The problem, which defines the rated torques.
+        robot: Nominal robot.
+        plant: The simulated robot, for its delay.
 
     Attributes:
         limit: The rated torques [N m], shape (n,).
@@ -46,11 +46,11 @@ class Controller:
         """
         import pinocchio as pin
 
-        towards = wanted[2] + GAIN**2 * (wanted[0] - q) + 2 * GAIN * (wanted[1] - dq)
+        acceleration = wanted[2] + GAIN_RAD_S**2 * (wanted[0] - q) + 2 * GAIN_RAD_S * (wanted[1] - dq)
         holding = np.clip(pin.rnea(self._model, self._data, q, dq, np.zeros_like(q)), -self.limit, self.limit)
-        pushing = pin.rnea(self._model, self._data, q, dq, towards) - holding
+        pushing = pin.rnea(self._model, self._data, q, dq, acceleration) - holding
         with np.errstate(divide="ignore", invalid="ignore"):
             share = np.nanmin((self.limit - np.sign(pushing) * holding) / np.abs(pushing))
         torque = holding + min(share, 1.0) * pushing
-        self._waiting.extend([torque] * (self._delay + 1 - len(self._waiting)))  # at the first tick it holds already
+        self._waiting.extend([torque] * (self._delay + 1 - len(self._waiting)))  # the first tick already holds the arm
         return self._waiting.popleft()

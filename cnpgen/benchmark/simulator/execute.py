@@ -1,4 +1,4 @@
-"""One plan executed: the world stepped under the controller, what was seen at every tick, and what came of it."""
+"""Execution of one plan: simulation under the controller, with a record of every tick and the result."""
 
 import os
 import sys
@@ -12,23 +12,23 @@ from numpy.typing import NDArray
 from cnpgen.benchmark.simulator.challenge import execute_in_challenge
 from cnpgen.benchmark.simulator.controller import Controller
 from cnpgen.benchmark.simulator.executed import Executed
-from cnpgen.benchmark.simulator.outcome import Seen, outcome_of, puck_is_done
+from cnpgen.benchmark.simulator.outcome import TickRecord, outcome_of, puck_is_done
 from cnpgen.benchmark.simulator.reference import TICK, Reference
-from cnpgen.benchmark.simulator.simulator_scene import STEP, Scene, scene_xml
+from cnpgen.benchmark.simulator.simulator_scene import SIMULATION_STEP_S, SimulatorScene, scene_xml
 from cnpgen.errors import MachineError, RecipeError
 
 Array = NDArray[np.float64]
 
-SETTLE = 0.2  # s: how long is watched after a motion without a puck
+OBSERVATION_TIME_S = 0.2  # after a motion without a puck
 
 
 @dataclass(frozen=True)
 class Execution:
-    """What happened, tick by tick, and what came of it.
+    """Record of an execution and its result.
 
     Attributes:
-        executed: What came of it.
-        states: Positions of all joints of the simulation, the puck's among them, shape (K, nq): for pictures.
+        executed: The result.
+        states: Positions of all simulated joints, including the puck, shape (K, nq), for rendering.
         tip: Positions of the tip [m], shape (K, 3).
         puck: Positions of the puck over the table [m], shape (K, 2); nan without one.
     """
@@ -43,10 +43,10 @@ def load_mujoco() -> Any:
     """Import MuJoCo.
 
     Raises:
-        MachineError: It is not installed, or broken.
+        MachineError: MuJoCo is not installed or broken.
     """
     if sys.platform == "linux" and not os.environ.get("DISPLAY"):
-        os.environ.setdefault("MUJOCO_GL", "egl")  # pictures without a screen; it is read when MuJoCo is imported
+        os.environ.setdefault("MUJOCO_GL", "egl")  # renders without a screen; read when MuJoCo is imported
     try:
         import mujoco
     except (ImportError, OSError, AttributeError) as error:
@@ -54,11 +54,11 @@ def load_mujoco() -> Any:
     return mujoco
 
 
-def compile_scene(scene: Scene) -> Any:
+def compile_scene(scene: SimulatorScene) -> Any:
     """Build MuJoCo's model of a scene.
 
     Raises:
-        RecipeError: MuJoCo refuses it: inertias of the URDF that no body can have, for example.
+        RecipeError: MuJoCo refuses the model, for example impossible inertias.
         MachineError: MuJoCo is missing.
     """
     try:
@@ -72,18 +72,17 @@ def _compiled(text: str) -> Any:
     return load_mujoco().MjModel.from_xml_string(text)
 
 
-def execute(scene: Scene, reference: Reference, goal_xyz: Array, start_dq: Array | None = None) -> Execution:
+def execute(scene: SimulatorScene, reference: Reference, goal_xyz: Array, start_dq: Array | None = None) -> Execution:
     """Execute one plan.
 
     Args:
         scene: The world.
-        reference: What the controller is to follow; the robot begins at its first position.
-        goal_xyz: Where the tip must be at the end of the plan [m], shape (3,).
-        start_dq: The robot's velocities at the start [rad/s], shape (n,); those of the reference by default.
+        reference: Reference of the controller; the robot starts at its first position.
+        goal_xyz: Tip position at the end of the plan [m], shape (3,).
+        start_dq: Velocities at the start [rad/s], shape (n,); default from the reference.
 
     Raises:
-        RecipeError: As ``compile_scene`` does.
-        MachineError: Likewise.
+        RecipeError, MachineError: As ``compile_scene``.
     """
     begins = reference.dq[0] if start_dq is None else start_dq
     if scene.plant.environment:
@@ -95,9 +94,9 @@ def execute(scene: Scene, reference: Reference, goal_xyz: Array, start_dq: Array
 
 
 class _Run:
-    """A world while it is stepped."""
+    """Simulation of one execution."""
 
-    def __init__(self, scene: Scene, reference: Reference) -> None:
+    def __init__(self, scene: SimulatorScene, reference: Reference) -> None:
         self._mujoco = load_mujoco()
         self._scene, self._reference = scene, reference
         self._model = compile_scene(scene)
@@ -106,10 +105,10 @@ class _Run:
         self._n = scene.robot.n
         self._tip = self._model.site("tip").id
         self._rows: list[tuple[Array, ...]] = []
-        self._deepest = 0.0  # m
+        self._max_penetration = 0.0  # m
 
-    def seen(self, start_dq: Array) -> Seen:
-        """Run to the end, and return what was seen."""
+    def seen(self, start_dq: Array) -> TickRecord:
+        """Simulate to the end and return the record."""
         data, n = self._data, self._n
         data.qpos[:n], data.qvel[:n] = self._reference.q[0], start_dq
         if self._scene.puck is not None:
@@ -124,10 +123,10 @@ class _Run:
         if self._scene.puck is None:
             puck = velocity = np.full((len(states), 2), np.nan)
         use = torque / self._control.limit
-        return Seen(states[:, :n], tip, rotation, wanted, use, puck, velocity, self._deepest)
+        return TickRecord(states[:, :n], tip, rotation, wanted, use, puck, velocity, self._max_penetration)
 
     def _step(self, tick: int) -> None:
-        """See what there is, decide on a torque, and let a tick pass."""
+        """Record the state, compute the torque, and simulate one tick."""
         data, n, last = self._data, self._n, len(self._reference.q) - 1
         reference, k = self._reference, min(tick, last)
         still = 0.0 if tick > last else 1.0
@@ -136,17 +135,17 @@ class _Run:
         tip, rotation = data.site_xpos[self._tip].copy(), data.site_xmat[self._tip].reshape(3, 3).copy()
         self._rows.append((data.qpos.copy(), tip, rotation, wanted[0], torque, data.qvel.copy()))
         data.qfrc_applied[:n] = torque
-        self._mujoco.mj_step(self._model, data, round(TICK / STEP))
+        self._mujoco.mj_step(self._model, data, round(TICK / SIMULATION_STEP_S))
         if self._scene.puck is None and data.ncon:
-            self._deepest = max(self._deepest, float(-data.contact.dist.min()))
+            self._max_penetration = max(self._max_penetration, float(-data.contact.dist.min()))
 
     def _is_over(self, tick: int) -> bool:
-        """Whether nothing can change the result any more."""
+        """Return whether the result is final."""
         reference, data, n = self._reference, self._data, self._n
         if not np.isfinite(data.qpos).all():
             return True
         if tick < reference.ticks:
             return False
         if self._scene.puck is None:
-            return tick >= reference.ticks + round(SETTLE / TICK)
+            return tick >= reference.ticks + round(OBSERVATION_TIME_S / TICK)
         return puck_is_done(reference, tick, float(data.qpos[n]), float(np.linalg.norm(data.qvel[n:])))

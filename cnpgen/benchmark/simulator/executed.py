@@ -1,4 +1,4 @@
-"""What came of executing a plan."""
+"""Result of the execution of a plan."""
 
 import math
 from dataclasses import dataclass
@@ -7,21 +7,21 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Executed:
-    """What a simulated robot did with one plan; what does not apply is None or nan.
+    """Result of the execution of one plan; inapplicable values are None or nan.
 
     Attributes:
         finished: Whether the tip was within 1 cm of the goal when the plan ended.
-        touched_early: Whether the mallet met the puck with more than 3 cm of the plan's way still to go.
-        hit: Whether the mallet met the puck at all.
+        touched_early: Whether the mallet touched the puck with more than 3 cm of the path left.
+        hit: Whether the mallet touched the puck.
         scored: Whether the puck went into the opponent's goal.
-        collided: Whether the object or a link entered an obstacle by more than 1 mm, outside what is legal.
-        hit_time: When mallet and puck met first [s].
-        puck_speed: The puck's speed after that [m/s].
-        z_error: Integral of |z - height of the table| over the plan's time, as executed [m s].
-        vertical_error: Integral of |roll| + |pitch| of the tip frame, likewise [rad s].
-        tracking_error: Integral of the sum over joints of |q - q planned|, likewise [rad s].
-        torque_use: Largest torque as a share of the rated one; 1 is a motor that saturated.
-        failure: Why nothing was executed, or empty.
+        collided: Whether object or links penetrated an obstacle by more than 1 mm outside legal contact.
+        hit_time: Time of the first contact of mallet and puck [s].
+        puck_speed: Speed of the puck after the contact [m/s].
+        z_error: Integral of |z - height of the table| over the executed plan [m s].
+        vertical_error: Integral of |roll| + |pitch| of the tip frame over the motion [rad s].
+        tracking_error: Integral of the sum over joints of |q - q planned| over the motion [rad s].
+        torque_use: Maximum torque as a fraction of the rated torque; 1 is a saturated motor.
+        failure: Reason why nothing was executed, or empty.
     """
 
     finished: bool = False
@@ -39,7 +39,7 @@ class Executed:
 
     @property
     def success(self) -> bool:
-        """Whether the task was done: a goal without touching the puck early, or the goal reached without collision."""
+        """Whether the task succeeded: scored without early contact, or goal reached without collision."""
         if self.failure:
             return False
         if self.scored is not None:
@@ -47,7 +47,7 @@ class Executed:
         return self.finished and not self.collided
 
     def to_dict(self) -> dict[str, Any]:
-        """Return it for JSON in the units of the paper's tables, without what does not apply."""
+        """Return the result for JSON in the units of the paper's tables, without inapplicable values."""
         values = {
             **{name: getattr(self, name) for name in ("finished", "touched_early", "hit", "scored", "collided")},
             "success": self.success,

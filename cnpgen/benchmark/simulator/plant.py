@@ -1,8 +1,7 @@
-"""What the simulated robot has that its controller does not know: friction, other masses, a delay.
+"""Plants: deviations of the simulated robot from the nominal model, such as friction, other masses and a delay.
 
-Dry and viscous friction of the iiwa's joints are those of the Air Hockey Challenge (2023), whose simulation of the
-same arm comes from the laboratory of the real one (docs/references.md). Joints of other names get a share of their
-rated torque.
+Dry and viscous friction of the iiwa's joints are those of the Air Hockey Challenge (2023), which simulates the same
+arm (docs/references.md). The friction of other joints is a fraction of their rated torque.
 """
 
 from dataclasses import dataclass
@@ -19,7 +18,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Friction:
-    """What brakes one joint.
+    """Friction of one joint.
 
     Attributes:
         dry: Dry friction [N m].
@@ -39,7 +38,7 @@ IIWA = {
     "joint_6": Friction(0.196149, 0.1),
     "joint_7": Friction(0.299238, 0.1),
 }
-DRY, VISCOUS = 2e-3, 1e-3  # of the rated torque, and of it per rad/s: of joints that no figures are known of
+DRY_FRACTION, VISCOUS_FRACTION = 2e-3, 1e-3  # of the rated torque, the second per rad/s; for other joints
 
 
 @dataclass(frozen=True)
@@ -48,10 +47,10 @@ class Plant:
 
     Attributes:
         name: Its name.
-        title: What is different from what the controller believes, in a line.
-        mass: Its masses and inertias are so many times those of the URDF.
-        delay: Ticks of the controller, of 1 ms, after which a torque takes effect.
-        environment: The folder of somebody else's environment that executes; empty for cnpgen's own.
+        title: Deviations from the nominal model, in one line.
+        mass: Factor of masses and inertias.
+        delay: Delay of torques in ticks of the controller, 1 ms each.
+        environment: Folder of an external environment; empty for cnpgen's own simulation.
     """
 
     name: str
@@ -64,7 +63,7 @@ class Plant:
 PLANTS = {
     plant.name: plant
     for plant in (
-        Plant("nominal", "friction and damping that the controller does not know"),
+        Plant("nominal", "friction and damping that the controller does not model"),
         Plant("heavier", "the same with 10 % more mass and inertia", mass=1.1),
         Plant("delayed", "the same with torques that take effect 1 ms late", delay=1),
     )
@@ -75,7 +74,7 @@ def as_plant(plant: Plant | str) -> Plant:
     """Return a plant by its name.
 
     Raises:
-        UsageError: There is none of this name.
+        UsageError: The name is unknown.
     """
     if isinstance(plant, Plant):
         return plant
@@ -85,10 +84,12 @@ def as_plant(plant: Plant | str) -> Plant:
 
 
 def joint_friction(problem: Problem, robot: Robot) -> tuple[Friction, ...]:
-    """Return the friction of the planned joints: the iiwa's, or some by the rated torque."""
+    """Return the friction of the planned joints: that of the iiwa, or a fraction of the rated torque."""
     if set(robot.joint_names) <= IIWA.keys():
         return tuple(IIWA[name] for name in robot.joint_names)
-    return tuple(Friction(DRY * rated, VISCOUS * rated) for rated in rated_torque(problem, robot).tolist())
+    return tuple(
+        Friction(DRY_FRACTION * rated, VISCOUS_FRACTION * rated) for rated in rated_torque(problem, robot).tolist()
+    )
 
 
 def rated_torque(problem: Problem, robot: Robot) -> Array:

@@ -1,4 +1,4 @@
-"""What the controller is to follow: the states of a plan at its ticks, and a stop where the plan ends in motion."""
+"""Reference of the controller: the states of a plan at its ticks, and a stop if the plan ends in motion."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,18 +14,18 @@ StatesAt = Callable[[Array], tuple[Array, Array, Array]]
 """Positions [rad], velocities [rad/s] and accelerations [rad/s^2] at times [s] of shape (K,), shape (K, n) each."""
 
 TICK = 1e-3  # s: period of the controller
-LONGEST = 60.0  # s: plans that take longer are not executed
+MAX_EXECUTED_DURATION_S = 60.0
 
 
 @dataclass(frozen=True)
 class Reference:
-    """States to follow at the ticks of the controller; at ticks after the last one, the robot holds still.
+    """States to follow at the ticks of the controller; after the last tick, the robot stands still.
 
     Attributes:
         q: Joint positions [rad], shape (K, n).
         dq: Joint velocities [rad/s], shape (K, n).
         ddq: Joint accelerations [rad/s^2], shape (K, n).
-        duration: When the plan ends [s]; what follows is the stop.
+        duration: Duration of the plan [s]; the stop follows.
     """
 
     q: Array
@@ -35,37 +35,40 @@ class Reference:
 
     @property
     def ticks(self) -> int:
-        """Number of the ticks within the plan, its end counted."""
+        """Number of ticks within the plan, including its end."""
         return int(np.ceil(self.duration / TICK)) + 1
 
 
 def states_of(motion: Motion) -> StatesAt:
-    """Return what evaluates one motion in time."""
+    """Return the function that evaluates one motion in time."""
 
     def states(t: Array) -> tuple[Array, Array, Array]:
-        found = motion.at_times(t[None])
-        return found.q[0], found.dq[0], found.ddq[0]
+        values = motion.at_times(t[None])
+        return values.q[0], values.dq[0], values.ddq[0]
 
     return states
 
 
 def make_reference(states: StatesAt, duration: float, *, acceleration_limit: Array) -> Reference:
-    """Sample a trajectory that lasts ``duration`` and add a stop: each joint is scaled in time evenly, all equally long.
+    """Sample a trajectory and add a stop, in which all joints decelerate uniformly in the same time.
 
     Args:
         states: The trajectory.
-        duration: How long it lasts [s].
-        acceleration_limit: How fast joints are stopped after a plan that ends in motion [rad/s^2], shape (n,).
+        duration: Duration of the trajectory [s].
+        acceleration_limit: Deceleration limit of the stop [rad/s^2], shape (n,).
 
     Raises:
-        UsageError: The plan never arrives, or it or the stop takes longer than ``LONGEST``.
+        UsageError: The plan never arrives, or plan or stop exceed ``MAX_EXECUTED_DURATION_S``.
     """
-    if not 0 < duration <= LONGEST:
-        raise UsageError(f"a plan of {duration:g} s cannot be executed: expected more than 0 and at most {LONGEST:g} s")
+    if not 0 < duration <= MAX_EXECUTED_DURATION_S:
+        raise UsageError(
+            f"a plan of {duration:g} s cannot be executed,"
+            f" expected more than 0 and at most {MAX_EXECUTED_DURATION_S:g} s"
+        )
     during = states(np.arange(0.0, duration, TICK))
     q, dq, _ = (values[0] for values in states(np.array([duration])))
     stop = max(float(np.max(np.abs(dq) / acceleration_limit)), TICK)
-    if not stop <= LONGEST:
+    if not stop <= MAX_EXECUTED_DURATION_S:
         raise UsageError(f"a plan after which the arm needs {stop:g} s to stop cannot be executed")
     first = len(during[0]) * TICK - duration  # the first tick after the end
     after = np.minimum(np.append(np.arange(first, stop, TICK), stop), stop)[:, None]

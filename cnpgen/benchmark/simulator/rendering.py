@@ -1,4 +1,4 @@
-"""Pictures and films of executed plans, drawn by MuJoCo without a screen."""
+"""Images and films of executed plans, rendered by MuJoCo without a screen."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,31 +11,31 @@ from numpy.typing import NDArray
 from cnpgen.benchmark.simulator import hockey
 from cnpgen.benchmark.simulator.execute import Execution, compile_scene, load_mujoco
 from cnpgen.benchmark.simulator.reference import TICK
-from cnpgen.benchmark.simulator.simulator_scene import Scene
+from cnpgen.benchmark.simulator.simulator_scene import SimulatorScene
 from cnpgen.errors import MachineError
 from cnpgen.store.files.atomic import machine_error
 
-WIDTH, HEIGHT = 640, 480
-FRAMES = 25  # per second
-SLOWER = 4  # films show motions so many times slower than they are
-AFTER = 1.0  # s: how much of what comes after the plan a film shows
-HOCKEY_VIEW = (1.3, 0.0, 0.1, 2.6, 150.0, -30.0)  # where the camera looks [m], distance [m], azimuth, elevation [deg]
+IMAGE_WIDTH, IMAGE_HEIGHT = 640, 480
+FILM_FRAMES_PER_S = 25
+SLOW_MOTION_FACTOR = 4
+FILM_TAIL_S = 1.0  # shown after the plan
+HOCKEY_VIEW = (1.3, 0.0, 0.1, 2.6, 150.0, -30.0)  # target of the camera [m], distance [m], azimuth and elevation [deg]
 OBJECT_VIEW = (0.3, 0.0, 0.35, 2.4, 180.0, -20.0)
 
 Image = NDArray[np.uint8]
 
 
-def save_picture(path: Path, scene: Scene, execution: Execution, tick: int) -> None:
-    """Draw the world as it was at a tick.
+def save_picture(path: Path, scene: SimulatorScene, execution: Execution, tick: int) -> None:
+    """Render the world at a tick.
 
     Args:
-        path: Picture file, ``.png``; replaced if it exists.
-        scene: What was simulated.
-        execution: What happened.
-        tick: When.
+        path: Image file, ``.png``; replaced if it exists.
+        scene: Simulated world.
+        execution: The execution.
+        tick: The tick.
 
     Raises:
-        MachineError: This machine has no way to draw, or the file cannot be written.
+        MachineError: This machine cannot render, or the file cannot be written.
     """
     imageio = _imageio()
     with _drawing(scene) as draw:
@@ -46,36 +46,40 @@ def save_picture(path: Path, scene: Scene, execution: Execution, tick: int) -> N
         raise machine_error("write", path, error) from error
 
 
-def save_film(path: Path, scene: Scene, execution: Execution, ticks: int, *, most: int | None = None) -> None:
-    """Draw a film of a plan and of the second after it, four times slower than it was.
+def save_film(
+    path: Path, scene: SimulatorScene, execution: Execution, ticks: int, *, max_frames: int | None = None
+) -> None:
+    """Render a film of a plan and of the second after it, in slow motion.
 
     Args:
         path: Film file, ``.mp4`` or ``.gif``; replaced if it exists.
-        scene: What was simulated.
-        execution: What happened.
-        ticks: How long the plan is.
-        most: How many pictures it may have; a longer motion is shown faster. As many as it takes by default.
+        scene: Simulated world.
+        execution: The execution.
+        ticks: Duration of the plan in ticks.
+        max_frames: Maximum number of frames; longer motions are shown faster. Unlimited by default.
 
     Raises:
-        MachineError: As ``save_picture`` does, or ffmpeg is missing.
+        MachineError: As ``save_picture``, or ffmpeg is missing.
     """
     imageio = _imageio()
-    last = min(ticks + round(AFTER / TICK), len(execution.states))
-    step = round(1 / (FRAMES * SLOWER * TICK))
-    chosen = range(0, last, step if most is None else max(step, -(-last // most)))
+    last = min(ticks + round(FILM_TAIL_S / TICK), len(execution.states))
+    step = round(1 / (FILM_FRAMES_PER_S * SLOW_MOTION_FACTOR * TICK))
+    chosen = range(0, last, step if max_frames is None else max(step, -(-last // max_frames)))
     with _drawing(scene) as draw:
         images = [draw(execution, tick) for tick in chosen]
     options = (
-        {"duration": 1000 / FRAMES, "loop": 0} if path.suffix == ".gif" else {"fps": FRAMES, "macro_block_size": 1}
+        {"duration": 1000 / FILM_FRAMES_PER_S, "loop": 0}
+        if path.suffix == ".gif"
+        else {"fps": FILM_FRAMES_PER_S, "macro_block_size": 1}
     )
     try:
         imageio.mimsave(path, images, **options)
     except OSError as error:
         raise machine_error("write", path, error) from error
-    except (ImportError, RuntimeError, ValueError) as error:  # so imageio says that it has no ffmpeg
+    except (ImportError, RuntimeError, ValueError) as error:  # raised by imageio without ffmpeg
         text = " ".join(str(error).split())
         raise MachineError(
-            f"no film {path.suffix} can be made here ({text:.200}): pip install 'imageio[ffmpeg]'"
+            f"{path.suffix} films cannot be written here ({text:.200}): pip install 'imageio[ffmpeg]'"
         ) from error
 
 
@@ -88,12 +92,12 @@ def _imageio() -> Any:
 
 
 @contextmanager
-def _drawing(scene: Scene) -> Iterator[Any]:
-    """Open what draws a tick of an execution."""
+def _drawing(scene: SimulatorScene) -> Iterator[Any]:
+    """Open a renderer of the ticks of an execution."""
     mujoco, model = load_mujoco(), compile_scene(scene)
     try:
-        renderer = mujoco.Renderer(model, HEIGHT, WIDTH)
-    except Exception as error:  # MuJoCo, EGL and OSMesa each have their own ways to fail
+        renderer = mujoco.Renderer(model, IMAGE_HEIGHT, IMAGE_WIDTH)
+    except Exception as error:  # MuJoCo, EGL and OSMesa raise different exceptions
         text = " ".join(str(error).split())
         raise MachineError(
             f"this machine cannot draw without a screen ({text}): install the libraries of EGL, or of OSMesa with"

@@ -1,4 +1,4 @@
-"""Whole sets of plans executed, in as many processes as are wanted."""
+"""Execution of sets of plans in several processes."""
 
 from collections.abc import Callable
 from contextlib import closing
@@ -16,7 +16,7 @@ from cnpgen.benchmark.simulator.executed import Executed
 from cnpgen.benchmark.simulator.hockey import puck_of
 from cnpgen.benchmark.simulator.plant import Plant, as_plant
 from cnpgen.benchmark.simulator.reference import Reference, StatesAt, make_reference, states_of
-from cnpgen.benchmark.simulator.simulator_scene import Scene
+from cnpgen.benchmark.simulator.simulator_scene import SimulatorScene
 from cnpgen.errors import UsageError, counted
 from cnpgen.machine.workers import distribute, worker_count
 from cnpgen.plans.plans import Plans, check_plans_type
@@ -30,16 +30,16 @@ Array = NDArray[np.float64]
 FORMAT = "cnpgen-simulation"
 SIMULATION_VERSION = 1
 FLAGS = ("success", "finished", "hit", "scored", "touched_early", "collided")
-ALONE = 20  # plans up to which a second process is not worth its start
+MAX_PLANS_OF_ONE_PROCESS = 20  # a second process pays off for more plans
 
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """What came of executing N plans.
+    """Results of the execution of N plans.
 
     Attributes:
         plans: The plans.
-        executed: What came of each, in the same order.
+        executed: Result of each plan, in the same order.
         plant: The robot that executed them.
     """
 
@@ -53,7 +53,7 @@ class Simulation:
         return f"<{plans} executed by the {self.plant.name} plant, {succeeded:,} with success>"
 
     def summary(self) -> dict[str, Any]:
-        """Return for JSON what is said of all plans together."""
+        """Return the summary of all plans for JSON."""
         rows = [each.to_dict() for each in self.executed]
         counts = {name: sum(row[name] for row in rows if name in row) for name in FLAGS if any(name in r for r in rows)}
         names = {name: None for row in rows for name, value in row.items() if isinstance(value, float)}
@@ -77,21 +77,21 @@ def simulate_plans(
     workers: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Simulation:
-    """Execute plans in MuJoCo: computed torque at 1 kHz on a robot with friction that its controller does not know.
+    """Execute plans in MuJoCo: computed torque at 1 kHz on a robot with friction that its controller does not model.
 
-    On a table, a plan that ends in motion is a hit: the puck lies 7 cm ahead of where it ends. Every plan is executed
-    for itself: neither the others nor the number of processes change what comes of it.
+    On a table, a plan that ends in motion is a hit, and the puck lies 7 cm ahead of its end. Plans are executed
+    independently of each other and of the number of processes.
 
     Args:
         plans: The plans.
         plant: The robot, or its name: "nominal", "heavier" or "delayed".
-        environment: A clone of the Air Hockey Challenge's environment that executes in the place of ``plant``.
-        workers: Processes; default one per available core, or one where a second would not pay.
-        progress: Called with the number of plans that were executed since the last call.
+        environment: A clone of the Air Hockey Challenge's environment, which replaces ``plant``.
+        workers: Processes; default one per available core, or one for few plans.
+        progress: Called with the number of plans executed since the last call.
 
     Raises:
-        UsageError: There is no such plant, there are fewer than one worker, or ``environment`` is no such clone or
-            cannot execute such plans.
+        UsageError: The plant is unknown, there is less than one worker, or ``environment`` is not a clone or
+            does not support the plans.
         RecipeError: MuJoCo cannot simulate the robot, or the problem needs a plug-in that is not installed.
         MachineError: MuJoCo is missing, the environment cannot be imported, or a worker died.
     """
@@ -101,7 +101,9 @@ def simulate_plans(
     if environment is not None:
         plant = challenge_plant(environment)
         check_challenge(*open_problem(plans.problem))
-    count = worker_count(1 if workers is None and len(plans) <= ALONE else workers, max(len(plans), 1))
+    count = worker_count(
+        1 if workers is None and len(plans) <= MAX_PLANS_OF_ONE_PROCESS else workers, max(len(plans), 1)
+    )
     executed: list[Executed] = []
     with closing(distribute(partial(_simulate, plant=plant), iter(plans), count, ordered=True)) as results:
         for each in results:
@@ -118,7 +120,7 @@ def _simulate(plan: Plans, *, plant: Plant) -> Executed:
         return Executed(failure=str(error))
 
 
-def execute_plan(plan: Plans, plant: Plant) -> tuple[Scene, Reference, Execution]:
+def execute_plan(plan: Plans, plant: Plant) -> tuple[SimulatorScene, Reference, Execution]:
     """Execute one plan.
 
     Args:
@@ -126,44 +128,41 @@ def execute_plan(plan: Plans, plant: Plant) -> tuple[Scene, Reference, Execution
         plant: The robot.
 
     Returns:
-        The world, what the controller followed, and what happened.
+        The simulated world, the reference of the controller, and the execution.
 
     Raises:
-        UsageError: It cannot be executed: it is not finite, never arrives, or takes too long.
-        RecipeError: As ``simulate_plans`` does.
-        MachineError: Likewise.
+        UsageError: The plan cannot be executed: it is not finite, never arrives, or takes too long.
+        RecipeError, MachineError: As ``simulate_plans``.
     """
     return execute_states(plan, states_of(plan.motion), float(plan.duration[0]), plant)
 
 
 def execute_states(
     problem: Plans, states: StatesAt, duration: float, plant: Plant, start_dq: Array | None = None
-) -> tuple[Scene, Reference, Execution]:
+) -> tuple[SimulatorScene, Reference, Execution]:
     """Execute a trajectory for one boundary problem.
 
     Args:
         problem: One boundary problem, or a plan for it.
         states: The trajectory.
-        duration: How long it lasts [s].
+        duration: Duration [s].
         plant: The robot.
-        start_dq: As of ``execute``.
+        start_dq: See ``execute``.
 
     Returns:
-        As ``execute_plan`` does.
+        As ``execute_plan``.
 
     Raises:
-        UsageError: As ``execute_plan`` does.
-        RecipeError: Likewise.
-        MachineError: Likewise.
+        UsageError, RecipeError, MachineError: As ``execute_plan``.
     """
     _, robot = open_problem(problem.problem)
     reference = make_reference(states, duration, acceleration_limit=robot.acceleration_limit)
-    scene = scene_of(problem, plant)
+    scene = simulator_scene(problem, plant)
     return scene, reference, execute(scene, reference, problem.columns["goal_xyz"][0], start_dq)
 
 
-def scene_of(problem: Plans, plant: Plant) -> Scene:
-    """Set the scene of one boundary problem: obstacles, and the puck where its goal is a hit.
+def simulator_scene(problem: Plans, plant: Plant) -> SimulatorScene:
+    """Build the simulated world of one boundary problem: obstacles, and the puck if the goal is a hit.
 
     Args:
         problem: One boundary problem, or a plan for it.
@@ -171,7 +170,7 @@ def scene_of(problem: Plans, plant: Plant) -> Scene:
     """
     loaded, robot = open_problem(problem.problem)
     start_xyz, goal_xyz = problem.columns["start_xyz"][0], problem.columns["goal_xyz"][0]
-    scene = Scene(loaded, robot, plant, obstacle_poses_of(loaded, start_xyz, goal_xyz))
+    scene = SimulatorScene(loaded, robot, plant, obstacle_poses_of(loaded, start_xyz, goal_xyz))
     if scene.height is None:
         return scene
     velocity = _tip_velocity(robot, problem.boundary.goal_q[0], problem.boundary.goal_dq[0])
@@ -179,7 +178,7 @@ def scene_of(problem: Plans, plant: Plant) -> Scene:
 
 
 def _tip_velocity(robot: Robot, q: Array, dq: Array) -> Array:
-    """Velocity of the tip [m/s], shape (3,)."""
+    """Return the velocity of the tip [m/s], shape (3,)."""
     import pinocchio as pin
 
     data, frame = robot.model.createData(), robot.tip_frame

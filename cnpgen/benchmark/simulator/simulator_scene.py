@@ -1,10 +1,9 @@
-"""The simulated world as MuJoCo's own format: the arm from the problem's URDF, and what stands around it.
+"""Simulated world in MuJoCo's format (MJCF): the arm of the problem's URDF and its environment.
 
-Nothing collides unless it is named in a pair: the mallet with the puck, the puck with the bands, the held object and
-the arm's links with the obstacles. The table carries the puck, which moves in its plane only; it does not carry the
-mallet, so that every millimetre that the controller is off its height is seen.
+Only listed pairs collide: mallet and puck, puck and bands, held object or links and obstacles. The puck moves in the
+plane of the table only. The table does not support the mallet, so that errors of its height are visible.
 
-Joints and obstacles are called by their numbers: their own names are strangers' texts, and MJCF can name other files.
+Joints and obstacles have numbers as names, because their own names are untrusted input and MJCF can refer to files.
 """
 
 from collections.abc import Iterator
@@ -25,18 +24,18 @@ from cnpgen.robots.solid import Box, Solid, solids_of
 
 Array = NDArray[np.float64]
 
-STEP = 2.5e-4  # s: four to a tick of the controller
-LINK_RADIUS = 0.07  # m: of the iiwa's links, about; plans keep twice as far away
+SIMULATION_STEP_S = 2.5e-4  # four per tick of the controller
+LINK_RADIUS_M = 0.07  # of the iiwa's links, about half of the clearance of plans
 PUCK_INERTIA = 2.5e-6  # kg m^2; the puck does not turn
-SHORTEST = 1e-3  # m: links that are shorter have no shape; the first one, which only turns, collides with nothing
-DEEP = 5.0  # m: how far obstacles reach down that have no lower end
-_SOFT = 'condim="3" solref="0.004 1" solimp="0.95 0.99 0.001"'  # object and pedestals press, they do not bounce
+MIN_LINK_LENGTH_M = 1e-3  # shorter links have no shape; the first link collides with nothing
+UNBOUNDED_DEPTH_M = 5.0  # depth of obstacles without lower end
+_SOFT = 'condim="3" solref="0.004 1" solimp="0.95 0.99 0.001"'  # contact of object and pedestals without bouncing
 _RIMS = {  # the bands and the four halves of both goals' sides: centre and half sizes over the table [m]
     "left": (hockey.HOME + hockey.LENGTH / 2, hockey.WIDTH / 2 + hockey.BAND, hockey.LENGTH / 2, hockey.BAND),
     "right": (hockey.HOME + hockey.LENGTH / 2, -hockey.WIDTH / 2 - hockey.BAND, hockey.LENGTH / 2, hockey.BAND),
     **{
         f"{end} {side}": (x, sign * (hockey.GOAL_WIDTH + hockey.WIDTH) / 4, hockey.BAND, half)
-        for end, x in (("home", hockey.HOME - hockey.BAND), ("far", hockey.FAR + hockey.BAND))
+        for end, x in (("home", hockey.HOME - hockey.BAND), ("far", hockey.GOAL_LINE_M + hockey.BAND))
         for side, sign, half in (
             ("left", 1, (hockey.WIDTH - hockey.GOAL_WIDTH) / 4),
             ("right", -1, (hockey.WIDTH - hockey.GOAL_WIDTH) / 4),
@@ -46,15 +45,15 @@ _RIMS = {  # the bands and the four halves of both goals' sides: centre and half
 
 
 @dataclass(frozen=True)
-class Scene:
-    """What is simulated.
+class SimulatorScene:
+    """Simulated world.
 
     Attributes:
         problem: The problem.
         robot: Its robot.
-        plant: What is different from what the controller believes.
-        obstacle_poses: What says where the obstacles are, as ``cnpgen.problems.obstacles.obstacle_poses_of`` returns it.
-        puck: Where the puck lies [m], shape (2,), or None if there is none.
+        plant: Deviations from the nominal model.
+        obstacle_poses: Poses and sizes of the obstacles, shape (width,).
+        puck: Position of the puck [m], shape (2,), or None.
     """
 
     problem: Problem
@@ -70,12 +69,12 @@ class Scene:
         return None if table is None else table.z
 
 
-def scene_xml(scene: Scene) -> str:
+def scene_xml(scene: SimulatorScene) -> str:
     """Write the scene as MJCF."""
     gravity = _numbers(scene.robot.chain.gravity)
     return f"""<mujoco model="{scene.problem.name}">
 <compiler angle="radian" autolimits="true"/>
-<option timestep="{STEP}" gravity="{gravity}" integrator="implicitfast" cone="elliptic"/>
+<option timestep="{SIMULATION_STEP_S}" gravity="{gravity}" integrator="implicitfast" cone="elliptic"/>
 <visual><global offwidth="1280" offheight="960"/><quality shadowsize="1024"/>
 <headlight ambient="0.4 0.4 0.4" diffuse="0.5 0.5 0.5"/></visual>
 <default><geom contype="0" conaffinity="0" mass="0"/></default>
@@ -93,8 +92,8 @@ def scene_xml(scene: Scene) -> str:
 </mujoco>"""
 
 
-def _arm(scene: Scene) -> Iterator[str]:
-    """Yield the nested bodies of the arm; the last one holds the tip and what is fixed to it."""
+def _arm(scene: SimulatorScene) -> Iterator[str]:
+    """Yield the nested bodies of the arm; the last one has the tip and the attached bodies."""
     chain = scene.robot.chain
     last = len(chain.joints) - 1
     ends = [joint.translation for joint in chain.joints[1:]] + [chain.tip_translation]
@@ -106,9 +105,9 @@ def _arm(scene: Scene) -> Iterator[str]:
         yield f'<body name="link {index + 1}" {place}>{_inertial(joint, scene.plant.mass)}'
         yield f'<joint name="joint {index + 1}" type="{kind}" axis="{_numbers(joint.axis)}"'
         yield f' damping="{friction.viscous}" frictionloss="{friction.dry}"/>'
-        if np.linalg.norm(end) > SHORTEST:
+        if np.linalg.norm(end) > MIN_LINK_LENGTH_M:
             rod = index == last
-            radius, colour = (0.012, "0.3 0.3 0.3 1") if rod else (LINK_RADIUS, "1 0.55 0.15 1")
+            radius, colour = (0.012, "0.3 0.3 0.3 1") if rod else (LINK_RADIUS_M, "1 0.55 0.15 1")
             yield f'<geom name="link {index + 1}" type="capsule" fromto="0 0 0 {_numbers(end)}" size="{radius}"'
             yield f' rgba="{colour}"/>'
     yield f'<body name="tip" pos="{_numbers(chain.tip_translation)}" quat="{_quaternion(chain.tip_rotation)}">'
@@ -120,7 +119,7 @@ def _arm(scene: Scene) -> Iterator[str]:
 
 
 def _legal_depth(problem: Problem) -> float:
-    """Return how deep in an obstacle a valid plan may carry the object [m]: so much smaller is what collides."""
+    """Return the legal penetration of the object [m]; the colliding shape is smaller by it."""
     return max(
         (each.depth + each.tolerance for each in problem.constraint if isinstance(each, ObjectContact)), default=0.0
     )
@@ -134,15 +133,15 @@ def _inertial(joint: Joint, mass: float) -> str:
     return f'<inertial pos="{_numbers(joint.com)}" mass="{mass * joint.mass!r}" fullinertia="{numbers}"/>'
 
 
-def _loaded_problem(scene: Scene) -> Iterator[str]:
+def _loaded_problem(scene: SimulatorScene) -> Iterator[str]:
     """Yield the obstacles; with a table, the table and its puck."""
     for name, obstacle, solid in _obstacles(scene):
         yield f'<geom name="{name}" {_shape(name, obstacle, solid)} rgba="0.6 0.65 0.7 1"/>'
     if scene.height is None:
         return
     surface = scene.height - hockey.MALLET_HEIGHT
-    middle = hockey.HOME + hockey.LENGTH / 2
-    yield f'<geom type="box" pos="{middle} 0 {surface - 0.02}" size="{hockey.LENGTH / 2} {hockey.WIDTH / 2} 0.02"'
+    center = hockey.HOME + hockey.LENGTH / 2
+    yield f'<geom type="box" pos="{center} 0 {surface - 0.02}" size="{hockey.LENGTH / 2} {hockey.WIDTH / 2} 0.02"'
     yield ' rgba="0.97 0.97 1 1"/>'
     for name, (x, y, half_x, half_y) in _RIMS.items():
         yield f'<geom name="{name}" type="box" pos="{x} {y} {surface}" size="{half_x} {half_y} 0.015"'
@@ -156,9 +155,11 @@ def _loaded_problem(scene: Scene) -> Iterator[str]:
 
 
 def _shape(name: str, obstacle: Obstacle, solid: Solid) -> str:
-    """Write what an obstacle is and where."""
+    """Return shape and pose of an obstacle as MJCF attributes."""
     if isinstance(solid, Box):
-        low = solid.low if obstacle.height is not None else np.array([*solid.low[:2], solid.high[2] - DEEP])
+        low = (
+            solid.low if obstacle.height is not None else np.array([*solid.low[:2], solid.high[2] - UNBOUNDED_DEPTH_M])
+        )
         return f'type="box" pos="{_numbers((low + solid.high) / 2)}" size="{_numbers((solid.high - low) / 2)}"'
     if obstacle.kind == "sphere":
         return f'type="sphere" pos="{_numbers(solid.position)}" size="{solid.radius!r}"'
@@ -168,26 +169,26 @@ def _shape(name: str, obstacle: Obstacle, solid: Solid) -> str:
     return f'type="mesh" mesh="{name}"'
 
 
-def _meshes(scene: Scene) -> Iterator[str]:
-    """Yield the hulls of obstacles that are neither boxes along the world's axes nor round."""
+def _meshes(scene: SimulatorScene) -> Iterator[str]:
+    """Yield the convex hulls of the obstacles that MuJoCo represents by meshes."""
     for name, _, solid in _obstacles(scene):
         if not isinstance(solid, Box) and not solid.radius:
             corners = _numbers(np.ravel(solid.position + solid.corners))
             yield f'<mesh name="{name}" vertex="{corners}"/>'
 
 
-def _obstacles(scene: Scene) -> Iterator[tuple[str, Obstacle, Solid]]:
-    """Yield what obstacles are called here, and what they are."""
+def _obstacles(scene: SimulatorScene) -> Iterator[tuple[str, Obstacle, Solid]]:
+    """Yield name, definition and body of every obstacle."""
     obstacles = scene.problem.obstacle
     for number, both in enumerate(zip(obstacles, solids_of(obstacles, scene.obstacle_poses), strict=True), start=1):
         yield f"obstacle {number}", *both
 
 
 def _puck(surface: float, height: float) -> Iterator[str]:
-    """Yield the puck: a disc that meets the bands, and one of both radii that the mallet meets.
+    """Yield the puck: a disc for the bands, and a disc with the sum of both radii for the mallet.
 
-    Its coordinates are those of its centre in the world. The larger disc reaches up to where the mallet's lower face
-    passes over the puck, and far enough down.
+    The coordinates are those of its centre in the world. The larger disc extends from below the table to the height at
+    which the mallet's lower face passes over the puck.
     """
     inertia = f"{PUCK_INERTIA} {PUCK_INERTIA} {2 * PUCK_INERTIA}"
     low, high = height - 0.05, height + hockey.PUCK_HEIGHT
@@ -203,8 +204,8 @@ def _puck(surface: float, height: float) -> Iterator[str]:
     yield f' pos="0 0 {(low + high) / 2 - surface}"/></body>'
 
 
-def _pairs(scene: Scene) -> Iterator[str]:
-    """Yield what can collide."""
+def _pairs(scene: SimulatorScene) -> Iterator[str]:
+    """Yield the colliding pairs."""
     if scene.puck is not None:
         k, b = hockey.bounce()
         bouncing = f'condim="1" solref="{-k} {-b}" solimp="0.9999 0.9999 0.001"'
@@ -213,7 +214,9 @@ def _pairs(scene: Scene) -> Iterator[str]:
             yield f'<pair geom1="puck" geom2="{name}" {bouncing}/>'
     chain = scene.robot.chain
     lengths = [float(np.linalg.norm(joint.translation)) for joint in chain.joints[1:]]
-    names = [f"link {index}" for index, length in enumerate(lengths, start=1) if index > 1 and length > SHORTEST]
+    names = [
+        f"link {index}" for index, length in enumerate(lengths, start=1) if index > 1 and length > MIN_LINK_LENGTH_M
+    ]
     names += ["object"] if scene.problem.object_size is not None else []
     for obstacle, _, _ in _obstacles(scene):
         for name in names:
@@ -228,5 +231,5 @@ def _quaternion(rotation: Array) -> str:
 
 
 def _numbers(values: Array) -> str:
-    """Write numbers so that they read back as the same float64."""
+    """Format numbers without loss of float64 precision."""
     return " ".join(repr(value) for value in np.asarray(values, float).tolist())

@@ -87,8 +87,8 @@ def clone(folder: Path, **files: str) -> Path:
     ("files", "said"),
     [
         ({"position_control_wrapper": "import mushroom_rl_that_is_missing"}, "cannot be imported"),
-        ({"position_control_wrapper": "class PositionControlIIWA: pass"}, "of another version"),
-        ({"iiwas": "class AirHockeyIIWA: pass"}, "of another version"),
+        ({"position_control_wrapper": "class PositionControlIIWA: pass"}, "has a version that cnpgen does not support"),
+        ({"iiwas": "class AirHockeyIIWA: pass"}, "has a version that cnpgen does not support"),
     ],
 )
 def test_a_clone_that_cannot_be_used_is_told_of(files: dict[str, str], said: str, tmp_path: Path) -> None:
@@ -108,7 +108,7 @@ except MachineError as error:
 
 def test_another_clone_that_is_already_imported_is_not_mistaken_for_it(tmp_path: Path) -> None:
     challenge_plant(CLONE)
-    with pytest.raises(MachineError, match="hidden by another one"):
+    with pytest.raises(MachineError, match="hidden by an installed copy"):
         challenge_plant(clone(tmp_path / "clone"))
     challenge_plant(CLONE)
 

@@ -9,7 +9,7 @@ import pytest
 from cnpgen.benchmark.simulator.execute import execute
 from cnpgen.benchmark.simulator.plant import PLANTS, as_plant
 from cnpgen.benchmark.simulator.reference import TICK, Reference
-from cnpgen.benchmark.simulator.simulate import execute_plan, scene_of, simulate_plans
+from cnpgen.benchmark.simulator.simulate import execute_plan, simulate_plans, simulator_scene
 from cnpgen.errors import UsageError
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.plans import Plans, make_plans
@@ -91,9 +91,9 @@ def test_the_puck_lies_where_it_did_if_a_joint_has_the_name_of_the_tip(hit: Plan
     urdf = hit.problem.urdf.replace('joint name="world_F_base_joint"', 'joint name="striker_tip"')
     assert urdf != hit.problem.urdf
     same = replace(hit, problem=replace(hit.problem, urdf=urdf))
-    puck = scene_of(hit, PLANTS["nominal"]).puck
+    puck = simulator_scene(hit, PLANTS["nominal"]).puck
     assert puck is not None
-    np.testing.assert_array_equal(scene_of(same, PLANTS["nominal"]).puck, puck)
+    np.testing.assert_array_equal(simulator_scene(same, PLANTS["nominal"]).puck, puck)
 
 
 def test_a_puck_in_the_way_is_touched_early(hit: Plans) -> None:

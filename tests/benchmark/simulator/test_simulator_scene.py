@@ -11,7 +11,7 @@ import pytest
 from cnpgen.benchmark.simulator import hockey
 from cnpgen.benchmark.simulator.controller import Controller
 from cnpgen.benchmark.simulator.plant import PLANTS, Plant
-from cnpgen.benchmark.simulator.simulator_scene import Scene, scene_xml
+from cnpgen.benchmark.simulator.simulator_scene import SimulatorScene, scene_xml
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.robots.robot_spec import Payload
 from cnpgen.robots.solid import place_obstacles
@@ -23,17 +23,17 @@ from tests.examples.plans import PROBLEMS, ROBOTS
 mujoco = pytest.importorskip("mujoco")
 
 
-def scene(name: str, plant: Plant = PLANTS["nominal"]) -> Scene:
-    return Scene(PROBLEMS[name], ROBOTS[name], plant, np.full(len(PROBLEMS[name].obstacle), -1.0))
+def scene(name: str, plant: Plant = PLANTS["nominal"]) -> SimulatorScene:
+    return SimulatorScene(PROBLEMS[name], ROBOTS[name], plant, np.full(len(PROBLEMS[name].obstacle), -1.0))
 
 
-def without_friction(simulated: Scene, step: float = 1e-4) -> "mujoco.MjModel":
+def without_friction(simulated: SimulatorScene, step: float = 1e-4) -> "mujoco.MjModel":
     model = mujoco.MjModel.from_xml_string(scene_xml(simulated))
     model.dof_damping[:], model.dof_frictionloss[:], model.opt.timestep = 0, 0, step
     return model
 
 
-def with_tool() -> Scene:
+def with_tool() -> SimulatorScene:
     """The heavy object held by a tool, with another body and other motors: all said in the problem, not in the URDF."""
     shipped = PROBLEMS["heavy-object"]
     problem = replace(
@@ -42,7 +42,7 @@ def with_tool() -> Scene:
         payload=Payload(mass=2.5, centre=(0.01, 0.02, 0.03), size=(0.1, 0.2, 0.3)),
         limits=replace(shipped.limits, torque=PerJoint((300.0, 300.0, 200.0, 200.0, 150.0, 60.0, 50.0))),
     )
-    return Scene(problem, load_robot(problem), PLANTS["nominal"], np.full(len(problem.obstacle), -1.0))
+    return SimulatorScene(problem, load_robot(problem), PLANTS["nominal"], np.full(len(problem.obstacle), -1.0))
 
 
 def test_a_tool_and_a_payload_of_the_problem_are_simulated() -> None:
@@ -62,7 +62,7 @@ def test_names_of_strangers_are_no_part_of_the_scene(tmp_path: Path) -> None:
     urdf = tmp_path / "arm.urdf"
     urdf.write_text(text, encoding="utf-8")
     problem = replace(problem, robot=replace(problem.robot, urdf=str(urdf)))
-    strange = Scene(problem, load_robot(problem), PLANTS["nominal"], np.full(len(problem.obstacle), -1.0))
+    strange = SimulatorScene(problem, load_robot(problem), PLANTS["nominal"], np.full(len(problem.obstacle), -1.0))
     assert "private" not in scene_xml(strange)
     assert mujoco.MjModel.from_xml_string(scene_xml(strange)).nq == 7
 
@@ -83,7 +83,7 @@ def test_inverse_dynamics_and_tip_are_those_of_pinocchio(name: str) -> None:
     compare_with_pinocchio(scene(name))
 
 
-def compare_with_pinocchio(simulated: Scene) -> None:
+def compare_with_pinocchio(simulated: SimulatorScene) -> None:
     robot, model = simulated.robot, without_friction(simulated)
     data, other = mujoco.MjData(model), robot.model.createData()
     random = np.random.default_rng(0)
@@ -138,7 +138,7 @@ def test_a_bounce_is_as_strong_as_it_was_asked_to_be(restitution: float, monkeyp
     """The puck meets a band, which cannot move: it comes back with so many times its speed, ten steps long."""
     k, b = hockey.bounce(restitution)
     monkeypatch.setattr(hockey, "bounce", lambda: (k, b))
-    hit = Scene(PROBLEMS["airhockey"], ROBOTS["airhockey"], PLANTS["nominal"], np.empty(0), np.zeros(2))
+    hit = SimulatorScene(PROBLEMS["airhockey"], ROBOTS["airhockey"], PLANTS["nominal"], np.empty(0), np.zeros(2))
     model = mujoco.MjModel.from_xml_string(scene_xml(hit))
     model.dof_damping[-2:] = 0
     data = mujoco.MjData(model)
@@ -154,7 +154,7 @@ def test_obstacles_of_every_kind_are_as_far_away_as_judges_say(kind: str) -> Non
     obstacles = tuple(draw_obstacle(kind, random, spread=0.5) for _ in range(3))
     problem = replace(problem, obstacle=obstacles)
     obstacle_poses = place_obstacles(problem.obstacle)
-    model = mujoco.MjModel.from_xml_string(scene_xml(Scene(problem, robot, PLANTS["nominal"], obstacle_poses)))
+    model = mujoco.MjModel.from_xml_string(scene_xml(SimulatorScene(problem, robot, PLANTS["nominal"], obstacle_poses)))
     data, world = mujoco.MjData(model), World(robot, problem.obstacle, problem.object_size)
     held, zero = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, "object"), np.zeros(robot.n)
     for q in random.uniform(robot.position_lower, robot.position_upper, (20, robot.n)):

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 
 from cnpgen.benchmark.simulator.plant import PLANTS
-from cnpgen.benchmark.simulator.simulator_scene import Scene, scene_xml
+from cnpgen.benchmark.simulator.simulator_scene import SimulatorScene, scene_xml
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
 
@@ -15,7 +15,7 @@ STEPS = 4  # of MuJoCo in a tick
 def model() -> mujoco.MjModel:
     """The simulator's own scene under the environment's names, with the seventh joint as one that does nothing."""
     problem = load_problem("airhockey")
-    text = scene_xml(Scene(problem, load_robot(problem), PLANTS["nominal"], np.zeros(0), np.array([1.0, 0.0])))
+    text = scene_xml(SimulatorScene(problem, load_robot(problem), PLANTS["nominal"], np.zeros(0), np.array([1.0, 0.0])))
     for number in range(1, 7):
         text = text.replace(f'joint name="joint {number}"', f'joint name="iiwa_1/joint_{number}"')
     for axis in "xy":

@@ -1,7 +1,6 @@
-"""A planner's results on disk: a line of JSON for every problem, written as it is finished.
+"""Results of a planner on disk: a line of JSON for every finished problem.
 
-A second line of a problem adds to the first: what came of executing its plan on one plant. What was cut off by an
-interruption is as if it had never been written.
+Further lines of a problem add the execution of its plan on one plant. An incomplete last line is ignored.
 """
 
 import json
@@ -52,20 +51,20 @@ class Results:
 
     Attributes:
         path: The file.
-        rows: Problem -> what is known of it: the fields of ``docs/benchmark.md``.
+        rows: Index of the problem -> its row, see ``docs/benchmark.md``.
     """
 
     path: Path
     rows: dict[int, dict[str, Any]] = field(default_factory=dict)
 
     def append(self, row: dict[str, Any]) -> None:
-        """Write a line down, and take it in.
+        """Append a line to the file and to the rows.
 
         Raises:
-            MachineError: The disk is full, or otherwise unwilling.
+            MachineError: The disk is full or cannot be written.
         """
         text = json.dumps(row, allow_nan=False)
-        self._take(json.loads(text))  # the same as what a later run reads
+        self._take(json.loads(text))  # equal to the row that a later run reads
         try:
             with self.path.open("a", encoding="utf-8") as file:
                 file.write(f"{text}\n")
@@ -75,11 +74,11 @@ class Results:
             raise machine_error("write", self.path, error) from error
 
     def missing(self, count: int) -> Iterator[int]:
-        """Yield the problems of the first ``count`` that are still to be planned."""
+        """Yield those of the first ``count`` problems without planning result."""
         return (index for index in range(count) if "ending" not in self.rows.get(index, {}))
 
     def unexecuted(self, plant: str, count: int) -> Iterator[int]:
-        """Yield the problems whose plans are still to be executed on a plant."""
+        """Yield the problems whose plans a plant has not executed."""
         for index in range(count):
             row = self.rows[index]
             if row.get("answer") is not None and plant not in row.get("executed", {}):
@@ -94,17 +93,17 @@ class Results:
 
 
 def open_results(path: Path, identity: dict[str, Any], *, discard: bool = False) -> Results:
-    """Open the results of a planner, with what earlier runs have finished.
+    """Open the results of a planner with the rows of earlier runs.
 
     Args:
         path: The file.
-        identity: What distinguishes a run; results of another one are not mixed in.
-        discard: Whether results of another run may be thrown away.
+        identity: Identity of the run; results of another run are refused.
+        discard: Whether to overwrite results of another run.
 
     Raises:
-        UsageError: The file is of another run.
-        DatasetError: It holds something else.
-        MachineError: It cannot be read or written.
+        UsageError: The file belongs to another run.
+        DatasetError: The file is damaged.
+        MachineError: The file cannot be read or written.
     """
     head = json.dumps({"format": FORMAT, "format_version": RESULTS_VERSION, **identity})
     results = Results(path)
@@ -131,7 +130,7 @@ def open_results(path: Path, identity: dict[str, Any], *, discard: bool = False)
 
 
 def _check_row(row: Any) -> None:
-    """Refuse with a ``ValueError`` what is no line of results; they may come from other people."""
+    """Raise ``ValueError`` if a line is not a row of results; files are untrusted input."""
     check_structure(row, {"problem": WHOLE})
     if "ending" in row:
         check_structure(row, {**_PLANNED, "answer": Nullable({ANY_KEY: ANYTHING})})
@@ -140,7 +139,7 @@ def _check_row(row: Any) -> None:
             check_structure(answer, form)
             check_structure(row, {"verdict": _VERDICT})
             for name in form.keys() - {"degree"}:
-                np.array(answer[name], float)  # of rows of one length
+                np.array(answer[name], float)  # rows of equal length
     if "executed" in row:
         check_structure(row, {"executed": {ANY_KEY: {ANY_KEY: ANYTHING}}})
         for executed in row["executed"].values():
@@ -152,7 +151,7 @@ def _present(forms: dict[str, Structure], table: dict[str, Any]) -> dict[str, St
 
 
 def _whole_lines(path: Path) -> list[str]:
-    """Return the lines of a file up to the first that is no JSON."""
+    """Return the lines of a file up to the first line that is not JSON."""
     found = []
     try:
         lines = path.read_bytes().decode("utf-8", "replace").splitlines()
@@ -179,10 +178,10 @@ def answer_to_dict(answer: Plans | Trajectory) -> dict[str, Any]:
 
 
 def answer_from_dict(problem: Plans, content: dict[str, Any]) -> Plans | Trajectory:
-    """Read an answer for one boundary problem back.
+    """Read an answer for one boundary problem.
 
     Raises:
-        UsageError: It is none: a shape is wrong, or its joints are others than those of the problem.
+        UsageError: A shape is wrong, or the number of joints differs from the problem.
     """
     known = _PLAN.keys() - {"degree"} if "degree" in content else _SAMPLES.keys() & content.keys()
     numbers = {name: np.array(content[name], float) for name in known}
@@ -203,7 +202,7 @@ def answer_from_dict(problem: Plans, content: dict[str, Any]) -> Plans | Traject
 
 
 def _rows(values: Any) -> list[Any]:
-    """Turn an array into lists; what is not finite becomes None, and nan when it is read."""
+    """Convert an array to lists; nonfinite values become None, which is read as nan."""
     array = np.asarray(values, float)
     found: list[Any] = np.where(np.isfinite(array), array.astype(object), None).tolist()  # type: ignore[call-overload]
     return found
