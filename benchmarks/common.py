@@ -1,4 +1,4 @@
-"""What all benchmarks share: the line about the machine, medians, tables and ``--json``."""
+"""Shared parts of the benchmarks: the line about the machine, medians, tables and ``--json``."""
 
 import argparse
 import json

@@ -24,20 +24,20 @@ from watching import MARKS, Sample, watch
 STEPS = (  # what happens before the first row
     ("Python", "pass"),
     ("NumPy", "import numpy"),
-    ("cnpgen.make.dataset", "import cnpgen.make.dataset"),
+    ("cnpgen.make.make_dataset", "import cnpgen.make.make_dataset"),
     ("recipe", "from cnpgen.make.recipe_file import load_dataset_recipe; recipe = load_dataset_recipe({name!r})"),
     ("Pinocchio, Coal", "import pinocchio, coal"),
     (
         "kernels, specification",
-        "from pathlib import Path; place = cnpgen.make.dataset.find_workspace(Path({out!r}));"
-        " cnpgen.make.dataset.draw_up(recipe, place)",
+        "from pathlib import Path; place = cnpgen.make.make_dataset.find_workspace(Path({out!r}));"
+        " cnpgen.make.make_dataset.draw_up(recipe, place)",
     ),
     ("h5py", "import h5py"),
     ("joblib", "from joblib import Parallel, delayed"),
     ("2 workers", "Parallel(n_jobs=2)(delayed(abs)(i) for i in range(2))"),
     (
         "cnpgen in workers",
-        "Parallel(n_jobs=2)(delayed(cnpgen.make.dataset.draw_up)(recipe, place) for i in range(2))",
+        "Parallel(n_jobs=2)(delayed(cnpgen.make.make_dataset.draw_up)(recipe, place) for i in range(2))",
     ),
 )
 

@@ -186,7 +186,7 @@ def main() -> None:
             ],
         ),
     ]
-    report({"strikes": struck, "same goal": same, "deadlines": cut}, tables, as_json=chosen.json)
+    report({"hits": struck, "same goal": same, "deadlines": cut}, tables, as_json=chosen.json)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from typing import Any
 from common import arguments, at_hand, median, progress, report, table, verdict
 
 from cnpgen.machine.threads import one_thread
-from cnpgen.make.dataset import make_dataset
+from cnpgen.make.make_dataset import make_dataset
 from cnpgen.planner.model_file import shipped_models
 from cnpgen.planner.plan_requests import read_rows
 from cnpgen.planner.planner import Planner

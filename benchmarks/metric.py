@@ -24,7 +24,7 @@ SHOWN = ("joint-velocity", "joint-acceleration", "table")
 
 @dataclass(frozen=True)
 class Curve:
-    """What a run was like.
+    """Result of one run.
 
     Attributes:
         checks: Records of the log with a validation.

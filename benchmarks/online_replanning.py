@@ -45,10 +45,12 @@ from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
 FIRST = ("airhockey-replan", "airhockey-hit")  # datasets and planners of the first motions
-MOMENTS = (0.05, 0.95)  # of T
+SWITCH_RANGE = (0.05, 0.95)  # of T
 REFINED_TIMES = 4  # on every refined motion
-SPARE = 1.25  # problems drawn for each that is wanted: some first motions are not valid, some tasks have no answer
-SAME_TIME = 1e-9  # s: of the rest of a plan, by rounding
+OVERSAMPLING = (
+    1.25  # problems drawn for each that is wanted: some first motions are not valid, some tasks have no answer
+)
+TIME_TOLERANCE_S = 1e-9  # s: of the rest of a plan, by rounding
 FULL_SPEED = 0.2
 CONE = np.deg2rad(120)
 TABLE = np.array([[0.6, 1.3], [-0.45, 0.45]])  # m
@@ -85,18 +87,20 @@ def first_motions(count: int, seed: int) -> Plans:
     """Valid plans of the shipped planners, half for replans and half for hits."""
     parts = []
     for name in FIRST:
-        plans = Planner(name).plan_batch(draw_boundary_problems(name, int(SPARE * count / 2), seed=seed).boundary)
+        plans = Planner(name).plan_batch(
+            draw_boundary_problems(name, int(OVERSAMPLING * count / 2), seed=seed).boundary
+        )
         parts.append(plans[evaluate_plans(plans).valid][: count // 2])
     return concatenate(parts)
 
 
 def times_of(plans: Plans, random: np.random.Generator) -> NDArray[np.float64]:
     """One random time of every plan."""
-    return random.uniform(*MOMENTS, len(plans)) * plans.duration
+    return random.uniform(*SWITCH_RANGE, len(plans)) * plans.duration
 
 
 def states_of(plans: Plans, random: np.random.Generator) -> State:
-    """Where every plan is at a random time."""
+    """Return the state of every plan at a random time."""
     return plans.states_at(times_of(plans, random))
 
 
@@ -136,7 +140,7 @@ def full_speed_hits(count: int, seed: int) -> Boundary:
 
 def sets(count: int, seed: int) -> dict[str, Problems]:
     """Make the six sets."""
-    random, drawn = np.random.default_rng(seed), int(SPARE * count)
+    random, drawn = np.random.default_rng(seed), int(OVERSAMPLING * count)
     progress(f"{drawn} first motions")
     plans = first_motions(drawn, seed)
     others = draw_boundary_problems("airhockey-replan", drawn, seed=seed + 1).boundary
@@ -170,7 +174,7 @@ def measure(planner: Planner, problems: Problems, refined: int) -> dict[str, flo
     return (
         found
         | {
-            "replan, rests of the old plan": float((np.abs(given - left) < SAME_TIME).mean()),
+            "replan, rests of the old plan": float((np.abs(given - left) < TIME_TOLERANCE_S).mean()),
             "T / best refined of both": float(plans.duration[:refined][good].mean() / best),
             "replan, T / best refined of both": float(given[:refined][good].mean() / best),
         }

@@ -183,8 +183,8 @@ class Boxes:
             pose = self.arm.data.oMf[self.arm.tip]
             moving.append((self.held, coal.Transform3s(pose.rotation, pose.translation)))
         for (x, y), box, top in zip(self.tables, self.boxes, obstacle_poses, strict=True):
-            middle = [(x.low + x.high) / 2, (y.low + y.high) / 2, top - 5.0]
-            place = coal.Transform3s(np.eye(3), np.array(middle))
+            center = [(x.low + x.high) / 2, (y.low + y.high) / 2, top - 5.0]
+            place = coal.Transform3s(np.eye(3), np.array(center))
             if any(coal.collide(s, pose, box, place, request, coal.CollisionResult()) for s, pose in moving):
                 return True
         return False

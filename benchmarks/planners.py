@@ -40,7 +40,7 @@ STEPS, CURVED = (1, 2, 3, 4, 6, 10), 100  # steps of the refiner's first pass; p
 
 @dataclass(frozen=True)
 class Target:
-    """What a figure is to reach.
+    """Goal of a figure.
 
     Attributes:
         value: The bound.

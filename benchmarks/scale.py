@@ -1,4 +1,4 @@
-"""What large datasets cost: docs/scale.md's table of core-hours, disk, files and memory, from rates measured here.
+"""Cost of large datasets: docs/scale.md's table of core-hours, disk, files and memory, from rates measured here.
 
 A small dataset of each kind is made and checked in this process, in shards as large as the large one's; the clock is
 the process's CPU time. The rest is multiplication.
@@ -20,7 +20,7 @@ from common import arguments, progress, report, table
 
 import cnpgen
 from cnpgen.cli.dry_run import row_bytes
-from cnpgen.make.dataset import finish
+from cnpgen.make.make_dataset import finish
 from cnpgen.make.repair import find_damaged
 from cnpgen.store.dataset_spec import default_shard_size, load_dataset_spec, shards
 from cnpgen.store.layout import DOCUMENTS
@@ -30,7 +30,7 @@ CERTIFIED_BLOCK = 64  # rows
 
 @dataclass(frozen=True)
 class Costs:
-    """What a dataset takes.
+    """Resources of a dataset.
 
     Attributes:
         name: What it is made of.
@@ -141,7 +141,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--rows", type=float, default=1e8, help="rows of the datasets without plans")
     parser.add_argument("--certified", type=float, default=1e7, help="rows of the certified one")
     parser.add_argument("--sample", type=int, default=131072, help="rows that are made")
-    parser.add_argument("--certified-sample", type=int, default=128, help="likewise, with plans")
+    parser.add_argument("--certified-sample", type=int, default=128, help="samples with plans to measure")
 
 
 def main() -> None:

@@ -23,7 +23,7 @@ import numpy as np
 from common import arguments, median, progress, report, table, verdict
 
 from cnpgen.machine.threads import one_thread
-from cnpgen.make.dataset import make_dataset
+from cnpgen.make.make_dataset import make_dataset
 from cnpgen.planner.inference_pipeline import loaded_problem
 from cnpgen.planner.plan_requests import read_rows
 from cnpgen.planner.planner import Planner

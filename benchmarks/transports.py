@@ -3,7 +3,7 @@
 * "found from the start": rows of the dataset heavy-object, whose goal configuration is the one that inverse kinematics
   finds from the start;
 * "independent": as the dataset heavy-object-anywhere draws them, but all goals are found from guesses of their own;
-* "on joint limits": likewise, with a joint of the start or of the goal on its limit;
+* "on joint limits": the same with a joint of the start or of the goal on its limit;
 * "another problem's": the goal of the next row of the dataset heavy-object, where both ends are free of collision.
 
 No joint is farther from start to goal than 165 degrees, as in the dataset. Nothing was chosen by these seeds. The clock
@@ -11,7 +11,7 @@ is CPU time, one BLAS thread. Goals stand beside the figures.
 
 With ``--again N``, N problems of each set are refined from the planner's plan and solved from nothing, and both results
 refined once more, to see what the first one left: how many are valid later only, how many become shorter by more than
-2 %, and how many take so much longer than the shortest of all four.
+2 %, and how many take so much longer than the fastest of all four.
 
     python benchmarks/transports.py
     python benchmarks/transports.py --again 100
@@ -40,8 +40,8 @@ from cnpgen.refine.refine_plans import Refinement, refine_plans, solve_plans
 from cnpgen.trajectory.boundary import Boundary
 
 OLD, NEW = "heavy-object", "heavy-object-anywhere"
-SPARE = 8  # drawn for each that is wanted of sets of which some are left out
-FARTHEST = np.deg2rad(165)
+OVERSAMPLING = 8  # drawn for each that is wanted of sets of which some are left out
+MAX_JOINT_CHANGE_RAD = np.deg2rad(165)
 GOALS = {"found from the start": 0.995, "independent": 0.9, "on joint limits": 0.9, "another problem's": 0.9}
 REFINED_VALID, OVER_REFINED = 0.995, 1.04
 SHORTER = 1.02
@@ -71,15 +71,15 @@ def on_limits(boundary: Boundary) -> NDArray[np.bool_]:
 
 def to_goals_of_others(count: int, seed: int) -> Boundary:
     """Problems from the start of one row to the goal configuration of the next."""
-    rows = draw_boundary_problems(OLD, SPARE * count, seed=seed).boundary
+    rows = draw_boundary_problems(OLD, OVERSAMPLING * count, seed=seed).boundary
     found = complete(OLD, start_q=rows.start_q, goal_q=np.roll(rows.goal_q, 1, axis=0)).plans.boundary
-    near = np.abs(found.goal_q - found.start_q).max(axis=1) <= FARTHEST
+    near = np.abs(found.goal_q - found.start_q).max(axis=1) <= MAX_JOINT_CHANGE_RAD
     return found[np.flatnonzero(near)[:count]]
 
 
 def sets(count: int, seed: int) -> dict[str, Boundary]:
     """Make the four sets."""
-    limits = draw_boundary_problems(independent(at_limit=0.5), SPARE * count, seed=seed + 2).boundary
+    limits = draw_boundary_problems(independent(at_limit=0.5), OVERSAMPLING * count, seed=seed + 2).boundary
     return {
         "found from the start": draw_boundary_problems(OLD, count, seed=seed).boundary,
         "independent": draw_boundary_problems(independent(at_limit=0.0), count, seed=seed + 1).boundary,

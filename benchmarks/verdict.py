@@ -37,12 +37,12 @@ TARGETS = {"airhockey": 3.0, "heavy-object": 8.0}  # ms per plan
 
 @dataclass(frozen=True)
 class Timing:
-    """What was measured of one file.
+    """Measurements of one file.
 
     Attributes:
         problem: Name of the problem.
         plans: Number of plans.
-        times: Moments per plan that were looked at, on average.
+        times: Mean number of evaluated times per plan.
         ms: CPU time of the verdict per plan [ms].
         times_faster: CPU time of the check state by state, in times the verdict's.
         missed: How much more than the verdict the check state by state saw at most, in what is allowed.
@@ -111,7 +111,7 @@ def measure(plans: Plans, *, repeat: int, slow: int) -> Timing:
 
 @dataclass(frozen=True)
 class Always:
-    """What became of plans at a tolerance.
+    """Results of plans at a tolerance.
 
     Attributes:
         problem: Name of the problem.
@@ -170,7 +170,7 @@ def main() -> None:
     """Run the benchmark."""
     options = arguments(__doc__, add)
     found = [measure(load_plans(file), repeat=options.repeat, slow=options.slow) for file in options.file]
-    head = ("problem", "plans", "moments", "ms per plan", "target", "", "times faster", "missed", "between")
+    head = ("problem", "plans", "times", "ms per plan", "target", "", "times faster", "missed", "between")
     rows = [
         (
             item.problem,

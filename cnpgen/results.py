@@ -9,7 +9,7 @@ from cnpgen.loader.normalization import Normalization
 from cnpgen.loader.split import Split
 from cnpgen.machine.times import Times
 from cnpgen.make.complete import Completed
-from cnpgen.make.dataset import MadeDataset
+from cnpgen.make.make_dataset import MadeDataset
 from cnpgen.planner.control_points import ControlPoints
 from cnpgen.planner.model import ModelConfig, Outputs
 from cnpgen.planner.network.architecture import Architecture, Layer

@@ -22,7 +22,7 @@ import pytest
 from cnpgen.kernels.cache import exclusive_lock, make_private_folder
 from cnpgen.kernels.compiler import find_compiler
 from cnpgen.kernels.library import Backend, KernelLibrary, default_cache_folder
-from cnpgen.make.dataset import make_dataset
+from cnpgen.make.make_dataset import make_dataset
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.make.recipe_file import load_dataset_recipe
 from cnpgen.pipelines.pipeline import Pipeline

@@ -13,6 +13,7 @@ ROOT = Path(__file__).parents[1]
 REPLACEMENTS: dict[str, str] = json.loads((ROOT / "tests" / "data" / "vocabulary.json").read_text(encoding="utf-8"))
 PREFIXES = {"MOST_": "MAX_", "ENOUGH": "MIN_", "ALONE": "MAX_ or MIN_", "SPARE": "MARGIN_", "DEEP": "DEPTH_"}
 EXCLUDED = {"CHANGELOG.md", "glossary.md", "references.md", "test_language.py"}  # old names, synonyms, titles, examples
+EXTERNAL_NAMES = re.compile(r"warm_start_slack_\w+")  # options of Ipopt
 TEXT = ("*.py", "*.pyi", "*.c", "*.h", "*.html", "*.md", "*.toml")
 MAX_WORDS = 25
 MAX_MEAN_WORDS = 18.0
@@ -40,7 +41,7 @@ def words_in(text: str) -> list[str]:
 
 def private_words(text: str) -> Iterator[tuple[int, str, str]]:
     """Yield line, word and replacement of every private word."""
-    for number, line in enumerate(text.splitlines(), 1):
+    for number, line in enumerate(EXTERNAL_NAMES.sub("", text).splitlines(), 1):
         for word in words_in(line):
             if word in REPLACEMENTS:
                 yield number, word, REPLACEMENTS[word]
@@ -153,4 +154,8 @@ def test_sentences_of_a_page_are_short(page: Path) -> None:
     lengths = {" ".join(text.split()): len(text.split()) for text in sentences(page.read_text(encoding="utf-8"))}
     long = [f"{words} words: {text}" for text, words in lengths.items() if words > MAX_WORDS]
     assert len(long) <= MAX_LONG_SHARE * max(len(lengths), 1), "\n".join(long)
-    assert sum(lengths.values()) <= MAX_MEAN_WORDS * max(len(lengths), 1), "the mean is above 18 words"
+
+
+def test_the_mean_length_of_all_sentences_is_small() -> None:
+    lengths = [len(text.split()) for page in PAGES for text in sentences(page.read_text(encoding="utf-8"))]
+    assert sum(lengths) / len(lengths) <= MAX_MEAN_WORDS

@@ -19,7 +19,7 @@ from cnpgen.schema import registry
 from cnpgen.schema.keys import PerJoint, Range, keys
 from cnpgen.store.joint_units import unit_of
 
-WIDTH = 100
+LINE_WIDTH = 100
 
 Recipe = Problem | Pipeline | DatasetRecipe
 
@@ -155,7 +155,7 @@ def with_units(units: str, cells: Sequence[str]) -> tuple[str, ...]:
 
 def title_lines(title: str) -> list[str]:
     """Wrap a title as lines below a name."""
-    return textwrap.wrap(title, WIDTH - 2, initial_indent="  ", subsequent_indent="  ")
+    return textwrap.wrap(title, LINE_WIDTH - 2, initial_indent="  ", subsequent_indent="  ")
 
 
 def numbers(obj: Any, *, leave_out: Sequence[str] = ()) -> str:
@@ -225,7 +225,7 @@ def _noun(recipe: Recipe) -> str:
 def table(
     rows: Sequence[Sequence[Any]], *, indent: str = "", right: Sequence[int] = (), one_line: bool = False
 ) -> list[str]:
-    """Lay out rows as aligned columns that fit into ``WIDTH``.
+    """Lay out rows as aligned columns that fit into ``LINE_WIDTH``.
 
     Args:
         rows: The cells, in rows of the same length. A path in the last column stays in one piece, for scripts.
@@ -238,7 +238,7 @@ def table(
     """
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]) - 1)]
     hanging = indent + " " * (sum(widths) + 2 * len(widths))
-    width = max(WIDTH - len(hanging), 30)
+    width = max(LINE_WIDTH - len(hanging), 30)
     lines = []
     for *cells, last in rows:
         pairs = enumerate(zip(cells, widths, strict=True))

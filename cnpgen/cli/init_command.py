@@ -31,7 +31,7 @@ def add(commands: "Commands[Parser]") -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     from cnpgen.cli.init.arm import read_arm
-    from cnpgen.cli.init.recipes import dataset_of
+    from cnpgen.cli.init.initial_recipes import dataset_of
     from cnpgen.cli.init.write import FILES, texts_of
     from cnpgen.robots.shape.mesh_files import packages_of_environment
     from cnpgen.store.files.atomic import write_file

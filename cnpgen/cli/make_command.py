@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from pathlib import Path
 
-    from cnpgen.make.dataset import MadeDataset
+    from cnpgen.make.make_dataset import MadeDataset
     from cnpgen.make.recipe import DatasetRecipe
     from cnpgen.store.sampling_statistics import SamplingStatistics
 
@@ -95,7 +95,7 @@ def _settings(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def _make(recipe: "DatasetRecipe", arguments: argparse.Namespace) -> None:
-    from cnpgen.make.dataset import make_dataset
+    from cnpgen.make.make_dataset import make_dataset
 
     make = partial(
         make_dataset,

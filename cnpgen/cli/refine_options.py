@@ -121,7 +121,7 @@ def refine_and_save(
         if arguments.explain:
             _explain(facts, found, meter)
     except KeyboardInterrupt as interruption:
-        kept = f"{journal} keeps what is finished, run the same command again to go on"
+        kept = f"{journal} keeps all finished problems; run the same command again to resume"
         raise type(interruption)(kept) from interruption
     finally:
         meter.close()

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from cnpgen.training.training_state import State
 
 
-WIDTH = 100  # of a line
+LINE_WIDTH = 100  # of a line
 OFTEN = 100  # passes over the same rows after which more rows help more
 
 
@@ -95,5 +95,5 @@ def summary(trained: "Trained") -> str:
 
 
 def _fitted(text: str) -> str:
-    """Wrap a line to ``WIDTH``."""
-    return "\n".join(textwrap.wrap(text, WIDTH, subsequent_indent="    ", break_on_hyphens=False))
+    """Wrap a line to ``LINE_WIDTH``."""
+    return "\n".join(textwrap.wrap(text, LINE_WIDTH, subsequent_indent="    ", break_on_hyphens=False))

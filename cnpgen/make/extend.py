@@ -6,7 +6,7 @@ from pathlib import Path
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.kernels.library import choose_backend
 from cnpgen.machine.engine import Engine
-from cnpgen.make.dataset import Begin, MadeDataset, Progress, carry_out
+from cnpgen.make.make_dataset import Begin, MadeDataset, Progress, carry_out
 from cnpgen.make.make_shards import Job, prepare
 from cnpgen.make.recipe import DatasetRecipe, split_rows
 from cnpgen.make.recipe_file import makes_its_rows, restored

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from cnpgen.errors import DatasetError, RecipeError, UsageError
 from cnpgen.make.certify import certified
-from cnpgen.make.dataset import Begin, MadeDataset, Progress, finish
+from cnpgen.make.make_dataset import Begin, MadeDataset, Progress, finish
 from cnpgen.make.recipe import recipe_digest
 from cnpgen.make.recipe_file import load_dataset_recipe, load_notes
 from cnpgen.schema.catalogue import list_recipes

@@ -31,7 +31,7 @@ CONTACT_DISTANCE_M = 0.07  # from the centre of the paper's puck to that of its 
 HIT_COLUMNS = ("start_q", "start_dq", "start_ddq", "goal_xyz", "hit_angle", SPEED_SHARE_COLUMN)
 
 State = tuple[ArrayLike, ArrayLike, ArrayLike]
-"""Positions [rad], velocities [rad/s] and accelerations [rad/s^2], shape (n,) or (N, n), as from ``Plans.states_at``."""
+"""Positions [rad], velocities [rad/s], accelerations [rad/s^2], shape (n,) or (N, n), as from ``Plans.states_at``."""
 
 _COMPLETIONS: WeakKeyDictionary[Planner, Completion] = WeakKeyDictionary()
 

@@ -39,7 +39,7 @@ def _robot_mistakes(robot: dict[str, Any], where: RecipeLocation, folder: Path) 
         return
     if not os.path.isfile(path):  # noqa: PTH113 - Path.is_file raises where a name is too long
         hint = nearest(urdf, [file.name for file in folder.glob("*.urdf")])
-        there = os.path.exists(path)  # noqa: PTH110 - likewise
+        there = os.path.exists(path)  # noqa: PTH110 - os.path does not raise for odd names
         yield (where / "urdf").message(f"not a file: {path}" if there else f"no such file: {path}{hint}")
         return
     try:

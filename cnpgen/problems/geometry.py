@@ -56,7 +56,7 @@ def _paper_mistakes(table: dict[str, Any], where: RecipeLocation) -> Iterator[st
             text = 'missing key, expected a length [m]: with geometry = "paper-capsules" the arm is so thick'
             yield (where / "constraint" / place / "radius").message(text)
     for place, _ in _constraints(table, "self-clearance"):
-        text = 'links are kept apart by their shapes: it needs geometry = "urdf" in [robot], and <collision> elements'
+        text = 'self-clearance needs geometry = "urdf" in [robot], and <collision> elements'
         yield (where / "constraint" / place).message(text)
     if _robot(table).get("convex_parts", 1) != 1:
         yield (where / "robot" / "convex_parts").message('meshes matter with geometry = "urdf" only')

@@ -44,7 +44,7 @@ def load_robot(problem: Problem) -> Robot:
         jerk = _given(limits.jerk, "jerk", JERK_RATE * acceleration)
     except RecipeError as error:
         raise type(error)([f"{problem.path}: {mistake}" for mistake in error.mistakes]) from error
-    middle = (np.array(model.upperPositionLimit) + np.array(model.lowerPositionLimit)) / 2
+    center = (np.array(model.upperPositionLimit) + np.array(model.lowerPositionLimit)) / 2
     half = limits.position_scale * (np.array(model.upperPositionLimit) - np.array(model.lowerPositionLimit)) / 2
     robot = Robot(
         urdf=problem.urdf_path,
@@ -52,8 +52,8 @@ def load_robot(problem: Problem) -> Robot:
         joint_names=tuple(spec.joints),
         tip=attached.tip,
         attached=attached,
-        position_lower=middle - half,
-        position_upper=middle + half,
+        position_lower=center - half,
+        position_upper=center + half,
         velocity_limit=velocity,
         acceleration_limit=acceleration,
         jerk_limit=jerk,

@@ -1,4 +1,4 @@
-"""The robot of a problem for planner authors: limits, batched kinematics, dynamics, collisions and constraint values."""
+"""Robot of a problem for planner authors: limits, batched kinematics, dynamics, collisions, constraint values."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 class ConstraintValues:
     """Values of all conditions of a problem at N states, with derivatives.
 
-    A state is valid if ``lower - tolerance <= g <= upper + tolerance``. Derivatives are those of the symbolic form, with
+    A state is valid if ``lower - tolerance <= g <= upper + tolerance``. Derivatives belong to the symbolic form, with
     closest points of distances treated as constant (envelope theorem).
 
     Attributes:
@@ -201,7 +201,7 @@ class RobotModel:
             scene: Obstacles of N samples, or of one for all states; by default where the problem places them.
 
         Returns:
-            Signed distances [m], negative for penetration, shape (N,); inf without obstacles and collision pairs. With the
+            Signed distances [m], negative for penetration, shape (N,); inf without collision pairs. With the
             paper's capsule model, the distance of the capsule axes less the radius of ``robot-clearance``.
         """
         states = self._states("q", q)

@@ -96,7 +96,7 @@ def chain_from_model(model: "pin.Model", tip: str) -> Chain:
     )
 
 
-def tell_links_apart(model: "pin.Model") -> None:
+def name_links_uniquely(model: "pin.Model") -> None:
     """Rename link frames with the name of a joint, since Pinocchio finds frames by name."""
     import pinocchio as pin
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError, nearest
 from cnpgen.robots.attached import Attached, attach, bounded
-from cnpgen.robots.chain import Chain, frame_of, tell_links_apart
+from cnpgen.robots.chain import Chain, frame_of, name_links_uniquely
 from cnpgen.robots.mimic import check_mimic
 from cnpgen.robots.shape.shape import Shape
 from cnpgen.robots.urdf import urdf_tree
@@ -113,7 +113,7 @@ def reduced_model(urdf: Path, text: str, joints: tuple[str, ...], attached: Atta
         tree = urdf_tree(text)
         check_mimic(tree, joints)
         model = pin.buildModelFromXML(bounded(text, tree, attached))
-        tell_links_apart(model)
+        name_links_uniquely(model)
     except (ValueError, RuntimeError, IndexError) as error:
         raise RecipeError([f"{urdf}: not a URDF that Pinocchio can read: {error}"]) from error
     known = list(model.names)[1:]

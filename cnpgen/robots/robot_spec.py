@@ -47,7 +47,7 @@ class RobotSpec:
         since_version=2,
     )
     srdf: str = field(
-        "SRDF file, relative to the problem file, whose disabled pairs of links are not kept apart; without it they are"
+        "SRDF file, relative to the problem file, whose disabled pairs of links are not checked; without it they are"
         " found by sampling",
         default="",
         since_version=2,

@@ -161,6 +161,6 @@ def _wrapped(position: Array, corners: Array, radius: float = 0.0) -> Solid:
 def _upright_box(obstacle: Obstacle, top: float) -> Box:
     x, y = obstacle.x or Range(0, 0), obstacle.y or Range(0, 0)
     height = obstacle.height or UNBOUNDED_OBSTACLE_HEIGHT_M
-    middle = np.array([(x.low + x.high) / 2, (y.low + y.high) / 2, top - height / 2])
+    center = np.array([(x.low + x.high) / 2, (y.low + y.high) / 2, top - height / 2])
     corners = CUBE * np.array([x.high - x.low, y.high - y.low, height])
-    return Box(middle, corners, np.array([x.low, y.low, top - height]), np.array([x.high, y.high, top]))
+    return Box(center, corners, np.array([x.low, y.low, top - height]), np.array([x.high, y.high, top]))

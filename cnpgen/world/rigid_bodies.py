@@ -64,7 +64,7 @@ class RigidBodies:
         moving = [index for index, frame in enumerate(self._frames[:n_parts]) if frame]
         obstacles = range(n_parts, n_parts + n_obstacles)
         self.obstacle_pairs = _pairs((obstacle, part) for part in moving for obstacle in obstacles)
-        self.link_pairs = _pairs(sorted(pair, key=self._frames.__getitem__) for pair in shape.apart)
+        self.link_pairs = _pairs(sorted(pair, key=self._frames.__getitem__) for pair in shape.checked_pairs)
         self._certified = CertifiedDistance()
         self._set_obstacles([])
 

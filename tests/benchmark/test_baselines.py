@@ -67,7 +67,7 @@ def test_trajopt_meets_its_own_constraints_and_its_boundary_conditions() -> None
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_the_quadratic_programme_of_aqp_has_the_optimum_that_another_solver_finds(seed: int) -> None:
+def test_the_quadratic_program_of_aqp_has_the_optimum_that_another_solver_finds(seed: int) -> None:
     random = np.random.default_rng(seed)
     null = np.linalg.svd(random.normal(size=(3, 6)))[2][3:].T
     weights, ahead, least = random.uniform(1, 10, 6), random.normal(size=6), 0.3 * random.normal(size=6)
@@ -89,7 +89,7 @@ def test_the_quadratic_programme_of_aqp_has_the_optimum_that_another_solver_find
     np.testing.assert_allclose(found, other.x, atol=1e-5)
 
 
-def test_a_quadratic_programme_without_solution_is_none() -> None:
+def test_a_quadratic_program_without_solution_is_none() -> None:
     null = np.linalg.svd(np.random.default_rng(0).normal(size=(3, 6)))[2][3:].T
     assert nearest_in_null_space(null, np.ones(6), np.zeros(6), (np.full(6, 2.0), np.full(6, 3.0))) is None
 

@@ -27,7 +27,7 @@ def test_a_row_without_a_plan_counts_as_not_done() -> None:
     assert "duration_s" not in found
 
 
-def test_planned_and_executed_errors_are_told_apart() -> None:
+def test_planned_and_executed_errors_are_distinguished() -> None:
     found = values_of(row(), "nominal")
     assert (found["planned_z_error_mm_s"], found["z_error_mm_s"]) == (0.2, 0.3)
     assert "z_error_mm_s" not in values_of(row())

@@ -13,7 +13,7 @@ from cnpgen.benchmark.planners import steering
 from cnpgen.benchmark.planners.cbirrt import Search
 from cnpgen.benchmark.planners.mpc_mpnet import MPCMPNet, ProposedExtension
 from cnpgen.benchmark.planners.proposals import (
-    MIN_DEVIATION,
+    MIN_PROPOSAL_DEVIATION,
     Proposals,
     likelihood_gradient,
     load_proposals,
@@ -91,7 +91,7 @@ def test_a_tree_of_sst_keeps_its_limits_and_comes_nearer_to_the_goal() -> None:
     check = StateCheck(problem, robot)
     tree = Tree(np.concatenate([task.boundary.start_q[0], task.boundary.start_dq[0]]), start_xyz, HIT, CONTROL_STEP_S)
     extend = RandomExtension(tree, robot, check, poses_of(check, task), goal, np.random.default_rng(0))
-    found = tree.grow(extend, goal, time_limit=60, most=3000)
+    found = tree.grow(extend, goal, time_limit=60, max_iterations=3000)
     assert found is not None
     ways(found, CONTROL_STEP_S, robot.acceleration_limit)
     tip = task.problem.tip_positions(found.q)
@@ -167,7 +167,10 @@ def test_the_gradient_of_the_likelihood_is_that_of_its_differences_and_the_likel
         difference = (value(parameters + 1e-6 * direction) - value(parameters - 1e-6 * direction)) / 2e-6
         assert gradient @ direction == pytest.approx(difference, rel=1e-6)
     given = forward(architecture.split(parameters), features)
-    logs = scipy.stats.norm.logpdf(targets, given.path, MIN_DEVIATION + np.exp(given.log_rate)) + np.log(2 * np.pi) / 2
+    logs = (
+        scipy.stats.norm.logpdf(targets, given.path, MIN_PROPOSAL_DEVIATION + np.exp(given.log_rate))
+        + np.log(2 * np.pi) / 2
+    )
     assert found == pytest.approx(-logs.sum(axis=1).mean())
 
 
@@ -186,7 +189,7 @@ def test_a_network_that_was_trained_on_plans_proposes_what_is_next_on_them(tmp_p
 
 
 def misses(network: Proposals, plans: Plans) -> float:
-    """How far proposals are from what is next, as a share of how far that is from the present."""
+    """Return the error of proposals relative to the change from the present."""
     random = np.random.default_rng(1)
     states = plans.motion.at_times(np.tile([0.1, 0.1 + network.ahead], (len(plans), 1)))
     now = np.concatenate([states.q[:, 0], states.dq[:, 0]], axis=1)
@@ -233,7 +236,7 @@ def test_mpc_mpnet_keeps_its_limits_and_gets_away_from_the_start(suite: str) -> 
 def test_a_network_of_another_arm_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     other = "cnpgen.benchmark.planners.mpc_mpnet.shipped_proposals"
     monkeypatch.setattr(other, lambda _: shipped_proposals("heavy-object"))
-    with pytest.raises(UsageError, match="'airhockey' is of another arm or world"):
+    with pytest.raises(UsageError, match="'airhockey' is trained for another arm or scene"):
         MPCMPNet().prepare(Setting(one_of("hits-81").problem))
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from cnpgen.cli.describe import (
-    WIDTH,
+    LINE_WIDTH,
     describe,
     describe_pipeline,
     numbers,
@@ -65,7 +65,7 @@ def test_a_dataset_is_described_with_everything_it_refers_to(name):
     assert str(recipe.seed) in text
     for joint in recipe.pipeline.problem.robot.joints:
         assert joint in text
-    long = [line for line in text.splitlines() if len(line) > WIDTH]
+    long = [line for line in text.splitlines() if len(line) > LINE_WIDTH]
     assert not [line for line in long if str(recipe.path) not in line]
 
 
@@ -138,7 +138,7 @@ def test_a_table_is_aligned_and_its_last_column_wraps():
     assert lines[0] == "  a      1  short"
     assert lines[1].startswith("  long  20  word word")
     assert lines[2].startswith(" " * 12 + "word")
-    assert all(len(line) <= WIDTH for line in lines)
+    assert all(len(line) <= LINE_WIDTH for line in lines)
 
 
 def test_a_path_stays_in_one_piece_for_scripts():
@@ -148,5 +148,5 @@ def test_a_path_stays_in_one_piece_for_scripts():
 
 def test_a_table_can_cut_its_last_column_instead():
     (line,) = table([("name", "word " * 40)], one_line=True)
-    assert len(line) <= WIDTH
+    assert len(line) <= LINE_WIDTH
     assert line.endswith(" ...")

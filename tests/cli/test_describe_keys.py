@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from cnpgen.cli.describe import WIDTH
+from cnpgen.cli.describe import LINE_WIDTH
 from cnpgen.cli.describe_keys import (
     FILES,
     describe_keys,
@@ -36,7 +36,7 @@ def test_every_kind_of_stage_and_constraint_is_described(group, name):
         assert key["name"] in text
         assert key["doc"]
         assert key["required"] == ("default" not in key)
-    assert all(len(line) <= WIDTH for line in text.splitlines())
+    assert all(len(line) <= LINE_WIDTH for line in text.splitlines())
 
 
 def test_an_unknown_kind_is_refused_with_the_nearest_one():

@@ -162,7 +162,7 @@ def test_processes_change_not_a_byte(run: Run, saved: Callable[[Plans], Path], m
     assert run(file, "--json", "--workers", 1) == run(file, "--json", "--workers", 2)
 
 
-def test_a_finer_step_looks_at_more_moments(run: Run, saved: Callable[[Plans], Path]) -> None:
+def test_a_finer_step_evaluates_more_times(run: Run, saved: Callable[[Plans], Path]) -> None:
     file = saved(plans_of(load("hit")))
     samples = [
         json.loads(run(file, "--json", "--step", step)[1])["verdicts"][0]["samples"] for step in ("1e-3", "5e-4")

@@ -356,7 +356,7 @@ def test_an_interruption_is_130_and_says_how_to_go_on(run, monkeypatch, tmp_path
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("cnpgen.make.dataset.make_dataset", interrupted)
+    monkeypatch.setattr("cnpgen.make.make_dataset.make_dataset", interrupted)
     code, out, err = run(*MAKE, tmp_path / "x", "--quiet")
     assert (code, out) == (130, "")
     assert err == "cnpgen: interrupted: finished shards are kept; run the same command again to resume\n"

@@ -1,4 +1,4 @@
-"""What the library says while a command runs: once, on stderr, and not at all if it is to be quiet."""
+"""Notices of the library while a command runs: once, on stderr, and not at all if it is to be quiet."""
 
 import logging
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What strangers wrote is shown and does not steer the terminal."""
+"""Untrusted text is shown and does not control the terminal."""
 
 import io
 import json

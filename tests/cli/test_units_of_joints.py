@@ -89,7 +89,7 @@ def test_files_of_plans_and_tables_have_the_units_of_their_joints(plans: Plans, 
     assert head[11:13] == ["ddq slide_x [m/s^2]", "ddq slide_y [m/s^2]"]
 
 
-def test_a_position_far_beyond_the_limits_of_a_sliding_joint_is_perhaps_in_millimetres(gantry: Problem) -> None:
+def test_a_position_far_outside_the_limits_of_a_sliding_joint_is_perhaps_in_millimetres(gantry: Problem) -> None:
     rest, goal = np.zeros((1, 5)), np.array([[0.0, 800.0, 0.0, 0.0, 0.0]])
     with pytest.warns(UserWarning, match=r"slide_y = 800 m .* must be in m, are these millimetres, or normalised"):
         make_plans(

@@ -50,7 +50,7 @@ def needs_meshcat(test: Callable[..., None]) -> Callable[..., None]:
 
 
 def content(page: Path) -> dict[str, Any]:
-    """What a page shows."""
+    """Content of a page."""
     return in_page(page.read_text(encoding="utf-8"))
 
 
@@ -83,7 +83,7 @@ def test_the_joints_of_a_plan_are_where_pinocchio_has_them(page, plans):
     shown, problem = content(page), load_problem("heavy-object")
     robot, motion = load_robot(problem), cnpgen.load_plans(plans).motion[1:2]
     poses = array(shown["poses"], "<f4", -1, shown["joints_and_tip"], 4, 4).transpose(0, 1, 3, 2)
-    assert len(poses) == len(shown["times"]) == len(shown["moments"]) == 240
+    assert len(poses) == len(shown["times"]) == len(shown["labels"]) == 240
     assert shown["times"][-1] == pytest.approx(motion.duration()[0])
     data = robot.model.createData()
     for k in (0, 100, 239):
@@ -136,7 +136,7 @@ def test_a_row_without_a_plan_is_shown_at_its_start_and_goal(plans, capsys, monk
     assert main(["view", str(folder), "--split", "train", "--row", "3"]) == 0
     assert capsys.readouterr().out == "rows.html\n"
     shown = content(tmp_path / "rows.html")
-    assert (shown["moments"], shown["curves"]) == (["start", "goal"], [])
+    assert (shown["labels"], shown["curves"]) == (["start", "goal"], [])
     tips = array(shown["poses"], "<f4", 2, -1, 4, 4)[:, -1, 3, :3]
     rows = cnpgen.load_dataset(folder).arrays("train", fields=["start_xyz", "goal_xyz"])
     np.testing.assert_allclose(tips, [rows["start_xyz"][3], rows["goal_xyz"][3]], atol=1e-6)
@@ -146,7 +146,7 @@ def test_a_row_without_a_plan_is_shown_at_its_start_and_goal(plans, capsys, monk
 def test_a_problem_is_shown_in_its_base_configuration(tmp_path):
     assert main(["view", "airhockey", "-o", str(tmp_path / "arm.html")]) == 0
     shown = content(tmp_path / "arm.html")
-    assert (shown["moments"], shown["note"]) == (
+    assert (shown["labels"], shown["note"]) == (
         ["base"],
         "drawn as the line through its joints' origins that stands for it",
     )
@@ -353,7 +353,7 @@ def chromium(page: Path, *options: str, address: str = "") -> str:
 def test_a_browser_runs_the_page(page):
     found = chromium(page, "--dump-dom")
     assert 'data-ready="yes"' in found
-    assert content(page)["moments"][120] in re.search(r'<output id="time">(.*?)</output>', found)[1]
+    assert content(page)["labels"][120] in re.search(r'<output id="time">(.*?)</output>', found)[1]
     assert found.count("<canvas") == 5  # the scene, and four curves
 
 

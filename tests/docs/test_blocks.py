@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cnpgen.make.dataset import make_dataset
+from cnpgen.make.make_dataset import make_dataset
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.world.path import PathWorld

@@ -3,7 +3,7 @@
 import hashlib
 from pathlib import Path
 
-from cnpgen.make.dataset import MadeDataset, make_dataset
+from cnpgen.make.make_dataset import MadeDataset, make_dataset
 from tests.conftest import TINY_SHARD, tiny_recipe
 
 SHARDS = 4  # of a tiny dataset: 250, 250 and 100 rows of training, 60 of validation

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cnpgen.make.dataset import make_dataset
+from cnpgen.make.make_dataset import make_dataset
 from cnpgen.make.recipe_file import load_dataset_recipe
 from cnpgen.planner.model_file import save_model
 from cnpgen.plans.save import save_plans

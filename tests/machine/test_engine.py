@@ -23,7 +23,7 @@ from cnpgen.errors import MachineError, UsageError
 from cnpgen.machine import clusters
 from cnpgen.machine.clusters import Cluster
 from cnpgen.machine.engine import Engine, assembled
-from cnpgen.make.dataset import _without_local_paths
+from cnpgen.make.make_dataset import _without_local_paths
 from cnpgen.make.make_shards import _PREPARED, make_shards
 from cnpgen.make.resolve_spec import draw_up
 from cnpgen.store.dataset_spec import shards, write_dataset_spec

@@ -31,7 +31,7 @@ def two_threads() -> Iterator[None]:
 
 
 def counts() -> set[int]:
-    """How many threads the BLAS libraries have now."""
+    """Return the number of threads of the BLAS libraries."""
     return {each["num_threads"] for each in threadpool_info() if each["user_api"] == "blas"}
 
 

@@ -157,7 +157,7 @@ def die(_task: int) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def test_a_dead_worker_is_a_machine_error_with_advice():
+def test_a_dead_worker_is_a_machine_error_with_a_hint():
     with pytest.raises(MachineError, match=r"^a worker died \(killed, or out of memory\): try again$"):
         list(distribute(die, range(4), 2, hint=": try again"))
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from cnpgen.make import repair
-from cnpgen.make.dataset import make_dataset
+from cnpgen.make.make_dataset import make_dataset
 from cnpgen.store.dataset_spec import load_dataset_spec, shards
 from cnpgen.store.layout import MANIFEST
 from cnpgen.store.manifest import load_manifest
@@ -139,7 +139,7 @@ def test_a_dataset_with_a_damaged_shard_is_unfinished_until_it_is_made_good(fold
     def killed(*_arguments: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("cnpgen.make.dataset.make_shards", killed)
+    monkeypatch.setattr("cnpgen.make.make_dataset.make_shards", killed)
     with pytest.warns(RuntimeWarning, match="damaged"), pytest.raises(KeyboardInterrupt):
         make_tiny(folder)
     assert not (folder / MANIFEST).exists()

@@ -14,7 +14,7 @@ from cnpgen.cli.main import main
 from cnpgen.errors import RecipeError, UsageError
 from cnpgen.judges.rows.certified_plans import PlanCheck, check_plans
 from cnpgen.make.certify import NO_PLAN, CertifiedPlan, certified
-from cnpgen.make.dataset import make_dataset
+from cnpgen.make.make_dataset import make_dataset
 from cnpgen.make.merge import _shipped_notes
 from cnpgen.make.recipe_file import load_dataset_recipe
 from cnpgen.planner.model_file import shipped_models

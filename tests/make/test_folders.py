@@ -16,7 +16,7 @@ import pytest
 import cnpgen
 from cnpgen.cli.main import main
 from cnpgen.errors import DatasetError, MachineError, RecipeError, UsageError
-from cnpgen.make.dataset import make_dataset
+from cnpgen.make.make_dataset import make_dataset
 from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.store.dataset_spec import load_dataset_spec
 from cnpgen.validate.validate_dataset import validate_dataset
@@ -120,7 +120,7 @@ def test_a_recipe_that_accepts_nothing_does_not_block_the_folder_for_the_correct
 
 
 @pytest.mark.parametrize("content", some(["cut", "flipped"], 1, "slow"))
-def test_a_damaged_blueprint_of_which_nothing_was_made_gives_way(tmp_path, content):
+def test_a_damaged_specification_without_rows_is_replaced(tmp_path, content):
     folder = tmp_path / "out"
     make_tiny(folder, part=(0, 9))
     assert not digests(folder)
@@ -134,7 +134,7 @@ def test_a_damaged_blueprint_of_which_nothing_was_made_gives_way(tmp_path, conte
 
 
 @pytest.mark.parametrize("content", some([b"", b"{", b"garbage", None], 2, "slow"))
-def test_a_damaged_blueprint_with_rows_is_refused_until_it_is_forced(folder, content):
+def test_a_damaged_specification_with_rows_is_refused_unless_forced(folder, content):
     if content is None:
         flip(folder / "specification.json")
     else:
@@ -147,7 +147,7 @@ def test_a_damaged_blueprint_with_rows_is_refused_until_it_is_forced(folder, con
     assert validate_dataset(folder).ok
 
 
-def test_force_works_where_the_blueprint_is_damaged_and_a_record_or_all_documents_are_lost(folder):
+def test_force_works_where_the_specification_is_damaged_and_a_record_or_all_documents_are_lost(folder):
     (folder / "specification.json").write_bytes(b"")
     for name in ("manifest.json", "stats.json", "README.md", "croissant.json", "validation/shard-00000.json"):
         (folder / name).unlink()
@@ -155,7 +155,7 @@ def test_force_works_where_the_blueprint_is_damaged_and_a_record_or_all_document
     assert validate_dataset(folder).ok
 
 
-def test_force_works_where_the_blueprint_is_lost(folder):
+def test_force_works_where_the_specification_is_lost(folder):
     (folder / "specification.json").unlink()
     with pytest.raises(DatasetError, match=r"specification.json is missing; force=True replaces the whole dataset"):
         make_tiny(folder)
@@ -182,7 +182,7 @@ def test_a_folder_that_is_no_dataset_is_refused_and_not_touched(tmp_path, force,
     assert snapshot(tmp_path) == before
 
 
-def test_no_detour_hides_what_is_in_a_folder(tmp_path):
+def test_no_other_path_hides_the_content_of_a_folder(tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "README.md").write_text("mine")
     with pytest.raises(UsageError, match="not empty and not a dataset of cnpgen"):
@@ -264,7 +264,7 @@ def test_a_place_that_the_system_does_not_give_is_a_machine_error(capsys):
 
 def test_a_read_only_folder_is_a_machine_error_before_any_work_is_done(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(os, "access", lambda path, _mode: path != tmp_path)  # root may write everywhere
-    monkeypatch.setattr("cnpgen.make.dataset.draw_up", None)
+    monkeypatch.setattr("cnpgen.make.make_dataset.draw_up", None)
     code, line = refused(capsys, str(tmp_path / "new"))
     assert code == 3
     assert line.endswith("new: Permission denied; choose a folder that you may write to")
@@ -303,7 +303,7 @@ def test_a_finished_dataset_on_read_only_storage_is_left_as_it_is(tmp_path, disk
 
 
 def test_a_read_only_file_system_is_named_as_that(tmp_path, capsys, monkeypatch):
-    """Where nobody can mount one, as the test above does."""
+    """Cover systems without mounts, which the test above needs."""
     monkeypatch.setattr(os, "access", lambda path, _mode: path != tmp_path)
     monkeypatch.setattr(os, "statvfs", lambda _path: SimpleNamespace(f_flag=os.ST_RDONLY))
     code, line = refused(capsys, str(tmp_path / "new"))

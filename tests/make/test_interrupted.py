@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from cnpgen.errors import MachineError, UsageError
-from cnpgen.make.dataset import make_dataset
+from cnpgen.make.make_dataset import make_dataset
 from cnpgen.make.recipe_file import load_dataset_recipe
 from cnpgen.store.layout import MANIFEST
 from cnpgen.store.sampling_statistics import SamplingStatistics
@@ -65,7 +65,7 @@ CHILD = """
 import sys
 from dataclasses import replace
 from cnpgen.make.recipe_file import load_dataset_recipe
-from cnpgen.make.dataset import make_dataset
+from cnpgen.make.make_dataset import make_dataset
 if __name__ == "__main__":
     recipe = replace(load_dataset_recipe("airhockey-hit"), splits={"train": 600, "validation": 60})
     def tell(rows, sampling statistics):

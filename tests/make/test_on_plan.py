@@ -35,7 +35,7 @@ def first(prepare: Prepare):
 
 
 def moved(first, stage: StartOnPlan) -> CandidateBatch:
-    """What the stage makes of them."""
+    """Apply the stage."""
     prepared, candidates = first
     found = CandidateBatch(len(candidates.alive))
     for name, values in candidates.columns.items():
@@ -109,7 +109,7 @@ def test_the_shipped_dataset_is_what_it_says(tiny) -> None:
 
 
 @pytest.mark.slow
-def test_goals_that_many_rows_have_are_not_taken_for_hits_that_were_slowed_down() -> None:
+def test_goals_that_many_rows_have_are_not_taken_for_hits_with_reduced_speed() -> None:
     drawn = draw_boundary_problems("airhockey-online", 3000, seed=7)
     _, count = np.unique(drawn.boundary.goal_q, axis=0, return_counts=True)
     assert count.max() > 3

@@ -48,8 +48,8 @@ def plain_rejection(stage: DrawPositions, count: int) -> dict[str, np.ndarray]:
     ends = {}
     for name, box in (("start", stage.start), ("goal", stage.goal)):
         ends[name] = np.array([random.uniform(axis.low, axis.high, count) for axis in box])
-    apart = np.linalg.norm((ends["goal"] - ends["start"])[:2], axis=0)
-    return {name: values[:, apart >= stage.min_distance] for name, values in ends.items()}
+    separation = np.linalg.norm((ends["goal"] - ends["start"])[:2], axis=0)
+    return {name: values[:, separation >= stage.min_distance] for name, values in ends.items()}
 
 
 def test_positions_have_the_distribution_of_plain_rejection_sampling(drawn):
@@ -88,8 +88,8 @@ def test_start_and_goal_are_independent_before_the_rejection(drawn):
 
 def test_start_and_goal_have_the_minimum_distance(drawn):
     prepared, candidates = drawn
-    apart = np.hypot(*(candidates["goal_xyz"] - candidates["start_xyz"])[:2])
-    assert apart.min() >= stage_of(prepared, "DrawPositions").min_distance
+    separation = np.hypot(*(candidates["goal_xyz"] - candidates["start_xyz"])[:2])
+    assert separation.min() >= stage_of(prepared, "DrawPositions").min_distance
     assert candidates.reasons == ["too close together"]
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from cnpgen.errors import UsageError
-from cnpgen.make.dataset import make_dataset
+from cnpgen.make.make_dataset import make_dataset
 from cnpgen.pipelines.stages.boundary_motion import TableAcceleration
 from cnpgen.pipelines.stages.stage import TaskBatch
 from cnpgen.planner.model import is_rest_to_rest

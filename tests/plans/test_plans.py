@@ -416,7 +416,7 @@ def test_cut_off_and_changed_files_never_give_anything_but_plans_or_an_error(tmp
     assert outcomes[False] > 20
 
 
-def test_a_changed_bit_anywhere_in_a_sealed_file_is_noticed(tmp_path: Path) -> None:
+def test_a_changed_bit_anywhere_in_a_file_with_a_checksum_is_detected(tmp_path: Path) -> None:
     plans = draw_plans()
     save_plans(tmp_path / "plan.h5", plans)
     content, path, draws = (tmp_path / "plan.h5").read_bytes(), tmp_path / "broken.h5", random.Random(1)
@@ -747,7 +747,7 @@ def test_importing_plans_imports_nothing_heavy() -> None:
 
 
 class Tensor:
-    """What NumPy makes of a tensor that carries a gradient, as torch has it: nothing, until it is detached."""
+    """Imitation of a torch tensor with a gradient: NumPy cannot convert it, until it is detached."""
 
     def __init__(self, values: np.ndarray) -> None:
         self.values, self.shape = values, values.shape

@@ -186,7 +186,7 @@ def test_symbolic_contact_of_an_upright_object_agrees_with_the_measurement(bench
         for symbolic, measured in zip(found, measured_forms(KINDS["object-contact"], bench.world), strict=True):
             expected = values(measured)
             np.testing.assert_allclose(np.minimum(symbolic, 0.0), np.minimum(expected, 0.0), atol=1e-9)
-            assert np.all(symbolic <= expected + 1e-9)  # apart: along a face normal, not the distance
+            assert np.all(symbolic <= expected + 1e-9)  # separation: along a face normal, not the distance
         overlapping += np.any(expected < 0)
     assert overlapping > 50
 
@@ -287,7 +287,7 @@ def expect(
         assert found == pytest.approx(broken, rel=1e-6, abs=1e-9), level
 
 
-def test_joint_position_is_met_on_the_limit_and_violated_beyond(benches):
+def test_joint_position_is_met_on_the_limit_and_violated_outside(benches):
     bench = benches["airhockey"]
     upper, lower = bench.robot.position_upper, bench.robot.position_lower
     expect(KINDS["joint-position"], bench.state(upper), {})
@@ -297,7 +297,7 @@ def test_joint_position_is_met_on_the_limit_and_violated_beyond(benches):
 
 
 @pytest.mark.parametrize(("name", "what"), [("velocity", "dq"), ("acceleration", "ddq")])
-def test_joint_rates_are_met_on_the_limit_and_violated_beyond(benches, name, what):
+def test_joint_rates_are_met_on_the_limit_and_violated_outside(benches, name, what):
     bench = benches["airhockey"]
     limit = getattr(bench.robot, f"{name}_limit")
     kind, sign = KINDS[f"joint-{name}"], np.array([1, -1, 1, -1, 1, -1])
@@ -424,7 +424,7 @@ def test_a_line_is_met_on_its_piece_and_violated_beside_it(benches):
     expect(replace(line, direction=(1, 0, 0)), bench.world, across, at=("start", "goal"))
 
 
-def test_an_axis_is_met_along_its_direction_or_within_its_angle_and_violated_beyond(benches):
+def test_an_axis_is_met_along_its_direction_or_within_its_angle_and_violated_outside(benches):
     bench, lean = benches["gantry"], np.array([0.3, -0.2, 0.1, 0.0, 0.2])
     leaning = Axis(direction=(0, -np.sin(0.2), np.cos(0.2)), tolerance=0.01)
     expect(leaning, bench.state(lean), {})
@@ -519,7 +519,7 @@ def test_what_is_no_number_is_an_infinite_violation():
     assert condition([np.nan, 0.0], [0.0, 0.0], [1.0, 1.0]).violation() == np.inf
 
 
-def test_slack_of_limits_is_relative_to_them_and_of_the_rest_absolute():
+def test_tolerances_of_limits_are_relative_and_others_absolute():
     np.testing.assert_allclose(
         condition([0.0, 0.0], [-300.0, -0.5], [100.0, np.inf]).tolerance("float64"), [3e-10, 1e-12]
     )
@@ -539,7 +539,7 @@ def test_tolerance_of_a_motion_is_absolute_or_a_fraction_of_the_limit(benches, n
         np.testing.assert_array_equal(kind.allowed(condition), expected)
 
 
-def test_funnel_lets_a_motion_down_to_the_table_and_nothing_else_in(benches):
+def test_the_time_varying_bound_admits_only_motions_down_to_the_table(benches):
     s, start = np.array([0.0, 0.1, 0.2, 0.3, 1.0]), np.array([0.8, 0.1, 0.157])
     rectangle, height = KINDS["table"].measured(benches["airhockey"].state(benches["airhockey"].robot.base))
     np.testing.assert_allclose(

@@ -106,7 +106,7 @@ def test_the_base_configuration_is_free_and_limits_decide_validity(model: RobotM
 def test_distances_are_negative_inside_an_obstacle() -> None:
     model = RobotModel("heavy-object")
     tip = model.forward_kinematics(model.base)[0]
-    touching, inside = model.scene(tip, tip), model.scene(tip + [0, 0, 0.3], tip + [0, 0, 0.3])
+    touching, inside = model.scene(tip, tip), model.scene(tip + np.array([0, 0, 0.3]), tip + np.array([0, 0, 0.3]))
     distances = [model.min_distance(model.base, scene=scene)[0] for scene in (touching, inside)]
     assert distances[1] < distances[0]
 

@@ -34,12 +34,12 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
 def symbolic(
     bench: Bench, constraint: Constraint, form: str, obstacle_poses: np.ndarray = OBSTACLE_POSES
 ) -> tuple[ca.Function, Condition]:
-    """How much larger the smallest distance of a form is than it must be, as a function of q; the form's condition."""
+    """Return the smallest margin of the symbolic form as a function of q; the form's condition."""
     (q_sx, q), zero = symbols("q", bench.robot.n), [0.0] * bench.robot.n
     state = SymbolicState(bench.robot, q, zero, zero, obstacle_poses.tolist(), bench.problem.obstacle, None)
     found = constraint.symbolic_at(state, "goal") if form == "symbolic_at" else getattr(constraint, form)(state)
     (condition,) = found
-    return ca.Function("room", [q_sx], [ca.mmin(ca.vertcat(*condition.g) - condition.lower)]), condition
+    return ca.Function("clearance", [q_sx], [ca.mmin(ca.vertcat(*condition.g) - condition.lower)]), condition
 
 
 def states(bench: Bench, count: int, seed: int) -> np.ndarray:
@@ -47,8 +47,8 @@ def states(bench: Bench, count: int, seed: int) -> np.ndarray:
     return random.uniform(bench.robot.position_lower, bench.robot.position_upper, (count, bench.robot.n))
 
 
-def room(bench: Bench, constraint: Constraint, q: np.ndarray) -> float:
-    """How much larger the smallest measured distance is than it must be [m]."""
+def clearance(bench: Bench, constraint: Constraint, q: np.ndarray) -> float:
+    """Return the smallest margin of the measured form [m]."""
     (condition,) = constraint.measured(bench.state(q, obstacle_poses=OBSTACLE_POSES))
     return float(np.min(np.array(condition.g) - condition.lower))
 
@@ -63,7 +63,7 @@ def test_what_capsules_clear_is_clear(bench, name, form):
     for q in states(bench, 400, seed=1):
         if float(function(q)) >= 0 and (name == "obstacles" or form == "symbolic_at"):
             clear += 1
-            assert room(bench, CLEARANCES[name], q) > -1e-9
+            assert clearance(bench, CLEARANCES[name], q) > -1e-9
     assert clear > 50 or (name == "itself" and form != "symbolic_at")
 
 
@@ -86,10 +86,10 @@ def test_what_capsules_clear_of_obstacles_of_every_kind_is_clear(tmp_path, form)
 
 @pytest.mark.parametrize("name", CLEARANCES)
 def test_capsules_are_no_further_off_than_their_overhangs(bench, name):
-    """What is further apart than both overhangs by the pieces is apart by the capsules."""
+    """Parts with a distance above both overhangs have disjoint capsules."""
     function, _ = symbolic(bench, CLEARANCES[name], "symbolic_at")
     most = 2 * max(capsule.overhang for capsule in bench.robot.shape.capsules)
-    far = [q for q in states(bench, 400, seed=2) if room(bench, CLEARANCES[name], q) > most]
+    far = [q for q in states(bench, 400, seed=2) if clearance(bench, CLEARANCES[name], q) > most]
     assert all(float(function(q)) > 0 for q in far)
 
 
@@ -97,13 +97,13 @@ def test_capsules_are_no_further_off_than_their_overhangs(bench, name):
 def test_a_met_and_a_violated_case(bench, name):
     met = np.array([1.57, -0.2, 0.4, 0.0])
     violated = {"obstacles": np.array([0.0, 0.3, 0.0, 0.0]), "itself": np.array([0.0, 0.6, 2.3, 0.0])}[name]
-    assert room(bench, CLEARANCES[name], met) > 0.01
-    assert room(bench, CLEARANCES[name], violated) < -0.01
+    assert clearance(bench, CLEARANCES[name], met) > 0.01
+    assert clearance(bench, CLEARANCES[name], violated) < -0.01
 
 
 def test_the_distance_that_is_asked_for_is_kept(bench):
     for q in states(bench, 20, seed=3):
-        near, far = (room(bench, RobotClearance(tolerance=0.0, distance=d), q) for d in (0.0, 0.05))
+        near, far = (clearance(bench, RobotClearance(tolerance=0.0, distance=d), q) for d in (0.0, 0.05))
         assert near - far == pytest.approx(0.05)
 
 
@@ -121,7 +121,7 @@ def segments(count: int) -> list[list[np.ndarray]]:
     return [list(points) for points in random.uniform(-1, 1, (count, 4, 3))]
 
 
-def test_segments_are_as_far_apart_as_their_nearest_points():
+def test_the_distance_of_segments_is_that_of_their_closest_points():
     shares = np.linspace(0, 1, 101)
     for a, b, c, d in segments(200):
         one, other = a + np.outer(shares, b - a), c + np.outer(shares, d - c)
@@ -164,4 +164,6 @@ def test_a_problem_with_a_shape_is_judged_by_its_pieces_along_a_path(tmp_path: P
     for constraint in CLEARANCES.values():
         (condition,) = constraint.measured(world)
         least = min(float(np.min(each)) for each in condition.g)
-        assert least - condition.lower[0] == pytest.approx(min(room(bench, constraint, q) for q in path.T), abs=1e-8)
+        assert least - condition.lower[0] == pytest.approx(
+            min(clearance(bench, constraint, q) for q in path.T), abs=1e-8
+        )

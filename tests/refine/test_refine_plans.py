@@ -16,7 +16,7 @@ import pytest
 
 from cnpgen.cli.main import main
 from cnpgen.errors import UsageError
-from cnpgen.make.dataset import make_dataset
+from cnpgen.make.make_dataset import make_dataset
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.plans import PlanStatus, load_plans, save_plans
 from cnpgen.plans.boundary_problems import load_boundary_problems
@@ -341,7 +341,7 @@ def test_invalid_plans_are_listed_and_the_exit_code_is_1(
     ("words", "message"),
     [
         (["solve", "airhockey-hit"], "--n is required"),
-        (["solve", "airhockey-hit", "--n", "2", "--split", "train"], "--split and --first are for the folder"),
+        (["solve", "airhockey-hit", "--n", "2", "--split", "train"], "--split and --first need the folder"),
         (["solve", "airhokey-hit", "--n", "2"], "did you mean 'airhockey-hit'"),
         (["refine", "nowhere.h5"], "nowhere.h5"),
         (["solve", "airhockey-hit", "--n", "2", "-o", "."], "must be a file in a folder that exists"),

@@ -1,4 +1,4 @@
-"""What a problem adds to the robot of a URDF: against the same robot with a URDF that was edited by hand."""
+"""Bodies that a problem adds to the robot of a URDF: against the same robot with a URDF that was edited by hand."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -57,7 +57,7 @@ CHANNEL = np.concatenate([box(*each) for each in BOXES])
 
 
 def covered(points: np.ndarray, parts: list[np.ndarray]) -> np.ndarray:
-    """Whether points are in one of the hulls, within a nanometre, by SciPy's Delaunay triangulation."""
+    """Return a mask of the points in one of the hulls, within a nanometre, by SciPy's Delaunay triangulation."""
     grown = [part.mean(axis=0) + (part - part.mean(axis=0)) * (1 + 1e-6) for part in parts]
     return np.any([Delaunay(part).find_simplex(points) >= 0 for part in grown], axis=0)
 
@@ -145,19 +145,19 @@ def test_without_coacd_it_is_said_what_to_install(monkeypatch):
 def test_what_coacd_cannot_do_is_said_with_the_mesh(tmp_path, stand_in, monkeypatch):
     monkeypatch.setenv("CNPGEN_CACHE", str(tmp_path / "cache"))
     with pytest.raises(
-        RecipeError, match=r"channel\.stl: CoACD cannot take a mesh apart: RuntimeError: no such random numbers"
+        RecipeError, match=r"channel\.stl: CoACD cannot decompose a mesh: RuntimeError: no such random numbers"
     ):
         load_robot(channel_problem(tmp_path, "convex_parts = 13"))
 
 
-def test_a_line_has_no_meshes_to_take_apart(tmp_path):
+def test_a_line_has_no_meshes_to_decompose(tmp_path):
     with pytest.raises(RecipeError, match=r"robot\.convex_parts.*meshes matter with geometry"):
         channel_problem(tmp_path, 'convex_parts = 3\ngeometry = "paper-capsules"')
 
 
 @pytest.mark.extended
 @pytest.mark.skipif(find_spec("coacd") is None, reason="CoACD is not installed")
-def test_coacd_takes_a_channel_apart():
+def test_coacd_decomposes_a_channel():
     parts = convex_parts(CHANNEL.reshape(-1, 3), np.arange(108).reshape(-1, 3), 8, None)
     assert covered(on_triangles(CHANNEL, np.random.default_rng(2)), parts).all()
     assert volume(parts) < 0.5 * ConvexHull(CHANNEL.reshape(-1, 3)).volume

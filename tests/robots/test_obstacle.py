@@ -109,7 +109,7 @@ def test_corners_that_are_none_are_refused(content: bytes) -> None:
     assert "mesh" in mistakes(kind="mesh", position=HERE, mesh=address)
 
 
-def test_tops_hold_the_numbers_of_all_obstacles(tmp_path: Path) -> None:
+def test_poses_hold_the_entries_of_all_obstacles(tmp_path: Path) -> None:
     problem = load_problem(write_problem(tmp_path, obstacles=KINDS))
     upright = load_problem(write_problem(tmp_path)).obstacle
     problem = replace(problem, obstacle=(*upright, *problem.obstacle))

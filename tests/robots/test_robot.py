@@ -54,15 +54,15 @@ def test_acceleration_limit_is_the_rate_times_the_velocity_limit_up_to_the_cap()
     assert robot.acceleration_limit.min() < 15.0
 
 
-def test_position_scale_narrows_limits_about_their_middle(tmp_path):
+def test_position_scale_narrows_limits_about_their_center(tmp_path):
     problem = with_urdf(tmp_path, 'lower="-2.9670597283903604"', 'lower="-1.0"')
     robot = load_robot(replace(problem, limits=replace(problem.limits, position_scale=0.5)))
-    middle, half = (2.9670597283903604 - 1.0) / 2, (2.9670597283903604 + 1.0) / 4
-    assert robot.position_lower[0] == pytest.approx(middle - half)
-    assert robot.position_upper[0] == pytest.approx(middle + half)
+    center, half = (2.9670597283903604 - 1.0) / 2, (2.9670597283903604 + 1.0) / 4
+    assert robot.position_lower[0] == pytest.approx(center - half)
+    assert robot.position_upper[0] == pytest.approx(center + half)
 
 
-def test_skeleton_of_the_heavy_object_is_shoulder_elbow_wrist_object():
+def test_capsule_axes_of_the_heavy_object_are_shoulder_elbow_wrist_object():
     robot = load_robot(HEAVY)
     assert robot.capsule_axes == ((1, 3), (3, 5), (5, 7))
     model, data = robot.model, robot.model.createData()
@@ -72,13 +72,13 @@ def test_skeleton_of_the_heavy_object_is_shoulder_elbow_wrist_object():
     np.testing.assert_allclose(lengths, [0.42, 0.4, 0.251], atol=1e-12)
 
 
-def test_skeleton_ends_at_the_tip_where_joint_7_is_locked():
+def test_capsule_axes_end_at_the_tip_where_joint_7_is_locked():
     robot = load_robot(AIRHOCKEY)
     assert robot.capsule_axes == ((1, 3), (3, 5), (5, 6))
     assert robot.n == 6
 
 
-def test_locked_joints_in_the_middle_leave_a_bent_skeleton():
+def test_locked_inner_joints_leave_angled_capsule_axes():
     joints = tuple(name for name in HEAVY.robot.joints if name != "joint_4")
     robot = load_robot(changed(HEAVY, joints=joints, base=(0.0,) * 6))
     assert robot.joint_names == joints

@@ -197,7 +197,7 @@ def test_a_mesh_without_volume_has_a_hull_none_the_less(tmp_path, flat):
 
 
 def inside(points: np.ndarray, capsule: module.Capsule) -> np.ndarray:
-    """How far points are inside a capsule [m]."""
+    """Return the depth of points inside a capsule [m]."""
     along = capsule.second - capsule.first
     share = np.clip((points - capsule.first) @ along / max(along @ along, 1e-18), 0, 1)
     return capsule.radius - np.linalg.norm(points - capsule.first - np.outer(share, along), axis=1)

@@ -1,4 +1,4 @@
-"""What make_dataset is given from Python is checked before anything is touched."""
+"""Arguments of make_dataset are checked before any file changes."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cnpgen.errors import RecipeError, UsageError
-from cnpgen.make.dataset import make_dataset
+from cnpgen.make.make_dataset import make_dataset
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.make.recipe_file import as_dataset_recipe
 from cnpgen.make.resolve_spec import draw_up
@@ -27,7 +27,7 @@ def test_integers_of_numpy_are_integers(value: Any) -> None:
 
 
 @pytest.mark.parametrize("value", [2, 8, 3.0, "3", None, True, np.bool_(True), np.float64(3), [3]])
-def test_what_is_no_integer_or_beyond_its_bounds_is_refused_with_the_bounds(value: object) -> None:
+def test_values_that_are_no_integers_or_outside_their_bounds_are_refused(value: object) -> None:
     with pytest.raises(UsageError, match=r"^n must be an integer from 3 to 7, got "):
         integer("n", value, least=3, most=7)
 
@@ -70,7 +70,7 @@ def test_what_is_no_array_of_numbers_is_refused_with_what_it_is(values: Any, why
 
 
 class Tensor:
-    """What NumPy makes of a tensor that carries a gradient: nothing, until it is detached."""
+    """Imitation of a tensor with a gradient: NumPy cannot convert it until it is detached."""
 
     def __array__(self, *_: Any, **__: Any) -> np.ndarray:
         raise RuntimeError("it requires grad")
@@ -112,7 +112,7 @@ def test_a_wrong_type_is_a_usage_error_that_names_the_argument_and_touches_nothi
     assert not list(tmp_path.iterdir())
 
 
-def test_whole_numbers_of_numpy_make_the_blueprint_of_python_s(tmp_path: Path) -> None:
+def test_whole_numbers_of_numpy_give_the_specification_of_python_integers(tmp_path: Path) -> None:
     recipe, place = tiny_recipe("airhockey-hit"), find_workspace(tmp_path)
     jobs = [draw_up(recipe, place, n=kind(50), seed=kind(3), shard_size=kind(20)) for kind in (int, np.int64)]
     assert jobs[0].spec.fingerprint == jobs[1].spec.fingerprint

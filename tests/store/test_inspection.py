@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from cnpgen.errors import DatasetError, MachineError, UsageError
-from cnpgen.make.dataset import make_dataset
+from cnpgen.make.make_dataset import make_dataset
 from cnpgen.store.dataset_plot import MIN_CANDIDATES_PER_CELL, plot_dataset
 from cnpgen.store.inspection import inspect_dataset
 from cnpgen.store.reader import open_dataset

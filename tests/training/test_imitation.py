@@ -9,7 +9,7 @@ import pytest
 
 from cnpgen.errors import UsageError
 from cnpgen.make.certify import certified
-from cnpgen.make.dataset import make_dataset
+from cnpgen.make.make_dataset import make_dataset
 from cnpgen.planner.control_points import ControlPoints
 from cnpgen.planner.network.architecture import initial_parameters
 from cnpgen.planner.plan_requests import read_rows

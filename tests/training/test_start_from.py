@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from cnpgen.errors import UsageError
-from cnpgen.make.dataset import make_dataset
+from cnpgen.make.make_dataset import make_dataset
 from cnpgen.planner.model_file import save_model
 from cnpgen.planner.via_points import ViaPoints
 from cnpgen.problems.problem_record import record_problem

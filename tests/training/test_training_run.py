@@ -17,7 +17,7 @@ import pytest
 from cnpgen.cli.train_text import summary
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.losses.metric_settings import BOUNDED
-from cnpgen.make.dataset import make_dataset
+from cnpgen.make.make_dataset import make_dataset
 from cnpgen.planner.model import Model
 from cnpgen.planner.model_file import load_model
 from cnpgen.store.files.leftovers import temporary_name

@@ -11,7 +11,7 @@ import pinocchio as pin
 import pytest
 
 from cnpgen.judges.rows.hits import highest_speed
-from cnpgen.make.dataset import make_dataset
+from cnpgen.make.make_dataset import make_dataset
 from cnpgen.make.recipe_file import load_dataset_recipe
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem

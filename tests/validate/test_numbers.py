@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cnpgen.make.dataset import make_dataset
+from cnpgen.make.make_dataset import make_dataset
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, load_dataset_spec, shards
 from cnpgen.store.shard import read_shard
 from cnpgen.store.shard_record import ShardRecord, load_record

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from cnpgen.errors import DatasetError, MachineError, UsageError
-from cnpgen.make.dataset import make_dataset
+from cnpgen.make.make_dataset import make_dataset
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.store.check import REMAKE_HINT

@@ -29,7 +29,7 @@ from cnpgen.training.adam import learning_rate, start_adam
 Array = NDArray[Any]
 
 KIND, VERSION = "cnpgen-proposals", 1
-MIN_DEVIATION = 0.02  # fraction of the reach
+MIN_PROPOSAL_DEVIATION = 0.02  # fraction of the reach
 STATES_PER_PLAN = 40
 HIDDEN, LAYERS, BATCH, STEPS, RATE = 128, 3, 256, 12_000, 2e-3
 
@@ -67,7 +67,7 @@ class Proposals:
         """
         inputs = standardize(inputs_of(state[None], goal_q[None], obstacle_poses[None]), self.mean, self.scale)
         given = forward(self._weights, inputs)
-        drawn = random.normal(given.path[0], MIN_DEVIATION + np.exp(given.log_rate[0]))
+        drawn = random.normal(given.path[0], MIN_PROPOSAL_DEVIATION + np.exp(given.log_rate[0]))
         return np.asarray(state[: len(goal_q)] + self.reach * drawn)
 
     @cached_property
@@ -195,9 +195,9 @@ def likelihood_gradient(weights: Weights, features: Array, targets: Array, *, ou
         What it is the gradient of.
     """
     given = forward(weights, features)
-    deviation = np.exp(given.log_rate) + MIN_DEVIATION
+    deviation = np.exp(given.log_rate) + MIN_PROPOSAL_DEVIATION
     off = (given.path - targets) / deviation
-    gradient = (1 - off * off) / deviation * (deviation - MIN_DEVIATION)
+    gradient = (1 - off * off) / deviation * (deviation - MIN_PROPOSAL_DEVIATION)
     backward(
         weights,
         given,

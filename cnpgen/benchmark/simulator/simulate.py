@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 FORMAT = "cnpgen-simulation"
 SIMULATION_VERSION = 1
 FLAGS = ("success", "finished", "hit", "scored", "touched_early", "collided")
-MAX_PLANS_OF_ONE_PROCESS = 20  # a second process pays off for more plans
+MAX_SIMULATIONS_OF_ONE_PROCESS = 20  # a second process pays off for more plans
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +102,7 @@ def simulate_plans(
         plant = challenge_plant(environment)
         check_challenge(*open_problem(plans.problem))
     count = worker_count(
-        1 if workers is None and len(plans) <= MAX_PLANS_OF_ONE_PROCESS else workers, max(len(plans), 1)
+        1 if workers is None and len(plans) <= MAX_SIMULATIONS_OF_ONE_PROCESS else workers, max(len(plans), 1)
     )
     executed: list[Executed] = []
     with closing(distribute(partial(_simulate, plant=plant), iter(plans), count, ordered=True)) as results:

@@ -10,7 +10,7 @@ from cnpgen.cli.describe_keys import GROUPS, is_array, kind_summary, part_of
 from cnpgen.schema import registry
 from cnpgen.schema.keys import Key, PerJoint, Range, keys
 
-WIDTH = 118
+RECIPE_LINE_WIDTH = 118
 NOTHING = "..."  # for people to fill in
 
 
@@ -72,7 +72,7 @@ def _unless(given: Any, line: str) -> str:
 
 
 def _comment(text: str) -> list[str]:
-    return textwrap.wrap(text, WIDTH, initial_indent="# ", subsequent_indent="# ", break_on_hyphens=False)
+    return textwrap.wrap(text, RECIPE_LINE_WIDTH, initial_indent="# ", subsequent_indent="# ", break_on_hyphens=False)
 
 
 def toml(value: Any) -> str:

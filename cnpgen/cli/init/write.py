@@ -7,7 +7,7 @@ from typing import Any
 
 from cnpgen.cli.describe import table, with_units
 from cnpgen.cli.init.arm import DEFAULT_RANGE_M, DEFAULT_RANGE_RAD, DEFAULT_SPEED, Arm
-from cnpgen.cli.init.recipes import TORQUE_STATES
+from cnpgen.cli.init.initial_recipes import TORQUE_STATES
 from cnpgen.cli.init.text import recipe_text
 from cnpgen.cli.shape_rows import link_rows, pair_rows
 from cnpgen.make.recipe import DatasetRecipe

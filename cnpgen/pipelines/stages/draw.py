@@ -23,7 +23,7 @@ class DrawPositions(Stage):
     def describe(self) -> str:
         """Describe the stage in one sentence."""
         text = f"draw a start position in {_box(self.start)} m and a goal position in {_box(self.goal)} m"
-        return f"{text}, at least {self.min_distance:g} m apart horizontally" if self.min_distance else text
+        return f"{text}, horizontal distance at least {self.min_distance:g} m" if self.min_distance else text
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
         """List the fields of both positions."""

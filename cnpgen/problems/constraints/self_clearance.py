@@ -32,14 +32,14 @@ class SelfClearance(Constraint):
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the distances of the capsules' axes [m] of the pairs for solvers."""
-        return self._apart(state, _for_solvers(state.robot))
+        return self._capsule_distances(state, _for_solvers(state.robot))
 
     def measured(self, world: "World") -> tuple[Condition, ...]:
         """Measure the signed distances of the convex parts with Coal [m]."""
         (found,) = self._least(world.self_distances(self.distance), [0.0], sufficient=False)
         shape = world.robot.shape
         links = [piece.link for piece in shape.convex_parts] if shape else []
-        pairs = shape.apart if shape else ()
+        pairs = shape.checked_pairs if shape else ()
         return (replace(found, parts=tuple(f"{links[i]}, {links[j]}" for i, j in pairs)),)
 
     def met(self, path: "PathWorld", tolerance: float) -> NDArray[np.bool_]:
@@ -53,9 +53,9 @@ class SelfClearance(Constraint):
 
     def symbolic_at(self, state: "SymbolicState", end: End) -> tuple[Condition, ...]:  # noqa: ARG002
         """State the distances of all pairs."""
-        return self._apart(state, _looked_at(state.robot))
+        return self._capsule_distances(state, _looked_at(state.robot))
 
-    def _apart(self, state: "SymbolicState", pairs: "Sequence[LinkPair]") -> tuple[Condition, ...]:
+    def _capsule_distances(self, state: "SymbolicState", pairs: "Sequence[LinkPair]") -> tuple[Condition, ...]:
         from cnpgen.kernels.symbolic.segment_distance import segment_distance
 
         ends = [(state.capsules[pair.first], state.capsules[pair.second]) for pair in pairs]

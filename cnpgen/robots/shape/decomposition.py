@@ -130,10 +130,10 @@ def _run_coacd(points: Array, triangles: NDArray[np.int64], most: int) -> list[A
             done = subprocess.run(command, capture_output=True, text=True, timeout=COACD_TIMEOUT_S, check=False)
             return _read(answer)
         except subprocess.TimeoutExpired as error:
-            raise RecipeError([f"CoACD did not take a mesh apart in {COACD_TIMEOUT_S:g} s"]) from error
+            raise RecipeError([f"CoACD did not decompose a mesh in {COACD_TIMEOUT_S:g} s"]) from error
         except (OSError, ValueError, KeyError) as error:
             said = (done.stderr or done.stdout).strip().splitlines()[-1:]
-            raise RecipeError([f"CoACD cannot take a mesh apart: {' '.join(said)}"]) from error
+            raise RecipeError([f"CoACD cannot decompose a mesh: {' '.join(said)}"]) from error
 
 
 def _written(parts: Sequence[Array]) -> bytes:

@@ -49,7 +49,7 @@ class Shape:
         return tuple(part for part in self.convex_parts if self.joints[part.link])
 
     @cached_property
-    def apart(self) -> tuple[tuple[int, int], ...]:
+    def checked_pairs(self) -> tuple[tuple[int, int], ...]:
         """Index pairs of convex parts of links that must not touch, ordered by link pair."""
         of_link = {link: [i for i, each in enumerate(self.convex_parts) if each.link == link] for link in self.joints}
         kept = [pair for pair in self.pairs if not pair.left_out]

@@ -13,8 +13,8 @@ import pytest
 from cnpgen.errors import MachineError, UsageError
 from cnpgen.kernels.library import choose_backend
 from cnpgen.make import make_shards as make
-from cnpgen.make.dataset import _part as make_part
-from cnpgen.make.dataset import is_quick, make_dataset, runs
+from cnpgen.make.make_dataset import _part as make_part
+from cnpgen.make.make_dataset import is_quick, make_dataset, runs
 from cnpgen.make.make_shards import Job, make_shards, shard_columns
 from cnpgen.make.recipe_file import load_dataset_recipe
 from cnpgen.make.resolve_spec import draw_up
@@ -292,7 +292,7 @@ def test_runs_are_the_shards_in_order_and_long_enough_to_share_blocks(job, size,
         assert len(groups) >= min(4 * workers * (workers > 1), 20)
 
 
-def test_the_blueprint_says_what_the_rows_came_from(tiny):
+def test_the_specification_records_the_source_of_the_rows(tiny):
     spec = load_dataset_spec(tiny("airhockey-replan"))
     assert (tiny("airhockey-replan") / SPECIFICATION).is_file()
     assert spec.recipe["pipeline"]["name"] == "airhockey-replan"
