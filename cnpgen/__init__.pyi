@@ -4,9 +4,9 @@ from cnpgen.loader.load import load_dataset as load_dataset
 from cnpgen.losses.plan_loss import PlanLoss as PlanLoss
 from cnpgen.machine.versions import __version__ as __version__
 from cnpgen.make.complete import complete as complete
-from cnpgen.make.make_dataset import make_dataset as make_dataset
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems as draw_boundary_problems
 from cnpgen.make.extend import extend_dataset as extend_dataset
+from cnpgen.make.make_dataset import make_dataset as make_dataset
 from cnpgen.make.merge import merge_datasets as merge_datasets
 from cnpgen.planner.boundary_layer import BoundaryLayer as BoundaryLayer
 from cnpgen.planner.model import Model as Model

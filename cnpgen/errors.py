@@ -39,8 +39,8 @@ class CnpgenError(Exception):
         self.argument, self.remedies = argument, remedies or {}
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the keyword arguments, too, for worker processes."""
-        return type(self), self.args, {"argument": self.argument, "remedies": self.remedies}
+        """Pickle the keyword arguments and notes, too, for worker processes."""
+        return type(self), self.args, vars(self)
 
     def text(self, spelling: Spelling = python_spelling) -> str:
         """Return the message with all arguments in one spelling, by default as in a Python call."""

@@ -1,8 +1,9 @@
-"""Stable import location for plug-ins: contracts of stages, constraints and planners, and the classes they use."""
+"""Stable import location for plug-ins: contracts of stages, constraints and exporters, and their arguments."""
 
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.stage import CandidateBatch, Stage
+from cnpgen.plans.exporter import ExportedSet, Exporter, SampledPlan
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.schema.keys import PerJoint, Range, field
 from cnpgen.store.field import Field
@@ -13,9 +14,12 @@ __all__ = [
     "Condition",
     "Constraint",
     "Context",
+    "ExportedSet",
+    "Exporter",
     "Field",
     "PerJoint",
     "Range",
+    "SampledPlan",
     "Stage",
     "SymbolicState",
     "World",

@@ -21,11 +21,11 @@ LAYERS = (
     ("kernels", "world"),
     ("problems",),
     ("pipelines", "judges", "losses"),
-    ("plans", "plugins"),
+    ("plans",),
     ("refine", "planner"),
     ("make", "training", "interop"),
     ("validate", "benchmark"),
-    ("cli", "recipes", "results", "__init__"),
+    ("cli", "plugins", "recipes", "results", "__init__"),
     ("__main__",),
 )
 MAX_PACKAGES = 26

@@ -12,15 +12,16 @@ from cnpgen.cli.plan_files import read_plans
 if TYPE_CHECKING:
     from cnpgen.plans import Plans
     from cnpgen.plans.export import Exported
+    from cnpgen.plans.exporter import Exporter
     from cnpgen.plans.join import JoinedPlans
 
-FORMS = ("npz", "csv", "joint-trajectory")  # those of cnpgen.plans.export, which takes a while to import
 MAX_LISTED_PLANS = 10  # invalid plans that are listed by number
 
 _TEXT = """\
 npz is one NumPy archive; csv and joint-trajectory (a message of ROS 2, as JSON) are a folder with one file per plan.
-docs/plan-format.md shows how to read them. The path of the output is printed on stdout. Plans that cannot be sampled
-are left out and listed on stderr; the exit code is then 1. With --join, positions, velocities and accelerations must be
+'cnpgen list exporters' shows all formats, including those of installed packages. docs/plan-format.md shows how to
+read them. The path of the output is printed on stdout. Plans that cannot be sampled are left out and listed on
+stderr; the exit code is then 1. With --join, positions, velocities and accelerations must be
 continuous from plan to plan (1e-9 in SI); otherwise nothing is written.
 """
 
@@ -30,14 +31,14 @@ def add(commands: "Commands[Parser]") -> None:
     parser = add_command(commands, "export", run, title="write plans as sampled trajectories", text=_TEXT)
     option = parser.add_argument
     option("file", metavar="FILE", type=Path, help="plan file, .h5")
-    option("--to", metavar="FORM", required=True, choices=FORMS, help="the form: npz, csv or joint-trajectory")
+    option("--to", metavar="FORMAT", required=True, help="format: npz, csv, joint-trajectory, or one of a package")
     option("--rate", metavar="HZ", type=values.hertz, default=1000.0, help="samples per second (default: 1000)")
     option(
         "-o",
         "--out",
         metavar="PATH",
         type=Path,
-        help="file (npz) or folder to write; default: in the current folder, named after FILE and FORM",
+        help="file (npz) or folder to write; default: in the current folder, named after FILE and FORMAT",
     )
     option("--plan", metavar="I", type=values.numbers, help="these plans only, by index: 0,3,10-12")
     option("--sample", metavar="I", type=values.numbers, help="these samples' plans only, by sample_id; adds to --plan")
@@ -60,17 +61,18 @@ def add(commands: "Commands[Parser]") -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
-    from cnpgen.plans.export import export_plans
+    from cnpgen.plans.export import export_plans, load_exporter
 
+    exporter = load_exporter(arguments.to)
     plans = _plans(arguments)
-    chosen, out = _chosen(plans, arguments), _place(arguments)
+    chosen, out = _chosen(plans, arguments), _place(arguments, exporter)
     exported = export_plans(plans, out, to=arguments.to, rate=arguments.rate, only=chosen)
     for why in exported.refused.values():
         print(f"cnpgen: left out: {why}", file=sys.stderr)
     if exported.invalid:
         print(f"cnpgen: warning: {_invalid(exported)}", file=sys.stderr)
     print(f"exported {_counted(exported)} at {arguments.rate:g} Hz", file=sys.stderr)
-    print(exported.files[0] if arguments.to == "npz" else out)
+    print(exported.files[0] if exporter.single_file else out)
     return 1 if exported.refused else 0
 
 
@@ -103,15 +105,16 @@ def _invalid(exported: "Exported") -> str:
     return f"not valid by their status ('cnpgen evaluate' reports why): plan{'s' * (len(first) > 1)} {which}"
 
 
-def _place(arguments: argparse.Namespace) -> Path:
+def _place(arguments: argparse.Namespace, exporter: "Exporter") -> Path:
     """Return the output path, which must not exist without ``--force``."""
     from cnpgen.errors import UsageError
 
     file: Path = arguments.file
-    out: Path = arguments.out or Path(f"{file.stem}.npz" if arguments.to == "npz" else f"{file.stem}-{arguments.to}")
+    name = f"{file.stem}{exporter.suffix}" if exporter.single_file else f"{file.stem}-{arguments.to}"
+    out: Path = arguments.out or Path(name)
     if not out.parent.is_dir():
         raise UsageError(f"{out} must be in a folder that exists")
-    target = out / "plans.npz" if arguments.to == "npz" and out.is_dir() else out
+    target = out / f"plans{exporter.suffix}" if exporter.single_file and out.is_dir() else out
     if target.exists() and not arguments.force and not (target.is_dir() and not any(target.iterdir())):
         raise UsageError(f"{target} exists; --force replaces files of the same name")
     return out

@@ -1,11 +1,11 @@
-"""``cnpgen list``: the recipes and models that cnpgen ships, and the kinds of stages and constraints for recipes."""
+"""``cnpgen list``: the recipes and models that cnpgen ships, and the kinds of stages, constraints and exporters."""
 
 import argparse
 from typing import Any
 
 from cnpgen.cli.parser import Commands, Parser, add_command, add_json
 
-WHAT = ("datasets", "models", "pipelines", "problems", "stages", "constraints")
+WHAT = ("datasets", "models", "pipelines", "problems", "stages", "constraints", "exporters")
 
 _HOW = {
     "datasets": "cnpgen make-dataset NAME",
@@ -14,6 +14,7 @@ _HOW = {
     "problems": "cnpgen show NAME --kind problem",
     "stages": "cnpgen show --stage NAME",
     "constraints": "cnpgen show --constraint NAME",
+    "exporters": "cnpgen export PLANS --to NAME",
 }
 
 
@@ -34,14 +35,14 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def list_all(what: str) -> list[dict[str, Any]]:
-    """List the recipes of one kind, the models, or the kinds of stages or constraints, with name, title and size.
+    """List the recipes of one kind, the models, or a group of kinds, with name, title and size.
 
     Args:
         what: One of ``WHAT``.
     """
     from cnpgen.schema import registry
 
-    groups = {"stages": registry.STAGES, "constraints": registry.CONSTRAINTS}
+    groups = {"stages": registry.STAGES, "constraints": registry.CONSTRAINTS, "exporters": registry.EXPORTERS}
     if what in groups:
         return [{"name": name, "title": _summary(groups[what], name)} for name in registry.names(groups[what])]
     return {"datasets": _datasets, "models": _models, "pipelines": _pipelines, "problems": _problems}[what]()

@@ -1,4 +1,4 @@
-"""Registry of stages, constraints and planners: built-in kinds, and kinds of installed packages."""
+"""Registry of stages, constraints, planners and exporters: built-in kinds, and kinds of installed packages."""
 
 import contextlib
 import dataclasses
@@ -17,11 +17,13 @@ from cnpgen.errors import RecipeError, nearest
 STAGES = "cnpgen.stages"
 CONSTRAINTS = "cnpgen.constraints"
 PLANNERS = "cnpgen.planners"
+EXPORTERS = "cnpgen.exporters"
 
 CONTRACTS: dict[str, str] = {  # base class of the kinds of a group
     STAGES: "cnpgen.pipelines.stages.stage:Stage",
     CONSTRAINTS: "cnpgen.problems.constraints.constraint:Constraint",
     PLANNERS: "cnpgen.benchmark.benchmark_planner:BenchmarkPlanner",
+    EXPORTERS: "cnpgen.plans.exporter:Exporter",
 }
 
 BUILT_IN: dict[str, dict[str, str]] = {
@@ -75,6 +77,11 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "sst": "cnpgen.benchmark.planners.sst:SST",
         "mpc-mpnet": "cnpgen.benchmark.planners.mpc_mpnet:MPCMPNet",
     },
+    EXPORTERS: {
+        "npz": "cnpgen.plans.formats:NumpyArchive",
+        "csv": "cnpgen.plans.formats:CsvTables",
+        "joint-trajectory": "cnpgen.plans.formats:JointTrajectory",
+    },
 }
 
 
@@ -82,7 +89,7 @@ def names(group: str) -> tuple[str, ...]:
     """List the kinds of a group: the built-in ones in their order, then those of installed packages by name.
 
     Args:
-        group: ``STAGES``, ``CONSTRAINTS`` or ``PLANNERS``.
+        group: ``STAGES``, ``CONSTRAINTS``, ``PLANNERS`` or ``EXPORTERS``.
     """
     others = {entry.name for entry in installed(group)} - BUILT_IN[group].keys()
     return (*BUILT_IN[group], *sorted(others))
@@ -92,11 +99,11 @@ def load(group: str, name: str) -> type[Any]:
     """Import the class of a kind.
 
     Args:
-        group: ``STAGES``, ``CONSTRAINTS`` or ``PLANNERS``.
+        group: ``STAGES``, ``CONSTRAINTS``, ``PLANNERS`` or ``EXPORTERS``.
         name: Name of the kind, as ``use`` has it in a recipe.
 
     Returns:
-        A concrete subclass of ``Stage``, ``Constraint`` or ``BenchmarkPlanner``.
+        A concrete subclass of the contract of the group.
 
     Raises:
         RecipeError: The kind is unknown, defined twice, or cannot be imported.
@@ -120,7 +127,7 @@ def contract(group: str) -> type[Any]:
 
 
 def noun_of(group: str) -> str:
-    """Return the noun of a group: "stage", "constraint" or "planner"."""
+    """Return the noun of a group, such as "stage"."""
     return group.removeprefix("cnpgen.").removesuffix("s")
 
 
@@ -134,7 +141,7 @@ def name_of(group: str, kind: type) -> str:
     """Return the name under which a class is registered, or ``"module:Class"`` if it is not.
 
     Args:
-        group: ``STAGES``, ``CONSTRAINTS`` or ``PLANNERS``.
+        group: ``STAGES``, ``CONSTRAINTS``, ``PLANNERS`` or ``EXPORTERS``.
         kind: The class.
     """
     spec = f"{kind.__module__}:{kind.__qualname__}"
@@ -181,7 +188,7 @@ def why_missing(group: str, use: str, package: str) -> str:
     """Return the missing package of a kind in a recipe; empty if the kind exists.
 
     Args:
-        group: ``STAGES``, ``CONSTRAINTS`` or ``PLANNERS``.
+        group: ``STAGES``, ``CONSTRAINTS``, ``PLANNERS`` or ``EXPORTERS``.
         use: Name of the kind.
         package: The package that had it, empty if that is not known.
     """

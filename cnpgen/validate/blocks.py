@@ -83,7 +83,7 @@ def backend_of(folder: Path, spec: DatasetSpec) -> tuple[Backend, Path]:
     except MachineError as error:
         raise MachineError(
             f"{folder} was made by the {spec.backend} backend, which does not work here ({error}): its blocks"
-            " cannot be made again; all checks but {{regenerate}} work without it",
+            " cannot be made again; all checks but {regenerate} work without it",
             remedies={"regenerate": None},
         ) from error
 

@@ -106,7 +106,7 @@ def test_a_report_leaves_out_the_picture_of_a_line_that_was_damaged(tmp_path: Pa
     failure = found.results["cnp-b"][0]["executed"]["heavier"]["failure"]
     assert failure.startswith("path_control_points has 3 joints, but 'airhockey' plans 6")
     report = save_benchmark_report(found, tmp_path / "report.html").read_text()
-    assert "cnp-b, problem 0: no picture: path_control_points has 3 joints" in report
+    assert "cnp-b, problem 0: no image: path_control_points has 3 joints" in report
     assert "1 of 1 (paper: 100 %)" in report
 
 
@@ -122,7 +122,7 @@ def test_a_report_is_made_although_the_first_answer_cannot_be_executed(tmp_path:
     found = run_benchmark("hits-81", tmp_path, planners=["cnp-b"], n=2, plants=["nominal"], workers=1)
     assert "cannot be executed" in found.results["cnp-b"][0]["executed"]["nominal"]["failure"]
     report = save_benchmark_report(found, tmp_path / "report.html").read_text()
-    assert "cnp-b, problem 1" in report or "No pictures" in report
+    assert "cnp-b, problem 1" in report or "No images" in report
 
 
 @pytest.mark.slow
@@ -148,11 +148,11 @@ def test_a_run_goes_on_where_it_was_and_adds_to_what_is_there(tmp_path: Path, mo
     assert all(row["executed"]["nominal"]["scored"] for row in again.results["cnp-b"])
     third = run_benchmark("hits-81", tmp_path, planners=["cnp-b"], n=3, plants=["nominal"], workers=1)
     assert third.results == again.results
-    monkeypatch.setattr("cnpgen.benchmark.html_report.FRAMES", 3)
+    monkeypatch.setattr("cnpgen.benchmark.html_report.MAX_FILM_FRAMES", 3)
     report = save_benchmark_report(third, tmp_path / "report.html", video=True).read_text()
     assert "paper: 100 %" in report
     assert "<svg" in report
-    assert "src='data:video/mp4;base64," in report or "No pictures: this machine cannot draw" in report
+    assert "src='data:video/mp4;base64," in report or "No images: this machine cannot draw" in report
     assert not re.search("(src|href)=['\"](?!data:|#)", report)
     assert [file.name for file in sorted(tmp_path.iterdir())] == ["cnp-b.jsonl", "report.html"]
 

@@ -9,10 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cnpgen.cli.export_command import FORMS
 from cnpgen.cli.main import main
 from cnpgen.plans import PlanStatus, save_plans
-from cnpgen.plans.export import FORMS as LIBRARY_FORMS
 from tests.examples.plan_files import garbage, plans_of
 from tests.examples.plans import load
 from tests.plans.test_plans import draw_plans
@@ -39,8 +37,10 @@ def hits(tmp_path: Path) -> Path:
     return tmp_path / "hits.h5"
 
 
-def test_the_forms_are_those_of_the_library() -> None:
-    assert FORMS == LIBRARY_FORMS
+def test_an_unknown_format_is_refused_with_all_known_ones(run: Run, hits: Path) -> None:
+    code, _, err = run(hits, "--to", "cvs")
+    assert code == 2
+    assert "unknown exporter 'cvs' (did you mean 'csv'?); known: npz, csv, joint-trajectory" in err
 
 
 def test_an_archive_is_named_after_the_file_and_its_name_is_the_output(run: Run, hits: Path) -> None:
@@ -146,7 +146,7 @@ def test_plans_that_cannot_be_sampled_are_named_and_the_others_written(run: Run,
     ("words", "message"),
     [
         ((), "--to"),
-        (("--to", "yaml"), "expected one of npz, csv, joint-trajectory, got 'yaml'"),
+        (("--to", "yaml"), "unknown exporter 'yaml'; known: npz, csv, joint-trajectory"),
         (("--to", "csv", "--rate", "0"), "expected a rate above 0, such as 1000 or 1000Hz; got '0'"),
         (("--to", "csv", "--rate", "1ms"), "expected a rate above 0"),
         (("--to", "csv", "--rate", "1e7"), "at most 1e+06 Hz"),

@@ -430,7 +430,7 @@ def test_list_shows_everything_that_there_is(run):
 def test_list_can_be_narrowed_and_read_by_programs(run):
     assert "start-ik" not in run("list", "datasets")[1]
     found = json.loads(run("list", "--json")[1])
-    assert list(found) == ["datasets", "models", "pipelines", "problems", "stages", "constraints"]
+    assert list(found) == ["datasets", "models", "pipelines", "problems", "stages", "constraints", "exporters"]
     assert found["datasets"][0]["rows"] == 19_800
     assert Path(found["problems"][0]["file"]).is_file()
 
@@ -500,7 +500,7 @@ def test_inspect_shows_rows_ranges_and_yield(run, hits):
 def test_inspect_writes_json_and_a_picture(run, hits, tmp_path):
     code, out, err = run("inspect", hits, "--json", "--plot", tmp_path / "hits.png")
     assert code == 0
-    assert json.loads(out)["densities"]["goal_xyz"]["drawn"]
+    assert json.loads(out)["densities"]["goal_xyz"]["candidates"]
     assert err == f"drawn: {tmp_path / 'hits.png'}\n"
     assert (tmp_path / "hits.png").stat().st_size > 10_000
     assert "ends in .png" in one_line(run("inspect", hits, "--plot", "hits.jpeg")[2])

@@ -132,7 +132,10 @@ def test_the_plug_in_of_the_docs_works_when_installed(tmp_path: Path) -> None:
     (tmp_path / "problem.toml").write_text(problem, encoding="utf-8")
     (tmp_path / "slow.toml").write_text(pipeline, encoding="utf-8")
 
-    assert "slow-hits" in run(["cnpgen", "list"], tmp_path)
+    assert all(name in run(["cnpgen", "list"], tmp_path) for name in ("slow-hits", "keep-out", "json-lines"))
+    run(["cnpgen", "solve", "airhockey-hit", "--n", "2", "-o", "plans.h5", "--workers", "1"], tmp_path)
+    run(["cnpgen", "export", "plans.h5", "--to", "json-lines", "--rate", "50"], tmp_path)
+    assert len((tmp_path / "plans.jsonl").read_text(encoding="utf-8").splitlines()) == 2
     run(["cnpgen", "make-dataset", "slow.toml", "--n", "300", "--workers", "1", "--out", "slow"], tmp_path)
     run(["cnpgen", "validate", "slow", "--deep", "--workers", "1"], tmp_path)
     rejected = run(["cnpgen", "inspect", "slow"], tmp_path)

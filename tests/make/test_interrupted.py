@@ -68,7 +68,7 @@ from cnpgen.make.recipe_file import load_dataset_recipe
 from cnpgen.make.make_dataset import make_dataset
 if __name__ == "__main__":
     recipe = replace(load_dataset_recipe("airhockey-hit"), splits={"train": 600, "validation": 60})
-    def tell(rows, sampling statistics):
+    def tell(rows, sampling):
         print(rows, flush=True)
         sys.stdin.readline()
     make_dataset(recipe, sys.argv[1], shard_size=int(sys.argv[3]), workers=int(sys.argv[2]), progress=tell)

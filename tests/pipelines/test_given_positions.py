@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from cnpgen.errors import RecipeError, UsageError
-from cnpgen.make.make_dataset import make_dataset
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
+from cnpgen.make.make_dataset import make_dataset
 from cnpgen.make.recipe_file import load_dataset_recipe
 from cnpgen.pipelines.pipeline_file import load_pipeline
 from cnpgen.pipelines.stages.behind_puck import BehindPuck

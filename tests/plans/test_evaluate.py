@@ -67,7 +67,7 @@ def test_plans_in_memory_and_in_a_file_get_one_verdict_where_a_tip_position_was_
 
 @pytest.mark.slow
 def test_processes_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cnpgen.plans.evaluate, "PLANS_PER_TASK", 3)
+    monkeypatch.setattr(cnpgen.plans.evaluate, "PLANS_PER_VERDICT_TASK", 3)
     plans = plans_of(*(plan for plan, _ in garbage().values()))
     counts: list[int] = []
     one, two = (evaluate_plans(plans, workers=workers, progress=counts.append) for workers in (1, 2))

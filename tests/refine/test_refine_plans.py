@@ -16,8 +16,8 @@ import pytest
 
 from cnpgen.cli.main import main
 from cnpgen.errors import UsageError
-from cnpgen.make.make_dataset import make_dataset
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
+from cnpgen.make.make_dataset import make_dataset
 from cnpgen.plans import PlanStatus, load_plans, save_plans
 from cnpgen.plans.boundary_problems import load_boundary_problems
 from cnpgen.plans.evaluate import evaluate_plans

@@ -8,6 +8,7 @@ import pytest
 from cnpgen.benchmark.benchmark_planner import BenchmarkPlanner
 from cnpgen.errors import RecipeError
 from cnpgen.pipelines.stages.stage import Stage
+from cnpgen.plans.exporter import Exporter
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.schema import registry
 from cnpgen.schema.keys import field
@@ -153,6 +154,7 @@ def test_every_group_has_a_base():
         STAGES: Stage,
         CONSTRAINTS: Constraint,
         registry.PLANNERS: BenchmarkPlanner,
+        registry.EXPORTERS: Exporter,
     }
     assert registry.CONTRACTS.keys() == registry.BUILT_IN.keys()
 

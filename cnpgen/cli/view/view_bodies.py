@@ -14,7 +14,7 @@ from cnpgen.errors import RecipeError
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.chain import frame_of
 from cnpgen.robots.robot import Robot
-from cnpgen.robots.shape.convex_part import origin_of, convex_part_of
+from cnpgen.robots.shape.convex_part import convex_part_of, origin_of
 from cnpgen.robots.shape.inline import read_mesh, scale_of, sides_of
 from cnpgen.robots.shape.mesh_files import find_named_file
 from cnpgen.robots.urdf import urdf_tree

@@ -1,0 +1,96 @@
+"""Contract of export formats: plans sampled in time, written to files."""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.trajectory.joined import JoinedMotion
+from cnpgen.trajectory.spline_motion import Motion
+
+Array = NDArray[np.float64]
+
+MIN_LAST_STEP_FRACTION = 0.01  # minimum length of the last step in steps; a shorter one is merged with the step before
+
+
+@dataclass(frozen=True)
+class SampledPlan:
+    """Plan sampled at K times.
+
+    Attributes:
+        index: Index of the plan in its set.
+        t: Times [s], shape (K,), strictly increasing from 0 to the duration.
+        q: Joint positions [rad], shape (K, n).
+        dq: Joint velocities [rad/s], shape (K, n).
+        ddq: Joint accelerations [rad/s^2], shape (K, n).
+        jerk: Joint jerks [rad/s^3], shape (K, n).
+    """
+
+    index: int
+    t: Array
+    q: Array
+    dq: Array
+    ddq: Array
+    jerk: Array
+
+
+@dataclass(frozen=True)
+class ExportedSet:
+    """Data of all N exported plans.
+
+    Attributes:
+        index: Index of each plan in its set, shape (N,).
+        sample_id: Sample ID of each plan, shape (N,).
+        joint_names: Names of the n planned joints.
+        prismatic: Whether each planned joint is prismatic; its values are in m instead of rad.
+        held_joints: Positions of the movable joints that are not planned: name -> rad or m.
+    """
+
+    index: NDArray[np.int64]
+    sample_id: NDArray[np.int64]
+    joint_names: tuple[str, ...]
+    prismatic: tuple[bool, ...]
+    held_joints: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Exporter(ABC):
+    """Format of sampled trajectories; a frozen dataclass without fields.
+
+    Packages register formats under the entry point ``cnpgen.exporters``; ``cnpgen export --to NAME`` then writes them.
+
+    Attributes:
+        suffix: Suffix of the files, with the dot.
+        single_file: Whether one file has all plans; otherwise each plan has its own file, and ``held_joints.yaml``
+            beside the files has the positions of the joints that are not planned.
+    """
+
+    suffix: ClassVar[str]
+    single_file: ClassVar[bool] = False
+
+    @abstractmethod
+    def write(self, path: Path, plans: Iterable[SampledPlan], exported: ExportedSet) -> None:
+        """Write a file; an existing file is replaced, atomically.
+
+        Args:
+            path: Path of the file.
+            plans: All plans for a single file, which are sampled one by one; otherwise one plan.
+            exported: Data of all exported plans.
+
+        Raises:
+            MachineError: The disk is full or read-only, or a file operation failed.
+        """
+
+
+def sample_plan(motion: Motion | JoinedMotion, rate: float, index: int = 0) -> SampledPlan:
+    """Sample one motion at ``rate`` [Hz], and at its last instant."""
+    duration = float(motion.duration()[0])
+    count = max(math.ceil(duration * rate - MIN_LAST_STEP_FRACTION), 1)
+    t = np.append(np.arange(count) / rate, duration)
+    states = motion.at_times(t[None])
+    return SampledPlan(index, t, states.q[0], states.dq[0], states.ddq[0], states.jerk[0])
