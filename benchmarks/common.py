@@ -1,4 +1,4 @@
-"""Shared parts of the benchmarks: the line about the machine, medians, tables and ``--json``."""
+"""Shared parts of the benchmarks: description of the machine, medians, tables and ``--json``."""
 
 import argparse
 import json
@@ -14,12 +14,12 @@ from typing import Any
 import cnpgen
 
 LIBRARIES = ("numpy", "scipy", "casadi", "pin", "coal", "h5py", "joblib")
-NEED_ROBOTS = ("panda-cup", "ur5-wipe")  # recipes of robots that come with the extra cnpgen[robots]
+ROBOT_RECIPES = ("panda-cup", "ur5-wipe")  # recipes of robots that come with the extra cnpgen[robots]
 INSTRUCTION_SETS = ("avx512f", "avx2", "avx", "asimd")  # best first
 
 
 def arguments(text: str | None, add: Callable[[argparse.ArgumentParser], None]) -> argparse.Namespace:
-    """Parse the command line: what ``add`` adds, and ``--json``."""
+    """Parse the command line: the options that ``add`` adds, and ``--json``."""
     parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
     add(parser)
     parser.add_argument("--json", action="store_true", help="write JSON instead of tables")
@@ -27,7 +27,7 @@ def arguments(text: str | None, add: Callable[[argparse.ArgumentParser], None]) 
 
 
 def machine() -> dict[str, Any]:
-    """Describe the machine as it is now."""
+    """Describe the machine and its present load."""
     lines = _cpuinfo()
     flags = next((set(line.split()) for line in lines if line.startswith(("flags", "Features"))), set())
     return {
@@ -55,24 +55,24 @@ def _version(name: str) -> str:
 
 
 def machine_line() -> str:
-    """Describe the machine in a line."""
-    found = machine()
-    versions = ", ".join(f"{name} {value}" for name, value in found["versions"].items())
-    head = f"{found['cores']} cores, {found['cpu']}, {found['instructions']}, load {found['load']}"
-    return f"machine: {head}; Python {found['python']}, {versions}"
+    """Describe the machine in one line."""
+    facts = machine()
+    versions = ", ".join(f"{name} {value}" for name, value in facts["versions"].items())
+    head = f"{facts['cores']} cores, {facts['cpu']}, {facts['instructions']}, load {facts['load']}"
+    return f"machine: {head}; Python {facts['python']}, {versions}"
 
 
-def at_hand(names: Iterable[str]) -> list[str]:
-    """Leave out recipes whose robots are not installed, and say so."""
-    chosen = list(names)
+def installed_recipes(names: Iterable[str]) -> list[str]:
+    """Return the recipes whose robots are installed; report the others on stderr."""
+    recipes = list(names)
     if _version("example-robot-data") != "not installed":
-        return chosen
-    progress(f"without {', '.join(NEED_ROBOTS)}, which need pip install 'cnpgen[robots]'")
-    return [name for name in chosen if name not in NEED_ROBOTS]
+        return recipes
+    progress(f"without {', '.join(ROBOT_RECIPES)}, which need pip install 'cnpgen[robots]'")
+    return [name for name in recipes if name not in ROBOT_RECIPES]
 
 
 def median(values: Iterable[float]) -> float:
-    """Median, nan of nothing."""
+    """Return the median; nan without values."""
     numbers = list(values)
     return statistics.median(numbers) if numbers else float("nan")
 
@@ -86,7 +86,7 @@ def verdict(value: float, target: float | None, *, at_most: bool = False) -> tup
 
 
 def table(title: str, head: Sequence[str], rows: Iterable[Sequence[str]], *, left: int = 1) -> str:
-    """Lay out a table: the first ``left`` columns aligned to the left, the others to the right."""
+    """Format a table: the first ``left`` columns aligned to the left, the others to the right."""
     cells = [tuple(head), *(tuple(row) for row in rows)]
     widths = [max(len(row[i]) for row in cells) for i in range(len(head))]
     lines = [
@@ -99,7 +99,7 @@ def table(title: str, head: Sequence[str], rows: Iterable[Sequence[str]], *, lef
 
 
 def report(results: dict[str, Any], tables: Iterable[str], *, as_json: bool) -> None:
-    """Print what was measured."""
+    """Print the results as tables or as JSON."""
     if as_json:
         print(json.dumps({"machine": machine(), **results}, indent=2))
     else:
@@ -107,5 +107,5 @@ def report(results: dict[str, Any], tables: Iterable[str], *, as_json: bool) -> 
 
 
 def progress(text: str) -> None:
-    """Say on stderr what is being measured."""
+    """Print a progress message on stderr."""
     print(f"... {text}", file=sys.stderr, flush=True)

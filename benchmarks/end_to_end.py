@@ -1,10 +1,11 @@
 """Wall time of whole ``cnpgen make-dataset`` processes: the documentation's table of datasets and its memory figures.
 
-Every repetition runs all cases in turn; times are medians. "Warm" runs find their kernels in the cache; "empty" runs
-get a fresh ``CNPGEN_CACHE`` and build and compile them. The start-up table says what passes before the first row.
+Every repetition runs all cases in turn; times are medians. "Warm" runs load their kernels from the cache; "empty" runs
+have a new ``CNPGEN_CACHE`` and build and compile them. The start-up table has the time of every step before the first
+row.
 
     python benchmarks/end_to_end.py
-    python benchmarks/end_to_end.py --large 10000000    does a worker's memory grow? (takes 0.35 GB per million rows)
+    python benchmarks/end_to_end.py --large 10000000    memory of the workers over time (0.35 GB per million rows)
 """
 
 import argparse
@@ -19,9 +20,9 @@ from pathlib import Path
 from typing import Any
 
 from common import arguments, median, progress, report, table, verdict
-from watching import MARKS, Sample, watch
+from process_memory import MARKS, Sample, sample_memory
 
-STEPS = (  # what happens before the first row
+STEPS = (  # before the first row
     ("Python", "pass"),
     ("NumPy", "import numpy"),
     ("cnpgen.make.make_dataset", "import cnpgen.make.make_dataset"),
@@ -44,7 +45,7 @@ STEPS = (  # what happens before the first row
 
 @dataclass
 class Case:
-    """A dataset, made from the beginning.
+    """A dataset that is made repeatedly.
 
     Attributes:
         walls: Wall times [s].
@@ -95,13 +96,13 @@ def make_command(name: str, rows: int, workers: int, out: Path) -> list[str]:
 
 
 def environment(cache: Path) -> dict[str, str]:
-    """Return the environment of a run. Modules keep their bytecode, as those of an installed package do."""
-    kept = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
-    return kept | {"CNPGEN_CACHE": str(cache)}
+    """Return the environment of a run; modules keep their bytecode, like those of an installed package."""
+    variables = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    return variables | {"CNPGEN_CACHE": str(cache)}
 
 
 def _children() -> float:
-    """CPU time of all processes that have ended [s]."""
+    """Return the CPU time of all processes that have ended [s]."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 
@@ -122,16 +123,16 @@ def measure(folder: Path, repeat: int, cold: int) -> list[Case]:
 
 
 def measure_start(folder: Path, name: str, repeat: int) -> dict[str, float]:
-    """Run the steps of a start in a fresh process and note the time after each; return what each takes [s]."""
+    """Run the steps of a start in a new process; return the time of each [s]."""
     lines = [line.format(name=name, out=str(folder / "none")) + "; print(time.time())" for _, line in STEPS]
     command = [sys.executable, "-c", "\n".join(["import time", *lines])]
-    found: list[list[float]] = []
+    clocks: list[list[float]] = []
     for _ in range(repeat):
         start = time.time()
         done = subprocess.run(command, check=True, stdout=subprocess.PIPE, env=environment(folder / "cache"), text=True)
-        found.append([start, *map(float, done.stdout.split())])
+        clocks.append([start, *map(float, done.stdout.split())])
     return {
-        step: median(times[number] - times[number - 1] for times in found)
+        step: median(times[number] - times[number - 1] for times in clocks)
         for number, (step, _) in enumerate(STEPS, start=1)
     }
 
@@ -169,18 +170,18 @@ def case_table(cases: list[Case]) -> str:
 
 def start_table(name: str, steps: dict[str, float]) -> str:
     rows = [(step, f"{1e3 * seconds:.0f}") for step, seconds in steps.items()]
-    rows.append(("together", f"{1e3 * sum(steps.values()):.0f}"))
+    rows.append(("sum", f"{1e3 * sum(steps.values()):.0f}"))
     return table(f"Start-up of {name}, warm: wall time of each step (median)", ("step", "ms"), rows)
 
 
 def run_large(folder: Path, rows: int) -> tuple[float, list[Sample]]:
-    """Make a large dataset once; return its wall time [s] and its samples."""
+    """Make a large dataset once; return its wall time [s] and the samples of memory."""
     Case("airhockey-replan", 1000, 1, True).run(folder)  # fills the cache
     out = folder / "large"
     command = make_command("airhockey-replan", rows, 2, out)
     start = time.perf_counter()
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, env=environment(folder / "cache")) as process:
-        samples = watch(process, out, rows)
+        samples = sample_memory(process, out, rows)
     if process.returncode:
         sys.exit(f"make-dataset failed with exit code {process.returncode}")
     return time.perf_counter() - start, samples
@@ -200,9 +201,9 @@ def large_table(rows: int, wall: float, samples: list[Sample]) -> str:
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--repeat", type=int, default=5, help="runs with a warm cache")
     parser.add_argument("--cold", type=int, default=2, help="runs with an empty cache")
-    parser.add_argument("--large", type=int, metavar="N", help="make N rows and watch the workers' memory instead")
+    parser.add_argument("--large", type=int, metavar="N", help="make N rows and measure the workers' memory instead")
     parser.add_argument(
-        "--folder", type=Path, help="where datasets are made, and deleted again; default a temporary one"
+        "--folder", type=Path, help="folder of the datasets, which are deleted; default a temporary one"
     )
 
 

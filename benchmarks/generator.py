@@ -1,7 +1,7 @@
 """Accepted rows per second and core: the documentation's table of generator speeds, stage by stage.
 
-The clock is the process's CPU time, so that other processes disturb little. Every repetition measures all cases in
-turn; rates are medians over the repetitions, ratios medians of the ratios within one repetition.
+The clock is the process's CPU time, so that other processes have little influence. Every repetition measures all
+cases in turn. Rates are medians over the repetitions, ratios are medians of the ratios within one repetition.
 
     python benchmarks/generator.py
     python benchmarks/generator.py --backend compiled numpy casadi --repeat 3
@@ -12,7 +12,7 @@ import time
 from dataclasses import dataclass, field
 from typing import Any
 
-from common import arguments, at_hand, median, progress, report, table, verdict
+from common import arguments, installed_recipes, median, progress, report, table, verdict
 
 from cnpgen.kernels.library import choose_backend
 from cnpgen.pipelines.pipeline_file import load_pipeline
@@ -32,7 +32,7 @@ TARGETS = {  # accepted rows per second and core
 
 @dataclass
 class StageTime:
-    """CPU time of one stage [s], and the draws that entered and left it."""
+    """CPU time of one stage [s], and the numbers of candidates before and after it."""
 
     name: str
     seconds: float = 0.0
@@ -42,26 +42,26 @@ class StageTime:
     def timed(self, run: StageFunction) -> StageFunction:
         """Wrap the stage's function."""
 
-        def timed(draws: CandidateBatch, random: Any) -> None:
-            self.entered += len(draws.alive)
+        def timed(candidates: CandidateBatch, random: Any) -> None:
+            self.entered += len(candidates.alive)
             start = time.process_time()
-            run(draws, random)
+            run(candidates, random)
             self.seconds += time.process_time() - start
-            self.left += len(draws.alive)
+            self.left += len(candidates.alive)
 
         return timed
 
 
 @dataclass
 class Case:
-    """One pipeline on one backend, and what was measured of it.
+    """Measurements of one pipeline on one backend.
 
     Attributes:
         rates: Accepted rows per second of CPU time, one per repetition.
-        stages: Time of each stage, the last gate included.
-        total: Time of the blocks that the stages were timed in [s].
+        stages: Time of each stage and of the acceptance.
+        total: Time of the blocks in which the stages were timed [s].
         rows: Accepted rows of these blocks.
-        drawn: Their draws.
+        candidates: Candidates of these blocks.
     """
 
     pipeline: str
@@ -72,7 +72,7 @@ class Case:
     stages: list[StageTime] = field(default_factory=list)
     total: float = 0.0
     rows: int = 0
-    drawn: int = 0
+    candidates: int = 0
 
     @property
     def rate(self) -> float:
@@ -80,12 +80,12 @@ class Case:
         return median(self.rates)
 
     def make(self, blocks: int) -> tuple[float, int]:
-        """Make fresh blocks; return the CPU time [s] and the number of draws."""
-        start, drawn = time.process_time(), 0
+        """Make fresh blocks; return the CPU time [s] and the number of candidates."""
+        start, candidates = time.process_time(), 0
         for _ in range(blocks):
-            drawn += self.prepared.block(1, "benchmark", self.next_block).sampling.tried
+            candidates += self.prepared.block(1, "benchmark", self.next_block).sampling.tried
             self.next_block += 1
-        return time.process_time() - start, drawn
+        return time.process_time() - start, candidates
 
 
 def prepare(pipeline: str, backend: str) -> Case:
@@ -110,17 +110,17 @@ def measure_stages(case: Case, blocks: int) -> None:
     prepared = case.prepared
     stages, accept = prepared._stages, prepared._accept
     names = [_name(label, stage) for (label, _), stage in zip(stages, prepared.pipeline.stage, strict=True)]
-    case.stages = [StageTime(name) for name in [*names, "(last gate)"]]
+    case.stages = [StageTime(name) for name in [*names, "(acceptance)"]]
     timed = [stage.timed(run) for stage, run in zip(case.stages, [*(run for _, run in stages), accept], strict=True)]
     prepared._stages = [(label, run) for (label, _), run in zip(stages, timed, strict=False)]
     prepared._accept = timed[-1]
-    case.total, case.drawn = case.make(blocks)
+    case.total, case.candidates = case.make(blocks)
     case.rows = blocks * BLOCK_ROWS
     prepared._stages, prepared._accept = stages, accept
 
 
 def _name(label: str, stage: Stage) -> str:
-    """Name a stage by its kind, which its label has after its number, and by what tells it from others of the kind."""
+    """Name a stage by the kind in its label and by the options that distinguish stages of one kind."""
     details = [getattr(stage, key, None) for key in ("end", "judge")]
     return " ".join([label.partition(". ")[2], *(str(detail) for detail in details if detail)])
 
@@ -131,10 +131,10 @@ def rate_table(cases: list[Case]) -> str:
         first = next(other for other in cases if other.pipeline == case.pipeline)
         ratio = median(a / b for a, b in zip(first.rates, case.rates, strict=True))
         numbers = (f"{case.rate:,.0f}", f"{max(case.rates):,.0f}", f"{1e6 / case.rate:.2f}")
-        draws = f"{case.drawn / case.rows:.3f}"
+        candidates = f"{case.candidates / case.rows:.3f}"
         target = TARGETS.get((case.pipeline, case.backend))
-        rows.append((case.pipeline, case.backend, *numbers, draws, f"{ratio:.1f}", *verdict(case.rate, target)))
-    head = ("pipeline", "backend", "rows/s/core", "best", "us/row", "draws/row", "times slower", "target", "")
+        rows.append((case.pipeline, case.backend, *numbers, candidates, f"{ratio:.1f}", *verdict(case.rate, target)))
+    head = ("pipeline", "backend", "rows/s/core", "best", "us/row", "candidates/row", "times slower", "target", "")
     return table("Accepted rows per second of CPU time (median, and best repetition)", head, rows, left=2)
 
 
@@ -146,9 +146,14 @@ def stage_table(case: Case) -> str:
     ]  # fmt: skip
     rest = case.total - sum(stage.seconds for stage in case.stages)
     rows.append(
-        ("(rounds, counting, joining)", f"{100 * rest / case.total:.1f} %", f"{1e6 * rest / case.rows:.3f}", "")
+        (
+            "(batches, statistics, concatenation)",
+            f"{100 * rest / case.total:.1f} %",
+            f"{1e6 * rest / case.rows:.3f}",
+            "",
+        )
     )
-    return table(f"{case.pipeline}, {case.backend}", ("stage", "share", "us/row", "passes"), rows)
+    return table(f"{case.pipeline}, {case.backend}", ("stage", "share", "us/row", "accepted"), rows)
 
 
 def results(cases: list[Case]) -> dict[str, Any]:
@@ -159,7 +164,7 @@ def results(cases: list[Case]) -> dict[str, Any]:
                 "backend": case.backend,
                 "rows_per_second": case.rate,
                 "repetitions": case.rates,
-                "draws_per_row": case.drawn / case.rows,
+                "candidates_per_row": case.candidates / case.rows,
                 "target": TARGETS.get((case.pipeline, case.backend)),
                 "stage_seconds": {
                     f"{number}. {stage.name}": stage.seconds for number, stage in enumerate(case.stages, 1)
@@ -172,15 +177,15 @@ def results(cases: list[Case]) -> dict[str, Any]:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--pipeline", nargs="+", help="which pipelines; by default all whose robots are there")
-    parser.add_argument("--backend", nargs="+", default=("compiled", "numpy"), choices=BLOCKS, help="which backends")
+    parser.add_argument("--pipeline", nargs="+", help="pipelines; by default all whose robots are installed")
+    parser.add_argument("--backend", nargs="+", default=("compiled", "numpy"), choices=BLOCKS, help="backends")
     parser.add_argument("--repeat", type=int, default=9, help="repetitions")
     parser.add_argument("--blocks", type=int, help=f"blocks of {BLOCK_ROWS} rows per repetition; default {BLOCKS}")
 
 
 def main() -> None:
     options = arguments(__doc__, add_options)
-    chosen = options.pipeline or at_hand(PIPELINES)
+    chosen = options.pipeline or installed_recipes(PIPELINES)
     blocks = {name: options.blocks or number for name, number in BLOCKS.items()}
     cases = [prepare(pipeline, backend) for pipeline in chosen for backend in options.backend]
     measure_rates(cases, options.repeat, blocks)

@@ -1,12 +1,12 @@
-"""PlannedHits online, replanning to the same goal, and refining until a deadline.
+"""Online hits, replanning to an unchanged goal, and refining until a deadline.
 
-* A hit, from a puck to a plan: completing the task and planning, one at a time and 1,024 together; by a planner
-  whose rates are the network's, and by one that paces them.
-* Replanning to a goal that has not moved: what the network alone takes over what was left, and what is kept.
-* Refining until a deadline: valid plans and motion time, and how long it took.
+* Hits: completion of the task and planning, one puck at a time and 1,024 together. One planner takes the rates of the
+  network, the other one computes them by time parametrization.
+* Replanning to an unchanged goal: durations of the network's plans and of ``replan``, over the remaining time.
+* Refining until a deadline: valid plans, motion times and CPU times.
 
-The clock is CPU time, that of deadlines too, so that other jobs on the machine count little; one BLAS thread; medians,
-and the cases of hits measured in turn.
+The clock is CPU time, also for deadlines, so that other processes have little influence. Times are medians with one
+BLAS thread; the cases of hits are measured in turn.
 
     python benchmarks/hits.py
 """
@@ -31,162 +31,168 @@ from cnpgen.refine.refine_plans import refine_plans
 
 NAME, TIME_PARAMETRIZED = "airhockey-replan", "airhockey-online"
 BATCH = 1024
-TARGET = np.array([2.49, 0.0])  # m, where pucks are sent
-GOALS = {(1, "completed"): 0.3, (1, "planned"): 0.3, (1, "both"): 0.6, (BATCH, "both"): 0.04}  # ms
-PARTS = (0.1, 0.3, 0.5, 0.7, 0.9, 0.95)  # of a plan's time
+TARGET = np.array([2.49, 0.0])  # m, target of the pucks
+TARGETS_MS = {(1, "completed"): 0.3, (1, "planned"): 0.3, (1, "both"): 0.6, (BATCH, "both"): 0.04}
+REPLAN_TIMES = (0.1, 0.3, 0.5, 0.7, 0.9, 0.95)  # fractions of the motion time
 DEADLINES = (None, 10e-3, 20e-3, 40e-3, 60e-3, 80e-3)  # s
 
 
 def hits(planner: Planner, repeat: int) -> dict[str, Any]:
-    """Milliseconds per hit, and of its halves."""
-    old = planner.plan_batch(draw_boundary_problems(NAME, BATCH, seed=5).boundary)
-    states, random = old.states_at(0.4 * old.duration), np.random.default_rng(0)
+    """Measure the CPU time per hit [ms], of the completion, of the planning, and of both."""
+    first = planner.plan_batch(draw_boundary_problems(NAME, BATCH, seed=5).boundary)
+    states, random = first.states_at(0.4 * first.duration), np.random.default_rng(0)
     pucks = np.stack([random.uniform(0.8, 1.2, BATCH), random.uniform(-0.3, 0.3, BATCH)], axis=1)
-    completion, found = load_completion(planner.model, None), {}
+    completion, results = load_completion(planner.model, None), {}
     for size in (1, BATCH):
         times: dict[str, list[float]] = {"completed": [], "planned": [], "both": []}
         for index in range(repeat if size == 1 else max(repeat // 20, 3)):
             row = slice(index % BATCH, index % BATCH + 1) if size == 1 else slice(None)
             state, puck = (states[0][row], states[1][row], states[2][row]), pucks[row]
-            struck = plan_hits(planner, state, puck, TARGET)
-            if not len(struck.plans):
+            planned = plan_hits(planner, state, puck, TARGET)
+            if not len(planned.plans):
                 continue
             clock = [time.process_time()]
             with one_thread():
                 hit_tasks(completion, state, puck, TARGET, contact_distance=CONTACT_DISTANCE_M, share=1.0)
             clock.append(time.process_time())
-            planner.plan_batch(struck.plans.boundary)
+            planner.plan_batch(planned.plans.boundary)
             clock.append(time.process_time())
             plan_hits(planner, state, puck, TARGET)
             clock.append(time.process_time())
-            for what, seconds in zip(times, np.diff(clock).tolist(), strict=True):
-                times[what].append(seconds)
-        for what, each in times.items():
-            found[f"{size} {what}"] = 1e3 * median(each) / size
-    struck = plan_hits(planner, states, pucks, TARGET)
-    found |= {"answered": len(struck.plans) / BATCH, "valid": float(evaluate_plans(struck.plans).valid.mean())}
-    return found
+            for part, seconds in zip(times, np.diff(clock).tolist(), strict=True):
+                times[part].append(seconds)
+        for part, durations in times.items():
+            results[f"{size} {part}"] = 1e3 * median(durations) / size
+    planned = plan_hits(planner, states, pucks, TARGET)
+    results |= {"planned": len(planned.plans) / BATCH, "valid": float(evaluate_plans(planned.plans).valid.mean())}
+    return results
 
 
-def same_goal(planner: Planner, plans: Plans, what: str) -> list[dict[str, Any]]:
-    """Replan to the same goal after parts of the time."""
-    found, goal = [], plans.boundary
-    for part in PARTS:
-        when = part * plans.duration
-        new = planner.replan(plans, when, goal_q=goal.goal_q, goal_dq=goal.goal_dq)
-        alone = planner.plan_batch(new.boundary)
-        left = plans.duration - when
-        found.append(
+def same_goal(planner: Planner, plans: Plans, source: str) -> list[dict[str, Any]]:
+    """Replan to the same goal after fractions of the motion time."""
+    records, goal = [], plans.boundary
+    for part in REPLAN_TIMES:
+        time = part * plans.duration
+        new = planner.replan(plans, time, goal_q=goal.goal_q, goal_dq=goal.goal_dq)
+        network = planner.plan_batch(new.boundary)
+        remaining = plans.duration - time
+        records.append(
             {
-                "of": what,
+                "of": source,
                 "at": part,
-                "network, median": median((alone.duration / left).tolist()),
-                "network, valid": float(evaluate_plans(alone).valid.mean()),
-                "largest": float((new.duration / left).max()),
+                "network, median": median((network.duration / remaining).tolist()),
+                "network, valid": float(evaluate_plans(network).valid.mean()),
+                "largest": float((new.duration / remaining).max()),
                 "valid": float(evaluate_plans(new).valid.mean()),
                 "points": new.path_control_points.shape[1],
             }
         )
-    return found
+    return records
 
 
-def deadlines(given: Plans) -> list[dict[str, Any]]:
-    """Refine plans one by one until deadlines, which count CPU time here."""
-    found, before = [], evaluate_plans(given).valid
-    cost = [each.cost for each in refine_serially(given, RefineOptions(deadline=1e-9))]  # as they are given
+def deadlines(plans: Plans) -> list[dict[str, Any]]:
+    """Refine plans one by one until deadlines in CPU time."""
+    records, input_valid = [], evaluate_plans(plans).valid
+    cost = [refined.cost for refined in refine_serially(plans, RefineOptions(deadline=1e-9))]  # of the input
     with patch("time.perf_counter", time.thread_time):
         for deadline in DEADLINES:
-            options, times, made = RefineOptions(deadline=deadline), [], []
-            for plan in given:
-                begun = time.thread_time()
-                made += refine_serially(plan, options)
-                times.append(1e3 * (time.thread_time() - begun))
-            valid = np.array([each.valid for each in made])
-            ratio = np.array([each.cost for each in made]) / cost
-            found.append(
+            options, times, results = RefineOptions(deadline=deadline), [], []
+            for plan in plans:
+                start = time.thread_time()
+                results += refine_serially(plan, options)
+                times.append(1e3 * (time.thread_time() - start))
+            valid = np.array([refined.valid for refined in results])
+            ratio = np.array([refined.cost for refined in results]) / cost
+            records.append(
                 {
                     "deadline ms": None if deadline is None else 1e3 * deadline,
                     "ms": [float(value) for value in np.percentile(times, [50, 95, 100])],
-                    "given valid": float(before.mean()),
+                    "input valid": float(input_valid.mean()),
                     "valid": float(valid.mean()),
-                    "worse": int((before & ~valid).sum()),
-                    "objective over given": median(ratio[valid].tolist()),
+                    "worse": int((input_valid & ~valid).sum()),
+                    "objective / input": median(ratio[valid].tolist()),
                 }
             )
-    return found
+    return records
 
 
-def rows_of(name: str, found: dict[str, Any]) -> list[tuple[str, ...]]:
-    """Lay out what hits of a planner take."""
+def rows_of(name: str, results: dict[str, Any]) -> list[tuple[str, ...]]:
+    """Return the rows of the table of hits."""
     rows: list[tuple[str, ...]] = []
     for size in (1, BATCH):
-        for what in ("completed", "planned", "both"):
-            value = found[f"{size} {what}"]
-            ratio = f"{value / found[f'{size} planned']:.2f}"
-            aim = verdict(value, GOALS.get((size, what)), at_most=True)
-            rows.append((name, str(size), what, f"{value:.4f}", ratio, *aim))
+        for part in ("completed", "planned", "both"):
+            value = results[f"{size} {part}"]
+            ratio = f"{value / results[f'{size} planned']:.2f}"
+            target = verdict(value, TARGETS_MS.get((size, part)), at_most=True)
+            rows.append((name, str(size), part, f"{value:.4f}", ratio, *target))
     return rows
 
 
 def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--repeat", type=int, default=300)
-    parser.add_argument("--plans", type=int, default=100, help="of replanning and refining")
+    parser.add_argument("--plans", type=int, default=100, help="plans that are replanned and refined")
 
 
 def main() -> None:
     chosen = arguments(__doc__, options)
-    struck = {}
+    hit_results = {}
     for name in (NAME, TIME_PARAMETRIZED):
-        progress(f"striking: {name}")
-        struck[name] = hits(Planner(name), chosen.repeat)
+        progress(f"hits: {name}")
+        hit_results[name] = hits(Planner(name), chosen.repeat)
     planner = Planner(NAME)
     progress("replanning to the same goal")
     plans = planner.plan_batch(draw_boundary_problems(NAME, chosen.plans, seed=6).boundary)
-    kept = plans[evaluate_plans(plans).valid]
-    same = same_goal(planner, kept, "network") + same_goal(planner, refine_plans(kept).plans, "refined")
+    valid_plans = plans[evaluate_plans(plans).valid]
+    same_goal_records = same_goal(planner, valid_plans, "network") + same_goal(
+        planner, refine_plans(valid_plans).plans, "refined"
+    )
     progress("refining until deadlines")
-    cut = deadlines(plans)
-    head = ("planner", "batch", "what", "ms", "of planning", "target", "")
+    deadline_records = deadlines(plans)
+    head = ("planner", "batch", "part", "ms", "of planning", "target", "")
     tables = [
-        table("hits, ms each", head, [row for item in struck.items() for row in rows_of(*item)], left=3),
+        table("CPU time per hit [ms]", head, [row for item in hit_results.items() for row in rows_of(*item)], left=3),
         *(
-            f"{name}: {found['answered']:.1%} have an answer; {found['valid']:.1%} of their plans are valid"
-            for name, found in struck.items()
+            f"{name}: {results['planned']:.1%} of the hits are planned; {results['valid']:.1%} of their plans are valid"
+            for name, results in hit_results.items()
         ),
         table(
-            "to the same goal, over what was left",
-            ("plans", "at", "network, median", "valid", "replan, largest", "valid", "path points"),
+            "replanning to the same goal, motion time over the remaining time",
+            ("plans", "at", "network, median", "valid", "replan, maximum", "valid", "path points"),
             [
                 (
-                    each["of"],
-                    f"{each['at']:g} T",
-                    f"{each['network, median']:.2f}",
-                    f"{each['network, valid']:.1%}",
-                    f"{each['largest']:.6f}",
-                    f"{each['valid']:.1%}",
-                    str(each["points"]),
+                    record["of"],
+                    f"{record['at']:g} T",
+                    f"{record['network, median']:.2f}",
+                    f"{record['network, valid']:.1%}",
+                    f"{record['largest']:.6f}",
+                    f"{record['valid']:.1%}",
+                    str(record["points"]),
                 )
-                for each in same
+                for record in same_goal_records
             ],
             left=2,
         ),
         table(
             "refining until a deadline",
-            ("deadline", "ms, median", "95 %", "largest", "given valid", "valid", "worse", "objective over given"),
+            ("deadline", "ms, median", "95 %", "maximum", "input valid", "valid", "worse", "objective / input"),
             [
                 (
-                    "none" if each["deadline ms"] is None else f"{each['deadline ms']:g} ms",
-                    *(f"{value:.1f}" for value in each["ms"]),
-                    f"{each['given valid']:.1%}",
-                    f"{each['valid']:.1%}",
-                    str(each["worse"]),
-                    f"{each['objective over given']:.4f}",
+                    "none" if record["deadline ms"] is None else f"{record['deadline ms']:g} ms",
+                    *(f"{value:.1f}" for value in record["ms"]),
+                    f"{record['input valid']:.1%}",
+                    f"{record['valid']:.1%}",
+                    str(record["worse"]),
+                    f"{record['objective / input']:.4f}",
                 )
-                for each in cut
+                for record in deadline_records
             ],
         ),
     ]
-    report({"hits": struck, "same goal": same, "deadlines": cut}, tables, as_json=chosen.json)
+    report(
+        {"hits": hit_results, "same goal": same_goal_records, "deadlines": deadline_records},
+        tables,
+        as_json=chosen.json,
+    )
 
 
 if __name__ == "__main__":

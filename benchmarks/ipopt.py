@@ -145,10 +145,10 @@ def ipopt_options(settings: Settings, limit: int, *, warm: bool) -> dict[str, An
     return {
         "print_level": 0,
         "sb": "yes",
-        "mumps_scaling": 0,  # like the next, it costs half as much again as the factorisation
+        "mumps_scaling": 0,  # with the next one, half the time of the factorization
         "mumps_permuting_scaling": 0,
         "max_iter": limit,
-        "tol": settings.cost_tolerance / 500,  # times the active residuals, what the barrier adds to the objective
+        "tol": settings.cost_tolerance / 500,  # the barrier adds this, times the active residuals, to the objective
         "constr_viol_tol": settings.violation_tolerance / 2,
         **(WARM_OPTIONS if warm else {"mu_strategy": "adaptive"}),
     }
@@ -164,14 +164,14 @@ def run(
     quiet = {"print_time": False, "error_on_fail": False, "show_eval_warnings": False}
     solver = {**quiet, "ipopt": options, "hess_lag": program.hessian(), "iteration_callback": callback}
     function = ca.nlpsol("refine", "ipopt", program.problem(), solver)
-    found = function(x0=x, lbg=program.lower, ubg=program.upper, lam_g0=program.select(multipliers))
+    solution = function(x0=x, lbg=program.lower, ubg=program.upper, lam_g0=program.select(multipliers))
     if program.raised:
         raise program.raised[0]
-    end = np.array(found["x"].nonzeros())
+    end = np.array(solution["x"].nonzeros())
     if not np.isfinite(program.at(end).g).all():
         return best.x, multipliers, max(len(best.costs), 1)
     steps = int(function.stats().get("iter_count", 0))
-    return end, program.multipliers(np.array(found["lam_g"].nonzeros())), max(steps, 1)
+    return end, program.multipliers(np.array(solution["lam_g"].nonzeros())), max(steps, 1)
 
 
 class Program:
@@ -236,7 +236,7 @@ class Program:
         """Return the option ``hess_lag``: the upper triangle of the Hessian of the Lagrangian."""
         nx, m, dense = self.motion.nx, len(self.lower), ca.Sparsity.dense
         output = ca.Sparsity.upper(nx)
-        row, column = (np.array(each) for each in output.get_triplet())
+        row, column = (np.array(indices) for indices in output.get_triplet())
 
         def compute(x: Array, _: Array, weight: Array, selected: Array) -> Array:
             full = lagrangian_hessian(self.motion, self.at(x), self.multipliers(selected), float(weight[0]))
@@ -282,7 +282,7 @@ class Program:
 
             def eval(self, arguments: Any) -> list[Any]:
                 try:
-                    return [ca.DM(output, compute(*(np.array(each.nonzeros()) for each in arguments)))]
+                    return [ca.DM(output, compute(*(np.array(argument.nonzeros()) for argument in arguments)))]
                 except BaseException as error:
                     raised.append(error)
                     raise

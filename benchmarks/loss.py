@@ -1,7 +1,7 @@
 """The loss of plans and its gradient: microseconds per quadrature point, milliseconds per batch, errors of the rules.
 
-The clock is the process's CPU time. Every repetition measures all cases in turn; times are medians over the
-repetitions, ratios medians of the ratios within one repetition.
+The clock is the process's CPU time. Every repetition measures all cases in turn. Times are medians over the
+repetitions, ratios are medians of the ratios within one repetition.
 
     python benchmarks/loss.py
     python benchmarks/loss.py --batch 64 --nodes 32 --repeat 50
@@ -24,10 +24,10 @@ from cnpgen.problems.problem_file import load_problem
 
 Array = np.ndarray[Any, np.dtype[Any]]
 PROBLEMS = ("airhockey", "heavy-object")
-WAYS = (("compiled", "float32"), ("compiled", "float64"), ("numpy", "float32"), ("casadi", "float64"))
-TARGET = 0.3  # us per point of the gradient kernel in float32
-FINE = 4096
-ROUGH = 0.05  # rad
+VARIANTS = (("compiled", "float32"), ("compiled", "float64"), ("numpy", "float32"), ("casadi", "float64"))
+TARGET_US = 0.3  # per point of the gradient kernel in float32
+REFERENCE_NODES = 4096
+MAX_NOISE_RAD = 0.05
 
 
 @dataclass(frozen=True)
@@ -45,19 +45,19 @@ def draw_plans(name: str, count: int) -> Plans:
     ends = robot.base + random.uniform(-0.5, 0.5, (2, count, 1, robot.n))
     along = np.linspace(0, 1, spec.path_control_points)[:, None]
     path = ends[0] * (1 - along) + ends[1] * along
-    path += ROUGH * random.uniform(-1, 1, path.shape)
+    path += MAX_NOISE_RAD * random.uniform(-1, 1, path.shape)
     rate = random.uniform(0.8, 1.4, (count, spec.rate_control_points))
     return Plans(path, rate, random.uniform(0.1, 0.4, (count, len(problem.obstacle))))
 
 
 @dataclass
 class Case:
-    """One problem in one way.
+    """One problem on one backend with one type.
 
     Attributes:
         calls: CPU time of a call with gradient [s], one per repetition.
-        kernels: Of the gradient kernel alone.
-        values: Of a call without gradient.
+        kernels: CPU time of the gradient kernel [s].
+        values: CPU time of a call without gradient [s].
     """
 
     problem: str
@@ -76,29 +76,29 @@ class Case:
 
     def measure(self) -> None:
         """Time a call with gradient, the kernel in it, and a call without gradient."""
-        inside = Timed(self.loss._gradient)
-        with mock.patch.dict(vars(self.loss), {"_gradient": inside}):
+        kernel = Timed(self.loss._gradient)
+        with mock.patch.dict(vars(self.loss), {"_gradient": kernel}):
             self.calls.append(seconds(self.call))
-        self.kernels.append(inside.seconds)
+        self.kernels.append(kernel.seconds)
         self.values.append(seconds(lambda: self.call(gradient=False)))
 
 
 class Timed:
-    """A kernel that adds up its CPU time."""
+    """Kernel that measures its CPU time."""
 
     def __init__(self, kernel: Any) -> None:
         self.kernel, self.tape, self.seconds = kernel, kernel.tape, 0.0
 
-    def __call__(self, *given: Array, out: Any) -> None:
+    def __call__(self, *inputs: Array, out: Any) -> None:
         """Run the kernel."""
         start = time.process_time()
-        self.kernel(*given, out=out)
+        self.kernel(*inputs, out=out)
         self.seconds += time.process_time() - start
 
 
-def seconds(what: Callable[[], None]) -> float:
+def seconds(function: Callable[[], None]) -> float:
     start = time.process_time()
-    what()
+    function()
     return time.process_time() - start
 
 
@@ -119,7 +119,7 @@ def speed_table(cases: list[Case], points: int) -> str:
         first = next(other for other in cases if other.problem == case.problem)
         slower = median(other / own for own, other in zip(first.calls, case.calls, strict=True))
         per_point = 1e6 * median(case.kernels) / points
-        target = TARGET if (case.backend, case.dtype) == ("compiled", "float32") else None
+        target = TARGET_US if (case.backend, case.dtype) == ("compiled", "float32") else None
         rows.append(
             (case.problem, case.backend, case.dtype, f"{len(case.loss._gradient.tape):,}", f"{per_point:.3f}",
              f"{1e3 * median(case.calls):.2f}", f"{1e3 * median(case.values):.2f}", f"{slower:.1f}",
@@ -132,7 +132,7 @@ def speed_table(cases: list[Case], points: int) -> str:
 
 @dataclass(frozen=True)
 class RuleError:
-    """Error of a rule: means over plans, relative to a very fine rule."""
+    """Error of a rule: means over plans, relative to ``REFERENCE_NODES`` nodes."""
 
     problem: str
     rule: str
@@ -142,7 +142,7 @@ class RuleError:
 
 
 def rule_errors(problem: str, plans: Plans) -> list[RuleError]:
-    """Errors of the offered rules, and of equal distances, which are not offered."""
+    """Return the errors of the available rules and of equidistant nodes."""
 
     def evaluate(rule: str, nodes: int) -> tuple[Array, Array]:
         rules.basis_table.cache_clear()
@@ -151,13 +151,13 @@ def rule_errors(problem: str, plans: Plans) -> list[RuleError]:
         rules.basis_table.cache_clear()
         return value.total, value.path_gradient.reshape(len(plans.path), -1)
 
-    total, gradient = evaluate("cosine", FINE)
+    total, gradient = evaluate("cosine", REFERENCE_NODES)
 
     def error(label: str, nodes: int, rule: str) -> RuleError:
-        found, computed_gradient = evaluate(rule, nodes)
-        of_gradient = np.linalg.norm(computed_gradient - gradient, axis=1) / np.linalg.norm(gradient, axis=1)
+        value_total, computed_gradient = evaluate(rule, nodes)
+        gradient_errors = np.linalg.norm(computed_gradient - gradient, axis=1) / np.linalg.norm(gradient, axis=1)
         return RuleError(
-            problem, label, nodes, float(np.mean(np.abs(found - total) / total)), float(np.mean(of_gradient))
+            problem, label, nodes, float(np.mean(np.abs(value_total - total) / total)), float(np.mean(gradient_errors))
         )
 
     errors = [error(rule, nodes, rule) for nodes in (32, 64, 128) for rule in rules.RULES]
@@ -167,19 +167,19 @@ def rule_errors(problem: str, plans: Plans) -> list[RuleError]:
 
 def rule_table(errors: list[RuleError]) -> str:
     rows = [(e.rule, str(e.nodes), f"{100 * e.total:.2f} %", f"{100 * e.gradient:.2f} %") for e in errors]
-    title = f"{errors[0].problem}: errors of quadrature rules against {FINE} nodes"
+    title = f"{errors[0].problem}: errors of quadrature rules against {REFERENCE_NODES} nodes"
     return table(title, ("rule", "nodes", "total", "gradient"), rows)
 
 
 def uniform(_rule: str, nodes: int, _shift: float = 0.0) -> tuple[Array, Array]:
-    """Return nodes at equal distances, ends included, with equal weights."""
+    """Return equidistant nodes, ends included, with equal weights."""
     return np.linspace(0, 1, nodes), np.full(nodes, 1 / nodes)
 
 
 def results(cases: list[Case], points: int, errors: list[list[RuleError]]) -> dict[str, Any]:
     return {
         "points": points,
-        "rules": [vars(error) for each in errors for error in each],
+        "rules": [vars(error) for of_problem in errors for error in of_problem],
         "cases": [
             {
                 "problem": case.problem,
@@ -204,7 +204,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def main() -> None:
     options = arguments(__doc__, add_options)
     points = options.batch * options.nodes
-    cases = [prepare(problem, *way, options) for problem in PROBLEMS for way in WAYS]
+    cases = [prepare(problem, *variant, options) for problem in PROBLEMS for variant in VARIANTS]
     for number in range(options.repeat):
         progress(f"repetition {number + 1} of {options.repeat}")
         for case in cases:

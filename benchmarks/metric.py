@@ -1,9 +1,9 @@
 """Learning curves of the metric's schedules: the same network, rows and CPU time.
 
-"learned" is the published rule, "bounded" the same made to work in minutes, "ramped" the default.
+"learned" is the published rule, "bounded" a variant of it for training within minutes, "ramped" the default.
 
-python benchmarks/metric.py
-python benchmarks/metric.py --seconds 60 --plot docs/images/metric.png
+    python benchmarks/metric.py
+    python benchmarks/metric.py --seconds 60 --plot docs/images/metric.png
 """
 
 import argparse
@@ -19,7 +19,7 @@ import cnpgen
 from cnpgen.training.settings import METRICS, TrainingSettings
 from cnpgen.training.train import train_model
 
-SHOWN = ("joint-velocity", "joint-acceleration", "table")
+PLOTTED_TERMS = ("joint-velocity", "joint-acceleration", "table")
 
 
 @dataclass(frozen=True)
@@ -61,19 +61,19 @@ def curve_table(curves: list[Curve]) -> str:
     rows = []
     for curve in curves:
         for check in curve.checks:
-            found = check["validation"]
-            rows.append((curve.schedule, f"{check['seconds']:.0f}", *_numbers(found)))
+            validation = check["validation"]
+            rows.append((curve.schedule, f"{check['seconds']:.0f}", *_numbers(validation)))
         rows.append((curve.schedule, "best, all rows", *_numbers(curve.final)))
     head = ("metric", "CPU s", "valid", "paper's rule", "motion time s", "z error mm s")
-    return table("Validation on the way (a part of the rows) and in the end", head, rows)
+    return table("Validation during training (on a part of the rows) and at the end", head, rows)
 
 
-def _numbers(found: dict[str, Any]) -> tuple[str, str, str, str]:
+def _numbers(validation: dict[str, Any]) -> tuple[str, str, str, str]:
     return (
-        f"{100 * found['valid']:.1f} %",
-        f"{100 * found['paper_valid']:.1f} %",
-        f"{found['duration_s']:.3f}",
-        f"{found['z_error_mm_s']:.2f}",
+        f"{100 * validation['valid']:.1f} %",
+        f"{100 * validation['paper_valid']:.1f} %",
+        f"{validation['duration_s']:.3f}",
+        f"{validation['z_error_mm_s']:.2f}",
     )
 
 
@@ -89,7 +89,7 @@ def plot(curves: list[Curve], path: str) -> None:
         for axis, key in ((axes[0], "valid"), (axes[1], "paper_valid")):
             axis.plot(seconds, [100 * check["validation"][key] for check in curve.checks], label=curve.schedule)
         times = [record["seconds"] for record in curve.weights]
-        for name, style in zip(SHOWN, ("-", "--", ":"), strict=True):
+        for name, style in zip(PLOTTED_TERMS, ("-", "--", ":"), strict=True):
             label = f"{name.removeprefix('joint-')}" if number == 0 else None
             values = [record["weights"][name] for record in curve.weights]
             axes[2].semilogy(times, values, style, color=f"C{number}", label=label)
@@ -102,11 +102,11 @@ def plot(curves: list[Curve], path: str) -> None:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--schedule", nargs="+", default=METRICS, choices=METRICS, help="which schedules")
+    parser.add_argument("--schedule", nargs="+", default=METRICS, choices=METRICS, help="schedules of the metric")
     parser.add_argument("--seconds", type=float, default=60, help="CPU seconds of training each")
-    parser.add_argument("--dataset", default="airhockey-hit", help="which dataset")
-    parser.add_argument("--n", type=int, default=19_800, help="its rows")
-    parser.add_argument("--seed", type=int, default=0, help="of the first parameters and the order of rows")
+    parser.add_argument("--dataset", default="airhockey-hit", help="dataset")
+    parser.add_argument("--n", type=int, default=19_800, help="rows of the dataset")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the initial parameters and of the order of rows")
     parser.add_argument("--plot", metavar="FILE.png", help="draw the curves")
 
 

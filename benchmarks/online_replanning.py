@@ -1,18 +1,18 @@
-"""Planning online: fresh problems that start on motions which are being executed, set by set.
+"""Online planning: new problems that start on motions in execution, in six sets.
 
-First motions are valid plans of the shipped planners for hits and replans; new problems start on them at a time
-between 0.05 and 0.95 of their time T, where they are, off the table by what plans are:
+First motions are valid plans of the shipped planners for hits and replans. New problems start on them at a random time
+between 0.05 and 0.95 of their motion time T, with the height error of the motion.
 
-* "new puck": to a new puck, anywhere on the table, in a direction within 120 degrees of the way to it, at full speed in
-  a fifth of the cases; the goal configuration is chosen close to where the arm is;
-* "same goal": to the goal of the motion; as the network plans it, and as ``replan`` answers, which keeps the rest of
-  the motion where the network is not faster by 2 %; where that has finer knots, also refined with all of them;
-* "near the base": to goals of the dataset airhockey-hit at full speed, chosen close to the base configuration;
-* "another problem's": to goals of the dataset airhockey-replan, chosen close to other starts;
-* "on refined plans": as "new puck", from motions that were refined before they were executed;
-* "today's rows": rows of the dataset airhockey-replan.
+* "new puck": to a new puck anywhere on the table. The hit direction is within 120 degrees of the direction to the puck.
+  A fifth of the hits has full speed. The goal configuration is close to the present one.
+* "same goal": to the goal of the motion, by the network and by ``replan``. The latter keeps the remaining trajectory
+  unless the network is faster by 2 %. If it has finer knots, it is also refined with all of its control points.
+* "near the base": to goals of the dataset airhockey-hit at full speed, close to the base configuration.
+* "another problem's": to goals of the dataset airhockey-replan, close to other starts.
+* "on refined plans": as "new puck", on motions that were refined before their execution.
+* "dataset rows": rows of the dataset airhockey-replan.
 
-Nothing was chosen by these seeds. The clock is CPU time, one BLAS thread. Goals stand beside the figures.
+Nothing was selected with these seeds. The clock is CPU time with one BLAS thread. The tables have targets.
 
     python benchmarks/online_replanning.py
     python benchmarks/online_replanning.py --problems 1000 --refined 1000
@@ -46,22 +46,20 @@ from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
 FIRST = ("airhockey-replan", "airhockey-hit")  # datasets and planners of the first motions
 SWITCH_RANGE = (0.05, 0.95)  # of T
-REFINED_TIMES = 4  # on every refined motion
-OVERSAMPLING = (
-    1.25  # problems drawn for each that is wanted: some first motions are not valid, some tasks have no answer
-)
-TIME_TOLERANCE_S = 1e-9  # s: of the rest of a plan, by rounding
-FULL_SPEED = 0.2
-CONE = np.deg2rad(120)
-TABLE = np.array([[0.6, 1.3], [-0.45, 0.45]])  # m
-GOALS = {  # share of valid plans, as the network gives them
+TIMES_PER_REFINED_MOTION = 4
+OVERSAMPLING = 1.25  # problems sampled per problem: some first motions are invalid, some tasks are infeasible
+TIME_TOLERANCE_S = 1e-9  # of a remaining trajectory, by rounding
+FULL_SPEED_FRACTION = 0.2
+MAX_DIRECTION_ERROR_RAD = np.deg2rad(120)
+TABLE_RANGE_M = np.array([[0.6, 1.3], [-0.45, 0.45]])
+VALID_TARGETS = {  # fraction of valid plans of the network
     "new puck": 0.97, "same goal": 0.96, "near the base": 0.95, "another problem's": 0.95, "on refined plans": 0.95,
-    "today's rows": 0.96,
+    "dataset rows": 0.96,
 }  # fmt: skip
-REFINED_VALID, OVER_REFINED, REFINE_MS, REFINE_P95_MS = 0.998, 1.08, 8.0, 15.0
+REFINED_VALID, TIME_RATIO, REFINE_MS, REFINE_P95_MS = 0.998, 1.08, 8.0, 15.0  # targets
 
 State = tuple[Any, Any, Any]
-Goals = dict[str, tuple[float, bool]]  # figure -> its goal, and whether that is the most rather than the least
+Targets = dict[str, tuple[float, bool]]  # figure -> target, and whether it is an upper bound
 
 
 @dataclass(frozen=True)
@@ -70,8 +68,8 @@ class Problems:
 
     Attributes:
         boundary: Their boundary conditions.
-        executed: The motions that they begin on, where these go to the same goals; else None.
-        time: Since when these are executed [s], shape (N,).
+        executed: The motions on which they start if the goals are the same, else None.
+        time: Time of the switch on these motions [s], shape (N,).
     """
 
     boundary: Boundary
@@ -84,7 +82,7 @@ class Problems:
 
 
 def first_motions(count: int, seed: int) -> Plans:
-    """Valid plans of the shipped planners, half for replans and half for hits."""
+    """Return valid plans of the shipped planners, half of them replans and half hits."""
     parts = []
     for name in FIRST:
         plans = Planner(name).plan_batch(
@@ -95,7 +93,7 @@ def first_motions(count: int, seed: int) -> Plans:
 
 
 def times_of(plans: Plans, random: np.random.Generator) -> NDArray[np.float64]:
-    """One random time of every plan."""
+    """Sample one time of every plan [s]."""
     return random.uniform(*SWITCH_RANGE, len(plans)) * plans.duration
 
 
@@ -105,102 +103,112 @@ def states_of(plans: Plans, random: np.random.Generator) -> State:
 
 
 def to_new_pucks(state: State, problem: ProblemRecord, random: np.random.Generator) -> Boundary:
-    """Problems from states to pucks anywhere, those that have an answer."""
+    """Return the feasible problems from states to pucks anywhere on the table."""
     q, dq, ddq = state
     count = len(q)
-    goal = random.uniform(TABLE[:, 0], TABLE[:, 1], (count, 2))
+    goal = random.uniform(TABLE_RANGE_M[:, 0], TABLE_RANGE_M[:, 1], (count, 2))
     x, y = (goal - problem.tip_positions(q)[:, :2]).T
-    asked = {"start_q": q, "start_dq": dq, "start_ddq": ddq, "goal_xyz": goal}
-    asked["hit_angle"] = np.arctan2(y, x) + random.uniform(-CONE, CONE, count)
-    share = np.where(random.uniform(size=count) < FULL_SPEED, 1.0, random.uniform(1e-3, 1.0, count))
-    return complete("airhockey-replan", **asked, hit_speed_share=share).plans.boundary
+    tasks = {"start_q": q, "start_dq": dq, "start_ddq": ddq, "goal_xyz": goal}
+    tasks["hit_angle"] = np.arctan2(y, x) + random.uniform(-MAX_DIRECTION_ERROR_RAD, MAX_DIRECTION_ERROR_RAD, count)
+    share = np.where(random.uniform(size=count) < FULL_SPEED_FRACTION, 1.0, random.uniform(1e-3, 1.0, count))
+    return complete("airhockey-replan", **tasks, hit_speed_share=share).plans.boundary
 
 
 def to_goals(state: State, goals: Boundary) -> Boundary:
-    """Problems from states to the goals of others."""
+    """Return problems from states to the goals of other problems."""
     q, dq, ddq = state
     return Boundary(q, dq, ddq, goals.goal_q[: len(q)], goals.goal_dq[: len(q)])
 
 
 def to_same_goals(plans: Plans, random: np.random.Generator) -> Problems:
-    """Problems from times of plans to their own goals."""
+    """Return problems from random states of plans to their own goals."""
     time = times_of(plans, random)
     return Problems(to_goals(plans.states_at(time), plans.boundary), plans, time)
 
 
 def full_speed_hits(count: int, seed: int) -> Boundary:
-    """Hits of the dataset airhockey-hit, all of them at full speed."""
+    """Return hits of the dataset airhockey-hit, all at full speed."""
     recipe = load_dataset_recipe("airhockey-hit")
     stages = (
-        replace(each, full_speed=1.0) if isinstance(each, HittingVelocity) else each for each in recipe.pipeline.stage
+        replace(stage, full_speed=1.0) if isinstance(stage, HittingVelocity) else stage
+        for stage in recipe.pipeline.stage
     )
-    fast = replace(recipe, pipeline=replace(recipe.pipeline, stage=tuple(stages)))
-    return draw_boundary_problems(fast, count, seed=seed).boundary
+    full_speed = replace(recipe, pipeline=replace(recipe.pipeline, stage=tuple(stages)))
+    return draw_boundary_problems(full_speed, count, seed=seed).boundary
 
 
 def sets(count: int, seed: int) -> dict[str, Problems]:
     """Make the six sets."""
-    random, drawn = np.random.default_rng(seed), int(OVERSAMPLING * count)
-    progress(f"{drawn} first motions")
-    plans = first_motions(drawn, seed)
-    others = draw_boundary_problems("airhockey-replan", drawn, seed=seed + 1).boundary
-    progress(f"{drawn // REFINED_TIMES} first motions refined")
-    refined = refine_plans(plans[::REFINED_TIMES])
-    executed = refined.plans[np.repeat(np.flatnonzero(refined.valid), REFINED_TIMES)]
-    found = {
+    random, sampled = np.random.default_rng(seed), int(OVERSAMPLING * count)
+    progress(f"{sampled} first motions")
+    plans = first_motions(sampled, seed)
+    other_goals = draw_boundary_problems("airhockey-replan", sampled, seed=seed + 1).boundary
+    progress(f"{sampled // TIMES_PER_REFINED_MOTION} first motions refined")
+    refined = refine_plans(plans[::TIMES_PER_REFINED_MOTION])
+    executed = refined.plans[np.repeat(np.flatnonzero(refined.valid), TIMES_PER_REFINED_MOTION)]
+    problems = {
         "new puck": Problems(to_new_pucks(states_of(plans, random), plans.problem, random)),
         "same goal": to_same_goals(plans, random),
-        "near the base": Problems(to_goals(states_of(plans, random), full_speed_hits(drawn, seed + 2))),
-        "another problem's": Problems(to_goals(states_of(plans, random), others)),
+        "near the base": Problems(to_goals(states_of(plans, random), full_speed_hits(sampled, seed + 2))),
+        "another problem's": Problems(to_goals(states_of(plans, random), other_goals)),
         "on refined plans": Problems(to_new_pucks(states_of(executed, random), plans.problem, random)),
-        "today's rows": Problems(draw_boundary_problems("airhockey-replan", count, seed=seed + 3).boundary),
+        "dataset rows": Problems(draw_boundary_problems("airhockey-replan", count, seed=seed + 3).boundary),
     }
-    return {name: each[random.permutation(len(each.boundary))[:count]] for name, each in found.items()}
+    return {
+        name: problem_set[random.permutation(len(problem_set.boundary))[:count]]
+        for name, problem_set in problems.items()
+    }
 
 
 def measure(planner: Planner, problems: Problems, refined: int) -> dict[str, float]:
-    """Plan, judge, refine some; also what replanning answers where the goal has not moved."""
+    """Plan, judge and refine; if the goal is unchanged, also by ``replan``."""
     plans = planner.plan_batch(problems.boundary)
-    made = refine_each(plans[:refined])
-    found = figures([plans], made)
+    refined_plans = refine_each(plans[:refined])
+    results = figures([plans], refined_plans)
     if problems.executed is None or problems.time is None:
-        return found
-    answers = replanned(planner, problems, problems.executed, problems.time)
-    others = [each for answer in answers[:refined] for each in refine_each(answer)]
-    found |= {f"replan, {what}": value for what, value in figures(answers, others).items() if what != "problems"}
-    good = np.array([one.valid and other.valid for one, other in zip(made, others, strict=True)])
-    best = np.array([min(one.duration, other.duration) for one, other in zip(made, others, strict=True)])[good].mean()
-    given, left = durations(answers), problems.executed.duration - problems.time
+        return results
+    replans = replanned(planner, problems, problems.executed, problems.time)
+    refined_replans = [plan for answer in replans[:refined] for plan in refine_each(answer)]
+    results |= {
+        f"replan, {key}": value for key, value in figures(replans, refined_replans).items() if key != "problems"
+    }
+    both_valid = np.array([a.valid and b.valid for a, b in zip(refined_plans, refined_replans, strict=True)])
+    best = np.array([min(a.duration, b.duration) for a, b in zip(refined_plans, refined_replans, strict=True)])[
+        both_valid
+    ].mean()
+    replan_times, remaining = durations(replans), problems.executed.duration - problems.time
     return (
-        found
+        results
         | {
-            "replan, rests of the old plan": float((np.abs(given - left) < TIME_TOLERANCE_S).mean()),
-            "T / best refined of both": float(plans.duration[:refined][good].mean() / best),
-            "replan, T / best refined of both": float(given[:refined][good].mean() / best),
+            "replan, remaining trajectories of the old plan": float(
+                (np.abs(replan_times - remaining) < TIME_TOLERANCE_S).mean()
+            ),
+            "T / best refined of both": float(plans.duration[:refined][both_valid].mean() / best),
+            "replan, T / best refined of both": float(replan_times[:refined][both_valid].mean() / best),
         }
-        | finely(answers[:refined], others, plans.motion.spec)
+        | refine_finer_knots(replans[:refined], refined_replans, plans.motion.spec)
     )
 
 
 def replanned(planner: Planner, problems: Problems, executed: Plans, time: NDArray[np.float64]) -> list[Plans]:
-    """Replan to goals that have not moved, one after the other, as a robot does."""
+    """Replan to unchanged goals, one after the other."""
     goals = problems.boundary
     rows = (slice(i, i + 1) for i in range(len(executed)))
     return [planner.replan(executed[i], time[i], goal_q=goals.goal_q[i], goal_dq=goals.goal_dq[i]) for i in rows]
 
 
-def finely(plans: list[Plans], usual: list[Made], spec: TrajectorySpec) -> dict[str, float]:
-    """Refine plans with finer knots with all of their control points, and say what that takes and gains."""
-    pairs = [(each, made) for each, made in zip(plans, usual, strict=True) if each.motion.spec != spec]
+def refine_finer_knots(plans: list[Plans], refined: list[Made], spec: TrajectorySpec) -> dict[str, float]:
+    """Refine plans that have finer knots with all of their control points; return times and gains."""
+    pairs = [(plan, result) for plan, result in zip(plans, refined, strict=True) if plan.motion.spec != spec]
     if not pairs:
         return {}
-    fine = [made for each, _ in pairs for made in refine_each(each, load_refiner_of(each))]
-    ratio = [one.duration / other.duration for (_, one), other in zip(pairs, fine, strict=True) if other.valid]
+    fine_refined = [result for plan, _ in pairs for result in refine_each(plan, load_refiner_of(plan))]
+    ratio = [a.duration / b.duration for (_, a), b in zip(pairs, fine_refined, strict=True) if b.valid]
     return {
         "replan, with finer knots": len(pairs) / len(plans),
-        "replan, finer knots, refine, median ms": median(made.ms for _, made in pairs),
-        "replan, finer knots, refine with all of them, median ms": median(made.ms for made in fine),
-        "replan, finer knots, refined / refined with all of them": float(np.mean(ratio)),
+        "replan, finer knots, refine, median ms": median(result.ms for _, result in pairs),
+        "replan, finer knots, refine with all points, median ms": median(result.ms for result in fine_refined),
+        "replan, finer knots, refined / refined with all points": float(np.mean(ratio)),
     }
 
 
@@ -217,67 +225,69 @@ def refine_each(plans: Plans, refiner: Refiner | None = None) -> list[Made]:
 
 
 def durations(parts: list[Plans]) -> NDArray[np.float64]:
-    """Motion times [s]."""
-    return np.concatenate([each.duration for each in parts])
+    """Return motion times [s]."""
+    return np.concatenate([plans.duration for plans in parts])
 
 
-def figures(parts: list[Plans], made: list[Made]) -> dict[str, float]:
-    """Say how good plans are, and the first of them beside what was refined from them."""
-    good, given = np.array([each.valid for each in made]), durations(parts)
-    after, ms = np.array([each.duration for each in made]), [each.ms for each in made]
+def figures(parts: list[Plans], refined: list[Made]) -> dict[str, float]:
+    """Return the figures of plans; the first ones are compared with the refined plans."""
+    valid, before = np.array([item.valid for item in refined]), durations(parts)
+    after, ms = np.array([item.duration for item in refined]), [item.ms for item in refined]
     return {
-        "problems": len(given),
-        "valid alone": float(np.concatenate([evaluate_plans(each, workers=1).valid for each in parts]).mean()),
-        "valid refined": float(good.mean()),
-        "T / refined": float(given[: len(made)][good].mean() / after[good].mean()),
+        "problems": len(before),
+        "valid, planned": float(np.concatenate([evaluate_plans(item, workers=1).valid for item in parts]).mean()),
+        "valid, refined": float(valid.mean()),
+        "T / refined": float(before[: len(refined)][valid].mean() / after[valid].mean()),
         "refine, median ms": median(ms),
         "refine, p95 ms": float(np.quantile(ms, 0.95)),
     }
 
 
-def goals_of(name: str) -> Goals:
-    """Say what is wanted of a set."""
+def targets_of(name: str) -> Targets:
+    """Return the targets of a set."""
     return {
-        "valid alone": (GOALS[name], False), "valid refined": (REFINED_VALID, False),
-        "T / refined": (OVER_REFINED, True), "refine, median ms": (REFINE_MS, True),
+        "valid, planned": (VALID_TARGETS[name], False), "valid, refined": (REFINED_VALID, False),
+        "T / refined": (TIME_RATIO, True), "refine, median ms": (REFINE_MS, True),
         "refine, p95 ms": (REFINE_P95_MS, True),
     }  # fmt: skip
 
 
-def rows_of(model: str, name: str, found: dict[str, float], goals: Goals) -> list[tuple[str, ...]]:
-    """Lay out what was found of a set, each figure beside its goal."""
+def rows_of(model: str, name: str, figures: dict[str, float], targets: Targets) -> list[tuple[str, ...]]:
+    """Return the rows of a set."""
     rows: list[tuple[str, ...]] = []
-    for what, value in found.items():
-        goal, at_most = goals.get(what.removeprefix("replan, "), (None, False))
-        rows.append((model, name, what, f"{value:,.4g}", *verdict(value, goal, at_most=at_most)))
+    for figure, value in figures.items():
+        target, at_most = targets.get(figure.removeprefix("replan, "), (None, False))
+        rows.append((model, name, figure, f"{value:,.4g}", *verdict(value, target, at_most=at_most)))
     return rows
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    """Add the options."""
-    parser.add_argument("--models", nargs="+", default=["airhockey-online"], help="shipped ones or files")
+    """Add the options of this benchmark."""
+    parser.add_argument("--models", nargs="+", default=["airhockey-online"], help="names or files of models")
     parser.add_argument(
-        "--sets", nargs="+", choices=GOALS, default=list(GOALS), metavar="SET", help="which are measured"
+        "--sets", nargs="+", choices=VALID_TARGETS, default=list(VALID_TARGETS), metavar="SET", help="sets of problems"
     )
-    parser.add_argument("--problems", type=int, default=300, help="of each set")
-    parser.add_argument("--refined", type=int, default=60, help="how many of them are refined")
-    parser.add_argument("--seed", type=int, default=271_828_183, help="of the problems")
+    parser.add_argument("--problems", type=int, default=300, help="problems of each set")
+    parser.add_argument("--refined", type=int, default=60, help="refined problems of each set")
+    parser.add_argument("--seed", type=int, default=271_828_183, help="seed of the problems")
 
 
 def main() -> None:
-    """Run."""
+    """Run the benchmark."""
     chosen = arguments(__doc__, options)
-    problems = {name: each for name, each in sets(chosen.problems, chosen.seed).items() if name in chosen.sets}
+    problems = {
+        name: problem_set for name, problem_set in sets(chosen.problems, chosen.seed).items() if name in chosen.sets
+    }
     results: dict[str, Any] = {}
     for model in chosen.models:
         planner = Planner(model)
-        for name, each in problems.items():
+        for name, problem_set in problems.items():
             progress(f"{model}: {name}")
-            results.setdefault(model, {})[name] = measure(planner, each, chosen.refined)
-    every = ((model, name, found) for model, by_set in results.items() for name, found in by_set.items())
-    rows = [row for model, name, found in every for row in rows_of(model, name, found, goals_of(name))]
-    head = ("planner", "problems", "figure", "value", "goal", "")
-    report({"online_replanning": results}, [table("planning online", head, rows, left=3)], as_json=chosen.json)
+            results.setdefault(model, {})[name] = measure(planner, problem_set, chosen.refined)
+    measured = ((model, name, figures) for model, by_set in results.items() for name, figures in by_set.items())
+    rows = [row for model, name, figures in measured for row in rows_of(model, name, figures, targets_of(name))]
+    head = ("planner", "problems", "figure", "value", "target", "")
+    report({"online_replanning": results}, [table("online planning", head, rows, left=3)], as_json=chosen.json)
 
 
 if __name__ == "__main__":

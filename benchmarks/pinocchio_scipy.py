@@ -1,4 +1,4 @@
-"""The reference of ``reference.py``: one state at a time, with Pinocchio, SciPy and Coal."""
+"""Reference implementation for ``reference.py``: one state at a time, with Pinocchio, SciPy and Coal."""
 
 from dataclasses import dataclass
 
@@ -15,12 +15,12 @@ from cnpgen.robots.robot import Robot
 Array = NDArray[np.float64]
 
 WORLD = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-IK_TOLERANCE = 1e-9  # m
-CLOSE = 1e-6  # m or rad: SLSQP counts as converged
+IK_TOLERANCE_M = 1e-9
+SLSQP_TOLERANCE = 1e-6  # m or rad, for convergence
 
 
 class Arm:
-    """The robot as the reference sees it: a Pinocchio model and limits, one state at a time."""
+    """Pinocchio model and limits of a robot, one state at a time."""
 
     def __init__(self, robot: Robot) -> None:
         self.robot, self.model = robot, robot.model
@@ -29,62 +29,63 @@ class Arm:
         self.bounds = Bounds(robot.position_lower, robot.position_upper)
 
     def position(self, q: Array) -> Array:
-        """Position of the tip [m]."""
+        """Return the position of the tip [m]."""
         pin.framesForwardKinematics(self.model, self.data, q)
         return np.array(self.data.oMf[self.tip].translation)
 
     def jacobian(self, q: Array) -> Array:
-        """Jacobian of the tip in world axes, shape (6, n)."""
+        """Return the Jacobian of the tip in world axes, shape (6, n)."""
         return np.array(pin.computeFrameJacobian(self.model, self.data, q, self.tip, WORLD))
 
     def jacobian_rate(self, q: Array, dq: Array) -> Array:
-        """Time derivative of the translational Jacobian, shape (3, n)."""
+        """Return the time derivative of the translational Jacobian, shape (3, n)."""
         pin.computeJointJacobiansTimeVariation(self.model, self.data, q, dq)
         return np.array(pin.getFrameJacobianTimeVariation(self.model, self.data, self.tip, WORLD)[:3])
 
     def torque(self, q: Array, dq: Array, ddq: Array) -> Array:
-        """Inverse dynamics [N m]."""
+        """Compute the inverse dynamics [N m]."""
         return np.array(pin.rnea(self.model, self.data, q, dq, ddq))
 
 
 def solve_ik(arm: Arm, target: Array, guess: Array) -> Array | None:
-    """Move the tip to ``target`` by damped Gauss-Newton steps clipped to the limits; None if that fails.
+    """Move the tip to ``target`` by damped Gauss-Newton steps clipped to the limits; return None if that fails.
 
-    The loop of Pinocchio's examples: 18 times faster than SLSQP here, 100 times faster than SciPy's least_squares.
+    This loop of Pinocchio's examples is 18 times faster than SLSQP here and 100 times faster than SciPy's
+    least_squares.
     """
     q = guess
     for _ in range(100):
-        miss = target - arm.position(q)
-        if np.linalg.norm(miss) < IK_TOLERANCE:
+        error = target - arm.position(q)
+        if np.linalg.norm(error) < IK_TOLERANCE_M:
             return q
         J = arm.jacobian(q)[:3]
-        step = J.T @ np.linalg.solve(J @ J.T + 1e-9 * np.eye(3), miss)
+        step = J.T @ np.linalg.solve(J @ J.T + 1e-9 * np.eye(3), error)
         q = np.clip(q + step, arm.bounds.lb, arm.bounds.ub)
     return None
 
 
 def solve_upright_ik(arm: Arm, target: Array, guess: Array) -> Array | None:
-    """Move the tip to ``target`` with its z axis up, within the limits, by SLSQP; None if that fails.
+    """Move the tip to ``target`` with its z axis up, within the limits, by SLSQP; return None if that fails.
 
-    Minimising the squared error solves 98 % of the draws; the nearest configuration with the error as a constraint,
-    or with the tilt alone, a quarter to a half.
+    Minimizing the squared error solves 98 % of the candidates. The nearest configuration with the error or only the
+    tilt as a constraint solves a quarter to a half of them.
     """
     goal = np.array([*target, 0.0, 0.0, 1.0])
 
     def error(q: Array) -> tuple[float, Array]:
         jacobian, position = arm.jacobian(q), arm.position(q)
         up = arm.data.oMf[arm.tip].rotation[:, 2]
-        miss = np.concatenate([position, up]) - goal
-        return float(miss @ miss), 2 * np.hstack([jacobian[:3].T, np.cross(jacobian[3:].T, up)]) @ miss
+        residual = np.concatenate([position, up]) - goal
+        return float(residual @ residual), 2 * np.hstack([jacobian[:3].T, np.cross(jacobian[3:].T, up)]) @ residual
 
     options = {"ftol": 1e-16, "maxiter": 300}
-    found = minimize(error, guess, jac=True, bounds=arm.bounds, method="SLSQP", options=options)
-    return found.x if found.fun < CLOSE**2 else None
+    solution = minimize(error, guess, jac=True, bounds=arm.bounds, method="SLSQP", options=options)
+    return solution.x if solution.fun < SLSQP_TOLERANCE**2 else None
 
 
 @dataclass(frozen=True)
 class Hit:
-    """The optimisation of one hitting configuration."""
+    """Optimization of one hitting configuration."""
 
     arm: Arm
     target: Array
@@ -92,20 +93,20 @@ class Hit:
     home: Array
 
     def objective(self, q: Array) -> float:
-        """``|J^T d|^2 - |(home - q) / rated velocity|^2``."""
+        """Return ``|J^T d|^2 - |(home - q) / rated velocity|^2``."""
         gain = self.arm.jacobian(q)[:3].T @ self.direction
-        away = (self.home - q) / self.arm.robot.rated_velocity
-        return float(gain @ gain - away @ away)
+        offset = (self.home - q) / self.arm.robot.rated_velocity
+        return float(gain @ gain - offset @ offset)
 
     def gradient(self, q: Array) -> Array:
-        """The derivative of ``|J^T d|^2`` is ``2 dJ^T d`` with dJ the rate of J along dq = J^T d (p'' is symmetric)."""
+        """Return the gradient: that of ``|J^T d|^2`` is ``2 dJ^T d`` with dJ the rate of J along dq = J^T d."""
         gain = self.arm.jacobian(q)[:3].T @ self.direction
-        curved = self.arm.jacobian_rate(q, gain).T @ self.direction
-        return 2 * curved + 2 * (self.home - q) / self.arm.robot.rated_velocity**2
+        curvature = self.arm.jacobian_rate(q, gain).T @ self.direction
+        return 2 * curvature + 2 * (self.home - q) / self.arm.robot.rated_velocity**2
 
     def solve(self, start: Array) -> Array | None:
-        """Maximise by SLSQP; None if it fails."""
-        found = minimize(
+        """Maximize by SLSQP; return None if it fails."""
+        solution = minimize(
             lambda q: -self.objective(q),
             start,
             jac=lambda q: -self.gradient(q),
@@ -118,20 +119,20 @@ class Hit:
             method="SLSQP",
             options={"ftol": 1e-12, "maxiter": 200},
         )
-        return found.x if np.linalg.norm(self.arm.position(found.x) - self.target) < CLOSE else None
+        return solution.x if np.linalg.norm(self.arm.position(solution.x) - self.target) < SLSQP_TOLERANCE else None
 
 
 def hitting_speed(arm: Arm, q: Array, direction: Array) -> tuple[Array, float] | None:
-    """Solve the linear program of the hitting velocity by HiGHS; None if it fails."""
+    """Solve the linear program of the hitting velocity by HiGHS; return None if it fails."""
     jacobian, limit = arm.jacobian(q)[:3], arm.robot.velocity_limit
     across = np.array([[-direction[1], direction[0], 0.0], [0.0, 0.0, 1.0]])
     bounds = np.column_stack([-limit, limit])
-    found = linprog(-jacobian.T @ direction, A_eq=across @ jacobian, b_eq=np.zeros(2), bounds=bounds, method="highs")
-    return (found.x, -found.fun) if found.success else None
+    solution = linprog(-jacobian.T @ direction, A_eq=across @ jacobian, b_eq=np.zeros(2), bounds=bounds, method="highs")
+    return (solution.x, -solution.fun) if solution.success else None
 
 
 def table_velocity(arm: Arm, q: Array, random: np.random.Generator) -> Array:
-    """Draw a velocity with ``J_z dq = 0`` within the limits."""
+    """Sample a velocity with ``J_z dq = 0`` within the limits."""
     limit, row = arm.robot.velocity_limit, arm.jacobian(q)[2]
     dq = limit * random.uniform(-1, 1, len(q))
     dq -= limit**2 * row * (row @ dq) / (limit**2 @ row**2)
@@ -139,7 +140,7 @@ def table_velocity(arm: Arm, q: Array, random: np.random.Generator) -> Array:
 
 
 def table_acceleration(arm: Arm, q: Array, dq: Array, random: np.random.Generator) -> Array | None:
-    """Draw an acceleration with ``J_z ddq + dJ_z dq = 0`` within the limits of acceleration and torque."""
+    """Sample an acceleration with ``J_z ddq + dJ_z dq = 0`` within the limits of acceleration and torque."""
     limit, row = arm.robot.acceleration_limit, arm.jacobian(q)[2]
     share = -(arm.jacobian_rate(q, dq)[2] @ dq) / (limit @ np.abs(row))
     particular, direction = share * limit * np.sign(row), limit * random.uniform(-1, 1, len(q))
@@ -154,7 +155,7 @@ def table_acceleration(arm: Arm, q: Array, dq: Array, random: np.random.Generato
 
 
 class Boxes:
-    """The obstacles, the arm's capsules and the held object as Coal shapes."""
+    """Obstacles, capsules of the arm and held object as shapes of Coal."""
 
     def __init__(self, problem: Problem, arm: Arm) -> None:
         self.arm = arm
@@ -173,7 +174,7 @@ class Boxes:
         return [(points[a], points[b]) for a, b in self.arm.robot.capsule_axes]
 
     def collide(self, q: Array, obstacle_poses: Array) -> bool:
-        """Ask Coal about every pair."""
+        """Check every pair with Coal."""
         request = coal.CollisionRequest()
         moving = [
             (capsule, coal.Transform3s(_towards(b - a), (a + b) / 2))

@@ -1,12 +1,13 @@
-"""Every dataset with a planner: rows per second, plans from nothing, from the planner alone, and from it and refined.
+"""Every dataset with a planner: rows per second, solved plans, plans of the planner, and refined plans.
 
-Problems are fresh, from a seed that nothing was trained on. The clock is the process's CPU time, one BLAS thread; a
-plan's share of the verdict is in its time. "T / refined" is the mean motion time before over that after refining.
-The replanner is also asked for new plans on the way: from valid plans, after parts of their time T, to the goal that
-they have and to that of another problem; "T / left" is the mean time of the new plans over what was left of the old.
+Problems are new, from a seed that was not used for training. The clock is the process's CPU time with one BLAS
+thread; times of plans include the verdict. "T / refined" is the ratio of the mean motion times before and after
+refining. airhockey-replan also replans valid plans after fractions of their motion time T, to the same goal and to that
+of another problem. "T / remaining" is the ratio of the mean motion time of the new plans and of the remaining
+trajectories.
 
     python benchmarks/planners.py
-    python benchmarks/planners.py --full      # as many problems as the targets are about
+    python benchmarks/planners.py --full      # numbers of problems of the targets
     python benchmarks/planners.py --models panda-cup ur5-wipe --curves 0
 """
 
@@ -16,7 +17,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from common import arguments, at_hand, median, progress, report, table, verdict
+from common import arguments, installed_recipes, median, progress, report, table, verdict
 from generator import measure_rates, prepare
 from refiner_problems import PUCKS, make_each
 
@@ -30,21 +31,21 @@ from cnpgen.refine.options import DEFAULT_OPTIONS
 from cnpgen.refine.refine_plans import refine_plans
 
 PLANNED, REFINED = 1000, {"airhockey-hit": 1000, "airhockey-replan": 1000}
-SOLVED, OTHERS = 200, 300  # plans from nothing; refined ones of the other planners
-BLOCKS, REPEATED = {"compiled": 4}, 3  # of rows, each time; times
-GRID = "airhockey-hit"
-SHORT = {"planned": 500, "refined": 40, "solved": 40}
-REPLANNER, WHEN = "airhockey-replan", (0.0, 0.1, 0.2, 0.4, 0.6, 0.8)  # parts of T
-STEPS, CURVED = (1, 2, 3, 4, 6, 10), 100  # steps of the refiner's first pass; plans
+SOLVED, REFINED_OF_OTHERS = 200, 300  # solved plans; refined plans of the other planners
+BLOCKS, REPETITIONS = {"compiled": 4}, 3  # blocks of rows per repetition
+GRID_PLANNER = "airhockey-hit"
+SMALL = {"planned": 500, "refined": 40, "solved": 40}
+REPLANNER, SWITCH_TIMES = "airhockey-replan", (0.0, 0.1, 0.2, 0.4, 0.6, 0.8)  # fractions of T
+ITERATIONS, LIMITED = (1, 2, 3, 4, 6, 10), 100  # limits of the refiner's iterations; plans
 
 
 @dataclass(frozen=True)
 class Target:
-    """Goal of a figure.
+    """Target of a figure.
 
     Attributes:
         value: The bound.
-        at_most: Whether it is an upper one.
+        at_most: Whether it is an upper bound.
     """
 
     value: float
@@ -53,24 +54,24 @@ class Target:
 
 ARM = {
     "rows/s/core": Target(20_000), "strict": Target(0.9), "refined valid": Target(0.995),
-    "from nothing valid": Target(0.99), "from nothing, median ms": Target(150, at_most=True),
+    "solved valid": Target(0.99), "solved, median ms": Target(150, at_most=True),
 }  # fmt: skip
 TARGETS = {
     "panda-cup": ARM,
     "ur5-wipe": ARM,
     "airhockey-hit": {
-        "from nothing valid": Target(0.995),
+        "solved valid": Target(0.995),
         "strict": Target(0.95), "loose": Target(0.999), "z error [mm s]": Target(0.2, at_most=True),
         "T / refined": Target(1.02, at_most=True), "refined valid": Target(0.995),
         "refine, median ms": Target(10, at_most=True), "grid, refined valid of 81": Target(81),
     },
     "airhockey-replan": {
-        "rows/s/core": Target(120_000), "from nothing valid": Target(0.995),
+        "rows/s/core": Target(120_000), "solved valid": Target(0.995),
         "strict": Target(0.85), "loose": Target(0.97), "refined valid": Target(0.995),
         "refine, median ms": Target(12, at_most=True),
     },
     "heavy-object": {
-        "rows/s/core": Target(45_000), "from nothing valid": Target(0.97),
+        "rows/s/core": Target(45_000), "solved valid": Target(0.97),
         "strict": Target(0.95), "loose": Target(0.985), "vertical error [rad s]": Target(0.012, at_most=True),
         "T / refined": Target(1.04, at_most=True), "refined valid": Target(0.98),
         "refine, median ms": Target(45, at_most=True),
@@ -79,153 +80,153 @@ TARGETS = {
 
 
 def judge(plans: Plans) -> dict[str, float]:
-    """Say what plans are worth as the network gave them."""
+    """Return verdicts and metrics of plans of the network."""
     summary = evaluate_plans(plans).summary()
     metrics = summary["metrics_of_all"]
-    named = {"z error [mm s]": "z_error_mm_s", "vertical error [rad s]": "vertical_error_rad_s"}
-    found = {"strict": summary["valid_ratio"], "loose": summary["paper_valid_ratio"]}
-    found["motion time [s]"] = metrics["duration_s"]["mean"]
-    return found | {name: metrics[key]["mean"] for name, key in named.items() if key in metrics}
+    keys = {"z error [mm s]": "z_error_mm_s", "vertical error [rad s]": "vertical_error_rad_s"}
+    figures = {"strict": summary["valid_ratio"], "loose": summary["paper_valid_ratio"]}
+    figures["motion time [s]"] = metrics["duration_s"]["mean"]
+    return figures | {name: metrics[key]["mean"] for name, key in keys.items() if key in metrics}
 
 
 def draw_rate(name: str) -> float:
-    """Accepted rows per second of CPU time."""
+    """Measure the accepted rows per second of CPU time."""
     case = prepare(name, "compiled")
-    measure_rates([case], REPEATED, BLOCKS)
+    measure_rates([case], REPETITIONS, BLOCKS)
     return case.rate
 
 
 def solve(problems: Plans) -> dict[str, float]:
-    """Make plans from nothing one by one."""
+    """Solve problems one by one without initial guess."""
     with one_thread():
-        made = make_each(problems, DEFAULT_OPTIONS)
+        solved = make_each(problems, DEFAULT_OPTIONS)
     return {
-        "from nothing valid": float(np.mean([each.valid for each in made])),
-        "from nothing, median ms": median(each.ms for each in made),
-        "from nothing, mean ms": float(np.mean([each.ms for each in made])),
+        "solved valid": float(np.mean([plan.valid for plan in solved])),
+        "solved, median ms": median(plan.ms for plan in solved),
+        "solved, mean ms": float(np.mean([plan.ms for plan in solved])),
     }
 
 
 def refine(plans: Plans) -> dict[str, float]:
-    """Refine plans one by one; compare times where the result is valid."""
+    """Refine plans one by one; compare motion times of valid results."""
     with one_thread():
-        made = make_each(plans, DEFAULT_OPTIONS)
-    good = np.array([each.valid for each in made])
-    after, ms = np.array([each.duration for each in made]), [each.ms for each in made]
+        refined = make_each(plans, DEFAULT_OPTIONS)
+    valid = np.array([plan.valid for plan in refined])
+    after, ms = np.array([plan.duration for plan in refined]), [plan.ms for plan in refined]
     return {
-        "T / refined": float(plans.duration[good].mean() / after[good].mean()),
-        "refined valid": float(good.mean()),
+        "T / refined": float(plans.duration[valid].mean() / after[valid].mean()),
+        "refined valid": float(valid.mean()),
         "refine, median ms": median(ms),
         "refine, mean ms": float(np.mean(ms)),
         "refine, p95 ms": float(np.quantile(ms, 0.95)),
-        "of it verdicts, median ms": median(each.verdict_ms for each in made),
+        "of it verdicts, median ms": median(plan.verdict_ms for plan in refined),
     }
 
 
 def measure_grid(name: str) -> dict[str, float]:
-    """The 81 pucks on a grid, hit from rest."""
+    """Measure the hits of 81 pucks on a grid from rest."""
     progress(f"{name}: 81 pucks on a grid")
     plans = Planner(name).plan_batch(draw_boundary_problems("airhockey-pucks", PUCKS).boundary)
-    made = make_each(plans, DEFAULT_OPTIONS)
+    refined = make_each(plans, DEFAULT_OPTIONS)
     strict = int(evaluate_plans(plans).valid.sum())
-    return {"grid, strict of 81": strict, "grid, refined valid of 81": sum(each.valid for each in made)}
+    return {"grid, strict of 81": strict, "grid, refined valid of 81": sum(plan.valid for plan in refined)}
 
 
 def replan(name: str, seed: int, planned: int, refined: int) -> list[dict[str, Any]]:
-    """Plan anew from points on valid plans, to the same goal and to another one, by the network alone."""
+    """Replan from states of valid plans by the network, to the same goal and to another one."""
     planner = Planner(name)
     plans = planner.plan_batch(draw_boundary_problems(name, planned, seed=seed).boundary)
-    plans, found = plans[evaluate_plans(plans).valid], []
-    others = np.roll(np.arange(len(plans)), 1)
-    for goal, ends in (("same", plans.boundary), ("another", plans.boundary[others])):
-        for when in WHEN:
-            progress(f"{name}: {len(plans)} plans replanned at {when:g} T to {goal} goal")
-            q, dq, ddq = plans.states_at(when * plans.duration)
+    plans, records = plans[evaluate_plans(plans).valid], []
+    other = np.roll(np.arange(len(plans)), 1)
+    for goal, ends in (("same", plans.boundary), ("another", plans.boundary[other])):
+        for fraction in SWITCH_TIMES:
+            progress(f"{name}: {len(plans)} plans replanned at {fraction:g} T to {goal} goal")
+            q, dq, ddq = plans.states_at(fraction * plans.duration)
             new = planner.plan(q, ends.goal_q, start_dq=dq, start_ddq=ddq, goal_dq=ends.goal_dq)
-            facts = {"goal": goal, "at": when, "plans": len(new), "valid": float(evaluate_plans(new).valid.mean())}
+            facts = {"goal": goal, "at": fraction, "plans": len(new), "valid": float(evaluate_plans(new).valid.mean())}
             facts["refined valid"] = float(refine_plans(new[:refined]).valid.mean())
-            facts["T / left"] = float(new.duration.mean() / ((1 - when) * plans.duration.mean()))
-            found.append(facts)
-    return found
+            facts["T / remaining"] = float(new.duration.mean() / ((1 - fraction) * plans.duration.mean()))
+            records.append(facts)
+    return records
 
 
 def curve(name: str, seed: int, count: int) -> dict[int, float]:
-    """Refine with few steps: mean motion time over that with as many as it takes, where both are valid."""
+    """Refine with few iterations; return the mean ratios of motion times to the default, of valid pairs."""
     plans = Planner(name).plan_batch(draw_boundary_problems(name, count, seed=seed).boundary)
-    found = {}
+    ratios = {}
     with one_thread():
         full = make_each(plans, DEFAULT_OPTIONS)
-        for steps in STEPS:
-            progress(f"{name}: {count} plans, at most {steps} steps")
-            made = make_each(plans, replace(DEFAULT_OPTIONS, max_iterations=steps))
-            both = [(a.duration, b.duration) for a, b in zip(made, full, strict=True) if a.valid and b.valid]
-            few, all_ = np.array(both).T
-            found[steps] = float(np.mean(few / all_))
-    return found
+        for steps in ITERATIONS:
+            progress(f"{name}: {count} plans, at most {steps} iterations")
+            limited = make_each(plans, replace(DEFAULT_OPTIONS, max_iterations=steps))
+            both = [(a.duration, b.duration) for a, b in zip(limited, full, strict=True) if a.valid and b.valid]
+            few_iterations, default = np.array(both).T
+            ratios[steps] = float(np.mean(few_iterations / default))
+    return ratios
 
 
-def replan_table(found: list[dict[str, Any]]) -> str:
-    """Lay out what ``replan`` found."""
+def replan_table(records: list[dict[str, Any]]) -> str:
+    """Format the results of ``replan``."""
     rows = [
-        (each["goal"], f"{each['at']:g} T", f"{each['valid']:.1%}", f"{each['refined valid']:.1%}",
-         f"{each['T / left']:.2f}" if each["goal"] == "same" else "")
-        for each in found
+        (record["goal"], f"{record['at']:g} T", f"{record['valid']:.1%}", f"{record['refined valid']:.1%}",
+         f"{record['T / remaining']:.2f}" if record["goal"] == "same" else "")
+        for record in records
     ]  # fmt: skip
-    head = ("goal", "at", "valid", "refined valid", "T / left")
-    return table(f"new plans from points on {found[0]['plans']} valid ones", head, rows, left=2)
+    head = ("goal", "at", "valid", "refined valid", "T / remaining")
+    return table(f"replanned from states of {records[0]['plans']} valid plans", head, rows, left=2)
 
 
 def measure(name: str, seed: int, sizes: dict[str, int]) -> dict[str, float]:
     planned, refined, solved = (sizes[key] for key in ("planned", "refined", "solved"))
-    progress(f"{name}: {planned} plans, {refined} of them refined, {solved} from nothing")
-    planner, given = Planner(name), draw_boundary_problems(name, max(sizes.values()), seed=seed)
-    planner.plan_batch(given.boundary[:10])  # warms up
-    begun = time.process_time()
-    plans = planner.plan_batch(given.boundary)
-    each = {"plan, ms each of many": 1e3 * (time.process_time() - begun) / len(plans)}
+    progress(f"{name}: {planned} plans, {refined} of them refined, {solved} solved")
+    planner, problems = Planner(name), draw_boundary_problems(name, max(sizes.values()), seed=seed)
+    planner.plan_batch(problems.boundary[:10])  # warm-up
+    start = time.process_time()
+    plans = planner.plan_batch(problems.boundary)
+    planning = {"plan, ms per plan of a batch": 1e3 * (time.process_time() - start) / len(plans)}
     rate = {"rows/s/core": draw_rate(name)}
-    return rate | each | judge(plans[:planned]) | refine(plans[:refined]) | solve(given[:solved])
+    return rate | planning | judge(plans[:planned]) | refine(plans[:refined]) | solve(problems[:solved])
 
 
-def rows_of(name: str, found: dict[str, float]) -> list[tuple[str, ...]]:
+def rows_of(name: str, figures: dict[str, float]) -> list[tuple[str, ...]]:
     rows: list[tuple[str, ...]] = []
-    for what, value in found.items():
-        target = TARGETS.get(name, {}).get(what)
+    for figure, value in figures.items():
+        target = TARGETS.get(name, {}).get(figure)
         cells = verdict(value, target.value if target else None, at_most=bool(target and target.at_most))
         ratio = f"{value / target.value:.3f}" if target else ""
-        rows.append((name, what, f"{value:,.4g}", *cells, ratio))
+        rows.append((name, figure, f"{value:,.4g}", *cells, ratio))
     return rows
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--models", nargs="+", help="by default all that are shipped and whose robots are there")
-    parser.add_argument("--full", action="store_true", help="1,000 plans of each, and as many refined as targets say")
-    parser.add_argument("--curves", type=int, help="plans that are refined with few steps; none: no new plans, either")
-    parser.add_argument("--seed", type=int, default=987_654_321, help="of the problems")
+    parser.add_argument("--models", nargs="+", help="by default all shipped models whose robots are installed")
+    parser.add_argument("--full", action="store_true", help="the numbers of plans of the targets")
+    parser.add_argument("--curves", type=int, help="plans refined with few iterations; 0 omits replanning, too")
+    parser.add_argument("--seed", type=int, default=987_654_321, help="seed of the problems")
 
 
 def main() -> None:
     chosen = arguments(__doc__, options)
-    found: dict[str, Any] = {}
-    models = chosen.models or at_hand(shipped_models())
-    curved = (CURVED if chosen.full else SHORT["refined"]) if chosen.curves is None else chosen.curves
+    figures: dict[str, Any] = {}
+    models = chosen.models or installed_recipes(shipped_models())
+    limited = (LIMITED if chosen.full else SMALL["refined"]) if chosen.curves is None else chosen.curves
     for name in models:
-        full = {"planned": PLANNED, "refined": REFINED.get(name, OTHERS), "solved": SOLVED}
-        found[name] = measure(name, chosen.seed, full if chosen.full else SHORT)
-        found[name] |= measure_grid(name) if name == GRID else {}
-    rows = [row for name, values in found.items() for row in rows_of(name, values)]
-    head = ("planner", "figure", "value", "target", "", "of target")
-    tables = [table("datasets and their planners, fresh problems", head, rows, left=2)]
-    curves = {name: curve(name, chosen.seed, curved) for name in models if curved}
+        full = {"planned": PLANNED, "refined": REFINED.get(name, REFINED_OF_OTHERS), "solved": SOLVED}
+        figures[name] = measure(name, chosen.seed, full if chosen.full else SMALL)
+        figures[name] |= measure_grid(name) if name == GRID_PLANNER else {}
+    rows = [row for name, values in figures.items() for row in rows_of(name, values)]
+    head = ("planner", "figure", "value", "target", "", "ratio")
+    tables = [table("datasets and their planners, new problems", head, rows, left=2)]
+    curves = {name: curve(name, chosen.seed, limited) for name in models if limited}
     lines = [(name, *(f"{value:.4f}" for value in values.values())) for name, values in curves.items()]
-    steps = [f"{step} step{'s' if step > 1 else ''}" for step in STEPS]
+    steps = [f"{step} iteration{'s' if step > 1 else ''}" for step in ITERATIONS]
     if curves:
-        tables.append(table("motion time over that after as many steps as it takes", ("planner", *steps), lines))
-    again = []
-    if REPLANNER in models and curved:
-        again = replan(REPLANNER, chosen.seed, SHORT["planned"], SHORT["refined"])
-        tables.append(replan_table(again))
-    report({"planners": found, "curves": curves, "replanned": again}, tables, as_json=chosen.json)
+        tables.append(table("motion time after few iterations over that of the default", ("planner", *steps), lines))
+    replanned = []
+    if REPLANNER in models and limited:
+        replanned = replan(REPLANNER, chosen.seed, SMALL["planned"], SMALL["refined"])
+        tables.append(replan_table(replanned))
+    report({"planners": figures, "curves": curves, "replanned": replanned}, tables, as_json=chosen.json)
 
 
 if __name__ == "__main__":

@@ -45,7 +45,7 @@ class Made:
         return self.refined.valid
 
 
-class WatchedChecker(PlanChecker):
+class TimedChecker(PlanChecker):
     """Plan checker that measures its CPU time."""
 
     seconds = 0.0
@@ -61,32 +61,32 @@ class WatchedChecker(PlanChecker):
 
 def make_each(plans: Plans, options: RefineOptions, refiner: Refiner | None = None) -> list[Made]:
     """Refine plans one by one in this process and measure the CPU time."""
-    tool = prepare(plans, options) if refiner is None else refiner
+    refiner = prepare(plans, options) if refiner is None else refiner
     problem, robot = open_problem(plans.problem)
-    checker = WatchedChecker(problem, robot, degree=plans.degree)
+    checker = TimedChecker(problem, robot, degree=plans.degree)
     tasks = tasks_of(plans)
-    refine_task(tool, checker, tasks[0])  # warm-up
-    return [_make(tool, checker, task) for task in tasks]
+    refine_task(refiner, checker, tasks[0])  # warm-up
+    return [_make(refiner, checker, task) for task in tasks]
 
 
-def _make(tool: Refiner, checker: WatchedChecker, task: RefinementTask) -> Made:
+def _make(refiner: Refiner, checker: TimedChecker, task: RefinementTask) -> Made:
     checker.seconds, start = 0.0, time.process_time()
-    refined = refine_task(tool, checker, task)
+    refined = refine_task(refiner, checker, task)
     ms = 1e3 * (time.process_time() - start)
-    duration = float(Motion(refined.path[None], refined.rate[None], tool.spec.degree).duration()[0])
+    duration = float(Motion(refined.path[None], refined.rate[None], refiner.spec.degree).duration()[0])
     return Made(refined, ms, 1e3 * checker.seconds, duration)
 
 
-def like_a_networks(plans: Plans, made: list[Made], seed: int) -> Plans:
-    """Perturb plans like a network: the tip is 2 to 10 mm too high or low, velocities are 5 % too high.
+def network_like_plans(plans: Plans, results: list[Made], seed: int) -> Plans:
+    """Perturb plans like a network: height errors of 2 to 10 mm and velocities that are 5 % too high.
 
-    Their ends are exact, like those of a network's plans.
+    The boundary conditions remain exact, like those of a network.
     """
     problem, robot = open_problem(plans.problem)
     random, arm, s = np.random.default_rng(seed), ArmKinematics(robot), np.linspace(0, 1, 41)
     paths, rates = [], []
-    for index, each in enumerate(made):
-        path, rate, boundary = each.refined.path, each.refined.rate, plans.boundary[index : index + 1]
+    for index, result in enumerate(results):
+        path, rate, boundary = result.refined.path, result.refined.rate, plans.boundary[index : index + 1]
         noise, end = np.zeros_like(path), len(path) - boundary.fixed_at_goal
         noise[3:end] = _smooth(random.normal(size=noise[3:end].shape))
         target, size = random.uniform(MIN_Z_ERROR_M, MAX_Z_ERROR_M), 4e-3
@@ -110,5 +110,5 @@ def _smooth(values: Array) -> Array:
 
 def _vertical(arm: ArmKinematics, path: Array, perturbed: Array, s: Array) -> float:
     """Return the largest vertical distance between the tips of two paths [m]."""
-    q = [Motion(each[None], np.ones((1, 20))).at(s).q[0] for each in (path, perturbed)]
-    return max(abs(float((arm.at(one).position - arm.at(other).position)[2])) for one, other in zip(*q, strict=True))
+    q = [Motion(control_points[None], np.ones((1, 20))).at(s).q[0] for control_points in (path, perturbed)]
+    return max(abs(float((arm.at(a).position - arm.at(b).position)[2])) for a, b in zip(*q, strict=True))

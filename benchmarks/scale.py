@@ -1,7 +1,7 @@
-"""Cost of large datasets: docs/scale.md's table of core-hours, disk, files and memory, from rates measured here.
+"""Cost of large datasets: core-hours, disk, files and memory, extrapolated from small datasets.
 
-A small dataset of each kind is made and checked in this process, in shards as large as the large one's; the clock is
-the process's CPU time. The rest is multiplication.
+A small dataset of each kind is made and checked in this process, with shards of the size of the large dataset. The
+clock is the process's CPU time.
 
     python benchmarks/scale.py
     python benchmarks/scale.py --rows 1e8 --certified 1e7 --sample 262144 --certified-sample 256
@@ -33,16 +33,16 @@ class Costs:
     """Resources of a dataset.
 
     Attributes:
-        name: What it is made of.
-        rows: Its rows.
+        name: Recipe and type.
+        rows: Number of rows.
         make: CPU time per row [s].
-        check: CPU time per row to compare it with its records [s].
+        check: CPU time per row of the comparison with the records [s].
         deep: CPU time per row of ``validate --deep`` [s].
-        finish: CPU time per shard to sum up [s].
+        finish: CPU time per shard of the manifest [s].
         row_bytes: Bytes per row.
-        shard_bytes: Bytes per shard beside its rows, its record included.
+        shard_bytes: Bytes per shard in addition to its rows, with its record.
         shard_rows: Rows per shard.
-        memory: The most that the process has held [MB].
+        memory: Peak memory of the process [MB].
     """
 
     name: str
@@ -58,7 +58,7 @@ class Costs:
 
     @property
     def shards(self) -> int:
-        """Shards, of one split; every further one may add one."""
+        """Number of shards of one split; every further split may add one."""
         return -(-self.rows // self.shard_rows)
 
     @property
@@ -68,21 +68,25 @@ class Costs:
 
     @property
     def files(self) -> int:
-        """Files: two per shard, and the documents."""
+        """Number of files: two per shard, and the documents."""
         return 2 * self.shards + len(DOCUMENTS)
 
 
 def measure(name: str, rows: int, sample: int, **options: Any) -> Costs:
-    """Make a small dataset, and say what a large one takes."""
+    """Make a small dataset and extrapolate to a large one."""
     block = CERTIFIED_BLOCK if options.get("certify") else 4096
     shard_rows = default_shard_size(rows, block)
-    with tempfile.TemporaryDirectory(prefix="cnpgen-scale-") as place:
-        folder = Path(place) / "out"
+    with tempfile.TemporaryDirectory(prefix="cnpgen-scale-") as temporary:
+        folder = Path(temporary) / "out"
         settings = {"workers": 1, "shard_size": min(shard_rows, sample), **options}
-        cnpgen.make_dataset(name, Path(place) / "first", n=block, **{**settings, "shard_size": block})  # compiles
-        begun: list[float] = []  # when rows were made, after all that large datasets pay once, too
-        cnpgen.make_dataset(name, folder, n=sample, begin=lambda *_: begun.append(time.process_time()), **settings)
-        make = time.process_time() - begun[-1]
+        cnpgen.make_dataset(
+            name, Path(temporary) / "first", n=block, **{**settings, "shard_size": block}
+        )  # compiles kernels
+        start_times: list[float] = []  # times after the preparation, which is done once
+        cnpgen.make_dataset(
+            name, folder, n=sample, begin=lambda *_: start_times.append(time.process_time()), **settings
+        )
+        make = time.process_time() - start_times[-1]
         deep = seconds(lambda: cnpgen.validate_dataset(folder, deep=True, workers=1))
         spec = load_dataset_spec(folder)
         tasks = shards(spec)
@@ -92,33 +96,33 @@ def measure(name: str, rows: int, sample: int, **options: Any) -> Costs:
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     title = f"{name}, certified" if options.get("certify") else f"{name}, {options.get('dtype', 'float64')}"
     per_row, width = (make / sample, check / sample, deep / sample), row_bytes(spec)
-    beside = (size - sample * width) / len(tasks)
-    return Costs(title, rows, *per_row, summed / len(tasks), width, beside, shard_rows, memory)
+    overhead = (size - sample * width) / len(tasks)
+    return Costs(title, rows, *per_row, summed / len(tasks), width, overhead, shard_rows, memory)
 
 
 def seconds(run: Callable[[], object]) -> float:
-    """Return the CPU time that something takes [s]."""
-    begun = time.process_time()
+    """Return the CPU time of a function [s]."""
+    start = time.process_time()
     run()
-    return time.process_time() - begun
+    return time.process_time() - start
 
 
 def rows_of(costs: list[Costs]) -> list[list[str]]:
     return [
         [
-            each.name,
-            f"{each.rows:.0e}",
-            f"{1 / each.make:,.0f}",
-            f"{each.rows * each.make / 3600:,.2f}",
-            f"{each.rows * each.deep / 3600:,.2f}",
-            f"{each.rows * each.check / 60:,.1f}",
-            f"{each.shards * each.finish / 60:,.2f}",
-            f"{each.bytes / 1e9:,.1f}",
-            f"{each.shard_rows:,}",
-            f"{each.files:,}",
-            f"{each.memory:,.0f}",
+            cost.name,
+            f"{cost.rows:.0e}",
+            f"{1 / cost.make:,.0f}",
+            f"{cost.rows * cost.make / 3600:,.2f}",
+            f"{cost.rows * cost.deep / 3600:,.2f}",
+            f"{cost.rows * cost.check / 60:,.1f}",
+            f"{cost.shards * cost.finish / 60:,.2f}",
+            f"{cost.bytes / 1e9:,.1f}",
+            f"{cost.shard_rows:,}",
+            f"{cost.files:,}",
+            f"{cost.memory:,.0f}",
         ]
-        for each in costs
+        for cost in costs
     ]
 
 
@@ -129,7 +133,7 @@ HEAD = (
     "core-hours to make",
     "for --deep",
     "core-minutes to compare",
-    "to sum up",
+    "for the manifest",
     "disk [GB]",
     "rows per shard",
     "files",
@@ -139,9 +143,9 @@ HEAD = (
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--rows", type=float, default=1e8, help="rows of the datasets without plans")
-    parser.add_argument("--certified", type=float, default=1e7, help="rows of the certified one")
-    parser.add_argument("--sample", type=int, default=131072, help="rows that are made")
-    parser.add_argument("--certified-sample", type=int, default=128, help="samples with plans to measure")
+    parser.add_argument("--certified", type=float, default=1e7, help="rows of the certified dataset")
+    parser.add_argument("--sample", type=int, default=131072, help="rows of the small datasets")
+    parser.add_argument("--certified-sample", type=int, default=128, help="rows of the small certified dataset")
 
 
 def main() -> None:
@@ -153,7 +157,7 @@ def main() -> None:
     progress(f"airhockey-hit: {options.certified_sample} rows with plans")
     costs.append(measure("airhockey-hit", int(options.certified), options.certified_sample, certify=True))
     report(
-        {"datasets": [asdict(each) for each in costs]}, [table("datasets", HEAD, rows_of(costs))], as_json=options.json
+        {"datasets": [asdict(cost) for cost in costs]}, [table("datasets", HEAD, rows_of(costs))], as_json=options.json
     )
 
 

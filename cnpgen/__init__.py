@@ -31,7 +31,7 @@ Classes:
 * ``cnpgen.losses``: the loss of a plan, its metric and its margins.
 * ``cnpgen.results``: classes that functions return.
 * ``cnpgen.errors``: the exceptions.
-* ``cnpgen.plugins``: contracts of stages, constraints, planners and exporters.
+* ``cnpgen.plugins``: contracts of stages, constraints and exporters.
 * ``cnpgen.benchmark``: comparison of planners, and simulation of plans.
 
 Names load on first use, so that importing the package is cheap. ``__init__.pyi`` lists them for type checkers (SPEC 1).

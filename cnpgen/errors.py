@@ -1,7 +1,8 @@
 """Exceptions of the public interface, their exit codes, and parts of their messages."""
 
 import difflib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 Spelling = Callable[[str, object], str]
@@ -20,23 +21,33 @@ class CnpgenError(Exception):
         message: The error. With ``argument`` it is a predicate: "must be positive, got 0". ``{name}`` stands for an
             argument of ``remedies``.
         argument: Name of the invalid argument, which begins the text.
+        concerns: Name of the invalid argument if the message is a whole sentence; by default the first of ``remedies``.
         remedies: Arguments that the message proposes, name -> value; None for any value.
 
     Attributes:
         exit_code: Exit code of the command line.
         argument: Name of the invalid argument, or None.
         remedies: Arguments that the message proposes.
+        is_predicate: Whether the text begins with the name of the argument.
     """
 
     exit_code = 2
     argument: str | None = None
     remedies: Mapping[str, object] = {}
+    is_predicate = False
 
     def __init__(
-        self, message: str = "", *, argument: str | None = None, remedies: Mapping[str, object] | None = None
+        self,
+        message: str = "",
+        *,
+        argument: str | None = None,
+        concerns: str | None = None,
+        remedies: Mapping[str, object] | None = None,
     ) -> None:
         super().__init__(message)
-        self.argument, self.remedies = argument, remedies or {}
+        self.remedies = remedies or {}
+        self.argument = argument or concerns or next(iter(self.remedies), None)
+        self.is_predicate = argument is not None
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the keyword arguments and notes, too, for worker processes."""
@@ -47,8 +58,9 @@ class CnpgenError(Exception):
         text = " ".join(str(part) for part in self.args)
         for name, value in self.remedies.items():
             text = text.replace(f"{{{name}}}", spelling(name, value))
-        named = "" if self.argument is None else spelling(self.argument, None).removesuffix("=") + " "
-        return named + text
+        if self.argument is None or not self.is_predicate:
+            return text
+        return spelling(self.argument, None).removesuffix("=") + " " + text
 
     def __str__(self) -> str:
         return self.text()
@@ -89,6 +101,24 @@ class MachineError(CnpgenError):
     """A failure of the machine: no compiler, a full disk, a folder without write permission, a dead worker."""
 
     exit_code = 3
+
+
+class MissingExtraError(MachineError, ImportError):
+    """An optional package that is missing or broken; the message names the extra of cnpgen that installs it."""
+
+
+@contextmanager
+def requires_extra(extra: str, package: str) -> Iterator[None]:
+    """Raise MissingExtraError if an import in the block fails.
+
+    Args:
+        extra: Name of the extra in pyproject.toml.
+        package: Name of the package, for the message.
+    """
+    try:
+        yield
+    except (ImportError, OSError, AttributeError) as error:  # broken installations raise any of them
+        raise MissingExtraError(f"{package} cannot be imported ({error}): pip install 'cnpgen[{extra}]'") from error
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

@@ -1,6 +1,7 @@
 """Import rules: packages import lower layers only, judges are independent, heavy libraries are imported on use."""
 
 import ast
+import re
 import subprocess
 import sys
 from collections.abc import Collection
@@ -122,6 +123,30 @@ def test_judges_do_not_import_the_solvers_that_they_check(part: str) -> None:
         if own == part or own.startswith(f"{part}."):
             shared = {target for target in modules_of(imports(module)) if package(target) in INDEPENDENT[part]}
             assert not shared, f"cnpgen.{own} imports {shared}"
+
+
+def test_verdicts_evaluate_splines_by_their_own_code() -> None:
+    """Judges of plans import control points and boundary conditions, but no evaluation of motions."""
+    data = {"spline_motion", "spline_motion.Motion", "boundary", "boundary.Boundary"}
+    for own, module in NAMES.items():
+        if own.startswith("judges.plans."):
+            prefix = "cnpgen.trajectory."
+            shared = {item.removeprefix(prefix) for item in imports(module) if item.startswith(prefix)}
+            assert shared <= data, f"cnpgen.{own} imports {shared - data}"
+
+
+def test_every_trace_of_the_docs_needs_at_most_nine_files_and_never_returns_to_one() -> None:
+    """A file of a later step imports none of an earlier step, so that its calls lead forwards only."""
+    page = (PACKAGE.parent / "docs" / "architecture.md").read_text(encoding="utf-8")
+    traces = [re.findall(r"`([\w/]+)\.(?:py|c)`", section) for section in page.split("\n## ") if section[:2] == "A "]
+    assert len(traces) == 3
+    for files in traces:
+        assert len(files) == len(set(files)) <= 9, files
+        names = [file.replace("/", ".") for file in files]
+        assert set(names) <= set(NAMES), set(names) - set(NAMES)
+        for step, own in enumerate(names):
+            returns = modules_of(imports(NAMES[own])) & set(names[:step])
+            assert not returns, f"cnpgen.{own} imports {returns}, which an earlier step of its trace has left"
 
 
 def test_the_simulator_does_not_import_the_rest_of_the_benchmark() -> None:

@@ -1,7 +1,7 @@
 """Installed files: only cnpgen, with its recipes; complete public names; one version everywhere."""
 
 import ast
-import importlib
+import importlib.metadata
 import os
 import re
 import shutil
@@ -9,12 +9,24 @@ import subprocess
 import sys
 import tomllib
 import zipfile
+from collections.abc import Callable
 from email.parser import Parser
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 import cnpgen
+from cnpgen.benchmark.planners import cbirrt
+from cnpgen.benchmark.simulator import rendering
+from cnpgen.benchmark.simulator.execute import load_mujoco
+from cnpgen.cli.view import page
+from cnpgen.errors import MissingExtraError
+from cnpgen.loader.frame import make_frame
+from cnpgen.machine.clusters import joined
+from cnpgen.robots.shape.decomposition import convex_parts
+from cnpgen.store.files.figure_file import new_figure
 
 ROOT = Path(__file__).parents[1]
 
@@ -154,8 +166,78 @@ def test_the_version_is_the_same_everywhere() -> None:
     assert tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["dynamic"] == ["version"]
 
 
-def test_the_bridge_to_tensorflow_says_what_to_install_where_that_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "tensorflow", None)
-    monkeypatch.delitem(sys.modules, "cnpgen.interop.tensorflow", raising=False)
-    with pytest.raises(ImportError, match=r"tensorflow cannot be imported .*: pip install tensorflow"):
-        importlib.import_module("cnpgen.interop.tensorflow")
+def bridge(framework: str) -> Callable[[], object]:
+    """Return a function that imports the bridge of a framework as if for the first time."""
+
+    def load() -> object:
+        name = f"cnpgen.interop.{framework}"
+        loaded = [module for module in sys.modules if module == name or module.startswith(f"{name}.")]
+        for module in loaded:
+            del sys.modules[module]
+        return importlib.import_module(name)
+
+    return load
+
+
+def cluster(name: str) -> None:
+    with joined(name, None, 1):
+        pass
+
+
+def frame(library: str) -> Any:
+    return make_frame({}, (), library=library)
+
+
+def decomposition() -> object:
+    return convex_parts(np.zeros((4, 3)), np.zeros((4, 3), int), 2, None)
+
+
+OPTIONAL = {  # package that cnpgen imports -> extra that installs it, function that needs it
+    "torch": ("torch", bridge("torch")),
+    "jax": ("jax", bridge("jax")),
+    "tensorflow": ("tensorflow", bridge("tensorflow")),
+    "matplotlib": ("plot", lambda: new_figure(1, 1)),
+    "mujoco": ("benchmark", load_mujoco),
+    "imageio": ("benchmark", rendering._imageio),
+    "ompl": ("benchmark", cbirrt._ompl),
+    "coacd": ("decompose", decomposition),
+    "meshcat": ("view", page._viewer),
+    "distributed": ("dask", lambda: cluster("dask")),
+    "ray": ("ray", lambda: cluster("ray")),
+    "polars": ("polars", lambda: frame("polars")),
+    "pandas": ("pandas", lambda: frame("pandas")),
+}
+BY_NAME = {"meshcat", "polars", "pandas"}  # loaded by name, without an import statement
+SETTINGS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+
+
+@pytest.mark.parametrize("package", OPTIONAL)
+def test_the_error_without_an_optional_package_names_its_extra(package: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def without(name: str) -> Any:
+        raise importlib.metadata.PackageNotFoundError(name)
+
+    extra, use = OPTIONAL[package]
+    parts = [name for name in sys.modules if name.partition(".")[0] == package]
+    for name in (package, *parts):
+        monkeypatch.setitem(sys.modules, name, None)
+    for name in [name for name in sys.modules if name.startswith("cnpgen.interop.")]:
+        monkeypatch.setitem(sys.modules, name, sys.modules[name])  # put back after the test
+    for function in ("version", "distribution"):
+        monkeypatch.setattr(importlib.metadata, function, without)
+    with pytest.raises(MissingExtraError, match=rf"pip install 'cnpgen\[{extra}\]'") as caught:
+        use()
+    assert caught.value.exit_code == 3
+    assert any(re.match(rf"{package}\b", requirement) for requirement in SETTINGS["optional-dependencies"][extra])
+
+
+def test_the_list_of_optional_packages_is_complete() -> None:
+    imported = {
+        name.partition(".")[0]
+        for file in (ROOT / "cnpgen").rglob("*.py")
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Import | ast.ImportFrom)
+        for name in ([node.module] if isinstance(node, ast.ImportFrom) else [alias.name for alias in node.names])
+    }
+    required = {re.split(r"[^\w-]", requirement)[0] for requirement in SETTINGS["dependencies"]}
+    required |= {"pinocchio", "cnpgen"}  # pinocchio is installed by `pin`
+    assert imported - required - sys.stdlib_module_names == OPTIONAL.keys() - BY_NAME

@@ -88,6 +88,7 @@ def annotated(public: Any) -> Iterator[tuple[str, Any]]:
 
 MODULES = ("benchmark", "errors", "losses", "plugins", "recipes", "results")
 MAX_NAMES, MAX_HELP_LINES = 40, 400
+MAX_ANNOTATION_CHARACTERS = 80  # of one argument in a signature; NumPy's ArrayLike in full has 300
 
 
 def public_names() -> dict[str, Any]:
@@ -137,6 +138,23 @@ def test_the_package_has_few_names_and_help_is_short() -> None:
     assert any("cnpgen.make_dataset(" in line for line in lines[:15])
     text = "\n".join(lines)
     assert all(f"``{name}``" in text for name in cnpgen.__all__ if name != "__version__")
+
+
+def test_signatures_name_aliases_of_types_and_do_not_expand_them() -> None:
+    public = public_names().values()
+    classes = [kind for kind in public if inspect.isclass(kind)]
+    bases = {base for kind in classes for base in kind.__mro__ if base.__module__.startswith("cnpgen.")}
+    functions = [each for each in public if inspect.isfunction(each)]
+    functions += [function for base in bases for function in functions_of(base)]
+    assert len(classes) > 80
+    assert len(functions) > 300
+    long = {}
+    for function in (*classes, *functions):
+        signature = inspect.signature(function)
+        hints = [signature.return_annotation, *(each.annotation for each in signature.parameters.values())]
+        texts = [text for text in map(inspect.formatannotation, hints) if len(text) > MAX_ANNOTATION_CHARACTERS]
+        long |= {function.__qualname__: texts} if texts else {}
+    assert long == {}, "let the module begin with 'from __future__ import annotations'"
 
 
 def test_public_modules_begin_with_one_sentence() -> None:

@@ -1,5 +1,7 @@
 """Contract of the planners of the benchmark: one boundary problem in, a plan or a sampled trajectory out."""
 
+from __future__ import annotations
+
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from cnpgen.benchmark.execution import Task, execution_of
-from cnpgen.benchmark.hypothesis_tests import FIGURES, FLAGS, compared_with, values_of
+from cnpgen.benchmark.hypothesis_tests import FIGURES, FLAGS, reference_planner, values_of
 from cnpgen.benchmark.run_suite import Benchmark
 from cnpgen.benchmark.simulator.plant import Plant
 from cnpgen.benchmark.simulator.rendering import save_film, save_picture
 from cnpgen.errors import CnpgenError, MachineError
+from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.store.files.atomic import write_file
 from cnpgen.store.files.figure_file import new_figure
 
@@ -28,12 +29,13 @@ PRINTED: dict[str, dict[str, dict[str, str]]] = {  # suite -> planner -> figure 
     },
     "hits-110": {"cnp-b": {"scored": "78.2 % (real robot)"}, "aqp": {"scored": "52.7 % (real robot)"}},
 }
-MAX_FILM_FRAMES = 300  # some seconds of work, and less than 1 MB
+MAX_FILM_FRAMES = 300  # less than 1 MB
 _STYLE = "body{font-family:sans-serif;max-width:75em;margin:2em auto}td,th{padding:.2em .8em;text-align:right}"
 _STYLE += "td:first-child,th:first-child{text-align:left}table{border-collapse:collapse}tr{border-top:1px solid #ccc}"
 _STYLE += "svg{max-width:100%;height:auto}figure{display:inline-block;width:46%;margin:1%}img,video{width:100%}"
 
 
+@checked_arguments
 def save_benchmark_report(benchmark: Benchmark, path: str | Path, *, video: bool = False) -> Path:
     """Write the report of a benchmark as one self-contained file; an existing file is replaced.
 
@@ -49,7 +51,7 @@ def save_benchmark_report(benchmark: Benchmark, path: str | Path, *, video: bool
     parts = [
         f"<h1>{escape(suite.name)} {suite.version}</h1><p>{escape(suite.title)}: {len(benchmark.problems)} problems</p>"
     ]
-    parts += [f"<p>{escape(trouble)}</p>" for trouble in troubles(benchmark)]
+    parts += [f"<p>{escape(text)}</p>" for text in failure_summaries(benchmark)]
     for plant in benchmark.executions:
         title = f"executed by the {plant} plant" if plant else "planned"
         parts.append(f"<h2>{title}</h2>{_table(benchmark, plant)}{_boxes(benchmark, plant)}")
@@ -64,21 +66,21 @@ def _table(benchmark: Benchmark, plant: str) -> str:
     head, *rows = table_rows(benchmark, plant)
     lines = ["<table><tr>" + "".join(f"<th>{escape(cell)}</th>" for cell in head) + "</tr>"]
     lines += ["<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows]
-    other = compared_with(benchmark.results)
+    other = reference_planner(benchmark.results)
     note = f"Medians [quartiles]; p: p-value of the difference from {other}, if below 5 %."
     return "\n".join([*lines, f"</table><p>{note}</p>"])
 
 
-def troubles(benchmark: Benchmark) -> list[str]:
+def failure_summaries(benchmark: Benchmark) -> list[str]:
     """Report the outcomes and the first error of every planner without a plan for some problems."""
-    found = []
+    texts = []
     for name, rows in benchmark.results.items():
-        without = [row for row in rows if row["answer"] is None]
-        for ending in dict.fromkeys(row["ending"] for row in without):
-            of_it = [row for row in without if row["ending"] == ending]
-            said = f", problem {of_it[0]['problem']}: {of_it[0]['error']}" if of_it[0]["error"] else ""
-            found.append(f"{name}: {len(of_it)} of {len(rows)} {ending}{said}")
-    return found
+        unplanned = [row for row in rows if row["answer"] is None]
+        for ending in dict.fromkeys(row["ending"] for row in unplanned):
+            failed = [row for row in unplanned if row["ending"] == ending]
+            detail = f", problem {failed[0]['problem']}: {failed[0]['error']}" if failed[0]["error"] else ""
+            texts.append(f"{name}: {len(failed)} of {len(rows)} {ending}{detail}")
+    return texts
 
 
 def table_rows(benchmark: Benchmark, plant: str) -> list[tuple[str, ...]]:
@@ -99,25 +101,25 @@ def table_rows(benchmark: Benchmark, plant: str) -> list[tuple[str, ...]]:
     return rows
 
 
-def cell_text(found: dict[str, Any] | None, printed: str | None = None) -> str:
+def cell_text(statistic: dict[str, Any] | None, printed: str | None = None) -> str:
     """Format a ratio or a figure with the paper's value."""
-    if found is None:
+    if statistic is None:
         return f"paper: {printed}" if printed else ""
-    if "share" in found:
-        text = f"{found['count']} of {found['of']}"
+    if "share" in statistic:
+        text = f"{statistic['count']} of {statistic['of']}"
     else:
-        text = f"{found['median']:.3g} [{found['q1']:.3g}, {found['q3']:.3g}]"
-    text += f", p {found['p']:.1g}" if found["p"] < 0.05 else ""
+        text = f"{statistic['median']:.3g} [{statistic['q1']:.3g}, {statistic['q3']:.3g}]"
+    text += f", p {statistic['p']:.1g}" if statistic["p"] < 0.05 else ""
     return text + (f" (paper: {printed})" if printed else "")
 
 
 def _boxes(benchmark: Benchmark, plant: str) -> str:
     """Draw box plots of all figures."""
     values = {name: [values_of(row, plant) for row in rows] for name, rows in benchmark.results.items()}
-    shown = [key for key in FIGURES if any(key in row for rows in values.values() for row in rows)]
-    figure = new_figure(4 * min(len(shown), 4), 3 * -(-len(shown) // 4), dpi=100)
-    for place, key in enumerate(shown, start=1):
-        axes = figure.add_subplot(-(-len(shown) // 4), min(len(shown), 4), place)
+    keys = [key for key in FIGURES if any(key in row for rows in values.values() for row in rows)]
+    figure = new_figure(4 * min(len(keys), 4), 3 * -(-len(keys) // 4), dpi=100)
+    for place, key in enumerate(keys, start=1):
+        axes = figure.add_subplot(-(-len(keys) // 4), min(len(keys), 4), place)
         axes.boxplot([[row[key] for row in rows if key in row] for rows in values.values()])
         axes.set_xticks(range(1, len(values) + 1), list(values), rotation=30, fontsize=7)
         axes.set_title(FIGURES[key], fontsize=9)
@@ -137,15 +139,15 @@ def _motions(benchmark: Benchmark, *, video: bool) -> list[str]:
         if index is None:
             continue
         task = benchmark.problems[index], rows[index]["answer"], benchmark.prefix and benchmark.prefix[index]
-        what = f"{escape(name)}, problem {index}"
+        label = f"{escape(name)}, problem {index}"
         try:
-            shown, text = _shown(task, plant, video=video)
+            element, caption = _render(task, plant, video=video)
         except MachineError as error:
             return [f"<p>No images: {escape(str(error))}</p>"]
-        except CnpgenError as error:  # a line that has been damaged since
-            parts.append(f"<p>{what}: no image: {escape(str(error))}</p>")
+        except CnpgenError as error:  # the line is damaged
+            parts.append(f"<p>{label}: no image: {escape(str(error))}</p>")
             continue
-        parts.append(f"<figure>{shown}<figcaption>{what}, {text}</figcaption></figure>")
+        parts.append(f"<figure>{element}<figcaption>{label}, {caption}</figcaption></figure>")
     return parts
 
 
@@ -154,23 +156,23 @@ def _was_executed(row: dict[str, Any], plant: str) -> bool:
     return executed is not None and "failure" not in executed
 
 
-def _shown(task: Task, plant: Plant, *, video: bool) -> tuple[str, str]:
+def _render(task: Task, plant: Plant, *, video: bool) -> tuple[str, str]:
     """Execute a plan; return an image or a film, and its caption."""
     scene, reference, execution = execution_of(task, plant)
     with tempfile.TemporaryDirectory() as folder:
         picture, film = Path(folder) / "end.png", Path(folder) / "plan.mp4"
         save_picture(picture, scene, execution, reference.ticks)
-        still, text = _embedded(picture, "image/png"), "at the end of its plan"
+        image, caption = _embedded(picture, "image/png"), "at the end of its plan"
         if video:
             try:
                 save_film(film, scene, execution, reference.ticks, max_frames=MAX_FILM_FRAMES)
             except MachineError as error:
-                text += f"; no film: {escape(str(error))}"
+                caption += f"; no film: {escape(str(error))}"
                 film.unlink(missing_ok=True)
         if not film.exists():
-            return f"<img src='{still}'>", text
+            return f"<img src='{image}'>", caption
         source = _embedded(film, "video/mp4")
-    return f"<video controls loop muted poster='{still}' src='{source}'></video>", "scaled in time"
+    return f"<video controls loop muted poster='{image}' src='{source}'></video>", "scaled in time"
 
 
 def _embedded(file: Path, kind: str) -> str:

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-FLAGS = {  # of a row; the last ones are those of the execution
+FLAGS = {  # of a row; those from "at the goal, executed" on need an execution
     "planned": "a plan was found",
     "valid": "valid by the verdict",
     "paper_valid": "valid by the paper's rules",
@@ -31,7 +31,7 @@ FIGURES = {
     "acceleration_use": "maximum acceleration / limit",
     "torque_use": "maximum torque / rated, executed",
 }
-REFERENCE = "cnp-b+refine"  # reference of the comparison, if present
+REFERENCE_PLANNER = "cnp-b+refine"  # reference of the comparison, if present
 
 
 def values_of(row: Mapping[str, Any], plant: str = "") -> dict[str, bool | float]:
@@ -41,23 +41,23 @@ def values_of(row: Mapping[str, Any], plant: str = "") -> dict[str, bool | float
         row: A row of results.
         plant: Name of the plant; empty for plans only.
     """
-    found: dict[str, bool | float] = {"planned": row["answer"] is not None}
-    found |= {"planning_ms": 1e3 * row["planning_s"], "planning_cpu_ms": 1e3 * row["planning_cpu_s"]}
+    values: dict[str, bool | float] = {"planned": row["answer"] is not None}
+    values |= {"planning_ms": 1e3 * row["planning_s"], "planning_cpu_ms": 1e3 * row["planning_cpu_s"]}
     if plant:
         executed = row.get("executed", {}).get(plant, {"success": False})
-        found |= {name: value for name, value in executed.items() if name in FLAGS or name in FIGURES}
+        values |= {name: value for name, value in executed.items() if name in FLAGS or name in FIGURES}
     verdict = row.get("verdict")
     if verdict is None:
-        return {**found, "valid": False, "paper_valid": False, "paper_finished": False}
+        return {**values, "valid": False, "paper_valid": False, "paper_finished": False}
     metrics = verdict["metrics"]
-    found |= {"valid": verdict["valid"], "paper_valid": verdict["paper"]["valid"]}
-    found |= {"paper_finished": verdict["paper"]["finished"]}
+    values |= {"valid": verdict["valid"], "paper_valid": verdict["paper"]["valid"]}
+    values |= {"paper_finished": verdict["paper"]["finished"]}
     named = {"duration_s": "duration_s", "planned_z_error_mm_s": "z_error_mm_s"}
     named["planned_vertical_error_rad_s"] = "vertical_error_rad_s"
-    found |= {name: metrics[key] for name, key in named.items() if key in metrics}
+    values |= {name: metrics[key] for name, key in named.items() if key in metrics}
     if "joint acceleration" in verdict["value_over_bound"]:
-        found["acceleration_use"] = verdict["value_over_bound"]["joint acceleration"]
-    return found
+        values["acceleration_use"] = verdict["value_over_bound"]["joint acceleration"]
+    return values
 
 
 def summarize_results(
@@ -75,11 +75,11 @@ def summarize_results(
         the reference planner: McNemar's exact test for ratios, Wilcoxon's signed-rank test for figures.
     """
     values = {name: [values_of(row, plant) for row in rows] for name, rows in results.items()}
-    reference = compared_with(values)
-    known = {key for rows in values.values() for row in rows for key in row}
+    reference = reference_planner(values)
+    keys = {key for rows in values.values() for row in rows for key in row}
     return {
         name: {
-            "ratios": {key: _ratio(key, rows, values[reference]) for key in FLAGS if key in known},
+            "ratios": {key: _ratio(key, rows, values[reference]) for key in FLAGS if key in keys},
             "figures": {
                 key: _figure(key, rows, values[reference])
                 for key in FIGURES
@@ -90,27 +90,27 @@ def summarize_results(
     }  # fmt: skip
 
 
-def compared_with(planners: Iterable[str]) -> str:
-    """Return the reference planner: ``REFERENCE`` if present, otherwise the first one."""
+def reference_planner(planners: Iterable[str]) -> str:
+    """Return the reference planner: ``REFERENCE_PLANNER`` if present, otherwise the first one."""
     names = list(planners)
-    return REFERENCE if REFERENCE in names else next(iter(names), "")
+    return REFERENCE_PLANNER if REFERENCE_PLANNER in names else next(iter(names), "")
 
 
 def _ratio(key: str, rows: Sequence[Mapping[str, Any]], others: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    mine, theirs = (np.array([bool(row.get(key, False)) for row in each]) for each in (rows, others))
+    mine, theirs = (np.array([bool(row.get(key, False)) for row in outcomes]) for outcomes in (rows, others))
     count, of = int(mine.sum()), len(mine)
     return {"count": count, "of": of, "share": count / max(of, 1), "p": mcnemar(mine, theirs)}
 
 
 def _figure(key: str, rows: Sequence[Mapping[str, Any]], others: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    found = np.array([row[key] for row in rows if key in row], float)
-    q1, median, q3 = np.quantile(found, [0.25, 0.5, 0.75]).tolist()
+    values = np.array([row[key] for row in rows if key in row], float)
+    q1, median, q3 = np.quantile(values, [0.25, 0.5, 0.75]).tolist()
     pairs = [(row[key], other[key]) for row, other in zip(rows, others, strict=True) if key in row and key in other]
     return {
         "median": median,
         "q1": q1,
         "q3": q3,
-        "of": len(found),
+        "of": len(values),
         "p": wilcoxon(np.array(pairs, float).reshape(-1, 2)),
     }
 

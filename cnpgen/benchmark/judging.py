@@ -19,7 +19,6 @@ from cnpgen.judges.plans.sampling import Samples
 from cnpgen.judges.plans.verdict import Reason, Verdict
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.plans import Plans
-from cnpgen.problems.obstacles import obstacle_poses_of
 from cnpgen.problems.problem_record import ProblemRecord, open_problem
 from cnpgen.world.path import PathWorld
 
@@ -48,8 +47,7 @@ def judge_answer(problem: Plans, answer: Plans | Trajectory) -> Verdict:
 def _judge(problem: Plans, samples: Samples, answer: Trajectory) -> Verdict:
     loaded, robot = open_problem(problem.problem)
     states = _trajectory(answer, samples.t, jerk=loaded.uses_jerk)
-    goal_xyz = problem.columns["goal_xyz"][0]
-    obstacle_poses = obstacle_poses_of(loaded, problem.columns["start_xyz"][0], goal_xyz)
+    goal_xyz, obstacle_poses = problem.columns["goal_xyz"][0], problem.scene.poses[0]
     world = _world(problem.problem)
     world.set_path(states.q, states.dq, states.ddq, obstacle_poses, states.jerk)
     start_tip = world.tip_position[:, 0]

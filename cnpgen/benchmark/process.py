@@ -79,7 +79,7 @@ class PlannerProcess:
             self._unprepared = self._start()
         if self._unprepared is not None:
             return self._unprepared
-        began = time.perf_counter()
+        start = time.perf_counter()
         try:
             assert self._pipe is not None
             self._pipe.send(problem)
@@ -88,9 +88,9 @@ class PlannerProcess:
                 return outcome
         except (EOFError, OSError):
             self.stop()
-            return PlanningOutcome(Ending.CRASHED, seconds=time.perf_counter() - began, error="its process ended")
+            return PlanningOutcome(Ending.CRASHED, seconds=time.perf_counter() - start, error="its process ended")
         self.stop()
-        return PlanningOutcome(Ending.OUT_OF_TIME, seconds=time.perf_counter() - began, error="stopped: no answer")
+        return PlanningOutcome(Ending.OUT_OF_TIME, seconds=time.perf_counter() - start, error="stopped: no answer")
 
     def stop(self) -> None:
         """End the process."""
@@ -103,13 +103,15 @@ class PlannerProcess:
 
     def _start(self) -> PlanningOutcome | None:
         """Start the process; return the outcome of all problems if the planner cannot be prepared."""
-        began = time.perf_counter()
-        self._pipe, theirs = multiprocessing.Pipe()
-        with theirs:  # multiprocessing.Process would run the caller's script and is forbidden in dask workers
-            program = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import serve; serve({theirs.fileno()})"
+        start = time.perf_counter()
+        self._pipe, child_end = multiprocessing.Pipe()
+        with child_end:  # multiprocessing.Process would run the caller's script and is forbidden in dask workers
+            program = (
+                f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import serve; serve({child_end.fileno()})"
+            )
             command = [sys.executable, "-c", program]
             self._process = subprocess.Popen(  # output of planners is not data
-                command, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, stdout=STDERR
+                command, pass_fds=[child_end.fileno()], stdin=subprocess.DEVNULL, stdout=STDERR
             )
         refusal, message = None, "its process ended or was not ready in time"
         with suppress(EOFError, OSError):
@@ -122,7 +124,7 @@ class PlannerProcess:
         if refusal is not None:
             raise refusal(f"planner {self._name!r} cannot plan here: {message}")
         return PlanningOutcome(
-            Ending.CRASHED, seconds=time.perf_counter() - began, error=f"before the first problem: {message}"
+            Ending.CRASHED, seconds=time.perf_counter() - start, error=f"before the first problem: {message}"
         )
 
 
@@ -142,18 +144,18 @@ def serve(descriptor: int) -> None:
             return
         pipe.send((None, ""))
         while True:
-            pipe.send(_attempt(plan, pipe.recv()))
+            pipe.send(_plan_once(plan, pipe.recv()))
 
 
-def _attempt(plan: Plan, problem: Plans) -> PlanningOutcome:
+def _plan_once(plan: Plan, problem: Plans) -> PlanningOutcome:
     """Plan for one problem and measure the time."""
-    began, cpu = time.perf_counter(), time.process_time()
+    start, cpu = time.perf_counter(), time.process_time()
     try:
         try:
             with one_thread():
                 answer = plan(problem)
         finally:
-            seconds, cpu = time.perf_counter() - began, time.process_time() - cpu
+            seconds, cpu = time.perf_counter() - start, time.process_time() - cpu
         content = _content(answer, problem)
     except Exception as error:  # noqa: BLE001 - a plug-in may raise any exception
         return PlanningOutcome(Ending.FAILED, None, seconds, cpu, _message(error))

@@ -1,5 +1,7 @@
 """Pucks on a grid, and the boundary problems of hitting each of them towards the goal."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -4,7 +4,6 @@ Further lines of a problem add the execution of its plan on one plant. An incomp
 """
 
 import json
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,14 +27,15 @@ from cnpgen.store.files.document_structure import (
     check_structure,
 )
 from cnpgen.store.files.documents import parse_json
+from cnpgen.store.files.journal import append_line
 from cnpgen.store.paths import require_file
 
-FORMAT = "cnpgen-benchmark"
+RESULTS_FORMAT = "cnpgen-benchmark"
 RESULTS_VERSION = 1
 _POINTS = [Nullable(FINITE)]
 _PLAN = {"degree": WHOLE, "path_control_points": [_POINTS], "rate_control_points": _POINTS}
-_NEEDED = {"t": _POINTS, "q": [_POINTS]}
-_SAMPLES = {**_NEEDED, "dq": [_POINTS], "ddq": [_POINTS]}
+_REQUIRED = {"t": _POINTS, "q": [_POINTS]}
+_SAMPLES = {**_REQUIRED, "dq": [_POINTS], "ddq": [_POINTS]}
 _PLANNED = {"ending": TEXT, "planning_s": FINITE, "planning_cpu_s": FINITE, "error": TEXT}
 _VERDICT = {
     "valid": ANYTHING,
@@ -64,14 +64,8 @@ class Results:
             MachineError: The disk is full or cannot be written.
         """
         text = json.dumps(row, allow_nan=False)
-        self._take(json.loads(text))  # equal to the row that a later run reads
-        try:
-            with self.path.open("a", encoding="utf-8") as file:
-                file.write(f"{text}\n")
-                file.flush()
-                os.fsync(file.fileno())
-        except OSError as error:
-            raise machine_error("write", self.path, error) from error
+        self._merge(json.loads(text))  # equal to the row that a later run reads
+        append_line(self.path, text)
 
     def missing(self, count: int) -> Iterator[int]:
         """Yield those of the first ``count`` problems without planning result."""
@@ -84,7 +78,7 @@ class Results:
             if row.get("answer") is not None and plant not in row.get("executed", {}):
                 yield index
 
-    def _take(self, row: dict[str, Any]) -> None:
+    def _merge(self, row: dict[str, Any]) -> None:
         known = self.rows.setdefault(row["problem"], {})
         executed = {**known.get("executed", {}), **row.get("executed", {})}
         known |= row
@@ -92,29 +86,29 @@ class Results:
             known["executed"] = executed
 
 
-def open_results(path: Path, identity: dict[str, Any], *, discard: bool = False) -> Results:
+def open_results(path: Path, identity: dict[str, Any], *, overwrite: bool = False) -> Results:
     """Open the results of a planner with the rows of earlier runs.
 
     Args:
         path: The file.
         identity: Identity of the run; results of another run are refused.
-        discard: Whether to overwrite results of another run.
+        overwrite: Whether to overwrite results of another run.
 
     Raises:
         UsageError: The file belongs to another run.
         DatasetError: The file is damaged.
         MachineError: The file cannot be read or written.
     """
-    head = json.dumps({"format": FORMAT, "format_version": RESULTS_VERSION, **identity})
+    head = json.dumps({"format": RESULTS_FORMAT, "format_version": RESULTS_VERSION, **identity})
     results = Results(path)
     lines: list[str] = []
     if path.exists():
         require_file(path, "the results of a planner")
-        lines = _whole_lines(path)
-        if lines and lines[0] != head and not discard:
+        lines = _complete_lines(path)
+        if lines and lines[0] != head and not overwrite:
             raise UsageError(
                 f"{path} holds results of another run (suite, version or time limit differ);"
-                " {force} discards them, another folder keeps them",
+                " {force} overwrites them, another folder keeps them",
                 remedies={"force": True},
             )
         lines = lines[1:] if lines and lines[0] == head else []
@@ -124,7 +118,7 @@ def open_results(path: Path, identity: dict[str, Any], *, discard: bool = False)
             _check_row(row)
         except ValueError as error:
             raise DatasetError(f"{path} is damaged: line {number}: {error}; delete that line") from error
-        results._take(row)
+        results._merge(row)
     write_file(path, "".join(f"{line}\n" for line in (head, *lines)).encode())
     return results
 
@@ -135,10 +129,10 @@ def _check_row(row: Any) -> None:
     if "ending" in row:
         check_structure(row, {**_PLANNED, "answer": Nullable({ANY_KEY: ANYTHING})})
         if (answer := row["answer"]) is not None:
-            form = _PLAN if "degree" in answer else {**_NEEDED, **_present(_SAMPLES, answer)}
-            check_structure(answer, form)
+            structure = _PLAN if "degree" in answer else {**_REQUIRED, **_present(_SAMPLES, answer)}
+            check_structure(answer, structure)
             check_structure(row, {"verdict": _VERDICT})
-            for name in form.keys() - {"degree"}:
+            for name in structure.keys() - {"degree"}:
                 np.array(answer[name], float)  # rows of equal length
     if "executed" in row:
         check_structure(row, {"executed": {ANY_KEY: {ANY_KEY: ANYTHING}}})
@@ -146,13 +140,13 @@ def _check_row(row: Any) -> None:
             check_structure(executed, _present(dict.fromkeys(FIGURES, Nullable(FINITE)), executed))
 
 
-def _present(forms: dict[str, Structure], table: dict[str, Any]) -> dict[str, Structure]:
-    return {name: form for name, form in forms.items() if name in table}
+def _present(structures: dict[str, Structure], table: dict[str, Any]) -> dict[str, Structure]:
+    return {name: structure for name, structure in structures.items() if name in table}
 
 
-def _whole_lines(path: Path) -> list[str]:
+def _complete_lines(path: Path) -> list[str]:
     """Return the lines of a file up to the first line that is not JSON."""
-    found = []
+    complete = []
     try:
         lines = path.read_bytes().decode("utf-8", "replace").splitlines()
     except OSError as error:
@@ -162,8 +156,8 @@ def _whole_lines(path: Path) -> list[str]:
             parse_json(line)
         except ValueError:
             break
-        found.append(line)
-    return found
+        complete.append(line)
+    return complete
 
 
 def answer_to_dict(answer: Plans | Trajectory) -> dict[str, Any]:
@@ -204,5 +198,5 @@ def answer_from_dict(problem: Plans, content: dict[str, Any]) -> Plans | Traject
 def _rows(values: Any) -> list[Any]:
     """Convert an array to lists; nonfinite values become None, which is read as nan."""
     array = np.asarray(values, float)
-    found: list[Any] = np.where(np.isfinite(array), array.astype(object), None).tolist()  # type: ignore[call-overload]
-    return found
+    rows: list[Any] = np.where(np.isfinite(array), array.astype(object), None).tolist()  # type: ignore[call-overload]
+    return rows

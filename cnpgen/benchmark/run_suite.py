@@ -28,7 +28,8 @@ from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem import resolved
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.schema import registry
-from cnpgen.schema.arguments import integer, number
+from cnpgen.schema.argument_types import checked_arguments
+from cnpgen.schema.arguments import concerning, integer, number
 from cnpgen.store.files.documents import canonical_sha256, plain
 
 PROBLEMS_PER_TASK = 4  # of a worker; starting a planner takes some seconds
@@ -70,6 +71,7 @@ class Benchmark:
         """Names of the plants; one empty name without execution."""
         return tuple(plant.name for plant in self.plants) or ("",)
 
+    @checked_arguments
     def summary(self, plant: str = "") -> dict[str, dict[str, dict[str, dict[str, Any]]]]:
         """Return ratios, medians, quartiles and p-values of every planner; see ``summarize_results``.
 
@@ -79,6 +81,7 @@ class Benchmark:
         return summarize_results(self.results, plant)
 
 
+@checked_arguments
 def run_benchmark(
     suite: str | Path | Suite,
     folder: str | Path,
@@ -122,9 +125,10 @@ def run_benchmark(
         MachineError: MuJoCo is missing, the results cannot be written, or a cluster cannot be reached.
     """
     where = Engine(engine, address, workers)
-    loaded = suite if isinstance(suite, Suite) else load_suite(suite)
+    with concerning("suite"):
+        loaded = suite if isinstance(suite, Suite) else load_suite(suite)
     _check_planners(planners)
-    robots = tuple(as_plant(plant) for plant in plants)
+    robots = tuple(as_plant(plant, argument="plants") for plant in plants)
     if environment is not None:
         robots += (challenge_plant(environment),)
     if robots:
@@ -137,17 +141,19 @@ def run_benchmark(
         check_challenge(*open_problem(problems.problem))
     setting = Setting(problems.problem, loaded.model, limit)
     place = Path(folder)
+    if place.exists() and not place.is_dir():
+        raise UsageError(f"must be a folder, {place} is a file", argument="folder")
     place.mkdir(parents=True, exist_ok=True)
     report = progress or (lambda *_: None)
     rows = {}
     with assembled(where, len(problems)) as pool:
         for name in planners:
-            results = open_results(place / f"{name}.jsonl", _identity(loaded, name, limit), discard=force)
+            results = open_results(place / f"{name}.jsonl", _identity(loaded, name, limit), overwrite=force)
             planned = _plan_locally if engine is None else partial(_plan_in_pool, pool)
             _plan_all(results, problems, partial(planned, name, setting), partial(report, f"{name} plans"))
             for plant in robots:
                 _execute_all(
-                    results, plant, problems, prefix, pool=pool, tell=partial(report, f"{name}, {plant.name} plant")
+                    results, plant, problems, prefix, pool=pool, report=partial(report, f"{name}, {plant.name} plant")
                 )
             rows[name] = [results.rows[index] for index in range(len(problems))]
     return Benchmark(loaded, problems, prefix, rows, robots)
@@ -157,10 +163,14 @@ def _check_planners(planners: Sequence[str]) -> None:
     """Check names before any work."""
     known = registry.names(registry.PLANNERS)
     if not planners:
-        raise UsageError(f"no planners, expected some of {', '.join(known)}")
+        raise UsageError(f"no planners, expected some of {', '.join(known)}", concerns="planners")
     for name in planners:
+        if not isinstance(name, str):
+            raise UsageError(f"must be names of planners, got {name!r:.100}", argument="planners")
         if name not in known:
-            raise UsageError(f"unknown planner {name!r}{nearest(name, known)}; known: {', '.join(known)}")
+            raise UsageError(
+                f"unknown planner {name!r}{nearest(name, known)}; known: {', '.join(known)}", concerns="planners"
+            )
 
 
 def _identity(suite: Suite, planner: str, time_limit: float) -> dict[str, Any]:
@@ -177,7 +187,7 @@ def _identity(suite: Suite, planner: str, time_limit: float) -> dict[str, Any]:
 
 
 def _plan_all(
-    results: Results, problems: Plans, planned: Callable[[list[Numbered]], Rows], tell: Callable[[int, int], None]
+    results: Results, problems: Plans, planned: Callable[[list[Numbered]], Rows], report: Callable[[int, int], None]
 ) -> None:
     """Plan for the problems without result."""
     waiting = [(index, problems[index]) for index in results.missing(len(problems))]
@@ -186,7 +196,7 @@ def _plan_all(
     with closing(planned(waiting)) as rows:
         for done, row in enumerate(rows, start=len(problems) - len(waiting) + 1):
             results.append(row)
-            tell(len(problems), done)
+            report(len(problems), done)
 
 
 def _plan_locally(name: str, setting: Setting, waiting: list[Numbered]) -> Rows:
@@ -203,8 +213,8 @@ def _plan_in_pool(pool: WorkerPool, name: str, setting: Setting, waiting: list[N
     """Yield the rows of problems that are distributed over a worker pool."""
     size = min(PROBLEMS_PER_TASK, -(-len(waiting) // pool.size))
     parts = (waiting[first : first + size] for first in range(0, len(waiting), size))
-    with closing(pool.distribute(partial(_plan_task, name, setting), parts)) as found:
-        for rows in found:
+    with closing(pool.distribute(partial(_plan_task, name, setting), parts)) as results:
+        for rows in results:
             yield from ({**row, "planners_at_once": pool.size} for row in rows)
 
 
@@ -212,18 +222,18 @@ def _plan_task(name: str, setting: Setting, part: list[Numbered]) -> list[dict[s
     return list(_plan_locally(name, setting, part))
 
 
-def _row(index: int, problem: Plans, attempt: PlanningOutcome) -> dict[str, Any]:
+def _row(index: int, problem: Plans, outcome: PlanningOutcome) -> dict[str, Any]:
     """Return the row of a problem."""
     row: dict[str, Any] = {
         "problem": index,
-        "ending": str(attempt.ending),
-        "planning_s": attempt.seconds,
-        "planning_cpu_s": attempt.cpu_seconds,
-        "error": attempt.error,
-        "answer": attempt.answer,
+        "ending": str(outcome.ending),
+        "planning_s": outcome.seconds,
+        "planning_cpu_s": outcome.cpu_seconds,
+        "error": outcome.error,
+        "answer": outcome.answer,
     }
-    if attempt.answer is not None:  # with the boundary conditions of the problem, not those of the answer
-        row["verdict"] = verdict_to_dict(judge_answer(problem, answer_from_dict(problem, attempt.answer)))
+    if outcome.answer is not None:  # with the boundary conditions of the problem, not those of the answer
+        row["verdict"] = verdict_to_dict(judge_answer(problem, answer_from_dict(problem, outcome.answer)))
     return row
 
 
@@ -251,14 +261,14 @@ def _execute_all(
     prefix: ExecutedPrefix | None,
     *,
     pool: WorkerPool,
-    tell: Callable[[int, int], None],
+    report: Callable[[int, int], None],
 ) -> None:
     """Execute the plans that this plant has not executed."""
     waiting = list(results.unexecuted(plant.name, len(problems)))
     if not waiting:
         return
     tasks = ((problems[index], results.rows[index]["answer"], prefix and prefix[index]) for index in waiting)
-    with closing(pool.distribute(partial(execute_answer, plant=plant), tasks, ordered=True)) as found:
-        for done, (index, executed) in enumerate(zip(waiting, found, strict=True), start=1):
+    with closing(pool.distribute(partial(execute_answer, plant=plant), tasks, ordered=True)) as executions:
+        for done, (index, executed) in enumerate(zip(waiting, executions, strict=True), start=1):
             results.append({"problem": index, "executed": {plant.name: executed.to_dict()}})
-            tell(len(waiting), done)
+            report(len(waiting), done)

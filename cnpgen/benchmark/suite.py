@@ -1,5 +1,7 @@
 """Suites: fixed, versioned sets of boundary problems for the comparison of planners, read from recipes."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,6 +14,8 @@ from cnpgen.pipelines.stages.given_positions import MAX_TASKS
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import read_problem
+from cnpgen.schema.argument_types import checked_arguments
+from cnpgen.schema.arguments import integer
 from cnpgen.schema.catalogue import list_recipes, load_recipe, reference
 from cnpgen.schema.keys import NAME, RecipeLocation, field
 from cnpgen.schema.parsing import Reader, parse
@@ -38,7 +42,7 @@ class Suite:
     title: str = field("title in one line", default="")
     model: str = field("shipped model for these problems", default="")
     pucks: Pucks | None = field("grid of pucks to hit from rest", default=None)
-    replanning: ReplanningScenario | None = field("pucks to hit by online replanning", default=None)
+    replanning: ReplanningScenario | None = field("replanning scenarios: pucks to hit from moving states", default=None)
     samples: SampledProblems | None = field("random problems of a dataset", default=None)
 
     def find_mistakes(self) -> Iterator[tuple[str, str]]:
@@ -46,6 +50,7 @@ class Suite:
         if sum(part is not None for part in (self.pucks, self.replanning, self.samples)) != 1:
             yield "pucks", "expected exactly one of [pucks], [replanning] and [samples]"
 
+    @checked_arguments
     def problems(self, n: int | None = None) -> tuple[Plans, ExecutedPrefix | None]:
         """Return the boundary problems, as plans without motions.
 
@@ -59,15 +64,17 @@ class Suite:
             RecipeError: A recipe has mistakes.
             UsageError: ``n`` is not positive.
         """
+        n = None if n is None else integer("n", n, least=1)
         if self.samples is not None:
             return draw_boundary_problems(self.samples.recipe, n or self.samples.n, seed=self.samples.seed), None
         if self.replanning is not None:
-            found, prefix = scenario_problems(self.replanning)
-            return found[:n], prefix
+            problems, prefix = scenario_problems(self.replanning)
+            return problems[:n], prefix
         assert self.pucks is not None
         return hits_of(self.pucks)[:n], None
 
 
+@checked_arguments
 def load_suite(name_or_path: str | Path) -> Suite:
     """Load a suite; a dataset or a pipeline becomes a suite of its samples.
 
@@ -89,7 +96,7 @@ def _read(path: Path, mistakes: list[str]) -> Suite | None:
     table = read_table(path, ("suite", "dataset", "pipeline"), mistakes)
     if table is None:
         return None
-    if not is_kind("suite", table):
+    if is_kind("dataset", table) or is_kind("pipeline", table):
         recipe = load_dataset_recipe(path)
         return Suite(
             name=recipe.name,

@@ -1,5 +1,7 @@
 """Trajectories sampled in time, as most planners return them, and their interpolation."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -8,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
+from cnpgen.schema.arguments import numbers
 from cnpgen.trajectory.samples import checked_samples
 
 Array = NDArray[np.float64]
@@ -39,12 +42,12 @@ class Trajectory:
         ddq = None
         if self.ddq is not None:
             if dq is None:
-                raise UsageError("a trajectory with accelerations needs velocities, too")
+                raise UsageError("a trajectory with accelerations needs velocities, too", concerns="ddq")
             ddq = checked_samples(t, q, self.ddq)[2]
         for name, values in (("t", t), ("q", q), ("dq", dq), ("ddq", ddq)):
             object.__setattr__(self, name, values)  # lists become arrays
         if self.t[0] != 0:
-            raise UsageError(f"a trajectory begins at t = 0, got {self.t[0]} s")
+            raise UsageError(f"a trajectory begins at t = 0, got {self.t[0]} s", concerns="t")
 
     @property
     def duration(self) -> float:
@@ -61,13 +64,24 @@ class Trajectory:
             Positions [rad], velocities [rad/s] and accelerations [rad/s^2], shape (K, n) each.
             Accelerations of linear spans are 0; they do not include jumps of the velocity.
         """
-        t = np.clip(t, 0, self.duration)
+        t = self._clipped(t)
         q, dq, ddq = (np.asarray(self._piecewise(t, order)) for order in range(3))
         return q, dq, ddq
 
     def jerks(self, t: Array) -> Array:
         """Evaluate the jerks within spans [rad/s^3] at times [s] of shape (K,), shape (K, n)."""
-        return np.asarray(self._piecewise(np.clip(t, 0, self.duration), 3))
+        times = self._clipped(t)
+        if self.dq is None:  # linear spans, of which SciPy has no third derivative
+            return np.zeros((len(times), self.q.shape[1]))
+        return np.asarray(self._piecewise(times, 3))
+
+    def _clipped(self, t: Array) -> Array:
+        """Return times as an array, clipped to the motion."""
+        times = numbers("t", t)
+        increasing = times.ndim == 1 and len(times) > 0 and not np.isnan(times).any()
+        if not increasing:
+            raise UsageError(f"must be times, shape (K,), got {times!s:.100}", argument="t")
+        return np.clip(times, 0, self.duration)
 
     @cached_property
     def _piecewise(self) -> Any:

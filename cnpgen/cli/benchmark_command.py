@@ -107,10 +107,10 @@ def _run(arguments: argparse.Namespace, folder: Path) -> "Benchmark":
 
 def _facts(found: "Benchmark", folder: Path) -> dict[str, Any]:
     """Return the results of all planners for JSON."""
-    from cnpgen.benchmark.results_file import FORMAT, RESULTS_VERSION
+    from cnpgen.benchmark.results_file import RESULTS_FORMAT, RESULTS_VERSION
 
     return {
-        "format": FORMAT,
+        "format": RESULTS_FORMAT,
         "format_version": RESULTS_VERSION,
         "suite": found.suite.name,
         "suite_version": found.suite.version,
@@ -122,12 +122,14 @@ def _facts(found: "Benchmark", folder: Path) -> dict[str, Any]:
 
 def _text(found: "Benchmark") -> str:
     """Format one table per plant with a column per planner."""
-    from cnpgen.benchmark.html_report import table_rows, troubles
+    from cnpgen.benchmark.html_report import failure_summaries, table_rows
     from cnpgen.cli.describe import table
 
     head = f"{found.suite.name} {found.suite.version}: {len(found.problems)} problems"
     tables = [table([(*row, "") for row in table_rows(found, plant)], indent="  ") for plant in found.executions]
-    return "\n\n".join([head, *("\n".join(lines) for lines in tables), *filter(None, ["\n".join(troubles(found))])])
+    return "\n\n".join(
+        [head, *("\n".join(lines) for lines in tables), *filter(None, ["\n".join(failure_summaries(found))])]
+    )
 
 
 def _listing(*, as_json: bool) -> str:

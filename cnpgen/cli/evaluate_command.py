@@ -94,13 +94,11 @@ def _write_json(file: Path, found: "Evaluation") -> None:
 def _draw(found: "Evaluation", picture: str, index: int | None) -> None:
     from cnpgen.judges.plans.plan_plot import plot_plan
     from cnpgen.plans import open_problem
-    from cnpgen.problems.obstacles import obstacle_poses_of
 
     plans, chosen = found.plans, _chosen(found) if index is None else index
     problem, robot = open_problem(plans.problem)
-    obstacle_poses = obstacle_poses_of(problem, plans.columns["start_xyz"][chosen], plans.columns["goal_xyz"][chosen])
     note = f"sample {plans.sample_id[chosen]}: {found.verdicts[chosen]}"
-    plot_plan(problem, robot, plans.motion, chosen, picture, obstacle_poses=obstacle_poses, note=note)
+    plot_plan(problem, robot, plans.motion, chosen, picture, scene=plans.scene[chosen], note=note)
     print(f"drawn: plan {chosen} in {picture}", file=sys.stderr)
 
 

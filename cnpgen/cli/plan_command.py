@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from cnpgen.cli import values
 from cnpgen.cli.parser import Commands, Parser, add_command, add_engine, add_json
 from cnpgen.cli.plan_files import check_suffix
-from cnpgen.cli.refine_options import REFINING, WORKERS, add_refining, check_place, refine_and_save
+from cnpgen.cli.refine_options import LARGE_ANGLES, REFINING, WORKERS, add_refining, check_place, refine_and_save
 from cnpgen.errors import counted
 
 if TYPE_CHECKING:
@@ -37,6 +37,7 @@ def add(commands: "Commands[Parser]") -> None:
     option("--first", metavar="I", type=values.natural, help="first sample of the split (default: 0)")
     option("--n", metavar="K", type=values.rows, help="number of samples; by default all that follow")
     option("--other-rows", action="store_true", help="accept samples of another pipeline than the training data")
+    option("--allow-large-angles", action="store_true", help=LARGE_ANGLES)
     option("--no-time-scaling", action="store_true", help="keep the rates of the network")
     option("--force", action="store_true", help="replace PLANS, and discard another run's PLANS.part")
     option("--quiet", action="store_true", help="no progress and no summary")
@@ -115,4 +116,6 @@ def _requests(arguments: argparse.Namespace, model: "Model") -> "Requests":
         )
     if arguments.split is not None or arguments.first is not None or arguments.n is not None:
         raise UsageError("--split, --first and --n need the folder of a dataset, got a file")
-    return read_file(arguments.problems, model, other=arguments.other_rows)
+    return read_file(
+        arguments.problems, model, other=arguments.other_rows, allow_large_angles=arguments.allow_large_angles
+    )

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from cnpgen.refine.refine_plans import Refinement
 
 REFINING = ("objective", "weight", "max_iterations", "tolerance", "deadline")  # what add_refining adds
+LARGE_ANGLES = "accept boundary conditions in a file that are probably in degrees or millimetres"
 WORKERS = "processes; default one per available core, or one for up to 60 plans"
 LISTED = 10  # plans without success that are listed
 

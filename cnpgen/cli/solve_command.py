@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from cnpgen.cli import values
 from cnpgen.cli.parser import Commands, Parser, add_command
-from cnpgen.cli.refine_options import TEXT, add_options, refine_and_save
+from cnpgen.cli.refine_options import LARGE_ANGLES, TEXT, add_options, refine_and_save
 
 if TYPE_CHECKING:
     from cnpgen.plans import Plans
@@ -43,6 +43,7 @@ def add(commands: "Commands[Parser]") -> None:
         help="the problem of boundary conditions in HDF5; its tolerances are used",
     )
     option("-o", "--out", metavar="OUT", type=Path, help="output file (default: DIR-plans.h5 or NAME-plans.h5)")
+    option("--allow-large-angles", action="store_true", help=LARGE_ANGLES)
     add_options(parser)
 
 
@@ -89,7 +90,9 @@ def _conditions(arguments: argparse.Namespace) -> "Plans":
 
     _refuse(arguments, ["split", "first", "n"], "--split, --first and --n need the folder of a dataset, got a file")
     _refuse(arguments, ["seed"], "--seed is for fresh draws of a recipe, got a file of boundary conditions")
-    problems = load_boundary_problems(arguments.what, problem=arguments.problem)
+    problems = load_boundary_problems(
+        arguments.what, problem=arguments.problem, allow_large_angles=arguments.allow_large_angles
+    )
     if not len(problems):
         raise DatasetError(f"no boundary conditions in {arguments.what}")
     return problems

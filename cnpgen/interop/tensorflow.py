@@ -3,12 +3,11 @@
 from collections.abc import Iterator
 from typing import Any
 
+from cnpgen.errors import requires_extra
 from cnpgen.loader.batches import Batches
 
-try:
+with requires_extra("tensorflow", "tensorflow"):
     import tensorflow as tf
-except ImportError as error:
-    raise ImportError(f"tensorflow cannot be imported ({error}): pip install tensorflow") from error
 
 
 def to_tensorflow(batches: Batches) -> Any:

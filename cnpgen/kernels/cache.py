@@ -15,9 +15,9 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO
 
 from cnpgen.errors import MachineError
+from cnpgen.store.files.file_lock import try_lock, unlock
 
 LIBRARIES, TAPES = "lib", "tape"
 _READ_ONLY_LINK = "warm"  # in a temporary folder: a link to a cache that is readable but not writable
@@ -107,34 +107,13 @@ def exclusive_lock(lock: Path) -> Iterator[None]:
         with suppress(FileNotFoundError):  # another process has finished and removed it
             lock.chmod(stat.S_IRUSR | stat.S_IWUSR)  # independent of the umask
         end = time.monotonic() + MAX_LOCK_WAIT_S
-        while not _acquire(file) and time.monotonic() < end:
+        while not try_lock(file) and time.monotonic() < end:
             time.sleep(0.02)
         try:
             yield
         finally:
             lock.unlink(missing_ok=True)
-            _release(file)
-
-
-def _acquire(file: IO[bytes]) -> bool:
-    """Lock a file; return False if another process holds the lock, True where there are no locks."""
-    try:
-        import fcntl
-
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except (ImportError, OSError):  # Windows, and file systems without locks
-        return True
-    return True
-
-
-def _release(file: IO[bytes]) -> None:
-    """Release the lock on a file, even if processes that were forked meanwhile have it open."""
-    with suppress(ImportError, OSError):
-        import fcntl
-
-        fcntl.flock(file, fcntl.LOCK_UN)
+            unlock(file)
 
 
 def read_only_cache(folder: Path) -> Path | None:

@@ -1,6 +1,7 @@
 """The C compiler of the machine: its command, version, target and flags."""
 
 import hashlib
+import logging
 import os
 import platform
 import shlex
@@ -18,8 +19,13 @@ COMPILER_FLAGS = (
     "-std=gnu11", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-shared", "-w",
     *_LINKER_FLAGS,
 )  # fmt: skip
-MAX_COMPILE_TIME_S = 3600  # the largest kernels take minutes on a busy machine; longer runs hang
+MAX_COMPILE_TIME_S = 3600  # the largest kernels, of some MB of source, take minutes on a busy machine
+MIN_COMPILE_LIMIT_S = 120  # the limit for the smallest kernels, which take less than 1 s
+LIMIT_S_PER_BYTE = 3e-3  # of source
 MAX_VERSION_TIME_S = 10
+NOTICE_AFTER_S = 60  # a user hears of a compiler that takes longer
+_LOG = logging.getLogger(__name__)
+_running: set["subprocess.Popen[str]"] = set()  # compilers of all threads
 
 
 @cache
@@ -80,21 +86,48 @@ def _run(command: list[str], seconds: float, purpose: str) -> "subprocess.Comple
     Raises:
         MachineError: It does not run, or exceeds the time limit.
     """
-    pipe = subprocess.PIPE
+    pipe, null = subprocess.PIPE, subprocess.DEVNULL  # a compiler that reads a terminal would be stopped
     try:
-        process = subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, errors="replace", process_group=0)
+        process = subprocess.Popen(
+            command, stdin=null, stdout=pipe, stderr=pipe, text=True, errors="replace", process_group=0
+        )
     except OSError as error:
         raise MachineError(f"the C compiler {command[0]} does not run: {error}") from error
     with process:
+        _running.add(process)
         try:
-            out, errors = process.communicate(timeout=seconds)
+            out, errors = _outputs(process, command[0], seconds, purpose)
         except BaseException as error:
-            with suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)
+            _kill(process)
             if isinstance(error, subprocess.TimeoutExpired):
-                raise MachineError(f"the C compiler {command[0]} took more than {seconds:g} s {purpose}") from error
+                hint = "set CC to another compiler, or choose the NumPy backend"
+                raise MachineError(f"the C compiler {command[0]} took more than {seconds:g} s {purpose}: {hint}") from error
             raise
+        finally:
+            _running.discard(process)
     return subprocess.CompletedProcess(command, process.returncode, out, errors)
+
+
+def _outputs(process: "subprocess.Popen[str]", name: str, seconds: float, purpose: str) -> tuple[str, str]:
+    """Wait for a compiler and return its output; log a notice if it takes long."""
+    try:
+        return process.communicate(timeout=min(NOTICE_AFTER_S, seconds))
+    except subprocess.TimeoutExpired:
+        if seconds <= NOTICE_AFTER_S:
+            raise
+    _LOG.info("the C compiler %s has taken %g s %s; it is ended after %g s", name, NOTICE_AFTER_S, purpose, seconds)
+    return process.communicate(timeout=seconds - NOTICE_AFTER_S)
+
+
+def _kill(process: "subprocess.Popen[str]") -> None:
+    with suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+
+
+def kill_compilers() -> None:
+    """Kill the compilers that other threads of this process wait for; their compilation fails."""
+    for process in tuple(_running):
+        _kill(process)
 
 
 @cache
@@ -123,10 +156,11 @@ def run_compiler(compiler: str, level: str, source: Path, built: Path) -> None:
     """Compile C source to a shared library.
 
     Raises:
-        MachineError: The compiler fails, or takes more than an hour.
+        MachineError: The compiler fails, or takes too long for the size of the source.
     """
     command = [*shlex.split(compiler), *flags_of(level), str(source), "-o", str(built), "-lm"]
-    completed = _run(command, MAX_COMPILE_TIME_S, f"for {source.name}")
+    seconds = min(MIN_COMPILE_LIMIT_S + round(LIMIT_S_PER_BYTE * source.stat().st_size), MAX_COMPILE_TIME_S)
+    completed = _run(command, seconds, f"for {source.name}")
     if completed.returncode != 0 or not built.exists():
         errors = completed.stderr
         first = next((line for line in errors.splitlines() if "error" in line), errors.strip()[:200])

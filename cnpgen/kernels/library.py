@@ -43,6 +43,7 @@ from cnpgen.store.files.atomic import write_file
 Backend = Literal["compiled", "numpy", "casadi"]
 BACKENDS: tuple[Backend, ...] = ("compiled", "numpy", "casadi")
 PACKAGE_FOLDER = Path(__file__).parents[1]
+ARRAYS = Path(__file__).with_name("arrays.h")
 BUILDER_PACKAGES = ("robots", "kernels", "problems", "trajectory")  # imported by builders of any package
 NUMPY_SLOWDOWN = "10 to 20 times slower than compiled code"  # benchmarks/generator.py: 9 to 24
 
@@ -120,9 +121,11 @@ class KernelLibrary:
         """Return the library of handwritten C source, or None if the backend is not "compiled".
 
         Args:
-            paths: Source files; see ``compile_source``.
+            paths: Source files that follow ``arrays.h``; see ``compile_source``.
         """
-        return ctypes.CDLL(str(compile_source(paths, self.cache_folder))) if self.backend == "compiled" else None
+        if self.backend != "compiled":
+            return None
+        return ctypes.CDLL(str(compile_source([ARRAYS, *paths], self.cache_folder)))
 
     def tape(self, builder: Callable[..., Any], **parameters: Any) -> Tape:
         """Return the tape of an SX function without compiling it.
@@ -238,7 +241,9 @@ def choose_backend(requested: str | None = None) -> tuple[Backend, Path]:
         MachineError: The requested backend does not work on this machine.
     """
     if requested is not None and requested not in BACKENDS:
-        raise UsageError(f"backend {requested!r} does not exist: expected one of {', '.join(BACKENDS)}")
+        raise UsageError(
+            f"backend {requested!r} does not exist: expected one of {', '.join(BACKENDS)}", concerns="backend"
+        )
     folder = usable_cache_folder(default_cache_folder())
     if requested == "numpy":
         return "numpy", folder

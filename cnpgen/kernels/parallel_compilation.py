@@ -7,12 +7,14 @@ from types import TracebackType
 from typing import TYPE_CHECKING
 
 from cnpgen.kernels.compiled_kernel import CompiledKernel, compile_tape, find_compiled
+from cnpgen.kernels.compiler import kill_compilers
 from cnpgen.kernels.kernel import Array, Kernel
 from cnpgen.kernels.tape import Tape
 
 if TYPE_CHECKING:
     from concurrent.futures import Future, ThreadPoolExecutor
 
+_KILL_INTERVAL_S = 0.05  # a thread may start its compiler just after the others were killed
 MAX_COMPILERS = 8  # compilers at the same time: each takes some 100 MB
 
 
@@ -75,7 +77,7 @@ class CompilerPool:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Wait for all compilations; after an error, cancel those that are not started.
+        """Wait for all compilations; after an error or an interruption, end those that are running or waiting.
 
         Raises:
             MachineError: A compiler failed.
@@ -85,5 +87,14 @@ class CompilerPool:
                 for job in self._jobs.values():
                     job.result()
         finally:
-            if self._pool is not None:
-                self._pool.shutdown(cancel_futures=True)
+            self._end()
+
+    def _end(self) -> None:
+        """End the threads; jobs that are left are those after an error."""
+        from concurrent.futures import wait
+
+        if self._pool is not None:
+            self._pool.shutdown(wait=False, cancel_futures=True)
+            while wait(self._jobs.values(), timeout=0).not_done:
+                kill_compilers()
+                wait(self._jobs.values(), timeout=_KILL_INTERVAL_S)

@@ -1,5 +1,7 @@
 """A batch of rows: a mapping from field names to arrays, which are views of one packed table."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any

@@ -32,11 +32,12 @@ class BatchPartition:
         object.__setattr__(self, "drop_last", flag("drop_last", self.drop_last))
         for name, value, count in (("rank", self.rank, self.world), ("worker", self.worker, self.workers)):
             if value >= count:
-                raise UsageError(f"{name} must be one of 0 to {count - 1}, got {value}")
+                raise UsageError(f"must be one of 0 to {count - 1}, got {value}", argument=name)
         if self.batch_size % self.world:
             raise UsageError(
                 f"batch_size counts the rows of all ranks together and must be a multiple of world ({self.world}),"
-                f" got {self.batch_size}"
+                f" got {self.batch_size}",
+                concerns="batch_size",
             )
 
     def end(self, rows: int, *, first: int = 0) -> int:
@@ -57,7 +58,8 @@ class BatchPartition:
         if 0 < remainder < self.world:
             raise UsageError(
                 f"the last batch of {rows} rows has {remainder} for {self.world} ranks: omit it with drop_last=True,"
-                " read all of it on every rank (world=1), or choose another batch_size"
+                " read all of it on every rank (world=1), or choose another batch_size",
+                concerns="batch_size",
             )
 
     def count(self, rows: int) -> int:

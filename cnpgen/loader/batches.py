@@ -1,5 +1,7 @@
 """The batches of a split, epoch by epoch, from any row of an epoch."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
@@ -46,7 +48,8 @@ class Batches:
         if partition.drop_last and partition.batch_size > source.rows:
             raise UsageError(
                 f"batch_size {partition.batch_size} is more than the {source.rows} rows of split {source.split!r};"
-                " drop_last=False returns them as one batch"
+                " drop_last=False returns them as one batch",
+                concerns="batch_size",
             )
         partition.check_ranks(source.rows, first=position.row)
         self._source, self._row_format, self._partition, self._position = source, row_format, partition, position
@@ -164,7 +167,7 @@ class Batches:
         self._position = position
         self.times_set += 1
 
-    def for_worker(self, worker: int, workers: int, *, epoch: int | None = None) -> "Batches":
+    def for_worker(self, worker: int, workers: int, *, epoch: int | None = None) -> Batches:
         """Return the batches of one of several workers, which share the remaining batches or those of an epoch."""
         partition = replace(self._partition, worker=worker, workers=workers)
         position = self._position if epoch is None else replace(self._position, epoch=epoch, row=0)

@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 from cnpgen.errors import UsageError
 from cnpgen.store.dataset_spec import DatasetSpec
@@ -75,7 +76,11 @@ def select_columns(spec: DatasetSpec, names: Iterable[str] | None) -> Columns:
         return Columns(tuple(field for field in spec.fields if field.dtype == "float" and field.role != "diagnostic"))
     if isinstance(names, str):
         raise UsageError(f"must be a list of names, got the text {names!r}: write [{names!r}]", argument="fields")
+    given: Any = names
+    if isinstance(given, bytes) or getattr(given, "ndim", 1) != 1:
+        raise UsageError(f"must be a list of names, got {names!r:.100}", argument="fields")
     selected: Sequence[str] = tuple(names)
-    if not selected or len(set(selected)) != len(selected):
-        raise UsageError(f"must be one or more different names, got {list(selected)}", argument="fields")
+    texts = all(isinstance(name, str) for name in selected)
+    if not selected or not texts or len(set(selected)) != len(selected):
+        raise UsageError(f"must be one or more different names, got {list(selected)!s:.200}", argument="fields")
     return Columns(tuple(spec.field_named(name) for name in selected))

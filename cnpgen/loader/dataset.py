@@ -1,5 +1,7 @@
 """A dataset opened for training: its rows as batches, arrays, tables or one by one; its fields and statistics."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,8 +19,10 @@ from cnpgen.loader.gather import Rows, gather
 from cnpgen.loader.normalization import Normalization, make_normalization
 from cnpgen.loader.position import checked_position
 from cnpgen.loader.row_format import RowFormat, make_row_format
-from cnpgen.loader.shard_reader import Shard, ShardReader, SplitShards
+from cnpgen.loader.shard_reader import ShardReader, SplitShards
 from cnpgen.loader.split import Split
+from cnpgen.schema.argument_types import checked_arguments
+from cnpgen.store.checked_shard import Shard
 from cnpgen.store.dataset_spec import DatasetSpec, StoredProblem
 from cnpgen.store.field import Field
 from cnpgen.store.statistics import FieldStatistics
@@ -77,6 +81,7 @@ class Dataset:
         statistics = self.statistics.get("train")
         return make_normalization(statistics, self.spec.fields) if statistics else None
 
+    @checked_arguments
     def __getitem__(self, split: str) -> Split:
         return Split(self._source(split), self._row_format())
 
@@ -89,6 +94,7 @@ class Dataset:
     def __len__(self) -> int:
         return len(self.shards)
 
+    @checked_arguments
     def batches(
         self,
         batch_size: int,
@@ -129,6 +135,7 @@ class Dataset:
         row_format = self._row_format(fields=fields, normalize=normalize, dtype=dtype)
         return Batches(self._source(split), row_format, partition, position)
 
+    @checked_arguments
     def rows(
         self,
         split: str,
@@ -157,6 +164,7 @@ class Dataset:
         row_format = self._row_format(fields=fields, normalize=normalize, dtype=dtype)
         return row_format.convert(gather(self._source(split), indices, row_format.layout))
 
+    @checked_arguments
     def arrays(
         self,
         split: str = "train",
@@ -176,6 +184,7 @@ class Dataset:
         indices = np.arange(self._source(split).rows)
         return self.rows(split, indices, fields=fields, normalize=normalize, dtype=dtype)
 
+    @checked_arguments
     def frame(self, split: str = "train", *, fields: Iterable[str] | None = None, library: str | None = None) -> Any:
         """Read all rows of a split as a table of polars or pandas, one column per joint or axis: ``start_q.joint_1``.
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import MachineError, UsageError
+from cnpgen.errors import MissingExtraError, UsageError
 from cnpgen.store.field import Field
 
 LIBRARIES = ("polars", "pandas")
@@ -27,7 +27,7 @@ def make_frame(rows: Mapping[str, NDArray[Any]], fields: Sequence[Field], *, lib
 
     Raises:
         UsageError: The library is not supported.
-        MachineError: The library is not installed.
+        MissingExtraError: The library is not installed.
     """
     name = _installed(library)
     columns = {
@@ -48,5 +48,6 @@ def _installed(library: str | None) -> str:
     candidates = LIBRARIES if library is None else (library,)
     installed = next((name for name in candidates if find_spec(name) is not None), None)
     if installed is None:
-        raise MachineError(f"a frame needs {' or '.join(candidates)}, not installed here: pip install {candidates[0]}")
+        text = f"a frame needs {' or '.join(candidates)}, not installed here: pip install 'cnpgen[{candidates[0]}]'"
+        raise MissingExtraError(text)
     return installed

@@ -1,4 +1,4 @@
-"""Random access to single rows through the memory maps of their shards."""
+"""Random access to rows: many rows of a shard are read, single rows come from its memory map."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -9,10 +9,13 @@ from numpy.typing import ArrayLike, NDArray
 from cnpgen.errors import UsageError
 from cnpgen.loader.columns import Columns, tail
 from cnpgen.loader.shard_reader import SplitShards
+from cnpgen.schema.arguments import reject_masked
 from cnpgen.store.shard import storage_dtype
 
 Rows = dict[str, NDArray[Any]]
 Indices = NDArray[np.int64]
+
+MAX_READ_ROWS_PER_ROW = 8  # of a shard whose file is read and not mapped
 
 
 class RowError(UsageError, IndexError):
@@ -38,7 +41,9 @@ def gather(source: SplitShards, indices: ArrayLike, layout: Columns) -> Rows:
     rows = _checked(indices, source)
     columns = {f.name: np.empty((len(rows), *tail(f)), storage_dtype(f, source.stored)) for f in layout.fields}
     for shard, positions, local in _by_shard(rows, source):
-        stored = source.reader.read(source.shards[shard], layout.fields)
+        file = source.shards[shard]
+        dense = MAX_READ_ROWS_PER_ROW * len(local) >= file.rows
+        stored = (source.reader.read if dense else source.reader.map)(file, layout.fields)
         for name, values in columns.items():
             values[positions] = stored[name][local]
     return columns
@@ -46,14 +51,20 @@ def gather(source: SplitShards, indices: ArrayLike, layout: Columns) -> Rows:
 
 def _checked(indices: ArrayLike, source: SplitShards) -> Indices:
     """Return non-negative row indices, shape (k,)."""
-    rows = np.asarray(indices)
+    reject_masked("indices", indices)
+    try:
+        rows = np.asarray(indices)
+    except ValueError as error:
+        raise UsageError(f"must be a list of integers, got {error}", argument="indices") from error
     if rows.size == 0:
         return np.empty(0, np.int64)
     if rows.ndim != 1 or rows.dtype.kind not in "iu":
-        raise UsageError(f"must be a list of integers, got {rows.dtype} of shape {rows.shape}", argument="rows")
+        raise UsageError(f"must be a list of integers, got {rows.dtype} of shape {rows.shape}", argument="indices")
     wrong = (rows < -source.rows) | (rows >= source.rows)
     if wrong.any():
-        raise RowError(f"split {source.split!r} has {source.rows} rows, there is no row {rows[wrong][0]}")
+        raise RowError(
+            f"split {source.split!r} has {source.rows} rows, there is no row {rows[wrong][0]}", concerns="indices"
+        )
     return np.where(rows < 0, rows + source.rows, rows).astype(np.int64)
 
 

@@ -6,9 +6,11 @@ from typing import Any
 
 from cnpgen.errors import DatasetError
 from cnpgen.loader.dataset import Dataset
-from cnpgen.loader.shard_reader import Shard, ShardReader
+from cnpgen.loader.shard_reader import ShardReader
+from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import flag
-from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, shards
+from cnpgen.store.checked_shard import Shard, recorded_shard, shard_of_record
+from cnpgen.store.dataset_spec import DatasetSpec, shards
 from cnpgen.store.dataset_summary import (
     STATS_FORMAT,
     STATS_STRUCTURE,
@@ -28,6 +30,7 @@ from cnpgen.store.statistics import FieldStatistics, are_of, statistics_from_jso
 Statistics = dict[str, dict[str, FieldStatistics]]
 
 
+@checked_arguments
 def load_dataset(folder: str | Path, *, allow_incomplete: bool = False, verify: bool = True) -> Dataset:
     """Open a dataset: its rows as batches for training, arrays, tables or one by one.
 
@@ -65,7 +68,7 @@ def _recorded(folder: Path, summary: DatasetSummary) -> dict[str, list[Shard]]:
     """Return the shards of an unfinished dataset, from their sidecars."""
     spec = summary.spec
     return {
-        split: [_shard(folder, spec, task, record.bytes, record.sha256) for task, record in summary.of_split(split)]
+        split: [shard_of_record(folder, spec, task, record) for task, record in summary.of_split(split)]
         for split in spec.splits
     }
 
@@ -75,14 +78,11 @@ def _listed(folder: Path, spec: DatasetSpec, manifest: Mapping[str, Any]) -> dic
     tasks = {task.file: task for task in shards(spec)}
     return {
         split: [
-            _shard(folder, spec, tasks[entry["file"]], entry["bytes"], entry["sha256"]) for entry in content["shards"]
+            recorded_shard(folder, spec, tasks[entry["file"]], size=entry["bytes"], sha256=entry["sha256"])
+            for entry in content["shards"]
         ]
         for split, content in manifest["splits"].items()
     }
-
-
-def _shard(folder: Path, spec: DatasetSpec, task: ShardTask, size: int, sha256: str) -> Shard:
-    return Shard(folder / task.file, task.rows, task.first_row, size, sha256, spec.version_with(task).key)
 
 
 def _load_statistics(folder: Path, spec: DatasetSpec) -> Statistics:

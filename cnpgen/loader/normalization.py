@@ -1,5 +1,7 @@
 """Normalization of every column to mean 0 and standard deviation 1 over the training rows."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from cnpgen.loader.columns import tail
 from cnpgen.loader.row_format import RowFormat
-from cnpgen.loader.shard_reader import Shard, ShardReader
+from cnpgen.loader.shard_reader import ShardReader
+from cnpgen.store.checked_shard import Shard
 
 _CHUNK_VALUES = 1 << 15  # float64 numbers that fit into the L2 cache of a processor
 

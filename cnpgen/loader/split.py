@@ -1,5 +1,7 @@
 """A split of a dataset as a sequence of rows."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from dataclasses import dataclass
 

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from cnpgen.kernels.symbolic.symbolic_state import FrozenState, SymbolicState, jerk_along
+from cnpgen.kernels.symbolic.symbolic_state import FrozenState, SymbolicState, time_derivatives
 from cnpgen.kernels.tape import Axes, GridSpec
 from cnpgen.losses.published_conditions import published_conditions
 from cnpgen.losses.terms import Term, constraint_term, task_term
@@ -106,13 +106,12 @@ def _stage(robot: "Robot", problem: Problem, form: str) -> tuple[Inputs, FrozenS
 
     sym, n, m = ca.SX.sym, robot.n, len(problem.constraint)
     orders = problem.path_orders
-    p, dp, ddp, *_ = path = tuple(sym("d" * order + "p", n) for order in range(orders))
+    path = tuple(sym("d" * order + "p", n) for order in range(orders))
     rate = sym("rate", orders - 1)
-    dq, ddq = dp * rate[0], ddp * (rate[0] * rate[0]) + dp * (rate[0] * rate[1])
     obstacle_poses, size = sym("obstacle_poses", pose_width(problem.obstacle)), problem.object_size
-    q_sx, dq_sx, ddq_sx, poses_sx = (ca.vertsplit(column) for column in (p, dq, ddq, obstacle_poses))
-    jerk = jerk_along([ca.vertsplit(column) for column in path[1:]], ca.vertsplit(rate))
-    state = FrozenState(robot, q_sx, dq_sx, ddq_sx, poses_sx, problem.obstacle, size, jerk)
+    q, *derivatives = (ca.vertsplit(column) for column in path)
+    dq, ddq, jerk = time_derivatives(derivatives, ca.vertsplit(rate))
+    state = FrozenState(robot, q, dq, ddq, ca.vertsplit(obstacle_poses), problem.obstacle, size, jerk)
     pairs = penalized_conditions(problem.constraint, state, form)
     sizes = [sum(len(condition.g) for condition in conditions) for _, conditions in pairs]
     varying = [has_time_varying_bound(constraint) for constraint, _ in pairs]

@@ -1,5 +1,7 @@
 """Margins: tightened bounds during training, so that the true bounds hold afterwards."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -9,6 +11,7 @@ from numpy.typing import NDArray
 from cnpgen.errors import UsageError, nearest
 from cnpgen.problems.problem import Problem
 from cnpgen.schema import registry
+from cnpgen.schema.argument_types import check_fields, checked_arguments
 
 
 @dataclass(frozen=True)
@@ -26,6 +29,14 @@ class Margins:
     factors: Mapping[str, float] = field(default_factory=dict)
     insets: Mapping[str, float] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        check_fields(self)
+        for name in ("factors", "insets"):
+            for value in getattr(self, name).values():
+                if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+                    raise UsageError(f"must be numbers by name, got {value!r:.100}", argument=name)
+
+    @checked_arguments
     def tightening(self, terms: Sequence[str]) -> NDArray[np.float64]:
         """Return the factors of all terms, then the insets of all terms, shape (2 m,).
 
@@ -35,8 +46,10 @@ class Margins:
         Raises:
             UsageError: A name is not a term, a factor is not in (0, 1] or an inset is not a number.
         """
+        if not all(isinstance(term, str) for term in terms):
+            raise UsageError(f"must be names of constraint terms, got {terms!r:.100}", argument="terms")
         for mistake in self._mistakes(terms):
-            raise UsageError(mistake)
+            raise UsageError(mistake, concerns="terms")
         return np.array(
             [self.factors.get(term, 1.0) for term in terms] + [self.insets.get(term, 0.0) for term in terms], float
         )
@@ -53,6 +66,7 @@ class Margins:
                 yield f"margin of {name!r}: an inset must be a finite number, got {inset}"
 
 
+@checked_arguments
 def suggested_margins(problem: Problem) -> Margins:
     """Return the margins that the constraint classes suggest: ``training_factor`` and ``training_inset``."""
     constraints = dict(zip(constraint_terms(problem), problem.constraint, strict=True))

@@ -5,6 +5,8 @@ budget, ``alpha += gamma log(mean L_i / C_i)``. This is slow in short runs, and 
 The default is therefore a metric whose weights grow with the progress of a run.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from typing import Any
 
@@ -13,6 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.losses.metric_settings import Average, MetricSettings
+from cnpgen.schema.argument_types import checked_arguments
+from cnpgen.schema.arguments import numbers
 
 Array = NDArray[np.float64]
 TRIMMED_FRACTION = 0.1  # of the plans, those with the largest losses, excluded from a trimmed mean
@@ -72,20 +76,27 @@ class Metric:
         alpha: Logarithms of the present weights, shape (m,).
     """
 
+    @checked_arguments
     def __init__(self, weights: ArrayLike, budgets: ArrayLike, settings: MetricSettings | None = None) -> None:
-        first, self._budgets = np.asarray(weights, float), np.asarray(budgets, float)
+        first, self._budgets = numbers("weights", weights), numbers("budgets", budgets)
         if first.ndim != 1 or first.shape != self._budgets.shape:
             raise UsageError(
-                f"weights and budgets must have one shape (m,), got {first.shape} and {self._budgets.shape}"
+                f"weights and budgets must have one shape (m,), got {first.shape} and {self._budgets.shape}",
+                concerns="budgets",
             )
         if not (np.isfinite(first).all() and (first > 0).all()):
-            raise UsageError(f"first weights must be positive and finite, got {first.tolist()}")
+            raise UsageError(
+                f"first weights must be positive and finite, got {first.tolist()!s:.200}", concerns="weights"
+            )
         if not (np.isfinite(self._budgets).all() and (self._budgets >= 0).all()):
-            raise UsageError(f"must be finite and not negative, got {self._budgets.tolist()}", argument="budgets")
+            raise UsageError(
+                f"must be finite and not negative, got {self._budgets.tolist()!s:.200}", argument="budgets"
+            )
         self.settings = settings or MetricSettings()
         self.alpha: Array = np.log(first)
         self._sum, self._count = np.zeros(len(first)), 0
 
+    @checked_arguments
     def weights(self, progress: float) -> Array:
         """Return the weights for the next batch, shape (m,).
 
@@ -95,6 +106,7 @@ class Metric:
         growth = self.settings.grown(progress) if self.settings.kind == "ramped" else 1.0
         return np.asarray(np.exp(self.alpha) * growth)
 
+    @checked_arguments
     def observe(self, terms: ArrayLike, progress: float) -> None:
         """Record the losses of the plans of a batch.
 
@@ -104,12 +116,16 @@ class Metric:
         """
         if self.settings.kind != "learned":
             return
-        mean = average_loss(np.asarray(terms)[:, 1:], self.settings.average)
+        values, count = numbers("terms", terms), 1 + len(self.alpha)
+        if values.ndim != 2 or values.shape[1] != count:
+            raise UsageError(f"must have shape (N, {count}), got {values.shape}", argument="terms")
+        mean = average_loss(values[:, 1:], self.settings.average)
         if np.isfinite(mean).all():
             self._sum, self._count = self._sum + mean, self._count + 1
         if self.settings.every == "batch":
             self._learn(progress)
 
+    @checked_arguments
     def end_epoch(self, progress: float) -> None:
         """Take the step of an epoch, if the settings have steps per epoch."""
         if self.settings.kind == "learned" and self.settings.every == "epoch":
@@ -130,6 +146,7 @@ class Metric:
         """Return the learned state, JSON-able."""
         return {"alpha": self.alpha.tolist(), "sum": self._sum.tolist(), "count": self._count}
 
+    @checked_arguments
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Restore a state of the same run.
 
@@ -139,7 +156,9 @@ class Metric:
         try:
             alpha, total, count = np.array(state["alpha"], float), np.array(state["sum"], float), int(state["count"])
         except (KeyError, TypeError, ValueError) as error:
-            raise UsageError(f"not the state of a metric: {error}") from error
+            raise UsageError(f"not the state of a metric: {error}", concerns="state") from error
         if alpha.shape != self.alpha.shape or total.shape != self.alpha.shape:
-            raise UsageError(f"the state is that of a metric of {alpha.size} terms, expected {self.alpha.size}")
+            raise UsageError(
+                f"the state is that of a metric of {alpha.size} terms, expected {self.alpha.size}", concerns="state"
+            )
         self.alpha, self._sum, self._count = alpha, total, count

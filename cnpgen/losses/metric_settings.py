@@ -1,5 +1,7 @@
 """The settings of a metric and the suggested first weights."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 from typing import Literal
@@ -7,8 +9,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cnpgen.errors import UsageError, nearest
+from cnpgen.errors import UsageError
 from cnpgen.problems.problem import Problem
+from cnpgen.schema.argument_types import check_fields, checked_arguments
+from cnpgen.schema.arguments import numbers
 
 Kind = Literal["fixed", "ramped", "learned"]
 METRIC_KINDS: tuple[Kind, ...] = ("fixed", "ramped", "learned")
@@ -47,20 +51,20 @@ class MetricSettings:
     frozen: float = math.inf
 
     def __post_init__(self) -> None:
-        for name, known in (("kind", METRIC_KINDS), ("every", ("epoch", "batch")), ("average", AVERAGES)):
-            value = getattr(self, name)
-            if value not in known:
-                raise UsageError(
-                    f"{name} of a metric must be one of {', '.join(known)}, got {value!r}{nearest(value, known)}"
-                )
+        check_fields(self)
         for name in ("growth", "gamma", "largest_log", "highest"):
             if not getattr(self, name) > 0:
-                raise UsageError(f"{name} of a metric must be above 0, got {getattr(self, name)}")
+                raise UsageError(f"{name} of a metric must be above 0, got {getattr(self, name)}", concerns=name)
         if not self.lowest <= self.highest:
             raise UsageError(f"must be at most highest = {self.highest}, got {self.lowest}", argument="lowest")
-        if not 0 <= self.ramp[0] < self.ramp[1]:
-            raise UsageError(f"the ramp of a metric must begin at 0 or later and before it ends, got {self.ramp}")
+        ramp = numbers("ramp", self.ramp)
+        if ramp.shape != (2,) or not 0 <= ramp[0] < ramp[1]:
+            raise UsageError(
+                f"the ramp of a metric must begin at 0 or later and before it ends, got {self.ramp!r:.99}",
+                concerns="ramp",
+            )
 
+    @checked_arguments
     def grown(self, progress: float) -> float:
         """Return the factor of the ramp."""
         begin, end = self.ramp
@@ -83,6 +87,7 @@ BOUNDED = MetricSettings(
 )
 
 
+@checked_arguments
 def suggested_weights(problem: Problem, weights0: ArrayLike) -> NDArray[np.float64]:
     """Return first weights: ``training_weight`` of the constraint classes, else 100 times those of the problem file.
 
@@ -93,7 +98,11 @@ def suggested_weights(problem: Problem, weights0: ArrayLike) -> NDArray[np.float
         problem: The problem.
         weights0: Weights from the problem file, ``PlanLoss.weights0``, shape (m,).
     """
-    pairs = zip(problem.constraint, np.asarray(weights0, float).tolist(), strict=True)
+    weights = numbers("weights0", weights0)
+    if weights.shape != (len(problem.constraint),):
+        expected = f"({len(problem.constraint)},), one weight per constraint"
+        raise UsageError(f"must have shape {expected}, got {weights.shape}", argument="weights0")
+    pairs = zip(problem.constraint, weights.tolist(), strict=True)
     suggested = [
         WEIGHT_FACTOR * weight if constraint.training_weight is None else constraint.training_weight
         for constraint, weight in pairs

@@ -81,9 +81,9 @@ def check_batch(
         "start_tip": (start_tip, "float64"),
     }
     arrays = {
-        name: numbers(name, values, kind, differentiable=True)
+        name: numbers(name, values, kind, differentiable=True)  # type: ignore[arg-type]
         for name, (values, kind) in arguments.items()
-        if values is not None
+        if values is not None or name in {"path", "rate"}
     }
     check_shapes(problem, {name: array.shape for name, array in arrays.items()})
     valid = np.asarray((arrays["rate"] > 0).all(axis=1))
@@ -108,7 +108,8 @@ def check_shapes(problem: Problem, shapes: Mapping[str, tuple[int, ...]]) -> Non
         names = ", ".join(box.name for box in problem.obstacle)
         raise UsageError(
             f"obstacle_poses is missing: the problem {problem.name!r} has obstacles ({names});"
-            " cnpgen.problems.obstacles.obstacle_poses_of returns their poses and sizes"
+            " the scene of plans and tasks has their poses and sizes, scene.poses",
+            concerns="obstacle_poses",
         )
     count = next(iter(shapes["path"]), 0)
     tails = {
@@ -120,4 +121,4 @@ def check_shapes(problem: Problem, shapes: Mapping[str, tuple[int, ...]]) -> Non
     for name, tail in tails.items():
         if name in shapes and shapes[name] != (count, *tail):
             expected = ", ".join(str(size) for size in ("N" if name == "path" else count, *tail))
-            raise UsageError(f"{name} must have shape ({expected}), got {shapes[name]}")
+            raise UsageError(f"must have shape ({expected}), got {shapes[name]}", argument=name)

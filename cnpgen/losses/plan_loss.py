@@ -1,5 +1,7 @@
 """The loss of plans with its gradient: integrals of the step losses over the phase."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,10 +20,12 @@ from cnpgen.losses.margins import Margins, constraint_terms
 from cnpgen.losses.plan_batch import PLANS_PER_BLOCK, PlanBatch, check_batch, check_shapes
 from cnpgen.losses.quadrature import BasisTable, basis_table, check_quadrature
 from cnpgen.losses.time_varying_bound import TimeVaryingBound, make_time_varying_bound
+from cnpgen.machine.memory import check_memory
 from cnpgen.machine.threads import one_thread
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import as_problem
+from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import flag, number, numbers
 from cnpgen.store.dataset_spec import StoredProblem
 
@@ -77,6 +81,7 @@ class PlanLoss:
         MachineError: The requested backend does not work on this machine.
     """
 
+    @checked_arguments
     def __init__(
         self,
         problem: Problem | StoredProblem | str | Path,
@@ -92,6 +97,7 @@ class PlanLoss:
         _check_choice("dtype", dtype, DTYPES)
         _check_choice("form", form, FORMS)
         check_quadrature(rule, nodes)
+        check_memory("nodes", nodes, nodes)
         self.problem, self.dtype, self.nodes, self.rule, self.form = as_problem(problem), dtype, nodes, rule, form
         self.terms = ("time", *constraint_terms(self.problem))
         self.budgets = np.array([constraint.budget for constraint in self.problem.constraint])
@@ -106,6 +112,7 @@ class PlanLoss:
         """Return the state without the kernels, which are loaded again when needed."""
         return {name: part for name, part in vars(self).items() if name not in _BUILT}
 
+    @checked_arguments
     @one_thread()
     def __call__(
         self,
@@ -194,6 +201,10 @@ class PlanLoss:
         Raises:
             UsageError: A shape is wrong, or the obstacle poses are missing.
         """
+        missing = [name for name in ("path", "rate", "weights") if name not in shapes]
+        if missing or not all(isinstance(shape, tuple) for shape in shapes.values()):
+            wrong = missing or [name for name, shape in shapes.items() if not isinstance(shape, tuple)]
+            raise UsageError("must be the shape of an array, a tuple", argument=wrong[0])
         self._check_count(shapes.pop("weights"))
         check_shapes(self.problem, shapes)
 
@@ -209,8 +220,10 @@ class PlanLoss:
         unknown = next((name for name in weights if name not in names), None)
         if unknown is not None:
             hint = nearest(str(unknown), names)
-            raise UsageError(f"weights: there is no constraint {unknown!r}{hint}, expected some of {', '.join(names)}")
-        values = {name: number(f"the weight of {name!r}", weight) for name, weight in weights.items()}
+            raise UsageError(
+                f"there is no constraint {unknown!r}{hint}, expected some of {', '.join(names)}", concerns="weights"
+            )
+        values = {name: _weight(name, weight) for name, weight in weights.items()}
         return np.array([values.get(name, default) for name, default in zip(names, self.weights0, strict=True)])
 
     def checked_weights(self, weights: ArrayLike | Mapping[str, float]) -> Array:
@@ -223,7 +236,9 @@ class PlanLoss:
         self._check_count(ordered.shape)
         for name, weight in zip(self.terms[1:], ordered.tolist(), strict=True):
             if not 0 <= weight < np.finfo(self.dtype).max:
-                raise UsageError(f"the weight of {name!r} must be a number that is not negative, got {weight}")
+                raise UsageError(
+                    f"the weight of {name!r} must be a number that is not negative, got {weight}", concerns="weights"
+                )
         return ordered.astype(self.dtype)
 
     def _check_count(self, shape: tuple[int, ...]) -> None:
@@ -246,7 +261,16 @@ class PlanLoss:
 
 def _check_choice(name: str, value: object, known: Sequence[str]) -> None:
     if value not in known:
-        raise UsageError(f"{name} must be one of {', '.join(known)}, got {value!r}{nearest(str(value), known)}")
+        raise UsageError(f"must be one of {', '.join(known)}, got {value!r}{nearest(str(value), known)}", argument=name)
+
+
+def _weight(name: str, value: Any) -> float:
+    try:
+        return number(name, value)
+    except UsageError as error:
+        raise UsageError(
+            f"the weight of {name!r} must be a finite number, got {value!r:.100}", concerns="weights"
+        ) from error
 
 
 def _checked_margins(margins: object) -> Margins:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError, nearest
+from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
 from cnpgen.trajectory.spline import basis
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
@@ -50,13 +51,16 @@ def check_quadrature(rule: str, nodes: int, shift: float = 0.0) -> None:
     if rule not in RULES:
         uniform = rule == "uniform"
         reason = "; between uniform nodes the ends of r hide violations" if uniform else nearest(str(rule), RULES)
-        raise UsageError(f"quadrature rule {rule!r} does not exist: expected one of {', '.join(RULES)}{reason}")
-    integer("the number of quadrature nodes", nodes, least=1)
+        raise UsageError(
+            f"quadrature rule {rule!r} does not exist: expected one of {', '.join(RULES)}{reason}", concerns="rule"
+        )
+    integer("nodes", nodes, least=1)
     if not 0 <= shift < 1 or (rule == "gauss" and shift != 0):
         expected = "0, Gauss nodes cannot be moved" if rule == "gauss" else "in [0, 1)"
-        raise UsageError(f"the shift of the quadrature nodes must be {expected}, got {shift}")
+        raise UsageError(f"the shift of the quadrature nodes must be {expected}, got {shift}", concerns="shift")
 
 
+@checked_arguments
 def rotating_shift(step: int, count: int = 8) -> float:
     """Return the shift of a training step: ``count`` equally spaced shifts in rotation, none with a node on an end.
 
@@ -64,6 +68,7 @@ def rotating_shift(step: int, count: int = 8) -> float:
         step: Index of the step.
         count: Number of shifts; 1 for constant nodes.
     """
+    integer("count", count, least=1)
     return ((step % count + 0.5) / count + 0.5) % 1
 
 

@@ -10,7 +10,7 @@ from functools import partial
 from itertools import islice
 from typing import Any, TypeVar
 
-from cnpgen.errors import MachineError
+from cnpgen.errors import MachineError, requires_extra
 from cnpgen.machine.workers import DIED, signals_blocked
 
 POLL_INTERVAL_S = 1.0  # between two checks for finished tasks and workers
@@ -196,13 +196,12 @@ def joined(name: str, address: str | None, workers: int | None) -> Iterator[Clus
         workers: Number of tasks that run at once; None for all workers of the cluster.
 
     Raises:
-        MachineError: The package is not installed, or the cluster cannot be reached.
+        MissingExtraError: The package is not installed.
+        MachineError: The cluster cannot be reached.
     """
     module, join = {"dask": ("distributed", _dask), "ray": ("ray", _ray)}[name]
-    try:
+    with requires_extra(name, module):
         importlib.import_module(module)
-    except ImportError as error:
-        raise MachineError(f"{module} cannot be imported ({error}): pip install 'cnpgen[{name}]'") from error
     what = f"the {name} cluster " + (f"at {address}" if address else "on this machine")
     with join(address, workers, what) as cluster:
         yield cluster

@@ -40,7 +40,7 @@ class Engine:
             integer("workers", self.workers, least=1)
         if self.name is not None and self.name not in ENGINES:
             expected = f"expected one of {', '.join(ENGINES)}{nearest(str(self.name), ENGINES)}"
-            raise UsageError(f"engine {self.name!r} does not exist: {expected}")
+            raise UsageError(f"engine {self.name!r} does not exist: {expected}", concerns="engine")
         if self.address is not None and self.name not in CLUSTERS:
             raise UsageError(
                 f"the address {self.address!r} is that of a cluster: choose {{engine}} dask or ray",

@@ -1,5 +1,7 @@
 """Completion of user tasks, positions to reach and hit directions, into boundary problems."""
 
+from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,6 +22,8 @@ from cnpgen.pipelines.steps import steps_of
 from cnpgen.plans.boundary_problems import plans_of_rows
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import record_problem
+from cnpgen.robots.plausible_values import UnitError, check_plausible
+from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import numbers
 from cnpgen.store.field import Field
 
@@ -48,6 +52,7 @@ class Completed:
         return dict(Counter(reason for reason in self.reasons if reason).most_common())
 
 
+@checked_arguments
 def complete(
     recipe: str | Path | Pipeline | DatasetRecipe, table: str | Path | None = None, /, **columns: ArrayLike
 ) -> Completed:
@@ -67,6 +72,7 @@ def complete(
             () or (N,). The value of one task applies to all.
 
     Raises:
+        UnitError: A value is so far outside of its range that it is probably in degrees or millimetres.
         UsageError: A column is unknown, has the wrong shape or is not finite, a goal is missing, there is no such
             table, or table and columns are both given.
         DatasetError: The table is damaged, lacks a goal, or has unknown or contradictory columns.
@@ -83,6 +89,8 @@ def complete(
     tasks = read_tasks(Path(table), fields, flat=flat)
     try:
         return _completed(pipeline, context, tasks)
+    except UnitError as error:
+        raise UnitError(f"{table}: {error}", concerns="table") from error
     except UsageError as error:
         raise DatasetError(f"{table}: {error}") from error
 
@@ -94,7 +102,12 @@ def _completed(pipeline: Pipeline, context: Context, columns: Mapping[str, Array
     count = max(map(len, given.values()))
     for name, values in given.items():
         if len(values) not in {1, count}:
-            raise UsageError(f"{name} is given for {counted(len(values), 'task')}, another column for {count:,}")
+            raise UsageError(
+                f"is given for {counted(len(values), 'task')}, another column for {count:,}", argument=name
+            )
+    check_plausible(
+        completion.context.robot, given, {name: field.unit for name, field in completion.given.items()}, noun="task"
+    )
     tasks = completion({name: rows.T for name, rows in given.items()})
     rows = {**completion.rows(tasks), "sample_id": tasks.alive.astype(np.int64)}
     problem, source = record_problem(pipeline.problem), f"tasks completed by {pipeline.name}"
@@ -109,11 +122,11 @@ def _rows(field: Field, values: ArrayLike, *, flat: bool) -> Array:
         array = array[..., None]
     if array.ndim not in {1, 2} or array.shape[-1] not in widths:
         expected = f"({width},) or (N, {width})" if field.width else "() or (N,)"
-        raise UsageError(f"{field.name} must have shape {expected}, got {np.shape(values)}")
+        raise UsageError(f"must have shape {expected}, got {np.shape(values)}", argument=field.name)
     rows = array.reshape(-1, array.shape[-1])
     if not np.isfinite(rows).all():
         row = int(np.argmin(np.isfinite(rows).all(axis=1)))
-        raise UsageError(f"{field.name} must be finite, got {rows[row]} in task {row}")
+        raise UsageError(f"must be finite, got {rows[row]} in task {row}", argument=field.name)
     if not len(rows):
-        raise UsageError(f"{field.name} has no rows, expected at least one task")
+        raise UsageError("has no rows, expected at least one task", argument=field.name)
     return rows

@@ -5,16 +5,19 @@ from pathlib import Path
 import numpy as np
 
 from cnpgen.kernels.library import choose_backend
+from cnpgen.machine.memory import check_memory
 from cnpgen.make.recipe import MAX_SEED, DatasetRecipe
 from cnpgen.make.recipe_file import as_dataset_recipe
 from cnpgen.plans.boundary_problems import plans_of_rows
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import record_problem
+from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
 
 SPLIT = "(fresh draws)"  # an invalid name of a split: no dataset contains these rows
 
 
+@checked_arguments
 def draw_boundary_problems(recipe: str | Path | DatasetRecipe, n: int, *, seed: int | None = None) -> Plans:
     """Draw fresh boundary problems of a recipe, as plans without motions for ``solve_plans``.
 
@@ -37,6 +40,7 @@ def draw_boundary_problems(recipe: str | Path | DatasetRecipe, n: int, *, seed: 
     backend, cache_folder = choose_backend(None)
     prepared = PreparedPipeline(loaded.pipeline, backend=backend, cache_folder=cache_folder, dtype="float64")
     rows = prepared.block_rows
+    check_memory("n", n, n * sum(max(field.width, 1) for field in prepared.fields))
     root = loaded.seed if root is None else root
     parts = [
         prepared.block(root, SPLIT, index, first=0, stop=min(n - index * rows, rows)).columns

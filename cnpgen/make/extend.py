@@ -1,5 +1,7 @@
 """Extension of datasets: new shards are added, existing shards stay unchanged."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +13,7 @@ from cnpgen.make.make_shards import Job, prepare
 from cnpgen.make.recipe import DatasetRecipe, split_rows
 from cnpgen.make.recipe_file import makes_its_rows, restored
 from cnpgen.make.resolve_spec import MAX_ROWS
+from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
 from cnpgen.schema.texts import read_own, utf8_text
 from cnpgen.store.card import card_notes
@@ -24,6 +27,7 @@ from cnpgen.store.shard_record import pending
 from cnpgen.store.workspace import check_place, find_workspace
 
 
+@checked_arguments
 def extend_dataset(
     folder: str | Path,
     n: int,
@@ -56,7 +60,7 @@ def extend_dataset(
         RecipeError: This version of cnpgen does not support the recipe in the specification.
         MachineError: The backend of the dataset does not work here, the disk is full, or a worker died.
     """
-    where, folder, n = Engine(engine, address, workers), Path(folder), integer("n", n, least=1, most=MAX_ROWS)
+    where, folder, n = Engine(engine, address, workers), require_folder(folder), integer("n", n, least=1, most=MAX_ROWS)
     begun = _begun(folder)
     with restored(begun) as recipe:
         extended = _extended(folder, begun, recipe, n)

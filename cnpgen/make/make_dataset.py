@@ -1,5 +1,7 @@
 """Generation of datasets: specification, check of existing shards, distribution of missing shards, manifest."""
 
+from __future__ import annotations
+
 import operator
 import warnings
 from collections.abc import Callable, Generator, Mapping, Sequence
@@ -18,6 +20,7 @@ from cnpgen.make.recipe_file import as_dataset_recipe, load_notes
 from cnpgen.make.repair import delete_shards, existing_shards, find_damaged
 from cnpgen.make.resolve_spec import dataset_folder, draw_up
 from cnpgen.pipelines.stages.stage import BLOCK_ROWS
+from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.store.check import check_documents
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, shards
 from cnpgen.store.intact import RERUN_HINT
@@ -59,6 +62,7 @@ class MadeDataset:
     repaired: tuple[str, ...] = ()
 
 
+@checked_arguments
 def make_dataset(
     recipe: str | Path | DatasetRecipe,
     out: str | Path | None = None,

@@ -16,9 +16,8 @@ from cnpgen.errors import MachineError
 from cnpgen.kernels.library import Backend, choose_backend
 from cnpgen.machine.versions import versions
 from cnpgen.make.recipe_file import makes_its_rows, restored
-from cnpgen.pipelines.block_chunk import Block
 from cnpgen.pipelines.pipeline import Pipeline
-from cnpgen.pipelines.prepared import PreparedPipeline
+from cnpgen.pipelines.prepared import Block, PreparedPipeline
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask
 from cnpgen.store.field import Field
 from cnpgen.store.sampling_statistics import SamplingStatistics, merge_sampling

@@ -1,5 +1,7 @@
 """Merge of the parts of a dataset, generated in separate folders, into one dataset."""
 
+from __future__ import annotations
+
 import shutil
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -10,9 +12,12 @@ from cnpgen.make.certify import certified
 from cnpgen.make.make_dataset import Begin, MadeDataset, Progress, finish
 from cnpgen.make.recipe import recipe_digest
 from cnpgen.make.recipe_file import load_dataset_recipe, load_notes
+from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.catalogue import list_recipes
+from cnpgen.store.checked_shard import read_rows, shard_of_record
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, load_dataset_spec, shards
 from cnpgen.store.files.atomic import committing, file_sha256, read_file, write_file
+from cnpgen.store.intact import COPY_HINT, OUTSIDE, leads_outside, outside_links
 from cnpgen.store.layout import WORK
 from cnpgen.store.manifest import source_date
 from cnpgen.store.paths import require_folder
@@ -22,6 +27,7 @@ from cnpgen.store.workspace import changed_settings, check_place, find_workspace
 MAX_LISTED_SHARDS = 3  # in an error message
 
 
+@checked_arguments
 def merge_datasets(
     parts: Sequence[str | Path],
     out: str | Path,
@@ -47,6 +53,8 @@ def merge_datasets(
         MachineError: The disk is full or a file operation failed.
     """
     source_date()
+    if not parts or not all(isinstance(part, str | Path) for part in parts):
+        raise UsageError(f"must name at least one folder, and only folders, got {parts!r:.100}", argument="parts")
     out, folders = Path(out), [Path(part) for part in parts]
     spec = _common_spec(folders)
     others = [folder for folder in folders if folder.resolve() != out.resolve()]
@@ -71,7 +79,9 @@ def _common_spec(folders: Sequence[Path]) -> DatasetSpec:
     if not folders:
         raise UsageError("must name at least one folder, got none", argument="parts")
     for folder in folders:
-        require_folder(folder)
+        require_folder(folder, argument="parts")
+        if outside := outside_links(folder):
+            raise DatasetError(f"{folder / outside[0]} {OUTSIDE}; {COPY_HINT}")
     first, *rest = folders
     spec = load_dataset_spec(first)
     for folder in rest:
@@ -111,10 +121,13 @@ def _owners(folders: Sequence[Path], out: Path, spec: DatasetSpec) -> dict[Shard
 def _copy(folder: Path, out: Path, task: ShardTask, spec: DatasetSpec) -> None:
     """Copy a shard and then its sidecar, which marks it as complete."""
     record = load_committed(folder, spec, task)
+    if outside := [name for name in (task.file, task.sidecar) if leads_outside(folder / name)]:
+        raise DatasetError(f"{folder / outside[0]} {OUTSIDE}; {COPY_HINT}")
     with committing(out / task.file, out / WORK) as temporary:
         shutil.copyfile(folder / task.file, temporary)
         if file_sha256(temporary) != record.sha256:
             raise DatasetError(f"{folder / task.file} was changed: its sha256 is not the recorded one")
+        read_rows(shard_of_record(folder, spec, task, record))
     write_file(out / task.sidecar, read_file(folder / task.sidecar), work=out / WORK)
 
 

@@ -57,7 +57,7 @@ def split_rows(recipe: DatasetRecipe, n: int) -> dict[str, int]:
         UsageError: ``n`` is less than 1.
     """
     if n < 1:
-        raise UsageError(f"the number of rows must be at least 1, got {n}")
+        raise UsageError(f"must be at least 1, got {n}", argument="n")
     total = sum(recipe.splits.values())
     rows = {name: n * share // total for name, share in recipe.splits.items()}
     for _ in range(n - sum(rows.values())):

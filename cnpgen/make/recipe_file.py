@@ -17,6 +17,7 @@ from cnpgen.problems.checks import tables
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import missing_kinds, restoring_reader, without_defaults
 from cnpgen.schema import registry
+from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.catalogue import load_recipe, read_kind, reference
 from cnpgen.schema.keys import RecipeLocation
 from cnpgen.schema.parsing import Reader, parse
@@ -25,6 +26,7 @@ from cnpgen.schema.toml import is_kind, read_table
 from cnpgen.store.dataset_spec import GENERATOR_REVISION, DatasetSpec
 
 
+@checked_arguments
 def load_dataset_recipe(name_or_path: str | Path, *, relative_to: Path | None = None) -> DatasetRecipe:
     """Load a dataset recipe, its pipeline and its problem.
 

@@ -7,10 +7,11 @@ from functools import partial
 from pathlib import Path
 
 from cnpgen.errors import DatasetError
+from cnpgen.store.checked_shard import read_rows, shard_of_record
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask
 from cnpgen.store.files.atomic import machine_error
 from cnpgen.store.layout import MANIFEST
-from cnpgen.store.shard_record import check_committed
+from cnpgen.store.shard_record import check_committed, load_record
 
 MAX_THREADS = 8
 
@@ -31,7 +32,7 @@ def find_damaged(
     *,
     progress: Callable[[ShardTask], None] | None = None,
 ) -> dict[ShardTask, str]:
-    """Compare the bytes of shards with their sidecars.
+    """Compare the bytes of shards with their sidecars, and their content with the specification.
 
     Args:
         folder: Folder of the dataset.
@@ -62,6 +63,7 @@ def _problem(folder: Path, spec: DatasetSpec, task: ShardTask) -> str:
     """Return a description of the damage of a shard; empty for an intact shard."""
     try:
         check_committed(folder, spec, task)
+        read_rows(shard_of_record(folder, spec, task, load_record(folder, task)))
     except DatasetError as error:
         return str(error)
     return ""

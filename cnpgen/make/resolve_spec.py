@@ -8,6 +8,7 @@ import numpy as np
 
 from cnpgen.errors import UsageError
 from cnpgen.kernels.library import choose_backend
+from cnpgen.machine.memory import check_memory
 from cnpgen.machine.versions import versions
 from cnpgen.make.make_shards import Job
 from cnpgen.make.recipe import MAX_SEED, DatasetRecipe, recipe_digest, split_rows
@@ -76,6 +77,8 @@ def draw_up(
     prepared = PreparedPipeline(recipe.pipeline, backend=chosen, cache_folder=cache_folder, dtype=dtype)
     if prepared.tasks is not None:
         total = _solved_tasks(prepared, recipe, root, n)
+    rows = shard_size or default_shard_size(total, prepared.block_rows)
+    check_memory("shard_size", rows, min(rows, total) * sum(max(field.width, 1) for field in prepared.fields))
     splits = split_rows(recipe, total)
     spec = DatasetSpec(
         name=recipe.name,
@@ -86,7 +89,7 @@ def draw_up(
         recipe=resolved(recipe),
         seed=root,
         splits=splits,
-        shard_size=shard_size or default_shard_size(total, prepared.block_rows),
+        shard_size=rows,
         block_rows=prepared.block_rows,
         dtype=dtype,
         backend=chosen,

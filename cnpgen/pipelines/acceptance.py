@@ -11,8 +11,8 @@ import numpy as np
 from cnpgen.kernels.symbolic.linalg import Scalar, Vec, dot, subtract, symbols
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
 from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.narrow_phase import narrow_phase_of, unmet
 from cnpgen.pipelines.stages.collision import candidate_poses
+from cnpgen.pipelines.stages.narrow_phase import narrow_phase_of, unmet
 from cnpgen.pipelines.stages.stage import CandidateBatch, StageFunction
 from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES, End
 from cnpgen.problems.constraints.needs import symbolic_needs
@@ -86,7 +86,7 @@ def boundary_unmet(
     For a hit it is ``(q, dq, ddq, obstacle_poses, position, angle, speed) -> unmet``: the tip velocity must be
     horizontal, along the angle, at the speed.
 
-    ``cnpgen.pipelines.narrow_phase`` checks conservative conditions.
+    ``cnpgen.pipelines.stages.narrow_phase`` checks conservative conditions.
 
     Args:
         robot: Robot.

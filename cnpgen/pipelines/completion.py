@@ -9,7 +9,7 @@ from cnpgen.kernels.symbolic.kinematics import tip_position
 from cnpgen.pipelines.acceptance import acceptance
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.pipeline import Pipeline
-from cnpgen.pipelines.stages.stage import Array, StageFunction, TaskBatch
+from cnpgen.pipelines.stages.stage import Array, TaskBatch
 from cnpgen.pipelines.steps import PipelineStep, prepare_steps, steps_of, stored_fields, written_columns
 from cnpgen.problems.constraints.constraint import End
 from cnpgen.problems.constraints.table import Table
@@ -51,7 +51,7 @@ class Completion:
         written = written_columns(pipeline.path, steps, context)
         with context.kernels.compile_in_parallel():
             self._tip = context.kernels.load(tip_position)
-            self._stages = _completing(_of_tasks(steps, context), context, known)
+            self._stages = prepare_steps(_of_tasks(steps, context), lambda stage: stage.complete(context, known))
             self._accept = acceptance(context, written, given=_given_ends(given))
         self._random = np.random.default_rng(0)  # for plug-ins that bypass candidates.draw
 
@@ -120,14 +120,18 @@ def _check(pipeline: Pipeline, fields: Mapping[str, Field], given: Collection[st
     """
     for name in given:
         if name not in fields:
-            raise UsageError(f"the pipeline {pipeline.name!r} {lacks('column to give', name, fields)}")
+            raise UsageError(f"the pipeline {pipeline.name!r} {lacks('column to give', name, fields)}", concerns=name)
     for joints, position in _EXCLUSIVE_COLUMNS:
         if joints in given and position in given:
             raise UsageError(
-                f"{joints} and {position} are both given: joint positions determine the tip position, give one of them"
+                f"{joints} and {position} are both given: joint positions determine the tip position, give one of them",
+                concerns=position,
             )
     if not {"goal_q", "goal_xyz"} & set(given):
-        raise UsageError(f"tasks of the pipeline {pipeline.name!r} must give goal_xyz, the tip position of the goal")
+        raise UsageError(
+            f"tasks of the pipeline {pipeline.name!r} must give goal_xyz, the tip position of the goal",
+            concerns="goal_xyz",
+        )
 
 
 def _derived(given: Collection[str]) -> tuple[str, ...]:
@@ -150,10 +154,3 @@ def _of_tasks(steps: Iterable[PipelineStep], context: Context) -> list[PipelineS
         kept = [other for other in kept if not replaced & {*other.stage.inputs, *other.stage.writes(context)}]
         kept.append(step)
     return kept
-
-
-def _completing(
-    steps: Iterable[PipelineStep], context: Context, known: Collection[str]
-) -> list[tuple[str, StageFunction]]:
-    """Prepare the stages for the known columns."""
-    return prepare_steps(list(steps), lambda stage: stage.complete(context, known))

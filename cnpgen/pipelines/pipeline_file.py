@@ -12,12 +12,14 @@ from cnpgen.pipelines.stages.stage import Stage
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import missing_kinds, read_problem, without_defaults
 from cnpgen.schema import registry
+from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.catalogue import load_recipe, read_kind, reference
 from cnpgen.schema.keys import RecipeLocation
 from cnpgen.schema.parsing import Reader, parse
 from cnpgen.schema.toml import read_table
 
 
+@checked_arguments
 def load_pipeline(name_or_path: str | Path, *, relative_to: Path | None = None) -> Pipeline:
     """Load a pipeline and its problem.
 

@@ -1,25 +1,42 @@
-"""Prepared pipelines: blocks of rows, each a pure function of (seed, split, block index)."""
+"""Prepared pipelines: blocks of rows, each a pure function of (seed, split, block index), with sampling statistics."""
 
 import hashlib
 from collections import deque
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError, UsageError
 from cnpgen.kernels.library import Backend
 from cnpgen.pipelines.acceptance import acceptance
-from cnpgen.pipelines.block_chunk import Block, BlockChunk
 from cnpgen.pipelines.context import load_context
 from cnpgen.pipelines.pipeline import Pipeline, listed_tasks
 from cnpgen.pipelines.stages.stage import Array, CandidateBatch
 from cnpgen.pipelines.steps import prepare_steps, steps_of, stored_fields, written_columns
 from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES
 from cnpgen.store.field import Field
+from cnpgen.store.sampling_statistics import DensityMap, SamplingStatistics
 
 MIN_ACCEPTANCE = 1e-4  # accepted fraction below which a pipeline raises an error
 MIN_CANDIDATES_BEFORE_ERROR = 100_000  # candidates before the accepted fraction is checked
+DENSITY_CELLS = 24  # along each side of a density map
+
+
+@dataclass(frozen=True)
+class Block:
+    """Accepted rows in sampling order, and the statistics of all candidates up to the last row.
+
+    Attributes:
+        columns: Field name -> values, shape (width, rows); (1, rows) for scalars.
+        sampling: Counts of candidates and rejections, and density maps.
+    """
+
+    columns: dict[str, NDArray[Any]]
+    sampling: SamplingStatistics
 
 
 class PreparedPipeline:
@@ -149,6 +166,144 @@ class PreparedPipeline:
             text = f"{accepted} of {tried:,} candidates were accepted"
             text += f"; of the last {candidates.size:,}, rejected for {reasons}"
             raise RecipeError([f"{self.pipeline.path}: {text}"])
+
+
+class BlockChunk:
+    """Rows ``first`` to ``stop`` of a block, collected batch by batch.
+
+    Args:
+        fields: Fields of a row; the last two are the bookkeeping fields.
+        first: First row.
+        stop: End of the rows, exclusive.
+    """
+
+    def __init__(self, fields: tuple[Field, ...], first: int, stop: int) -> None:
+        self.first, self.stop = first, stop
+        self._fields = fields
+        self._statistics = BlockStatistics(fields)
+        self._parts: list[dict[str, NDArray[Any]]] = []
+
+    def take(self, candidates: CandidateBatch, accepted: int) -> bool:
+        """Append the rows of a batch that belong to the chunk.
+
+        Args:
+            candidates: Batch of candidates.
+            accepted: Number of rows of the block that were accepted before the batch.
+
+        Returns:
+            Whether the chunk is complete; the batch may contain rows of the next chunk.
+        """
+        taken = candidates.alive[: self.stop - accepted]
+        end = accepted + len(taken)
+        if end < self.first:
+            return False
+        skip = min(max(self.first - accepted, 0), len(taken))
+        # No later chunk counts the candidates after the last row.
+        final = candidates.last and end == accepted + len(candidates.alive)
+        attempts = self._statistics.count(candidates, taken, first=skip, last=end == self.stop and not final)
+        if final:
+            attempts[-1:] += self._statistics.waiting
+        part = {field.name: candidates[field.name][:, skip : len(taken)] for field in self._fields[:-2]}
+        self._parts.append({**part, "attempts": attempts[None]})
+        return end == self.stop
+
+    def block(self, first_row: int) -> Block:
+        """Return the rows of a complete chunk.
+
+        Args:
+            first_row: Index, within the split, of the first row of the block.
+        """
+        columns = {name: np.concatenate([part[name] for part in self._parts], axis=1) for name in self._parts[0]}
+        columns["sample_id"] = first_row + np.arange(self.first, self.stop, dtype=np.int64)[None]
+        return Block(columns, self._statistics.sampling())
+
+
+class BlockStatistics:
+    """Running counts of one block.
+
+    Args:
+        fields: Fields of the dataset; each position field gets a density map over its range.
+
+    Attributes:
+        tried: Number of candidates counted so far.
+        accepted: Number of rows accepted so far.
+        waiting: Number of candidates since the last accepted one.
+    """
+
+    def __init__(self, fields: tuple[Field, ...]) -> None:
+        self.tried = 0
+        self.accepted = 0
+        self.waiting = 0
+        self._rejections: dict[str, int] = {}
+        self._stages: dict[str, str] = {}
+        self._maps = [field for field in fields if field.name.endswith("_xyz")]
+        self._drawn = {field.name: np.zeros(DENSITY_CELLS * DENSITY_CELLS, np.int64) for field in self._maps}
+        self._kept = {field.name: np.zeros(DENSITY_CELLS * DENSITY_CELLS, np.int64) for field in self._maps}
+
+    def count(
+        self, candidates: CandidateBatch, taken: NDArray[np.intp], *, first: int, last: bool
+    ) -> NDArray[np.int64]:
+        """Count the candidates of a finished batch that belong to the requested rows.
+
+        Args:
+            candidates: Batch of candidates.
+            taken: Indices of its accepted candidates, ascending, shape (k,).
+            first: Number of entries of ``taken`` before the first requested row; these candidates are not counted.
+            last: Whether ``taken`` ends at the last requested row; later candidates are then not counted.
+
+        Returns:
+            Number of candidates per counted row, including the accepted one.
+        """
+        rows = taken[first:]
+        start = int(taken[first - 1]) + 1 if first else 0
+        stop = int(taken[-1]) + 1 if last else candidates.size
+        if first:
+            self.waiting = 0
+        sampling = np.bincount(candidates.outcome[start:stop], minlength=1 + len(candidates.reasons))
+        for reason, number in zip(candidates.reasons, sampling[1:].tolist(), strict=True):
+            self._rejections[reason] = self._rejections.get(reason, 0) + number
+        self._stages.update(candidates.origins)
+        self.tried += stop - start
+        self.accepted += len(rows)
+        for field in self._maps:
+            cells = _cells(candidates.drawn[field.name][:, start:stop], field)
+            self._drawn[field.name] += np.bincount(cells, minlength=DENSITY_CELLS * DENSITY_CELLS)
+            self._kept[field.name] += np.bincount(cells[rows - start], minlength=DENSITY_CELLS * DENSITY_CELLS)
+        attempts = np.diff(rows, prepend=start - 1 - self.waiting).astype(np.int64)
+        self.waiting = stop - 1 - int(rows[-1]) if len(rows) else self.waiting + stop - start
+        return attempts
+
+    def sampling(self) -> SamplingStatistics:
+        """Return the present counts."""
+        maps = {}
+        for field in self._maps:
+            assert field.valid_min is not None
+            assert field.valid_max is not None
+            shape = (DENSITY_CELLS, DENSITY_CELLS)
+            (x, y), drawn, kept = _extent(field), self._drawn[field.name], self._kept[field.name]
+            maps[field.name] = DensityMap(x, y, drawn.reshape(shape), kept.reshape(shape))
+        return SamplingStatistics(
+            tried=self.tried,
+            accepted=self.accepted,
+            rejections=self._rejections,
+            stages=self._stages,
+            densities=maps,
+        )
+
+
+def _extent(field: Field) -> tuple[tuple[float, float], tuple[float, float]]:
+    assert field.valid_min is not None
+    assert field.valid_max is not None
+    return (field.valid_min[0], field.valid_max[0]), (field.valid_min[1], field.valid_max[1])
+
+
+def _cells(position: Array, field: Field) -> NDArray[np.intp]:
+    """Return the index of the cell of each position, for positions of shape (3, n)."""
+    index = np.zeros(position.shape[1], np.intp)
+    for axis, (low, high) in enumerate(_extent(field)):
+        fraction = (position[axis] - low) / max(high - low, 1e-300)
+        index = index * DENSITY_CELLS + np.clip((fraction * DENSITY_CELLS).astype(np.intp), 0, DENSITY_CELLS - 1)
+    return index
 
 
 def random_generator(seed: int, split: str, index: int) -> np.random.Generator:

@@ -3,6 +3,8 @@
 It combines boundary conditions, line, expected time and network outputs on the CPU, in float64.
 """
 
+from __future__ import annotations
+
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -22,9 +24,9 @@ from cnpgen.planner.tasks import EXPECTED_TIMES, Tasks
 from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.plans.plausible import warn_of_far_joints
 from cnpgen.problems.load_robot import load_robot
-from cnpgen.problems.obstacles import obstacle_poses_of
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import as_problem
+from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer, number, numbers
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.trajectory.boundary import Boundary
@@ -63,6 +65,7 @@ class BoundaryLayer:
         MachineError: The backend is not available on this machine.
     """
 
+    @checked_arguments
     def __init__(
         self,
         problem: Problem | StoredProblem | str | Path,
@@ -115,6 +118,7 @@ class BoundaryLayer:
                 problem, kernels, steps=self._projection_steps, fixed_at_goal=self._fixed_at_goal
             )
 
+    @checked_arguments
     @one_thread()
     def tasks(self, boundary: Boundary) -> Tasks:
         """Prepare N tasks: compute everything that the network needs from boundary conditions.
@@ -127,22 +131,22 @@ class BoundaryLayer:
                 match ``goal_acceleration``.
         """
         if boundary.fixed_at_goal > self._fixed_at_goal:
-            raise UsageError('goal_acceleration is "free", so goal_ddq must be None; pass goal_acceleration="given"')
+            raise UsageError(
+                'goal_acceleration is "free", so goal_ddq must be None; pass goal_acceleration="given"',
+                concerns="boundary",
+            )
         if boundary.fixed_at_goal < self._fixed_at_goal:
-            raise UsageError('goal_ddq is missing: goal_acceleration is "given"')
+            raise UsageError('goal_ddq is missing: goal_acceleration is "given"', concerns="boundary")
         arrays = {name: numbers(name, values, differentiable=True) for name, values in boundary.conditions().items()}
         shape = (len(np.atleast_1d(arrays["start_q"])), len(self.problem.robot.joints))
         for name, array in arrays.items():
             if array.shape != shape:
-                raise UsageError(f"{name} must have shape (N, {shape[1]}), N = {shape[0]}, got {array.shape}")
+                raise UsageError(f"must have shape (N, {shape[1]}), N = {shape[0]}, got {array.shape}", argument=name)
         checked = Boundary(**arrays)
         warn_of_far_joints(self._kernels.arguments["robot"], checked)
         return self._preprocessor_and_projection[0](checked)
 
-    def obstacle_poses(self, tasks: Tasks) -> Array:
-        """Return poses and sizes of the obstacles, shape (N, width): ``obstacle_poses`` of the loss."""
-        return obstacle_poses_of(self.problem, tasks.start_xyz, tasks.goal_xyz)
-
+    @checked_arguments
     @one_thread()
     def __call__(self, tasks: Tasks, phi: ArrayLike, log_rate: ArrayLike) -> ControlPoints:
         """Compute control points, in float64.
@@ -159,8 +163,9 @@ class BoundaryLayer:
         if projection is None:
             return points
         with np.errstate(all="ignore"):  # an overflow affects its own row only
-            return replace(points, path=projection.project(points.path, self.obstacle_poses(tasks)))
+            return replace(points, path=projection.project(points.path, tasks.scene.poses))
 
+    @checked_arguments
     @one_thread()
     def vjp(
         self, tasks: Tasks, phi: ArrayLike, log_rate: ArrayLike, *, path_gradient: Array, rate_gradient: Array
@@ -180,10 +185,10 @@ class BoundaryLayer:
             Gradients with respect to phi and log_rate.
         """
         points, projection = self._before_projection(tasks, phi, log_rate), self._preprocessor_and_projection[1]
+        path_gradient = _checked_gradient("path_gradient", path_gradient, points.path.shape)
+        rate_gradient = _checked_gradient("rate_gradient", rate_gradient, points.rate.shape)
         with np.errstate(all="ignore"):
-            by_path = (
-                projection.vjp(points.path, self.obstacle_poses(tasks), path_gradient) if projection else path_gradient
-            )
+            by_path = projection.vjp(points.path, tasks.scene.poses, path_gradient) if projection else path_gradient
             spec = self.problem.trajectory
             gradients = control_points.vjp(
                 tasks, points, path_gradient=by_path, rate_gradient=rate_gradient, scale=self._path_scale, spec=spec
@@ -193,6 +198,7 @@ class BoundaryLayer:
             gradient[overflowed] = 0
         return gradients
 
+    @checked_arguments
     def plans(self, tasks: Tasks, phi: ArrayLike, log_rate: ArrayLike, *, sample_id: ArrayLike | None = None) -> Plans:
         """Make plans from network outputs, to be evaluated, refined or saved.
 
@@ -216,6 +222,7 @@ class BoundaryLayer:
             sample_id=sample_id,
         )
 
+    @checked_arguments
     def check_shapes(self, tasks: Tasks, phi: tuple[int, ...], log_rate: tuple[int, ...]) -> None:
         """Check the shapes of network outputs.
 
@@ -224,7 +231,7 @@ class BoundaryLayer:
         """
         for name, shape, width in (("phi", phi, self.path_outputs), ("log_rate", log_rate, self.rate_outputs)):
             if shape != (len(tasks), width):
-                raise UsageError(f"{name} must have shape ({len(tasks)}, {width}), got {shape}")
+                raise UsageError(f"must have shape ({len(tasks)}, {width}), got {shape}", argument=name)
 
     def _before_projection(self, tasks: Tasks, phi: ArrayLike, log_rate: ArrayLike) -> ControlPoints:
         phi = numbers("phi", phi, differentiable=True)
@@ -234,6 +241,13 @@ class BoundaryLayer:
             return control_points.control_points(
                 tasks, phi, log_rate, scale=self._path_scale, spec=self.problem.trajectory
             )
+
+
+def _checked_gradient(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
+    gradient = values if isinstance(values, np.ndarray) and values.dtype.kind == "f" else numbers(name, values)
+    if gradient.shape != shape:
+        raise UsageError(f"must have shape {shape}, got {gradient.shape}", argument=name)
+    return gradient
 
 
 def _finite(*arrays: NDArray[Any]) -> NDArray[np.bool_]:

@@ -31,43 +31,29 @@ def tips_at_ends(robot: "Robot", *, fixed_at_goal: int) -> Any:
     return ca.Function("tips_at_ends", [ends_sx], tips)
 
 
-def line_change(robot: "Robot", problem: Problem, *, steps: int, fixed_at_goal: int, within_limits: bool) -> Any:
-    """Build ``(ends, rate, obstacle_poses) -> change`` of the line's interior points at a constant rate [1/s]."""
+def line_change(
+    robot: "Robot", problem: Problem, *, steps: int, fixed_at_goal: int, within_limits: bool, with_offsets: bool
+) -> Any:
+    """Build ``(ends, rate, obstacle_poses) -> change`` of the line's interior points at a constant rate [1/s].
+
+    With offsets [rad] from the line it is ``(ends, offsets, rate, obstacle_poses) -> offsets + change``.
+    """
     import casadi as ca
 
-    ends_sx, rate, points = _line(robot, problem, fixed_at_goal)
+    (ends_sx, ends), rate, spec = symbols("ends", (3 + fixed_at_goal) * robot.n), ca.SX.sym("rate"), problem.trajectory
     poses_sx, obstacle_poses = symbols("obstacle_poses", pose_width(problem.obstacle))
-    change = projection_change(
-        robot, problem, points, obstacle_poses, steps=steps, fixed_at_goal=fixed_at_goal, within_limits=within_limits
-    )
-    return ca.Function("line_change", [ends_sx, rate, poses_sx], [ca.cse(_column(change))])
-
-
-def via_line_change(robot: "Robot", problem: Problem, *, steps: int, fixed_at_goal: int, within_limits: bool) -> Any:
-    """Build ``(ends, offsets, rate, obstacle_poses) -> offsets + change`` of a line with offsets [rad]."""
-    import casadi as ca
-
-    ends_sx, rate, points = _line(robot, problem, fixed_at_goal)
-    poses_sx, obstacle_poses = symbols("obstacle_poses", pose_width(problem.obstacle))
+    points = _points(_split(ends, robot.n), [rate] * spec.rate_control_points, spec)
     interior = slice(3, -fixed_at_goal)
-    offsets_sx, offsets = symbols("offsets", len(points[interior]) * robot.n)
-    shifts = _split(offsets, robot.n)
-    points[interior] = _sums(points[interior], shifts)
+    offsets_sx, scalars = symbols("offsets", len(points[interior]) * robot.n if with_offsets else 0)
+    offsets = _split(scalars, robot.n)
+    if with_offsets:
+        points[interior] = _sums(points[interior], offsets)
     change = projection_change(
         robot, problem, points, obstacle_poses, steps=steps, fixed_at_goal=fixed_at_goal, within_limits=within_limits
     )
-    return ca.Function(
-        "via_line_change", [ends_sx, offsets_sx, rate, poses_sx], [ca.cse(_column(_sums(shifts, change)))]
-    )
-
-
-def _line(robot: "Robot", problem: Problem, fixed_at_goal: int) -> tuple[Any, Any, list[Vec]]:
-    """Return symbols of boundary conditions and of a constant rate, and the control points of the line between them."""
-    import casadi as ca
-
-    (ends_sx, ends), rate = symbols("ends", (3 + fixed_at_goal) * robot.n), ca.SX.sym("rate")
-    spec = problem.trajectory
-    return ends_sx, rate, _points(_split(ends, robot.n), [rate] * spec.rate_control_points, spec)
+    change = _sums(offsets, change) if with_offsets else change
+    columns = [ends_sx, *([offsets_sx] if with_offsets else []), rate, poses_sx]
+    return ca.Function("line_change", columns, [ca.cse(_column(change))])
 
 
 def projected_path(robot: "Robot", problem: Problem, *, steps: int, fixed_at_goal: int, within_limits: bool) -> Any:

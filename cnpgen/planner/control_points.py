@@ -5,6 +5,8 @@ The boundary control points follow from the rates, so that boundary conditions h
 on two of them, so gradients of the path reach the rates both directly and through the line.
 """
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 from functools import lru_cache

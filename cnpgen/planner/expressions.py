@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.kernels.symbolic.linalg import Vec, symbols
-from cnpgen.kernels.symbolic.symbolic_state import SymbolicState, jerk_along
+from cnpgen.kernels.symbolic.symbolic_state import SymbolicState, time_derivatives
 from cnpgen.problems.constraints.constraint import MIN_TOLERANCE, Condition
 from cnpgen.problems.constraints.needs import symbolic_needs
 from cnpgen.problems.problem import Problem
@@ -73,11 +73,9 @@ def speed_violation(robot: "Robot", problem: Problem) -> Any:
     import casadi as ca
 
     columns, (p, *path, rate, obstacle_poses) = _on_path(robot, problem)
-    orders, (p1, p2), (r, r1) = problem.path_orders, path[:2], rate[:2]
-    dq = [gradient * r for gradient in p1]
-    ddq = [(curve * r + gradient * r1) * r for curve, gradient in zip(p2, p1, strict=True)]
+    orders = problem.path_orders
     moving = tuple(ca.vertcat(columns[order], columns[orders][order - 1]) for order in range(1, orders))
-    state = _State(p, dq, ddq, jerk_along(path, rate), moving)
+    state = _State(p, *time_derivatives(path, rate), moving)
     violations: list[Any] = []
     for condition, needs in _conditions(robot, problem, state, obstacle_poses):
         if needs:

@@ -41,7 +41,7 @@ def projection_change(
         robot: The robot.
         problem: The problem.
         control: All control points of the path, SX scalars [rad].
-        obstacle_poses: Poses and sizes of the obstacles (``obstacle_poses_of``).
+        obstacle_poses: Poses and sizes of the obstacles (``Scene.poses``).
         steps: Number of Gauss-Newton steps.
         fixed_at_goal: Number of control points that the goal fixes.
         within_limits: Whether interior control points are clipped to the joint limits after every step.
@@ -73,7 +73,7 @@ def _gauss_newton(equality: Any, q: list[Vec], obstacle_poses: Vec, inner: Array
     Args:
         equality: Function of ``equality_residuals``.
         q: Positions at the K phases.
-        obstacle_poses: Poses and sizes of the obstacles (``obstacle_poses_of``).
+        obstacle_poses: Poses and sizes of the obstacles (``Scene.poses``).
         inner: Basis of the interior control points at the phases, shape (K, interior points).
         response: Response of the interior control points to a force at the phases, shape (interior points, K).
     """

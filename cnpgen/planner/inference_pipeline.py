@@ -13,7 +13,7 @@ from cnpgen.kernels.library import KernelLibrary, choose_backend, problem_kernel
 from cnpgen.planner.control_point_functions import projected_path
 from cnpgen.planner.expressions import effective_steps
 from cnpgen.planner.model import Model, ModelConfig
-from cnpgen.planner.phase_grid import MOTIONS_PER_BLOCK
+from cnpgen.planner.phase_grid import blocks_of_motions
 from cnpgen.planner.task_preprocessor import TaskPreprocessor, ends_of, lanes, make_task_preprocessor, rows
 from cnpgen.planner.tasks import Tasks
 from cnpgen.planner.time_parametrization import TimeParametrization, make_time_parametrization
@@ -116,27 +116,23 @@ class InferencePipeline:
         """Plan N motions; return the tasks with the selected lines, and the motions."""
         ends = ends_of(boundary)
         tasks = self.prepare(boundary, ends=ends)
-        obstacle_poses = self.prepare.obstacle_poses(tasks.start_xyz, tasks.goal_xyz)
-        motion = self._fitted(self._projected(model, tasks, ends, obstacle_poses), obstacle_poses)
-        return (
-            (tasks, motion)
-            if self.via_points is None
-            else self._with_via_points(self.via_points, model, tasks, motion, obstacle_poses)
-        )
+        motion = self._fitted(self._projected(model, tasks, ends), tasks.scene.poses)
+        if self.via_points is None:
+            return tasks, motion
+        return self._with_via_points(self.via_points, model, tasks, motion)
 
-    def motion(self, model: Model, tasks: Tasks, obstacle_poses: Array) -> Motion:
+    def motion(self, model: Model, tasks: Tasks) -> Motion:
         """Evaluate the network, project its paths onto the equalities, and fit the rates to the limits.
 
         Args:
             model: A model of the same problem.
             tasks: N tasks from ``prepare``.
-            obstacle_poses: Poses and sizes of the obstacles, shape (N, width).
         """
-        return self._fitted(self._projected(model, tasks, ends_of(tasks.boundary), obstacle_poses), obstacle_poses)
+        return self._fitted(self._projected(model, tasks, ends_of(tasks.boundary)), tasks.scene.poses)
 
-    def _projected(self, model: Model, tasks: Tasks, ends: Array, obstacle_poses: Array) -> Motion:
+    def _projected(self, model: Model, tasks: Tasks, ends: Array) -> Motion:
         outputs = model.outputs(tasks)
-        (path,) = self.path(ends, lanes(outputs.offsets), lanes(outputs.rate), lanes(obstacle_poses))
+        (path,) = self.path(ends, lanes(outputs.offsets), lanes(outputs.rate), tasks.scene.lanes)
         return Motion(rows(path, tasks.boundary.start_q.shape[1]), outputs.rate, model.problem.trajectory.degree)
 
     def _fitted(self, motion: Motion, obstacle_poses: Array) -> Motion:
@@ -148,21 +144,19 @@ class InferencePipeline:
         return motion
 
     def _with_via_points(
-        self, via_points: ViaPoints, model: Model, tasks: Tasks, motion: Motion, obstacle_poses: Array
+        self, via_points: ViaPoints, model: Model, tasks: Tasks, motion: Motion
     ) -> tuple[Tasks, Motion]:
         """Replace motions that violate static conditions by ones through via points with a smaller violation."""
-        path, rate, before = motion.path.copy(), motion.rate.copy(), via_points.violation(motion, obstacle_poses)
+        path, rate, before = motion.path.copy(), motion.rate.copy(), via_points.violation(motion, tasks.scene.poses)
         correction = np.zeros_like(path[:, 3 : path.shape[1] - tasks.boundary.fixed_at_goal])
         correction += 0.0 if tasks.correction is None else tasks.correction
         violating, count = np.flatnonzero(before > 1), len(via_points.via_points)
-        for some in (
-            violating[first : first + MOTIONS_PER_BLOCK] for first in range(0, len(violating), MOTIONS_PER_BLOCK)
-        ):
+        for some in (violating[block] for block in blocks_of_motions(len(violating))):
             repeated = np.repeat(some, count)
             alternatives = self.prepare(tasks.boundary[repeated], np.tile(via_points.via_points, (len(some), 1)))
             assert alternatives.correction is not None
-            ends, poses = ends_of(alternatives.boundary), obstacle_poses[repeated]
-            motions = self._projected(model, alternatives, ends, poses)
+            motions = self._projected(model, alternatives, ends_of(alternatives.boundary))
+            poses = alternatives.scene.poses
             after = via_points.violation(motions, poses)
             candidates = via_points.candidates(after)
             fitted, time = self._fitted(motions[candidates], poses[candidates]), np.full(len(repeated), np.inf)

@@ -1,5 +1,7 @@
 """A trained model: network parameters, definition of its inputs and outputs, and training metadata."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -13,6 +15,7 @@ from cnpgen.planner.network.features import Features
 from cnpgen.planner.network.forward import forward
 from cnpgen.planner.tasks import Tasks
 from cnpgen.problems.problem_record import ProblemRecord
+from cnpgen.schema.argument_types import checked_arguments
 
 Array = NDArray[Any]
 
@@ -81,6 +84,7 @@ class Model:
     def __repr__(self) -> str:
         return f"<Model of {self.problem.name!r}: a network of {self.architecture}>"
 
+    @checked_arguments
     def outputs(self, tasks: Tasks) -> Outputs:
         """Evaluate the network for N tasks, in float32; sums and the exponential are in float64."""
         activations = forward(self._weights, self.features.of(tasks))

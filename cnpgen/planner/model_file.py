@@ -19,6 +19,7 @@ from cnpgen.planner.tasks import EXPECTED_TIMES
 from cnpgen.plans.format import CONDITIONS
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import ProblemRecord, as_record
+from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.catalogue import recipes_root
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.store.files.checksum_file import Content, read_with_checksum, write_with_checksum
@@ -46,6 +47,7 @@ _TRAINING_STRUCTURE = {
 }  # of the keys that are read; both are optional
 
 
+@checked_arguments
 def save_model(path: str | Path, model: Model) -> None:
     """Write a model to a file, atomically; equal models give equal bytes.
 
@@ -59,6 +61,7 @@ def save_model(path: str | Path, model: Model) -> None:
     write_with_checksum(Path(path), model_content(model), kind=MODEL_KIND, version=MODEL_VERSION)
 
 
+@checked_arguments
 def load_model(name_or_path: str | Path) -> Model:
     """Read a model.
 
@@ -89,7 +92,9 @@ def model_for(problem: Problem | StoredProblem) -> Model:
     matches = [name for name, model in models.items() if model.problem.comparable_sha256 == record.comparable_sha256]
     if len(matches) != 1:
         subject = f"several shipped models ({', '.join(matches)})" if matches else "no shipped model"
-        raise UsageError(f"{subject} for the problem {record.name!r}: pass the name or the file of a model")
+        raise UsageError(
+            f"{subject} for the problem {record.name!r}: pass the name or the file of a model", concerns="model"
+        )
     return models[matches[0]]
 
 
@@ -106,12 +111,15 @@ def find_model(name_or_path: str | Path) -> Path:
         UsageError: There is no shipped model of this name.
     """
     if not isinstance(name_or_path, str | Path):
-        raise UsageError(f"a model must be a name or a path, got {name_or_path!r}")
+        raise UsageError(f"a model must be a name or a path, got {name_or_path!r}", concerns="name_or_path")
     text, known = os.fspath(name_or_path), shipped_models()
     if isinstance(name_or_path, Path) or text.endswith(".h5") or os.sep in text or Path(text).is_file():
         return Path(text)
     if text not in known:
-        raise UsageError(f"unknown model {text!r}{nearest(text, known)}; known: {', '.join(known) or 'none'}")
+        raise UsageError(
+            f"unknown model {text!r}{nearest(text, known)}; known: {', '.join(known) or 'none'}",
+            concerns="name_or_path",
+        )
     return known[text]
 
 

@@ -17,6 +17,11 @@ Array = NDArray[np.float64]
 MOTIONS_PER_BLOCK = 64  # small enough for arrays to stay in the CPU cache
 
 
+def blocks_of_motions(count: int) -> list[slice]:
+    """Split motions into blocks of ``MOTIONS_PER_BLOCK``."""
+    return [slice(first, first + MOTIONS_PER_BLOCK) for first in range(0, count, MOTIONS_PER_BLOCK)]
+
+
 @dataclass(frozen=True)
 class PhaseGrid:
     """Grid of K phases, for time scaling and time parametrization; made by ``make_phase_grid``.

@@ -1,6 +1,9 @@
 """Plan air hockey hits: from arm state, puck and target to a boundary problem and its plan."""
 
+from __future__ import annotations
+
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from weakref import WeakKeyDictionary
 
@@ -22,6 +25,8 @@ from cnpgen.planner.planner import Planner
 from cnpgen.plans.boundary_file import CONTEXT
 from cnpgen.plans.format import BOUNDARY, CONDITIONS
 from cnpgen.plans.plans import Plans
+from cnpgen.robots.plausible_values import check_plausible
+from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import number, numbers
 from cnpgen.trajectory.boundary import Boundary
 
@@ -29,6 +34,10 @@ Array = NDArray[np.float64]
 
 CONTACT_DISTANCE_M = 0.07  # from the centre of the paper's puck to that of its mallet at contact
 HIT_COLUMNS = ("start_q", "start_dq", "start_ddq", "goal_xyz", "hit_angle", SPEED_SHARE_COLUMN)
+
+_ARGUMENT_OF = {"goal_xyz": "puck", "hit_angle": "target", SPEED_SHARE_COLUMN: "speed_share"} | dict.fromkeys(
+    HIT_COLUMNS[:3], "state"
+)
 
 State = tuple[ArrayLike, ArrayLike, ArrayLike]
 """Positions [rad], velocities [rad/s], accelerations [rad/s^2], shape (n,) or (N, n), as from ``Plans.states_at``."""
@@ -52,6 +61,7 @@ class PlannedHits:
         return f"<{len(self.plans):,} of {counted(len(self.reasons), 'hit')} of {self.plans.problem.name!r} planned>"
 
 
+@checked_arguments
 @one_thread()
 def plan_hits(
     planner: Planner,
@@ -118,26 +128,37 @@ def hit_tasks(
 ) -> TaskBatch:
     """Complete the tasks of N hits; see ``plan_hits``."""
     n = completion.context.robot.n
-    if np.ndim(state[0]) == 0 or len(state) != 3:
+    if len(state) != 3 or np.ndim(state[0]) == 0:
         raise UsageError(
             f"must be positions, velocities and accelerations, got {len(state)} values or arrays", argument="state"
         )
-    parts = [_lanes(name, values, {n}) for name, values in zip(HIT_COLUMNS, state, strict=False)]
+    parts = [_lanes("state", values, {n}) for values in state]
     centre, goal = _lanes("puck", puck, {2, 3}), _lanes("target", target, {2})
     direction = goal - centre[:2]
     if not np.count_nonzero(direction, axis=0).all():
         raise UsageError(f"must differ from the puck's position, got {goal.T.tolist()} for both", argument="target")
     angle = np.arctan2(direction[1:], direction[:1])
     shares = _lanes("speed_share", np.reshape(numbers("speed_share", share), (-1, 1)), {1})
+    _check_distance(completion, contact_distance, {"puck": centre, "target": goal})
     columns = [*parts, behind(centre, angle, number("contact_distance", contact_distance)), angle, shares]
     counts = {name: values.shape[1] for name, values in zip(HIT_COLUMNS, columns, strict=True)}
     largest = max(counts.values())
-    for name, count in counts.items():
+    for column, count in counts.items():
+        name = _ARGUMENT_OF[column]
         if count == 0:
-            raise UsageError(f"{name} is empty, expected at least 1 hit")
+            raise UsageError("is empty, expected at least 1 hit", argument=name)
         if count not in {1, largest}:
-            raise UsageError(f"{name} has {count:,} hits, another argument has {largest:,}")
+            raise UsageError(f"has {count:,} hits, another argument has {largest:,}", argument=name)
     return completion(dict(zip(HIT_COLUMNS, columns, strict=True)))
+
+
+def _check_distance(completion: Completion, contact_distance: float, positions: Mapping[str, Array]) -> None:
+    """Check that lengths are not in millimetres."""
+    lengths = {"contact_distance": np.array([[number("contact_distance", contact_distance)]])}
+    lengths |= {name: values.T for name, values in positions.items()}
+    if max(np.abs(values).max(initial=0) for values in lengths.values()) < completion.context.robot.reach:
+        return  # the usual case: the check takes 50 microseconds
+    check_plausible(completion.context.robot, lengths, dict.fromkeys(lengths, "m"), noun="hit")
 
 
 def boundary_of_tasks(tasks: TaskBatch, fixed_at_goal: int) -> Boundary:
@@ -153,7 +174,7 @@ def _lanes(name: str, values: ArrayLike, widths: set[int]) -> Array:
         array = array[None]
     if array.ndim != 2 or array.shape[1] not in widths:
         expected = " or ".join(f"({width},) or (N, {width})" for width in sorted(widths))
-        raise UsageError(f"{name} must have shape {expected}, got {np.shape(values)}")
+        raise UsageError(f"must have shape {expected}, got {np.shape(values)}", argument=name)
     if not math.isfinite(np.vdot(array, array)) and not np.isfinite(array).all():  # vdot takes a third of the time
-        raise UsageError(f"{name} must be finite, got {array}")
+        raise UsageError(f"must be finite, got {array}", argument=name)
     return array.T

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.planner.model import Model
-from cnpgen.plans.boundary_file import ASKED, CONTEXT, BoundaryFile, boundary_in, read_boundary_file
+from cnpgen.plans.boundary_file import ASKED, CONTEXT, BoundaryFile, boundary_in, check_units, read_boundary_file
 from cnpgen.plans.boundary_problems import chosen_rows
-from cnpgen.problems.problem_record import ProblemRecord, as_record
+from cnpgen.problems.problem_record import ProblemRecord, as_record, open_problem
 from cnpgen.store.dataset_spec import DatasetSpec
 from cnpgen.store.files.documents import canonical_sha256
 from cnpgen.store.reader import open_dataset
@@ -66,15 +66,17 @@ def read_rows(
     return Requests(boundary, arrays.get("sample_id", np.array(rows)), columns)
 
 
-def read_file(path: Path, model: Model, *, other: bool = False) -> Requests:
+def read_file(path: Path, model: Model, *, other: bool = False, allow_large_angles: bool = False) -> Requests:
     """Read boundary conditions from an HDF5 file: a shard, a plan file, or boundary conditions alone.
 
     Args:
         path: The file, as read by ``read_boundary_file``.
         model: The model that will plan.
         other: Whether to accept rows of a shard drawn by another recipe than the training rows.
+        allow_large_angles: Whether to accept boundary conditions that are probably in degrees or millimetres.
 
     Raises:
+        UnitError: Boundary conditions are probably in degrees or millimetres.
         UsageError: There is no such file, or ``other`` is set and the file is no shard.
         DatasetError: The file is damaged, incomplete, of another problem, of a shard of other rows, or prescribes goal
             accelerations that the model leaves free.
@@ -90,6 +92,8 @@ def read_file(path: Path, model: Model, *, other: bool = False) -> Requests:
     else:
         _check_recorded_problem(file, model)
     boundary = checked_boundary(str(path), file.columns, model)
+    if not allow_large_angles:
+        check_units(str(path), open_problem(model.problem)[1], boundary)
     columns = {name: np.asarray(file.columns[name], np.float64) for name in CONTEXT if name in file.columns}
     return Requests(boundary, file.sample_id(len(boundary)), columns)
 

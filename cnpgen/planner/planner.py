@@ -1,5 +1,7 @@
 """Plan motions from boundary conditions with a trained model, in a fraction of a millisecond; online replanning."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
@@ -15,10 +17,11 @@ from cnpgen.planner.inference_pipeline import loaded_problem, make_inference_pip
 from cnpgen.planner.model import Model
 from cnpgen.planner.model_file import load_model, model_for
 from cnpgen.planner.plan_reuse import reuse_previous_plan
-from cnpgen.plans.plans import Plans, check_plans_type
+from cnpgen.plans.plans import Plans
 from cnpgen.plans.plausible import warn_of_far_joints
 from cnpgen.problems.problem import Problem
-from cnpgen.schema.arguments import numbers
+from cnpgen.schema.argument_types import checked_arguments
+from cnpgen.schema.arguments import concerning, numbers
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.boundary_arguments import boundary_of
@@ -49,6 +52,7 @@ class Planner:
         CnpgenError: The model cannot be read, or a dependency is missing.
     """
 
+    @checked_arguments
     def __init__(
         self,
         model: Model | Problem | StoredProblem | str | Path,
@@ -58,7 +62,8 @@ class Planner:
     ) -> None:
         if isinstance(model, Problem | StoredProblem):
             model = model_for(model)
-        self.model = model if isinstance(model, Model) else load_model(model)
+        with concerning("model"):
+            self.model = model if isinstance(model, Model) else load_model(model)
         self.backend, self._scale_time = backend, scale_time
         config = self.model.config if scale_time else replace(self.model.config, time_parametrized=False)
         with loaded_problem(self.model.problem, backend) as loaded:
@@ -80,6 +85,7 @@ class Planner:
         """Pickle without kernels; they are loaded again when the planner is unpickled."""
         return partial(type(self), scale_time=self._scale_time, backend=self.backend), (self.model,)
 
+    @checked_arguments
     def plan(
         self,
         start_q: ArrayLike,
@@ -114,6 +120,7 @@ class Planner:
         """
         return self.plan_batch(boundary_of(self.robot.n, start_q, start_dq, start_ddq, goal_q, goal_dq, goal_ddq))
 
+    @checked_arguments
     @one_thread()
     def plan_batch(
         self,
@@ -135,6 +142,7 @@ class Planner:
         warn_of_far_joints(self.robot, boundary)
         return self._inference.plan(self.model, self._checked(boundary), sample_id=sample_id, columns=columns)
 
+    @checked_arguments
     def replan(
         self,
         plans: Plans,
@@ -166,9 +174,11 @@ class Planner:
             UsageError: The number of times differs from that of plans, a time is outside its plan, the plans are of
                 another robot, or see ``plan``.
         """
-        check_plans_type(plans)
         if plans.problem.joint_names != self.model.problem.joint_names:
-            raise UsageError(f"the planner is of {self.model.problem.name!r}, the plans are of {plans.problem.name!r}")
+            raise UsageError(
+                f"the planner is of {self.model.problem.name!r}, the plans are of {plans.problem.name!r}",
+                concerns="plans",
+            )
         q, dq, ddq = plans.states_at(time)
         new = self.plan(q, goal_q, start_dq=dq, start_ddq=ddq, goal_dq=goal_dq, goal_ddq=goal_ddq)
         times = np.broadcast_to(numbers("time", time), (len(plans),))
@@ -187,8 +197,9 @@ class Planner:
             row = int(largest.argmax())
             if (np.abs(values) > self._rest_tolerance[name]).any():
                 raise UsageError(
-                    f"{name} was zero in every row that the model was trained on, got {largest[row]:g} in plan {row}:"
-                    " train on such rows, or use a model that was"
+                    f"was zero in every row that the model was trained on, got {largest[row]:g} in plan {row}:"
+                    " train on such rows, or use a model that was",
+                    argument=name,
                 )
             zeroed[name] = np.zeros_like(values)
         return replace(boundary, **zeroed) if zeroed else boundary
@@ -198,5 +209,5 @@ class Planner:
         if boundary.fixed_at_goal == self.model.fixed_at_goal:
             return boundary
         if boundary.goal_ddq is not None:
-            raise UsageError("the model leaves goal accelerations free, so goal_ddq must be None")
+            raise UsageError("the model leaves goal accelerations free, so goal_ddq must be None", concerns="goal_ddq")
         return replace(boundary, goal_ddq=np.zeros_like(boundary.goal_q))

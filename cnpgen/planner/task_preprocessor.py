@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
-from cnpgen.planner.control_point_functions import line_change, tips_at_ends, via_line_change
+from cnpgen.planner.control_point_functions import line_change, tips_at_ends
 from cnpgen.planner.control_points import along_line
 from cnpgen.planner.expressions import effective_steps
 from cnpgen.planner.tasks import Tasks, expected_time, reaching_time
-from cnpgen.problems.obstacles import obstacle_poses_of
+from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem import Problem
 from cnpgen.trajectory.boundary import Boundary
 
@@ -49,8 +49,7 @@ class TaskPreprocessor:
         tips: Kernel of ``control_point_functions.tips_at_ends``.
         line: Kernel of ``control_point_functions.line_change``; None if the line is not projected.
         reaching_time: Kernel of ``tasks.reaching_time``; None if the expected time is that of the distance.
-        via_line: Kernel of ``control_point_functions.via_line_change``; None if there are no via points, or no
-            projection.
+        via_line: The same kernel with offsets; None if there are no via points, or no projection.
     """
 
     problem: Problem
@@ -71,24 +70,21 @@ class TaskPreprocessor:
         """
         ends = ends_of(boundary) if ends is None else ends
         start_xyz, goal_xyz = (tip.T for tip in self.tips(ends))
+        scene = scene_of(self.problem, start_xyz, goal_xyz)
         reaching = self.reaching_time
         time = expected_time(boundary, self.velocity_limit) if reaching is None else reaching(ends)[0][0]
         correction = None if via_point is None else self._via_offsets(boundary, via_point)
         kernel, offsets = (self.line, []) if correction is None else (self.via_line, [lanes(correction)])
         if kernel is not None:
-            (change,) = kernel(ends, *offsets, 1 / time[None], lanes(self.obstacle_poses(start_xyz, goal_xyz)))
+            (change,) = kernel(ends, *offsets, 1 / time[None], scene.lanes)
             correction = rows(change, boundary.start_q.shape[1])
-        return Tasks(boundary, start_xyz, goal_xyz, time, correction)
+        return Tasks(boundary, start_xyz, goal_xyz, time, scene, correction)
 
     def _via_offsets(self, boundary: Boundary, via_point: Array) -> Array:
         """Return offsets of lines through via points from straight ones at interior points [rad], shape (N, m, n)."""
         along = along_line(self.problem.trajectory.path_control_points - 3 - boundary.fixed_at_goal)
         offset = via_point - (boundary.start_q + boundary.goal_q) / 2
         return np.asarray((1 - np.abs(2 * along - 1)) * offset[:, None])
-
-    def obstacle_poses(self, start_xyz: Array, goal_xyz: Array) -> Array:
-        """Return poses and sizes of the obstacles (``obstacle_poses_of``), shape (N, width)."""
-        return obstacle_poses_of(self.problem, start_xyz, goal_xyz)
 
 
 def make_task_preprocessor(
@@ -116,8 +112,8 @@ def make_task_preprocessor(
     """
     steps = effective_steps(kernels, line_projection_steps)
     load = partial(kernels.load, steps=steps, fixed_at_goal=fixed_at_goal, within_limits=within_limits)
-    line = load(line_change) if steps else None
+    line = load(line_change, with_offsets=False) if steps else None
     tips = kernels.load(tips_at_ends, fixed_at_goal=fixed_at_goal)
     time = kernels.load(reaching_time, fixed_at_goal=fixed_at_goal) if expected_time == "reach" else None
-    via_line = load(via_line_change) if steps and via_lines else None
+    via_line = load(line_change, with_offsets=True) if steps and via_lines else None
     return TaskPreprocessor(problem, robot.velocity_limit, tips, line, time, via_line)

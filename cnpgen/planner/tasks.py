@@ -1,5 +1,7 @@
 """Planning tasks: boundary conditions and the values computed from them before the network runs."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from functools import reduce
 from typing import TYPE_CHECKING, Any
@@ -7,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.robots.scene import Scene
 from cnpgen.trajectory.boundary import Boundary
 
 if TYPE_CHECKING:
@@ -28,6 +31,7 @@ class Tasks:
         start_xyz: Tip positions at the start, world frame [m], shape (N, 3).
         goal_xyz: Tip positions at the goal, world frame [m], shape (N, 3).
         expected_time: Unit of durations [s], shape (N,): network outputs are rates times this.
+        scene: Obstacles of the tasks.
         correction: Offsets of the projected line from the straight one [rad], shape (N, m, n); None if it is straight.
     """
 
@@ -35,6 +39,7 @@ class Tasks:
     start_xyz: Array
     goal_xyz: Array
     expected_time: Array
+    scene: Scene
     correction: Array | None = None
 
     def __repr__(self) -> str:
@@ -43,17 +48,18 @@ class Tasks:
     def __len__(self) -> int:
         return len(self.expected_time)
 
-    def take(self, rows: slice | NDArray[Any]) -> "Tasks":
+    def take(self, rows: slice | NDArray[Any]) -> Tasks:
         """Return a subset of the tasks."""
         return Tasks(
             self.boundary[rows],
             self.start_xyz[rows],
             self.goal_xyz[rows],
             self.expected_time[rows],
+            self.scene[rows],
             None if self.correction is None else self.correction[rows],
         )
 
-    def astype(self, dtype: str) -> "Tasks":
+    def astype(self, dtype: str) -> Tasks:
         """Return the tasks in another float type."""
         parts = {name: None if part is None else np.asarray(part, dtype) for name, part in vars(self.boundary).items()}
         return Tasks(
@@ -61,6 +67,7 @@ class Tasks:
             self.start_xyz.astype(dtype),
             self.goal_xyz.astype(dtype),
             self.expected_time.astype(dtype),
+            self.scene.astype(dtype),
             None if self.correction is None else self.correction.astype(dtype),
         )
 
@@ -80,7 +87,7 @@ def expected_time(boundary: Boundary, velocity_limit: Array) -> Array:
     return time
 
 
-def reaching_time(robot: "Robot", *, fixed_at_goal: int) -> Any:
+def reaching_time(robot: Robot, *, fixed_at_goal: int) -> Any:
     """Build ``ends -> time``: the minimum time in which every joint alone could reach its goal state [s].
 
     Each joint accelerates at its limit in either direction, and cruises at its velocity limit if it would exceed it.

@@ -1,12 +1,5 @@
-/* Fit rates to limits, as in time_parametrization.py; vectors.h precedes this file. All bounded values are
+/* Fit rates to limits, as in time_parametrization.py; arrays.h precedes this file. All bounded values are
 g = constant + square r^2 + mixed r r', with coefficients of every row at every phase. */
-
-#define EACH(i, from, to) for (long i = (from); i < (to); i++)
-
-I v at(const double *p) { return *(const vu *)p; }
-I void put(double *p, v x) { *(vu *)p = x; }
-
-typedef void kernel(long n, const double *const *in, const long *distances, double *const *out);
 
 typedef struct {
   long joints, pose_width, path_points, points; /* numbers; control points of p and of r */
@@ -102,15 +95,14 @@ static double advance(const parametrization *p, const workspace *m, long from, l
   return back > p->max_decrease ? back : p->max_decrease;
 }
 
-static void add(double *out, double x, const double *b, long from, long to) {
-  for (long k = from; k < to; k += W) put(out + k, at(out + k) + x * at(b + k));
-}
-
 /* out = c[first] basis[first] + ...; `stride` is the distance between control points. */
 static void combine(const double *basis, const long *span, long phases, const double *c, long stride, long first, long last,
                     double *out) {
   EACH(k, 0, phases) out[k] = 0;
-  EACH(j, first, last) add(out, c[j * stride], basis + j * phases, span[2 * j], span[2 * j + 1]);
+  EACH(j, first, last) {
+    long from = span[2 * j], to = span[2 * j + 1];
+    add(out + from, c[j * stride], basis + j * phases + from, to - from);
+  }
 }
 
 static void combine_rates(const parametrization *p, const double *c, long first, long last, double *r, double *r1) {
@@ -152,7 +144,7 @@ static void parametrize_motion(const parametrization *p, double *c, const worksp
     for (long k = from; k < to; k += W) put(b + k, c[j] * at(basis + k)), put(b1 + k, c[j] * at(derivative + k));
     double x = advance(p, m, from, to);
     if (x > 0) x *= p->step_fractions[move];
-    add(r, x, b, from, to), add(r1, x, b1, from, to);
+    add(r + from, x, b + from, to - from), add(r1 + from, x, b1 + from, to - from);
     c[j] += x * c[j];
   }
   combine_rates(p, c, p->first, p->last, b, b1);

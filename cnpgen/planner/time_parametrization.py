@@ -23,7 +23,7 @@ from cnpgen.kernels.compiled_kernel import address_of, aligned_array
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.planner.expressions import coefficient_bounds, speed_bounds, speed_coefficients
-from cnpgen.planner.phase_grid import MOTIONS_PER_BLOCK, PhaseGrid, make_phase_grid
+from cnpgen.planner.phase_grid import PhaseGrid, blocks_of_motions, make_phase_grid
 from cnpgen.problems.problem import Problem
 from cnpgen.trajectory.spline_motion import Motion
 
@@ -88,9 +88,7 @@ class TimeParametrization(PhaseGrid):
         if self.library is not None:
             self._parametrize_compiled(motion.path, obstacle_poses, rate)
         else:
-            for block in (
-                slice(first, first + MOTIONS_PER_BLOCK) for first in range(0, len(motion), MOTIONS_PER_BLOCK)
-            ):
+            for block in blocks_of_motions(len(motion)):
                 rate[block] = self._parametrize_interpreted(motion[block], obstacle_poses[block])
         return Motion(motion.path, rate, motion.degree)
 

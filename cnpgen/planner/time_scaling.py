@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.planner.expressions import SpeedBounds, speed_bounds, speed_residuals
-from cnpgen.planner.phase_grid import MOTIONS_PER_BLOCK, PhaseGrid, make_phase_grid
+from cnpgen.planner.phase_grid import PhaseGrid, blocks_of_motions, make_phase_grid
 from cnpgen.problems.problem import Problem
-from cnpgen.trajectory.spline_motion import Motion
+from cnpgen.trajectory.spline_motion import Motion, time_derivatives
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
@@ -54,7 +54,7 @@ class TimeScaling(PhaseGrid):
             Shape (N,).
         """
         factor, phases = np.ones(len(motion)), self.path.shape[1]
-        for block in (slice(first, first + MOTIONS_PER_BLOCK) for first in range(0, len(motion), MOTIONS_PER_BLOCK)):
+        for block in blocks_of_motions(len(motion)):
             column = self.column(motion[block], obstacle_poses[block])
             (violation,) = self.violation(column)
             violating = np.flatnonzero(violation[0] > 0)  # empty for most motions
@@ -68,8 +68,7 @@ class TimeScaling(PhaseGrid):
         n, orders = self.residuals.tape.inputs[0], len(self.path)
         p, p1, p2, *third = column[: orders * n].reshape(orders, n, -1)
         (r, r1, *second), obstacle_poses = column[orders * n :][: orders - 1], column[orders * n + orders - 1 :]
-        moving = [p1 * r, (p2 * r + p1 * r1) * r]
-        moving += [((third[0] * r + 3 * p2 * r1) * r + p1 * (second[0] * r + r1**2)) * r] if third else []
+        _, *moving = time_derivatives([p, p1, p2, *third], [r, r1, *second])
         fast, slow, static = (
             self.residuals(p, *(term / k**order for order, term in enumerate(moving, 1)), obstacle_poses)[0]
             for k in (1.0, 2.0, np.inf)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.planner.expressions import static_violation
-from cnpgen.planner.phase_grid import MOTIONS_PER_BLOCK
+from cnpgen.planner.phase_grid import blocks_of_motions
 from cnpgen.problems.problem import Problem
 from cnpgen.trajectory.spline import basis, chebyshev
 from cnpgen.trajectory.spline_motion import Motion
@@ -43,7 +43,7 @@ class ViaPoints:
             Shape (N,); at most 1 if all conditions hold at the phases, inf if a position is not finite.
         """
         violation, phases = np.empty(len(motion)), len(self.path)
-        for block in (slice(first, first + MOTIONS_PER_BLOCK) for first in range(0, len(motion), MOTIONS_PER_BLOCK)):
+        for block in blocks_of_motions(len(motion)):
             q = (self.path @ motion.path[block]).reshape(-1, motion.path.shape[2])
             (worst,) = self.static_violation(
                 np.ascontiguousarray(q.T), np.repeat(obstacle_poses[block].T, phases, axis=1)

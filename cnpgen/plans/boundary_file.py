@@ -14,7 +14,10 @@ from cnpgen.plans.format import FORMAT as PLANS
 from cnpgen.plans.format import PLAN_FILE_VERSION as PLANS_VERSION
 from cnpgen.plans.plan_file import stored_problem
 from cnpgen.problems.problem_record import ProblemRecord, as_record
-from cnpgen.store.dataset_spec import DatasetSpec, load_dataset_spec
+from cnpgen.robots.plausible_values import UnitError, check_plausible
+from cnpgen.robots.robot import Robot
+from cnpgen.store.checked_shard import read_rows, recorded_shard
+from cnpgen.store.dataset_spec import DatasetSpec, load_dataset_spec, shards
 from cnpgen.store.files.checksum_file import verify_checksum
 from cnpgen.store.files.hdf5 import opened_hdf5
 from cnpgen.store.paths import file_kind, require_file
@@ -24,7 +27,9 @@ from cnpgen.trajectory.boundary_arguments import boundary_of
 
 CONTEXT = ("hit_angle", "hit_speed")  # dataset columns that plans keep
 ASKED = (*CONDITIONS, "sample_id", *CONTEXT)
-SAID = (*ATTRIBUTES, "specification_fingerprint", "recipe_sha256")  # attributes, the last two of shards
+_OF_SHARDS = ("specification_fingerprint", "recipe_sha256", "first_sample_id", "rows")
+UNIT_SUFFIXES = {"q": "", "dq": "/s", "ddq": "/s^2"}
+SAID = (*ATTRIBUTES, *_OF_SHARDS)  # attributes
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +69,18 @@ class BoundaryFile:
         mine = self.text("specification_fingerprint")
         return spec if any(each.fingerprint == mine for each in spec.spec_versions) else None
 
+    def check_shard(self) -> None:
+        """Compare a shard in its dataset with the specification; see ``read_rows``.
+
+        Raises:
+            DatasetError: They differ, or a value is not finite.
+        """
+        if spec := self.spec():
+            folder, name = self.path.absolute().parents[1], "/".join(self.path.absolute().parts[-2:])
+            for task in shards(spec):
+                if task.file == name:
+                    read_rows(recorded_shard(folder, spec, task, size=0, sha256=""))
+
     def problem(self) -> ProblemRecord | None:
         """Return the problem named by the file or by the dataset that contains it; None if neither names one.
 
@@ -73,24 +90,41 @@ class BoundaryFile:
         spec = self.spec()
         return stored_problem(self.path, self.attributes) if spec is None else as_record(spec.problem)
 
-    def boundary(self, n: int) -> Boundary:
-        """Return the boundary conditions of motions of n joints, shape (N, n) each.
+    def boundary(self, robot: Robot, *, allow_large_angles: bool = False) -> Boundary:
+        """Return the boundary conditions of motions of a robot, shape (N, n) each.
+
+        Args:
+            robot: Robot of the problem.
+            allow_large_angles: Whether to accept values that are probably in another unit than rad or m.
 
         Raises:
             DatasetError: A shape is wrong, or a value is not finite.
+            UnitError: A value is so far outside of its range that it is probably in degrees or millimetres.
         """
-        return boundary_in(str(self.path), self.columns, n)
+        boundary = boundary_in(str(self.path), self.columns, robot.n)
+        if not allow_large_angles:
+            check_units(str(self.path), robot, boundary)
+        return boundary
 
     def sample_id(self, rows: int) -> NDArray[np.int64]:
         """Return the sample IDs of the N boundary problems, shape (N,); 0, 1, ... by default.
 
         Raises:
-            DatasetError: The sample IDs are not N integers.
+            DatasetError: The sample IDs are not N integers, or not the indices of the rows of a shard.
         """
         ids = self.columns.get("sample_id", np.arange(rows))
         if ids.shape != (rows,) or ids.dtype.kind not in "iu":
             raise DatasetError(f"{self.path}: sample_id must hold {rows} integers, got {ids.dtype} of {ids.shape}")
+        if self.is_shard and not self._has_indices(ids):
+            raise DatasetError(f"{self.path}: sample_id is not the index of the row in the split")
         return ids.astype(np.int64)
+
+    def _has_indices(self, ids: NDArray[Any]) -> bool:
+        """Return whether sample IDs are the indices of all rows of a shard, by its attributes."""
+        first, rows = (self.attributes.get(name) for name in ("first_sample_id", "rows"))
+        if not isinstance(first, int | np.integer) or not isinstance(rows, int | np.integer):
+            return False
+        return len(ids) == rows and ("sample_id" not in self.columns or np.array_equal(ids, first + np.arange(rows)))
 
 
 def read_boundary_file(path: Path) -> BoundaryFile:
@@ -114,6 +148,7 @@ def read_boundary_file(path: Path) -> BoundaryFile:
         columns = {name: file[name].read() for name in ASKED if name in file}
         names = file.names()
     found = BoundaryFile(path, attributes, columns, has_checksum)
+    found.check_shard()
     if not has_checksum and not found.is_shard:  # files of cnpgen are complete
         refuse_misspelt(path, names, ASKED)
     missing = [name for name in ("start_q", "goal_q") if name not in columns]
@@ -122,6 +157,26 @@ def read_boundary_file(path: Path) -> BoundaryFile:
         hint = "; of tasks in the workspace 'cnpgen complete' makes them" if tasks else ""
         raise DatasetError(f"{path} lacks {' and '.join(missing)}: boundary conditions are needed to plan{hint}")
     return found
+
+
+def check_units(where: str, robot: Robot, boundary: Boundary) -> None:
+    """Check that boundary conditions are not in degrees or millimetres.
+
+    Args:
+        where: Source of the boundary conditions, for messages.
+        robot: Robot of the problem.
+        boundary: The boundary conditions.
+
+    Raises:
+        UnitError: A value is so far outside of its range that it is probably in another unit.
+    """
+    columns = boundary.conditions()
+    units = {name: robot.units(f"rad{UNIT_SUFFIXES[name.rpartition('_')[2]]}") for name in columns}
+    try:
+        check_plausible(robot, columns, units, noun="plan")
+    except UnitError as error:
+        text = f"{where}: {error} {{allow_large_angles}} accepts such values."
+        raise UnitError(text, remedies={"allow_large_angles": True}) from error
 
 
 def boundary_in(where: str, columns: Mapping[str, NDArray[Any]], n: int) -> Boundary:

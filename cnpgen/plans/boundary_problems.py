@@ -1,5 +1,7 @@
 """Boundary problems of a dataset or file, as plans without motions; rows of a certified dataset have motions."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +14,8 @@ from cnpgen.plans.boundary_file import CONTEXT, read_boundary_file
 from cnpgen.plans.plan_file import agreed_problem
 from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.problem_record import ProblemRecord, as_record
+from cnpgen.problems.problem_record import ProblemRecord, as_record, open_problem
+from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.store.paths import require_folder
@@ -25,6 +28,7 @@ if TYPE_CHECKING:
     from cnpgen.store.dataset_spec import DatasetSpec
 
 
+@checked_arguments
 def load_boundary_problems(
     path: str | Path,
     *,
@@ -32,6 +36,7 @@ def load_boundary_problems(
     start: int | None = None,
     n: int | None = None,
     problem: Problem | StoredProblem | str | Path | None = None,
+    allow_large_angles: bool = False,
 ) -> Plans:
     """Read boundary problems as plans without motions for ``solve_plans``: their control points are nan.
 
@@ -45,21 +50,28 @@ def load_boundary_problems(
         split: Split of the dataset; "train" by default.
         start: First row of the split; 0 by default.
         n: Number of rows; by default all that follow.
+        allow_large_angles: Whether to accept boundary conditions in a file that are probably in degrees or millimetres.
         problem: Required problem of a file: name, path, problem or record. Its tolerances replace those in the file.
 
     Raises:
         DatasetError: The dataset or the file cannot be read, is incomplete or is of another problem.
         UsageError: The folder, file, split or rows do not exist, or rows of a file are requested.
+        UnitError: Boundary conditions of a file are probably in degrees or millimetres.
         RecipeError: ``problem`` has mistakes.
     """
     path = Path(path)
     if path.is_file() or (path.suffix == ".h5" and not path.is_dir()):
         if (split, start, n) != (None, None, None):
-            raise UsageError(f"split, start and n choose rows of the folder of a dataset, {path} is a file")
-        return _of_file(path, None if problem is None else as_record(problem))
-    require_folder(path)
+            raise UsageError(
+                f"split, start and n choose rows of the folder of a dataset, {path} is a file", concerns="split"
+            )
+        return _of_file(path, None if problem is None else as_record(problem), allow_large_angles=allow_large_angles)
+    require_folder(path, argument="path")
     if problem is not None:
-        raise UsageError(f"problem says which problem a file is of: {path} is the folder of a dataset, which says it")
+        raise UsageError(
+            f"problem says which problem a file is of: {path} is the folder of a dataset, which says it",
+            concerns="problem",
+        )
     return _of_folder(path, split or "train", 0 if start is None else start, n)
 
 
@@ -72,7 +84,7 @@ def _of_folder(folder: Path, split: str, start: int, n: int | None) -> Plans:
     return plans_of_rows(as_record(dataset.spec.problem), columns, source=source)
 
 
-def chosen_rows(folder: Path, spec: "DatasetSpec", *, split: str, start: int, n: int | None) -> range:
+def chosen_rows(folder: Path, spec: DatasetSpec, *, split: str, start: int, n: int | None) -> range:
     """Return the range of rows of a split.
 
     Args:
@@ -87,22 +99,22 @@ def chosen_rows(folder: Path, spec: "DatasetSpec", *, split: str, start: int, n:
     """
     start = integer("start", start, least=0)
     if split not in spec.splits:
-        raise UsageError(f"{folder} {lacks('split', split, spec.splits)}")
+        raise UsageError(f"{folder} {lacks('split', split, spec.splits)}", concerns="split")
     rows = spec.splits[split]
     stop = rows if n is None else start + integer("n", n, least=1)
     if not start < stop <= rows:
         wanted = f"{max(stop - start, 1)} from row {start} on"
-        raise UsageError(f"split {split!r} of {folder} has {rows} rows, got {wanted}")
+        raise UsageError(f"split {split!r} of {folder} has {rows} rows, got {wanted}", concerns="n")
     return range(start, stop)
 
 
-def _of_file(path: Path, wanted: ProblemRecord | None) -> Plans:
+def _of_file(path: Path, wanted: ProblemRecord | None, *, allow_large_angles: bool) -> Plans:
     """Return the boundary problems of a file."""
     file = read_boundary_file(path)
     problem = agreed_problem(path, file.problem(), wanted, content="boundary problems", command="solve")
     if (said := file.text("problem_sha256")) and said != problem.comparable_sha256:
         raise DatasetError(f"{path} is of another problem than {problem.name!r}: its problem_sha256 is not this one's")
-    boundary = file.boundary(len(problem.joint_names))
+    boundary = file.boundary(open_problem(problem)[1], allow_large_angles=allow_large_angles)
     conditions = {name: values for name, values in vars(boundary).items() if values is not None}
     columns = {**file.columns, **conditions, "sample_id": file.sample_id(len(boundary))}
     try:
@@ -112,7 +124,7 @@ def _of_file(path: Path, wanted: ProblemRecord | None) -> Plans:
     return replace(plans, has_checksum=file.has_checksum)
 
 
-def plans_of_rows(problem: ProblemRecord, columns: "Mapping[str, NDArray[Any]]", *, source: str = "") -> Plans:
+def plans_of_rows(problem: ProblemRecord, columns: Mapping[str, NDArray[Any]], *, source: str = "") -> Plans:
     """Return rows of a dataset as plans, with the plans of a certified dataset or control points of nan.
 
     Args:

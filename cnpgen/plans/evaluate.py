@@ -1,5 +1,7 @@
 """Evaluation of sets of plans by the independent verdict, in several processes."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import dataclass
@@ -14,10 +16,11 @@ from cnpgen.errors import counted
 from cnpgen.judges.plans import Reason, Verdict, judge, summarize_verdicts
 from cnpgen.judges.plans.judge import check_step
 from cnpgen.machine.workers import distribute, worker_count
-from cnpgen.plans.plans import Plans, check_plans_type
+from cnpgen.plans.plans import Plans
 from cnpgen.plans.status import PlanStatus
 from cnpgen.plans.tips import correct_tips
 from cnpgen.problems.problem_record import open_problem
+from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import number
 
 FORMAT = "cnpgen-evaluation"
@@ -80,6 +83,7 @@ class Evaluation:
             yield {"plan": index, "sample_id": sample, **verdict.to_dict()}
 
 
+@checked_arguments
 def evaluate_plans(
     plans: Plans,
     *,
@@ -104,7 +108,6 @@ def evaluate_plans(
         RecipeError: A required plug-in is not installed.
         MachineError: A worker died.
     """
-    check_plans_type(plans)
     check_step(step := number("step", step))
     plans = correct_tips(plans)
     parts = [plans[first : first + PLANS_PER_VERDICT_TASK] for first in range(0, len(plans), PLANS_PER_VERDICT_TASK)]
@@ -120,5 +123,4 @@ def evaluate_plans(
 
 def _judge(plans: Plans, *, step: float) -> list[Verdict]:
     problem, robot = open_problem(plans.problem)
-    ends = (plans.columns["start_xyz"], plans.columns["goal_xyz"])
-    return judge(problem, robot, plans.motion, plans.boundary, *ends, step=step)
+    return judge(problem, robot, plans.motion, plans.boundary, plans.scene, plans.columns["goal_xyz"], step=step)

@@ -1,8 +1,10 @@
 """Export of plans: selection, sampling in time, and writing in a registered format."""
 
+from __future__ import annotations
+
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +12,11 @@ import numpy as np
 from cnpgen.errors import DatasetError, RecipeError, UsageError
 from cnpgen.plans.exporter import ExportedSet, Exporter, SampledPlan, sample_plan
 from cnpgen.plans.join import JoinedPlans
-from cnpgen.plans.plans import Plans, check_plans_type, screen
+from cnpgen.plans.plans import Plans, screen
 from cnpgen.plans.status import PlanStatus
 from cnpgen.schema import registry
+from cnpgen.schema.argument_types import checked_arguments
+from cnpgen.schema.arguments import integer
 from cnpgen.store.files.atomic import write_file
 
 MAX_SAMPLES = 1_000_000  # per plan
@@ -43,15 +47,18 @@ def load_exporter(name: str) -> Exporter:
     """Load an export format by its registered name.
 
     Raises:
-        UsageError: The format is unknown, defined twice, or cannot be imported.
+        UsageError: The format is unknown, defined twice, cannot be imported, or has no suffix.
     """
     try:
         kind: type[Exporter] = registry.load(registry.EXPORTERS, name)
     except RecipeError as error:
-        raise UsageError(f"{error}") from error
+        raise UsageError(f"{error}", concerns="to") from error
+    if fields(kind) or not getattr(kind, "suffix", ""):
+        raise UsageError(f"exporter {name!r}: {kind.__name__} must have a suffix and no fields", concerns="to")
     return kind()
 
 
+@checked_arguments
 def export_plans(
     plans: Plans | JoinedPlans, out: str | Path, *, to: str, rate: float = 1000.0, only: Sequence[int] | None = None
 ) -> Exported:
@@ -75,11 +82,9 @@ def export_plans(
         DatasetError: No plan can be exported.
         MachineError: The disk is full or read-only, or a file operation failed.
     """
-    if not isinstance(plans, JoinedPlans):
-        check_plans_type(plans)
     exporter = load_exporter(to)
     if not 0 < rate <= MAX_RATE_HZ:
-        raise UsageError(f"the rate must be above 0 and at most {MAX_RATE_HZ:g} Hz, got {rate}")
+        raise UsageError(f"the rate must be above 0 and at most {MAX_RATE_HZ:g} Hz, got {rate}", concerns="rate")
     chosen = _chosen(plans, only)
     out, refused = Path(out), _refused(plans, rate, chosen)
     kept = [index for index in chosen if index not in refused]
@@ -87,7 +92,7 @@ def export_plans(
         reasons = "; ".join(list(refused.values())[:3])
         raise DatasetError(f"none of the {len(chosen)} plans can be exported{': ' if reasons else ''}{reasons}")
     if not exporter.single_file and out.exists() and not out.is_dir():
-        raise UsageError(f"{out} is a file, but {to!r} makes one file per plan: give a folder")
+        raise UsageError(f"{out} is a file, but {to!r} makes one file per plan: give a folder", concerns="out")
     problem, sampled = plans.problem, _sampled(plans, rate, kept)
     exported = ExportedSet(
         np.array(kept), plans.sample_id[kept], problem.joint_names, problem.sliding_joints, problem.held_joints
@@ -107,10 +112,10 @@ def export_plans(
 
 def _chosen(plans: Plans | JoinedPlans, only: Sequence[int] | None) -> list[int]:
     """Return the indices of the requested plans, ascending."""
-    chosen = sorted(set(range(len(plans)) if only is None else only))
+    chosen = sorted(set(range(len(plans)) if only is None else (integer("only", index) for index in only)))
     for index in chosen:
         if not 0 <= index < len(plans):
-            raise UsageError(f"there is no plan {index}: {len(plans)} plans are numbered from 0")
+            raise UsageError(f"there is no plan {index}: {len(plans)} plans are numbered from 0", concerns="only")
     return chosen
 
 

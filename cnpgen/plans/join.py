@@ -1,5 +1,7 @@
 """Joined plans: sequences in which a plan is cut at a time and continued by another plan."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -7,9 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
-from cnpgen.plans.plans import Plans, check_made, check_plans_type
+from cnpgen.plans.plans import Plans, check_made
 from cnpgen.plans.status import PlanStatus
 from cnpgen.problems.problem_record import ProblemRecord
+from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import numbers
 from cnpgen.trajectory.joined import JoinedMotion
 
@@ -62,6 +65,7 @@ class JoinedPlans:
         return self.motion.duration()
 
 
+@checked_arguments
 def join_plans(first: Plans | JoinedPlans, following: Plans, *, at: ArrayLike | None = None) -> JoinedPlans:
     """Cut each of N plans at a time and join it with the plan that follows it.
 
@@ -79,12 +83,15 @@ def join_plans(first: Plans | JoinedPlans, following: Plans, *, at: ArrayLike | 
             motion, or there is a discontinuity.
     """
     joined = first if isinstance(first, JoinedPlans) else _alone(first)
-    check_plans_type(following)
     if len(following) != len(joined):
-        raise UsageError(f"{len(joined)} plans are followed by {len(following)}, expected one for each")
+        raise UsageError(
+            f"{len(joined)} plans are followed by {len(following)}, expected one for each", concerns="following"
+        )
     if following.problem.comparable_sha256 != joined.problem.comparable_sha256:
         differs = ", ".join(following.problem.differences(joined.problem)[:4])
-        raise UsageError(f"plans of {joined.problem.name!r} and {following.problem.name!r} differ in {differs}")
+        raise UsageError(
+            f"plans of {joined.problem.name!r} and {following.problem.name!r} differ in {differs}", concerns="following"
+        )
     check_made(following)
     try:
         begins = joined.duration if at is None else np.broadcast_to(numbers("at", at), (len(joined),))
@@ -98,6 +105,5 @@ def join_plans(first: Plans | JoinedPlans, following: Plans, *, at: ArrayLike | 
 
 
 def _alone(plans: Plans) -> JoinedPlans:
-    check_plans_type(plans)
     check_made(plans)
     return JoinedPlans((plans,), np.zeros((1, len(plans))))

@@ -1,5 +1,8 @@
 """Reader of plan files: names, shapes and types are checked, values are not."""
 
+from __future__ import annotations
+
+import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -27,6 +30,7 @@ from cnpgen.plans.tips import correct_tips
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.problems.problem_record import ProblemRecord, as_record, record_problem
+from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.store.files.checksum_file import verify_checksum
 from cnpgen.store.files.hdf5 import Column, Hdf5, opened_hdf5
@@ -36,6 +40,7 @@ from cnpgen.trajectory.boundary import Boundary
 Array = NDArray[np.float64]
 
 
+@checked_arguments
 def load_plans(path: str | Path, *, problem: Problem | StoredProblem | str | Path | None = None) -> Plans:
     """Read plans from a file of cnpgen or of other software.
 
@@ -163,13 +168,19 @@ def stored_problem(path: Path, attributes: Mapping[str, Any]) -> ProblemRecord |
         attributes: Attributes of the file: ``problem``, ``problem_recipe``, ``problem_urdf`` and ``problem_sha256``.
 
     Raises:
-        DatasetError: The named problem is damaged or cannot be found.
+        DatasetError: The named problem is damaged, cannot be found or is in another folder than the file.
     """
     if "problem_recipe" in attributes:
         return _stored_record(path, attributes)
     if "problem" not in attributes:
         return None
     name = _text(path, attributes, "problem")
+    if not _is_beside(path, name):
+        raise DatasetError(
+            f"{path}: the attribute 'problem' names {name!r:.200}, which is not in the folder of the file or below: pass"
+            " {problem} to use this file",
+            remedies={"problem": None},
+        )
     try:
         record = record_problem(load_problem(name, relative_to=path.parent))
     except RecipeError as error:
@@ -178,6 +189,16 @@ def stored_problem(path: Path, attributes: Mapping[str, Any]) -> ProblemRecord |
         ours = record.comparable_sha256
         raise DatasetError(f"{path} is of another {name!r}: its problem_sha256 is not this one's, {ours}")
     return record
+
+
+def _is_beside(path: Path, problem: str) -> bool:
+    """Return whether a problem is a name, or a path in the folder of the file that names it, links resolved."""
+    try:
+        folder, file = os.path.realpath(path.parent), os.path.realpath(path.parent / problem)
+    except ValueError:  # a zero byte
+        return False
+    is_name = not {"/", os.sep} & set(problem) and not os.path.isfile(file)  # noqa: PTH113 - as in find_file
+    return is_name or Path(file).is_relative_to(folder)
 
 
 def _stored_record(path: Path, attributes: Mapping[str, Any]) -> ProblemRecord:

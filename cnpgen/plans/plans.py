@@ -1,5 +1,7 @@
 """Plans: N motions, each for its own boundary conditions, all of one problem."""
 
+from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,9 +16,12 @@ from cnpgen.errors import UsageError, counted
 from cnpgen.plans.format import FLOATS, INTEGERS, NOTES
 from cnpgen.plans.plausible import warn_of_far_joints
 from cnpgen.plans.status import PlanStatus
+from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import ProblemRecord, as_record, open_problem
-from cnpgen.schema.arguments import integer, numbers
+from cnpgen.robots.scene import Scene
+from cnpgen.schema.argument_types import check_fields, checked_arguments
+from cnpgen.schema.arguments import integer, numbers, reject_masked
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.spline_motion import Motion, states_at_times
@@ -66,8 +71,24 @@ class Plans:
 
     def __post_init__(self) -> None:
         integer("degree", self.degree, least=3, most=MAX_DEGREE)
-        if next(_mistakes(self), None):
-            raise UsageError(next(_mistakes(self, _rows(self))))
+        try:
+            wrong = next(_mistakes(self), None)
+        except (AttributeError, TypeError, IndexError):
+            check_fields(self)
+            check_fields(self.boundary)
+            raise
+        if wrong is not None:
+            check_fields(self)
+            text = next(_mistakes(self, _rows(self)))
+            raise UsageError(text, concerns=self._argument_of(text))
+
+    def _argument_of(self, message: str) -> str:
+        """Return the name of the argument that a message of ``_mistakes`` begins with, or that holds the array."""
+        name = message.split(maxsplit=1)[0]
+        if name in vars(self.boundary):
+            return "boundary"
+        holder = "columns" if name in self.columns or message.startswith("a column") else "path_control_points"
+        return name if name in vars(self) else holder
 
     def __len__(self) -> int:
         return len(self.path_control_points)
@@ -82,6 +103,15 @@ class Plans:
     def motion(self) -> Motion:
         """The N motions."""
         return Motion(self.path_control_points, self.rate_control_points, self.degree)
+
+    @cached_property
+    def scene(self) -> Scene:
+        """Obstacles of the plans.
+
+        Raises:
+            RecipeError: The problem needs a plug-in that is not installed.
+        """
+        return scene_of(open_problem(self.problem)[0], self.columns["start_xyz"], self.columns["goal_xyz"])
 
     @cached_property
     def duration(self) -> Array:
@@ -111,11 +141,12 @@ class Plans:
             row = int(outside.argmax())
             check_made(self)
             raise UsageError(
-                f"plan {row} lasts from 0 to {self.duration[row]:.9g} s, it cannot be evaluated at {times[row]:.9g} s"
+                f"plan {row} lasts from 0 to {self.duration[row]:.9g} s, it cannot be evaluated at {times[row]:.9g} s",
+                concerns="time",
             )
         return states_at_times(self.motion, times)
 
-    def __getitem__(self, which: int | slice | Sequence[int] | NDArray[Any]) -> "Plans":
+    def __getitem__(self, which: int | slice | Sequence[int] | NDArray[Any]) -> Plans:
         """Return a selection of the plans, as Plans also for a single plan.
 
         Args:
@@ -135,7 +166,7 @@ class Plans:
             status=self.status[which],
         )
 
-    def __iter__(self) -> Iterator["Plans"]:
+    def __iter__(self) -> Iterator[Plans]:
         return (self[index] for index in range(len(self)))
 
 
@@ -143,6 +174,7 @@ class PlanIndexError(UsageError, IndexError):
     """Index of a plan that does not exist."""
 
 
+@checked_arguments
 def make_plans(
     problem: Problem | StoredProblem | str | Path,
     boundary: Boundary,
@@ -198,16 +230,6 @@ def make_plans(
     return replace(plans, columns={**plans.columns, **missing})
 
 
-def check_plans_type(plans: Any) -> None:
-    """Check that an argument is ``Plans``, and not a file name, for example.
-
-    Raises:
-        UsageError: The argument has another type.
-    """
-    if not isinstance(plans, Plans):
-        raise UsageError(f"expected Plans, as load_plans and make_plans return them, got {type(plans).__name__}")
-
-
 def check_made(plans: Plans) -> None:
     """Check that plans have motions.
 
@@ -216,7 +238,9 @@ def check_made(plans: Plans) -> None:
     """
     waiting = np.isnan(plans.path_control_points).all(axis=(1, 2))
     if waiting.any():
-        raise UsageError(f"plan {int(waiting.argmax())} has no control points yet: solve_plans(plans) makes them")
+        raise UsageError(
+            f"plan {int(waiting.argmax())} has no control points yet: solve_plans(plans) makes them", concerns="plans"
+        )
 
 
 def screen(plans: Plans) -> NDArray[np.uint8]:
@@ -235,13 +259,14 @@ def screen(plans: Plans) -> NDArray[np.uint8]:
 def _integers(name: str, values: ArrayLike, kind: type[np.integer[Any]]) -> NDArray[Any]:
     """Return values as an integer array of a type; raise an error for other values."""
     try:
+        reject_masked(name, values)
         found = np.asarray(values)
         whole = found.astype(kind)
     except (TypeError, ValueError, OverflowError) as error:
-        raise UsageError(f"{name} must be an array of integers: {error}") from error
+        raise UsageError(f"must be an array of integers: {error}", argument=name) from error
     low, high = np.iinfo(kind).min, np.iinfo(kind).max
     if found.size and not (found.dtype.kind in "iu" and low <= found.min() and found.max() <= high):
-        raise UsageError(f"{name} must hold integers from {low} to {high}, got {found.dtype} {found!s:.60}")
+        raise UsageError(f"must hold integers from {low} to {high}, got {found.dtype} {found!s:.60}", argument=name)
     return whole
 
 
@@ -249,17 +274,22 @@ def _checked(which: Any, plans: int) -> slice | NDArray[Any]:
     """Return a selection of plans as a slice or an index array of shape (k,)."""
     if isinstance(which, slice):
         return which
-    found = np.asarray(which)
+    try:
+        found = np.asarray(which)
+    except ValueError as error:
+        raise PlanIndexError(f"plans are selected by numbers or a mask: {error}", concerns="which") from error
     found = found.astype(np.int64) if found.size == 0 and found.dtype.kind == "f" else found  # an empty list
     if found.ndim > 1 or found.dtype.kind not in "biu" or (found.ndim == 0 and found.dtype.kind == "b"):
         got = f"{found.dtype} of shape {found.shape}"
-        raise PlanIndexError(f"plans are selected by a number, numbers, a mask or a slice, got {got}")
+        raise PlanIndexError(f"plans are selected by a number, numbers, a mask or a slice, got {got}", concerns="which")
     if found.dtype.kind == "b":
         if len(found) != plans:
-            raise PlanIndexError(f"a mask must have shape ({plans},) as there are {plans} plans, got {found.shape}")
+            raise PlanIndexError(
+                f"a mask must have shape ({plans},) as there are {plans} plans, got {found.shape}", concerns="which"
+            )
     elif found.size and not -plans <= int(found.min()) <= int(found.max()) < plans:
         wrong = int(found.max() if found.max() >= plans else found.min())
-        raise PlanIndexError(f"there is no plan {wrong}: {plans} plans are numbered from 0")
+        raise PlanIndexError(f"there is no plan {wrong}: {plans} plans are numbered from 0", concerns="which")
     return np.atleast_1d(found)
 
 
@@ -305,11 +335,15 @@ def _rows(plans: Plans) -> int:
     fields: list[NDArray[Any]] = [part for part in _parts(plans.boundary) if part is not None]
     fields += [plans.path_control_points, plans.rate_control_points, plans.sample_id, plans.status]
     fields += plans.columns.values()
-    return Counter(len(field) if field.ndim else 0 for field in fields).most_common(1)[0][0]
+    return Counter(len(field) if getattr(field, "ndim", 0) else 0 for field in fields).most_common(1)[0][0]
 
 
 def _column_mistakes(plans: Plans, rows: int) -> Iterator[str]:
     for name, values in plans.columns.items():
+        array: Any = values
+        if not isinstance(array, np.ndarray):
+            yield f"columns must hold arrays of NumPy, got {array!r:.60} at {name!r:.60}"
+            return
         if name in _NO_COLUMNS or "/" in name:
             yield f"a column cannot be called {name!r}"
         if values.ndim not in {1, 2} or len(values) != rows:

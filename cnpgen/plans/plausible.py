@@ -5,11 +5,9 @@ import warnings
 
 import numpy as np
 
+from cnpgen.robots.plausible_values import find_implausible_value
 from cnpgen.robots.robot import Robot
-from cnpgen.store.joint_units import unit_of
 from cnpgen.trajectory.boundary import Boundary
-
-MAX_RANGE_RATIO = 2.0  # distance from the center of a joint's range, in half ranges
 
 
 def warn_of_far_joints(robot: Robot, boundary: Boundary) -> None:
@@ -27,14 +25,14 @@ def warn_of_far_joints(robot: Robot, boundary: Boundary) -> None:
         q = np.asarray(getattr(boundary, name))
         if np.count_nonzero((low <= q) & (q <= high)) == q.size:
             continue
-        far = np.abs(q - (low + high) / 2) > MAX_RANGE_RATIO * (high - low) / 2
-        if far.any():
-            plan, joint = np.argwhere(far)[0]
-            unit = unit_of(robot.units("rad"), int(joint))
+        wrong = find_implausible_value(robot, name, q, robot.units("rad"))
+        if wrong is not None:
+            joint, unit = wrong.column, wrong.unit
             other = "millimetres" if unit == "m" else "degrees"
-            value, limits = f"{q[plan, joint]:.6g} {unit}", f"[{low[joint]:.3g}, {high[joint]:.3g}]"
+            value, limits = f"{wrong.value:.6g} {unit}", f"[{low[joint]:.3g}, {high[joint]:.3g}]"
+            label = robot.joint_names[joint]
             warnings.warn(
-                f"{name} of plan {plan}: {robot.joint_names[joint]} = {value} is far outside of its limits, {limits}:"
+                f"{name} of plan {wrong.row}: {label} = {value} is far outside of its limits, {limits}:"
                 f" joint positions must be in {unit}, are these {other}, or normalised?",
                 UserWarning,
                 stacklevel=_users_level(),

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.plans.format import FORMAT, NOTES, PLAN_FILE_VERSION, plan_fields
-from cnpgen.plans.plans import Plans, check_plans_type
+from cnpgen.plans.plans import Plans
 from cnpgen.plans.status import PlanStatus
+from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.store.files.atomic import write_file
 from cnpgen.store.files.checksum_file import HEADER_BYTES, with_checksum
 from cnpgen.store.files.hdf5 import create_hdf5
@@ -20,6 +21,7 @@ from cnpgen.store.paths import file_kind
 from cnpgen.store.shard import field_attributes
 
 
+@checked_arguments
 def save_plans(path: str | Path, plans: Plans) -> None:
     """Write plans to a file with a checksum, atomically; equal plans give equal bytes.
 
@@ -33,7 +35,6 @@ def save_plans(path: str | Path, plans: Plans) -> None:
     """
     import h5py
 
-    check_plans_type(plans)
     check_replaceable(Path(path))
     buffer = io.BytesIO()
     fields = plan_fields(plans.problem.joint_names, plans.problem.sliding_joints)
@@ -54,13 +55,13 @@ def check_replaceable(path: Path) -> None:
         UsageError: The path holds another file.
     """
     if path.is_dir():
-        raise UsageError(f"{path} is a folder, expected a file for plans")
+        raise UsageError(f"{path} is a folder, expected a file for plans", concerns="path")
     if not path.exists() or (path.is_file() and path.stat().st_size == 0):
         return
     kind = file_kind(path)
     if kind != PLANS:
         what = f"{kind}, not one of plans" if kind else "not a file of plans"
-        raise UsageError(f"{path} is {what}: it is not replaced; remove it, or choose another file")
+        raise UsageError(f"{path} is {what}: it is not replaced; remove it, or choose another file", concerns="path")
 
 
 def _datasets(plans: Plans) -> dict[str, NDArray[Any]]:

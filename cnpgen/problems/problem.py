@@ -19,6 +19,7 @@ from cnpgen.robots.shape.mesh_files import find_urdf
 from cnpgen.robots.shape.srdf import with_disabled_pairs
 from cnpgen.robots.urdf import read_urdf
 from cnpgen.schema import registry
+from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.keys import NAME, field, to_dict
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
@@ -61,6 +62,7 @@ class Problem:
     objective: Objective = field("objective of the optimization", default=Objective())
     path: Path = Path()
 
+    @checked_arguments
     def first(self, kind: type[Kind]) -> Kind | None:
         """Return the first constraint of a kind; None if there is none."""
         return next((each for each in self.constraint if isinstance(each, kind)), None)

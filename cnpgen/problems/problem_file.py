@@ -18,6 +18,7 @@ from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.inline import inline_mesh, is_inline, mesh_files
 from cnpgen.robots.shape.mesh_files import find_named_file
 from cnpgen.schema import registry
+from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.catalogue import load_recipe, read_kind, reference
 from cnpgen.schema.keys import RecipeLocation
 from cnpgen.schema.parsing import Reader, parse
@@ -25,6 +26,7 @@ from cnpgen.schema.toml import Kind, read_table
 from cnpgen.schema.units import show
 
 
+@checked_arguments
 def load_problem(name_or_path: str | Path, *, relative_to: Path | None = None) -> Problem:
     """Load a problem.
 

@@ -1,5 +1,7 @@
 """Problem records: problems as text, so that plan files are self-contained."""
 
+from __future__ import annotations
+
 import hashlib
 import json
 import tempfile
@@ -17,6 +19,8 @@ from cnpgen.errors import RecipeError, UsageError
 from cnpgen.problems.problem import FILES, Problem, resolved
 from cnpgen.problems.problem_file import load_problem_behind, restore_problem
 from cnpgen.robots.urdf import urdf_tree
+from cnpgen.schema.argument_types import checked_arguments
+from cnpgen.schema.arguments import numbers
 from cnpgen.schema.keys import RecipeLocation
 from cnpgen.schema.parsing import parse
 from cnpgen.store.dataset_spec import StoredProblem
@@ -109,7 +113,8 @@ class ProblemRecord(StoredProblem):
         """
         return canonical_sha256(_comparable(self))
 
-    def differences(self, other: "ProblemRecord") -> list[str]:
+    @checked_arguments
+    def differences(self, other: ProblemRecord) -> list[str]:
         """Return the keys in which two problems differ, such as ``"limits.velocity_scale"``."""
         return [each.key for each in differences(_comparable(self), _comparable(other))]
 
@@ -123,6 +128,7 @@ class ProblemRecord(StoredProblem):
         with tempfile.TemporaryDirectory(prefix="cnpgen-") as folder:
             yield restore_problem(self.content, self.urdf, Path(folder))
 
+    @checked_arguments
     def tip_positions(self, q: Array) -> Array:
         """Compute tip positions with Pinocchio.
 
@@ -135,7 +141,9 @@ class ProblemRecord(StoredProblem):
         import pinocchio as pin
 
         _, robot = open_problem(self)
-        model = robot.model
+        model, q = robot.model, numbers("q", q)
+        if q.ndim != 2 or q.shape[1] != model.nq:
+            raise UsageError(f"must have shape (N, {model.nq}), got {q.shape}", argument="q")
         data, frame = model.createData(), robot.tip_frame
         found = np.empty((len(q), 3))
         for row, configuration in enumerate(q):
@@ -193,7 +201,7 @@ def _rebuilt(record: ProblemRecord) -> Problem:
 
 
 @lru_cache(maxsize=8)
-def open_problem(record: ProblemRecord) -> "tuple[Problem, Robot]":
+def open_problem(record: ProblemRecord) -> tuple[Problem, Robot]:
     """Rebuild a problem and its robot, which both contain the URDF; the files are deleted afterwards.
 
     Raises:

@@ -1,5 +1,7 @@
 """Robot of a problem for planner authors: limits, batched kinematics, dynamics, collisions, constraint values."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +15,7 @@ from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import as_problem
 from cnpgen.robots.scene import Scene
 from cnpgen.robots.solid import place_obstacles, pose_width
+from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import numbers
 from cnpgen.store.dataset_spec import StoredProblem
 
@@ -94,6 +97,7 @@ class RobotModel:
         MachineError: The backend is not available.
     """
 
+    @checked_arguments
     def __init__(self, problem: Problem | StoredProblem | str | Path, *, backend: str | None = None) -> None:
         from cnpgen.kernels.library import choose_backend, problem_kernels
 
@@ -111,6 +115,7 @@ class RobotModel:
     def __repr__(self) -> str:
         return f"<RobotModel of {self.problem.name!r}: {len(self.joint_names)} joints, tip {self.tip!r}>"
 
+    @checked_arguments
     def forward_kinematics(self, q: ArrayLike) -> tuple[Array, Array]:
         """Compute the pose of the tip.
 
@@ -123,6 +128,7 @@ class RobotModel:
         position, rotation, _ = self._run("tip_pose", self._states("q", q))
         return position.T.copy(), rotation.T.reshape(-1, 3, 3)
 
+    @checked_arguments
     def jacobian(self, q: ArrayLike) -> Array:
         """Compute the geometric Jacobian of the tip in world axes, linear rows first.
 
@@ -135,6 +141,7 @@ class RobotModel:
         _, _, jacobian = self._run("tip_pose", self._states("q", q))
         return jacobian.T.reshape(-1, 6, len(self.joint_names))
 
+    @checked_arguments
     def inverse_dynamics(self, q: ArrayLike, dq: ArrayLike | None = None, ddq: ArrayLike | None = None) -> Array:
         """Compute joint torques, payload included.
 
@@ -149,6 +156,7 @@ class RobotModel:
         (torque,) = self._run("inverse_dynamics_of", *self._motion(q, dq, ddq))
         return torque.T.copy()
 
+    @checked_arguments
     def scene(self, start_xyz: ArrayLike, goal_xyz: ArrayLike) -> Scene:
         """Place the obstacles of N samples; some stand below the object at the start or at the goal.
 
@@ -158,11 +166,14 @@ class RobotModel:
         """
         from cnpgen.problems.obstacles import scene_of
 
-        start, goal = (
-            np.atleast_2d(numbers(name, xyz)) for name, xyz in (("start_xyz", start_xyz), ("goal_xyz", goal_xyz))
-        )
+        places = {"start_xyz": start_xyz, "goal_xyz": goal_xyz}
+        start, goal = (np.atleast_2d(numbers(name, xyz)) for name, xyz in places.items())
+        for name, xyz in zip(places, (start, goal), strict=True):
+            if xyz.shape != (len(start), 3):
+                raise UsageError(f"must have shape ({len(start)}, 3) or (3,), got {xyz.shape}", argument=name)
         return scene_of(self.problem, start, goal)
 
+    @checked_arguments
     def constraint_values(
         self,
         q: ArrayLike,
@@ -193,6 +204,7 @@ class RobotModel:
             *(part.T.reshape(-1, *shape).swapaxes(1, 2) for part in jacobians),
         )
 
+    @checked_arguments
     def min_distance(self, q: ArrayLike, *, scene: Scene | None = None) -> Array:
         """Measure the smallest distance with Coal: links and held object from obstacles, and links from each other.
 
@@ -208,6 +220,7 @@ class RobotModel:
         poses = self._lanes(scene, states.shape[1])
         return np.array([self._distance_at(states[:, k], poses[:, k]) for k in range(states.shape[1])])
 
+    @checked_arguments
     def is_collision_free(self, q: ArrayLike, *, scene: Scene | None = None) -> NDArray[np.bool_]:
         """Return whether nothing penetrates at each state, shape (N,); arguments as of ``min_distance``."""
         return np.asarray(self.min_distance(q, scene=scene) >= 0)
@@ -242,9 +255,9 @@ class RobotModel:
         """Return states as kernels take them, shape (n, N)."""
         array, n = np.atleast_2d(numbers(name, values)), len(self.joint_names)
         if array.ndim != 2 or array.shape[1] != n or not len(array):
-            raise UsageError(f"{name} must have shape (N, {n}) or ({n},), got {np.shape(values)}")
+            raise UsageError(f"must have shape (N, {n}) or ({n},), got {np.shape(values)}", argument=name)
         if not np.isfinite(array).all():
-            raise UsageError(f"{name} must be finite")
+            raise UsageError("must be finite", argument=name)
         return np.ascontiguousarray(array.T)
 
     def _motion(self, q: ArrayLike, dq: ArrayLike | None, ddq: ArrayLike | None) -> tuple[Array, Array, Array]:
@@ -254,7 +267,7 @@ class RobotModel:
         ]
         for name, rate in zip(("dq", "ddq"), rates, strict=True):
             if rate.shape != states.shape:
-                raise UsageError(f"{name} must have as many rows as q, {states.shape[1]}, got {rate.shape[1]}")
+                raise UsageError(f"must have as many rows as q, {states.shape[1]}, got {rate.shape[1]}", argument=name)
         return states, rates[0], rates[1]
 
     def _run(self, builder: str, *arguments: Array) -> list[Array]:
@@ -278,7 +291,7 @@ def load_robot_model(problem: Problem | StoredProblem | str | Path, *, backend: 
     return RobotModel(problem, backend=backend)
 
 
-def tip_pose(robot: "Robot") -> Any:
+def tip_pose(robot: Robot) -> Any:
     """Build ``q -> (p, R, J)``: position, rotation row by row, and geometric Jacobian row by row of the tip."""
     import casadi as ca
 
@@ -294,7 +307,7 @@ def tip_pose(robot: "Robot") -> Any:
     return ca.Function("tip_pose", [q_sx], ca.cse(outputs))
 
 
-def inverse_dynamics_of(robot: "Robot") -> Any:
+def inverse_dynamics_of(robot: Robot) -> Any:
     """Build ``(q, dq, ddq) -> tau``, recursive Newton-Euler."""
     import casadi as ca
 
@@ -306,7 +319,7 @@ def inverse_dynamics_of(robot: "Robot") -> Any:
     return ca.Function("inverse_dynamics_of", [sx for sx, _ in pairs], [ca.cse(ca.densify(ca.vertcat(*torque)))])
 
 
-def constraint_values_of(robot: "Robot", problem: Problem) -> Any:
+def constraint_values_of(robot: Robot, problem: Problem) -> Any:
     """Build ``(q, dq, ddq, obstacle poses) -> (g, dg/dq, dg/d(dq), dg/d(ddq))``, Jacobians column by column."""
     import casadi as ca
 
@@ -318,7 +331,7 @@ def constraint_values_of(robot: "Robot", problem: Problem) -> Any:
     return ca.Function("constraint_values_of", inputs, outputs)
 
 
-def _symbolic_conditions(robot: "Robot", problem: Problem) -> "tuple[FrozenState, list[tuple[Constraint, Condition]]]":
+def _symbolic_conditions(robot: Robot, problem: Problem) -> tuple[FrozenState, list[tuple[Constraint, Condition]]]:
     from cnpgen.kernels.symbolic.linalg import symbols
     from cnpgen.kernels.symbolic.symbolic_state import FrozenState
 

@@ -72,7 +72,7 @@ class FineCheck:
     def __init__(self, problem: Problem, world: "World", kernels: ResidualKernels) -> None:
         self._grid = make_grid(kernels.spec, FINE_POINTS, problem.path_orders)
         self._last = cache_last(
-            lambda task: Transcription(kernels, self._grid, boundary=task.boundary, obstacle_poses=task.obstacle_poses)
+            lambda task: Transcription(kernels, self._grid, boundary=task.boundary, obstacle_poses=task.scene.poses[0])
         )
         self._bounds = BoundsTemplate(problem, world, self._grid.s, NO_TIGHTENING)
         conditions = self._bounds.conditions

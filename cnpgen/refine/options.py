@@ -6,6 +6,7 @@ from typing import Any
 from cnpgen.errors import UsageError, nearest
 from cnpgen.refine.solver.cost_term import OBJECTIVES
 from cnpgen.refine.solver.sqp import DEFAULT_SETTINGS
+from cnpgen.schema.argument_types import check_fields
 from cnpgen.schema.arguments import integer, number
 
 
@@ -33,9 +34,10 @@ class RefineOptions:
     deadline: float | None = None
 
     def __post_init__(self) -> None:
+        check_fields(self)
         if self.objective not in OBJECTIVES:
             expected = f"expected one of {', '.join(OBJECTIVES)}{nearest(self.objective, OBJECTIVES)}"
-            raise UsageError(f"objective {self.objective!r} does not exist: {expected}")
+            raise UsageError(f"objective {self.objective!r} does not exist: {expected}", concerns="objective")
         if self.weight is not None and number("weight", self.weight) < 0:
             raise UsageError(f"must not be negative, got {self.weight}", argument="weight")
         integer("max_iterations", self.max_iterations, least=0)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cnpgen.kernels.library import KernelLibrary, choose_backend, problem_kernels
 from cnpgen.plans.plans import Plans
-from cnpgen.problems.obstacles import obstacle_poses_of
+from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem_record import ProblemRecord, open_problem
 from cnpgen.refine.grid_levels import GridLevels
 from cnpgen.refine.options import DEFAULT_OPTIONS, RefineOptions
@@ -28,6 +28,7 @@ from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 if TYPE_CHECKING:
     from cnpgen.problems.problem import Problem
     from cnpgen.robots.robot import Robot
+    from cnpgen.robots.scene import Scene
 
 Array = NDArray[np.float64]
 
@@ -67,8 +68,7 @@ def prepare(plans: Plans, options: RefineOptions) -> Refiner:
 
 def tasks_of(plans: Plans) -> list[RefinementTask]:
     """Return the boundary problem of every plan, with the plan as input plan."""
-    problem, _ = open_problem(plans.problem)
-    tasks = _tasks(problem, plans.boundary, plans.columns["start_xyz"], plans.columns["goal_xyz"])
+    tasks = _tasks(plans.boundary, plans.scene, plans.columns["start_xyz"], plans.columns["goal_xyz"])
     control_points = zip(plans.path_control_points, plans.rate_control_points, strict=True)
     return [replace(task, path=path, rate=rate) for task, (path, rate) in zip(tasks, control_points, strict=True)]
 
@@ -89,7 +89,8 @@ def load_solver(problem: "Problem", robot: "Robot", kernels: KernelLibrary) -> S
     checker, spec = PlanChecker(problem, robot, degree=refiner.spec.degree), refiner.spec
 
     def solve(columns: Mapping[str, Array], initial_guess: Motion | None = None) -> tuple[Motion, NDArray[np.bool_]]:
-        tasks = _tasks(problem, Boundary.from_batch(columns, None), columns["start_xyz"], columns["goal_xyz"])
+        ends = columns["start_xyz"], columns["goal_xyz"]
+        tasks = _tasks(Boundary.from_batch(columns, None), scene_of(problem, *ends), *ends)
         if initial_guess is not None:
             tasks = [
                 replace(task, path=initial_guess.path[i], rate=initial_guess.rate[i]) for i, task in enumerate(tasks)
@@ -107,11 +108,8 @@ def load_solver(problem: "Problem", robot: "Robot", kernels: KernelLibrary) -> S
     return solve
 
 
-def _tasks(problem: "Problem", boundary: Boundary, start_xyz: Array, goal_xyz: Array) -> list[RefinementTask]:
-    obstacle_poses = obstacle_poses_of(problem, start_xyz, goal_xyz)
-    return [
-        RefinementTask(boundary[i : i + 1], obstacle_poses[i], start_xyz[i], goal_xyz[i]) for i in range(len(boundary))
-    ]
+def _tasks(boundary: Boundary, scene: "Scene", start_xyz: Array, goal_xyz: Array) -> list[RefinementTask]:
+    return [RefinementTask(boundary[i : i + 1], scene[i], start_xyz[i], goal_xyz[i]) for i in range(len(boundary))]
 
 
 @lru_cache(maxsize=8)

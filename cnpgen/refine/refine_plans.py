@@ -1,5 +1,7 @@
 """Refinement of sets of plans in several processes, with a journal for interrupted runs."""
 
+from __future__ import annotations
+
 import hashlib
 import json
 import time
@@ -19,13 +21,14 @@ from cnpgen.machine.engine import Engine, assembled
 from cnpgen.machine.threads import one_thread
 from cnpgen.machine.times import NO_TIME, Stopwatch, Times
 from cnpgen.machine.versions import __version__
-from cnpgen.plans.plans import Plans, check_plans_type, screen
+from cnpgen.plans.plans import Plans, screen
 from cnpgen.plans.status import PlanStatus
 from cnpgen.plans.tips import correct_tips
 from cnpgen.refine.options import DEFAULT_OPTIONS, RefineOptions
 from cnpgen.refine.refine_engine import prepare, refine_serially
 from cnpgen.refine.refinement_journal import Journal, open_journal
 from cnpgen.refine.task import Attempt, Outcome
+from cnpgen.schema.argument_types import checked_arguments
 
 REFINEMENT_FORMAT = "cnpgen-refinement"
 REFINEMENT_VERSION = 1
@@ -91,6 +94,7 @@ class Refinement:
         }
 
 
+@checked_arguments
 def solve_plans(
     problems: Plans,
     *,
@@ -121,7 +125,6 @@ def solve_plans(
         RecipeError: See ``refine_plans``.
         MachineError: See ``refine_plans``.
     """
-    check_plans_type(problems)
     without_plans = replace(
         problems,
         path_control_points=np.full_like(problems.path_control_points, np.nan),
@@ -140,6 +143,7 @@ def solve_plans(
     )
 
 
+@checked_arguments
 def refine_plans(
     plans: Plans,
     *,
@@ -174,7 +178,6 @@ def refine_plans(
         RecipeError: The problem needs a plug-in that is not installed.
         MachineError: A worker died, or the journal cannot be written.
     """
-    check_plans_type(plans)
     watch, where = Stopwatch(), Engine(engine, address, workers)
     plans = correct_tips(plans)
     file = None if journal is None else open_journal(Path(journal), _identity(plans, options), discard=discard)

@@ -64,7 +64,9 @@ def open_journal(path: Path, identity: str, *, discard: bool = False) -> Journal
     try:
         file = open_journal_file(path, JOURNAL_MAGIC)
     except DatasetError as error:
-        raise UsageError(f"{path} is not a journal of cnpgen: remove it, or choose another output") from error
+        raise UsageError(
+            f"{path} is not a journal of cnpgen: remove it, or choose another output", concerns="journal"
+        ) from error
     try:
         return _resume(path, file, identity, discard=discard)
     except BaseException:
@@ -79,7 +81,7 @@ def _resume(path: Path, file: JournalFile, identity: str, *, discard: bool) -> J
         try:
             journal.finished |= _unpack(record)
         except _RECORD_ERRORS as error:
-            raise UsageError(f"{path} is not a journal that cnpgen has written: {error}") from error
+            raise UsageError(f"{path} is not a journal that cnpgen has written: {error}", concerns="journal") from error
     if file.records and file.records[0] == identity.encode():
         return journal
     if journal.finished and not discard:

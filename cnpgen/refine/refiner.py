@@ -108,7 +108,7 @@ class Refiner:
                 motion.grid,
                 hulls,
                 boundary=task.boundary,
-                obstacle_poses=task.obstacle_poses,
+                obstacle_poses=task.scene.poses[0],
             )
             bounds = self._bounds[level].with_hull_distances(bounds, hulls.min_distances)
         return minimize(motion, bounds, x, settings, deadline=task.deadline)
@@ -119,7 +119,7 @@ class Refiner:
             self.residual_kernels,
             self._grids[level.points],
             boundary=task.boundary,
-            obstacle_poses=task.obstacle_poses,
+            obstacle_poses=task.scene.poses[0],
         )
 
     def bounds(self, task: RefinementTask, level: GridLevel, ends: Array) -> Bounds:
@@ -195,7 +195,7 @@ class Refiner:
 
     def rest_space(self, task: RefinementTask, hulls: Hulls | None = None) -> RestSpace:
         """Return the valid states at rest, for the search of joint-space paths."""
-        return RestSpace(self.residual_kernels, self.robot, self.check.rest_bounds(task), task.obstacle_poses, hulls)
+        return RestSpace(self.residual_kernels, self.robot, self.check.rest_bounds(task), task.scene.poses[0], hulls)
 
     @cached_property
     def _range_center(self) -> Array:

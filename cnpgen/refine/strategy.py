@@ -32,6 +32,7 @@ from cnpgen.refine.solver.deadline import Deadline
 from cnpgen.refine.solver.hulls import Hulls, has_clearance_constraints
 from cnpgen.refine.solver.sqp import Result
 from cnpgen.refine.task import Attempt, Outcome, RefinementTask
+from cnpgen.robots.scene import Scene
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.remaining_trajectory import with_fewer_knots, with_finer_knots
 from cnpgen.trajectory.spline_motion import Motion
@@ -48,7 +49,6 @@ MAX_JUDGED_VIOLATION = 3.0  # tolerances on the fine grid; attempts with larger 
 MAX_ROUNDING_ERROR = 1e-12  # rad and 1/s: smaller differences are rounding errors
 INPUT_OUTCOMES = {Outcome.UNCHANGED, Outcome.ADJUSTED}
 VERDICT_TIME_S = 5e-3  # of a verdict, before one was timed
-VERDICT_TIME_FACTOR = 1.3  # of the last verdict's time is reserved for the next
 
 
 # Order of the attempts
@@ -198,10 +198,10 @@ def _around_obstacles(refiner: Refiner, task: RefinementTask, best: Attempt) -> 
     """
     hulls = Hulls(refiner.problem, refiner.robot)
     ends = np.stack([task.boundary.start_q[0], task.boundary.goal_q[0]], axis=1)
-    if hulls.max_penetration(ends, task.obstacle_poses) > hulls.tolerance + MIN_END_PENETRATION_M:
+    if hulls.max_penetration(ends, task.scene.poses[0]) > hulls.tolerance + MIN_END_PENETRATION_M:
         return  # no motion is valid
     positions = refiner.check.transcription(task).positions(best.variables)
-    best_first = hulls.max_penetration(positions, task.obstacle_poses) < MAX_PENETRATION_M
+    best_first = hulls.max_penetration(positions, task.scene.poses[0]) < MAX_PENETRATION_M
     if best_first:
         yield from _on_hulls(refiner, task, best, hulls)
     for guess in _path_guesses(refiner, task, hulls):
@@ -260,8 +260,8 @@ class PlanChecker:
         """Return whether a few samples prove that such a plan is not valid."""
         return self._judge.refutes(*self._arguments(task, path, rate))[0]
 
-    def _arguments(self, task: RefinementTask, path: Array, rate: Array) -> tuple[Motion, Boundary, Array, Array]:
-        return Motion(path[None], rate[None], self._degree), task.boundary, task.start_xyz[None], task.goal_xyz[None]
+    def _arguments(self, task: RefinementTask, path: Array, rate: Array) -> tuple[Motion, Boundary, Scene, Array]:
+        return Motion(path[None], rate[None], self._degree), task.boundary, task.scene, task.goal_xyz[None]
 
 
 @dataclass
@@ -384,24 +384,26 @@ def refine_task_until(refiner: Refiner, checker: PlanChecker, task: RefinementTa
     until = time.perf_counter() + seconds
     if not task.is_finite:
         return _invalid_input(refiner, task)
-    search, x, reserve = RefinementSearch(refiner, checker, task), refiner.input_variables(task), VERDICT_TIME_S
+    search, x = RefinementSearch(refiner, checker, task), refiner.input_variables(task)
+    verdicts = Deadline(until, max_duration=VERDICT_TIME_S)
     best: Attempt | None = None
     for path, rate, outcome in _input_plans(refiner, task, x):
         begun = time.perf_counter()
         best = _better(best, search.judge(search.input_attempt(path, rate, outcome)))
-        reserve = VERDICT_TIME_FACTOR * (time.perf_counter() - begun)
+        verdicts = Deadline(until)
+        verdicts.note(begun)
         if best.valid:
             break
-    attempts = make_attempts(refiner, replace(task, deadline=Deadline(until - reserve)), x)
-    cut = late = best is not None and time.perf_counter() + reserve > until
+    attempts = make_attempts(refiner, replace(task, deadline=Deadline(until - verdicts.max_duration)), x)
+    cut = late = best is not None and not verdicts.allows(1)
     while not late and (attempt := next(attempts, None)) is not None:
         cut |= attempt.outcome is Outcome.NOT_CONVERGED
-        if best is None or time.perf_counter() + reserve <= until:
+        if best is None or verdicts.allows(1):
             ends = search.add(attempt)
             best = _better(best, search.best())
             if ends:
                 break
-        late = time.perf_counter() + reserve > until
+        late = not verdicts.allows(1)
         cut |= late
     assert best is not None  # without an input plan the first attempt is judged
     return best.result(search.iterations, Outcome.OUT_OF_TIME if cut else None)

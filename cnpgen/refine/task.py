@@ -1,5 +1,7 @@
 """Boundary problems of the refiner and the attempts at solving them."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from enum import IntEnum
 
@@ -8,6 +10,7 @@ from numpy.typing import NDArray
 
 from cnpgen.judges.plans.verdict import Reason
 from cnpgen.refine.solver.deadline import Deadline
+from cnpgen.robots.scene import Scene
 from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]
@@ -50,7 +53,7 @@ class RefinementTask:
 
     Attributes:
         boundary: Boundary conditions of one motion, shape (1, n) each.
-        obstacle_poses: Poses and sizes of its obstacles, shape (width,).
+        scene: Its obstacles, one sample.
         start_xyz: Position of the tip at the start [m], shape (3,).
         goal_xyz: Position of the tip at the goal [m], shape (3,).
         path: Path control points of the input plan [rad], shape (C, n), or None.
@@ -59,7 +62,7 @@ class RefinementTask:
     """
 
     boundary: Boundary
-    obstacle_poses: Array
+    scene: Scene
     start_xyz: Array
     goal_xyz: Array
     path: Array | None = None
@@ -75,7 +78,7 @@ class RefinementTask:
     @property
     def is_finite(self) -> bool:
         """Whether the boundary conditions are finite."""
-        conditions = (self.obstacle_poses, self.start_xyz, self.goal_xyz, *vars(self.boundary).values())
+        conditions = (self.scene.poses, self.start_xyz, self.goal_xyz, *vars(self.boundary).values())
         return all(values is None or bool(np.isfinite(values).all()) for values in conditions)
 
 
@@ -126,12 +129,12 @@ class Attempt:
         assert self.x is not None
         return self.x
 
-    def is_better(self, other: "Attempt") -> bool:
+    def is_better(self, other: Attempt) -> bool:
         """Return whether the violation is smaller than another's, or as small at a lower cost."""
         mine, others = max(self.violation, 1.0), max(other.violation, 1.0)
         return self.cost < other.cost if mine == others else mine < others
 
-    def result(self, iterations: int, outcome: Outcome | None = None) -> "Attempt":
+    def result(self, iterations: int, outcome: Outcome | None = None) -> Attempt:
         """Return the attempt as the result of a search with so many iterations in total."""
         return replace(
             self,

@@ -1,5 +1,7 @@
 """Robot: Pinocchio model, reduced to the planned joints, and planning limits of the problem."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -13,8 +15,10 @@ from cnpgen.errors import RecipeError, nearest
 from cnpgen.robots.attached import Attached, attach, bounded
 from cnpgen.robots.chain import Chain, frame_of, name_links_uniquely
 from cnpgen.robots.mimic import check_mimic
+from cnpgen.robots.model_comparison import check_model
 from cnpgen.robots.shape.shape import Shape
 from cnpgen.robots.urdf import urdf_tree
+from cnpgen.robots.urdf_parameters import urdf_parameters
 from cnpgen.store.joint_units import units_of_joints
 
 if TYPE_CHECKING:
@@ -94,6 +98,12 @@ class Robot:
         """Index of the tip frame in the model."""
         return frame_of(self.model, self.tip)
 
+    @cached_property
+    def reach(self) -> float:
+        """Length of the polyline from the world's origin over all joints to the tip [m]."""
+        placements = [*self.model.jointPlacements, self.model.frames[self.tip_frame].placement]
+        return float(sum(np.linalg.norm(placement.translation) for placement in placements))
+
 
 def reduced_model(urdf: Path, text: str, joints: tuple[str, ...], attached: Attached) -> "pin.Model":
     """Build the Pinocchio model of a URDF, reduced to the planned joints, with the attachments of a problem.
@@ -105,14 +115,17 @@ def reduced_model(urdf: Path, text: str, joints: tuple[str, ...], attached: Atta
         attached: Attachments of the problem.
 
     Raises:
-        RecipeError: The text is not a URDF, or it lacks the joints in this order.
+        RecipeError: The text is not a URDF, it lacks the joints in this order, or Pinocchio reads other numbers.
     """
     import pinocchio as pin
 
     try:
         tree = urdf_tree(text)
         check_mimic(tree, joints)
-        model = pin.buildModelFromXML(bounded(text, tree, attached))
+        limited = bounded(text, tree, attached)
+        with _mistakes_in(urdf):
+            parameters = urdf_parameters(tree)
+        model = pin.buildModelFromXML(limited)
         name_links_uniquely(model)
     except (ValueError, RuntimeError, IndexError) as error:
         raise RecipeError([f"{urdf}: not a URDF that Pinocchio can read: {error}"]) from error
@@ -124,8 +137,19 @@ def reduced_model(urdf: Path, text: str, joints: tuple[str, ...], attached: Atta
     reduced = pin.buildReducedModel(model, locked, pin.neutral(model)) if locked else model
     if tuple(reduced.names)[1:] != tuple(joints):
         raise RecipeError([f"robot.joints: must be in the URDF's order {list(reduced.names)[1:]}, got {list(joints)}"])
+    with _mistakes_in(urdf):
+        check_model(reduced, parameters)
     attach(reduced, attached)
     return reduced
+
+
+@contextmanager
+def _mistakes_in(urdf: Path) -> Iterator[None]:
+    """Put the name of the URDF before the mistakes that the block raises."""
+    try:
+        yield
+    except RecipeError as error:
+        raise RecipeError([f"{urdf}: {mistake}" for mistake in error.mistakes]) from error
 
 
 def _capsule_axes(model: "pin.Model", tip: str) -> tuple[tuple[int, int], ...]:

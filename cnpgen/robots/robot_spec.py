@@ -1,5 +1,7 @@
 """Robot specification in a problem file: URDF, joints, limits, held object and payload."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from dataclasses import dataclass
 

@@ -1,5 +1,7 @@
 """The scene of samples: their obstacles with poses and sizes."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -7,10 +9,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.errors import UsageError
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.solid import Solid, solids_of
+from cnpgen.schema.arguments import integer
 
 Array = NDArray[np.float64]
+
+
+class SampleIndexError(UsageError, IndexError):
+    """Index of a sample that does not exist."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,10 +36,23 @@ class Scene:
     def __len__(self) -> int:
         return len(self.poses)
 
-    def __getitem__(self, index: int | slice | Sequence[int] | NDArray[Any]) -> "Scene":
+    def __getitem__(self, index: int | slice | Sequence[int] | NDArray[Any]) -> Scene:
         """Select samples; an integer selects one sample and keeps the first axis."""
         rows = slice(index, index + 1 or None) if isinstance(index, int) else index
-        return Scene(self.obstacles, self.poses[rows])
+        if isinstance(index, int) and not -len(self) <= index < len(self):  # ends a loop over the samples, too
+            raise SampleIndexError(
+                f"there is no sample {index}: {len(self)} samples are numbered from 0", concerns="index"
+            )
+        try:
+            return Scene(self.obstacles, self.poses[rows])
+        except IndexError as error:
+            raise SampleIndexError(
+                f"samples are selected by numbers, a mask or a slice: {error}", concerns="index"
+            ) from error
+
+    def astype(self, dtype: str) -> Scene:
+        """Return the scene in another float type."""
+        return Scene(self.obstacles, self.poses.astype(dtype))
 
     @property
     def lanes(self) -> Array:
@@ -40,4 +61,9 @@ class Scene:
 
     def bodies(self, sample: int = 0) -> list[Solid]:
         """Return the obstacles of one sample as convex bodies in the world frame."""
+        sample = integer("sample", sample)
+        if not -len(self) <= sample < len(self):
+            raise SampleIndexError(
+                f"there is no sample {sample}: {len(self)} samples are numbered from 0", concerns="sample"
+            )
         return solids_of(self.obstacles, self.poses[sample])

@@ -11,6 +11,8 @@ Kernels and judges receive poses and sizes of obstacles per sample. The entries 
   mesh: the rows of its rotation matrix.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -11,6 +11,7 @@ from cnpgen.schema.texts import read_at_most, utf8_text
 MAX_URDF_BYTES = 1 << 23
 MAX_URDF_ELEMENTS = 1_000  # links or joints: Pinocchio recurses along a chain and crashes at 5,000
 MAX_DEPTH = 64  # of nested elements
+_DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 _CONTROL = re.compile(
     "[\t\n\r\x7f-\x9f]"
 )  # others are invalid in XML; parsers replace line ends in attributes by spaces
@@ -80,11 +81,34 @@ def number_in(element: ElementTree.Element | None, attribute: str, default: floa
     Raises:
         ValueError: The attribute is not a number.
     """
-    text = default if element is None else element.get(attribute, default)
-    try:
-        found = float(text)
-    except ValueError:
-        found = math.nan
-    if not math.isfinite(found):
-        raise ValueError(f"{attribute}={text!r} must be a number (with a point, not a comma)")
+    return numbers_in(element, attribute, (default,))[0]
+
+
+def numbers_in(
+    element: ElementTree.Element | None, attribute: str, default: tuple[float, ...]
+) -> tuple[float, ...]:
+    """Return the numbers in an attribute of an element.
+
+    The accepted notation is that of URDF parsers, which drop an element with other numbers without an error.
+
+    Args:
+        element: The element, or None.
+        attribute: Name of the attribute.
+        default: Numbers of a missing element or attribute; their count is required.
+
+    Raises:
+        ValueError: The attribute does not have as many finite decimal numbers.
+    """
+    text = None if element is None else element.get(attribute)
+    if element is None or text is None:
+        return default
+    words = [text] if len(default) == 1 else [word for word in text.split(" ") if word]
+    if len(words) != len(default) or not all(_DECIMAL.fullmatch(word) for word in words):
+        expected = "a number" if len(default) == 1 else f"{len(default)} numbers"
+        raise ValueError(
+            f"<{element.tag} {attribute}={text!r}> must be {expected}, with a point and not a comma, without units"
+        )
+    found = tuple(map(float, words))
+    if not all(map(math.isfinite, found)):
+        raise ValueError(f"<{element.tag} {attribute}={text!r}> is too large")
     return found

@@ -2,6 +2,8 @@
 
 import math
 import operator
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -12,25 +14,25 @@ from cnpgen.errors import UsageError
 Array = NDArray[Any]
 
 
-def integer(name: str, value: Any, *, least: int, most: int | None = None) -> int:
+def integer(name: str, value: Any, *, least: int | None = None, most: int | None = None) -> int:
     """Return an argument as an integer; accept NumPy integers, reject bool.
 
     Args:
         name: Name of the argument.
         value: Value of the argument.
-        least: Minimum value.
+        least: Minimum value, None for no minimum.
         most: Maximum value, None for no maximum.
 
     Raises:
         UsageError: The value is not an integer, or out of range.
     """
     try:
-        found = operator.index(value)
+        found = None if isinstance(value, bool) else operator.index(value)
     except TypeError:
-        found = least - 1
-    if not least <= found or (most is not None and found > most) or isinstance(value, bool):
-        bounds = f"from {least} on" if most is None else f"from {least} to {most}"
-        raise UsageError(f"must be an integer {bounds}, got {value!r}", argument=name)
+        found = None
+    if found is None or (least is not None and found < least) or (most is not None and found > most):
+        bounds = "" if least is None else f" from {least} on" if most is None else f" from {least} to {most}"
+        raise UsageError(f"must be an integer{bounds}, got {value!r:.100}", argument=name)
     return found
 
 
@@ -64,6 +66,7 @@ def numbers(name: str, values: ArrayLike, dtype: str = "float64", *, differentia
     """
     if type(values) is np.ndarray and values.dtype == dtype:  # the usual case
         return values
+    reject_masked(name, values)
     wrong = f"must be an array of numbers, got {type(values).__name__}"
     try:
         detached = values.detach() if hasattr(values, "detach") and not differentiable else values
@@ -79,6 +82,26 @@ def numbers(name: str, values: ArrayLike, dtype: str = "float64", *, differentia
     if array.dtype.kind in "cUSmM" or missing:  # NumPy would drop imaginary parts and convert texts and None
         raise UsageError(f"{wrong}: {array.dtype} is no real type", argument=name)
     return real
+
+
+def reject_masked(name: str, values: Any) -> None:
+    """Reject masked arrays, whose masks NumPy's functions drop without notice.
+
+    Raises:
+        UsageError: The argument is a masked array, or a list of them.
+    """
+    parts = values if isinstance(values, list | tuple) else [values]
+    if any(isinstance(part, np.ma.MaskedArray) for part in parts):
+        raise UsageError("must not be a masked array: pass filled values, such as values.filled(0.0)", argument=name)
+
+
+@contextmanager
+def concerning(argument: str) -> Iterator[None]:
+    """Attribute usage errors of a function that is called in the block to an argument of the caller."""
+    try:
+        yield
+    except UsageError as error:
+        raise UsageError(str(error), concerns=argument) from error
 
 
 def flag(name: str, value: Any) -> bool:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, TypeVar
 
-from cnpgen.errors import RecipeError, either, nearest
+from cnpgen.errors import RecipeError, UsageError, either, nearest
 from cnpgen.schema import registry
 from cnpgen.schema.keys import RecipeLocation
 from cnpgen.schema.parsing import Reader, parse
@@ -26,6 +26,8 @@ _LAYOUT: dict[Kind, str] = {  # paths of the shipped files of a kind
 
 def list_recipes(kind: Kind) -> dict[str, Path]:
     """List the shipped recipes of a kind: name -> file, by name."""
+    if not isinstance(kind, str) or kind not in _LAYOUT:
+        raise UsageError(f"must be one of {', '.join(_LAYOUT)}, got {kind!r:.100}", argument="kind")
     folder, _, pattern = _LAYOUT[kind].partition("/")
     files = sorted((recipes_root() / folder).glob(pattern))
     return {file.parent.name if kind == "problem" else file.stem: file for file in files}

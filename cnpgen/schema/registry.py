@@ -113,7 +113,8 @@ def load(group: str, name: str) -> type[Any]:
     if not sources:
         known = names(group)
         hint = nearest(name, known)
-        raise RecipeError([f"unknown {noun} {name!r}{hint}; known: {', '.join(known)}"])
+        known_names = f"known: {', '.join(known)}, and those of packages with the entry point group {group!r}"
+        raise RecipeError([f"unknown {noun} {name!r}{hint}; {known_names}"])
     if len(sources) > 1:
         raise RecipeError([f"{noun} {name!r} is defined more than once: by {' and by '.join(sources)}"])
     source, importer = next(iter(sources.items()))

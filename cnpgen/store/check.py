@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 
 from cnpgen.errors import DatasetError
+from cnpgen.store.checked_shard import read_rows, recorded_shard
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, load_dataset_spec, shard_attributes, shards
 from cnpgen.store.dataset_summary import summarize_dataset, unfinished
 from cnpgen.store.field import Field
 from cnpgen.store.files.atomic import file_sha256
-from cnpgen.store.intact import OUTSIDE, RERUN_HINT, leads_outside
+from cnpgen.store.intact import COPY_HINT, OUTSIDE, RERUN_HINT, leads_outside, outside_links
 from cnpgen.store.layout import CARD, CROISSANT, MANIFEST, SPECIFICATION, STATS, WORK
 from cnpgen.store.manifest import data_fingerprint, lists_shards_of, load_manifest
 from cnpgen.store.shard import (
@@ -35,7 +36,6 @@ REPLACE_HINT = (
     " 'cnpgen make-dataset --force'"
 )
 DELETE_HINT = f"delete the shard and its .json file, then {RERUN_HINT}"
-COPY_HINT = "replace the links by files: copy the dataset with cp -rL"
 REMOVE_HINT = "move files that are not part of the dataset to another folder"
 
 
@@ -71,11 +71,13 @@ def check_dataset(folder: Path) -> list[Finding]:
     Raises:
         MachineError: A file cannot be read.
     """
+    links = [Finding(name, OUTSIDE, hint=COPY_HINT) for name in outside_links(folder)]
     try:
         spec = load_dataset_spec(folder)
     except DatasetError as error:
-        return [Finding(SPECIFICATION, _reason(error, folder / SPECIFICATION), hint=REPLACE_HINT)]
+        return [*links, Finding(SPECIFICATION, _reason(error, folder / SPECIFICATION), hint=REPLACE_HINT)]
     findings, manifest = _check_manifest(folder, spec)
+    findings = links + findings
     entries, finished = _shard_entries(manifest), (folder / MANIFEST).exists()
     for task in shards(spec):
         entry = entries.get(task.file)
@@ -213,7 +215,7 @@ def check_content(folder: Path, spec: DatasetSpec, task: ShardTask) -> list[Find
         task: The shard; verify its sha256 before, because HDF5 can hang on a damaged file.
 
     Returns:
-        The findings about attributes, fields, shapes, types and units.
+        The findings about attributes, fields, shapes, types, units, values that are not finite, and sample IDs.
     """
     path = folder / task.file
     try:
@@ -232,7 +234,18 @@ def check_content(folder: Path, spec: DatasetSpec, task: ShardTask) -> list[Find
     for field in spec.fields:
         if field.name in schema:
             problems += _check_field(field, schema[field.name], spec, task)
+    if not problems:
+        problems = _check_rows(folder, spec, task)
     return [Finding(task.file, problem, hint=DELETE_HINT) for problem in problems]
+
+
+def _check_rows(folder: Path, spec: DatasetSpec, task: ShardTask) -> list[str]:
+    """Check the values of a shard whose description is that of the specification."""
+    try:
+        read_rows(recorded_shard(folder, spec, task, size=0, sha256=""))
+    except DatasetError as error:
+        return [_reason(error, folder / task.file)]
+    return []
 
 
 def _check_field(field: Field, stored: StoredField, spec: DatasetSpec, task: ShardTask) -> list[str]:

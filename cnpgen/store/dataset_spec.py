@@ -3,6 +3,8 @@
 It is stored in ``specification.json`` before the first shard is made.
 """
 
+from __future__ import annotations
+
 import json
 import math
 from collections.abc import Mapping
@@ -157,7 +159,7 @@ class DatasetSpec:
         return canonical_sha256(identity)
 
     @cached_property
-    def spec_versions(self) -> tuple["DatasetSpec", ...]:
+    def spec_versions(self) -> tuple[DatasetSpec, ...]:
         """All versions of the specification, from the first one to this one; an extension adds one."""
         previous = self.previous_splits
         older = (
@@ -165,7 +167,7 @@ class DatasetSpec:
         )
         return (*older, self)
 
-    def version_with(self, task: "ShardTask") -> "DatasetSpec":
+    def version_with(self, task: ShardTask) -> DatasetSpec:
         """Return the first version of the specification that contains a shard; the shard is made from that version."""
         end = task.first_row + task.rows
         return next((spec for spec in self.spec_versions if end <= spec.splits.get(task.split, 0)), self)
@@ -220,9 +222,9 @@ class DatasetSpec:
 
 def _check_sizes(spec: DatasetSpec) -> None:
     if spec.block_rows < 1 or spec.shard_size < 1:
-        raise UsageError(f"the shard size must be at least 1, got {spec.shard_size}")
+        raise UsageError(f"the shard size must be at least 1, got {spec.shard_size}", concerns="shard_size")
     if spec.seed < 0:
-        raise UsageError(f"the seed must not be negative, got {spec.seed}")
+        raise UsageError(f"the seed must not be negative, got {spec.seed}", concerns="seed")
     if spec.dtype not in {"float64", "float32"}:
         raise UsageError(f"must be 'float64' or 'float32', got {spec.dtype!r}", argument="dtype")
     count = sum(-(-rows // spec.shard_size) for rows in spec.splits.values())

@@ -1,5 +1,7 @@
 """Summary of the finished shards of a dataset, in shard order."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property

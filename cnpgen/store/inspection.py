@@ -152,8 +152,7 @@ def inspect_dataset(folder: str | Path) -> Inspection:
         DatasetError: It contains no dataset, or its specification is damaged.
         MachineError: A file cannot be read.
     """
-    folder = Path(folder)
-    require_folder(folder)
+    folder = require_folder(folder)
     if not is_dataset(folder):
         raise DatasetError(f"{folder} is not a dataset of cnpgen: it has no {SPECIFICATION}")
     try:

@@ -1,11 +1,14 @@
 """Verification of shards against their recorded size and sha256, before their values are used."""
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 
 from cnpgen.errors import DatasetError
 from cnpgen.store.files.atomic import file_sha256
+from cnpgen.store.layout import DOCUMENTS, WORK
 
+COPY_HINT = "replace the links by files: copy the dataset with cp -rL"
 RERUN_HINT = "run make_dataset or 'cnpgen make-dataset' again with the same arguments"
 
 OUTSIDE = "is a link that leads outside the folder of the dataset"
@@ -15,12 +18,22 @@ _verified: set[tuple[Path, int, int, str]] = (
 )  # path, mtime [ns], size and sha256 of the shards that this process has verified
 
 
-def leads_outside(path: Path) -> bool:
-    """Return whether a file of a split, or its folder, is a link that leads outside the folder of the dataset."""
-    if not (path.is_symlink() or path.parent.is_symlink()):
+def leads_outside(path: Path, folder: Path | None = None) -> bool:
+    """Return whether a file, or its folder, is a link that leads outside the folder of the dataset.
+
+    Args:
+        path: The file.
+        folder: Folder of the dataset; by default, the file is in the folder of a split.
+    """
+    folder = path.parents[1] if folder is None else folder
+    if not (path.is_symlink() or (path.parent != folder and path.parent.is_symlink())):
         return False
-    folder = os.path.realpath(path.parents[1])  # Path.resolve raises an error for circular links
-    return not Path(os.path.realpath(path)).is_relative_to(folder)
+    return not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))  # resolve() refuses circular links
+
+
+def outside_links(folder: Path, splits: Iterable[str] = ()) -> list[str]:
+    """List the documents of a dataset and the folders in it that are links that lead outside its folder."""
+    return [name for name in (*DOCUMENTS, WORK, *splits) if leads_outside(folder / name, folder)]
 
 
 def size_problem(path: Path, size: int) -> str:

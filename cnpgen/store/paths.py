@@ -9,18 +9,23 @@ from cnpgen.store.workspace import is_dataset
 _KIND_OF_FORMAT = {"cnpgen-plans": PLANS, "cnpgen-shard": "a shard of a dataset"}
 
 
-def require_folder(folder: Path) -> None:
-    """Raise an error if a folder does not exist.
+def require_folder(folder: str | Path, *, argument: str = "folder") -> Path:
+    """Return the path of a folder that exists.
 
     Args:
         folder: Folder of a dataset.
+        argument: Name of the argument, for the error.
 
     Raises:
-        UsageError: The folder is missing or is a file.
+        UsageError: It is no text or path, or the folder is missing or is a file.
     """
+    if not isinstance(folder, str | Path) or not str(folder) or "\0" in str(folder):
+        raise UsageError(f"must name a folder, got {folder!r:.100}", argument=argument)
+    folder = Path(folder)
     if not folder.is_dir():
         actual = "a file" if folder.exists() else "not there"
-        raise UsageError(f"{folder} is {actual}, expected the folder of a dataset")
+        raise UsageError(f"{folder} is {actual}, expected the folder of a dataset", concerns=argument)
+    return folder
 
 
 def require_file(path: Path, expected: str, *, of_dataset: str = "") -> None:
@@ -36,11 +41,11 @@ def require_file(path: Path, expected: str, *, of_dataset: str = "") -> None:
     """
     if path.is_dir():
         actual, hint = ("the folder of a dataset", of_dataset) if is_dataset(path) else ("a folder", "")
-        raise UsageError(f"{path} is {actual}, expected {expected}{hint and f': {hint}'}")
+        raise UsageError(f"{path} is {actual}, expected {expected}{hint and f': {hint}'}", concerns="path")
     if not path.exists():
-        raise UsageError(f"{path} is not there, expected {expected}")
+        raise UsageError(f"{path} is not there, expected {expected}", concerns="path")
     if not path.is_file():
-        raise UsageError(f"{path} is a device or a pipe, expected {expected}")
+        raise UsageError(f"{path} is a device or a pipe, expected {expected}", concerns="path")
 
 
 def file_kind(path: Path) -> str:

@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, lacks
+from cnpgen.store.checked_shard import read_checked, recorded_shard
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, load_dataset_spec, shards
 from cnpgen.store.dataset_summary import summarize_dataset, unfinished
-from cnpgen.store.intact import require_intact
 from cnpgen.store.layout import MANIFEST, SPECIFICATION
 from cnpgen.store.manifest import lists_shards_of, load_manifest
 from cnpgen.store.paths import require_folder
-from cnpgen.store.shard import read_shard, storage_dtype
+from cnpgen.store.shard import storage_dtype
 from cnpgen.store.shard_record import is_committed, load_record
 
 
@@ -102,10 +102,8 @@ class StoredDataset:
 
     def _read(self, task: ShardTask, names: Sequence[str]) -> dict[str, NDArray[Any]]:
         """Verify a shard and read fields of it."""
-        path = self.folder / task.file
         size, sha256 = self._recorded.get(task.file) or _size_and_sha256(self.folder, task)
-        require_intact(path, size=size, sha256=sha256)
-        return read_shard(path, names)
+        return read_checked(recorded_shard(self.folder, self.spec, task, size=size, sha256=sha256), names)
 
     @cached_property
     def _recorded(self) -> dict[str, tuple[int, str]]:

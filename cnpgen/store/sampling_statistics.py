@@ -1,5 +1,7 @@
 """Sampling statistics of a shard: numbers of candidates, rejections by reason, and density maps."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -28,7 +30,7 @@ class DensityMap:
     candidates: NDArray[np.int64]
     accepted: NDArray[np.int64]
 
-    def merge(self, other: "DensityMap") -> "DensityMap":
+    def merge(self, other: DensityMap) -> DensityMap:
         """Add the counts of two maps of the same grid.
 
         Raises:
@@ -67,7 +69,7 @@ class SamplingStatistics:
             if not math.isfinite(worst):
                 raise DatasetError(f"the worst violation of {name!r} must be a finite number, got {worst}")
 
-    def merge(self, other: "SamplingStatistics") -> "SamplingStatistics":
+    def merge(self, other: SamplingStatistics) -> SamplingStatistics:
         """Return the statistics of both sets of candidates: the sums of counts and the maxima of violations."""
         reasons = _merged_order(list(self.rejections), list(other.rejections))
         densities = dict(self.densities)

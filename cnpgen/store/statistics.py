@@ -1,5 +1,7 @@
 """Statistics of a field: count, mean, variance, extrema and histogram, which can be merged exactly over shards."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -52,7 +54,7 @@ class FieldStatistics:
         """Standard deviation sqrt(m2 / count), exactly 0 for constant columns, shape (c,)."""
         return np.where(self.constant, 0.0, np.sqrt(self.m2 / self.count))
 
-    def merge(self, other: "FieldStatistics") -> "FieldStatistics":
+    def merge(self, other: FieldStatistics) -> FieldStatistics:
         """Return the statistics of the union of both sets of rows (Chan, Golub and LeVeque 1979).
 
         Raises:

@@ -14,6 +14,7 @@ from cnpgen.store.dataset_spec import INFORMATIONAL, DatasetSpec, load_dataset_s
 from cnpgen.store.files.atomic import machine_error, read_file
 from cnpgen.store.files.documents import Difference, differences
 from cnpgen.store.files.leftovers import remove_leftovers
+from cnpgen.store.intact import COPY_HINT, OUTSIDE, outside_links
 from cnpgen.store.layout import CARD, CROISSANT, MANIFEST, OLD_SPECIFICATION, SPECIFICATION, STATS, WORK
 
 _SUMMARIES = (MANIFEST, STATS, CROISSANT, CARD)
@@ -73,7 +74,7 @@ def check_place(workspace: Workspace) -> None:
     The folder of a finished dataset need not be writable.
 
     Raises:
-        UsageError: It is a file, or contains files that are not a dataset of cnpgen.
+        UsageError: It is a file, contains files that are not a dataset of cnpgen, or a link out of it.
         MachineError: It cannot be written.
     """
     if workspace.content == "a file":
@@ -85,6 +86,9 @@ def check_place(workspace: Workspace) -> None:
             f"{workspace.folder} is not empty and not a dataset of cnpgen; choose another {{out}}",
             remedies={"out": None},
         )
+    splits = () if workspace.spec is None else tuple(workspace.spec.splits)
+    if workspace.content == "a dataset" and (outside := outside_links(workspace.folder, splits)):
+        raise UsageError(f"{workspace.folder / outside[0]} {OUTSIDE}; {COPY_HINT}")
     if (workspace.folder / MANIFEST).is_file():
         return
     if not os.access(workspace.existing, os.W_OK | os.X_OK):

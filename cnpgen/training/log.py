@@ -5,8 +5,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from cnpgen.store.files.atomic import machine_error, write_file
+from cnpgen.store.files.atomic import write_file
 from cnpgen.store.files.documents import parse_json
+from cnpgen.store.files.journal import append_line
 
 FIRST_LINE_KEYS = {"step", "epoch", "learning_rate", "seconds", "lost"}
 
@@ -34,11 +35,7 @@ class TrainingLog:
         """
         line = json.dumps(record, allow_nan=False)
         self.lines.append(line)
-        try:
-            with self.path.open("a", encoding="utf-8") as file:
-                file.write(line + "\n")
-        except OSError as error:
-            raise machine_error("write", self.path, error) from error
+        append_line(self.path, line)
 
     @property
     def text(self) -> str:

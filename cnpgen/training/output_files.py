@@ -6,13 +6,13 @@ from cnpgen.errors import UsageError
 from cnpgen.store.files.leftovers import remove_leftovers_of
 from cnpgen.training.log import is_log
 
-CHECKPOINT, LOG, PICTURE = ".checkpoint", ".jsonl", ".png"  # in place of .h5
+CHECKPOINT, LOG, PICTURE, LOCK = ".checkpoint", ".jsonl", ".png", ".lock"  # in place of .h5
 
 
 def check_out(out: Path) -> None:
     """Raise an error if the path is no possible model file."""
     if out.suffix != ".h5" or out.is_dir() or not out.parent.is_dir():
-        raise UsageError(f"{out} must be a file that ends in .h5, in a folder that exists")
+        raise UsageError(f"{out} must be a file that ends in .h5, in a folder that exists", concerns="out")
 
 
 def check_beside(out: Path) -> None:

@@ -11,6 +11,7 @@ from cnpgen.losses.margins import suggested_margins
 from cnpgen.losses.metric import Metric
 from cnpgen.losses.metric_settings import suggested_weights
 from cnpgen.losses.plan_loss import PlanLoss
+from cnpgen.machine.memory import check_memory
 from cnpgen.machine.versions import __version__
 from cnpgen.planner.inference_pipeline import InferencePipeline, LoadedProblem, make_inference_pipeline
 from cnpgen.planner.model import Model, ModelConfig, is_rest_to_rest
@@ -142,6 +143,8 @@ def _parameter_definition(architecture: Architecture, config: ModelConfig, zero:
 def _architecture(
     loaded: LoadedProblem, settings: TrainingSettings, boundary: Boundary, initial_model: Model | None
 ) -> Architecture:
+    check_memory("hidden", settings.hidden, settings.layers * settings.hidden**2)
+    check_memory("batch_size", settings.batch_size, settings.batch_size * settings.nodes)
     spec = loaded.problem.trajectory
     blocks = usual_blocks(boundary) if initial_model is None else initial_model.features.blocks
     return Architecture(

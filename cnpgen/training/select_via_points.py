@@ -62,10 +62,9 @@ def _planned(
 ) -> tuple[Motion, NDArray[np.bool_]]:
     """Plan, along lines through via points if given; return the motions and a mask of those without violation."""
     tasks = inference.prepare(boundary, via_point)
-    obstacle_poses = inference.prepare.obstacle_poses(tasks.start_xyz, tasks.goal_xyz)
-    motion = inference.motion(model, tasks, obstacle_poses)
+    motion = inference.motion(model, tasks)
     assert inference.via_points is not None
-    return motion, inference.via_points.violation(motion, obstacle_poses) <= 1
+    return motion, inference.via_points.violation(motion, tasks.scene.poses) <= 1
 
 
 def _greedy_cover(repaired: NDArray[np.bool_], count: int) -> list[int]:

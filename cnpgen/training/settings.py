@@ -9,6 +9,7 @@ from cnpgen.errors import UsageError
 from cnpgen.losses.metric_settings import BOUNDED, PUBLISHED, MetricSettings
 from cnpgen.planner.model import ModelConfig
 from cnpgen.planner.tasks import EXPECTED_TIMES
+from cnpgen.schema.argument_types import check_fields
 from cnpgen.schema.arguments import integer, number
 
 METRICS = {
@@ -84,13 +85,14 @@ class TrainingSettings:
     imitation: float = 0.0
 
     def __post_init__(self) -> None:
+        check_fields(self)
         for name, least in MIN_INTEGERS.items():
             integer(name, getattr(self, name), least=least)
         for name, interval in VALID_INTERVALS.items():
             _within(name, getattr(self, name), interval)
         _within("growth", self.metric.growth, "(0, inf)")
         for term, factor in self.margins.items():
-            _within(f"margin of {term!r}", factor, "(0, 1]")
+            _within("margins", factor, "(0, 1]", of=f" for {term!r}")
         if self.expected_time not in EXPECTED_TIMES:
             raise UsageError(
                 f"must be one of {', '.join(EXPECTED_TIMES)}, got {self.expected_time!r}", argument="expected_time"
@@ -131,16 +133,18 @@ class Length:
     def __post_init__(self) -> None:
         lengths = {name: value for name, value in vars(self).items() if value is not None}
         if len(lengths) != 1:
-            raise UsageError(f"pass exactly one of steps, epochs or cpu_seconds, got {lengths or 'none'}")
+            raise UsageError(
+                f"pass exactly one of steps, epochs or cpu_seconds, got {lengths or 'none'}", concerns="steps"
+            )
         if self.steps is not None:
             integer("steps", self.steps, least=1)
         else:
             _within(*lengths.popitem(), "(0, inf)")
 
 
-def _within(name: str, value: Any, interval: str) -> None:
+def _within(name: str, value: Any, interval: str, *, of: str = "") -> None:
     """Raise an error if a value is no number, or outside an interval such as ``[0, 1)``, which may include infinity."""
     low, high = map(float, interval[1:-1].split(","))
     real = value if isinstance(value, float) and math.isinf(value) else number(name, value)
     if not low <= real <= high or (real == low and interval[0] == "(") or (real == high and interval[-1] == ")"):
-        raise UsageError(f"{name} must be in {interval}, got {value!r}")
+        raise UsageError(f"must be in {interval}{of}, got {value!r}", argument=name)

@@ -81,7 +81,7 @@ class Learner:
                 points.path,
                 points.rate,
                 weights=weights,
-                obstacle_poses=rows.obstacle_poses,
+                obstacle_poses=rows.tasks.scene.poses,
                 start_tip=start_tip,
                 shift=shift,
             )
@@ -124,14 +124,14 @@ class Learner:
             gradient.astype(points.path.dtype, copy=False) for gradient in (value.path_gradient, value.rate_gradient)
         )
         if self.projection is not None:
-            by_path = self.projection.vjp(points.path, rows.obstacle_poses, by_path)
+            by_path = self.projection.vjp(points.path, rows.tasks.scene.poses, by_path)
         scale = self.settings.path_scale
         return vjp(rows.tasks, points, path_gradient=by_path, rate_gradient=by_rate, scale=scale, spec=self.spec)
 
     def _projected(self, points: ControlPoints, rows: Rows) -> ControlPoints:
         if self.projection is None:
             return points
-        return ControlPoints(self.projection.project(points.path, rows.obstacle_poses), points.rate)
+        return ControlPoints(self.projection.project(points.path, rows.tasks.scene.poses), points.rate)
 
     def _factors(self, phi: Array, log_rate: Array, clipping: Clipping) -> Array:
         """Return the factors of the samples' gradients, shape (N, 1); a gradient that is not finite becomes 0."""

@@ -1,5 +1,7 @@
 """Train a model on a dataset: a model file at the end, a checkpoint and a log during the run."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,13 +14,15 @@ from cnpgen.planner.inference_pipeline import InferencePipeline, loaded_problem
 from cnpgen.planner.model import Model
 from cnpgen.planner.model_file import find_model, load_model, save_model
 from cnpgen.problems.problem_record import as_record
-from cnpgen.schema.arguments import integer
+from cnpgen.schema.argument_types import checked_arguments
+from cnpgen.schema.arguments import concerning, integer
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.files.documents import differences, plain
+from cnpgen.store.files.file_lock import output_lock
 from cnpgen.training.checkpoint import Checkpoints
 from cnpgen.training.data import TrainingData, open_training_data
 from cnpgen.training.log import TrainingLog
-from cnpgen.training.output_files import CHECKPOINT, LOG, check_beside, check_out, remove_temporary_files
+from cnpgen.training.output_files import CHECKPOINT, LOCK, LOG, check_beside, check_out, remove_temporary_files
 from cnpgen.training.prepare import begin_run, identity, prepare_run
 from cnpgen.training.score import validate
 from cnpgen.training.settings import Length, TrainingSettings
@@ -49,6 +53,7 @@ class Trained:
     times: Times = NO_TIME
 
 
+@checked_arguments
 def train_model(
     folder: str | Path,
     out: str | Path,
@@ -89,8 +94,8 @@ def train_model(
         watch: Called with every line of the log.
 
     Raises:
-        UsageError: An argument is invalid, the initial model is missing or does not fit, or there is another model,
-            another run's checkpoint, or a log or picture of another origin.
+        UsageError: An argument is invalid, the initial model is missing or does not fit, there is another model,
+            another run's checkpoint, or a log or picture of another origin, or another process writes the same model.
         DatasetError: The dataset or the checkpoint is damaged.
         MachineError: The disk is full, or the loss is not finite any more.
     """
@@ -102,7 +107,8 @@ def train_model(
         if job.out.exists() and not job.checkpoints.path.exists():
             return _finished(job)
         check_beside(job.out)
-    with one_thread(), loaded_problem(as_record(job.source.dataset.problem)) as loaded:
+    lock = output_lock(job.out, job.out.with_suffix(LOCK))
+    with lock, one_thread(), loaded_problem(as_record(job.source.dataset.problem)) as loaded:
         run, inference = prepare_run(
             job.source,
             loaded,
@@ -115,10 +121,10 @@ def train_model(
         clock.prepared()
         if begin is not None:
             begin(state, run)
-        journal = TrainingLog(job.out.with_suffix(LOG), state.log)
-        run.train(state, job.checkpoints, journal, watch)
+        log = TrainingLog(job.out.with_suffix(LOG), state.log)
+        run.train(state, job.checkpoints, log, watch)
         job.checkpoints.save(state)
-        trained = _saved(job, run, state, inference=inference, journal=journal, workers=workers)
+        trained = _saved(job, run, state, inference=inference, log=log, workers=workers)
     clock.computed_here()
     return replace(trained, times=clock.times())
 
@@ -167,18 +173,19 @@ def _read_initial_model(start_from: str | Path | None) -> tuple[Model | None, st
     """Read the model to start from, and its file's sha256; None if there is none."""
     if start_from is None:
         return None, None
-    return load_model(start_from), file_sha256(find_model(start_from))
+    with concerning("start_from"):
+        return load_model(start_from), file_sha256(find_model(start_from))
 
 
 def _saved(
-    job: _Job, run: Run, state: State, *, inference: InferencePipeline, journal: TrainingLog, workers: int | None
+    job: _Job, run: Run, state: State, *, inference: InferencePipeline, log: TrainingLog, workers: int | None
 ) -> Trained:
     """Score the best model and write it; the log's last line is not in the checkpoint, so it is written once."""
     best = run.model(state.best.parameters)
     score = validate(best, inference, job.source.judged(MAX_SCORED_ROWS, after=job.check_rows), workers=workers)
-    journal.write({"step": state.adam.step, "best": state.best.step, "final": score})
+    log.write({"step": state.adam.step, "best": state.best.step, "final": score})
     training = {**best.training, **job.checkpoints.identity, **_outcome(state, score)}
-    model = replace(best, log=journal.text, training=training)
+    model = replace(best, log=log.text, training=training)
     save_model(job.out, model)
     job.checkpoints.remove()
     return Trained(model, job.out, score)

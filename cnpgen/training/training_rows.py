@@ -1,4 +1,4 @@
-"""Training rows in memory: tasks, features and obstacle poses."""
+"""Training rows in memory: tasks and features."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -13,6 +13,7 @@ from cnpgen.planner.network.features import Features, fit_features, usual_blocks
 from cnpgen.planner.task_preprocessor import TaskPreprocessor
 from cnpgen.planner.tasks import Tasks
 from cnpgen.plans.format import BOUNDARY, CONDITIONS
+from cnpgen.robots.scene import Scene
 from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[Any]
@@ -26,13 +27,11 @@ class Rows:
     Attributes:
         tasks: The tasks.
         features: The network's inputs, shape (N, F).
-        obstacle_poses: Poses and sizes of the obstacles, shape (N, width).
         target: Control points of demonstrations; None if there are none.
     """
 
     tasks: Tasks
     features: Array
-    obstacle_poses: Array
     target: ControlPoints | None = None
 
     def __len__(self) -> int:
@@ -41,7 +40,7 @@ class Rows:
     def take(self, which: NDArray[np.intp]) -> "Rows":
         """Return a subset of the rows."""
         target = None if self.target is None else ControlPoints(self.target.path[which], self.target.rate[which])
-        return Rows(self.tasks.take(which), self.features[which], self.obstacle_poses[which], target)
+        return Rows(self.tasks.take(which), self.features[which], target)
 
 
 def boundary_columns(columns: dict[str, Array]) -> Boundary:
@@ -79,23 +78,20 @@ def prepare_rows(
     definition = features or fit_features((straight(boundary[block]) for block in blocks), usual_blocks(boundary))
     arrays: dict[str, Array] = {}
     for block in blocks:
-        for name, values in _arrays((lines or prepare)(boundary[block]), prepare, definition, dtype).items():
+        for name, values in _arrays((lines or prepare)(boundary[block]), definition, dtype).items():
             if name not in arrays:
                 arrays[name] = np.empty((len(boundary), *values.shape[1:]), dtype)
             arrays[name][block] = values
     ends = Boundary(**{name: arrays.pop(name) for name in boundary.conditions()})
-    row_features, obstacle_poses = arrays.pop("features"), arrays.pop("obstacle_poses")
-    return Rows(features=row_features, obstacle_poses=obstacle_poses, tasks=Tasks(ends, **arrays)), definition
+    row_features, scene = arrays.pop("features"), Scene(tuple(prepare.problem.obstacle), arrays.pop("poses"))
+    return Rows(features=row_features, tasks=Tasks(ends, scene=scene, **arrays)), definition
 
 
-def _arrays(tasks: Tasks, prepare: TaskPreprocessor, features: Features, dtype: str) -> dict[str, Array]:
+def _arrays(tasks: Tasks, features: Features, dtype: str) -> dict[str, Array]:
     """Return all arrays of a block of rows with one entry per task, by name."""
     arrays = tasks.boundary.conditions()
-    arrays |= {name: values for name, values in vars(tasks).items() if name != "boundary" and values is not None}
-    return arrays | {
-        "features": features.of(tasks, dtype),
-        "obstacle_poses": prepare.obstacle_poses(tasks.start_xyz, tasks.goal_xyz),
-    }
+    parts = {name: values for name, values in vars(tasks).items() if isinstance(values, np.ndarray)}
+    return arrays | parts | {"features": features.of(tasks, dtype), "poses": tasks.scene.poses}
 
 
 def zero_conditions(boundary: Boundary) -> tuple[str, ...]:

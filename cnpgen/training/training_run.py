@@ -67,13 +67,13 @@ class Run:
         settings = self.learner.settings
         self.order = StepRows(len(self.rows), settings.batch_size, settings.seed)
 
-    def train(self, state: State, checkpoints: Checkpoints, journal: TrainingLog, watch: Watcher | None = None) -> None:
+    def train(self, state: State, checkpoints: Checkpoints, log: TrainingLog, watch: Watcher | None = None) -> None:
         """Train until the last step.
 
         Args:
             state: State of the run; changed in place.
             checkpoints: Checkpoints, written at intervals.
-            journal: The log.
+            log: The log.
             watch: Called with every line of the log.
 
         Raises:
@@ -85,18 +85,18 @@ class Run:
         while state.adam.step < state.steps:
             with signals_deferred() as waiting:
                 while state.adam.step < state.steps and not waiting.came:
-                    self._train_step(state, gradient, journal, watch)
+                    self._train_step(state, gradient, log, watch)
                     checkpoints.save_if_due(state)
                 if waiting.came:
                     checkpoints.save(state)
 
-    def _train_step(self, state: State, gradient: Array, journal: TrainingLog, watch: Watcher | None) -> None:
+    def _train_step(self, state: State, gradient: Array, log: TrainingLog, watch: Watcher | None) -> None:
         """Take a step, and write the records that are due after it."""
         started = time.process_time()
         self.step(state, gradient)
         state.seconds += time.process_time() - started
         for record in self._due(state):
-            journal.write(record)
+            log.write(record)
             if watch is not None:
                 watch(record)
 

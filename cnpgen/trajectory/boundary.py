@@ -1,5 +1,7 @@
 """Boundary conditions, and the control points that meet them exactly (paper, Appendix A)."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from enum import Enum
@@ -9,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
+from cnpgen.schema.arguments import integer
 from cnpgen.trajectory.spline import EndDerivatives, end_derivatives
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
@@ -32,6 +35,10 @@ class Missing(Enum):
 MISSING = Missing.MISSING
 
 
+class MotionIndexError(UsageError, IndexError):
+    """Index of a motion that does not exist."""
+
+
 @dataclass(frozen=True)
 class Boundary:
     """Boundary conditions of N motions of n joints.
@@ -53,7 +60,7 @@ class Boundary:
     goal_ddq: Array | None = None
 
     @classmethod
-    def from_batch(cls, batch: Mapping[str, Any], normalization: Scaling | Missing | None = MISSING) -> "Boundary":
+    def from_batch(cls, batch: Mapping[str, Any], normalization: Scaling | Missing | None = MISSING) -> Boundary:
         """Read the boundary conditions from a batch of rows, in SI units; ignore its other fields.
 
         Args:
@@ -71,10 +78,19 @@ class Boundary:
                 f"a {kind} needs {{normalization}}, which is dataset.normalization, or None for SI units",
                 remedies={"normalization": None},
             )
+        if not hasattr(batch, "keys"):
+            raise UsageError(f"must be a batch or a mapping, got {type(batch).__name__}", argument="batch")
+        if scaling is not None and not hasattr(scaling, "denormalize"):
+            got = type(scaling).__name__
+            raise UsageError(
+                f"must be dataset.normalization, or None for SI units, got {got}", argument="normalization"
+            )
         names = [entry.name for entry in fields(cls)]
         missing = [name for name in names if name not in batch and name != "goal_ddq"]
         if missing:
-            raise UsageError(f"the batch lacks {', '.join(missing)}: it has the fields {', '.join(map(str, batch))}")
+            present = ", ".join(map(str, batch))
+            text = f"the batch lacks {', '.join(missing)}: it has the fields {present:.200}"
+            raise UsageError(text, concerns="batch")
         rows = {name: batch[name] for name in names if name in batch}
         return cls(**(rows if scaling is None else scaling.denormalize(rows)))
 
@@ -88,6 +104,7 @@ class Boundary:
 
     def min_control_points(self, degree: int) -> int:
         """Return the minimum number of path control points of a spline of this degree that meets these conditions."""
+        integer("degree", degree, least=1)
         return max(degree + 2, 3 + self.fixed_at_goal)
 
     def conditions(self) -> dict[str, Array]:
@@ -97,15 +114,20 @@ class Boundary:
     def __len__(self) -> int:
         return len(self.start_q)
 
-    def __getitem__(self, index: slice | NDArray[Any]) -> "Boundary":
-        return Boundary(
-            self.start_q[index],
-            self.start_dq[index],
-            self.start_ddq[index],
-            self.goal_q[index],
-            self.goal_dq[index],
-            None if self.goal_ddq is None else self.goal_ddq[index],
-        )
+    def __getitem__(self, index: slice | NDArray[Any]) -> Boundary:
+        try:
+            return Boundary(
+                self.start_q[index],
+                self.start_dq[index],
+                self.start_ddq[index],
+                self.goal_q[index],
+                self.goal_dq[index],
+                None if self.goal_ddq is None else self.goal_ddq[index],
+            )
+        except (IndexError, TypeError, ValueError) as error:
+            raise MotionIndexError(
+                f"motions are selected by a slice, numbers or a mask: {error}", concerns="index"
+            ) from error
 
 
 def start_points(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> Array:

@@ -47,7 +47,7 @@ def boundary_of(  # noqa: PLR0917 - in the order of the paper
     rows = max(len(values) for values in arrays.values())
     for name, values in arrays.items():
         if len(values) not in {1, rows}:
-            raise UsageError(f"{name} has {len(values)} rows, another boundary condition has {rows}")
+            raise UsageError(f"has {len(values)} rows, another boundary condition has {rows}", argument=name)
     if goal_ddq is None:
         del arguments["goal_ddq"]
     zero = np.zeros((1, n))
@@ -57,11 +57,11 @@ def boundary_of(  # noqa: PLR0917 - in the order of the paper
 def _rows(name: str, values: ArrayLike, n: int) -> Array:
     array = numbers(name, values)
     if array.ndim not in {1, 2} or array.shape[-1] != n:
-        raise UsageError(f"{name} must have shape ({n},) or (N, {n}), got {array.shape}")
+        raise UsageError(f"must have shape ({n},) or (N, {n}), got {array.shape}", argument=name)
     rows = array.reshape(-1, n)
     if not math.isfinite(rows.sum()) and not np.isfinite(rows).all():
         row = int(np.argmin(np.isfinite(rows).all(axis=1)))
-        raise UsageError(f"{name} must be finite, got {rows[row]} in row {row}")
+        raise UsageError(f"must be finite, got {rows[row]} in row {row}", argument=name)
     return rows
 
 

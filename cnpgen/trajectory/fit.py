@@ -8,6 +8,8 @@ with the path eliminated (variable projection, Golub and Pereyra 1973). The path
 to the samples, so that no r causes a drift in time.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from functools import cache
 
@@ -16,6 +18,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
+from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import numbers
 from cnpgen.trajectory.boundary import Boundary, assemble
 from cnpgen.trajectory.samples import checked_samples, resampled, sampled_boundary
@@ -32,6 +35,7 @@ MAX_LOG_RATE_CHANGE = 4.0  # in the optimization of r
 PATH_SMOOTHNESS, RATE_SMOOTHNESS = 1e-8, 3e-5  # weights of p''' and of second differences of log r; positions: rad
 
 
+@checked_arguments
 def fit_motion(
     t: ArrayLike, q: ArrayLike, dq: ArrayLike | None = None, *, spec: TrajectorySpec, boundary: Boundary | None = None
 ) -> Motion:
@@ -77,12 +81,12 @@ def largest_error(motion: Motion, t: ArrayLike, q: ArrayLike) -> float:
 
 def _checked_boundary(boundary: Boundary, n: int) -> Boundary:
     """Return the boundary conditions of one motion as arrays; check their shapes."""
-    arrays = {name: numbers(f"the boundary's {name}", row) for name, row in vars(boundary).items() if row is not None}
+    arrays = {name: numbers("boundary", row) for name, row in vars(boundary).items() if row is not None}
     for name, row in arrays.items():
         if row.shape != (1, n):
-            raise UsageError(f"the boundary's {name} must have shape (1, {n}), got {row.shape}")
+            raise UsageError(f"the boundary's {name} must have shape (1, {n}), got {row.shape}", concerns="boundary")
         if not np.isfinite(row).all():
-            raise UsageError(f"the boundary's {name} must be finite, got {row[0]}")
+            raise UsageError(f"the boundary's {name} must be finite, got {row[0]}", concerns="boundary")
     return Boundary(**arrays)
 
 
@@ -126,7 +130,7 @@ class _Fit:
         """The interior path control points."""
         return slice(3, self.spec.path_control_points - self.boundary.fixed_at_goal)
 
-    def thinned(self, max_samples: int) -> "_Fit":
+    def thinned(self, max_samples: int) -> _Fit:
         """Subsample evenly to at most ``max_samples``."""
         step = -(-len(self.t) // max_samples)
         return _Fit(self.t[::step], self.q[::step], self.duration, self.spec, self.boundary)

@@ -1,5 +1,7 @@
 """Sequences of motions: each part is cut at a time, and the next one continues from that state without a jump."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,7 +42,7 @@ class JoinedMotion:
     def __len__(self) -> int:
         return len(self.parts[0])
 
-    def __getitem__(self, index: list[int]) -> "JoinedMotion":
+    def __getitem__(self, index: list[int]) -> JoinedMotion:
         return JoinedMotion(tuple(part[index] for part in self.parts), self.start_times[:, index])
 
     def duration(self) -> Array:
@@ -66,7 +68,9 @@ def _check_joint(before: Motion, after: Motion, start: Array, cut_time: Array) -
     if outside.any():
         row = int(outside.argmax())
         interval = f"from {start[row]:.6g} to {start[row] + duration[row]:.6g} s"
-        raise UsageError(f"plan {row} cannot be cut at {cut_time[row]:.6g} s: its last part lasts {interval}")
+        raise UsageError(
+            f"plan {row} cannot be cut at {cut_time[row]:.6g} s: its last part lasts {interval}", concerns="at"
+        )
     left, right = states_at_times(before, cut), states_at_times(after, np.zeros_like(cut))
     tolerance = MAX_JOINT_GAP + _rounding(before) + _rounding(after)
     for name, unit, end, begin, max_gap in zip(
@@ -78,7 +82,7 @@ def _check_joint(before: Motion, after: Motion, start: Array, cut_time: Array) -
             text = (
                 f"{name} jumps by {gap[row]:.3g} {unit} at {cut_time[row]:.6g} s, expected at most {max_gap[row]:.3g}"
             )
-            raise UsageError(f"plan {row} cannot be joined: {text}")
+            raise UsageError(f"plan {row} cannot be joined: {text}", concerns="following")
 
 
 def _rounding(motion: Motion) -> Array:

@@ -9,6 +9,7 @@ from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]
 
+MAX_SAMPLE = 1e9  # of times, positions and velocities in SI units; powers of larger ones overflow
 MIN_DENSE_SAMPLES = 400  # fewer samples are resampled from the cubic through positions and velocities
 WINDOWS = (5, 8, 12, 18, 27, 40, 60, 90, 135, 200)  # samples at each end for estimating velocity and acceleration
 MAX_REST_SPEED_RATIO = 2e-3  # of the mean speed: smaller velocities are 0; accelerations: ten times, per duration
@@ -34,11 +35,13 @@ def checked_samples(t: ArrayLike, q: ArrayLike, dq: ArrayLike | None) -> tuple[A
     if velocities is not None and velocities.shape != positions.shape:
         raise UsageError(f"must have the shape of q, {positions.shape}, got {velocities.shape}", argument="dq")
     if len(times) < 2:
-        raise UsageError(f"a trajectory needs at least 2 samples, got {len(times)}")
+        raise UsageError(f"a trajectory needs at least 2 samples, got {len(times)}", concerns="t")
     for name, values in (("t", times), ("q", positions), ("dq", velocities)):
         if values is not None and not np.isfinite(values).all():
             index = int(np.argmin(np.isfinite(values).reshape(len(values), -1).all(axis=1)))
-            raise UsageError(f"{name} must be finite, got {values[index]} in sample {index}")
+            raise UsageError(f"must be finite, got {values[index]} in sample {index}", argument=name)
+        if values is not None and np.abs(values).max() > MAX_SAMPLE:
+            raise UsageError(f"must be at most {MAX_SAMPLE:g}, got {np.abs(values).max():g}", argument=name)
     if np.any(np.diff(times) <= 0):
         index = int(np.argmin(np.diff(times) > 0))
         raise UsageError(

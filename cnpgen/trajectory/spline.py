@@ -1,7 +1,8 @@
 """Clamped uniform B-splines: knots, basis functions, derivatives, extrema, and quadrature cells.
 
-The NumPy evaluations of splines are here: a matrix of basis functions (``basis``), Horner's rule in the power basis of
-each span (``horner``, ``derivatives``), and one phase of each of N splines (``derivatives_of_each``).
+All production code evaluates splines by this module: by a matrix of basis functions at common phases (``basis``), which
+kernels and compiled code multiply with control points, by Horner's rule at the phases of each spline (``horner``), or
+at one phase of each of N splines (``derivatives_of_each``). The judges have their own splines.
 """
 
 from dataclasses import dataclass
@@ -130,40 +131,21 @@ def select_spans(coefficients: Array, s: Array) -> tuple[Array, Array]:
 def horner(selected: Array, offset: Array, order: int = 0) -> Array:
     """Evaluate the polynomials of ``select_spans``, or a derivative of them, by Horner's rule.
 
+    Args:
+        selected: Coefficients, shape (D + 1, N, K, ...).
+        offset: Phases minus left knots, shape (N, K), or (M, N, K) for M phases of each polynomial.
+        order: Order of the derivative.
+
     Returns:
-        Values, shape (N, K, ...).
+        Values, shape (N, K, ...) or (M, N, K, ...).
     """
     degree = len(selected) - 1
     offset = offset.reshape(*offset.shape, *(1,) * (selected.ndim - 3))
     value = np.zeros(selected.shape[1:])
-    for power in range(degree, order - 1, -1):
-        value = value * offset + perm(power, order) * selected[degree - power]
+    powers = range(degree, order - 1, -1)
+    for coefficients in [perm(power, order) * selected[degree - power] for power in powers] if order else selected:
+        value = value * offset + coefficients
     return value
-
-
-def derivatives(control: Array, degree: int, s: Array, *, orders: int) -> list[Array]:
-    """Evaluate one spline and its first derivatives together at many phases by Horner's rule.
-
-    Args:
-        control: Control points, shape (C, n).
-        degree: Degree D, at least 3.
-        s: Phases in [0, 1], shape (K,).
-        orders: Number of results: 1 is the spline alone.
-
-    Returns:
-        Arrays of shape (n, K).
-    """
-    spans = len(control) - degree
-    span = np.clip(s * spans, 0, spans - 1).astype(np.intp)
-    offset = s - span / spans
-    powers = control.T @ taylor_coefficients(len(control), degree).transpose(0, 2, 1)  # (D + 1, n, spans)
-    coefficients = powers.take(span, axis=2)
-    values = [coefficients[-1], *(np.zeros_like(coefficients[-1]) for _ in range(orders - 1))]
-    for coefficient in coefficients[-2::-1]:
-        for order in range(orders - 1, 0, -1):
-            values[order] = values[order] * offset + values[order - 1]
-        values[0] = values[0] * offset + coefficient
-    return [factorial(order) * value for order, value in enumerate(values)]
 
 
 def derivatives_of_each(control: Array, degree: int, s: Array) -> Array:

@@ -1,5 +1,7 @@
 """N motions of one robot: positions and their time derivatives, duration, time as a function of phase."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -10,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.schema.arguments import numbers
+from cnpgen.trajectory.boundary import MotionIndexError
 from cnpgen.trajectory.spline import (
     basis,
     derivatives_of_each,
@@ -70,9 +73,15 @@ class Motion:
     def __post_init__(self) -> None:
         path, rate = np.shape(self.path), np.shape(self.rate)
         if len(path) != 3 or len(rate) != 2 or path[0] != rate[0]:
-            raise UsageError(f"control points must have shapes (N, C, n) and (N, R), got {path} and {rate}")
+            raise UsageError(
+                f"control points must have shapes (N, C, n) and (N, R), got {path} and {rate}", concerns="path"
+            )
+        if not isinstance(self.degree, int | np.integer):
+            raise UsageError(f"must be an integer, got {self.degree!r:.100}", argument="degree")
         if min(path[1], rate[1]) <= self.degree:
-            raise UsageError(f"splines of degree {self.degree} need at least {self.degree + 1} control points")
+            raise UsageError(
+                f"splines of degree {self.degree} need at least {self.degree + 1} control points", concerns="degree"
+            )
 
     def __repr__(self) -> str:
         return f"<Motion of degree {self.degree}: path {np.shape(self.path)}, rate {np.shape(self.rate)}>"
@@ -80,9 +89,13 @@ class Motion:
     def __len__(self) -> int:
         return len(self.path)
 
-    def __getitem__(self, index: int | slice | list[int] | NDArray[Any]) -> "Motion":
+    def __getitem__(self, index: int | slice | list[int] | NDArray[Any]) -> Motion:
         index = [int(index)] if isinstance(index, int | np.integer) else index
-        return Motion(self.path[index], self.rate[index], self.degree)
+        try:
+            return Motion(self.path[index], self.rate[index], self.degree)
+        except (IndexError, TypeError, ValueError, UsageError) as error:
+            text = f"motions are selected by a number, numbers, a mask or a slice: {error}"
+            raise MotionIndexError(text, concerns="index") from error
 
     @property
     def spec(self) -> TrajectorySpec:
@@ -100,7 +113,7 @@ class Motion:
         Raises:
             UsageError: s has another shape.
         """
-        s = self._checked("phases", s)
+        s = self._checked("s", s)
         blocks = self._blocks(s.shape[1]) if s.ndim == 2 else []
         if len(blocks) > 1:
             parts = [vars(self[block].at(s[block])) for block in blocks]
@@ -149,7 +162,7 @@ class Motion:
         Raises:
             UsageError: s has another shape.
         """
-        s = np.clip(self._checked("phases", s), 0.0, 1.0)
+        s = np.clip(self._checked("s", s), 0.0, 1.0)
         if s.ndim == 2:
             return np.array([self[[i]].time_at(s[i])[0] for i in range(len(self))]).reshape(s.shape)
         times = np.empty((len(self), len(s)))
@@ -181,7 +194,7 @@ class Motion:
         Raises:
             UsageError: t has another shape.
         """
-        t = self._checked("times", t)
+        t = self._checked("t", t)
         t = np.repeat(t[None], len(self), axis=0) if t.ndim == 1 else t
         blocks = self._blocks(len(_NODES) * t.shape[1])
         if len(blocks) > 1:
@@ -205,7 +218,7 @@ class Motion:
             ahead = width * left / np.take_along_axis(np.diff(known), cell, axis=1)
             done = np.zeros(t.shape, bool)
             for _ in range(30):  # three or four are enough if r is positive
-                values = _values(rate, offset + ahead * _NODES_AND_END)
+                values = horner(rate, offset + ahead * _NODES_AND_END)
                 taken = ahead * sum(_WEIGHTS[:, None, None] / values[:-1])  # node by node: same bits in any batch
                 new = np.minimum(np.maximum(ahead + (left - taken) * values[-1], 0.0), width)
                 ahead, done = np.where(done, ahead, new), done | ~(np.abs(new - ahead) > 1e-15)
@@ -217,7 +230,7 @@ class Motion:
         """Evaluate the motions at times t [s], shape (K,) or (N, K), clipped to the motion; see ``at``."""
         return self.at(self.phase_at(t))
 
-    def time_scaled(self, factor: Array | float) -> "Motion":
+    def time_scaled(self, factor: Array | float) -> Motion:
         """Scale time uniformly: keep the path and divide the rate by a factor.
 
         Exact for motions from rest to rest: their boundary velocities and accelerations stay zero.
@@ -225,13 +238,19 @@ class Motion:
         Args:
             factor: Scale of the durations, at least 1: one per motion, shape (N,), or one for all.
         """
-        return Motion(self.path, self.rate / np.reshape(factor, (-1, 1)), self.degree)
+        factors = numbers("factor", factor).reshape(-1, 1)
+        if len(factors) not in {1, len(self)} or not (factors > 0).all():
+            got = f"got {factor!s:.100}"
+            raise UsageError(
+                f"must be one positive number or one for each of {len(self)} motions, {got}", argument="factor"
+            )
+        return Motion(self.path, self.rate / factors, self.degree)
 
     def _checked(self, name: str, values: ArrayLike) -> Array:
         """Return phases or times as an array of shape (K,) or (N, K)."""
         array = numbers(name, values)
         if array.ndim not in {1, 2} or (array.ndim == 2 and len(array) != len(self)):
-            raise UsageError(f"{name} must have shape (K,) or ({len(self)}, K), got {array.shape}")
+            raise UsageError(f"must have shape (K,) or ({len(self)}, K), got {array.shape}", argument=name)
         return array
 
     def _cells(self) -> Iterator[tuple[slice | list[int], Array, Array]]:
@@ -275,14 +294,6 @@ def _nodes(edges: Array, points: int, degree: int) -> Array:
     """Return the basis of r at the Gauss nodes of the cells between the edges, shape (R, cells x 8)."""
     nodes = edges[:-1, None] + np.diff(edges)[:, None] * _NODES
     return basis(nodes.ravel(), points, degree).T
-
-
-def _values(selected: Array, offset: Array) -> Array:
-    """Evaluate polynomials of ``select_spans``, shape (D + 1, N, K), each at M offsets, shape (M, N, K)."""
-    value = np.zeros_like(offset)
-    for coefficients in selected:
-        value = value * offset + coefficients
-    return value
 
 
 def time_derivatives(p: Sequence[Array], r: Sequence[Array]) -> list[Array]:

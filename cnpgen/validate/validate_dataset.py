@@ -9,6 +9,7 @@ from cnpgen.errors import DatasetError, counted
 from cnpgen.judges.rows.row_report import RowReport
 from cnpgen.machine.engine import Engine
 from cnpgen.make.recipe_file import restored
+from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
 from cnpgen.store.check import Finding, check_dataset
 from cnpgen.store.dataset_spec import DatasetSpec, load_dataset_spec, shards
@@ -95,6 +96,7 @@ class ValidationReport:
         return f"{text} ({self.wanted:,} were requested)" if self.wanted > self.blocks else text
 
 
+@checked_arguments
 def validate_dataset(
     folder: str | Path,
     *,

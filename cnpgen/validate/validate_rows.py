@@ -19,8 +19,8 @@ from cnpgen.machine.engine import Engine, assembled
 from cnpgen.make.recipe_file import restored
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.store.check import DELETE_HINT, Finding
+from cnpgen.store.checked_shard import read_checked, shard_of_record
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask
-from cnpgen.store.shard import read_shard
 from cnpgen.store.shard_record import load_record
 from cnpgen.validate.numbers import check_numbers
 
@@ -100,8 +100,8 @@ class _ShardCheck:
 def _verify_shard(folder: Path, spec: DatasetSpec, task: ShardTask) -> _ShardCheck:
     """Verify one shard; a shard that cannot be read is a finding, not an exception."""
     try:
-        columns = read_shard(folder / task.file)
         record = load_record(folder, task)
+        columns = read_checked(shard_of_record(folder, spec, task, record))
     except CnpgenError as error:
         return _ShardCheck(None, [str(error)], np.empty(0, np.uint64), PlanCheck(), np.empty(0), np.empty(0, np.uint64))
     with restored(spec) as recipe:

@@ -1,5 +1,7 @@
 """A robot among its obstacles at one state, evaluated with Pinocchio and Coal."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -41,8 +43,8 @@ class World:
 
     def __init__(
         self,
-        robot: "Robot",
-        obstacles: "Sequence[Obstacle]" = (),
+        robot: Robot,
+        obstacles: Sequence[Obstacle] = (),
         object_size: tuple[float, float, float] | None = None,
     ) -> None:
         self.robot, self.obstacles = robot, obstacles

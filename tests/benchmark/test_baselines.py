@@ -1,4 +1,4 @@
-"""TrajOpt and AQP, each against something that shares no code with it."""
+"""TrajOpt, AQP and CBiRRT, compared with finite differences, SciPy and Pinocchio."""
 
 from dataclasses import replace
 
@@ -13,7 +13,13 @@ from cnpgen.benchmark.judging import judge_answer
 from cnpgen.benchmark.planners.aqp import AQP, nearest_in_null_space
 from cnpgen.benchmark.planners.knots import knot_constraints
 from cnpgen.benchmark.planners.obstacle_boxes import boxes_of
-from cnpgen.benchmark.planners.table_plane import HIGH, LOW, PlanePath, stopping_path, striking_path
+from cnpgen.benchmark.planners.table_plane import (
+    MAX_MALLET_XY_M,
+    MIN_MALLET_XY_M,
+    PlanePath,
+    stopping_path,
+    striking_path,
+)
 from cnpgen.benchmark.planners.tip import Tip
 from cnpgen.benchmark.planners.trajopt import TrajOpt, TrajOptTranscription
 from cnpgen.benchmark.process import PlannerProcess
@@ -32,49 +38,54 @@ def one_of(suite: str, index: int = 0) -> Plans:
 
 def transcription(task: Plans) -> TrajOptTranscription:
     problem, robot = open_problem(task.problem)
-    at_knots = knot_constraints(problem, robot, task.columns["start_xyz"][0], task.columns["goal_xyz"][0])
+    at_knots = knot_constraints(problem, robot, task.scene)
     return TrajOptTranscription(robot, task.boundary, at_knots)
 
 
 @pytest.mark.parametrize("suite", some(["hits-81", "heavy-100"], 1, "slow"))
-def test_the_derivatives_of_trajopt_are_those_of_its_functions(suite: str) -> None:
-    found = transcription(one_of(suite))
-    x = found.start() + 0.1 * np.random.default_rng(0).normal(size=len(found.start()))
+def test_derivatives_of_trajopt_equal_finite_differences(suite: str) -> None:
+    program = transcription(one_of(suite))
+    x = program.start() + 0.1 * np.random.default_rng(0).normal(size=len(program.start()))
     x[-1] = 0.7
     direction = np.random.default_rng(1).normal(size=(4, len(x)))
-    for function, jacobian in ((found.defects, found.defects_jacobian), (found.margins, found.margins_jacobian)):
+    for function, jacobian in (
+        (program.defects, program.defects_jacobian),
+        (program.margins, program.margins_jacobian),
+    ):
         J = jacobian(x)
         for d in direction:
             difference = (function(x + 1e-6 * d) - function(x - 1e-6 * d)) / 2e-6
             np.testing.assert_allclose(J @ d, difference, atol=2e-5)
 
 
-def test_trajopt_meets_its_own_constraints_and_its_boundary_conditions() -> None:
+def test_trajopt_satisfies_its_constraints_and_boundary_conditions() -> None:
     task = one_of("hits-81", 40)
-    found = TrajOpt().prepare(Setting(task.problem))(task)
-    assert isinstance(found, Trajectory)
-    own = transcription(task)
-    x = np.concatenate([found.q[1:-1].ravel(), found.dq[1:-1].ravel(), found.ddq.ravel(), [found.duration]])
-    assert np.abs(own.defects(x)).max() < 1e-5
-    assert own.margins(x).min() > -1e-5
-    low, high = own.bounds()
+    trajectory = TrajOpt().prepare(Setting(task.problem))(task)
+    assert isinstance(trajectory, Trajectory)
+    program = transcription(task)
+    x = np.concatenate(
+        [trajectory.q[1:-1].ravel(), trajectory.dq[1:-1].ravel(), trajectory.ddq.ravel(), [trajectory.duration]]
+    )
+    assert np.abs(program.defects(x)).max() < 1e-5
+    assert program.margins(x).min() > -1e-5
+    low, high = program.bounds()
     assert np.all((x > low - 1e-9) & (x < high + 1e-9))
-    np.testing.assert_allclose(found.q[[0, -1]], [task.boundary.start_q[0], task.boundary.goal_q[0]], atol=1e-12)
-    np.testing.assert_allclose(found.dq[-1], task.boundary.goal_dq[0], atol=1e-12)
-    verdict = judge_answer(task, found)
+    np.testing.assert_allclose(trajectory.q[[0, -1]], [task.boundary.start_q[0], task.boundary.goal_q[0]], atol=1e-12)
+    np.testing.assert_allclose(trajectory.dq[-1], task.boundary.goal_dq[0], atol=1e-12)
+    verdict = judge_answer(task, trajectory)
     assert verdict.paper.finished
     assert verdict.metrics.duration < 0.6
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_the_quadratic_program_of_aqp_has_the_optimum_that_another_solver_finds(seed: int) -> None:
+def test_the_quadratic_program_of_aqp_has_the_optimum_of_slsqp(seed: int) -> None:
     random = np.random.default_rng(seed)
     null = np.linalg.svd(random.normal(size=(3, 6)))[2][3:].T
-    weights, ahead, least = random.uniform(1, 10, 6), random.normal(size=6), 0.3 * random.normal(size=6)
-    low, high = -0.8 - least, 0.8 - least
-    found = nearest_in_null_space(null, weights, ahead, (low, high))
+    weights, ahead, min_norm = random.uniform(1, 10, 6), random.normal(size=6), 0.3 * random.normal(size=6)
+    low, high = -0.8 - min_norm, 0.8 - min_norm
+    solution = nearest_in_null_space(null, weights, ahead, (low, high))
     H, f = null.T @ (weights[:, None] * null), null.T @ (weights * ahead)
-    other = minimize(
+    expected = minimize(
         lambda a: a @ H @ a / 2 + f @ a,
         np.zeros(3),
         jac=lambda a: H @ a + f,
@@ -85,11 +96,11 @@ def test_the_quadratic_program_of_aqp_has_the_optimum_that_another_solver_finds(
         ],
         options={"ftol": 1e-14},
     )
-    assert LinearConstraint(null, low, high).residual(other.x)[0].min() > -1e-9
-    np.testing.assert_allclose(found, other.x, atol=1e-5)
+    assert LinearConstraint(null, low, high).residual(expected.x)[0].min() > -1e-9
+    np.testing.assert_allclose(solution, expected.x, atol=1e-5)
 
 
-def test_a_quadratic_program_without_solution_is_none() -> None:
+def test_an_infeasible_quadratic_program_returns_none() -> None:
     null = np.linalg.svd(np.random.default_rng(0).normal(size=(3, 6)))[2][3:].T
     assert nearest_in_null_space(null, np.ones(6), np.zeros(6), (np.full(6, 2.0), np.full(6, 3.0))) is None
 
@@ -102,70 +113,70 @@ def length_of(path: PlanePath) -> float:
 
 
 @pytest.mark.parametrize("hit", [(1.1, 0.3), (0.9, -0.35), (1.0, 0.0)])
-def test_paths_in_the_plane_are_smooth_of_their_length_and_end_where_they_should(hit: tuple[float, float]) -> None:
+def test_paths_in_the_plane_have_smooth_headings_correct_lengths_and_ends(hit: tuple[float, float]) -> None:
     start, end = np.array([0.65, 0.0]), np.array(hit)
-    way = np.array([2.478, 0.0]) - end
-    hit = striking_path(start, end, way, 1.5)
+    direction = np.array([2.478, 0.0]) - end
+    hit = striking_path(start, end, direction, 1.5)
     np.testing.assert_allclose(hit.at(0.0), start, atol=1e-12)
     np.testing.assert_allclose(hit.at(hit.length), end, atol=1e-12)
     assert length_of(hit) == pytest.approx(hit.length, abs=1e-4)
     last = hit.at(hit.length) - hit.at(hit.length - 1e-5)
-    np.testing.assert_allclose(last / np.linalg.norm(last), way / np.linalg.norm(way), atol=1e-3)
+    np.testing.assert_allclose(last / np.linalg.norm(last), direction / np.linalg.norm(direction), atol=1e-3)
     steps = np.diff([hit.at(s) for s in np.linspace(0, hit.length, 2000)], axis=0)
     heading = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
     assert np.abs(np.diff(heading)).max() < 0.1  # no corner
     points = np.array(list(hit.sampled(0.01)))
-    assert np.all((points > LOW - 1e-9) & (points < HIGH + 1e-9))
+    assert np.all((points > MIN_MALLET_XY_M - 1e-9) & (points < MAX_MALLET_XY_M + 1e-9))
     stop = stopping_path(hit)
     np.testing.assert_allclose(stop.at(0.0), end, atol=1e-12)
     first = stop.at(1e-5) - stop.at(0.0)
-    np.testing.assert_allclose(first / np.linalg.norm(first), way / np.linalg.norm(way), atol=1e-3)
+    np.testing.assert_allclose(first / np.linalg.norm(first), direction / np.linalg.norm(direction), atol=1e-3)
 
 
-def test_aqp_hits_where_and_in_the_direction_that_it_should() -> None:
+def test_aqp_hits_the_goal_in_the_required_direction() -> None:
     task = one_of("hits-81", 40)
-    found = AQP().prepare(Setting(task.problem))(task)
-    assert isinstance(found, Trajectory)
-    tip = task.problem.tip_positions(found.q)
+    trajectory = AQP().prepare(Setting(task.problem))(task)
+    assert isinstance(trajectory, Trajectory)
+    tip = task.problem.tip_positions(trajectory.q)
     assert np.linalg.norm(tip[-1] - task.columns["goal_xyz"][0]) < 1e-3
     assert np.abs(tip[:, 2] - 0.16).max() < 1e-3
-    way = np.array([2.478, 0.0]) - task.columns["goal_xyz"][0][:2]
+    direction = np.array([2.478, 0.0]) - task.columns["goal_xyz"][0][:2]
     last = tip[-1, :2] - tip[-2, :2]
-    assert abs(np.arctan2(last[1], last[0]) - np.arctan2(way[1], way[0])) < 0.01
+    assert abs(np.arctan2(last[1], last[0]) - np.arctan2(direction[1], direction[0])) < 0.01
     robot = open_problem(task.problem)[1]
-    assert np.all(np.abs(np.diff(found.q, axis=0)) <= robot.velocity_limit * found.t[1] * (1 + 1e-6))
+    assert np.all(np.abs(np.diff(trajectory.q, axis=0)) <= robot.velocity_limit * trajectory.t[1] * (1 + 1e-6))
 
 
-def test_aqp_plans_hits_only() -> None:
+def test_aqp_refuses_transports() -> None:
     with pytest.raises(UsageError, match="plans hits on a table"):
         AQP().prepare(Setting(one_of("heavy-100").problem))
 
 
 @pytest.mark.parametrize("suite", some(["hits-81", "heavy-100"], 0, "slow"))
-def test_the_paths_of_cbirrt_stay_on_the_manifold_and_are_timed_by_the_velocity_limits(suite: str) -> None:
-    """In a process of its own, as in a benchmark: OMPL tells of leaks when its process ends."""
+def test_paths_of_cbirrt_stay_on_the_manifold_and_within_the_velocity_limits(suite: str) -> None:
+    """Use a separate process, because OMPL reports leaks when its process ends."""
     pytest.importorskip("ompl")
     task = one_of(suite)
     _, robot = open_problem(task.problem)
     process = PlannerProcess("cbirrt", Setting(task.problem, time_limit=20))
     try:
-        found = answer_from_dict(task, process.plan(task).answer)
+        trajectory = answer_from_dict(task, process.plan(task).answer)
     finally:
         process.stop()
-    assert isinstance(found, Trajectory)
+    assert isinstance(trajectory, Trajectory)
     data, frame = robot.model.createData(), robot.model.getFrameId(robot.tip)
-    for q in found.q:
+    for q in trajectory.q:
         pin.framesForwardKinematics(robot.model, data, q)
         tip = data.oMf[frame]
-        off = tip.translation[2] - 0.16 if suite == "hits-81" else tip.rotation[2, 2] - 1
-        assert abs(off) < 0.011
-    np.testing.assert_allclose(found.q[[0, -1]], [task.boundary.start_q[0], task.boundary.goal_q[0]], atol=0.01)
-    use = np.abs(np.diff(found.q, axis=0)) / np.diff(found.t)[:, None] / robot.velocity_limit
+        residual = tip.translation[2] - 0.16 if suite == "hits-81" else tip.rotation[2, 2] - 1
+        assert abs(residual) < 0.011
+    np.testing.assert_allclose(trajectory.q[[0, -1]], [task.boundary.start_q[0], task.boundary.goal_q[0]], atol=0.01)
+    use = np.abs(np.diff(trajectory.q, axis=0)) / np.diff(trajectory.t)[:, None] / robot.velocity_limit
     assert use.max() <= 1
     assert np.median(use.max(axis=1)) > 0.98
 
 
-def test_planners_know_the_tip_if_a_joint_has_its_name() -> None:
+def test_planners_use_the_tip_frame_if_a_joint_has_the_same_name() -> None:
     task = one_of("hits-81")
     urdf = task.problem.urdf.replace('joint name="world_F_base_joint"', 'joint name="striker_tip"')
     robot = open_problem(replace(task.problem, urdf=urdf))[1]
@@ -173,8 +184,8 @@ def test_planners_know_the_tip_if_a_joint_has_its_name() -> None:
     np.testing.assert_allclose(tip, task.problem.tip_positions(task.boundary.start_q)[0], atol=1e-12)
 
 
-def test_baselines_know_upright_boxes_only() -> None:
+def test_baselines_refuse_obstacles_that_are_not_upright_boxes() -> None:
     problem, _ = open_problem(one_of("heavy-100").problem)
     ball = Obstacle(name="ball", kind="sphere", position=(0.4, 0.1, 0.5), radius=0.1)
     with pytest.raises(UsageError, match="supported are upright boxes only, 'heavy-object' has ball"):
-        boxes_of(replace(problem, obstacle=(*problem.obstacle, ball)), np.zeros(3), np.zeros(3))
+        boxes_of(replace(problem, obstacle=(*problem.obstacle, ball)), one_of("heavy-100").scene)

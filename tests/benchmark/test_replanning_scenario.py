@@ -1,4 +1,4 @@
-"""ReplanningScenario: motions that are left for others go on without a jump, and score."""
+"""Replanning scenarios: second motions continue the first ones without a jump, and score."""
 
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from tests.conftest import some
 
 
 @pytest.mark.parametrize("name", some(["replan", "online"], 1, "slow"))
-def test_a_turn_goes_on_in_position_velocity_and_acceleration(name: str) -> None:
+def test_a_switch_is_continuous_in_position_velocity_and_acceleration(name: str) -> None:
     suite = load_suite(name)
     problems, prefix = suite.problems()
     assert prefix is not None
@@ -30,13 +30,12 @@ def test_a_turn_goes_on_in_position_velocity_and_acceleration(name: str) -> None
             assert np.abs(one - other).max() < 1e-9
         around = joined(prefix[index], states_of(plan.motion))(until + np.array([-1e-7, 1e-7]))
         assert np.abs(np.diff(around[0], axis=0)).max() < 1e-6
-        assert np.array_equal(
-            joined(prefix[index], states_of(plan.motion))(np.array([0.1]))[0], first(np.array([0.1]))[0]
-        )
+        early = np.array([0.1])
+        assert np.array_equal(joined(prefix[index], states_of(plan.motion))(early)[0], first(early)[0])
 
 
 @pytest.mark.slow
-def test_the_opposite_puck_is_hit_and_the_first_one_left_alone() -> None:
+def test_only_the_opposite_puck_is_hit() -> None:
     pytest.importorskip("mujoco")
     suite = load_suite("online")
     problems, prefix = suite.problems(1)
@@ -51,14 +50,14 @@ def test_the_opposite_puck_is_hit_and_the_first_one_left_alone() -> None:
     assert execution.executed.hit_time == pytest.approx(reference.duration, abs=0.02)
 
 
-def test_a_turn_after_the_end_of_the_first_motion_is_refused(tmp_path: Path) -> None:
+def test_a_switch_after_the_end_of_the_first_motion_is_refused(tmp_path: Path) -> None:
     text = list_suites()["online"].read_text(encoding="utf-8").replace("250 ms", "400 ms")
     (tmp_path / "late.toml").write_text(text, encoding="utf-8")
     with pytest.raises(RecipeError, match=r"a first motion ends after 0\.3\d+ s, the switch is at 0\.4 s"):
         load_suite(tmp_path / "late.toml").problems()
 
 
-def test_a_grid_with_a_center_puck_is_refused(tmp_path: Path) -> None:
+def test_a_grid_with_a_puck_in_its_center_is_refused(tmp_path: Path) -> None:
     text = list_suites()["online"].read_text(encoding="utf-8").replace("rows = 4", "rows = 3")
     (tmp_path / "odd.toml").write_text(text, encoding="utf-8")
     with pytest.raises(RecipeError, match="an even number of pucks"):

@@ -1,4 +1,4 @@
-"""Runs that are resumed, and planners that crash, hang or return garbage: each costs its own row."""
+"""Resumed runs; planners that crash, time out or return invalid results."""
 
 import json
 import os
@@ -6,18 +6,19 @@ import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from cnpgen.benchmark.html_report import save_benchmark_report, troubles
+from cnpgen.benchmark.html_report import failure_summaries, save_benchmark_report
 from cnpgen.benchmark.results_file import answer_from_dict, answer_to_dict, open_results
 from cnpgen.benchmark.run_suite import run_benchmark
 from cnpgen.benchmark.suite import load_suite
 from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.errors import DatasetError, UsageError
 from tests.conftest import some
-from tests.examples.installed import installed_planner
+from tests.examples.installed import installed_kind
 
-BAD = """
+UNRELIABLE = """
 import os, time
 from dataclasses import dataclass
 import numpy as np
@@ -27,12 +28,12 @@ from cnpgen.benchmark.planners.learned import CNPB
 from cnpgen.benchmark.suite import load_suite
 
 @dataclass(frozen=True)
-class Moody(BenchmarkPlanner):
-    "Fails in another way at every problem."
+class Unreliable(BenchmarkPlanner):
+    "Fails differently on every problem."
 
     def prepare(self, setting):
         good, others = CNPB().prepare(setting), load_suite("hits-81").problems()[0]
-        ways = {
+        actions = {
             0: lambda problem: os._exit(1),
             1: good,
             2: lambda problem: "garbage",
@@ -45,31 +46,31 @@ class Moody(BenchmarkPlanner):
             9: lambda problem: Trajectory(np.array([0, 1e4]), np.zeros((2, 6))),
             10: lambda problem: good(others[50]),
             11: lambda problem: type("Mine", (Trajectory,), {})([0, 1.0], np.zeros((2, 6))),
-            12: lambda problem: print("{not json") or Trajectory(np.array([0, 1.0]), np.full((2, 6), 1e200)),
+            12: lambda problem: print("{not json") or Trajectory(np.array([0, 1.0]), np.full((2, 6), 1e8)),
         }
-        return lambda problem: ways[int(problem.sample_id[0])](problem)
+        return lambda problem: actions[int(problem.sample_id[0])](problem)
 """
 
 
 @pytest.fixture
-def moody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+def unreliable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     """A planner of an installed package."""
-    (tmp_path / "moody.py").write_text(BAD, encoding="utf-8")
-    with installed_planner(tmp_path, "moody", "moody:Moody", monkeypatch):
-        yield "moody"
+    (tmp_path / "unreliable.py").write_text(UNRELIABLE, encoding="utf-8")
+    with installed_kind(tmp_path, "unreliable", "unreliable:Unreliable", monkeypatch):
+        yield "unreliable"
 
 
 @pytest.mark.slow
-def test_whatever_a_planner_does_costs_its_own_row_only(
-    moody: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+def test_a_failure_of_a_planner_affects_only_its_own_problem(
+    unreliable: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("cnpgen.benchmark.process.STOP_MARGIN_S", 0.5)
-    found = run_benchmark("hits-81", tmp_path / "results", planners=[moody], n=13, time_limit=0.2)
-    rows = found.results[moody]
+    benchmark = run_benchmark("hits-81", tmp_path / "results", planners=[unreliable], n=13, time_limit=0.2)
+    rows = benchmark.results[unreliable]
     endings = [row["ending"] for row in rows]
     assert endings[:7] == ["crashed", "planned", "failed", "failed", "no plan", "out of time", "planned"]
     assert endings[7:] == ["failed", *["planned"] * 5]
-    assert capfd.readouterr().out == ""  # what planners print does not mix with results
+    assert capfd.readouterr().out == ""  # output of planners does not mix with results
     assert rows[7]["error"] == "the problem has 6 joints, its answer 3"
     assert [row["verdict"]["reason"] for row in rows[8:]] == [
         "not finite",
@@ -81,37 +82,44 @@ def test_whatever_a_planner_does_costs_its_own_row_only(
     assert [row["answer"] is not None for row in rows[:7]] == [False, True, False, False, False, False, True]
 
 
-@pytest.mark.parametrize("way", some(["os._exit(1)", "1 / 0"], 1, "slow"))
-def test_a_planner_that_cannot_even_be_prepared_costs_its_own_rows_only(moody: str, way: str, tmp_path: Path) -> None:
-    text = (tmp_path / "moody.py").read_text(encoding="utf-8")
-    (tmp_path / "moody.py").write_text(
-        text.replace("good, others =", f"{way}\n        good, others ="), encoding="utf-8"
+@pytest.mark.parametrize("failure", some(["os._exit(1)", "1 / 0"], 1, "slow"))
+def test_a_planner_that_cannot_be_prepared_affects_only_its_own_rows(
+    unreliable: str, failure: str, tmp_path: Path
+) -> None:
+    text = (tmp_path / "unreliable.py").read_text(encoding="utf-8")
+    (tmp_path / "unreliable.py").write_text(
+        text.replace("good, others =", f"{failure}\n        good, others ="), encoding="utf-8"
     )
-    found = run_benchmark("hits-81", tmp_path / "results", planners=[moody, "cnp-b"], n=2)
-    assert [row["ending"] for row in found.results[moody]] == ["crashed"] * 2
-    assert [row["ending"] for row in found.results["cnp-b"]] == ["planned"] * 2
-    said = {"1 / 0": "ZeroDivisionError: division by zero", "os._exit(1)": "its process ended or was not ready in time"}
-    assert troubles(found) == [f"moody: 2 of 2 crashed, problem 0: before the first problem: {said[way]}"]
+    benchmark = run_benchmark("hits-81", tmp_path / "results", planners=[unreliable, "cnp-b"], n=2)
+    assert [row["ending"] for row in benchmark.results[unreliable]] == ["crashed"] * 2
+    assert [row["ending"] for row in benchmark.results["cnp-b"]] == ["planned"] * 2
+    messages = {
+        "1 / 0": "ZeroDivisionError: division by zero",
+        "os._exit(1)": "its process ended or was not ready in time",
+    }
+    assert failure_summaries(benchmark) == [
+        f"unreliable: 2 of 2 crashed, problem 0: before the first problem: {messages[failure]}"
+    ]
 
 
 @pytest.mark.slow
-def test_a_report_leaves_out_the_picture_of_a_line_that_was_damaged(tmp_path: Path) -> None:
+def test_a_report_omits_the_image_of_a_damaged_line(tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
     run_benchmark("hits-81", tmp_path, planners=["cnp-b"], n=1, plants=["nominal"], workers=1)
     file = tmp_path / "cnp-b.jsonl"
     head, planned, *others = map(json.loads, file.read_text().splitlines())
     planned["answer"]["path_control_points"] = [row[:3] for row in planned["answer"]["path_control_points"]]
     file.write_text("".join(json.dumps(row) + "\n" for row in (head, planned, *others)))
-    found = run_benchmark("hits-81", tmp_path, planners=["cnp-b"], n=1, plants=["nominal", "heavier"], workers=1)
-    failure = found.results["cnp-b"][0]["executed"]["heavier"]["failure"]
+    benchmark = run_benchmark("hits-81", tmp_path, planners=["cnp-b"], n=1, plants=["nominal", "heavier"], workers=1)
+    failure = benchmark.results["cnp-b"][0]["executed"]["heavier"]["failure"]
     assert failure.startswith("path_control_points has 3 joints, but 'airhockey' plans 6")
-    report = save_benchmark_report(found, tmp_path / "report.html").read_text()
+    report = save_benchmark_report(benchmark, tmp_path / "report.html").read_text()
     assert "cnp-b, problem 0: no image: path_control_points has 3 joints" in report
     assert "1 of 1 (paper: 100 %)" in report
 
 
 @pytest.mark.slow
-def test_a_report_is_made_although_the_first_answer_cannot_be_executed(tmp_path: Path) -> None:
+def test_a_report_uses_the_next_answer_if_the_first_cannot_be_executed(tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
     first = run_benchmark("hits-81", tmp_path, planners=["cnp-b"], n=2)
     file = tmp_path / "cnp-b.jsonl"
@@ -119,35 +127,35 @@ def test_a_report_is_made_although_the_first_answer_cannot_be_executed(tmp_path:
     broken = first.results["cnp-b"][0]
     broken["answer"]["rate_control_points"][0] = None
     file.write_text("\n".join([lines[0], json.dumps(broken), *lines[2:]]) + "\n")
-    found = run_benchmark("hits-81", tmp_path, planners=["cnp-b"], n=2, plants=["nominal"], workers=1)
-    assert "cannot be executed" in found.results["cnp-b"][0]["executed"]["nominal"]["failure"]
-    report = save_benchmark_report(found, tmp_path / "report.html").read_text()
+    benchmark = run_benchmark("hits-81", tmp_path, planners=["cnp-b"], n=2, plants=["nominal"], workers=1)
+    assert "cannot be executed" in benchmark.results["cnp-b"][0]["executed"]["nominal"]["failure"]
+    report = save_benchmark_report(benchmark, tmp_path / "report.html").read_text()
     assert "cnp-b, problem 1" in report or "No images" in report
 
 
 @pytest.mark.slow
-def test_a_run_goes_on_where_it_was_and_adds_to_what_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_resumes_and_adds_executions_and_problems(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("mujoco")
     first = run_benchmark("hits-81", tmp_path, planners=["cnp-b"], n=2)
     file = tmp_path / "cnp-b.jsonl"
     text = file.read_text()
     file.write_text(text + text.splitlines()[-1][:100])  # cut off by an interruption
-    seen: list[str] = []
-    again = run_benchmark(
+    activities: list[str] = []
+    second = run_benchmark(
         "hits-81",
         tmp_path,
         planners=["cnp-b"],
         n=3,
         plants=["nominal"],
         workers=1,
-        progress=lambda *a: seen.append(a[0]),
+        progress=lambda *a: activities.append(a[0]),
     )
-    assert seen == ["cnp-b plans", *["cnp-b, nominal plant"] * 3]
+    assert activities == ["cnp-b plans", *["cnp-b, nominal plant"] * 3]
     assert file.read_text().startswith(text)
-    assert again.results["cnp-b"][0]["planning_s"] == first.results["cnp-b"][0]["planning_s"]
-    assert all(row["executed"]["nominal"]["scored"] for row in again.results["cnp-b"])
+    assert second.results["cnp-b"][0]["planning_s"] == first.results["cnp-b"][0]["planning_s"]
+    assert all(row["executed"]["nominal"]["scored"] for row in second.results["cnp-b"])
     third = run_benchmark("hits-81", tmp_path, planners=["cnp-b"], n=3, plants=["nominal"], workers=1)
-    assert third.results == again.results
+    assert third.results == second.results
     monkeypatch.setattr("cnpgen.benchmark.html_report.MAX_FILM_FRAMES", 3)
     report = save_benchmark_report(third, tmp_path / "report.html", video=True).read_text()
     assert "paper: 100 %" in report
@@ -161,20 +169,20 @@ def test_a_run_goes_on_where_it_was_and_adds_to_what_is_there(tmp_path: Path, mo
 @pytest.mark.parametrize(
     "engine", ["loky", *(pytest.param(name, marks=pytest.mark.extended) for name in ("dask", "ray"))]
 )
-@pytest.mark.filterwarnings("default")  # of dask's and ray's own
-def test_planners_that_plan_at_once_return_what_one_returns(tmp_path: Path, engine: str) -> None:
+@pytest.mark.filterwarnings("default")  # of dask and ray
+def test_parallel_planners_return_the_results_of_one(tmp_path: Path, engine: str) -> None:
     pytest.importorskip({"loky": "joblib", "dask": "distributed"}.get(engine, engine))
-    (alone,) = run_benchmark("hits-81", tmp_path / "alone", planners=["cnp-b"], n=3).results.values()
-    (found,) = run_benchmark(
-        "hits-81", tmp_path / "at once", planners=["cnp-b"], n=3, engine=engine, workers=2
+    (serial,) = run_benchmark("hits-81", tmp_path / "serial", planners=["cnp-b"], n=3).results.values()
+    (parallel,) = run_benchmark(
+        "hits-81", tmp_path / "parallel", planners=["cnp-b"], n=3, engine=engine, workers=2
     ).results.values()
-    assert [row["planners_at_once"] for row in found] == [2] * 3
-    for what in ("problem", "answer", "verdict"):
-        assert [row[what] for row in found] == [row[what] for row in alone]
+    assert [row["planners_at_once"] for row in parallel] == [2] * 3
+    for key in ("problem", "answer", "verdict"):
+        assert [row[key] for row in parallel] == [row[key] for row in serial]
 
 
 @pytest.mark.slow
-def test_results_of_another_run_are_not_mixed_in(tmp_path: Path) -> None:
+def test_results_of_another_run_are_refused(tmp_path: Path) -> None:
     run_benchmark("hits-81", tmp_path, planners=["cnp-b"], n=1)
     with pytest.raises(UsageError, match="holds results of another run"):
         run_benchmark("hits-110", tmp_path, planners=["cnp-b"], n=1)
@@ -204,7 +212,7 @@ ANSWER = {"degree": 7, "path_control_points": [[0.0]], "rate_control_points": [1
         ({"problem": 0, "executed": {"nominal": {"hit_time_s": "nan"}}}, "hit_time_s must be a finite number"),
     ],
 )
-def test_a_line_that_is_no_result_is_named(tmp_path: Path, row: Any, text: str) -> None:
+def test_an_invalid_line_is_named(tmp_path: Path, row: Any, text: str) -> None:
     open_results(tmp_path / "a.jsonl", {})
     with (tmp_path / "a.jsonl").open("a") as file:
         file.write(json.dumps(row) + "\n")
@@ -212,7 +220,7 @@ def test_a_line_that_is_no_result_is_named(tmp_path: Path, row: Any, text: str) 
         open_results(tmp_path / "a.jsonl", {})
 
 
-def test_results_that_are_nested_without_end_are_as_if_cut_off_and_a_pipe_is_none(tmp_path: Path) -> None:
+def test_deeply_nested_lines_are_ignored_and_a_pipe_is_refused(tmp_path: Path) -> None:
     open_results(tmp_path / "a.jsonl", {})
     with (tmp_path / "a.jsonl").open("a") as file:
         file.write("[" * 100_000 + "\n")
@@ -222,7 +230,7 @@ def test_results_that_are_nested_without_end_are_as_if_cut_off_and_a_pipe_is_non
         open_results(tmp_path / "b.jsonl", {})
 
 
-def test_mistakes_are_found_before_any_work(tmp_path: Path) -> None:
+def test_mistakes_are_reported_before_any_work(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"unknown planner 'cnpb'.*did you mean 'cnp-b'"):
         run_benchmark("hits-81", tmp_path, planners=["cnpb"])
     with pytest.raises(UsageError, match="unknown plant"):
@@ -232,19 +240,19 @@ def test_mistakes_are_found_before_any_work(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_planner_for_other_problems_is_refused_with_its_reason(tmp_path: Path) -> None:
+def test_an_unsuitable_planner_is_refused_with_its_reason(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="planner 'aqp' cannot plan here: aqp plans hits on a table"):
         run_benchmark("heavy-100", tmp_path, planners=["aqp"], n=1)
 
 
-def test_answers_read_back_as_they_were(tmp_path: Path) -> None:
+def test_answers_are_read_back_exactly(tmp_path: Path) -> None:
     problem = load_suite("hits-81").problems(1)[0]
-    trajectory = Trajectory(problem.boundary.start_q[0, :2] * 0 + [0.0, 1 / 3], problem.boundary.start_q[[0, 0]] / 3)
+    trajectory = Trajectory(np.array([0.0, 1 / 3]), problem.boundary.start_q[[0, 0]] / 3)
     results = open_results(tmp_path / "a.jsonl", {})
     verdict = {"valid": False, "paper": {"valid": False, "finished": False}, "metrics": {}, "value_over_bound": {}}
     results.append({**PLANNED, "answer": answer_to_dict(trajectory), "verdict": verdict})
-    again = open_results(tmp_path / "a.jsonl", {})
-    read = answer_from_dict(problem, again.rows[0]["answer"])
+    reread = open_results(tmp_path / "a.jsonl", {})
+    read = answer_from_dict(problem, reread.rows[0]["answer"])
     assert isinstance(read, Trajectory)
     assert (read.q == trajectory.q).all()
     assert (read.t == trajectory.t).all()

@@ -15,7 +15,7 @@ def test_every_shipped_suite_is_named_after_its_file() -> None:
     assert all(load_suite(name).name == name for name in list_suites())
 
 
-def test_the_81_hits_meet_every_puck_of_the_grid_towards_the_goal() -> None:
+def test_hits_81_has_every_puck_of_the_grid_with_a_hit_towards_the_goal() -> None:
     suite, robot = load_suite("hits-81"), ROBOTS["airhockey"]
     assert suite.pucks is not None
     problems, puck = suite.problems()[0], suite.pucks.positions().T
@@ -23,9 +23,9 @@ def test_the_81_hits_meet_every_puck_of_the_grid_towards_the_goal() -> None:
     assert {tuple(row) for row in puck.round(9).tolist()} == {
         (round(x, 9), round(y, 9)) for x in np.linspace(0.8, 1.2, 9) for y in np.linspace(-0.4, 0.4, 9)
     }
-    tip, way = problems.columns["goal_xyz"], np.array([2.478, 0.0]) - puck
+    tip, direction = problems.columns["goal_xyz"], np.array([2.478, 0.0]) - puck
     np.testing.assert_allclose(np.linalg.norm(puck - tip[:, :2], axis=1), 0.07, atol=1e-12)
-    across = (puck - tip[:, :2])[:, 0] * way[:, 1] - (puck - tip[:, :2])[:, 1] * way[:, 0]
+    across = (puck - tip[:, :2])[:, 0] * direction[:, 1] - (puck - tip[:, :2])[:, 1] * direction[:, 0]
     assert np.abs(across).max() < 1e-12
     np.testing.assert_allclose(problems.problem.tip_positions(problems.boundary.goal_q), tip, atol=1e-8)
     assert np.all(problems.boundary.start_q == robot.base)
@@ -34,16 +34,17 @@ def test_the_81_hits_meet_every_puck_of_the_grid_towards_the_goal() -> None:
     assert np.isnan(problems.path_control_points).all()
 
 
-def test_a_suite_of_samples_is_the_same_every_time_and_of_any_size() -> None:
+def test_a_suite_of_samples_is_reproducible_for_every_number_of_problems() -> None:
     suite = load_suite("heavy-100")
     few, more = suite.problems(2)[0], suite.problems(3)[0]
     assert np.array_equal(few.boundary.goal_q, more.boundary.goal_q[:2])
-    assert len(load_suite("airhockey-replan").problems(4)[0]) == 4  # a dataset is a suite of random problems of it
+    assert len(load_suite("airhockey-replan").problems(4)[0]) == 4  # a dataset is a suite of its samples
 
 
 MISTAKES = {
     'name = "a"\nversion = "1.0.0"\n[pucks]\nrows = 0\n': "rows: 0 is too small",
     'name = "a"\nversion = "1.0.0"\n[samples]\nrecipe = "heavy-object"\nseed = -1\n': "seed: -1 is too small",
+    'name = "a"\nversion = "1.0.0"\n[turns]\nwhen = ["350 ms"]\n': "turns: unknown key",
     'name = "a"\nversion = "1"\n[samples]\nrecipe = "heavy-object"\n': "version: '1' does not match",
 }
 
@@ -70,12 +71,15 @@ def test_a_grid_without_end_is_refused_before_it_is_made(tmp_path: Path) -> None
         load_suite(tmp_path / "large.toml")
 
 
-def test_problems_without_end_are_refused_before_any_is_drawn(tmp_path: Path) -> None:
-    turns = list_suites()["replan"].read_text(encoding="utf-8")
-    draws = list_suites()["heavy-100"].read_text(encoding="utf-8")
+def test_too_many_problems_are_refused_before_sampling(tmp_path: Path) -> None:
+    replanning = list_suites()["replan"].read_text(encoding="utf-8")
+    sampled = list_suites()["heavy-100"].read_text(encoding="utf-8")
     for text, message in (
-        (draws.replace("n = 100", f"n = {10**15}"), "is too large, expected at most 100000"),
-        (turns.replace('["350 ms"]', str([0.1] * 500)), "when: 12,000 switches are too many, expected at most 10,000"),
+        (sampled.replace("n = 100", f"n = {10**15}"), "is too large, expected at most 100000"),
+        (
+            replanning.replace('["350 ms"]', str([0.1] * 500)),
+            "switch_times: 12,000 switches are too many, expected at most 10,000",
+        ),
     ):
         (tmp_path / "large.toml").write_text(text, encoding="utf-8")
         with pytest.raises(RecipeError, match=message):

@@ -1,4 +1,4 @@
-"""Sampled trajectories: what lies between two samples, how they are judged and executed."""
+"""Sampled trajectories: interpolation, verdicts and execution."""
 
 import numpy as np
 import pytest
@@ -30,19 +30,19 @@ def sampled(plan: Plans, count: int) -> Trajectory:
 
 
 @pytest.mark.parametrize("degree", [1, 3, 5])
-def test_a_polynomial_of_its_degree_is_followed_exactly(degree: int) -> None:
-    wanted = [np.polynomial.Polynomial(np.arange(1.0, degree + 2)).deriv(order) for order in range(3)]
-    parts = [part(T)[:, None] for part in wanted][: (degree + 1) // 2]
-    at = np.linspace(0, 1, 37)
-    for found, part in zip(Trajectory(T, *parts).states(at), wanted, strict=True):
-        np.testing.assert_allclose(found[:, 0], part(at), atol=1e-10)
+def test_interpolation_reproduces_polynomials(degree: int) -> None:
+    expected = [np.polynomial.Polynomial(np.arange(1.0, degree + 2)).deriv(order) for order in range(3)]
+    parts = [part(T)[:, None] for part in expected][: (degree + 1) // 2]
+    times = np.linspace(0, 1, 37)
+    for values, part in zip(Trajectory(T, *parts).states(times), expected, strict=True):
+        np.testing.assert_allclose(values[:, 0], part(times), atol=1e-10)
 
 
-def test_after_its_end_a_trajectory_stays_at_its_last_position() -> None:
+def test_a_trajectory_stays_at_its_last_position() -> None:
     assert Trajectory(T, T[:, None]).states(np.array([2.0]))[0] == 1.0
 
 
-def test_what_is_no_trajectory_is_refused() -> None:
+def test_invalid_samples_are_refused() -> None:
     with pytest.raises(UsageError, match="begins at t = 0, got 1"):
         Trajectory(T + 1, T[:, None])
     with pytest.raises(UsageError, match="must increase"):
@@ -54,16 +54,16 @@ def test_what_is_no_trajectory_is_refused() -> None:
 
 
 @pytest.mark.parametrize("label", ["hit", "transport"])
-def test_a_plan_and_its_samples_are_judged_alike(label: str) -> None:
+def test_a_plan_and_its_samples_have_the_same_verdict(label: str) -> None:
     plan = stored(label)
-    one, other = judge_answer(plan, plan), judge_answer(plan, sampled(plan, 400))
-    assert one.valid
-    assert other.valid, str(other)
-    assert one.paper == other.paper
-    assert other.metrics.duration == pytest.approx(one.metrics.duration)
-    assert other.metrics.effort == pytest.approx(one.metrics.effort, rel=1e-3)
+    of_plan, of_samples = judge_answer(plan, plan), judge_answer(plan, sampled(plan, 400))
+    assert of_plan.valid
+    assert of_samples.valid, str(of_samples)
+    assert of_plan.paper == of_samples.paper
+    assert of_samples.metrics.duration == pytest.approx(of_plan.metrics.duration)
+    assert of_samples.metrics.effort == pytest.approx(of_plan.metrics.effort, rel=1e-3)
     for name in ("z_error", "vertical_error"):
-        assert getattr(other.metrics, name) == pytest.approx(getattr(one.metrics, name), rel=0.02, nan_ok=True)
+        assert getattr(of_samples.metrics, name) == pytest.approx(getattr(of_plan.metrics, name), rel=0.02, nan_ok=True)
 
 
 def test_a_faster_trajectory_exceeds_the_acceleration_limit() -> None:
@@ -75,50 +75,52 @@ def test_a_faster_trajectory_exceeds_the_acceleration_limit() -> None:
     assert verdict.margins["joint acceleration"].severity > 1
 
 
-def test_jumps_in_the_velocity_of_a_linear_trajectory_are_seen_as_accelerations() -> None:
+def test_velocity_jumps_of_linear_interpolation_count_as_accelerations() -> None:
     plan = stored("transport")
-    few = sampled(plan, 12)
-    verdict = judge_answer(plan, Trajectory(few.t, few.q))
+    samples = sampled(plan, 12)
+    verdict = judge_answer(plan, Trajectory(samples.t, samples.q))
     margin = verdict.margins["joint acceleration"]
     assert abs(margin.value) > 5 * abs(margin.bound)
 
 
 @pytest.mark.parametrize("known", ["positions", "velocities", "accelerations"])
-def test_jerks_are_judged_where_a_problem_limits_them(known: str) -> None:
+def test_jerks_are_judged_if_the_problem_limits_them(known: str) -> None:
     example = jerk_limited_plan("transport")
     motion = example.motion
     plan = make_plans(
         example.problem, example.boundary, path_control_points=motion.path, rate_control_points=motion.rate
     )
-    whole = judge_answer(plan, plan)
-    given = sampled(plan, 400)
-    parts = {"positions": (), "velocities": (given.dq,), "accelerations": (given.dq, given.ddq)}[known]
-    verdict = judge_answer(plan, Trajectory(given.t, given.q, *parts))
-    margin, wanted = (each.margins["joint jerk"] for each in (verdict, whole))
+    expected = judge_answer(plan, plan)
+    samples = sampled(plan, 400)
+    parts = {"positions": (), "velocities": (samples.dq,), "accelerations": (samples.dq, samples.ddq)}[known]
+    verdict = judge_answer(plan, Trajectory(samples.t, samples.q, *parts))
+    margin, expected_margin = (result.margins["joint jerk"] for result in (verdict, expected))
     assert margin.severity > 1
     if known == "accelerations":
-        assert margin.part == wanted.part
-        assert abs(margin.value) == pytest.approx(abs(wanted.value), rel=0.05)
-        assert verdict.metrics.jerk == pytest.approx(whole.metrics.jerk, rel=0.05)
+        assert margin.part == expected_margin.part
+        assert abs(margin.value) == pytest.approx(abs(expected_margin.value), rel=0.05)
+        assert verdict.metrics.jerk == pytest.approx(expected.metrics.jerk, rel=0.05)
 
 
 @pytest.mark.slow
-def test_a_plan_and_its_samples_are_executed_alike() -> None:
+def test_a_plan_and_its_samples_have_the_same_execution() -> None:
     pytest.importorskip("mujoco")
     plan = stored("hit")
-    one, other = (
-        execute_answer((plan, answer_to_dict(each), None), plant=PLANTS["nominal"])
-        for each in (plan, sampled(plan, 400))
+    of_plan, of_samples = (
+        execute_answer((plan, answer_to_dict(answer), None), plant=PLANTS["nominal"])
+        for answer in (plan, sampled(plan, 400))
     )
-    assert other.hit_time == one.hit_time
-    assert other.puck_speed == pytest.approx(one.puck_speed, rel=1e-3)
-    assert other.z_error == pytest.approx(one.z_error, rel=0.02)
+    assert of_samples.hit_time == of_plan.hit_time
+    assert of_samples.puck_speed == pytest.approx(of_plan.puck_speed, rel=1e-3)
+    assert of_samples.z_error == pytest.approx(of_plan.z_error, rel=0.02)
 
 
-def test_what_cannot_be_executed_says_so() -> None:
+def test_a_trajectory_of_excessive_duration_is_not_executed() -> None:
     pytest.importorskip("mujoco")
     plan = stored("transport")
-    slow = sampled(plan, 10)
-    found = execute_answer((plan, answer_to_dict(Trajectory(slow.t * 1000, slow.q)), None), plant=PLANTS["nominal"])
-    assert "cannot be executed" in found.failure
-    assert judge_answer(plan, Trajectory(slow.t * 1000, slow.q)).reason == "too long"
+    samples = sampled(plan, 10)
+    executed = execute_answer(
+        (plan, answer_to_dict(Trajectory(samples.t * 1000, samples.q)), None), plant=PLANTS["nominal"]
+    )
+    assert "cannot be executed" in executed.failure
+    assert judge_answer(plan, Trajectory(samples.t * 1000, samples.q)).reason == "too long"

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from cnpgen.cli.main import main
-from tests.examples.installed import installed_planner
+from tests.examples.installed import installed_kind
 
 
 def test_the_list_names_suites_planners_and_plants(capsys: pytest.CaptureFixture[str]) -> None:
@@ -20,7 +20,7 @@ def test_the_list_names_suites_planners_and_plants(capsys: pytest.CaptureFixture
 def test_the_list_says_of_a_planner_that_cannot_be_imported_why(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with installed_planner(tmp_path, "mine", "no_such_module:Mine", monkeypatch):
+    with installed_kind(tmp_path, "mine", "no_such_module:Mine", monkeypatch):
         assert main(["benchmark", "--list", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert "No module named 'no_such_module'" in found["planners"]["mine"]

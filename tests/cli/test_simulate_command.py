@@ -73,7 +73,7 @@ def test_without_ffmpeg_there_is_no_film_and_the_reason_is_said(
     monkeypatch.setitem(sys.modules, "av", None)
     assert main(["simulate", str(carried), "--workers", "1", "--video", str(tmp_path / "film.mp4")]) == 3
     said = capsys.readouterr().err
-    assert "pip install 'imageio[ffmpeg]'" in said or "cannot draw without a screen" in said
+    assert "pip install 'cnpgen[benchmark]'" in said or "cannot draw without a screen" in said
 
 
 def test_mistakes_are_said_in_a_line(carried: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -54,8 +54,8 @@ def test_joints_of_one_kind_have_one_unit_above_them() -> None:
 
 
 def test_a_verdict_speaks_of_a_joint_in_its_unit(gantry: Problem, plans: Plans) -> None:
-    tips = plans.columns["start_xyz"], plans.columns["goal_xyz"]
-    found = judge(gantry, load_robot(gantry), plans.motion, plans.boundary, *tips)[0].margins
+    ends = plans.scene, plans.columns["goal_xyz"]
+    found = judge(gantry, load_robot(gantry), plans.motion, plans.boundary, *ends)[0].margins
     units = {name: (found[f"joint {name}"].part, found[f"joint {name}"].unit) for name in ("velocity", "acceleration")}
     assert units == {"velocity": ("slide_x", "m/s"), "acceleration": ("slide_x", "m/s^2")}
     assert (found["boundary velocity"].part, found["boundary velocity"].unit) == ("slide_y", "m/s")

@@ -9,7 +9,6 @@ import pinocchio as pin
 from scipy.interpolate import BSpline
 
 from cnpgen.losses.plan_loss import PlanLoss
-from cnpgen.problems.obstacles import obstacle_poses_of
 from cnpgen.world.world import World
 from tests.examples.plans import KNOTS, PROBLEMS, ROBOTS, load
 
@@ -49,7 +48,7 @@ def batch(label: str, count: int, by: float = 0.1, seed: int = 0, raised: float 
     random = np.random.default_rng(seed)
     path = plan.motion.path + by * random.uniform(-1, 1, (count, *plan.motion.path.shape[1:]))
     rate = plan.motion.rate * random.uniform(0.9, 1.4, (count, plan.motion.rate.shape[1]))
-    obstacle_poses = np.repeat(obstacle_poses_of(plan.problem, plan.start_xyz, plan.goal_xyz), count, axis=0)
+    obstacle_poses = np.repeat(plan.scene.poses, count, axis=0)
     obstacle_poses += random.uniform(-0.02, raised, obstacle_poses.shape)  # obstacles that may collide with the arm
     return Batch(PROBLEM_OF[label], path, rate, obstacle_poses)
 
@@ -65,6 +64,7 @@ class States:
 
 
 def states(path: np.ndarray, rate: np.ndarray, s: np.ndarray) -> States:
+    """Evaluate a plan independently of cnpgen's splines, on purpose."""
     p, r = BSpline(KNOTS[len(path)], path, 7), BSpline(KNOTS[len(rate)], rate, 7)
     r0, r1 = r(s)[:, None], r(s, 1)[:, None]
     return States(p(s), p(s, 1) * r0, p(s, 2) * r0**2 + p(s, 1) * r1 * r0, r0[:, 0])

@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 
 from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.refine.refine_engine import load_refiner
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.task import RefinementTask
-from cnpgen.robots.solid import place_obstacles
 from cnpgen.trajectory.boundary import Boundary
 from tests.examples.shaped_robot import write_problem
 
@@ -55,4 +55,4 @@ def between(problem: Problem, ends: np.ndarray) -> RefinementTask:
     """Return the task of moving from one configuration to another, from rest to rest."""
     (start, goal), rest = ends[:, None], np.zeros((1, ends.shape[1]))
     boundary = Boundary(start, rest, rest, goal, rest)
-    return RefinementTask(boundary, place_obstacles(problem.obstacle), np.zeros(3), np.zeros(3))
+    return RefinementTask(boundary, scene_of(problem, np.zeros((1, 3)), np.zeros((1, 3))), np.zeros(3), np.zeros(3))

@@ -14,7 +14,8 @@ from tests.examples.plans import Plan, joined, load, perturbed
 
 def plans_of(*plans: Plan, sample_id: Sequence[int] | None = None) -> Plans:
     """Put plans of one problem together, as they would be in a file."""
-    problem, _, motion, boundary, start_xyz, goal_xyz = joined(*plans)
+    problem, _, motion, boundary, _, goal_xyz = joined(*plans)
+    start_xyz = np.concatenate([plan.start_xyz for plan in plans])
     return make_plans(
         problem,
         boundary,

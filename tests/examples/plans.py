@@ -13,9 +13,11 @@ from scipy.interpolate import BSpline
 from cnpgen.judges.plans import Verdict
 from cnpgen.judges.plans.judge import Judge
 from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.robots.robot import Robot
+from cnpgen.robots.scene import Scene
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.spline_motion import Motion
 
@@ -36,8 +38,12 @@ class Plan:
     start_xyz: np.ndarray
     goal_xyz: np.ndarray
 
+    @property
+    def scene(self) -> Scene:
+        return scene_of(self.problem, self.start_xyz, self.goal_xyz)
+
     def judged(self, *, early_exit: bool = False, **options: Any) -> Verdict:
-        arguments = self.motion, self.boundary, self.start_xyz, self.goal_xyz
+        arguments = self.motion, self.boundary, self.scene, self.goal_xyz
         (verdict,) = Judge(self.problem, self.robot, **options)(*arguments, early_exit=early_exit)
         return verdict
 
@@ -72,8 +78,8 @@ def joined(*plans: Plan) -> tuple[Any, ...]:
     names = ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq")
     boundary = Boundary(*(stack([getattr(plan.boundary, name) for plan in plans]) for name in names))
     motion = Motion(stack([plan.motion.path for plan in plans]), stack([plan.motion.rate for plan in plans]))
-    xyz = (stack([plan.start_xyz for plan in plans]), stack([plan.goal_xyz for plan in plans]))
-    return plans[0].problem, plans[0].robot, motion, boundary, *xyz
+    scene = Scene(plans[0].scene.obstacles, stack([plan.scene.poses for plan in plans]))
+    return plans[0].problem, plans[0].robot, motion, boundary, scene, stack([plan.goal_xyz for plan in plans])
 
 
 def perturbed(plan: Plan, by: float, *, seed: int = 0) -> Plan:
@@ -115,6 +121,7 @@ class ReferenceTrajectory:
 
 
 def reference_trajectory(plan: Plan, count: int = 4001) -> ReferenceTrajectory:
+    """Evaluate a plan independently of cnpgen's splines, on purpose."""
     s = np.linspace(0, 1, count)
     path, rate = plan.motion.path[0], plan.motion.rate[0]
     p, r = BSpline(KNOTS[15], path, 7), BSpline(KNOTS[20], rate, 7)

@@ -35,7 +35,7 @@ def outputs(layer: BoundaryLayer, count: int, seed: int = 1) -> tuple[np.ndarray
 
 
 def at_ends(path: Any, rate: Any) -> list[np.ndarray]:
-    """Return states at start and goal of motions by SciPy's splines: q, dq, ddq, q, dq, ddq."""
+    """Return q, dq and ddq at start and goal of motions by SciPy, on purpose independent of cnpgen's splines."""
     path, rate, states = np.asarray(path, float), np.asarray(rate, float), []
     p = BSpline(clamped_knots(path.shape[1], 7), path.swapaxes(0, 1), 7)
     r = BSpline(clamped_knots(rate.shape[1], 7), rate.T[..., None], 7)

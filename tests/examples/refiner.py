@@ -8,7 +8,6 @@ import pytest
 from cnpgen.judges.plans import Verdict, judge
 from cnpgen.kernels.compiler import find_compiler
 from cnpgen.kernels.library import KernelLibrary, default_cache_folder, problem_kernels
-from cnpgen.problems.obstacles import obstacle_poses_of
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.solver.cost_term import CostTerm
@@ -48,17 +47,15 @@ def refiner_of(problem: Problem, cost_term: CostTerm | None = None, **options: o
 
 
 def obstacle_poses(plan: Plan) -> np.ndarray:
-    return obstacle_poses_of(plan.problem, plan.start_xyz, plan.goal_xyz)[0]
+    return np.asarray(plan.scene.poses[0])
 
 
 def task(plan: Plan, boundary: Boundary | None = None, **input_plan: np.ndarray) -> RefinementTask:
-    return RefinementTask(
-        boundary or plan.boundary, obstacle_poses(plan), plan.start_xyz[0], plan.goal_xyz[0], **input_plan
-    )
+    return RefinementTask(boundary or plan.boundary, plan.scene, plan.start_xyz[0], plan.goal_xyz[0], **input_plan)
 
 
 def verdict(plan: Plan, boundary: Boundary, path: np.ndarray, rate: np.ndarray) -> Verdict:
-    return judge(plan.problem, plan.robot, Motion(path[None], rate[None]), boundary, plan.start_xyz, plan.goal_xyz)[0]
+    return judge(plan.problem, plan.robot, Motion(path[None], rate[None]), boundary, plan.scene, plan.goal_xyz)[0]
 
 
 def refine(plan: Plan, boundary: Boundary | None = None, **input_plan: np.ndarray) -> Attempt:

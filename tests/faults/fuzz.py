@@ -64,7 +64,7 @@ def fuzz(
         good = Path(temporary) / "good"
         good.mkdir()
         make_good_files(good)
-        with _limited():
+        with limited_resources():
             for number in range(first, first + inputs):
                 _try(number, seed, kinds[number % len(kinds)], good, Path(temporary) / "given", outcome)
                 if progress is not None:
@@ -109,7 +109,7 @@ def _read(subject: Subject, folder: Path, draw: Random) -> None:
 
 
 @contextmanager
-def _limited() -> Iterator[None]:
+def limited_resources() -> Iterator[None]:
     """Limit memory to the present use and ``MAX_EXTRA_BYTES`` more, and time by a signal."""
 
     def too_slow(_number: int, _frame: FrameType | None) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from cnpgen.make.make_dataset import make_dataset
+from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.make.recipe_file import load_dataset_recipe
 from cnpgen.planner.model_file import save_model
 from cnpgen.plans.save import save_plans
@@ -24,10 +25,14 @@ from tests.examples.plans import load as stored_plan
 IDENTITY = {"steps": 10}  # of the run of the checkpoint and the journal
 
 
+def tiny_recipe_of(name: str) -> DatasetRecipe:
+    """Return a shipped recipe with 24 rows for training and 8 for validation."""
+    return replace(load_dataset_recipe(name), splits={"train": 24, "validation": 8})
+
+
 def make_good_files(folder: Path) -> None:
     """Make a valid file of every kind."""
-    tiny = replace(load_dataset_recipe("airhockey-hit"), splits={"train": 24, "validation": 8})
-    make_dataset(tiny, folder / "set", workers=1, shard_size=24)
+    make_dataset(tiny_recipe_of("airhockey-hit"), folder / "set", workers=1, shard_size=24)
     shutil.copytree(recipes_root() / "problems" / "airhockey", folder / "recipes")
     for kind in ("pipelines", "datasets"):
         shutil.copy(recipes_root() / kind / "airhockey-hit.toml", folder / "recipes" / f"{kind}.toml")

@@ -309,7 +309,7 @@ def test_a_layer_learns_through_control_points_and_loss_despite_an_overflow(
     jnp, loss = jax.numpy, make_loss(problem, "float32", cache_folder, fastest)
     tasks, overflow = layer.tasks(boundary(problem, 4)), np.zeros((4, layer.rate_outputs))
     overflow[3] = 1000.0
-    obstacle_poses = layer.obstacle_poses(tasks)
+    obstacle_poses = tasks.scene.poses
 
     @jax.jit
     def step(layer: Any, tasks: Any) -> Any:

@@ -550,7 +550,7 @@ def test_a_network_learns_through_control_points_and_loss_despite_an_overflow(la
         phi, log_rate = network(torch.eye(4)).split([layer.path_outputs, layer.rate_outputs], dim=1)
         path, rate = control_points(layer, tasks, phi.tanh(), log_rate + overflow)
         total, _ = plan_loss(
-            of, path, rate, weights=of.weights0, obstacle_poses=layer.obstacle_poses(tasks), start_tip=tasks.start_xyz
+            of, path, rate, weights=of.weights0, obstacle_poses=tasks.scene.poses, start_tip=tasks.start_xyz
         )
         assert total.isfinite().tolist() == [True, True, True, False]
         optimizer.zero_grad()

@@ -11,7 +11,6 @@ import pytest
 from cnpgen.judges.plans.continuous_collision import Intervals, chord_deviation_bounds
 from cnpgen.judges.plans.evaluated_trajectory import evaluate_trajectory
 from cnpgen.problems.load_robot import load_robot
-from cnpgen.problems.obstacles import obstacle_poses_of
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.robots.robot import Robot
@@ -91,7 +90,7 @@ def test_the_intervals_with_the_lowest_bounds_are_chosen_if_there_are_too_many(
 @pytest.mark.parametrize(("label", "kind"), [("transport", "object"), ("dragging", "object"), ("transport", "segment")])
 def test_interval_bounds_hold_at_finer_samples(label: str, kind: str) -> None:
     plan = perturbed(load(label), 0.01, seed=1)
-    (poses,) = obstacle_poses_of(plan.problem, plan.start_xyz, plan.goal_xyz)
+    (poses,) = plan.scene.poses
     assert_bounds_hold(plan.problem, plan.robot, plan.motion, poses, kind)
 
 

@@ -13,6 +13,7 @@ import pytest
 from cnpgen.judges.plans import Reason, judge
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.constraints.table import Table
+from cnpgen.problems.obstacles import scene_of
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.world.world import World
@@ -71,7 +72,10 @@ def test_verdicts_do_not_depend_on_the_order_of_plans():
 def test_an_empty_batch_has_no_verdicts():
     empty = Boundary(*(np.zeros((0, 6)) for _ in range(5)))
     motion, xyz = Motion(np.zeros((0, 15, 6)), np.zeros((0, 20))), np.zeros((0, 3))
-    assert judge(PROBLEMS["airhockey"], ROBOTS["airhockey"], motion, empty, xyz, xyz) == []
+    assert (
+        judge(PROBLEMS["airhockey"], ROBOTS["airhockey"], motion, empty, scene_of(PROBLEMS["airhockey"], xyz, xyz), xyz)
+        == []
+    )
 
 
 # --- violations ------------------------------------------------------------------------------------------------------

@@ -129,7 +129,7 @@ def test_a_kink_of_the_torque_at_a_knot_of_either_spline_is_sampled() -> None:
     state = motion.at(np.array([0.0, 1.0]))
     ends = Boundary(*(getattr(state, name)[:, k] for k in (0, 1) for name in ("q", "dq", "ddq")))
     only = tuple(constraint for constraint in plan.problem.constraint if isinstance(constraint, JointTorque))
-    arguments = motion, ends, plan.start_xyz, plan.goal_xyz
+    arguments = motion, ends, plan.scene, plan.goal_xyz
     margin = Judge(replace(plan.problem, constraint=only), plan.robot)(*arguments)[0].margins["joint torque"]
     assert margin.phase == pytest.approx(knot, abs=1e-9)
     ratio = margin.violation / margin.tolerance

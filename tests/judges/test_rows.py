@@ -18,7 +18,7 @@ from cnpgen.judges.rows.verify import verify_rows
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.load_robot import load_robot
-from cnpgen.problems.obstacles import obstacle_poses_of
+from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.solid import solids_of
@@ -237,7 +237,7 @@ def diagnosed(carries) -> Case:
     for end in ("start", "goal"):
         columns[f"{end}_torque_ratio"], columns[f"{end}_clearance"] = np.empty(ROWS), np.empty(ROWS)
     for row in range(ROWS):
-        poses = obstacle_poses_of(HEAVY, columns["start_xyz"][row], columns["goal_xyz"][row])
+        poses = scene_of(HEAVY, columns["start_xyz"][row : row + 1], columns["goal_xyz"][row : row + 1]).poses[0]
         boxes = [
             (np.array([box.x.low, box.y.low, -9.0]), np.array([box.x.high, box.y.high, top]))
             for box, top in zip(HEAVY.obstacle, poses, strict=True)
@@ -588,9 +588,8 @@ def test_a_constraint_of_a_plug_in_is_checked(hits):
 def test_obstacle_poses_follow_the_object_or_are_fixed():
     high = replace(HEAVY.obstacle[1], top=0.7, below="")
     problem = replace(HEAVY, obstacle=(HEAVY.obstacle[0], high, HEAVY.obstacle[1]))
-    poses = obstacle_poses_of(problem, np.array([[0.4, -0.4, 0.5], [0.4, -0.4, 0.6]]), np.array([[0.4, 0.4, 0.3]] * 2))
+    poses = scene_of(problem, np.array([[0.4, -0.4, 0.5], [0.4, -0.4, 0.6]]), np.array([[0.4, 0.4, 0.3]] * 2)).poses
     np.testing.assert_allclose(poses, [[0.35, 0.7, 0.15], [0.45, 0.7, 0.15]])
-    np.testing.assert_allclose(obstacle_poses_of(problem, np.array([0, 0, 0.5]), np.array([0, 0, 0.3])), poses[0])
 
 
 def test_the_collision_world_measures_segments_in_order_and_exactly():

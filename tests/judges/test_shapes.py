@@ -5,6 +5,7 @@ import pytest
 
 from cnpgen.judges.plans.judge import judge
 from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.robots.robot import Robot
@@ -31,7 +32,9 @@ def straight(start: np.ndarray, goal: np.ndarray, speed: float) -> tuple[Motion,
 
 def verdict(crane: tuple[Problem, Robot], start: list[float], goal: list[float], step: float):
     motion, boundary = straight(np.array(start), np.array(goal), 1.0)
-    return judge(*crane, motion, boundary, np.zeros((1, 3)), np.zeros((1, 3)), step=step)[0]
+    return judge(
+        *crane, motion, boundary, scene_of(crane[0], np.zeros((1, 3)), np.zeros((1, 3))), np.zeros((1, 3)), step=step
+    )[0]
 
 
 def test_a_motion_into_the_wall_is_invalid_with_link_and_obstacle(crane):
@@ -57,7 +60,8 @@ def test_the_depth_between_samples_is_found(crane):
 
 def test_a_margin_agrees_with_the_world_at_its_phase(crane):
     motion, boundary = straight(np.array([1.57, -0.2, 0.4, 0.0]), np.array([1.0, 0.2, 0.6, 0.3]), 1.0)
-    (found,) = judge(*crane, motion, boundary, np.zeros((1, 3)), np.zeros((1, 3)))
+    tip = np.zeros((1, 3))
+    (found,) = judge(*crane, motion, boundary, scene_of(crane[0], tip, tip), tip)
     problem, robot = crane
     world, zero = World(robot, problem.obstacle), np.zeros(robot.n)
     for name, what in (("robot clearance", "shape_distances"), ("self clearance", "self_distances")):

@@ -697,6 +697,57 @@ def test_a_compiler_that_hangs_is_killed_with_its_child_processes(own_cache, mon
     assert not alive(child)
 
 
+def hanging_compiler(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Make a compiler that hangs, except for its version; return the file with its child process."""
+    hanging = folder / "cc"
+    version = 'if [ "$1" = --version ]; then echo fake 1.0; exit; fi'
+    hanging.write_text(f"#!/bin/sh\n{version}\nsleep 1000 &\necho $! > {folder}/child\ncat\nwait\n")
+    hanging.chmod(0o755)
+    monkeypatch.setenv("CC", str(hanging))
+    return folder / "child"
+
+
+def ended(child: Path) -> bool:
+    process, deadline = int(child.read_text()), time.monotonic() + HANGING
+    while alive(process) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    return not alive(process)
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc")
+def test_a_compilation_that_hangs_is_announced_and_killed(own_cache, monkeypatch, tmp_path, caplog):
+    child = hanging_compiler(tmp_path, monkeypatch)
+    for name, value in {"MIN_COMPILE_LIMIT_S": 1.0, "LIMIT_S_PER_BYTE": 0.0, "NOTICE_AFTER_S": 0.3}.items():
+        monkeypatch.setattr(compiler, name, value)
+    with caplog.at_level("INFO"), pytest.raises(MachineError, match=r"cc took more than 1 s for selftest\.c: set CC"):
+        choose_backend("compiled")
+    assert any("has taken 0.3 s for selftest.c; it is ended after 1 s" in text for text in caplog.messages)
+    assert ended(child)
+    backend, _, (warning,) = chosen_with_warnings()
+    assert backend == "numpy"
+    assert "took more than 1 s" in warning
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc")
+def test_an_interruption_ends_the_compilers_of_all_threads(root, own_cache, monkeypatch, tmp_path):
+    child = hanging_compiler(tmp_path, monkeypatch)
+    library = KernelLibrary("compiled", own_cache, "test")
+
+    def interrupted() -> None:
+        library.load(lambda: root, ROOT)
+        deadline = time.monotonic() + HANGING
+        while not (child.exists() and child.read_text()) and time.monotonic() < deadline:
+            time.sleep(0.01)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(KernelLibrary, "_tape", lambda *_, **__: tape_from_function(root, ROOT))
+    begun = time.monotonic()
+    with pytest.raises(KeyboardInterrupt), library.compile_in_parallel():
+        interrupted()
+    assert time.monotonic() - begun < HANGING / 10
+    assert ended(child)
+
+
 @needs_compiler
 @pytest.mark.parametrize("command", ["'{cc}' -g", "{cc} -DNAME='two words'", "{cc}"])
 def test_cc_may_be_a_path_with_spaces_and_options(root, own_cache, monkeypatch, tmp_path, command):

@@ -16,7 +16,8 @@ from cnpgen.loader import in_memory_rows, order, windows
 from cnpgen.loader.batch import Batch
 from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.load import load_dataset
-from cnpgen.loader.shard_reader import Shard, ShardReader
+from cnpgen.loader.shard_reader import ShardReader
+from cnpgen.store.checked_shard import Shard
 from tests.conftest import HANGING
 from tests.examples.loader import ALL, columns, ids, make, same
 

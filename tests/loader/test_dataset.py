@@ -114,9 +114,9 @@ def test_a_frame_of_another_library_or_of_none_is_refused(dataset: Dataset, monk
     with pytest.raises(UsageError, match="library must be one of polars, pandas, got 'spark'"):
         dataset.frame("train", library="spark")
     monkeypatch.setattr(frame, "find_spec", lambda name: None)
-    with pytest.raises(MachineError, match=r"a frame needs polars or pandas, .* pip install polars"):
+    with pytest.raises(MachineError, match=r"a frame needs polars or pandas, .* pip install 'cnpgen\[polars\]'"):
         dataset.frame("train")
-    with pytest.raises(MachineError, match=r"a frame needs pandas, .* pip install pandas"):
+    with pytest.raises(MachineError, match=r"a frame needs pandas, .* pip install 'cnpgen\[pandas\]'"):
         dataset.frame("train", library="pandas")
 
 
@@ -172,14 +172,14 @@ def test_an_invalid_row_index_is_an_index_error_and_a_cnpgen_error(dataset: Data
 
 @pytest.mark.parametrize("indices", [[0.5], [[1, 2]], np.ones(50, bool), ["a"]])
 def test_indices_that_are_not_integers_are_refused(dataset: Dataset, indices: list[float]) -> None:
-    with pytest.raises(UsageError, match="rows must be a list of integers"):
+    with pytest.raises(UsageError, match="indices must be a list of integers"):
         dataset.rows("train", indices)
 
 
 def test_the_number_of_mapped_shards_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shard_reader, "MAX_MEMORY_MAPS", 3)
-    dataset = load_dataset(make(tmp_path, shard_size=4))
-    rows = columns(shard_size=4)["start_q"]
+    dataset = load_dataset(make(tmp_path, splits={"train": 50}, shard_size=10))
+    rows = columns(splits={"train": 50}, shard_size=10)["start_q"]
     for row in np.random.default_rng(0).integers(50, size=60):
         assert np.array_equal(dataset["train"][row]["start_q"], rows[row])
     assert len(dataset.reader._maps) == 3

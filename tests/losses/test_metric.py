@@ -150,11 +150,11 @@ def test_the_state_of_another_metric_is_refused(state):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"kind": "learnt"}, r"kind of a metric must be one of fixed, ramped, learned, got 'learnt' \(did you mean"),
-        ({"every": "step"}, "every of a metric must be one of epoch, batch, got 'step'"),
-        ({"average": "mode"}, "average of a metric must be one of mean, median, trimmed"),
+        ({"kind": "learnt"}, r"kind must be one of fixed, ramped, learned, got 'learnt' \(did you mean"),
+        ({"every": "step"}, "every must be one of epoch, batch, got 'step'"),
+        ({"average": "mode"}, "average must be one of mean, median, trimmed"),
         ({"gamma": 0.0}, "gamma of a metric must be above 0, got 0.0"),
-        ({"growth": float("nan")}, "growth of a metric must be above 0, got nan"),
+        ({"growth": float("nan")}, "growth must be a finite number, got nan"),
         ({"lowest": 2.0, "highest": 1.0}, "lowest must be at most highest = 1.0, got 2.0"),
         ({"ramp": (0.5, 0.5)}, "must begin at 0 or later and before it ends"),
     ],

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from cnpgen.pipelines.acceptance import acceptance
-from cnpgen.pipelines.narrow_phase import unmet
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
+from cnpgen.pipelines.stages.narrow_phase import unmet
 from cnpgen.pipelines.stages.stage import CandidateBatch
 from cnpgen.problems.constraints.constraint import Condition
 from tests.conftest import SHIPPED, Prepare, needs_compiler, run_stages, some

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from cnpgen.errors import RecipeError
-from cnpgen.pipelines.block_chunk import Block
-from cnpgen.pipelines.prepared import PreparedPipeline, as_stored, random_generator
+from cnpgen.pipelines.prepared import Block, PreparedPipeline, as_stored, random_generator
 from cnpgen.pipelines.stages.hitting_velocity import HittingVelocity
 from cnpgen.pipelines.stages.stage import BLOCK_ROWS, CandidateBatch
 from cnpgen.store.field import Field

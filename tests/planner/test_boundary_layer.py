@@ -126,7 +126,7 @@ def test_plans_contain_the_control_points_and_tasks(cache_folder: Path) -> None:
     np.testing.assert_array_equal(plans.path_control_points, layer(tasks, *values).path)
     np.testing.assert_array_equal(plans.boundary.goal_dq, given.goal_dq)
     np.testing.assert_allclose(plans.columns["goal_xyz"], plans.problem.tip_positions(given.goal_q), atol=1e-9)
-    assert layer.obstacle_poses(tasks).shape == (3, 2)
+    assert tasks.scene.poses.shape == (3, 2)
 
 
 def test_without_projection_steps_and_outputs_the_path_is_the_papers_line() -> None:

@@ -6,6 +6,7 @@ from scipy.interpolate import BSpline
 
 from cnpgen.planner.control_points import control_points, vjp
 from cnpgen.planner.tasks import MIN_EXPECTED_TIME_S, Tasks, expected_time
+from cnpgen.robots.scene import Scene
 from cnpgen.trajectory.boundary import Boundary, anchor_line
 from cnpgen.trajectory.spline import clamped_knots
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
@@ -19,7 +20,7 @@ def tasks(*, goal_ddq: bool = False, corrected: bool = True, seed: int = 0) -> T
     interior = SPEC.path_control_points - 3 - boundary.fixed_at_goal
     correction = random.normal(0, 0.1, (N, interior, JOINTS)) if corrected else None
     tips = random.normal(size=(2, N, 3))
-    return Tasks(boundary, *tips, expected_time(boundary, np.ones(JOINTS)), correction)
+    return Tasks(boundary, *tips, expected_time(boundary, np.ones(JOINTS)), Scene((), np.empty((N, 0))), correction)
 
 
 def outputs(given: Tasks, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:

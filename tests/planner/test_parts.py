@@ -13,7 +13,8 @@ from cnpgen.planner.inference_pipeline import make_inference_pipeline
 from cnpgen.planner.time_scaling import MAX_TIME_SCALE, SCALING_INTERVALS, make_time_scaling
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.plans import make_plans
-from cnpgen.problems.obstacles import obstacle_poses_of
+from cnpgen.problems.obstacles import scene_of
+from cnpgen.problems.problem_record import as_problem
 from cnpgen.trajectory.boundary import Boundary, anchor_line, assemble
 from cnpgen.trajectory.spline import chebyshev
 from cnpgen.trajectory.spline_motion import Motion
@@ -107,7 +108,7 @@ def fast(tiny):
     tasks = inference.prepare(boundary)
     shape = 0.4 + np.sin(np.pi * np.linspace(0, 1, 20))  # slow at the ends
     motion = Motion(path, 0.9 * shape / tasks.expected_time[:, None])
-    obstacle_poses = obstacle_poses_of(given.problem, ends["start_xyz"], ends["goal_xyz"])
+    obstacle_poses = scene_of(as_problem(given.problem), ends["start_xyz"], ends["goal_xyz"]).poses
     return given, boundary, ends, motion, obstacle_poses
 
 

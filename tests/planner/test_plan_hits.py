@@ -86,11 +86,11 @@ def test_a_planner_can_be_pickled_after_planning_hits(planner, state):
             ((np.zeros(6),) * 2, [1.0, 0.0], TARGET),
             "state must be positions, .* got 2 values or arrays",
         ),
-        (((np.zeros(5),) * 3, [1.0, 0.0], TARGET), r"start_q must have shape \(6,\) or \(N, 6\), got \(5,\)"),
+        (((np.zeros(5),) * 3, [1.0, 0.0], TARGET), r"state must have shape \(6,\) or \(N, 6\), got \(5,\)"),
         (((np.zeros(6),) * 3, [1.0], TARGET), r"puck must have shape \(2,\) or \(N, 2\) or \(3,\) or \(N, 3\), got"),
         (((np.zeros(6),) * 3, [1.0, np.nan], TARGET), "puck must be finite"),
-        (((np.zeros((2, 6)),) * 3, np.ones((3, 2)), TARGET), "start_q has 2 hits, another argument has 3"),
-        (((np.zeros((0, 6)),) * 3, np.ones((0, 2)), TARGET), "start_q is empty, expected at least 1 hit"),
+        (((np.zeros((2, 6)),) * 3, np.ones((3, 2)), TARGET), "state has 2 hits, another argument has 3"),
+        (((np.zeros((0, 6)),) * 3, np.ones((0, 2)), TARGET), "state is empty, expected at least 1 hit"),
     ],
 )
 def test_invalid_arguments_raise_errors_with_their_name(planner, arguments, message):

@@ -106,10 +106,10 @@ def test_one_plan_can_be_replanned_to_several_goals_including_its_own(planner, r
 
 def test_replanning_rejects_plans_of_other_types_and_problems(planner, rows):
     old, goal = planned(planner, rows), {"goal_q": rows.goal_q, "goal_dq": rows.goal_dq}
-    with pytest.raises(UsageError, match=r"expected Plans, .* got Boundary"):
+    with pytest.raises(UsageError, match=r"must be Plans, .* got Boundary"):
         planner.replan(rows, 0.1, **goal)
     joined = join_plans(old, planner.replan(old, 0.5 * old.duration, **goal), at=0.5 * old.duration)
-    with pytest.raises(UsageError, match=r"expected Plans, .* got JoinedPlans"):
+    with pytest.raises(UsageError, match=r"must be Plans, .* got JoinedPlans"):
         planner.replan(joined, 0.1, **goal)
     with pytest.raises(UsageError, match="the planner is of 'airhockey', the plans are of 'heavy-object'"):
         planner.replan(draw_boundary_problems("heavy-object", 2, seed=1), 0.0, **goal)

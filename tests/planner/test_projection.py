@@ -36,7 +36,7 @@ def nearby(tiny, name: str, count: int = 8, fixed: int = 2) -> tuple[np.ndarray,
     rate = np.repeat(1 / tasks.expected_time[:, None], 20, axis=1)
     interior = anchor_line(boundary, rate, spec) + tasks.correction
     interior += 0.05 * np.random.default_rng(0).uniform(-1, 1, interior.shape)
-    return assemble(boundary, interior, rate, spec), inference.prepare.obstacle_poses(tasks.start_xyz, tasks.goal_xyz)
+    return assemble(boundary, interior, rate, spec), tasks.scene.poses
 
 
 def drawn(tiny, name: str, count: int, fixed: int) -> Boundary:
@@ -140,7 +140,7 @@ def test_the_planners_kernel_and_training_give_the_same_paths(tiny, name, fixed)
     tasks, random = inference.prepare(boundary), np.random.default_rng(2)
     phi, log_rate = random.uniform(-1, 1, (8, (12 - fixed) * given.robot.n)), random.normal(0, 0.3, (8, 20))
     points = control_points(tasks, phi, log_rate, scale=0.1, spec=given.problem.trajectory)
-    obstacle_poses = inference.prepare.obstacle_poses(tasks.start_xyz, tasks.goal_xyz)
+    obstacle_poses = tasks.scene.poses
     expected = projection_of(name, fixed).project(points.path, obstacle_poses)
     offsets = 0.1 * phi + tasks.correction.reshape(8, -1)
     (found,) = inference.path(ends_of(boundary), lanes(offsets), lanes(points.rate), lanes(obstacle_poses))
@@ -154,6 +154,6 @@ def test_the_projected_line_is_the_projection_of_the_papers_line(tiny, name, fix
     tasks = inference.prepare(boundary)
     rate, spec = np.repeat(1 / tasks.expected_time[:, None], 20, axis=1), given.problem.trajectory
     line = anchor_line(boundary, rate, spec)
-    obstacle_poses = inference.prepare.obstacle_poses(tasks.start_xyz, tasks.goal_xyz)
+    obstacle_poses = tasks.scene.poses
     projected = projection_of(name, fixed).project(assemble(boundary, line, rate, spec), obstacle_poses)
     np.testing.assert_allclose(tasks.correction, projected[:, 3 : 15 - fixed] - line, atol=1e-12)

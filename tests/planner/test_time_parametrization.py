@@ -18,7 +18,6 @@ from cnpgen.planner.time_parametrization import (
 )
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.plans import make_plans
-from cnpgen.problems.obstacles import obstacle_poses_of
 from cnpgen.trajectory.spline_motion import Motion
 from tests.conftest import columns_of, needs_compiler
 from tests.examples.constraints import TipSpeed
@@ -146,7 +145,7 @@ def test_compiled_and_interpreted_time_parametrization_agree_with_obstacles(tiny
     """Only with obstacles a state has more values than the motion; compiling its kernels takes some seconds."""
     given, boundary = loaded_problem_of("heavy-object"), boundary_of_columns(columns_of(tiny("heavy-object")), COUNT)
     plans = Planner("heavy-object", backend="numpy").plan_batch(boundary)
-    obstacle_poses = obstacle_poses_of(given.problem, plans.columns["start_xyz"], plans.columns["goal_xyz"])
+    obstacle_poses = plans.scene.poses
     assert obstacle_poses.size
     calm = make_time_parametrization(given.problem, given.robot, interpreted(given).kernels)
     found = compiled_time_parametrization("heavy-object").parametrize(plans.motion, obstacle_poses).rate

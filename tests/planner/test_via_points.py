@@ -12,7 +12,6 @@ from cnpgen.planner.model_file import load_model
 from cnpgen.planner.planner import Planner
 from cnpgen.planner.via_points import ViaPoints, make_via_points
 from cnpgen.plans.evaluate import evaluate_plans
-from cnpgen.problems.obstacles import obstacle_poses_of
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.world.world import World
 from tests.conftest import needs_compiler
@@ -36,7 +35,7 @@ def problems() -> Boundary:
 def test_static_violations_agree_with_pinocchio_and_coal() -> None:
     problem, robot, plan = PROBLEMS["heavy-object"], ROBOTS["heavy-object"], load("transport")
     world, random = World(robot, problem.obstacle, problem.object_size), np.random.default_rng(0)
-    obstacle_poses = obstacle_poses_of(problem, plan.start_xyz, plan.goal_xyz)[0]
+    obstacle_poses = plan.scene.poses[0]
     on_way = plan.motion.at(np.linspace(0, 1, 6)).q[0]
     states = np.concatenate([random.uniform(robot.position_lower, robot.position_upper, (6, robot.n)), on_way])
     via_points = make_via_points(problem, quickest("heavy-object").kernels, np.empty((0, robot.n)))
@@ -68,7 +67,7 @@ def test_via_points_repair_plans_and_keep_those_without_violation(model: Model, 
     planner = Planner(model)
     found, inference = planner.plan_batch(problems), planner._inference
     assert inference.via_points is not None
-    obstacle_poses = inference.prepare.obstacle_poses(found.columns["start_xyz"], found.columns["goal_xyz"])
+    obstacle_poses = found.scene.poses
     before, after = (inference.via_points.violation(plans.motion, obstacle_poses) for plans in (straight, found))
     same = (found.path_control_points == straight.path_control_points).all(axis=(1, 2))
     assert same[before <= 1].all()

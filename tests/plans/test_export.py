@@ -19,6 +19,7 @@ from cnpgen.plans.exporter import sample_plan
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.schema import registry
 from cnpgen.trajectory.spline_motion import Motion
+from tests.examples.installed import installed_kind
 from tests.plans.test_plans import AIRHOCKEY, draw_plans, garbage
 
 FORMATS = registry.names(registry.EXPORTERS)
@@ -251,6 +252,54 @@ def test_wrong_forms_and_places_are_refused(tmp_path: Path, monkeypatch: pytest.
     for form in FORMATS:
         with pytest.raises(MachineError, match="No space left"):
             export_plans(plans, tmp_path / f"full-{form}", to=form)
+
+
+EXPORTER = """
+from dataclasses import dataclass
+from cnpgen.plugins import Exporter, field
+@dataclass(frozen=True)
+class Durations(Exporter):
+    suffix = ".txt"
+    single_file = True
+    def write(self, path, plans, exported):
+        path.write_text("".join(f"{plan.index} {plan.t[-1]}\\n" for plan in plans))
+"""
+
+
+def test_a_package_adds_a_format(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plans = draw_plans()
+    (tmp_path / "durations.py").write_text(EXPORTER)
+    with installed_kind(tmp_path, "durations", "durations:Durations", monkeypatch, group=registry.EXPORTERS):
+        exported = export_plans(plans, tmp_path, to="durations", only=[1, 0])
+        with pytest.raises(
+            UsageError, match=r"exporter 'duration' \(did you mean 'durations'\?\).* 'cnpgen.exporters'"
+        ):
+            export_plans(plans, tmp_path, to="duration")
+    assert exported.files == (tmp_path / "plans.txt",)
+    assert exported.files[0].read_text() == f"0 {plans.duration[0]}\n1 {plans.duration[1]}\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "message"),
+    [
+        ("csv", "", "", r"exporter 'csv' is defined more than once: by cnpgen and by csv \(.*:Durations\)"),
+        ("broken", "Exporter, field", "Exporters, field", "exporter 'broken' of .* cannot be imported: ImportError"),
+        ("broken", "(Exporter)", "", "is not a subclass of cnpgen.plans.exporter.Exporter"),
+        ("broken", "def write", "def save", "Durations is abstract, it does not define write"),
+        ("broken", 'suffix = ".txt"', "", "Durations must have a suffix and no fields"),
+        ("broken", "single_file = True", 'single_file: bool = field("?")', "must have a suffix and no fields"),
+    ],
+)
+def test_a_broken_format_of_a_package_is_refused(
+    name: str, old: str, new: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module = tmp_path.name  # unlike those of other tests, which are imported already
+    (tmp_path / f"{module}.py").write_text(EXPORTER.replace(old, new, 1))
+    with (
+        installed_kind(tmp_path, name, f"{module}:Durations", monkeypatch, group=registry.EXPORTERS),
+        pytest.raises(UsageError, match=message),
+    ):
+        export_plans(draw_plans(), tmp_path, to=name)
 
 
 def test_the_highest_rate_still_has_different_stamps(tmp_path: Path) -> None:

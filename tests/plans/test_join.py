@@ -102,7 +102,7 @@ def test_a_jump_is_refused_with_its_size_place_and_time(three):
             r"plan 0 cannot be cut at 60 s: its last part lasts from 0 to",
         ),
         (lambda first, second, at: (first, second, -0.1), r"plan 0 cannot be cut at -0.1 s"),
-        (lambda first, second, at: (first, "plans.h5", at), "expected Plans"),
+        (lambda first, second, at: (first, "plans.h5", at), "must be Plans"),
         (lambda first, second, at: (first, unsolved(second), at), "plan 0 has no control points yet"),
         (lambda first, second, at: (unsolved(first), second, at), "plan 0 has no control points yet"),
     ],

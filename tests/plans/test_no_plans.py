@@ -38,7 +38,7 @@ def test_nothing_is_planned_refined_judged_saved_and_joined(planner: Planner, no
         assert (len(found.plans), found.summary()["valid"]) == (0, 0)
     assert evaluate_plans(none, workers=2).summary()["valid_ratio"] is None
     problem, robot = open_problem(none.problem)
-    assert judge(problem, robot, none.motion, none.boundary, np.zeros((0, 3)), np.zeros((0, 3))) == []
+    assert judge(problem, robot, none.motion, none.boundary, none.scene, np.zeros((0, 3))) == []
     save_plans(tmp_path / "none.h5", none)
     assert len(join_plans(none, none, at=[])) == 0
 

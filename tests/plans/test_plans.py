@@ -639,7 +639,7 @@ def test_what_is_not_plans_is_refused_by_name(tmp_path: Path) -> None:
         lambda plans: save_plans(tmp_path / "a.h5", plans),
     ]
     for call in calls:
-        with pytest.raises(UsageError, match=r"expected Plans, as load_plans and make_plans return them, got str"):
+        with pytest.raises(UsageError, match=r"must be Plans, as load_plans and make_plans return them.* got str"):
             call("plans.h5")
 
 

@@ -50,7 +50,7 @@ def test_a_urdf_without_shapes_is_a_line_through_its_joints(tmp_path):
     [
         ({"clearance": RADIUS}, "constraint 2.radius", "the robot has the shape that its URDF gives it, and no radius"),
         ({"robot": PAPER, "more": ""}, "constraint 2.radius", "missing key, expected a length [m]"),
-        ({"robot": PAPER, "clearance": RADIUS}, "constraint 3", 'it needs geometry = "urdf" in [robot]'),
+        ({"robot": PAPER, "clearance": RADIUS}, "constraint 3", 'needs geometry = "urdf" in [robot]'),
         ({"robot": f'{PAPER}\nsrdf = "a.srdf"', "more": "", "clearance": RADIUS}, "robot.srdf", "matter with"),
         ({"robot": 'srdf = "a.srdf"'}, "robot.srdf", "no such file: "),
         ({"robot": 'packages = ["nowhere"]'}, "robot.packages", "no such folder: "),

@@ -10,7 +10,7 @@ from scipy.interpolate import BSpline
 
 from cnpgen.errors import RecipeError
 from cnpgen.kernels.symbolic.linalg import symbols
-from cnpgen.kernels.symbolic.symbolic_state import SymbolicState, jerk_along
+from cnpgen.kernels.symbolic.symbolic_state import SymbolicState, time_derivatives
 from cnpgen.problems.constraints.joint import JointJerk
 from cnpgen.problems.constraints.needs import measured_needs, symbolic_needs
 from cnpgen.problems.load_robot import load_robot
@@ -61,7 +61,7 @@ def test_the_jerk_along_a_path_is_the_third_difference_in_time() -> None:
     knots = [np.r_[np.zeros(8), np.linspace(0, 1, 5)[1:-1], np.ones(8)]] * 2
     p, r = BSpline(knots[0], random.normal(size=(11, n)), 7), BSpline(knots[1], random.uniform(1, 2, 11), 7)
     columns = [ca.SX.sym(f"p{order}", n) for order in (1, 2, 3)], ca.SX.sym("r", 3)
-    formula = jerk_along([ca.vertsplit(each) for each in columns[0]], ca.vertsplit(columns[1]))
+    _, _, formula = time_derivatives([ca.vertsplit(each) for each in columns[0]], ca.vertsplit(columns[1]))
     jerk = ca.Function("jerk", [*columns[0], columns[1]], [ca.vertcat(*formula)])
     for s in (0.2, 0.5, 0.8):
         times, phases = h * np.arange(-2, 3), []
@@ -80,7 +80,7 @@ def test_the_jerk_along_a_path_is_the_third_difference_in_time() -> None:
 
 
 def test_a_path_without_a_third_derivative_has_none() -> None:
-    assert jerk_along([[1.0], [2.0]], [1.0, 0.5]) is None
+    assert time_derivatives([[1.0], [2.0]], [1.0, 0.5]) == ([1.0], [2.5], None)
 
 
 def state_of(problem: Problem, jerk: list | None) -> SymbolicState:

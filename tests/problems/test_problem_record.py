@@ -14,7 +14,7 @@ from cnpgen.errors import RecipeError, UsageError
 from cnpgen.losses.plan_loss import PlanLoss
 from cnpgen.planner.boundary_layer import BoundaryLayer
 from cnpgen.plans import make_plans, record_problem
-from cnpgen.problems.obstacles import obstacle_poses_of
+from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.problems.problem_record import as_problem, as_record, open_problem
@@ -102,8 +102,8 @@ def test_everything_that_takes_a_problem_takes_what_plans_have_of_it(given: Prob
     tasks = omega.tasks(Boundary(q, zero, zero, q + 0.1, zero))
     phi, log_rate = np.zeros((2, omega.path_outputs)), np.zeros((2, omega.rate_outputs))
     plans = omega.plans(tasks, phi, log_rate)
-    obstacle_poses = obstacle_poses_of(given, plans.columns["start_xyz"], plans.columns["goal_xyz"])
-    np.testing.assert_array_equal(obstacle_poses, omega.obstacle_poses(tasks))
+    obstacle_poses = scene_of(as_problem(given), plans.columns["start_xyz"], plans.columns["goal_xyz"]).poses
+    np.testing.assert_array_equal(obstacle_poses, tasks.scene.poses)
     arrays = plans.path_control_points, plans.rate_control_points
     found = loss(*arrays, weights=loss.weights0, obstacle_poses=obstacle_poses)
     expected = PlanLoss(HEAVY, backend="numpy")(*arrays, weights=loss.weights0, obstacle_poses=obstacle_poses)

@@ -19,6 +19,7 @@ from cnpgen.refine.solver.compiled_backend import CompiledBackend
 from cnpgen.refine.solver.qp_subproblem import NumpyBackend, ResidualSelection
 from cnpgen.refine.strategy import PlanChecker, refine_task
 from cnpgen.refine.task import RefinementTask
+from cnpgen.robots.scene import Scene
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 from tests.conftest import some
@@ -96,7 +97,7 @@ def test_steps_of_arms_of_any_number_of_joints_are_those_of_numpy_and_daqp(
     for goal_ddq in (None, random.normal(size=(1, joints))):
         ends = Boundary(q[0], dq[0], 0.3 * random.normal(size=(1, joints)), q[1], dq[1], goal_ddq)
         compare(
-            tool, RefinementTask(ends, np.zeros(0), np.zeros(3), np.zeros(3)), within=1e-5
+            tool, RefinementTask(ends, Scene((), np.empty((1, 0))), np.zeros(3), np.zeros(3)), within=1e-5
         )  # with one joint the objective is flat
 
 

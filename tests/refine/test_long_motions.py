@@ -20,14 +20,14 @@ GOAL = (1.3863047942929525, 1.4057591633344235, -0.2559910277347963, -0.79634045
 
 
 def long_task() -> RefinementTask:
-    from cnpgen.problems.obstacles import obstacle_poses_of
+    from cnpgen.problems.obstacles import scene_of
     from cnpgen.problems.problem_record import record_problem
 
     problem, zero = PROBLEMS["heavy-object"], np.zeros((1, 7))
     start, goal = np.array([START]), np.array([GOAL])
     tips = record_problem(problem).tip_positions
-    obstacle_poses = obstacle_poses_of(problem, tips(start), tips(goal))[0]
-    return RefinementTask(Boundary(start, zero, zero, goal, zero), obstacle_poses, tips(start)[0], tips(goal)[0])
+    scene = scene_of(problem, tips(start), tips(goal))
+    return RefinementTask(Boundary(start, zero, zero, goal, zero), scene, tips(start)[0], tips(goal)[0])
 
 
 def test_a_motion_of_seconds_does_not_trade_violations_for_time() -> None:

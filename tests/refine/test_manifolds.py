@@ -9,6 +9,7 @@ from cnpgen.kernels.library import problem_kernels
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.strategy import PlanChecker, refine_task
 from cnpgen.refine.task import RefinementTask
+from cnpgen.robots.scene import Scene
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.world.world import World
 from tests.examples.manifolds import MANIFOLDS, ROBOT, ends_on, problem_on
@@ -27,6 +28,8 @@ def test_a_motion_on_a_manifold_is_found_without_input_plan(name: str, tmp_path:
     kernels = problem_kernels(problem, ROBOT, "numpy", tmp_path)
     tool = Refiner(problem, ROBOT, kernels=kernels, world=world)
     boundary = Boundary(q[0][None], rest, rest, q[1][None], rest)
-    found = refine_task(tool, PlanChecker(problem, ROBOT, degree=7), RefinementTask(boundary, np.zeros(0), *tips))
+    found = refine_task(
+        tool, PlanChecker(problem, ROBOT, degree=7), RefinementTask(boundary, Scene((), np.empty((1, 0))), *tips)
+    )
     assert found.valid, found
     assert np.linalg.norm(tips[1] - tips[0]) > 0.2

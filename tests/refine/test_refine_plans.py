@@ -63,7 +63,7 @@ def test_solving_ignores_existing_plans(problems: Plans, solved: Plans) -> None:
     slow = replace(solved, rate_control_points=0.5 * solved.rate_control_points)
     assert same(solve_plans(slow, workers=1).plans, solved)
     assert not same(refine_plans(slow, workers=1).plans, solved)
-    with pytest.raises(UsageError, match="expected Plans"):
+    with pytest.raises(UsageError, match="problems must be Plans"):
         solve_plans("airhockey-hit")  # type: ignore[arg-type]
 
 

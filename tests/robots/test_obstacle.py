@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cnpgen.errors import RecipeError
-from cnpgen.problems.obstacles import obstacle_poses_of
+from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.problems.problem_record import as_problem, record_problem
 from cnpgen.robots.obstacle import Obstacle
@@ -113,7 +113,7 @@ def test_poses_hold_the_entries_of_all_obstacles(tmp_path: Path) -> None:
     problem = load_problem(write_problem(tmp_path, obstacles=KINDS))
     upright = load_problem(write_problem(tmp_path)).obstacle
     problem = replace(problem, obstacle=(*upright, *problem.obstacle))
-    obstacle_poses = obstacle_poses_of(problem, np.zeros((4, 3)), np.zeros((4, 3)))
+    obstacle_poses = scene_of(problem, np.zeros((4, 3)), np.zeros((4, 3))).poses
     assert obstacle_poses.shape == (4, 2 + 45)
     np.testing.assert_array_equal(obstacle_poses[:, :2], [[0.3, 0.9]] * 4)
     np.testing.assert_array_equal(obstacle_poses[2], place_obstacles(problem.obstacle))

@@ -112,7 +112,7 @@ def test_an_offset_with_a_comma_is_no_number(tmp_path: Path) -> None:
     )
     link = SHIPPED.urdf_text.split('<link name="')[1].split('"')[0]
     urdf = shipped_with(("</robot>", f"{finger.replace('iiwa_link_1', link)}{mimic}</joint></robot>"))
-    with pytest.raises(RecipeError, match=r"'finger' mimics 'other' with offset='0,5' must be a number"):
+    with pytest.raises(RecipeError, match=r"'finger' mimics 'other' with <mimic offset='0,5'> must be a number"):
         load(problem_with(tmp_path, urdf))
 
 

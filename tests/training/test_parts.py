@@ -178,7 +178,7 @@ def test_margins_tighten_the_limits_that_they_name_and_no_others(monkeypatch: py
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"margins": {"joint-velocity": 1.5}}, r"margin of 'joint-velocity' must be in \(0, 1\], got 1.5"),
+        ({"margins": {"joint-velocity": 1.5}}, r"margins must be in \(0, 1\] for 'joint-velocity', got 1.5"),
         ({"expected_time": "soon"}, "expected_time must be one of distance, reach, got 'soon'"),
     ],
 )

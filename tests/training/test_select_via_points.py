@@ -39,6 +39,6 @@ def test_selected_via_points_repair_plans_of_other_problems(monkeypatch: pytest.
     )
     assert inference.via_points is not None
     plans = [Planner(each).plan_batch(others) for each in (model, chosen)]
-    obstacle_poses = inference.prepare.obstacle_poses(plans[0].columns["start_xyz"], plans[0].columns["goal_xyz"])
+    obstacle_poses = plans[0].scene.poses
     violating = [(inference.via_points.violation(each.motion, obstacle_poses) > 1).sum() for each in plans]
     assert violating[1] < 0.85 * violating[0]

@@ -66,7 +66,8 @@ def test_derivatives_by_single_parameters_agree_with_finite_differences(tiny, fi
 @pytest.mark.slow
 def test_a_plan_with_a_loss_of_nan_does_not_affect_the_gradient_of_others(tiny):
     learner, rows, parameters = prepared(tiny, "heavy-object")
-    broken = replace(rows, obstacle_poses=np.where(np.arange(6)[:, None] == 2, np.nan, rows.obstacle_poses))
+    poses = np.where(np.arange(6)[:, None] == 2, np.nan, rows.tasks.scene.poses)
+    broken = replace(rows, tasks=replace(rows.tasks, scene=replace(rows.tasks.scene, poses=poses)))
     weights, gradient = np.ones(7), np.empty_like(parameters)
     terms = learner.gradient(parameters, broken, weights, shift=0.3, clipping=Clipping(), out=gradient)
     assert np.isnan(terms[2]).all()

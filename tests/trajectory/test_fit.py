@@ -252,7 +252,7 @@ def test_a_boundary_of_a_wrong_shape_raises_an_error() -> None:
         fit_motion(t, q, spec=SPEC, boundary=at_rest(np.zeros((2, 2))))
     with pytest.raises(UsageError, match="start_q must be finite"):
         fit_motion(t, q, spec=SPEC, boundary=at_rest(np.full((2, 3), np.nan)))
-    with pytest.raises(UsageError, match="goal_dq must be an array of numbers"):
+    with pytest.raises(UsageError, match="boundary must be an array of numbers"):
         fit_motion(t, q, spec=SPEC, boundary=replace(at_rest(np.zeros((2, 3))), goal_dq=[["a", 0, 0]]))
     lists = Boundary(*(values.tolist() for values in vars(at_rest(np.zeros((2, 3)))).values() if values is not None))
     assert np.array_equal(fit_motion(t, q, spec=SPEC, boundary=lists).path, np.zeros((1, 15, 3)))

@@ -132,7 +132,7 @@ def test_phases_and_times_may_be_shared_or_individual() -> None:
     assert motion[:0].time_at(np.zeros((0, 4))).shape == (0, 4)
     np.testing.assert_array_equal(motion[3].path, motion.path[[3]])
     np.testing.assert_array_equal(motion.time_scaled(2.0).rate, motion.rate / 2)
-    for method, what in ((motion.at, "phases"), (motion.time_at, "phases"), (motion.phase_at, "times")):
+    for method, what in ((motion.at, "s"), (motion.time_at, "s"), (motion.phase_at, "t")):
         for wrong in (0.5, np.full((1, 4), 0.5), np.full((3, 4), 0.5), np.zeros((5, 2, 2))):
             with pytest.raises(UsageError, match=rf"{what} must have shape \(K,\) or \(5, K\), got"):
                 method(wrong)

@@ -5,6 +5,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -16,14 +17,11 @@ from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.store.check import REMAKE_HINT
 from cnpgen.store.dataset_spec import ShardTask, load_dataset_spec, shards
-from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.layout import MANIFEST
-from cnpgen.store.manifest import finalize
 from cnpgen.store.shard import read_shard
-from cnpgen.store.shard_record import load_record, save_record
-from cnpgen.store.statistics import column_statistics
 from cnpgen.validate.validate_dataset import ValidationReport, validate_dataset
 from tests.conftest import SHIPPED, TINY_SHARD, Arm, needs_compiler, some, tiny_recipe
+from tests.examples.forged_shards import edit, task_of
 
 Tiny = Callable[[str], Path]
 FILES = [
@@ -41,24 +39,6 @@ def named(report: ValidationReport) -> dict[str, str]:
 
 def copied(tiny: Tiny, tmp_path: Path, name: str = "airhockey-hit") -> Path:
     return Path(shutil.copytree(tiny(name), tmp_path / name))
-
-
-def task_of(folder: Path, file: str) -> ShardTask:
-    return next(task for task in shards(load_dataset_spec(folder)) if task.file == file)
-
-
-def edit(folder: Path, file: str, change: Callable[[h5py.File], None]) -> None:
-    """Change a shard and every checksum, count and statistic that would reveal it."""
-    task = task_of(folder, file)
-    with h5py.File(folder / file, "r+") as shard:
-        change(shard)
-    record, spec = load_record(folder, task), load_dataset_spec(folder)
-    columns, statistics = read_shard(folder / file), record.statistics
-    if len(columns) == len(spec.fields) and all(np.isfinite(values).all() for values in columns.values()):
-        statistics = column_statistics(columns, spec.fields)
-    size, digest = (folder / file).stat().st_size, file_sha256(folder / file)
-    save_record(folder, task, replace(record, bytes=size, sha256=digest, statistics=statistics))
-    finalize(folder, spec)
 
 
 # --- good datasets ----------------------------------------------------------------------------------------------------
@@ -220,7 +200,8 @@ def test_two_shards_that_changed_places_are_named_even_if_the_manifest_is_rewrit
 
         def exchange(shard: h5py.File, values=values) -> None:
             for name, column in values.items():
-                shard[name][...] = column
+                if name != "sample_id":
+                    shard[name][...] = column
 
         edit(damaged, file, exchange)
     assert validate_dataset(damaged).ok
@@ -295,10 +276,21 @@ def put_nan(column: str) -> Callable[[h5py.File], None]:
     return change
 
 
-def test_deep_names_values_that_are_not_finite(damaged: Path):
-    edit(damaged, "train/shard-00000.h5", put_nan("goal_q"))
-    report = validate_dataset(damaged, deep=True, workers=1)
-    assert any("finite: 1 row out" in finding.problem for finding in report.findings)
+@pytest.mark.parametrize("column", ["goal_q", "goal_dq"])
+@pytest.mark.parametrize("options", [{}, {"deep": True, "workers": 1}, {"regenerate": 40}], ids=str)
+def test_values_that_are_not_finite_are_named(damaged: Path, column: str, options: dict[str, Any]):
+    edit(damaged, "train/shard-00000.h5", put_nan(column))
+    report = validate_dataset(damaged, **options)
+    assert named(report) == {
+        "train/shard-00000.h5": f"field '{column}' is not finite in 1 rows, first in row 5"
+    }
+
+
+def test_sample_ids_of_other_rows_are_named(damaged: Path):
+    edit(damaged, "train/shard-00001.h5", lambda shard: shard["sample_id"].__setitem__(7, 3))
+    assert named(validate_dataset(damaged)) == {
+        "train/shard-00001.h5": "sample_id is not the index of the row in the split"
+    }
 
 
 def test_a_field_that_is_gone_is_a_finding_of_the_deep_check_too(damaged: Path):
@@ -329,12 +321,6 @@ def test_regeneration_finds_changes_that_satisfy_checksums_and_constraints(damag
     assert set(named(report)) == {"train/shard-00001.h5"}
     assert "made again from the seed" in named(report)["train/shard-00001.h5"]
     assert 0 < report.identical < report.regenerated
-
-
-def test_regeneration_finds_values_that_are_not_finite(damaged: Path):
-    edit(damaged, "train/shard-00000.h5", put_nan("goal_dq"))
-    report = validate_dataset(damaged, regenerate=40)
-    assert "made again from the seed: goal_dq differs by nan" in named(report)["train/shard-00000.h5"]
 
 
 def test_differences_by_rounding_are_accepted_but_not_identical(damaged: Path):

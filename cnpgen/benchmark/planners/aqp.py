@@ -1,8 +1,8 @@
 """Anchored quadratic programming (docs/references.md, 2), a baseline of the paper for hits.
 
 The planner first computes a path of the tip in the plane, two lines and an arc, with constant acceleration up to the
-hit. At each sample, a quadratic program in the null space of the tip's Jacobian then computes the joint velocity that
-follows the path and moves the arm towards the hitting configuration. It has limits of position and velocity only.
+hit. At each sample, a quadratic program then computes the joint velocity that follows the path. It moves the arm
+towards the hitting configuration in the null space of the tip's Jacobian, within limits of position and velocity only.
 """
 
 from dataclasses import dataclass
@@ -65,9 +65,9 @@ class _Follower:
         for _ in range(MAX_TRIES):
             hit = striking_path(start[:2], self._goal[:2], velocity[:2], speed)
             stop = stopping_path(hit)
-            found = self._follow(hit, stop, height)
-            if found is not None:
-                return found
+            trajectory = self._follow(hit, stop, height)
+            if trajectory is not None:
+                return trajectory
             speed *= SPEED_REDUCTION
         return None
 
@@ -81,36 +81,37 @@ class _Follower:
         t = period * np.arange(len(samples) + 1.0)
         q = [self._boundary.start_q[0]]
         dq = self._boundary.start_dq[0]
-        for sample, now in zip(samples, t[1:], strict=True):
-            following = self._velocity(
-                q[-1], np.append(sample, height), period, self._anchor_velocity(q[-1], now, t[count], t[-1])
+        for sample, time in zip(samples, t[1:], strict=True):
+            next_dq = self._velocity(
+                q[-1], np.append(sample, height), period, self._anchor_velocity(q[-1], time, t[count], t[-1])
             )
-            if following is None:
+            if next_dq is None:
                 return None
-            q.append(q[-1] + (dq + following) / 2 * period)
-            dq = following
+            q.append(q[-1] + (dq + next_dq) / 2 * period)
+            dq = next_dq
         spline = CubicSpline(t, np.array(q), bc_type="clamped")
         until = slice(0, count + 1)
         return Trajectory(t[until], np.array(q)[until], np.asarray(spline(t, 1))[until])
 
-    def _anchor_velocity(self, q: Array, now: float, hit: float, end: float) -> Array:
-        """Return the velocity towards the anchor, which increases up to the hit and then decreases."""
-        pull = (self._boundary.goal_q[0] - q) / ANCHOR_TIME_S
-        if now > hit:
-            return np.asarray((end - now) / (end - hit) * pull)
-        share = now / hit
-        return np.asarray(share * pull + np.clip(1 - share, 0, 1) * self._boundary.start_dq[0])
+    def _anchor_velocity(self, q: Array, t: float, hit: float, end: float) -> Array:
+        """Return the velocity towards the anchor; it increases up to the hit and then decreases."""
+        velocity = (self._boundary.goal_q[0] - q) / ANCHOR_TIME_S
+        if t > hit:
+            return np.asarray((end - t) / (end - hit) * velocity)
+        share = t / hit
+        return np.asarray(share * velocity + np.clip(1 - share, 0, 1) * self._boundary.start_dq[0])
 
-    def _velocity(self, q: Array, wanted: Array, period: float, towards: Array) -> Array | None:
+    def _velocity(self, q: Array, position: Array, period: float, anchor_velocity: Array) -> Array | None:
         """Return the joint velocity that moves the tip to the sample, closest to the velocity of the anchor."""
         robot, (tip, _, J) = self._robot, self._tip.at(q)
         J = J[:3]
-        least = J.T @ np.linalg.solve(J @ J.T, (wanted - tip) / period)
+        min_norm = J.T @ np.linalg.solve(J @ J.T, (position - tip) / period)
         null = np.linalg.svd(J)[2][3:].T
         low = np.maximum(-robot.velocity_limit, (JOINT_LIMIT_FRACTION * robot.position_lower - q) / period)
         high = np.minimum(robot.velocity_limit, (JOINT_LIMIT_FRACTION * robot.position_upper - q) / period)
-        along = nearest_in_null_space(null, self._weights, least - towards, (low - least, high - least))
-        return None if along is None else np.asarray(least + null @ along)
+        bounds = low - min_norm, high - min_norm
+        null_velocity = nearest_in_null_space(null, self._weights, min_norm - anchor_velocity, bounds)
+        return None if null_velocity is None else np.asarray(min_norm + null @ null_velocity)
 
 
 def nearest_in_null_space(null: Array, weights: Array, ahead: Array, bounds: tuple[Array, Array]) -> Array | None:
@@ -132,7 +133,7 @@ def nearest_in_null_space(null: Array, weights: Array, ahead: Array, bounds: tup
     low, high = (np.ascontiguousarray(bound) for bound in bounds)
     if np.any(low > high):
         return None
-    found, _, status, _ = daqp.solve(
+    solution, _, status, _ = daqp.solve(
         np.ascontiguousarray(hessian), np.ascontiguousarray(gradient), np.ascontiguousarray(null), high, low
     )
-    return np.array(found) if status > 0 else None
+    return np.array(solution) if status > 0 else None

@@ -21,7 +21,7 @@ from cnpgen.benchmark.planners.obstacle_boxes import (
 )
 from cnpgen.benchmark.planners.tip import Tip
 from cnpgen.benchmark.trajectory import Trajectory
-from cnpgen.errors import MachineError
+from cnpgen.errors import requires_extra
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem
@@ -57,12 +57,10 @@ class CBiRRT(BenchmarkPlanner):
 
 
 def _ompl() -> Any:
-    try:
+    with requires_extra("benchmark", "OMPL"):
         import ompl.base
         import ompl.geometric
         import ompl.util
-    except ImportError as error:
-        raise MachineError(f"OMPL cannot be imported ({error}): pip install 'cnpgen[benchmark]'") from error
     return ompl
 
 
@@ -92,8 +90,7 @@ class Search:
         self._table = problem.first(Table)
         self._data = robot.model.createData()
         if self._table is None:
-            ends = task.columns["start_xyz"][0], task.columns["goal_xyz"][0]
-            self._size, self._boxes = boxes_of(problem, *ends)
+            self._size, self._boxes = boxes_of(problem, task.scene)
 
     def residual(self, q: Array) -> tuple[float, Array]:
         """Return the residual of the manifold at q [m or 1] and its gradient, shape (n,)."""
@@ -110,8 +107,8 @@ class Search:
         if self._table is not None:
             x, y = self._table.x, self._table.y
             return bool(x.low <= position[0] <= x.high and y.low <= position[1] <= y.high)
-        holding = pin.computeGeneralizedGravity(self._robot.model, self._data, q)
-        if np.any(np.abs(holding) > self._robot.torque_limit):
+        gravity_torque = pin.computeGeneralizedGravity(self._robot.model, self._data, q)
+        if np.any(np.abs(gravity_torque) > self._robot.torque_limit):
             return False
         corners = position + (CUBE * self._size) @ rotation.T
         return all(
@@ -129,14 +126,14 @@ class Search:
         manifold = base.ProjectedStateSpace(space, constraint)
         manifold.setDelta(DELTA)
         manifold.setLambda(LAMBDA)
-        about = base.ConstrainedSpaceInformation(manifold)
-        setup = ompl.geometric.SimpleSetup(about)
+        information = base.ConstrainedSpaceInformation(manifold)
+        setup = ompl.geometric.SimpleSetup(information)
         setup.setStateValidityChecker(lambda state: self.is_valid(self._positions(state)))
         ends = [manifold.allocState() for _ in self._ends]
         for state, q in zip(ends, self._ends, strict=True):
             state.copy(q.tolist())
         setup.setStartAndGoalStates(*ends, MAX_GOAL_ERROR_RAD)
-        setup.setPlanner(ompl.geometric.RRTConnect(about))
+        setup.setPlanner(ompl.geometric.RRTConnect(information))
         setup.setup()
         setup.solve(time_limit)
         if not setup.haveExactSolutionPath():
@@ -170,6 +167,6 @@ def _constraint(base: Any, n: int, residual: Callable[[Array], tuple[float, Arra
         def jacobian(self, x: Any, out: Any) -> None:
             out[0, :] = residual(np.array(x))[1]
 
-    found = Manifold()
-    found.setMaxIterations(MAX_PROJECTIONS)
-    return found
+    manifold = Manifold()
+    manifold.setMaxIterations(MAX_PROJECTIONS)
+    return manifold

@@ -10,6 +10,7 @@ from cnpgen.benchmark.planners.tip import Tip
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
+from cnpgen.robots.scene import Scene
 from cnpgen.robots.shape.hull import CUBE
 
 Array = NDArray[np.float64]
@@ -18,17 +19,16 @@ KnotConstraints = Callable[[Array, Array, Array], tuple[Array, tuple[Array, Arra
 negative, shape (K, m), and their three derivatives, shape (K, m, n) each."""
 
 MAX_HEIGHT_ERROR_M = 0.01
-MIN_CENTER_DISTANCE_M = 0.15  # of the object from the pedestals
+MIN_CENTER_DISTANCE_M = 0.15  # of the object from the obstacles
 
 
-def knot_constraints(problem: Problem, robot: Robot, start_xyz: Array, goal_xyz: Array) -> KnotConstraints:
+def knot_constraints(problem: Problem, robot: Robot, scene: Scene) -> KnotConstraints:
     """Return the constraints of a boundary problem: of a hit, or of a transport.
 
     Args:
         problem: The problem.
         robot: Its robot.
-        start_xyz: Tip position at the start [m], shape (3,).
-        goal_xyz: Tip position at the goal [m], shape (3,).
+        scene: Obstacles of the boundary problem.
 
     Raises:
         UsageError: The problem has neither a table nor a held object.
@@ -36,7 +36,7 @@ def knot_constraints(problem: Problem, robot: Robot, start_xyz: Array, goal_xyz:
     table = problem.first(Table)
     if table is not None:
         return _on_table(table, robot)
-    return _carrying(robot, *boxes_of(problem, start_xyz, goal_xyz))
+    return _with_object(robot, *boxes_of(problem, scene))
 
 
 def _on_table(table: Table, robot: Robot) -> KnotConstraints:
@@ -56,28 +56,28 @@ def _on_table(table: Table, robot: Robot) -> KnotConstraints:
     return at
 
 
-def _carrying(robot: Robot, size: Array, boxes: list[Box]) -> KnotConstraints:
+def _with_object(robot: Robot, size: Array, boxes: list[Box]) -> KnotConstraints:
     """Constrain the object: upright, centre away from the boxes, corners outside; torques within limits."""
     import pinocchio as pin
 
     tip, model, data, limit = Tip(robot), robot.model, robot.model.createData(), robot.torque_limit
 
-    def of_the_object(q: Array) -> tuple[list[float], Array]:
+    def object_values(q: Array) -> tuple[list[float], Array]:
         position, rotation, J = tip.at(q)
         turning = J[3:]
         values, gradients = [rotation[2, 2] - 1.0], [np.cross(turning.T, rotation[:, 2])[:, 2]]
         for box in boxes:
-            separation, out = distance(position, box)
+            separation, normal = distance(position, box)
             values.append(min(separation - MIN_CENTER_DISTANCE_M, 0.0))
-            gradients.append(out @ J[:3] * (separation < MIN_CENTER_DISTANCE_M))
+            gradients.append(normal @ J[:3] * (separation < MIN_CENTER_DISTANCE_M))
             for corner in (CUBE * size) @ rotation.T:
-                deep, out = depth(position + corner, box)
-                values.append(-deep)
-                gradients.append(-out @ (J[:3] + np.cross(turning.T, corner).T))
+                penetration, normal = depth(position + corner, box)
+                values.append(-penetration)
+                gradients.append(-normal @ (J[:3] + np.cross(turning.T, corner).T))
         return values, np.array(gradients)
 
     def knot(q: Array, dq: Array, ddq: Array) -> tuple[Array, Array, Array, Array]:
-        values, gradient = of_the_object(q)
+        values, gradient = object_values(q)
         pin.computeRNEADerivatives(model, data, q, dq, ddq)
         inertia, torque = np.triu(data.M) + np.triu(data.M, 1).T, np.array(data.tau)
         g = np.concatenate([values, limit - torque, limit + torque])

@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.benchmark.benchmark_planner import Answer, BenchmarkPlanner, Plan, Setting
-from cnpgen.benchmark.planners import steering
 from cnpgen.benchmark.planners.proposals import Proposals, load_proposals, shipped_proposals
 from cnpgen.benchmark.planners.state_check import StateCheck
-from cnpgen.benchmark.planners.steering import Steering
+from cnpgen.benchmark.planners.steering import STEERING_STEP_S, Steering, spread_of
 from cnpgen.benchmark.planners.tree import Tree, radii_of
 from cnpgen.errors import UsageError
 from cnpgen.plans.plans import Plans
@@ -24,12 +23,12 @@ Array = NDArray[np.float64]
 
 MAX_PROPOSALS = 300_000
 GOAL_FRACTION = 0.05  # of the targets
-MAX_STEPS_IN_A_ROW = 100  # before it continues from another node
+MAX_CONSECUTIVE_STEPS = 100  # before it continues from another node
 
 
 @dataclass(frozen=True)
 class MPCMPNet(BenchmarkPlanner):
-    """A tree of states, steered by the cross-entropy method to what a network proposes (Li et al., 2021)."""
+    """A tree of states, steered by the cross-entropy method towards proposals of a network (Li et al., 2021)."""
 
     def prepare(self, setting: Setting) -> Plan:
         """Load the network and the kernel that checks states."""
@@ -40,15 +39,15 @@ class MPCMPNet(BenchmarkPlanner):
             raise UsageError(
                 f"the network that proposes configurations for {problem.name!r} is trained for another arm or scene"
             )
-        spread = steering.HIT if problem.object_size is None else steering.TRANSPORT
+        spread = spread_of(problem)
         random = np.random.default_rng(setting.seed)
 
         def plan(task: Plans) -> Answer:
             boundary = task.boundary
             start_xyz, goal_xyz = task.columns["start_xyz"][0], task.columns["goal_xyz"][0]
             start = np.concatenate([boundary.start_q[0], boundary.start_dq[0]])
-            tree = Tree(start, start_xyz, radii_of(problem), steering.STEERING_STEP_S)
-            steer = Steering(check, check.obstacle_poses(start_xyz, goal_xyz), robot.acceleration_limit, spread, random)
+            tree = Tree(start, start_xyz, radii_of(problem), STEERING_STEP_S)
+            steer = Steering(check, task.scene.poses[0], robot.acceleration_limit, spread, random)
             extend = ProposedExtension(tree, network, steer, boundary.goal_q[0])
             return tree.grow(extend, goal_xyz, time_limit=setting.time_limit, max_iterations=MAX_PROPOSALS)
 
@@ -80,12 +79,10 @@ class ProposedExtension:
         state, target, random = self.tree.state(self.node), self.goal_q, self.steer.random
         if random.random() >= GOAL_FRACTION:
             target = self.network.propose(state, self.goal_q, self.steer.obstacle_poses, random)
-        found = self.steer(state, target)
-        reached = 0 if found is None else self.tree.add(self.node, *found)
-        self.node, self.steps = reached, self.steps + 1
-        if found is None or self.steps > MAX_STEPS_IN_A_ROW:
-            self.node, self.steps = (
-                self.tree.selected(self.steer.check.random_place(self.steer.obstacle_poses, random)),
-                0,
-            )
-        return reached
+        motion = self.steer(state, target)
+        node = 0 if motion is None else self.tree.add(self.node, *motion)
+        self.node, self.steps = node, self.steps + 1
+        if motion is None or self.steps > MAX_CONSECUTIVE_STEPS:
+            position = self.steer.check.random_position(self.steer.obstacle_poses, random)
+            self.node, self.steps = self.tree.select(position), 0
+        return node

@@ -4,9 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
-from cnpgen.problems.obstacles import obstacle_poses_of
 from cnpgen.problems.problem import Problem
-from cnpgen.robots.solid import solids_of
+from cnpgen.robots.scene import Scene
 
 Array = NDArray[np.float64]
 Box = tuple[Array, Array]
@@ -16,20 +15,18 @@ MIN_OBJECT_DISTANCE_M = 0.14  # of the object's centre, for samplers
 MAX_CORNER_PENETRATION_M = 0.01  # of the object's corners, for samplers
 
 
-def boxes_of(problem: Problem, start_xyz: Array, goal_xyz: Array) -> tuple[Array, list[Box]]:
+def boxes_of(problem: Problem, scene: Scene) -> tuple[Array, list[Box]]:
     """Return the edge lengths of the held object [m], shape (3,), and the obstacles.
 
     Args:
         problem: The problem.
-        start_xyz: Tip position at the start [m], shape (3,).
-        goal_xyz: Tip position at the goal [m], shape (3,).
+        scene: Obstacles of one boundary problem.
 
     Raises:
         UsageError: There is no held object, or an obstacle is not an upright box.
     """
     size = require_transport(problem)
-    solids = solids_of(problem.obstacle, obstacle_poses_of(problem, start_xyz, goal_xyz))
-    boxes = [(np.array([*solid.low[:2], -np.inf]), solid.high) for solid in solids]
+    boxes = [(np.array([*solid.low[:2], -np.inf]), solid.high) for solid in scene.bodies()]
     return size, boxes
 
 
@@ -41,7 +38,7 @@ def require_transport(problem: Problem) -> Array:
     """
     if problem.object_size is None:
         raise UsageError(f"supported are hits on a table and transports, {problem.name!r} has neither table nor object")
-    others = [each.name for each in problem.obstacle if not each.upright]
+    others = [obstacle.name for obstacle in problem.obstacle if not obstacle.upright]
     if others:
         raise UsageError(f"supported are upright boxes only, {problem.name!r} has {', '.join(others)}")
     return np.array(problem.object_size)
@@ -57,9 +54,9 @@ def distance(point: Array, box: Box) -> tuple[float, Array]:
 def depth(point: Array, box: Box) -> tuple[float, Array]:
     """Return the penetration depth of a point in a box [m], 0 outside, and its gradient, shape (3,)."""
     depths = np.concatenate([point - box[0], box[1] - point])
-    least = int(np.argmin(depths))
+    nearest_face = int(np.argmin(depths))
     normal = np.zeros(3)
-    if depths[least] <= 0:
+    if depths[nearest_face] <= 0:
         return 0.0, normal
-    normal[least % 3] = 1.0 if least < 3 else -1.0
-    return float(depths[least]), normal
+    normal[nearest_face % 3] = 1.0 if nearest_face < 3 else -1.0
+    return float(depths[nearest_face]), normal

@@ -1,4 +1,4 @@
-"""Network that proposes the next configuration on the way to a goal, trained on certified plans (Li et al., 2021).
+"""Network that proposes the next configuration towards a goal, trained on certified plans (Li et al., 2021).
 
 From a state, the goal and the obstacles, it predicts the change of every joint within a time as a normal distribution.
 The configuration head predicts the mean, within the velocity limits, and the linear head the deviation. Proposals are
@@ -20,7 +20,6 @@ from cnpgen.machine.versions import __version__
 from cnpgen.planner.network.architecture import Architecture, Weights, initial_parameters
 from cnpgen.planner.network.forward import backward, forward
 from cnpgen.plans.plans import Plans
-from cnpgen.problems.obstacles import obstacle_poses_of
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.schema.catalogue import recipes_root
 from cnpgen.store.files.checksum_file import Content, read_with_checksum, write_with_checksum
@@ -28,10 +27,10 @@ from cnpgen.training.adam import learning_rate, start_adam
 
 Array = NDArray[Any]
 
-KIND, VERSION = "cnpgen-proposals", 1
+PROPOSALS_KIND, PROPOSALS_VERSION = "cnpgen-proposals", 1
 MIN_PROPOSAL_DEVIATION = 0.02  # fraction of the reach
 STATES_PER_PLAN = 40
-HIDDEN, LAYERS, BATCH, STEPS, RATE = 128, 3, 256, 12_000, 2e-3
+HIDDEN_WIDTH, HIDDEN_LAYERS, BATCH_ROWS, TRAINING_STEPS, PEAK_LEARNING_RATE = 128, 3, 256, 12_000, 2e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,13 +61,13 @@ class Proposals:
         Args:
             state: Positions [rad] and velocities [rad/s], shape (2 n,).
             goal_q: Goal configuration [rad], shape (n,).
-            obstacle_poses: Heights of the obstacles' upper faces [m], shape (obstacles,).
+            obstacle_poses: Poses and sizes of the obstacles, shape (width,).
             random: Random generator.
         """
         inputs = standardize(inputs_of(state[None], goal_q[None], obstacle_poses[None]), self.mean, self.scale)
-        given = forward(self._weights, inputs)
-        drawn = random.normal(given.path[0], MIN_PROPOSAL_DEVIATION + np.exp(given.log_rate[0]))
-        return np.asarray(state[: len(goal_q)] + self.reach * drawn)
+        prediction = forward(self._weights, inputs)
+        change = random.normal(prediction.path[0], MIN_PROPOSAL_DEVIATION + np.exp(prediction.log_rate[0]))
+        return np.asarray(state[: len(goal_q)] + self.reach * change)
 
     @cached_property
     def _weights(self) -> Weights:
@@ -94,7 +93,8 @@ def save_proposals(path: str | Path, proposals: Proposals) -> None:
     arrays = {name: getattr(proposals, name) for name in ("parameters", "mean", "scale", "reach")}
     arrays["ahead"] = np.array([proposals.ahead])
     arrays["architecture"] = np.array(list(asdict(proposals.architecture).values()))
-    write_with_checksum(Path(path), Content(arrays, dict(proposals.training)), kind=KIND, version=VERSION)
+    content = Content(arrays, dict(proposals.training))
+    write_with_checksum(Path(path), content, kind=PROPOSALS_KIND, version=PROPOSALS_VERSION)
 
 
 def load_proposals(path: str | Path) -> Proposals:
@@ -104,7 +104,7 @@ def load_proposals(path: str | Path) -> Proposals:
         DatasetError: The file is damaged or of another kind.
         MachineError: The file cannot be read.
     """
-    content = read_with_checksum(Path(path), kind=KIND, version=VERSION)
+    content = read_with_checksum(Path(path), kind=PROPOSALS_KIND, version=PROPOSALS_VERSION)
     arrays = dict(content.arrays)
     try:
         names = ("inputs", "hidden", "layers", "path_outputs", "rate_outputs")
@@ -124,12 +124,12 @@ def shipped_proposals(problem: str) -> Path:
     folder = recipes_root() / "datasets" / "proposals"
     path = folder / f"{problem}.h5"
     if not path.is_file():
-        known = ", ".join(sorted(each.stem for each in folder.glob("*.h5")))
+        known = ", ".join(sorted(file.stem for file in folder.glob("*.h5")))
         raise UsageError(f"no network proposes configurations for {problem!r}, only for {known} (datasets/proposals)")
     return path
 
 
-def train_proposals(plans: Plans, *, ahead: float, steps: int = STEPS, seed: int = 0) -> Proposals:
+def train_proposals(plans: Plans, *, ahead: float, steps: int = TRAINING_STEPS, seed: int = 0) -> Proposals:
     """Train a network to predict the next configuration on plans.
 
     Args:
@@ -144,65 +144,63 @@ def train_proposals(plans: Plans, *, ahead: float, steps: int = STEPS, seed: int
     if not len(plans):
         raise UsageError("no plans to train on")
     random = np.random.default_rng(seed)
-    inputs, moved = _rows(plans, ahead, random)
+    inputs, changes = _training_rows(plans, ahead, random)
     robot = open_problem(plans.problem)[1]
     reach, deviation = robot.velocity_limit * ahead, inputs.std(axis=0)
     scale = np.where(deviation > 1e-9, 1 / np.maximum(deviation, 1e-9), 0.0)
     architecture = Architecture(
-        inputs=inputs.shape[1], hidden=HIDDEN, layers=LAYERS, path_outputs=robot.n, rate_outputs=robot.n
+        inputs=inputs.shape[1], hidden=HIDDEN_WIDTH, layers=HIDDEN_LAYERS, path_outputs=robot.n, rate_outputs=robot.n
     )
     parameters = initial_parameters(architecture, seed=seed, head_scale=0.1, rate_bias=-1.0)
     made = {"made": f"{len(plans)} plans of {plans.problem.name}, {steps} steps, seed {seed}, cnpgen {__version__}"}
     network = Proposals(architecture, parameters, inputs.mean(axis=0), scale, reach, ahead, made)
-    features, targets = standardize(inputs, network.mean, scale), (moved / reach).astype(np.float32)
-    return replace(network, parameters=_fitted(network, features, targets, steps, random))
+    features, targets = standardize(inputs, network.mean, scale), (changes / reach).astype(np.float32)
+    return replace(network, parameters=_fit(network, features, targets, steps, random))
 
 
-def _rows(plans: Plans, ahead: float, random: np.random.Generator) -> tuple[Array, Array]:
+def _training_rows(plans: Plans, ahead: float, random: np.random.Generator) -> tuple[Array, Array]:
     """Return inputs and the following changes of the joints [rad], at random times of all plans."""
     first = random.uniform(0, 1, (len(plans), STATES_PER_PLAN)) * plans.duration[:, None]
     now = plans.motion.at_times(first)
     later = plans.motion.at_times(np.minimum(first + ahead, plans.duration[:, None]))
-    obstacle_poses = obstacle_poses_of(plans.problem, plans.columns["start_xyz"], plans.columns["goal_xyz"])
-    goal_q, obstacle_poses = (
-        np.repeat(each, STATES_PER_PLAN, axis=0) for each in (plans.boundary.goal_q, obstacle_poses)
-    )
+    ends = plans.boundary.goal_q, plans.scene.poses
+    goal_q, obstacle_poses = (np.repeat(values, STATES_PER_PLAN, axis=0) for values in ends)
     states = np.concatenate([now.q, now.dq], axis=2).reshape(len(goal_q), -1)
     return inputs_of(states, goal_q, obstacle_poses), (later.q - now.q).reshape(len(goal_q), -1)
 
 
-def _fitted(network: Proposals, features: Array, targets: Array, steps: int, random: np.random.Generator) -> Array:
+def _fit(network: Proposals, features: Array, targets: Array, steps: int, random: np.random.Generator) -> Array:
     """Run all training steps; return the average of the last parameters."""
     adam, gradient = start_adam(network.parameters.copy()), np.empty_like(network.parameters)
     split = network.architecture.split
     for step in range(steps):
-        batch = random.integers(0, len(features), BATCH)
+        batch = random.integers(0, len(features), BATCH_ROWS)
         likelihood_gradient(split(adam.parameters), features[batch], targets[batch], out=split(gradient))
-        adam.update(gradient, rate=learning_rate(step, steps, peak=RATE, final=0.01, warm_up=100))
+        adam.update(gradient, rate=learning_rate(step, steps, peak=PEAK_LEARNING_RATE, final=0.01, warm_up=100))
     return adam.average
 
 
 def likelihood_gradient(weights: Weights, features: Array, targets: Array, *, out: Weights) -> float:
-    """Write the gradient of the mean negative logarithm of the likelihood, up to a constant.
+    """Write the gradient of the mean negative logarithm of the likelihood.
 
     Args:
-        weights: Of the network.
-        features: Its standardize inputs, shape (N, F).
-        targets: What the joints moved by, as shares of their reach, shape (N, n).
-        out: Where to, as ``weights``.
+        weights: Weights of the network.
+        features: Standardized inputs, shape (N, F).
+        targets: Changes of the joints as fractions of their reach, shape (N, n).
+        out: Output, like ``weights``.
 
     Returns:
-        What it is the gradient of.
+        The mean negative logarithm of the likelihood, up to the constant.
     """
-    given = forward(weights, features)
-    deviation = np.exp(given.log_rate) + MIN_PROPOSAL_DEVIATION
-    off = (given.path - targets) / deviation
-    gradient = (1 - off * off) / deviation * (deviation - MIN_PROPOSAL_DEVIATION)
+    prediction = forward(weights, features)
+    deviation = np.exp(prediction.log_rate) + MIN_PROPOSAL_DEVIATION
+    residual = (prediction.path - targets) / deviation
+    log_rate_gradient = (1 - residual * residual) / deviation * (deviation - MIN_PROPOSAL_DEVIATION)
     backward(
         weights,
-        given,
-        path_gradient=off / deviation / len(features),
-        log_rate_gradient=gradient / len(features),
+        prediction,
+        path_gradient=residual / deviation / len(features),
+        log_rate_gradient=log_rate_gradient / len(features),
         out=out,
     )
-    return float(np.mean(np.sum(off * off / 2 + np.log(deviation), axis=1)))
+    return float(np.mean(np.sum(residual * residual / 2 + np.log(deviation), axis=1)))

@@ -27,7 +27,7 @@ GOAL_BIAS = 0.05  # fraction of the samples
 
 @dataclass(frozen=True)
 class SST(BenchmarkPlanner):
-    """Stable sparse trees over the arm's states with random accelerations, to a place of the tip."""
+    """Stable sparse trees over the arm's states with random accelerations, to a position of the tip."""
 
     def prepare(self, setting: Setting) -> Plan:
         """Load the kernel that checks states."""
@@ -38,14 +38,7 @@ class SST(BenchmarkPlanner):
             boundary = task.boundary
             start_xyz, goal_xyz = task.columns["start_xyz"][0], task.columns["goal_xyz"][0]
             tree = Tree(np.concatenate([boundary.start_q[0], boundary.start_dq[0]]), start_xyz, radii, CONTROL_STEP_S)
-            extend = RandomExtension(
-                tree,
-                robot,
-                check,
-                obstacle_poses=check.obstacle_poses(start_xyz, goal_xyz),
-                goal=goal_xyz,
-                random=random,
-            )
+            extend = RandomExtension(tree, robot, check, task.scene.poses[0], goal_xyz, random)
             return tree.grow(extend, goal_xyz, time_limit=setting.time_limit, max_iterations=MAX_TREE_ITERATIONS)
 
         return plan
@@ -59,7 +52,7 @@ class RandomExtension:
         tree: The tree.
         robot: The robot.
         check: Check of states.
-        obstacle_poses: Heights of the obstacles' upper faces [m], shape (obstacles,).
+        obstacle_poses: Poses and sizes of the obstacles, shape (width,).
         goal: Goal position of the tip [m], shape (3,).
         random: Random generator.
     """
@@ -74,13 +67,12 @@ class RandomExtension:
     def __call__(self) -> int:
         """Apply a random acceleration for a random time; return the new node, or 0 if a state is invalid."""
         to_goal = self.random.random() < GOAL_BIAS
-        parent = self.tree.selected(self.goal if to_goal else self.check.random_place(self.obstacle_poses, self.random))
+        position = self.goal if to_goal else self.check.random_position(self.obstacle_poses, self.random)
+        parent = self.tree.select(position)
         q, dq = np.split(self.tree.state(parent), 2)
         limit = self.robot.acceleration_limit
-        ddq = (
-            self.random.uniform(-limit, limit) * self.random.random()
-        )  # also small accelerations: 12 kg need much torque
+        ddq = self.random.uniform(-limit, limit) * self.random.random()  # often small: 12 kg need much torque
         t = CONTROL_STEP_S * np.arange(1.0, self.random.integers(1, MAX_CONTROL_STEPS + 1) + 1)[:, None]
         path_q, path_dq = q + t * (dq + t / 2 * ddq), dq + t * ddq
-        tips, allowed = self.check(path_q, path_dq, np.broadcast_to(ddq, path_q.shape), self.obstacle_poses)
-        return self.tree.add(parent, np.concatenate([path_q, path_dq], axis=1), tips[-1]) if allowed.all() else 0
+        tips, valid = self.check(path_q, path_dq, np.broadcast_to(ddq, path_q.shape), self.obstacle_poses)
+        return self.tree.add(parent, np.concatenate([path_q, path_dq], axis=1), tips[-1]) if valid.all() else 0

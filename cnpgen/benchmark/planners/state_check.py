@@ -10,7 +10,6 @@ from cnpgen.kernels.library import choose_backend, problem_kernels
 from cnpgen.kernels.symbolic.linalg import Scalar, Vec, dot, symbols
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
 from cnpgen.problems.constraints.table import Table
-from cnpgen.problems.obstacles import obstacle_poses_of
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.shape.hull import CUBE
 from cnpgen.robots.solid import pose_width
@@ -38,12 +37,8 @@ class StateCheck:
     def __init__(self, problem: Problem, robot: "Robot") -> None:
         if problem.first(Table) is None:
             require_transport(problem)
-        self._problem, self._robot = problem, robot
+        self._robot = robot
         self._kernel = problem_kernels(problem, robot, *choose_backend(None)).load(tip_and_violation)
-
-    def obstacle_poses(self, start_xyz: Array, goal_xyz: Array) -> Array:
-        """Return the heights of the obstacles' upper faces [m], shape (obstacles,), from the ends of a motion."""
-        return obstacle_poses_of(self._problem, start_xyz, goal_xyz)
 
     def __call__(self, q: Array, dq: Array, ddq: Array, obstacle_poses: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Check N states.
@@ -52,7 +47,7 @@ class StateCheck:
             q: Joint positions [rad], shape (N, n).
             dq: Joint velocities [rad/s], shape (N, n).
             ddq: Joint accelerations [rad/s^2], shape (N, n).
-            obstacle_poses: Result of ``obstacle_poses``.
+            obstacle_poses: Poses and sizes of the obstacles, shape (width,).
 
         Returns:
             Positions of the tip [m], shape (N, 3), and a mask of the valid states, shape (N,).
@@ -63,7 +58,7 @@ class StateCheck:
         )
         return np.ascontiguousarray(tip.T), violation[0] <= 0
 
-    def random_place(self, obstacle_poses: Array, random: np.random.Generator) -> Array:
+    def random_position(self, obstacle_poses: Array, random: np.random.Generator) -> Array:
         """Return the tip position of a random configuration [m], shape (3,)."""
         q = random.uniform(self._robot.position_lower, self._robot.position_upper)[None]
         still = np.zeros_like(q)
@@ -86,40 +81,34 @@ def tip_and_violation(robot: "Robot", problem: Problem) -> Any:
     violation += [value - high for value, high in zip(q, robot.position_upper.tolist(), strict=True)]
     violation += _table_violations(table, tip) if table is not None else _obstacle_violations(state, obstacle_poses)
     worst: Scalar = violation[0]
-    for each in violation[1:]:
-        worst = ca.fmax(worst, each)
+    for value in violation[1:]:
+        worst = ca.fmax(worst, value)
     return ca.Function("tip_and_violation", [q_sx, dq_sx, ddq_sx, poses_sx], [ca.vertcat(*tip), worst])
 
 
 def _table_violations(table: Table, tip: Vec) -> list[Scalar]:
     import casadi as ca
 
-    sides = [
-        side
-        for place, span in zip(tip, (table.x, table.y), strict=False)
-        for side in (span.low - place, place - span.high)
-    ]
+    sides = [side for x, span in zip(tip, (table.x, table.y), strict=False) for side in (span.low - x, x - span.high)]
     return [ca.fabs(tip[2] - table.z) - MAX_TIP_HEIGHT_ERROR_M, *sides]
 
 
 def _obstacle_violations(state: SymbolicState, obstacle_poses: Vec) -> list[Scalar]:
-    """Return violations of the tilt, of the distance to pedestals, and of the penetration of corners."""
+    """Return violations of the tilt, of the distance to the obstacles, and of the penetration of corners."""
     import casadi as ca
 
     rotation, tip = state.kinematics.rotation, state.kinematics.tip
     corners = [
-        [place + dot(row, corner) for place, row in zip(tip, rotation, strict=True)]
+        [x + dot(row, corner) for x, row in zip(tip, rotation, strict=True)]
         for corner in (CUBE * np.array(state.object_size)).tolist()
     ]
     violation: list[Scalar] = [1.0 - rotation[2][2] - MAX_UPRIGHT_ERROR]
     for box, top in zip(state.obstacles, obstacle_poses, strict=True):
         spans = [(span.low, span.high) for span in (box.x, box.y) if span is not None]
         sides = (*spans, (-np.inf, top))
-        outside = [
-            ca.fmax(ca.fmax(low - place, place - high), 0) for place, (low, high) in zip(tip, sides, strict=True)
-        ]
+        outside = [ca.fmax(ca.fmax(low - x, x - high), 0) for x, (low, high) in zip(tip, sides, strict=True)]
         violation.append(MIN_OBJECT_DISTANCE_M - ca.sqrt(dot(outside, outside)))
         for corner in corners:
-            depths = [ca.fmin(place - low, high - place) for place, (low, high) in zip(corner, sides, strict=True)]
+            depths = [ca.fmin(x - low, high - x) for x, (low, high) in zip(corner, sides, strict=True)]
             violation.append(ca.fmin(ca.fmin(depths[0], depths[1]), depths[2]) - MAX_CORNER_PENETRATION_M)
     return violation

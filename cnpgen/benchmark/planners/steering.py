@@ -1,4 +1,4 @@
-"""Steering by the cross-entropy method: accelerations and a time that move the arm near a configuration."""
+"""Steering by the cross-entropy method: accelerations and a duration that move the arm near a configuration."""
 
 from dataclasses import dataclass
 
@@ -6,13 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.benchmark.planners.state_check import StateCheck
+from cnpgen.problems.problem import Problem
 
 Array = NDArray[np.float64]
 
 STEERING_STEP_S = 0.01
-SAMPLES, ELITES, ITERATIONS = 64, 4, 30
+CEM_SAMPLES, CEM_ELITES, MAX_CEM_ITERATIONS = 64, 4, 30
 TARGET_TOLERANCE_RAD = 0.02
-LEARNING_RATE = 0.1  # of mean and deviation towards the elites
+CEM_LEARNING_RATE = 0.1  # of mean and deviation towards the elites
 
 
 @dataclass(frozen=True)
@@ -32,8 +33,13 @@ class Spread:
     max_duration: float
 
 
-HIT = Spread(0.4, 0.1, 0.4, 0.5)
-TRANSPORT = Spread(0.8, 0.05, 0.1, 0.1)
+HIT_SPREAD = Spread(0.4, 0.1, 0.4, 0.5)
+TRANSPORT_SPREAD = Spread(0.8, 0.05, 0.1, 0.1)
+
+
+def spread_of(problem: Problem) -> Spread:
+    """Return the initial distribution for hits or for transports."""
+    return HIT_SPREAD if problem.object_size is None else TRANSPORT_SPREAD
 
 
 @dataclass(frozen=True)
@@ -42,7 +48,7 @@ class Steering:
 
     Attributes:
         check: Check of states.
-        obstacle_poses: Heights of the obstacles' upper faces [m], shape (obstacles,).
+        obstacle_poses: Poses and sizes of the obstacles, shape (width,).
         limit: Limits of the accelerations [rad/s^2], shape (n,).
         spread: Initial distribution of controls.
         random: Random generator.
@@ -68,28 +74,29 @@ class Steering:
         mean = np.append(np.zeros_like(self.limit), self.spread.mean_time)
         deviation = np.append(self.spread.acceleration * self.limit, self.spread.time)
         best, least = None, np.inf
-        for _ in range(ITERATIONS):
-            controls = self._drawn(mean, deviation)
-            paths, tips, lengths = self.followed(state, controls)
-            ends = paths[np.arange(SAMPLES), lengths - 1, : len(target)]
-            away = np.where(lengths > 0, np.linalg.norm(ends - target, axis=1), np.inf)
-            order = np.argsort(away)[:ELITES]
+        for _ in range(MAX_CEM_ITERATIONS):
+            controls = self._sample_controls(mean, deviation)
+            paths, tips, lengths = self.integrate(state, controls)
+            ends = paths[np.arange(CEM_SAMPLES), lengths - 1, : len(target)]
+            distances = np.where(lengths > 0, np.linalg.norm(ends - target, axis=1), np.inf)
+            order = np.argsort(distances)[:CEM_ELITES]
             first, length = int(order[0]), int(lengths[order[0]])
-            if away[first] < least:
-                best, least = (paths[first, :length], tips[first, length - 1]), float(away[first])
-            elites = controls[order[np.isfinite(away[order])]]
+            if distances[first] < least:
+                best, least = (paths[first, :length], tips[first, length - 1]), float(distances[first])
+            elites = controls[order[np.isfinite(distances[order])]]
             if least < TARGET_TOLERANCE_RAD or not len(elites):
                 break
-            mean = (1 - LEARNING_RATE) * mean + LEARNING_RATE * elites.mean(axis=0)
-            deviation = (1 - LEARNING_RATE) * deviation + LEARNING_RATE * elites.std(axis=0)
+            mean = (1 - CEM_LEARNING_RATE) * mean + CEM_LEARNING_RATE * elites.mean(axis=0)
+            deviation = (1 - CEM_LEARNING_RATE) * deviation + CEM_LEARNING_RATE * elites.std(axis=0)
         return best
 
-    def _drawn(self, mean: Array, deviation: Array) -> Array:
-        """Draw controls within their limits: accelerations [rad/s^2] and a time [s], shape (SAMPLES, n + 1)."""
-        drawn = self.random.normal(mean, deviation, (SAMPLES, len(mean)))
-        return np.clip(drawn, np.append(-self.limit, STEERING_STEP_S), np.append(self.limit, self.spread.max_duration))
+    def _sample_controls(self, mean: Array, deviation: Array) -> Array:
+        """Sample controls within their limits: accelerations [rad/s^2] and a time [s], shape (CEM_SAMPLES, n + 1)."""
+        controls = self.random.normal(mean, deviation, (CEM_SAMPLES, len(mean)))
+        low, high = np.append(-self.limit, STEERING_STEP_S), np.append(self.limit, self.spread.max_duration)
+        return np.clip(controls, low, high)
 
-    def followed(self, state: Array, controls: Array) -> tuple[Array, Array, NDArray[np.int64]]:
+    def integrate(self, state: Array, controls: Array) -> tuple[Array, Array, NDArray[np.int64]]:
         """Integrate controls from a state.
 
         Args:
@@ -97,15 +104,15 @@ class Steering:
             controls: Accelerations [rad/s^2] and times [s], shape (N, n + 1).
 
         Returns:
-            States every ``STEERING_STEP_S``, shape (N, K, 2 n), tip positions [m], shape (N, K, 3), and the numbers of
-            valid states from the first, shape (N,).
+            States every ``STEERING_STEP_S``, shape (N, K, 2 n), and tip positions [m], shape (N, K, 3). The third array
+            has the numbers of states before the first invalid one, shape (N,).
         """
         (q, dq), n = np.split(state, 2), len(self.limit)
         ddq = np.repeat(controls[:, None, :n], round(self.spread.max_duration / STEERING_STEP_S), axis=1)
         t = STEERING_STEP_S * np.arange(1.0, ddq.shape[1] + 1)[:, None]
         paths = np.concatenate([q + t * (dq + t / 2 * ddq), dq + t * ddq], axis=2)
         flat = paths.reshape(-1, 2 * n)
-        tips, allowed = self.check(flat[:, :n], flat[:, n:], ddq.reshape(-1, n), self.obstacle_poses)
-        within = t[:, 0] < controls[:, n:] + STEERING_STEP_S / 2
-        going = np.logical_and.accumulate(allowed.reshape(within.shape) & within, axis=1)
-        return paths, tips.reshape(*within.shape, 3), going.sum(axis=1)
+        tips, valid_states = self.check(flat[:, :n], flat[:, n:], ddq.reshape(-1, n), self.obstacle_poses)
+        active = t[:, 0] < controls[:, n:] + STEERING_STEP_S / 2
+        valid = np.logical_and.accumulate(valid_states.reshape(active.shape) & active, axis=1)
+        return paths, tips.reshape(*active.shape, 3), valid.sum(axis=1)

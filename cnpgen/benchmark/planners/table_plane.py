@@ -6,16 +6,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.benchmark.simulator.hockey import HOME, LENGTH, MALLET_RADIUS, WIDTH
+from cnpgen.benchmark.simulator.hockey import HOME_M, LENGTH_M, MALLET_RADIUS_M, WIDTH_M
 
 Array = NDArray[np.float64]
 
-MARGIN = 0.02  # m: between the mallet and a band
-LOW = np.array([HOME + MALLET_RADIUS + MARGIN, -WIDTH / 2 + MALLET_RADIUS + MARGIN])
-HIGH = np.array([HOME + LENGTH / 2 - MALLET_RADIUS, WIDTH / 2 - MALLET_RADIUS - MARGIN])
+BAND_MARGIN_M = 0.02  # between the mallet and a band
+MIN_MALLET_XY_M = np.array([HOME_M + MALLET_RADIUS_M + BAND_MARGIN_M, -WIDTH_M / 2 + MALLET_RADIUS_M + BAND_MARGIN_M])
+MAX_MALLET_XY_M = np.array([HOME_M + LENGTH_M / 2 - MALLET_RADIUS_M, WIDTH_M / 2 - MALLET_RADIUS_M - BAND_MARGIN_M])
 MAX_PLANE_ACCELERATION_M_S2 = 8.0
 STOP_OFFSET_M = np.array([0.1, 0.15])  # ahead of the hit and towards the centre
-STOP_HIGH = np.array([HOME + 0.9, 0.42085])  # m
+MAX_STOP_XY_M = np.array([HOME_M + 0.9, 0.42085])
 MIN_BEND_RAD = 1e-6
 
 
@@ -54,8 +54,8 @@ class PlanePath:
         duration, length = self.duration, self.length
         for k in range(1, round(duration / period + 0.499) + 1):
             t = min(k * period, duration)
-            run = t * t / (2 * duration)
-            yield self.at(min(self.speed * (t - run if self.stops else run), length))
+            accelerated = t * t / (2 * duration)
+            yield self.at(min(self.speed * (t - accelerated if self.stops else accelerated), length))
 
     def at(self, s: float) -> Array:
         """Return the position at a length of the path [m], shape (2,)."""
@@ -94,9 +94,12 @@ def striking_path(start: Array, hit: Array, velocity: Array, speed: float) -> Pl
         velocity: Direction of the hit, of any length, shape (2,).
         speed: Speed of the hit [m/s], reduced if it needs more than ``MAX_PLANE_ACCELERATION_M_S2``.
     """
-    start, hit = np.clip(start, LOW, HIGH), np.clip(hit, LOW, HIGH)
-    low, high = np.array([min(start[0], hit[0]), LOW[1]]), np.array([max(start[0], hit[0]), HIGH[1]])
-    path = PlanePath(start, _leave(hit, -velocity, low, high), hit, speed)
+    start, hit = np.clip(start, MIN_MALLET_XY_M, MAX_MALLET_XY_M), np.clip(hit, MIN_MALLET_XY_M, MAX_MALLET_XY_M)
+    low, high = (
+        np.array([min(start[0], hit[0]), MIN_MALLET_XY_M[1]]),
+        np.array([max(start[0], hit[0]), MAX_MALLET_XY_M[1]]),
+    )
+    path = PlanePath(start, _exit_point(hit, -velocity, low, high), hit, speed)
     duration = max(2 * path.length / speed, np.sqrt(2 * path.length / MAX_PLANE_ACCELERATION_M_S2))
     return PlanePath(path.start, path.bend, hit, 2 * path.length / duration)
 
@@ -105,13 +108,13 @@ def stopping_path(hit_path: PlanePath) -> PlanePath:
     """Plan the path from a hit to rest, ahead and towards the centre of the table."""
     hit = hit_path.end
     aside = STOP_OFFSET_M * np.array([1.0, -1.0 if hit[1] > 0 else 1.0])
-    end = np.clip(hit + aside, [-np.inf, -STOP_HIGH[1]], STOP_HIGH)
+    end = np.clip(hit + aside, [-np.inf, -MAX_STOP_XY_M[1]], MAX_STOP_XY_M)
     low, high = np.minimum(hit, end), np.maximum(hit, end)
     forwards = hit_path.end - hit_path.bend
-    return PlanePath(hit, _leave(hit, forwards, low, high), end, hit_path.speed, stops=True)
+    return PlanePath(hit, _exit_point(hit, forwards, low, high), end, hit_path.speed, stops=True)
 
 
-def _leave(point: Array, direction: Array, low: Array, high: Array) -> Array:
+def _exit_point(point: Array, direction: Array, low: Array, high: Array) -> Array:
     """Return the point at which a ray leaves a box."""
     with np.errstate(divide="ignore", invalid="ignore"):
         reach = np.where(direction > 0, (high - point) / direction, (low - point) / direction)

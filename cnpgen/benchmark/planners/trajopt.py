@@ -1,8 +1,8 @@
-"""TrajOpt as the paper's authors ran it: direct collocation by SciPy's SLSQP, its quirks kept (docs/benchmark.md).
+"""TrajOpt as the paper's authors ran it: direct collocation by SciPy's SLSQP (docs/benchmark.md).
 
-Fifteen knots, explicit Euler steps of ``T / 15`` between them, T minimised, at most 100 iterations, from a cubic whose
-derivatives are not scaled by T. What comes out is sent with a spacing of ``T / 14``, as theirs was: it is a fifteenth
-slower than what was optimised.
+The program has 15 knots and explicit Euler steps of ``T / 15`` between them. SLSQP minimizes T in at most 100
+iterations. The initial guess is a cubic whose derivatives are not scaled by T. The knots are sent with a spacing of
+``T / 14``, so the sent motion is slower than the optimized one by a fifteenth. Both are as in the authors' version.
 """
 
 from dataclasses import dataclass
@@ -33,7 +33,7 @@ class TrajOpt(BenchmarkPlanner):
         problem, robot = open_problem(setting.problem)
 
         def plan(task: Plans) -> Answer:
-            at_knots = knot_constraints(problem, robot, task.columns["start_xyz"][0], task.columns["goal_xyz"][0])
+            at_knots = knot_constraints(problem, robot, task.scene)
             return TrajOptTranscription(robot, task.boundary, at_knots).solve()
 
         return plan
@@ -66,7 +66,7 @@ class TrajOptTranscription:
         """Minimize T and return the knots; None if they are not finite."""
         from scipy.optimize import Bounds, minimize
 
-        first = self.start()
+        guess = self.start()
         low, high = self.bounds()
         gradient = np.zeros(self._size)
         gradient[-1] = 1.0
@@ -74,18 +74,18 @@ class TrajOptTranscription:
             {"type": "eq", "fun": self.defects, "jac": self.defects_jacobian},
             {"type": "ineq", "fun": self.margins, "jac": self.margins_jacobian},
         ]
-        found = minimize(
+        solution = minimize(
             lambda x: x[-1],
-            np.clip(first, low, high),
+            np.clip(guess, low, high),
             jac=lambda _: gradient,
             method="SLSQP",
             bounds=Bounds(low, high),
             constraints=constraints,
             options={"maxiter": iterations},
         )
-        if not np.isfinite(found.x).all():
+        if not np.isfinite(solution.x).all():
             return None
-        q, dq, ddq, duration = self.unpack(found.x)
+        q, dq, ddq, duration = self.unpack(solution.x)
         return Trajectory(np.linspace(0, duration, KNOTS), q, dq, ddq)
 
     def unpack(self, x: Array) -> tuple[Array, Array, Array, float]:
@@ -135,15 +135,15 @@ class TrajOptTranscription:
         n, inner = self._robot.n, KNOTS - 2
         _, dq, ddq, duration = self.unpack(x)
         step, rows = duration / KNOTS, (KNOTS - 1) * n
-        ahead = np.eye(KNOTS)[1:, 1:-1] - np.eye(KNOTS)[:-1, 1:-1]  # of the inner knots in differences
-        here = np.eye(KNOTS)[:-1]
+        differences = np.eye(KNOTS)[1:, 1:-1] - np.eye(KNOTS)[:-1, 1:-1]  # of consecutive knots, in the inner ones
+        selection = np.eye(KNOTS)[:-1]
         unit = np.eye(n)
         J = np.zeros((2 * rows, self._size))
         first, second = slice(0, inner * n), slice(inner * n, 2 * inner * n)
-        J[:rows, first] = np.kron(ahead, unit)
-        J[:rows, second] = -step * np.kron(here[:, 1:-1], unit)
-        J[rows:, second] = np.kron(ahead, unit)
-        J[rows:, second.stop : -1] = -step * np.kron(here[:, self._free_ddq], unit)
+        J[:rows, first] = np.kron(differences, unit)
+        J[:rows, second] = -step * np.kron(selection[:, 1:-1], unit)
+        J[rows:, second] = np.kron(differences, unit)
+        J[rows:, second.stop : -1] = -step * np.kron(selection[:, self._free_ddq], unit)
         J[:rows, -1], J[rows:, -1] = -dq[:-1].ravel() / KNOTS, -ddq[:-1].ravel() / KNOTS
         return J
 

@@ -1,6 +1,7 @@
 """Sparse trees of states that grow from a start, as in SST (Li, Littlefield, Bekris, 2016).
 
-The tree of ``refine/rrt_connect.py`` has other nodes and no pruning, so the two share no code.
+A node has a path of states, a cost and a witness, and expensive nodes are pruned. The trees of
+``refine/rrt_connect.py`` have configurations and parents only, so the two share no code.
 """
 
 from collections.abc import Callable
@@ -31,13 +32,13 @@ class Radii:
     goal: float
 
 
-HIT = Radii(0.05, 0.02, 0.02)
-TRANSPORT = Radii(0.2, 0.02, 0.2)  # the paper has 0.1 for witnesses, which a state from rest cannot leave
+HIT_RADII = Radii(0.05, 0.02, 0.02)
+TRANSPORT_RADII = Radii(0.2, 0.02, 0.2)  # the paper has 0.1 for witnesses, which a state from rest cannot leave
 
 
 def radii_of(problem: Problem) -> Radii:
     """Return the radii for hits or for transports."""
-    return HIT if problem.object_size is None else TRANSPORT
+    return HIT_RADII if problem.object_size is None else TRANSPORT_RADII
 
 
 class Tree:
@@ -55,8 +56,8 @@ class Tree:
     def __init__(self, start: Array, tip: Array, radii: Radii, step: float) -> None:
         self._radii, self._step = radii, step
         self._paths, self._parents = [start[None]], [-1]
-        self._tips, self._cost = _Rows((3,)), _Rows(())
-        self._witnesses, self._holders = _Rows((3,)), _Rows(())
+        self._tips, self._cost = _GrowingArray((3,)), _GrowingArray(())
+        self._witnesses, self._holders = _GrowingArray((3,)), _GrowingArray(())
         for rows, row in ((self._tips, tip), (self._cost, 0.0), (self._witnesses, tip), (self._holders, 0)):
             rows.append(row)
 
@@ -68,12 +69,12 @@ class Tree:
         """Return the tip position of a node [m], shape (3,)."""
         return np.asarray(self._tips.rows[node])
 
-    def selected(self, place: Array) -> int:
+    def select(self, position: Array) -> int:
         """Return the active node of least cost near a position, or the nearest one."""
-        kept = self._holders.rows.astype(int)
-        away = np.linalg.norm(self._tips.rows[kept] - place, axis=1)
-        near = kept[away < self._radii.select]
-        return int(near[np.argmin(self._cost.rows[near])]) if len(near) else int(kept[np.argmin(away)])
+        active = self._holders.rows.astype(int)
+        distances = np.linalg.norm(self._tips.rows[active] - position, axis=1)
+        close = active[distances < self._radii.select]
+        return int(close[np.argmin(self._cost.rows[close])]) if len(close) else int(active[np.argmin(distances)])
 
     def add(self, parent: int, path: Array, tip: Array) -> int:
         """Add a node unless a cheaper one exists near the same witness.
@@ -87,9 +88,9 @@ class Tree:
             The active node near the witness: the new one or the cheaper one.
         """
         node, cost = len(self._paths), self._cost.rows[parent] + self._step * len(path)
-        away = np.linalg.norm(self._witnesses.rows - tip, axis=1)
-        witness = int(np.argmin(away))
-        if away[witness] >= self._radii.witness:
+        distances = np.linalg.norm(self._witnesses.rows - tip, axis=1)
+        witness = int(np.argmin(distances))
+        if distances[witness] >= self._radii.witness:
             self._witnesses.append(tip)
             self._holders.append(node)
         elif self._cost.rows[holder := int(self._holders.rows[witness])] <= cost:
@@ -126,20 +127,20 @@ class Tree:
         Returns:
             The trajectory to the node nearest to the goal; None if it is the root.
         """
-        until = perf_counter() + time_limit
-        best, nearest = 0, float(np.linalg.norm(self.tip(0) - goal))
+        deadline = perf_counter() + time_limit
+        best, min_distance = 0, float(np.linalg.norm(self.tip(0) - goal))
         for _ in range(max_iterations):
-            if nearest <= self._radii.goal or perf_counter() > until:
+            if min_distance <= self._radii.goal or perf_counter() > deadline:
                 break
             node = extend()
-            away = float(np.linalg.norm(self.tip(node) - goal))
-            if away < nearest:
-                best, nearest = node, away
+            distance = float(np.linalg.norm(self.tip(node) - goal))
+            if distance < min_distance:
+                best, min_distance = node, distance
         return self.path_to(best) if best else None
 
 
-class _Rows:
-    """An array that grows by rows."""
+class _GrowingArray:
+    """Array to which rows are appended."""
 
     def __init__(self, shape: tuple[int, ...]) -> None:
         self._all, self._count = np.empty((1024, *shape)), 0

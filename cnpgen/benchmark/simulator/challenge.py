@@ -1,7 +1,7 @@
 """Execution in a clone of the Air Hockey Challenge's environment (2023), with its own arm, table and controller.
 
-Two of its classes are used: the environment of one iiwa at the table, and the position controller at 1 kHz, which
-receives 20 ticks of positions, velocities and accelerations at a time.
+Two of its classes are used: the environment of one iiwa at the table, and the position controller at 1 kHz. The
+controller receives 20 ticks of positions, velocities and accelerations at a time.
 """
 
 import importlib
@@ -41,8 +41,11 @@ def challenge_plant(folder: str | Path) -> Plant:
     """
     place = Path(folder).resolve()
     if not (place / MODULE.replace(".", "/")).with_suffix(".py").is_file():
-        wanted = f"{MODULE.replace('.', '/')}.py"
-        raise UsageError(f"{folder} is no clone of the Air Hockey Challenge's environment: it has no {wanted}")
+        module_file = f"{MODULE.replace('.', '/')}.py"
+        raise UsageError(
+            f"{folder} is no clone of the Air Hockey Challenge's environment: it has no {module_file}",
+            concerns="environment",
+        )
     plant = Plant("challenge", "the environment of the Air Hockey Challenge", environment=str(place))
     _environment(plant.environment)
     return plant
@@ -54,7 +57,7 @@ def check_challenge(problem: Problem, robot: Robot) -> None:
     Raises:
         UsageError: The problem is another one.
     """
-    table = any(isinstance(each, Table) for each in problem.constraint)
+    table = any(isinstance(constraint, Table) for constraint in problem.constraint)
     if not table or not set(robot.joint_names) <= set(JOINTS):
         needed = f"a table and an arm with {JOINTS[0]} to {JOINTS[-1]}"
         raise UsageError(f"the Air Hockey Challenge has {needed}, {problem.name!r} is another problem")
@@ -85,39 +88,39 @@ def execute_in_challenge(scene: SimulatorScene, reference: Reference, start_dq: 
         raise UsageError(f"the Air Hockey Challenge's environment aborted: {error}") from error
     except (AttributeError, KeyError, TypeError) as error:
         raise MachineError(f"{scene.plant.environment} has a version that cnpgen does not support: {error}") from error
-    return _seen(scene, reference, environment)
+    return _tick_record(scene, reference, environment)
 
 
 def _all_joints(scene: SimulatorScene, values: Array) -> Array:
     """Set joints without plan to zero, shape (K, 7)."""
-    found = np.zeros((len(values), len(JOINTS)))
-    found[:, [JOINTS.index(name) for name in scene.robot.joint_names]] = values
-    return found
+    all_values = np.zeros((len(values), len(JOINTS)))
+    all_values[:, [JOINTS.index(name) for name in scene.robot.joint_names]] = values
+    return all_values
 
 
 def _action(scene: SimulatorScene, reference: Reference, tick: int) -> Array:
     """Return the next 20 positions, velocities and accelerations, shape (20, 3, 7); then it stands still."""
-    wanted = np.arange(tick, tick + TICKS_PER_STEP)
+    ticks = np.arange(tick, tick + TICKS_PER_STEP)
     last = len(reference.q) - 1
-    moving, at = (wanted <= last)[:, None], np.minimum(wanted, last)
-    parts = (reference.q[at], reference.dq[at] * moving, reference.ddq[at] * moving)
+    moving, rows = (ticks <= last)[:, None], np.minimum(ticks, last)
+    parts = (reference.q[rows], reference.dq[rows] * moving, reference.ddq[rows] * moving)
     return np.stack([_all_joints(scene, part) for part in parts], axis=1)
 
 
-def _seen(scene: SimulatorScene, reference: Reference, environment: Any) -> TickRecord:
+def _tick_record(scene: SimulatorScene, reference: Reference, environment: Any) -> TickRecord:
     """Return the recorded states in the robot's frame."""
     import pinocchio as pin
 
     robot, planned = scene.robot, [JOINTS.index(name) for name in scene.robot.joint_names]
-    q, torque, puck, velocity = (np.array(each) for each in zip(*environment.seen, strict=True))
+    q, torque, puck, velocity = (np.array(column) for column in zip(*environment.recorded, strict=True))
     q, data, tips = q[:, planned], robot.model.createData(), []
-    for each in q:
-        pin.framesForwardKinematics(robot.model, data, each)
+    for positions in q:
+        pin.framesForwardKinematics(robot.model, data, positions)
         tips.append(data.oMf[robot.tip_frame].copy())
-    wanted = reference.q[np.minimum(np.arange(len(q)), len(reference.q) - 1)]
-    use = torque[:, planned] / rated_torque(scene.problem, robot)
+    desired = reference.q[np.minimum(np.arange(len(q)), len(reference.q) - 1)]
+    torque_use = torque[:, planned] / rated_torque(scene.problem, robot)
     tip, rotation = np.array([tip.translation for tip in tips]), np.array([tip.rotation for tip in tips])
-    return TickRecord(q, tip, rotation, wanted, use, puck, velocity)
+    return TickRecord(q, tip, rotation, desired, torque_use, puck, velocity)
 
 
 @lru_cache(maxsize=1)
@@ -142,12 +145,12 @@ def _environment(folder: str) -> Any:
 class _Recorder:
     """Mix-in for the environment's classes: sets the start and records every tick."""
 
-    seen: list[tuple[Array, ...]]
+    recorded: list[tuple[Array, ...]]
     _start: Array
 
     def begin(self: Any, q: Array, dq: Array, puck: Array) -> None:
         """Reset to positions and velocities of the arm, shape (7,), and a resting puck [m], shape (2,)."""
-        self.seen, self._start = [], dq
+        self.recorded, self._start = [], dq
         self._frame = np.array(self.env_info["robot"]["base_frame"][0])
         self._puck = (self._frame @ [*puck, 0.0, 1.0])[:2]
         self.init_state = q
@@ -172,7 +175,7 @@ class _Recorder:
 
     def puck_state(self: Any) -> tuple[float, float]:
         """Return the position of the puck along the table [m] and its speed [m/s]."""
-        puck, velocity = self._puck_seen()
+        puck, velocity = self._puck_in_robot_frame()
         return float(puck[0]), float(np.linalg.norm(velocity))
 
     def _compute_action(self: Any, obs: Any, action: Any) -> Any:
@@ -184,9 +187,9 @@ class _Recorder:
     def record(self: Any, torque: Array) -> None:
         """Record the state and the torques that take effect [N m], shape (7,)."""
         q = np.array([float(np.squeeze(self._data.joint(f"iiwa_1/{name}").qpos)) for name in JOINTS])
-        self.seen.append((q, torque, *self._puck_seen()))
+        self.recorded.append((q, torque, *self._puck_in_robot_frame()))
 
-    def _puck_seen(self: Any) -> tuple[Array, Array]:
+    def _puck_in_robot_frame(self: Any) -> tuple[Array, Array]:
         """Return the puck's position [m] and velocity [m/s] in the robot's frame, shape (2,) each."""
         place = [float(np.squeeze(self._read_data(f"puck_{axis}_pos"))) for axis in "xy"]
         velocity = [float(np.squeeze(self._read_data(f"puck_{axis}_vel"))) for axis in "xy"]

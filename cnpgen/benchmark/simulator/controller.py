@@ -34,23 +34,25 @@ class Controller:
         self._data = robot.model.createData()
         self.limit = rated_torque(problem, robot)
         self._delay = plant.delay
-        self._waiting: deque[Array] = deque()
+        self._delayed: deque[Array] = deque()
 
-    def __call__(self, q: Array, dq: Array, wanted: tuple[Array, Array, Array]) -> Array:
+    def __call__(self, q: Array, dq: Array, desired: tuple[Array, Array, Array]) -> Array:
         """Compute the torque that takes effect now [N m], shape (n,).
 
         Args:
             q: Measured positions [rad], shape (n,).
             dq: Measured velocities [rad/s], shape (n,).
-            wanted: Positions, velocities and accelerations to follow.
+            desired: Positions, velocities and accelerations to follow.
         """
         import pinocchio as pin
 
-        acceleration = wanted[2] + GAIN_RAD_S**2 * (wanted[0] - q) + 2 * GAIN_RAD_S * (wanted[1] - dq)
-        holding = np.clip(pin.rnea(self._model, self._data, q, dq, np.zeros_like(q)), -self.limit, self.limit)
-        pushing = pin.rnea(self._model, self._data, q, dq, acceleration) - holding
+        acceleration = desired[2] + GAIN_RAD_S**2 * (desired[0] - q) + 2 * GAIN_RAD_S * (desired[1] - dq)
+        holding_torque = np.clip(pin.rnea(self._model, self._data, q, dq, np.zeros_like(q)), -self.limit, self.limit)
+        acceleration_torque = pin.rnea(self._model, self._data, q, dq, acceleration) - holding_torque
         with np.errstate(divide="ignore", invalid="ignore"):
-            share = np.nanmin((self.limit - np.sign(pushing) * holding) / np.abs(pushing))
-        torque = holding + min(share, 1.0) * pushing
-        self._waiting.extend([torque] * (self._delay + 1 - len(self._waiting)))  # the first tick already holds the arm
-        return self._waiting.popleft()
+            scale = np.nanmin(
+                (self.limit - np.sign(acceleration_torque) * holding_torque) / np.abs(acceleration_torque)
+            )
+        torque = holding_torque + min(scale, 1.0) * acceleration_torque
+        self._delayed.extend([torque] * (self._delay + 1 - len(self._delayed)))  # the first tick already holds the arm
+        return self._delayed.popleft()

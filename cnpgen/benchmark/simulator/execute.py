@@ -13,9 +13,9 @@ from cnpgen.benchmark.simulator.challenge import execute_in_challenge
 from cnpgen.benchmark.simulator.controller import Controller
 from cnpgen.benchmark.simulator.executed import Executed
 from cnpgen.benchmark.simulator.outcome import TickRecord, outcome_of, puck_is_done
-from cnpgen.benchmark.simulator.reference import TICK, Reference
+from cnpgen.benchmark.simulator.reference import TICK_S, Reference
 from cnpgen.benchmark.simulator.simulator_scene import SIMULATION_STEP_S, SimulatorScene, scene_xml
-from cnpgen.errors import MachineError, RecipeError
+from cnpgen.errors import RecipeError, requires_extra
 
 Array = NDArray[np.float64]
 
@@ -43,14 +43,12 @@ def load_mujoco() -> Any:
     """Import MuJoCo.
 
     Raises:
-        MachineError: MuJoCo is not installed or broken.
+        MissingExtraError: MuJoCo is not installed or broken.
     """
     if sys.platform == "linux" and not os.environ.get("DISPLAY"):
         os.environ.setdefault("MUJOCO_GL", "egl")  # renders without a screen; read when MuJoCo is imported
-    try:
+    with requires_extra("benchmark", "MuJoCo"):
         import mujoco
-    except (ImportError, OSError, AttributeError) as error:
-        raise MachineError(f"MuJoCo cannot be imported ({error}): pip install 'cnpgen[benchmark]'") from error
     return mujoco
 
 
@@ -84,13 +82,13 @@ def execute(scene: SimulatorScene, reference: Reference, goal_xyz: Array, start_
     Raises:
         RecipeError, MachineError: As ``compile_scene``.
     """
-    begins = reference.dq[0] if start_dq is None else start_dq
+    start_dq = reference.dq[0] if start_dq is None else start_dq
     if scene.plant.environment:
-        seen = execute_in_challenge(scene, reference, begins)
+        record = execute_in_challenge(scene, reference, start_dq)
     else:
-        seen = _Run(scene, reference).seen(begins)
-    states = seen.q if scene.puck is None else np.concatenate([seen.q, seen.puck], axis=1)
-    return Execution(outcome_of(scene, reference, goal_xyz, seen), states, seen.tip, seen.puck)
+        record = _Run(scene, reference).simulate(start_dq)
+    states = record.q if scene.puck is None else np.concatenate([record.q, record.puck], axis=1)
+    return Execution(outcome_of(scene, reference, goal_xyz, record), states, record.tip, record.puck)
 
 
 class _Run:
@@ -107,7 +105,7 @@ class _Run:
         self._rows: list[tuple[Array, ...]] = []
         self._max_penetration = 0.0  # m
 
-    def seen(self, start_dq: Array) -> TickRecord:
+    def simulate(self, start_dq: Array) -> TickRecord:
         """Simulate to the end and return the record."""
         data, n = self._data, self._n
         data.qpos[:n], data.qvel[:n] = self._reference.q[0], start_dq
@@ -118,24 +116,26 @@ class _Run:
         while not self._is_over(tick):
             self._step(tick)
             tick += 1
-        states, tip, rotation, wanted, torque, speeds = (np.array(each) for each in zip(*self._rows, strict=True))
+        states, tip, rotation, reference, torque, speeds = (
+            np.array(column) for column in zip(*self._rows, strict=True)
+        )
         puck, velocity = states[:, n:], speeds[:, n:]
         if self._scene.puck is None:
             puck = velocity = np.full((len(states), 2), np.nan)
         use = torque / self._control.limit
-        return TickRecord(states[:, :n], tip, rotation, wanted, use, puck, velocity, self._max_penetration)
+        return TickRecord(states[:, :n], tip, rotation, reference, use, puck, velocity, self._max_penetration)
 
     def _step(self, tick: int) -> None:
         """Record the state, compute the torque, and simulate one tick."""
         data, n, last = self._data, self._n, len(self._reference.q) - 1
         reference, k = self._reference, min(tick, last)
-        still = 0.0 if tick > last else 1.0
-        wanted = (reference.q[k], still * reference.dq[k], still * reference.ddq[k])
-        torque = self._control(data.qpos[:n].copy(), data.qvel[:n].copy(), wanted)
+        moving = 0.0 if tick > last else 1.0
+        desired = (reference.q[k], moving * reference.dq[k], moving * reference.ddq[k])
+        torque = self._control(data.qpos[:n].copy(), data.qvel[:n].copy(), desired)
         tip, rotation = data.site_xpos[self._tip].copy(), data.site_xmat[self._tip].reshape(3, 3).copy()
-        self._rows.append((data.qpos.copy(), tip, rotation, wanted[0], torque, data.qvel.copy()))
+        self._rows.append((data.qpos.copy(), tip, rotation, desired[0], torque, data.qvel.copy()))
         data.qfrc_applied[:n] = torque
-        self._mujoco.mj_step(self._model, data, round(TICK / SIMULATION_STEP_S))
+        self._mujoco.mj_step(self._model, data, round(TICK_S / SIMULATION_STEP_S))
         if self._scene.puck is None and data.ncon:
             self._max_penetration = max(self._max_penetration, float(-data.contact.dist.min()))
 
@@ -147,5 +147,5 @@ class _Run:
         if tick < reference.ticks:
             return False
         if self._scene.puck is None:
-            return tick >= reference.ticks + round(OBSERVATION_TIME_S / TICK)
+            return tick >= reference.ticks + round(OBSERVATION_TIME_S / TICK_S)
         return puck_is_done(reference, tick, float(data.qpos[n]), float(np.linalg.norm(data.qvel[n:])))

@@ -11,23 +11,23 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-HOME, LENGTH, WIDTH = 0.53, 1.948, 1.038  # m: home edge along x, and the playing field
-GOAL_LINE_M = HOME + LENGTH
-GOAL_WIDTH = 0.25  # m
-BAND = 0.045  # m: half the width of a band
-PUCK_RADIUS, PUCK_MASS, PUCK_DRAG = 0.03165, 0.01, 0.005  # m, kg, N s/m
-MALLET_RADIUS, MALLET_HEIGHT = 0.04815, 0.0645  # m: from the tip down to the table
-PUCK_HEIGHT = 0.006  # m
-BEHIND = 0.07  # m: distance of the tip from the puck's centre at the end of a hit
+HOME_M, LENGTH_M, WIDTH_M = 0.53, 1.948, 1.038  # home edge along x; playing field
+GOAL_LINE_M = HOME_M + LENGTH_M
+GOAL_WIDTH_M = 0.25
+BAND_M = 0.045  # half the width of a band
+PUCK_RADIUS_M, PUCK_MASS_KG, PUCK_DRAG_N_S_M = 0.03165, 0.01, 0.005
+MALLET_RADIUS_M, MALLET_HEIGHT_M = 0.04815, 0.0645  # height: from the tip down to the table
+PUCK_HEIGHT_M = 0.006
+PUCK_OFFSET_M = 0.07  # distance of the tip from the puck's centre at the end of a hit
 RESTITUTION = 0.75  # of mallet and puck, and of puck and bands
-CONTACT_TIME = 2.5e-3  # s: a bounce; ten steps of the simulation
+CONTACT_TIME_S = 2.5e-3  # of a bounce; ten steps of the simulation
 
 
-def bounce(restitution: float = RESTITUTION, contact_time: float = CONTACT_TIME) -> tuple[float, float]:
+def bounce(restitution: float = RESTITUTION, contact_time: float = CONTACT_TIME_S) -> tuple[float, float]:
     """Compute stiffness and damping of a contact, per unit of the colliding mass, from restitution and contact time.
 
     A contact ``x'' = -k x - b x'`` that can push but not pull ends when its force does. With ``b = 2 zeta sqrt(k)`` and
-    ``a = pi - atan2(2 zeta sqrt(1 - zeta^2), 1 - 2 zeta^2)`` this is after ``a / sqrt(k (1 - zeta^2))``, and the bodies
+    ``a = pi - atan2(2 zeta sqrt(1 - zeta^2), 1 - 2 zeta^2)`` this is after ``a / sqrt(k (1 - zeta^2))``. The bodies
     separate with ``exp(-a zeta / sqrt(1 - zeta^2))`` times the initial speed (Schwager and Poeschel, 2007).
 
     Args:
@@ -51,7 +51,7 @@ def bounce(restitution: float = RESTITUTION, contact_time: float = CONTACT_TIME)
 
 
 def puck_of(goal_xyz: Array, tip_velocity: Array) -> Array | None:
-    """Place the puck of a hit: ``BEHIND`` ahead of the tip, along its velocity at the goal.
+    """Place the puck of a hit: ``PUCK_OFFSET_M`` ahead of the tip, along its velocity at the goal.
 
     Args:
         goal_xyz: Tip position at the goal [m], shape (3,).
@@ -61,4 +61,4 @@ def puck_of(goal_xyz: Array, tip_velocity: Array) -> Array | None:
         Its centre over the table [m], shape (2,); None if the motion ends at rest and is not a hit.
     """
     speed = float(np.linalg.norm(tip_velocity[:2]))
-    return goal_xyz[:2] + BEHIND * tip_velocity[:2] / speed if speed > 1e-3 else None
+    return goal_xyz[:2] + PUCK_OFFSET_M * tip_velocity[:2] / speed if speed > 1e-3 else None

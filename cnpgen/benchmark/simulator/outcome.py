@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from cnpgen.benchmark.simulator import hockey
 from cnpgen.benchmark.simulator.executed import Executed
-from cnpgen.benchmark.simulator.reference import TICK, Reference
+from cnpgen.benchmark.simulator.reference import TICK_S, Reference
 from cnpgen.benchmark.simulator.simulator_scene import SimulatorScene
 from cnpgen.judges.plans.paper import tilt
 
@@ -28,7 +28,7 @@ class TickRecord:
         q: Joint positions [rad], shape (K, n).
         tip: Positions of the tip [m], shape (K, 3).
         rotation: Its rotation, shape (K, 3, 3).
-        wanted: Reference positions of the joints [rad], shape (K, n).
+        reference: Reference positions of the joints [rad], shape (K, n).
         torque_use: Torques as fractions of the rated torques, shape (K, n).
         puck: Positions of the puck over the table [m], shape (K, 2); nan without one.
         puck_velocity: Its velocities [m/s], shape (K, 2); nan without one.
@@ -38,7 +38,7 @@ class TickRecord:
     q: Array
     tip: Array
     rotation: Array
-    wanted: Array
+    reference: Array
     torque_use: Array
     puck: Array
     puck_velocity: Array
@@ -55,51 +55,50 @@ def puck_is_done(reference: Reference, tick: int, x: float, speed: float) -> boo
         speed: Speed of the puck [m/s].
     """
     stopped = tick > len(reference.q) and speed < MIN_PUCK_SPEED_M_S
-    return (
-        stopped or x > hockey.GOAL_LINE_M + hockey.PUCK_RADIUS or tick > reference.ticks + round(MAX_PUCK_TIME_S / TICK)
-    )
+    outside = x > hockey.GOAL_LINE_M + hockey.PUCK_RADIUS_M
+    return stopped or outside or tick > reference.ticks + round(MAX_PUCK_TIME_S / TICK_S)
 
 
-def outcome_of(scene: SimulatorScene, reference: Reference, goal_xyz: Array, seen: TickRecord) -> Executed:
+def outcome_of(scene: SimulatorScene, reference: Reference, goal_xyz: Array, record: TickRecord) -> Executed:
     """Compute the result of an execution.
 
     Args:
         scene: The simulated world.
         reference: Reference of the controller.
         goal_xyz: Tip position at the end of the plan [m], shape (3,).
-        seen: Record of all ticks.
+        record: Record of all ticks.
     """
-    ticks, height = min(reference.ticks, len(seen.q)), scene.height
+    ticks, height = min(reference.ticks, len(record.q)), scene.height
     during = slice(0, ticks)
     executed = Executed(
-        finished=bool(np.linalg.norm(seen.tip[ticks - 1] - goal_xyz) < MAX_GOAL_DISTANCE_M),
-        z_error=np.nan if height is None else TICK * float(np.abs(seen.tip[during, 2] - height).sum()),
+        finished=bool(np.linalg.norm(record.tip[ticks - 1] - goal_xyz) < MAX_GOAL_DISTANCE_M),
+        z_error=np.nan if height is None else TICK_S * float(np.abs(record.tip[during, 2] - height).sum()),
         vertical_error=np.nan
         if height is not None
-        else TICK * float(tilt(seen.rotation[during].transpose(1, 2, 0)).sum()),
-        tracking_error=TICK * float(np.abs(seen.q[during] - seen.wanted[during]).sum()),
-        torque_use=float(np.abs(seen.torque_use).max()),
+        else TICK_S * float(tilt(record.rotation[during].transpose(1, 2, 0)).sum()),
+        tracking_error=TICK_S * float(np.abs(record.q[during] - record.reference[during]).sum()),
+        torque_use=float(np.abs(record.torque_use).max()),
     )
     if scene.puck is None:
-        return replace(executed, collided=seen.max_penetration > MAX_LEGAL_PENETRATION_M)
-    return _of_the_puck(executed, seen, seen.tip[during])
+        return replace(executed, collided=record.max_penetration > MAX_LEGAL_PENETRATION_M)
+    return _with_puck(executed, record, record.tip[during])
 
 
-def _of_the_puck(executed: Executed, seen: TickRecord, tip: Array) -> Executed:
+def _with_puck(executed: Executed, record: TickRecord, tip: Array) -> Executed:
     """Add the result of the puck."""
-    speed = np.linalg.norm(seen.puck_velocity, axis=1)
+    speed = np.linalg.norm(record.puck_velocity, axis=1)
     moved = np.flatnonzero(speed > MIN_PUCK_SPEED_M_S)
     if not len(moved):
         return replace(executed, hit=False, scored=False, touched_early=False)
     first = int(moved[0])
     steps = np.linalg.norm(np.diff(tip[first:], axis=0), axis=1)
-    away = speed[first : first + round(10 * hockey.CONTACT_TIME / TICK)]
-    x, y = seen.puck.T
+    speeds_after = speed[first : first + round(10 * hockey.CONTACT_TIME_S / TICK_S)]
+    x, y = record.puck.T
     return replace(
         executed,
         hit=True,
-        scored=bool(np.any((x > hockey.GOAL_LINE_M) & (np.abs(y) < hockey.GOAL_WIDTH / 2))),
+        scored=bool(np.any((x > hockey.GOAL_LINE_M) & (np.abs(y) < hockey.GOAL_WIDTH_M / 2))),
         touched_early=float(steps.sum()) > EARLY_CONTACT_M,
-        hit_time=first * TICK,
-        puck_speed=float(away.max()),
+        hit_time=first * TICK_S,
+        puck_speed=float(speeds_after.max()),
     )

@@ -70,7 +70,7 @@ PLANTS = {
 }
 
 
-def as_plant(plant: Plant | str) -> Plant:
+def as_plant(plant: Plant | str, *, argument: str = "plant") -> Plant:
     """Return a plant by its name.
 
     Raises:
@@ -78,8 +78,12 @@ def as_plant(plant: Plant | str) -> Plant:
     """
     if isinstance(plant, Plant):
         return plant
+    if not isinstance(plant, str):
+        raise UsageError(f"must be the name of a plant or a Plant, got {plant!r:.100}", argument=argument)
     if plant not in PLANTS:
-        raise UsageError(f"unknown plant {plant!r}{nearest(plant, PLANTS)}, expected one of {', '.join(PLANTS)}")
+        raise UsageError(
+            f"unknown plant {plant!r}{nearest(plant, PLANTS)}, expected one of {', '.join(PLANTS)}", concerns=argument
+        )
     return PLANTS[plant]
 
 

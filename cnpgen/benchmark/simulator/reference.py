@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 StatesAt = Callable[[Array], tuple[Array, Array, Array]]
 """Positions [rad], velocities [rad/s] and accelerations [rad/s^2] at times [s] of shape (K,), shape (K, n) each."""
 
-TICK = 1e-3  # s: period of the controller
+TICK_S = 1e-3  # period of the controller
 MAX_EXECUTED_DURATION_S = 60.0
 
 
@@ -36,7 +36,7 @@ class Reference:
     @property
     def ticks(self) -> int:
         """Number of ticks within the plan, including its end."""
-        return int(np.ceil(self.duration / TICK)) + 1
+        return int(np.ceil(self.duration / TICK_S)) + 1
 
 
 def states_of(motion: Motion) -> StatesAt:
@@ -65,13 +65,13 @@ def make_reference(states: StatesAt, duration: float, *, acceleration_limit: Arr
             f"a plan of {duration:g} s cannot be executed,"
             f" expected more than 0 and at most {MAX_EXECUTED_DURATION_S:g} s"
         )
-    during = states(np.arange(0.0, duration, TICK))
+    during = states(np.arange(0.0, duration, TICK_S))
     q, dq, _ = (values[0] for values in states(np.array([duration])))
-    stop = max(float(np.max(np.abs(dq) / acceleration_limit)), TICK)
+    stop = max(float(np.max(np.abs(dq) / acceleration_limit)), TICK_S)
     if not stop <= MAX_EXECUTED_DURATION_S:
         raise UsageError(f"a plan after which the arm needs {stop:g} s to stop cannot be executed")
-    first = len(during[0]) * TICK - duration  # the first tick after the end
-    after = np.minimum(np.append(np.arange(first, stop, TICK), stop), stop)[:, None]
+    first = len(during[0]) * TICK_S - duration  # the first tick after the end
+    after = np.minimum(np.append(np.arange(first, stop, TICK_S), stop), stop)[:, None]
     left = 1 - after / stop
     parts = (q + dq * after * (1 + left) / 2, dq * left, np.where(left > 0, -dq / stop, 0.0))
     q, dq, ddq = (np.concatenate([a, b]) for a, b in zip(during, parts, strict=True))

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from cnpgen.benchmark.simulator import hockey
 from cnpgen.benchmark.simulator.execute import Execution, compile_scene, load_mujoco
-from cnpgen.benchmark.simulator.reference import TICK
+from cnpgen.benchmark.simulator.reference import TICK_S
 from cnpgen.benchmark.simulator.simulator_scene import SimulatorScene
-from cnpgen.errors import MachineError
+from cnpgen.errors import MachineError, MissingExtraError, requires_extra
 from cnpgen.store.files.atomic import machine_error
 
 IMAGE_WIDTH, IMAGE_HEIGHT = 640, 480
@@ -38,7 +38,7 @@ def save_picture(path: Path, scene: SimulatorScene, execution: Execution, tick: 
         MachineError: This machine cannot render, or the file cannot be written.
     """
     imageio = _imageio()
-    with _drawing(scene) as draw:
+    with _renderer(scene) as draw:
         image = draw(execution, min(tick, len(execution.states) - 1))
     try:
         imageio.imwrite(path, image)
@@ -62,11 +62,11 @@ def save_film(
         MachineError: As ``save_picture``, or ffmpeg is missing.
     """
     imageio = _imageio()
-    last = min(ticks + round(FILM_TAIL_S / TICK), len(execution.states))
-    step = round(1 / (FILM_FRAMES_PER_S * SLOW_MOTION_FACTOR * TICK))
-    chosen = range(0, last, step if max_frames is None else max(step, -(-last // max_frames)))
-    with _drawing(scene) as draw:
-        images = [draw(execution, tick) for tick in chosen]
+    last = min(ticks + round(FILM_TAIL_S / TICK_S), len(execution.states))
+    step = round(1 / (FILM_FRAMES_PER_S * SLOW_MOTION_FACTOR * TICK_S))
+    ticks_shown = range(0, last, step if max_frames is None else max(step, -(-last // max_frames)))
+    with _renderer(scene) as draw:
+        images = [draw(execution, tick) for tick in ticks_shown]
     options = (
         {"duration": 1000 / FILM_FRAMES_PER_S, "loop": 0}
         if path.suffix == ".gif"
@@ -78,21 +78,19 @@ def save_film(
         raise machine_error("write", path, error) from error
     except (ImportError, RuntimeError, ValueError) as error:  # raised by imageio without ffmpeg
         text = " ".join(str(error).split())
-        raise MachineError(
-            f"{path.suffix} films cannot be written here ({text:.200}): pip install 'imageio[ffmpeg]'"
+        raise MissingExtraError(
+            f"{path.suffix} films cannot be written here ({text:.200}): pip install 'cnpgen[benchmark]'"
         ) from error
 
 
 def _imageio() -> Any:
-    try:
+    with requires_extra("benchmark", "imageio"):
         import imageio.v2 as imageio
-    except ImportError as error:
-        raise MachineError(f"imageio cannot be imported ({error}): pip install 'cnpgen[benchmark]'") from error
     return imageio
 
 
 @contextmanager
-def _drawing(scene: SimulatorScene) -> Iterator[Any]:
+def _renderer(scene: SimulatorScene) -> Iterator[Any]:
     """Open a renderer of the ticks of an execution."""
     mujoco, model = load_mujoco(), compile_scene(scene)
     try:
@@ -110,7 +108,7 @@ def _drawing(scene: SimulatorScene) -> Iterator[Any]:
     def draw(execution: Execution, tick: int) -> Image:
         data.qpos[:] = execution.states[tick]
         if model.nmocap and scene.height is not None:
-            data.mocap_pos[0] = execution.tip[tick] - [0.0, 0.0, hockey.MALLET_HEIGHT]
+            data.mocap_pos[0] = execution.tip[tick] - [0.0, 0.0, hockey.MALLET_HEIGHT_M]
         mujoco.mj_forward(model, data)
         renderer.update_scene(data, camera)
         return np.array(renderer.render())

@@ -19,17 +19,17 @@ from cnpgen.benchmark.simulator.reference import Reference, StatesAt, make_refer
 from cnpgen.benchmark.simulator.simulator_scene import SimulatorScene
 from cnpgen.errors import UsageError, counted
 from cnpgen.machine.workers import distribute, worker_count
-from cnpgen.plans.plans import Plans, check_plans_type
+from cnpgen.plans.plans import Plans
 from cnpgen.plans.tips import correct_tips
-from cnpgen.problems.obstacles import obstacle_poses_of
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.robots.robot import Robot
+from cnpgen.schema.argument_types import checked_arguments
 
 Array = NDArray[np.float64]
 
-FORMAT = "cnpgen-simulation"
+SIMULATION_FORMAT = "cnpgen-simulation"
 SIMULATION_VERSION = 1
-FLAGS = ("success", "finished", "hit", "scored", "touched_early", "collided")
+COUNTED_FLAGS = ("success", "finished", "hit", "scored", "touched_early", "collided")
 MAX_SIMULATIONS_OF_ONE_PROCESS = 20  # a second process pays off for more plans
 
 
@@ -48,18 +48,22 @@ class Simulation:
     plant: Plant
 
     def __repr__(self) -> str:
-        succeeded = sum(each.success for each in self.executed)
+        succeeded = sum(result.success for result in self.executed)
         plans = f"{counted(len(self.executed), 'plan')} of {self.plans.problem.name!r}"
         return f"<{plans} executed by the {self.plant.name} plant, {succeeded:,} with success>"
 
     def summary(self) -> dict[str, Any]:
         """Return the summary of all plans for JSON."""
-        rows = [each.to_dict() for each in self.executed]
-        counts = {name: sum(row[name] for row in rows if name in row) for name in FLAGS if any(name in r for r in rows)}
+        rows = [result.to_dict() for result in self.executed]
+        counts = {
+            name: sum(row[name] for row in rows if name in row)
+            for name in COUNTED_FLAGS
+            if any(name in r for r in rows)
+        }
         names = {name: None for row in rows for name, value in row.items() if isinstance(value, float)}
         medians = {name: float(np.median([row[name] for row in rows if name in row])) for name in names}
         return {
-            "format": FORMAT,
+            "format": SIMULATION_FORMAT,
             "format_version": SIMULATION_VERSION,
             "problem": self.plans.problem.name,
             "plant": self.plant.name,
@@ -69,6 +73,7 @@ class Simulation:
         }
 
 
+@checked_arguments
 def simulate_plans(
     plans: Plans,
     *,
@@ -95,7 +100,6 @@ def simulate_plans(
         RecipeError: MuJoCo cannot simulate the robot, or the problem needs a plug-in that is not installed.
         MachineError: MuJoCo is missing, the environment cannot be imported, or a worker died.
     """
-    check_plans_type(plans)
     plant, plans = as_plant(plant), correct_tips(plans)
     load_mujoco()
     if environment is not None:
@@ -106,8 +110,8 @@ def simulate_plans(
     )
     executed: list[Executed] = []
     with closing(distribute(partial(_simulate, plant=plant), iter(plans), count, ordered=True)) as results:
-        for each in results:
-            executed.append(each)
+        for result in results:
+            executed.append(result)
             if progress is not None:
                 progress(1)
     return Simulation(plans, tuple(executed), plant)
@@ -169,8 +173,7 @@ def simulator_scene(problem: Plans, plant: Plant) -> SimulatorScene:
         plant: The robot.
     """
     loaded, robot = open_problem(problem.problem)
-    start_xyz, goal_xyz = problem.columns["start_xyz"][0], problem.columns["goal_xyz"][0]
-    scene = SimulatorScene(loaded, robot, plant, obstacle_poses_of(loaded, start_xyz, goal_xyz))
+    goal_xyz, scene = problem.columns["goal_xyz"][0], SimulatorScene(loaded, robot, plant, problem.scene.poses[0])
     if scene.height is None:
         return scene
     velocity = _tip_velocity(robot, problem.boundary.goal_q[0], problem.boundary.goal_dq[0])

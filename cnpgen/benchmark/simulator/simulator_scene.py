@@ -29,16 +29,26 @@ LINK_RADIUS_M = 0.07  # of the iiwa's links, about half of the clearance of plan
 PUCK_INERTIA = 2.5e-6  # kg m^2; the puck does not turn
 MIN_LINK_LENGTH_M = 1e-3  # shorter links have no shape; the first link collides with nothing
 UNBOUNDED_DEPTH_M = 5.0  # depth of obstacles without lower end
-_SOFT = 'condim="3" solref="0.004 1" solimp="0.95 0.99 0.001"'  # contact of object and pedestals without bouncing
+_SOFT = 'condim="3" solref="0.004 1" solimp="0.95 0.99 0.001"'  # contact of object and obstacles without bouncing
 _RIMS = {  # the bands and the four halves of both goals' sides: centre and half sizes over the table [m]
-    "left": (hockey.HOME + hockey.LENGTH / 2, hockey.WIDTH / 2 + hockey.BAND, hockey.LENGTH / 2, hockey.BAND),
-    "right": (hockey.HOME + hockey.LENGTH / 2, -hockey.WIDTH / 2 - hockey.BAND, hockey.LENGTH / 2, hockey.BAND),
+    "left": (
+        hockey.HOME_M + hockey.LENGTH_M / 2,
+        hockey.WIDTH_M / 2 + hockey.BAND_M,
+        hockey.LENGTH_M / 2,
+        hockey.BAND_M,
+    ),
+    "right": (
+        hockey.HOME_M + hockey.LENGTH_M / 2,
+        -hockey.WIDTH_M / 2 - hockey.BAND_M,
+        hockey.LENGTH_M / 2,
+        hockey.BAND_M,
+    ),
     **{
-        f"{end} {side}": (x, sign * (hockey.GOAL_WIDTH + hockey.WIDTH) / 4, hockey.BAND, half)
-        for end, x in (("home", hockey.HOME - hockey.BAND), ("far", hockey.GOAL_LINE_M + hockey.BAND))
+        f"{end} {side}": (x, sign * (hockey.GOAL_WIDTH_M + hockey.WIDTH_M) / 4, hockey.BAND_M, half)
+        for end, x in (("home", hockey.HOME_M - hockey.BAND_M), ("far", hockey.GOAL_LINE_M + hockey.BAND_M))
         for side, sign, half in (
-            ("left", 1, (hockey.WIDTH - hockey.GOAL_WIDTH) / 4),
-            ("right", -1, (hockey.WIDTH - hockey.GOAL_WIDTH) / 4),
+            ("left", 1, (hockey.WIDTH_M - hockey.GOAL_WIDTH_M) / 4),
+            ("right", -1, (hockey.WIDTH_M - hockey.GOAL_WIDTH_M) / 4),
         )
     },
 }
@@ -84,7 +94,7 @@ def scene_xml(scene: SimulatorScene) -> str:
 <geom type="plane" pos="0 0 -0.5" size="4 4 0.1" rgba="0.9 0.9 0.92 1"/>
 <geom type="cylinder" fromto="0 0 -0.5 0 0 0.1" size="0.1" rgba="0.4 0.4 0.4 1"/>
 {"".join(_arm(scene))}
-{"".join(_loaded_problem(scene))}
+{"".join(_environment(scene))}
 </worldbody>
 <contact>
 {"".join(_pairs(scene))}
@@ -106,10 +116,10 @@ def _arm(scene: SimulatorScene) -> Iterator[str]:
         yield f'<joint name="joint {index + 1}" type="{kind}" axis="{_numbers(joint.axis)}"'
         yield f' damping="{friction.viscous}" frictionloss="{friction.dry}"/>'
         if np.linalg.norm(end) > MIN_LINK_LENGTH_M:
-            rod = index == last
-            radius, colour = (0.012, "0.3 0.3 0.3 1") if rod else (LINK_RADIUS_M, "1 0.55 0.15 1")
+            is_last = index == last
+            radius, color = (0.012, "0.3 0.3 0.3 1") if is_last else (LINK_RADIUS_M, "1 0.55 0.15 1")
             yield f'<geom name="link {index + 1}" type="capsule" fromto="0 0 0 {_numbers(end)}" size="{radius}"'
-            yield f' rgba="{colour}"/>'
+            yield f' rgba="{color}"/>'
     yield f'<body name="tip" pos="{_numbers(chain.tip_translation)}" quat="{_quaternion(chain.tip_rotation)}">'
     yield '<site name="tip" size="0.001"/><geom name="mallet" type="sphere" size="0.001"/>'
     if scene.problem.object_size is not None:
@@ -121,7 +131,7 @@ def _arm(scene: SimulatorScene) -> Iterator[str]:
 def _legal_depth(problem: Problem) -> float:
     """Return the legal penetration of the object [m]; the colliding shape is smaller by it."""
     return max(
-        (each.depth + each.tolerance for each in problem.constraint if isinstance(each, ObjectContact)), default=0.0
+        (item.depth + item.tolerance for item in problem.constraint if isinstance(item, ObjectContact)), default=0.0
     )
 
 
@@ -133,15 +143,15 @@ def _inertial(joint: Joint, mass: float) -> str:
     return f'<inertial pos="{_numbers(joint.com)}" mass="{mass * joint.mass!r}" fullinertia="{numbers}"/>'
 
 
-def _loaded_problem(scene: SimulatorScene) -> Iterator[str]:
-    """Yield the obstacles; with a table, the table and its puck."""
+def _environment(scene: SimulatorScene) -> Iterator[str]:
+    """Yield the obstacles and, if there is one, the table with its puck."""
     for name, obstacle, solid in _obstacles(scene):
         yield f'<geom name="{name}" {_shape(name, obstacle, solid)} rgba="0.6 0.65 0.7 1"/>'
     if scene.height is None:
         return
-    surface = scene.height - hockey.MALLET_HEIGHT
-    center = hockey.HOME + hockey.LENGTH / 2
-    yield f'<geom type="box" pos="{center} 0 {surface - 0.02}" size="{hockey.LENGTH / 2} {hockey.WIDTH / 2} 0.02"'
+    surface = scene.height - hockey.MALLET_HEIGHT_M
+    center = hockey.HOME_M + hockey.LENGTH_M / 2
+    yield f'<geom type="box" pos="{center} 0 {surface - 0.02}" size="{hockey.LENGTH_M / 2} {hockey.WIDTH_M / 2} 0.02"'
     yield ' rgba="0.97 0.97 1 1"/>'
     for name, (x, y, half_x, half_y) in _RIMS.items():
         yield f'<geom name="{name}" type="box" pos="{x} {y} {surface}" size="{half_x} {half_y} 0.015"'
@@ -149,8 +159,8 @@ def _loaded_problem(scene: SimulatorScene) -> Iterator[str]:
     if scene.puck is not None:
         yield from _puck(surface, scene.height)
     yield '<body name="shown mallet" mocap="true">'
-    yield f'<geom type="cylinder" size="{hockey.MALLET_RADIUS} 0.01" pos="0 0 0.01" rgba="0.15 0.15 0.15 1"/>'
-    yield f'<geom type="cylinder" size="0.015 {hockey.MALLET_HEIGHT / 2}" pos="0 0 {hockey.MALLET_HEIGHT / 2}"'
+    yield f'<geom type="cylinder" size="{hockey.MALLET_RADIUS_M} 0.01" pos="0 0 0.01" rgba="0.15 0.15 0.15 1"/>'
+    yield f'<geom type="cylinder" size="0.015 {hockey.MALLET_HEIGHT_M / 2}" pos="0 0 {hockey.MALLET_HEIGHT_M / 2}"'
     yield ' rgba="0.15 0.15 0.15 1"/></body>'
 
 
@@ -180,8 +190,8 @@ def _meshes(scene: SimulatorScene) -> Iterator[str]:
 def _obstacles(scene: SimulatorScene) -> Iterator[tuple[str, Obstacle, Solid]]:
     """Yield name, definition and body of every obstacle."""
     obstacles = scene.problem.obstacle
-    for number, both in enumerate(zip(obstacles, solids_of(obstacles, scene.obstacle_poses), strict=True), start=1):
-        yield f"obstacle {number}", *both
+    for number, pair in enumerate(zip(obstacles, solids_of(obstacles, scene.obstacle_poses), strict=True), start=1):
+        yield f"obstacle {number}", *pair
 
 
 def _puck(surface: float, height: float) -> Iterator[str]:
@@ -191,15 +201,15 @@ def _puck(surface: float, height: float) -> Iterator[str]:
     which the mallet's lower face passes over the puck.
     """
     inertia = f"{PUCK_INERTIA} {PUCK_INERTIA} {2 * PUCK_INERTIA}"
-    low, high = height - 0.05, height + hockey.PUCK_HEIGHT
+    low, high = height - 0.05, height + hockey.PUCK_HEIGHT_M
     yield f'<body name="puck" pos="0 0 {surface}">'
-    yield f'<inertial pos="0 0 0" mass="{hockey.PUCK_MASS}" diaginertia="{inertia}"/>'
-    yield f'<joint name="puck x" type="slide" axis="1 0 0" damping="{hockey.PUCK_DRAG}"/>'
-    yield f'<joint name="puck y" type="slide" axis="0 1 0" damping="{hockey.PUCK_DRAG}"/>'
-    yield f'<geom name="puck" type="sphere" size="{hockey.PUCK_RADIUS}" rgba="0 0 0 0"/>'
-    yield f'<geom type="cylinder" size="{hockey.PUCK_RADIUS} {hockey.PUCK_HEIGHT / 2}" rgba="0.85 0.1 0.1 1"'
-    yield f' pos="0 0 {hockey.PUCK_HEIGHT / 2}"/>'
-    radius = hockey.PUCK_RADIUS + hockey.MALLET_RADIUS - 0.001
+    yield f'<inertial pos="0 0 0" mass="{hockey.PUCK_MASS_KG}" diaginertia="{inertia}"/>'
+    yield f'<joint name="puck x" type="slide" axis="1 0 0" damping="{hockey.PUCK_DRAG_N_S_M}"/>'
+    yield f'<joint name="puck y" type="slide" axis="0 1 0" damping="{hockey.PUCK_DRAG_N_S_M}"/>'
+    yield f'<geom name="puck" type="sphere" size="{hockey.PUCK_RADIUS_M}" rgba="0 0 0 0"/>'
+    yield f'<geom type="cylinder" size="{hockey.PUCK_RADIUS_M} {hockey.PUCK_HEIGHT_M / 2}" rgba="0.85 0.1 0.1 1"'
+    yield f' pos="0 0 {hockey.PUCK_HEIGHT_M / 2}"/>'
+    radius = hockey.PUCK_RADIUS_M + hockey.MALLET_RADIUS_M - 0.001
     yield f'<geom name="reach" type="cylinder" size="{radius} {(high - low) / 2}" rgba="0 0 0 0"'
     yield f' pos="0 0 {(low + high) / 2 - surface}"/></body>'
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cnpgen.cli.view.view_bodies import Body
 from cnpgen.cli.view.view_scene import ViewScene
-from cnpgen.errors import MachineError
+from cnpgen.errors import requires_extra
 
 _NOTES = {
     "meshes": "",
@@ -29,7 +29,7 @@ def page_of(scene: ViewScene, *, stamp: str = "") -> str:
         stamp: Of the files behind it, for a page that is loaded again when the server has another one.
 
     Raises:
-        MachineError: MeshCat is not installed.
+        MissingExtraError: MeshCat is not installed.
     """
     template = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
     data = json.dumps(_content(scene) | {"stamp": stamp}, separators=(",", ":")).replace("<", "\\u003c")
@@ -39,13 +39,11 @@ def page_of(scene: ViewScene, *, stamp: str = "") -> str:
 
 def _viewer() -> str:
     """Return MeshCat's viewer, three.js in it, as a script."""
-    from importlib.metadata import PackageNotFoundError, distribution
+    from importlib.metadata import distribution
 
-    try:
+    with requires_extra("view", "MeshCat's viewer"):
         path = Path(str(distribution("meshcat").locate_file("meshcat/viewer/dist/main.min.js")))
         return path.read_text(encoding="utf-8")
-    except (PackageNotFoundError, OSError) as error:
-        raise MachineError(f"MeshCat's viewer is missing ({error}): pip install 'cnpgen[view]'") from error
 
 
 def _content(scene: ViewScene) -> dict[str, Any]:

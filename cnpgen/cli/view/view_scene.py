@@ -10,11 +10,11 @@ from cnpgen.cli.view.view_bodies import Body, capsule_bodies, robot_bodies, tube
 from cnpgen.judges.plans.plan_plot import along, shares_of_limits
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.constraints.table import Table
-from cnpgen.problems.obstacles import obstacle_poses_of
+from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
+from cnpgen.robots.scene import Scene
 from cnpgen.robots.shape.hull import CUBE
-from cnpgen.robots.solid import solids_of
 from cnpgen.world.forward_kinematics import ForwardKinematics
 
 Array = NDArray[np.float64]
@@ -110,7 +110,7 @@ def _scene(
         robot=tuple(bodies[0]),
         kind=bodies[1],
         capsules=tuple(capsule_bodies(robot)),
-        world=tuple(_world(problem, obstacle_poses_of(problem, tip[0], tip[-1]))),
+        world=tuple(_world(problem, scene_of(problem, tip[:1], tip[-1:]))),
         path=(tube("path of the tip", tip, LINE),) if shares else (),
         held=() if size is None else (wrapped("object", robot.n + 1, CUBE * np.array(size), 0.0),),
         joints=robot.joint_names,
@@ -130,9 +130,9 @@ def _poses(robot: Robot, q: Array) -> Array:
     return poses
 
 
-def _world(problem: Problem, obstacle_poses: Array) -> Iterator[Body]:
+def _world(problem: Problem, scene: Scene) -> Iterator[Body]:
     """Draw obstacles, and a table."""
-    for obstacle, solid in zip(problem.obstacle, solids_of(problem.obstacle, obstacle_poses), strict=True):
+    for obstacle, solid in zip(problem.obstacle, scene.bodies(), strict=True):
         if obstacle.upright and obstacle.height is None:
             yield _box(obstacle.name, np.array([*solid.low[:2], solid.high[2] - DRAWN_DEPTH_M]), solid.high)
         else:

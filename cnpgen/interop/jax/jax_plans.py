@@ -14,6 +14,7 @@ from cnpgen.errors import UsageError
 from cnpgen.interop.host_evaluation import evaluate
 from cnpgen.losses.quadrature import check_quadrature
 from cnpgen.planner.tasks import Tasks
+from cnpgen.robots.scene import Scene
 from cnpgen.schema.arguments import number, numbers
 from cnpgen.trajectory.boundary import Boundary
 
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 
 for _kind in (Tasks, Boundary):
     jax.tree_util.register_dataclass(_kind, [field.name for field in fields(_kind)], [])  # for arguments of jit
+jax.tree_util.register_dataclass(Scene, ["poses"], ["obstacles"])
 
 
 def control_points(

@@ -15,7 +15,7 @@ from math import comb
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.trajectory.spline import derivative
+from cnpgen.judges.plans.scipy_splines import derivative_matrix
 from cnpgen.trajectory.spline_motion import Motion
 
 Array = NDArray[np.float64]
@@ -135,7 +135,7 @@ def _to_bernstein_form(points: int, degree: int, orders: tuple[int, ...], edges:
     """
     rows = []
     for order in orders:
-        (knots, matrix), size = derivative(points, degree, order), degree - order
+        (knots, matrix), size = derivative_matrix(points, degree, order), degree - order
         for k, (low, high) in product(range(size + 1), pairwise(edges)):
             last = int(np.searchsorted(knots, (low + high) / 2)) - 1
             rows.append(_polar(knots, last, [low] * (size - k) + [high] * k) @ matrix)

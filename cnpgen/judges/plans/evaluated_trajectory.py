@@ -1,7 +1,6 @@
 """One motion evaluated at many phases: joint positions and their time derivatives, joint by joint.
 
-The judges share the B-splines with the code that they check (``cnpgen.trajectory``), but neither the kernels nor the
-solver's evaluation of them.
+The splines are those of ``scipy_splines``, not those of the planners and solvers that are checked.
 """
 
 from dataclasses import dataclass
@@ -10,8 +9,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.trajectory.spline import basis, derivatives
-from cnpgen.trajectory.spline_motion import Motion, time_derivatives
+from cnpgen.judges.plans.scipy_splines import basis_matrix, spline_derivatives, states_by_chain_rule
+from cnpgen.trajectory.spline_motion import Motion
 
 Array = NDArray[np.float64]
 PATH_ORDERS = 3  # derivatives of the path for accelerations, including order 0; jerks need one more
@@ -60,10 +59,9 @@ def evaluate_trajectory(motion: Motion, s: Array, *, jerk: bool = False) -> Eval
         jerk: Whether to evaluate jerks.
     """
     orders = PATH_ORDERS + jerk
-    p = derivatives(motion.path[0], motion.degree, s, orders=orders)
-    return EvaluatedTrajectory(
-        *time_derivatives(p, derivatives(motion.rate[0, :, None], motion.degree, s, orders=orders - 1))
-    )
+    p = spline_derivatives(motion.path[0], motion.degree, s, orders=orders)
+    r = spline_derivatives(motion.rate[0, :, None], motion.degree, s, orders=orders - 1)
+    return EvaluatedTrajectory(*states_by_chain_rule(p, r))
 
 
 def evaluate_at_phases(motion: Motion, phases: Phases, *, jerk: bool = False) -> EvaluatedTrajectory:
@@ -74,7 +72,7 @@ def evaluate_at_phases(motion: Motion, phases: Phases, *, jerk: bool = False) ->
     r = motion.rate[0] @ _bases(rates, motion.degree, orders - 1, phases)
     count = len(phases.s)
     return EvaluatedTrajectory(
-        *time_derivatives(
+        *states_by_chain_rule(
             [p[:, k * count : (k + 1) * count] for k in range(orders)],
             [r[k * count : (k + 1) * count] for k in range(orders - 1)],
         )
@@ -84,11 +82,12 @@ def evaluate_at_phases(motion: Motion, phases: Phases, *, jerk: bool = False) ->
 @lru_cache(maxsize=8)
 def _bases(points: int, degree: int, orders: int, phases: Phases) -> Array:
     """Return the bases of a spline and of its derivatives, concatenated, shape (C, orders K)."""
-    bases = [basis(phases.s, points, degree, order) for order in range(orders)]
+    bases = [basis_matrix(phases.s, points, degree, order) for order in range(orders)]
     return np.ascontiguousarray(np.concatenate(bases).T)
 
 
 def jerks(motion: Motion, s: Array) -> Array:
     """Evaluate the joint jerks of one motion at phases s [rad/s^3], shape (n, K)."""
-    p = derivatives(motion.path[0], motion.degree, s, orders=4)
-    return time_derivatives(p, derivatives(motion.rate[0, :, None], motion.degree, s, orders=3))[3]
+    jerk = evaluate_trajectory(motion, s, jerk=True).jerk
+    assert jerk is not None
+    return jerk

@@ -1,7 +1,7 @@
 """Independent check of plans with Pinocchio and Coal, on a fine time grid and between its samples.
 
-It shares with the optimizers only the problem (bounds, tolerances, obstacle poses) and the definition of the splines
-(``cnpgen.trajectory``): no kinematics, dynamics or distances, and no transcription.
+It shares with the optimizers only the problem (bounds, tolerances, obstacle poses) and the control points of motions:
+no kinematics, dynamics, distances or splines, and no transcription.
 """
 
 from dataclasses import dataclass
@@ -35,10 +35,11 @@ from cnpgen.judges.plans.sampling import (
     time_table,
     times,
 )
+from cnpgen.judges.plans.scipy_splines import is_positive
 from cnpgen.judges.plans.verdict import Margin, Metrics, PaperRule, Reason, Verdict
-from cnpgen.problems.obstacles import obstacle_poses_of
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
+from cnpgen.robots.scene import Scene
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.world.path import PathWorld
@@ -55,7 +56,7 @@ def judge(  # noqa: PLR0917 - all of them are needed to interpret a plan
     robot: Robot,
     motion: Motion,
     boundary: Boundary,
-    start_xyz: Array,
+    scene: Scene,
     goal_xyz: Array,
     *,
     step: float = 1e-3,
@@ -74,14 +75,14 @@ def judge(  # noqa: PLR0917 - all of them are needed to interpret a plan
         robot: Its robot.
         motion: N motions.
         boundary: Boundary conditions of the motions.
-        start_xyz: Tip positions at the start [m], shape (N, 3); they place the obstacles below the object.
+        scene: Obstacles of the N plans.
         goal_xyz: Tip positions at the goal [m], shape (N, 3).
         step: Time step [s].
 
     Raises:
         UsageError: Shapes do not match, or the step is not positive or too long.
     """
-    return Judge(problem, robot, step=step)(motion, boundary, start_xyz, goal_xyz)
+    return Judge(problem, robot, step=step)(motion, boundary, scene, goal_xyz)
 
 
 class Judge:
@@ -103,32 +104,31 @@ class Judge:
         self._limits = joint_limits(problem, self._world)
 
     def __call__(
-        self, motion: Motion, boundary: Boundary, start_xyz: Array, goal_xyz: Array, *, early_exit: bool = False
+        self, motion: Motion, boundary: Boundary, scene: Scene, goal_xyz: Array, *, early_exit: bool = False
     ) -> list[Verdict]:
         """Judge N plans; arguments as of ``judge``.
 
         A verdict with early exit has neither metrics nor the paper's rule, and starts from fewer samples. Validity does
         not depend on that, but margins are less accurate.
         """
-        plans = self._plans(motion, boundary, start_xyz, goal_xyz)
+        plans = self._plans(motion, boundary, scene, goal_xyz)
         with np.errstate(all="ignore"):  # overflows give inf or nan, which are detected
             return [_judge_plan(plan, self._world, self._limits, self._step, early_exit=early_exit) for plan in plans]
 
-    def refutes(self, motion: Motion, boundary: Boundary, start_xyz: Array, goal_xyz: Array) -> list[bool]:
+    def refutes(self, motion: Motion, boundary: Boundary, scene: Scene, goal_xyz: Array) -> list[bool]:
         """Return for N plans whether a few samples prove that they are invalid; False proves nothing."""
-        plans = self._plans(motion, boundary, start_xyz, goal_xyz)
+        plans = self._plans(motion, boundary, scene, goal_xyz)
         with np.errstate(all="ignore"):
             return [_is_refuted(plan, self._world) for plan in plans]
 
-    def _plans(self, motion: Motion, boundary: Boundary, start_xyz: Array, goal_xyz: Array) -> "list[_Plan]":
-        _check_shapes(self._robot, motion, boundary, start_xyz, goal_xyz)
-        poses = obstacle_poses_of(self._problem, start_xyz, goal_xyz)
+    def _plans(self, motion: Motion, boundary: Boundary, scene: Scene, goal_xyz: Array) -> "list[_Plan]":
+        _check_shapes(self._robot, motion, boundary, scene, goal_xyz)
         return [
             _Plan(
                 self._problem,
                 Motion(motion.path[i : i + 1], motion.rate[i : i + 1], motion.degree),
                 boundary[i : i + 1],
-                poses[i],
+                scene.poses[i],
                 goal_xyz[i],
             )
             for i in range(len(motion))
@@ -142,7 +142,7 @@ def check_step(step: float) -> None:
         UsageError: The step is outside this range.
     """
     if not 0 < step <= MAX_STEP_S:
-        raise UsageError(f"the time step must be above 0 and at most {MAX_STEP_S:g} s, got {step:g} s")
+        raise UsageError(f"the time step must be above 0 and at most {MAX_STEP_S:g} s, got {step:g} s", concerns="step")
 
 
 @dataclass(frozen=True)
@@ -188,15 +188,16 @@ def _corners(path_points: int, rate_points: int, degree: int, kinks: tuple[float
     return knots(path_points, rate_points, degree).union(s + k * KINK_OFFSET for s in kinks for k in range(-2, 3))
 
 
-def _check_shapes(robot: Robot, motion: Motion, boundary: Boundary, start_xyz: Array, goal_xyz: Array) -> None:
+def _check_shapes(robot: Robot, motion: Motion, boundary: Boundary, scene: Scene, goal_xyz: Array) -> None:
     n_plans, n = len(motion), robot.n
     expected = {
         "path control points": (motion.path, (n_plans, *motion.path.shape[1:2], n)),
         "rate control points": (motion.rate, (n_plans, *motion.rate.shape[1:2])),
-        "start_xyz": (start_xyz, (n_plans, 3)),
         "goal_xyz": (goal_xyz, (n_plans, 3)),
         **{name: (values, (n_plans, n)) for name, values in vars(boundary).items() if values is not None},
     }
+    if len(scene) != n_plans:
+        raise UsageError(f"must have {n_plans} samples, one for each plan, got {len(scene)}", argument="scene")
     for name, (values, shape) in expected.items():
         if np.shape(values) != shape or len(shape) < 2:
             raise UsageError(
@@ -286,8 +287,7 @@ def _invalid_reason(plan: _Plan) -> Reason | None:
     """Return the reason for which a plan cannot be evaluated, or None."""
     if not plan.is_finite():
         return Reason.NOT_FINITE
-    forward = plan.motion.rate.min() > 0 or plan.motion.runs_forward()[0]  # r lies between its control points
-    return None if forward else Reason.RATE
+    return None if is_positive(plan.motion.rate[0], plan.motion.degree) else Reason.RATE
 
 
 def reason_of(margins: list[Margin]) -> str:

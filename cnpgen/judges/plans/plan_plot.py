@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.problems.constraints.table import Table
-from cnpgen.problems.obstacles import obstacle_poses_of
+from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
-from cnpgen.robots.solid import Solid, place_obstacles, solids_of
+from cnpgen.robots.scene import Scene
+from cnpgen.robots.solid import Solid, place_obstacles
 from cnpgen.store.files.figure_file import new_figure, save_figure
 from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.world.forward_kinematics import ForwardKinematics
@@ -38,7 +39,7 @@ def plot_plan(
     index: int,
     path: str | Path,
     *,
-    obstacle_poses: Array | None = None,
+    scene: Scene | None = None,
     note: str = "",
 ) -> None:
     """Draw one plan.
@@ -49,7 +50,7 @@ def plot_plan(
         motion: N motions.
         index: Index of the motion.
         path: Image file, ``.png``, ``.pdf`` or ``.svg``; overwritten if it exists.
-        obstacle_poses: Poses and sizes of the obstacles, shape (width,); by default from the ends of the motion.
+        scene: Obstacles of this motion; by default from its ends.
         note: Additional text of the title.
 
     Raises:
@@ -61,25 +62,20 @@ def plot_plan(
     one = Motion(motion.path[index : index + 1], motion.rate[index : index + 1], motion.degree)
     with np.errstate(all="ignore"):
         world, s, t = along(problem, robot, one, index)
-    if obstacle_poses is None:
-        obstacle_poses = _default_poses(problem, world)
+    if scene is None:
+        scene = scene_of(problem, world.tip_position[:, :1].T, world.tip_position[:, -1:].T)
     figure = new_figure(15, 9)
     figure.suptitle(f"{problem.name}, plan {index}: {t[-1]:.3f} s" + (f"\n{note}" if note else ""))
     joints, tip = figure.subfigures(1, 2, width_ratios=[1.15, 1.0], squeeze=False)[0]
     _draw_joints(joints, world, t)
     table = problem.first(Table)
     if table is None:
-        _draw_views(tip, problem, world, obstacle_poses)
+        _draw_views(tip, problem, world, scene.bodies())
     else:
         _draw_over_table(tip, table, world, s, t)
     named = {name: item for axis in tip.axes for item, name in zip(*axis.get_legend_handles_labels(), strict=True)}
     tip.legend(named.values(), named.keys(), loc="outside lower center", ncols=len(named), fontsize=8)
     save_figure(figure, Path(path))
-
-
-def _default_poses(problem: Problem, world: PathWorld) -> Array:
-    """Return the poses and sizes of the obstacles for the ends of the motion."""
-    return obstacle_poses_of(problem, world.tip_position[:, 0], world.tip_position[:, -1])
 
 
 def along(
@@ -173,9 +169,9 @@ def _draw_over_table(figure: "SubFigure", table: Table, world: PathWorld, s: Arr
     beside.grid(color="0.9", linewidth=0.6)
 
 
-def _draw_views(figure: "SubFigure", problem: Problem, world: PathWorld, obstacle_poses: Array) -> None:
+def _draw_views(figure: "SubFigure", problem: Problem, world: PathWorld, solids: list[Solid]) -> None:
     """Draw arm, object and obstacles in two views: from the side with the largest tip motion, and from above."""
-    solids, corners = solids_of(problem.obstacle, obstacle_poses), world.object_corners() if problem.object else None
+    corners = world.object_corners() if problem.object else None
     side = int(np.ptp(world.tip_position[1]) >= np.ptp(world.tip_position[0]))
     colors = [_BETWEEN] * (DRAWN_STATES - 2) + [_START, _GOAL]
     indices = np.linspace(0, world.q.shape[1] - 1, DRAWN_STATES).round().astype(int)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.judges.plans.evaluated_trajectory import Phases
-from cnpgen.trajectory.spline import basis
+from cnpgen.judges.plans.scipy_splines import basis_matrix
 
 Array = NDArray[np.float64]
 
@@ -128,4 +128,4 @@ def _nodes(points: int, degree: int, cells: int) -> Array:
     """Return the basis of r at the Gauss nodes of the table's cells, shape (2 cells, R)."""
     phases, halves = _table_phases(cells)
     centers, offset = (phases[1:] + phases[:-1]) / 2, halves / np.sqrt(3)
-    return basis(np.stack([centers - offset, centers + offset], axis=1).ravel(), points, degree)
+    return basis_matrix(np.stack([centers - offset, centers + offset], axis=1).ravel(), points, degree)

@@ -1,5 +1,7 @@
 """Results of the verification of rows: the worst value of every check, and the rows that fail."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -133,14 +133,19 @@ class FrozenState(SymbolicState):
         return substituted
 
 
-def jerk_along(path: Sequence[Vec], rate: Sequence[Scalar]) -> Vec | None:
-    """Return the jerk ``p''' r^3 + 3 p'' r' r^2 + p' (r'' r + r'^2) r``, or None without p'''.
+def time_derivatives(path: Sequence[Vec], rate: Sequence[Scalar]) -> tuple[Vec, Vec, Vec | None]:
+    """Return ``dq = p' r``, ``ddq = p'' r^2 + p' r r'`` and the jerk ``p''' r^3 + 3 p'' r' r^2 + p' (r'' r + r'^2) r``.
+
+    It is ``cnpgen.trajectory.spline_motion.time_derivatives`` in SX.
 
     Args:
-        path: p', p'' and p'''.
-        rate: r, r' and r''.
+        path: p', p'' and p''' of every joint; the jerk is None without p'''.
+        rate: r, r' and r''; r'' only with p'''.
     """
+    (p1, p2), (r, r1) = path[:2], rate[:2]
+    dq = [a * r for a in p1]
+    ddq = [b * r * r + a * r * r1 for a, b in zip(p1, p2, strict=True)]
     if len(path) < 3:
-        return None
-    (p1, p2, p3), (r, r1, r2) = path, rate
-    return [c * r**3 + 3 * b * r1 * r**2 + a * (r2 * r + r1**2) * r for a, b, c in zip(p1, p2, p3, strict=True)]
+        return dq, ddq, None
+    r2, terms = rate[2], zip(p1, p2, path[2], strict=True)
+    return dq, ddq, [c * r**3 + 3 * b * r1 * r**2 + a * (r2 * r + r1**2) * r for a, b, c in terms]

@@ -21,7 +21,7 @@ from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Stage, StageFunction
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
-from cnpgen.problems.obstacles import obstacle_poses_of
+from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.shape.hull import coal_hull
 from cnpgen.robots.shape.shape import Shape
@@ -119,8 +119,8 @@ class Collision(Stage):
 
 
 def candidate_poses(problem: Problem, candidates: CandidateBatch) -> Array:
-    """Return the obstacle poses of every candidate, shape (width, n), see ``obstacle_poses_of``."""
-    return np.ascontiguousarray(obstacle_poses_of(problem, candidates["start_xyz"].T, candidates["goal_xyz"].T).T)
+    """Return the obstacle poses of every candidate, shape (width, n)."""
+    return scene_of(problem, candidates["start_xyz"].T, candidates["goal_xyz"].T).lanes
 
 
 def capsule_axes_distance(robot: "Robot", problem: Problem) -> Any:

@@ -1,5 +1,7 @@
 """Base class of stages, and the batch of candidates that stages process."""
 
+from __future__ import annotations
+
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
@@ -117,15 +119,15 @@ class Stage(ABC):
         """Describe the stage in one sentence, with its values and units."""
 
     @abstractmethod
-    def outputs(self, context: "Context") -> tuple[Field, ...]:
+    def outputs(self, context: Context) -> tuple[Field, ...]:
         """List the stored fields that this stage writes, in order."""
 
-    def writes(self, context: "Context") -> tuple[str, ...]:
+    def writes(self, context: Context) -> tuple[str, ...]:
         """List the columns that this stage writes, stored or not; by default its outputs."""
         return tuple(field.name for field in self.outputs(context))
 
     @abstractmethod
-    def prepare(self, context: "Context") -> StageFunction:
+    def prepare(self, context: Context) -> StageFunction:
         """Load the kernels and geometry of the stage and return its stage function.
 
         Args:
@@ -136,11 +138,11 @@ class Stage(ABC):
             random numbers with ``candidates.draw`` only.
         """
 
-    def task_inputs(self, context: "Context") -> tuple[Field, ...]:
+    def task_inputs(self, context: Context) -> tuple[Field, ...]:
         """List the fields that tasks may give instead; by default all outputs except diagnostics."""
         return tuple(field for field in self.outputs(context) if field.role != "diagnostic")
 
-    def complete(self, context: "Context", given: Collection[str]) -> StageFunction:
+    def complete(self, context: Context, given: Collection[str]) -> StageFunction:
         """Prepare the stage for tasks: keep the given columns and compute the missing ones.
 
         By default the stage does nothing if all its task inputs are given, and runs as usual if none is given. Its

@@ -1,5 +1,7 @@
 """The architecture of the network (paper, section on the neural network), with all parameters in one vector."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any

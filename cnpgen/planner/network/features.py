@@ -1,5 +1,7 @@
 """The network's inputs: start and goal states and derived values, standardized by the training rows."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any

@@ -1,5 +1,7 @@
 """Base class of constraints: named conditions on a robot state, in two independent forms."""
 
+from __future__ import annotations
+
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -138,10 +140,10 @@ class Constraint(ABC):
         return np.zeros((*start_tip.shape[:-1], len(s)))
 
     @abstractmethod
-    def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
+    def symbolic(self, state: SymbolicState) -> tuple[Condition, ...]:
         """State the condition on a motion as SX expressions of the symbolic state."""
 
-    def penalized(self, state: "SymbolicState") -> tuple[Condition, ...]:
+    def penalized(self, state: SymbolicState) -> tuple[Condition, ...]:
         """State the condition for the training loss, by default ``symbolic``.
 
         It must be equivalent; override it if the violation of ``symbolic`` has poor gradients.
@@ -149,7 +151,7 @@ class Constraint(ABC):
         return self.symbolic(state)
 
     @abstractmethod
-    def measured(self, world: "World") -> tuple[Condition, ...]:
+    def measured(self, world: World) -> tuple[Condition, ...]:
         """Evaluate the same condition with Pinocchio and Coal at the state, or at the K states, that ``world`` holds.
 
         It is written for one state, and also called with ``cnpgen.world.path.PathWorld``, whose arrays have a trailing
@@ -159,7 +161,7 @@ class Constraint(ABC):
         not depend on the state.
         """
 
-    def met(self, path: "PathWorld", tolerance: float) -> NDArray[np.bool_] | None:  # noqa: ARG002
+    def met(self, path: PathWorld, tolerance: float) -> NDArray[np.bool_] | None:  # noqa: ARG002
         """Return a mask of the K states that satisfy ``measured`` up to a tolerance, or None without a fast check.
 
         The default is None; constraints with a batched check override it.
@@ -170,17 +172,17 @@ class Constraint(ABC):
         """
         return None
 
-    def solved(self, world: "World") -> tuple[Condition, ...]:
+    def solved(self, world: World) -> tuple[Condition, ...]:
         """Return the conditions of ``symbolic`` with numeric values, from which solvers read bounds.
 
         The default is ``measured``; override it if the two forms state different conditions.
         """
         return self.measured(world)
 
-    def symbolic_at(self, state: "SymbolicState", end: End) -> tuple[Condition, ...]:  # noqa: ARG002
+    def symbolic_at(self, state: SymbolicState, end: End) -> tuple[Condition, ...]:  # noqa: ARG002
         """State the conditions on a boundary state, by default those on every state."""
         return self.symbolic(state)
 
-    def measured_at(self, world: "World", end: End) -> tuple[Condition, ...]:  # noqa: ARG002
+    def measured_at(self, world: World, end: End) -> tuple[Condition, ...]:  # noqa: ARG002
         """Evaluate the conditions on a boundary state with Pinocchio and Coal; ``world`` holds one state."""
         return self.measured(world)

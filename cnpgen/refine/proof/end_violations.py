@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.constraints.joint import JointTorque
 from cnpgen.problems.constraints.needs import measured_needs
-from cnpgen.problems.obstacles import obstacle_poses_of
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.proof.reachable_positions import joint_limits
 from cnpgen.robots.robot import Robot
+from cnpgen.robots.scene import Scene
 from cnpgen.store.joint_units import unit_of
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.world.world import World
@@ -22,9 +22,7 @@ Array = NDArray[np.float64]
 BOUNDARY_MARGIN = (1e-5, 1e-5, 1e-3)
 
 
-def end_violations(
-    problem: Problem, robot: Robot, boundary: Boundary, *, start_xyz: Array, goal_xyz: Array
-) -> Iterator[str]:
+def end_violations(problem: Problem, robot: Robot, boundary: Boundary, scene: Scene) -> Iterator[str]:
     """Describe the constraints that an end of one motion violates by more than their tolerance.
 
     If the boundary conditions leave the acceleration at the goal free, there must be one within its limits whose
@@ -34,11 +32,10 @@ def end_violations(
         problem: The problem.
         robot: Its robot.
         boundary: Boundary conditions of one motion.
-        start_xyz: Position of the tip at the start [m], shape (3,).
-        goal_xyz: Position of the tip at the goal [m], shape (3,).
+        scene: Its obstacles, one sample.
     """
     world = World(robot, problem.obstacle, problem.object_size)
-    obstacle_poses = obstacle_poses_of(problem, start_xyz, goal_xyz)
+    (obstacle_poses,) = scene.poses
     goal_ddq = np.zeros(robot.n) if boundary.goal_ddq is None else boundary.goal_ddq[0]
     ends = {
         "start": (boundary.start_q[0], boundary.start_dq[0], boundary.start_ddq[0]),

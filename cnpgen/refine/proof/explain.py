@@ -17,6 +17,8 @@ from cnpgen.errors import UsageError
 from cnpgen.refine.proof.end_violations import end_violations
 from cnpgen.refine.proof.reachable_positions import end_states, joint_limits, sample_times
 from cnpgen.refine.proof.table_proof import find_table_exit
+from cnpgen.schema.argument_types import checked_arguments
+from cnpgen.schema.arguments import integer
 from cnpgen.store.joint_units import unit_of
 from cnpgen.trajectory.boundary import Boundary
 
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
     from cnpgen.plans.plans import Plans
     from cnpgen.problems.problem import Problem
     from cnpgen.robots.robot import Robot
+    from cnpgen.robots.scene import Scene
 
 Array = NDArray[np.float64]
 POSITION_MARGIN_RAD = 1e-4  # for motion between the times of the verdict, and its tolerance of boundary conditions
@@ -54,22 +57,19 @@ class Explanation:
         return f"{self.kind}: {self.text}"
 
 
-def explain_failure(
-    problem: "Problem", robot: "Robot", boundary: Boundary, *, start_xyz: Array, goal_xyz: Array
-) -> Explanation:
+def explain_failure(problem: "Problem", robot: "Robot", boundary: Boundary, scene: "Scene") -> Explanation:
     """Explain why no valid plan of a boundary problem was found.
 
     Args:
         problem: The problem.
         robot: Its robot.
         boundary: Boundary conditions of one motion.
-        start_xyz: Position of the tip at the start [m], shape (3,).
-        goal_xyz: Position of the tip at the goal [m], shape (3,).
+        scene: Its obstacles, one sample.
     """
-    conditions = (start_xyz, goal_xyz, *vars(boundary).values())
+    conditions = (scene.poses, *vars(boundary).values())
     if not all(values is None or np.isfinite(values).all() for values in conditions):
         return Explanation(Feasibility.INFEASIBLE, "the boundary conditions are not finite")
-    for text in end_violations(problem, robot, boundary, start_xyz=start_xyz, goal_xyz=goal_xyz):
+    for text in end_violations(problem, robot, boundary, scene):
         return Explanation(Feasibility.INFEASIBLE, text)
     for text in _cannot_brake(problem, robot, boundary):
         return Explanation(Feasibility.INFEASIBLE, text)
@@ -77,6 +77,7 @@ def explain_failure(
     return _off_table(problem, robot, boundary) or unknown
 
 
+@checked_arguments
 def explain_plans(plans: "Plans", indices: Sequence[int] | None = None) -> dict[int, Explanation]:
     """Explain why no valid plans of some problems were found.
 
@@ -94,19 +95,17 @@ def explain_plans(plans: "Plans", indices: Sequence[int] | None = None) -> dict[
     from cnpgen.plans.tips import correct_tips
     from cnpgen.problems.problem_record import open_problem
 
+    indices = None if indices is None else [integer("indices", index) for index in indices]
     if indices is None:
         indices = np.flatnonzero(plans.status != PlanStatus.VALID).tolist()
     if wrong := [index for index in indices if not 0 <= index < len(plans)]:
-        raise UsageError(f"there are plans 0 to {len(plans) - 1}, got {wrong[0]}")
+        raise UsageError(f"there are plans 0 to {len(plans) - 1}, got {wrong[0]}", concerns="indices")
     if not len(indices):
         return {}
     plans = correct_tips(plans)
     problem, robot = open_problem(plans.problem)
-    ends = plans.columns["start_xyz"], plans.columns["goal_xyz"]
     return {
-        index: explain_failure(
-            problem, robot, plans.boundary[index : index + 1], start_xyz=ends[0][index], goal_xyz=ends[1][index]
-        )
+        index: explain_failure(problem, robot, plans.boundary[index : index + 1], plans.scene[index])
         for index in indices
     }
 

@@ -1,17 +1,14 @@
 /* Dual active-set method for quadratic programs (Goldfarb and Idnani, Mathematical Programming 27, 1983): minimize
 x x / 2 + f x subject to low <= a x <= high for every row a. It replaces DAQP. The initial working set is activated at
-once; DAQP adds its rows one after the other. Requires vectors.h.
+once; DAQP adds its rows one after the other. Requires arrays.h.
 
 Arrays of rows are padded with zeros to `stride`, with memory for B more numbers. */
 
-#define EACH(i, from, to) for (long i = (from); i < (to); i++)
 #define B (4 * W) /* rows in a block, stored column by column */
 #define MIN_INDEPENDENCE 1e-11 /* fraction of its square that remains of a row that depends on active ones */
 #define MAX_ROUNDS 4 /* of repairs; one and a check are nearly always enough */
 #define SERIOUS_FRACTION 0.1 /* of the largest violation: rows with smaller ones are added later */
 
-I v at(const double *p) { return *(const vu *)p; }
-I void put(double *p, v x) { *(vu *)p = x; }
 I double sum(v x) {
   double s[W];
   put(s, x);
@@ -27,12 +24,6 @@ static double dot(const double *a, const double *b, long n) {
   for (; i + W <= n; i += W) s += at(a + i) * at(b + i);
   for (; i < n; i++) rest += a[i] * b[i];
   return sum(s) + rest;
-}
-
-static void add(double *restrict a, double f, const double *restrict b, long n) {
-  long i = 0;
-  for (; i + W <= n; i += W) put(a + i, at(a + i) + f * at(b + i));
-  for (; i < n; i++) a[i] += f * b[i];
 }
 
 /* out = rows a, of `length` numbers, padded with zeros. */

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.kernels.symbolic.linalg import symbols
-from cnpgen.kernels.symbolic.symbolic_state import SymbolicState, jerk_along
+from cnpgen.kernels.symbolic.symbolic_state import SymbolicState, time_derivatives
 from cnpgen.problems.problem import Problem
 
 if TYPE_CHECKING:
@@ -72,12 +72,9 @@ def cost_term_residuals(robot: "Robot", kind: Kind) -> Any:
 
     n = robot.n
     w_sx, w = symbols("w", 4 * n + 3)
-    p, p1, p2, p3 = (w[order * n : (order + 1) * n] for order in range(4))
-    r, r1, r2 = w[4 * n :]
-    dq = [a * r for a in p1]
-    ddq = [b * r * r + a * r * r1 for a, b in zip(p1, p2, strict=True)]
+    p, *path = (w[order * n : (order + 1) * n] for order in range(4))
+    dq, ddq, jerk = time_derivatives(path, w[4 * n :])
     if kind == "jerk":
-        jerk = jerk_along((p1, p2, p3), (r, r1, r2))
         e = [x / float(limit) for x, limit in zip(jerk or (), robot.jerk_limit, strict=True)]
     else:
         state = SymbolicState(robot, p, dq, ddq, [], (), None)

@@ -1,4 +1,4 @@
-"""Deadline of the iterations of a solver."""
+"""Deadline of a sequence of steps: iterations of a solver, or verdicts."""
 
 import time
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ STEP_TIME_FACTOR = 1.3  # times the largest duration of a step so far is reserve
 
 @dataclass
 class Deadline:
-    """Time at which iterations must have ended.
+    """Time at which steps must have ended.
 
     Attributes:
         until: Time in the clock of ``time.perf_counter`` [s].

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.kernels.symbolic.linalg import symbols
-from cnpgen.kernels.symbolic.symbolic_state import FrozenState, jerk_along
+from cnpgen.kernels.symbolic.symbolic_state import FrozenState, time_derivatives
 from cnpgen.problems.constraints.constraint import MIN_TOLERANCE
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.solid import pose_width
@@ -48,11 +48,7 @@ def _stage(robot: "Robot", problem: Problem) -> tuple[list[Any], FrozenState, li
         symbols("obstacle_poses", pose_width(problem.obstacle)),
     )
     p, *path = (w[order * n : (order + 1) * n] for order in range(orders))
-    (p1, p2), rate = path[:2], w[orders * n :]
-    r, r1 = rate[:2]
-    dq = [a * r for a in p1]
-    ddq = [b * r * r + a * r * r1 for a, b in zip(p1, p2, strict=True)]
-    jerk = jerk_along(path, rate)
+    dq, ddq, jerk = time_derivatives(path, w[orders * n :])
     state = FrozenState(robot, p, dq, ddq, obstacle_poses, problem.obstacle, problem.object_size, jerk)
     g = []
     for constraint in problem.constraint:

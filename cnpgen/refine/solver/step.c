@@ -6,8 +6,6 @@ joints, nx variables; w = (p, p', ..., r, r', ...) of `width` components. Requir
 
 #define TILE 8 /* grid points whose Jacobians are computed at once: they fit in the L1 cache */
 
-typedef void kernel(long, const double *const *, const long *, double *const *);
-
 typedef struct { /* a spline basis at some phases: three or four orders of the path */
   long orders, points;
   const double *path, *rate;         /* (orders, C, points), (orders - 1, R, points) */

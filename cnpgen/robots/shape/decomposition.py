@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import MachineError, RecipeError
+from cnpgen.errors import MachineError, RecipeError, requires_extra
 from cnpgen.robots.shape.hull import hull_corners
 from cnpgen.store.files.atomic import write_file
 
@@ -46,7 +46,7 @@ def convex_parts(points: Array, triangles: NDArray[np.int64], most: int, keep: P
         Corners of each part [m], shape (V, 3); those of the hull if the parts are hardly smaller.
 
     Raises:
-        MachineError: CoACD is not installed.
+        MissingExtraError: CoACD is not installed.
         RecipeError: CoACD cannot decompose the mesh.
     """
     whole = hull_corners(points)
@@ -70,10 +70,8 @@ def convex_parts(points: Array, triangles: NDArray[np.int64], most: int, keep: P
 
 def _identity(points: Array, triangles: NDArray[np.int64], most: int) -> str:
     """Return a digest of the inputs of a decomposition."""
-    try:
+    with requires_extra("decompose", "CoACD (for robot.convex_parts)"):
         version = metadata.version("coacd")
-    except metadata.PackageNotFoundError as error:
-        raise MachineError("robot.convex_parts needs CoACD: pip install 'cnpgen[decompose]'") from error
     numbers = b"".join(np.ascontiguousarray(each).tobytes() for each in (points, triangles.astype("<i8")))
     about = f"{DECOMPOSITION_REVISION} {version} {most} {SEED} {len(points)} "
     return hashlib.sha256(about.encode() + numbers).hexdigest()[:32]

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cnpgen.errors import MachineError
+from cnpgen.errors import requires_extra
 from cnpgen.store.files.atomic import machine_error
 
 if TYPE_CHECKING:
@@ -14,12 +14,10 @@ def new_figure(width: float, height: float, dpi: int = 110) -> "Figure":
     """Return an empty figure with a size [inch] and automatic layout.
 
     Raises:
-        MachineError: matplotlib is missing.
+        MissingExtraError: matplotlib is missing.
     """
-    try:
+    with requires_extra("plot", "matplotlib"):
         from matplotlib.figure import Figure
-    except ImportError as error:
-        raise MachineError(f"matplotlib cannot be imported ({error}): pip install 'cnpgen[plot]'") from error
     return Figure(figsize=(width, height), layout="constrained", dpi=dpi)
 
 

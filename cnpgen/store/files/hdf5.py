@@ -230,13 +230,7 @@ def require_possible_size(path: Path) -> int:
 def _check_bytes(path: Path, content: bytes | None) -> int:
     """Raise an error for damage that makes HDF5 hang; return the size of the file [bytes]."""
     if content is not None:
-        check_heaps(path, np.frombuffer(content, np.uint8))
-        return len(content)
-    if require_possible_size(path) == 0:  # an empty file cannot be mapped
-        return 0
-    try:
-        data: NDArray[np.uint8] = np.memmap(path, np.uint8, "r")
-    except OSError:  # file systems without memory maps
-        data = np.fromfile(path, np.uint8)
-    check_heaps(path, data)
-    return len(data)
+        return check_heaps(path, io.BytesIO(content))
+    require_possible_size(path)
+    with path.open("rb") as file:
+        return check_heaps(path, file)

@@ -1,7 +1,8 @@
 """An append-only journal: records with checksums, which survive a crash except for an incomplete last record.
 
 The file starts with a line that names its format. Every record has its length (8 bytes, little endian), its sha256 and
-its bytes. A reader stops at the first incomplete or damaged record; the next writer overwrites it.
+its bytes. A reader stops at the first incomplete or damaged record; the next writer overwrites it. Logs that users read
+are text without checksums, line by line (``append_line``).
 """
 
 import hashlib
@@ -13,11 +14,27 @@ from typing import IO
 
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.store.files.atomic import machine_error
+from cnpgen.store.files.file_lock import try_lock
 
 MAX_RECORD_BYTES = 1 << 30
 _LENGTH_BYTES = 8
 _DIGEST_BYTES = hashlib.sha256().digest_size
 _MODE = os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0)  # the file is not truncated before it is locked
+
+
+def append_line(path: Path, line: str) -> None:
+    """Append a line to a text file and flush it to the disk.
+
+    Raises:
+        MachineError: The file cannot be written.
+    """
+    try:
+        with path.open("a", encoding="utf-8") as file:
+            file.write(f"{line}\n")
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError as error:
+        raise machine_error("write", path, error) from error
 
 
 @dataclass
@@ -127,13 +144,5 @@ def _read_records(file: IO[bytes]) -> list[bytes]:
 
 def _lock(path: Path, file: IO[bytes]) -> None:
     """Lock the file for this process, if the system supports it."""
-    try:
-        import fcntl
-    except ImportError:  # Windows
-        return
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        raise UsageError(f"{path} is in use by another process") from error
-    except OSError:  # file systems without locks
-        return
+    if not try_lock(file):
+        raise UsageError(f"{path} is in use by another process")

@@ -1,4 +1,4 @@
-"""Execution in a clone of the Air Hockey Challenge's environment: with a stand-in that has its interface."""
+"""Execution in a clone of the Air Hockey Challenge's environment; a stand-in has its interface."""
 
 import shutil
 import subprocess
@@ -27,10 +27,10 @@ def plans() -> Plans:
 
 
 @pytest.mark.slow
-def test_plans_are_executed_there_with_the_same_outcome_up_to_the_controllers(plans: Plans) -> None:
-    there, here = simulate_plans(plans, environment=CLONE, workers=1), simulate_plans(plans, workers=1)
-    assert there.plant.name == "challenge"
-    for a, b in zip(there.executed, here.executed, strict=True):
+def test_outcomes_in_the_challenge_differ_only_by_its_controller(plans: Plans) -> None:
+    in_challenge, in_mujoco = simulate_plans(plans, environment=CLONE, workers=1), simulate_plans(plans, workers=1)
+    assert in_challenge.plant.name == "challenge"
+    for a, b in zip(in_challenge.executed, in_mujoco.executed, strict=True):
         assert a.success
         assert b.success
         assert a.hit_time == pytest.approx(b.hit_time, abs=0.005)
@@ -41,25 +41,25 @@ def test_plans_are_executed_there_with_the_same_outcome_up_to_the_controllers(pl
         assert 0.1 < a.torque_use < 1
 
 
-def test_the_puck_and_the_arm_are_seen_in_the_robots_frame(plans: Plans) -> None:
-    scene, reference, found = execute_plan(plans[0], challenge_plant(CLONE))
+def test_records_are_in_the_robots_frame(plans: Plans) -> None:
+    scene, reference, execution = execute_plan(plans[0], challenge_plant(CLONE))
     assert scene.puck is not None
-    np.testing.assert_allclose(found.puck[0], scene.puck, atol=1e-12)
-    np.testing.assert_allclose(found.states[0, :6], reference.q[0], atol=1e-12)
-    at_the_hit = found.tip[reference.ticks - 1]
+    np.testing.assert_allclose(execution.puck[0], scene.puck, atol=1e-12)
+    np.testing.assert_allclose(execution.states[0, :6], reference.q[0], atol=1e-12)
+    at_the_hit = execution.tip[reference.ticks - 1]
     assert np.linalg.norm(at_the_hit - plans.columns["goal_xyz"][0]) < 0.002
 
 
 @pytest.mark.slow
-def test_a_benchmark_executes_there_too(tmp_path: Path) -> None:
-    found = run_benchmark("hits-81", tmp_path, planners=["cnp-b"], n=1, environment=CLONE, workers=1)
-    assert found.executions == ("challenge",)
-    assert found.results["cnp-b"][0]["executed"]["challenge"]["success"]
-    assert "executed by the challenge plant" in save_benchmark_report(found, tmp_path / "report.html").read_text()
+def test_a_benchmark_executes_in_the_challenge(tmp_path: Path) -> None:
+    benchmark = run_benchmark("hits-81", tmp_path, planners=["cnp-b"], n=1, environment=CLONE, workers=1)
+    assert benchmark.executions == ("challenge",)
+    assert benchmark.results["cnp-b"][0]["executed"]["challenge"]["success"]
+    assert "executed by the challenge plant" in save_benchmark_report(benchmark, tmp_path / "report.html").read_text()
 
 
 @pytest.mark.slow
-def test_the_command_line_executes_there_and_refuses_what_is_no_clone(plans: Plans, tmp_path: Path) -> None:
+def test_the_command_line_executes_in_the_challenge_and_refuses_other_folders(plans: Plans, tmp_path: Path) -> None:
     save_plans(tmp_path / "plans.h5", plans[:1])
 
     def run(folder: Path) -> subprocess.CompletedProcess[str]:
@@ -76,7 +76,7 @@ def test_the_command_line_executes_there_and_refuses_what_is_no_clone(plans: Pla
 
 
 def clone(folder: Path, **files: str) -> Path:
-    """A clone with some files changed; their names without the folder of environments."""
+    """Copy the clone and replace some modules of its environments."""
     shutil.copytree(CLONE, folder)
     for name, text in files.items():
         (folder / "air_hockey_challenge" / "environments" / f"{name}.py").write_text(text, encoding="utf-8")
@@ -84,15 +84,15 @@ def clone(folder: Path, **files: str) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("files", "said"),
+    ("files", "message"),
     [
         ({"position_control_wrapper": "import mushroom_rl_that_is_missing"}, "cannot be imported"),
         ({"position_control_wrapper": "class PositionControlIIWA: pass"}, "has a version that cnpgen does not support"),
         ({"iiwas": "class AirHockeyIIWA: pass"}, "has a version that cnpgen does not support"),
     ],
 )
-def test_a_clone_that_cannot_be_used_is_told_of(files: dict[str, str], said: str, tmp_path: Path) -> None:
-    """In a process of its own: modules of one name are imported once."""
+def test_an_unusable_clone_is_reported(files: dict[str, str], message: str, tmp_path: Path) -> None:
+    """Use a separate process, because modules of one name are imported once."""
     folder = clone(tmp_path / "clone", **files)
     code = f"""
 from cnpgen.errors import MachineError
@@ -103,10 +103,10 @@ except MachineError as error:
     print(error)
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert said in done.stdout
+    assert message in done.stdout
 
 
-def test_another_clone_that_is_already_imported_is_not_mistaken_for_it(tmp_path: Path) -> None:
+def test_an_imported_clone_is_not_confused_with_another(tmp_path: Path) -> None:
     challenge_plant(CLONE)
     with pytest.raises(MachineError, match="hidden by an installed copy"):
         challenge_plant(clone(tmp_path / "clone"))

@@ -1,4 +1,4 @@
-"""Hits that score, that miss the goal and that miss the puck; objects carried, and dragged through a pedestal."""
+"""Hits that score or miss the goal or the puck; transports with and without collision."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,7 +8,7 @@ import pytest
 
 from cnpgen.benchmark.simulator.execute import execute
 from cnpgen.benchmark.simulator.plant import PLANTS, as_plant
-from cnpgen.benchmark.simulator.reference import TICK, Reference
+from cnpgen.benchmark.simulator.reference import TICK_S, Reference
 from cnpgen.benchmark.simulator.simulate import execute_plan, simulate_plans, simulator_scene
 from cnpgen.errors import UsageError
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
@@ -21,19 +21,19 @@ from tests.examples.plans import ROBOTS, load
 pytest.importorskip("mujoco")
 
 
-def straight(folder: Path, target: str) -> Plans:
-    """A valid hit that sends its puck exactly towards a place."""
+def hit_towards(folder: Path, target: str) -> Plans:
+    """Return a valid hit that sends its puck towards a target."""
     recipe = (list_recipes("pipeline")["airhockey-hit"]).read_text(encoding="utf-8")
     path = folder / "pipeline.toml"
     path.write_text(recipe.replace("0.3 rad", "0 rad").replace("[2.49, 0] m", target), encoding="utf-8")
-    found = solve_plans(draw_boundary_problems(path, 1, seed=3), workers=1)
-    assert found.valid.all()
-    return found.plans
+    solved = solve_plans(draw_boundary_problems(path, 1, seed=3), workers=1)
+    assert solved.valid.all()
+    return solved.plans
 
 
 @pytest.fixture(scope="module")
 def hit(tmp_path_factory: pytest.TempPathFactory) -> Plans:
-    return straight(tmp_path_factory.mktemp("hit"), "[2.49, 0] m")
+    return hit_towards(tmp_path_factory.mktemp("hit"), "[2.49, 0] m")
 
 
 def stored(label: str) -> Plans:
@@ -56,12 +56,12 @@ def test_a_valid_hit_scores_on_every_plant(hit: Plans, plant: str) -> None:
     assert executed.torque_use < 1
 
 
-def test_a_hit_that_is_03_rad_off_hits_and_does_not_score(tmp_path: Path) -> None:
-    plan = straight(tmp_path, "[2.49, 0.47] m")
+def test_a_hit_with_an_angle_error_of_03_rad_does_not_score(tmp_path: Path) -> None:
+    plan = hit_towards(tmp_path, "[2.49, 0.47] m")
     goal, (velocity, _, _) = plan.columns["goal_xyz"][0], np.array([2.49, 0.0, 0.16]) - plan.columns["goal_xyz"][0]
     (executed,) = simulate_plans(plan, workers=1).executed
-    off = np.arctan2(0.47 - goal[1], 2.49 - goal[0]) - np.arctan2(-goal[1], velocity)
-    assert off == pytest.approx(0.3, abs=0.05)
+    angle = np.arctan2(0.47 - goal[1], 2.49 - goal[0]) - np.arctan2(-goal[1], velocity)
+    assert angle == pytest.approx(0.3, abs=0.05)
     assert executed.finished
     assert executed.hit
     assert not executed.scored
@@ -69,7 +69,7 @@ def test_a_hit_that_is_03_rad_off_hits_and_does_not_score(tmp_path: Path) -> Non
 
 
 def raised(reference: Reference, height: float) -> Reference:
-    """The same motion with the arm lifted: the tip passes over the puck."""
+    """Lift the arm, so that the tip passes over the puck."""
     lifted = reference.q.copy()
     lifted[:, 3] += height
     return replace(reference, q=lifted)
@@ -78,16 +78,16 @@ def raised(reference: Reference, height: float) -> Reference:
 def test_a_motion_5_cm_too_high_misses_the_puck(hit: Plans) -> None:
     scene, reference, execution = execute_plan(hit, PLANTS["nominal"])
     goal = hit.columns["goal_xyz"][0]
-    for turn in (-0.08, 0.08):
-        found = execute(scene, raised(reference, turn), goal)
-        if found.tip[reference.ticks, 2] > execution.tip[reference.ticks, 2] + 0.05:
-            assert not found.executed.hit
-            assert not found.executed.scored
+    for change in (-0.08, 0.08):
+        lifted = execute(scene, raised(reference, change), goal)
+        if lifted.tip[reference.ticks, 2] > execution.tip[reference.ticks, 2] + 0.05:
+            assert not lifted.executed.hit
+            assert not lifted.executed.scored
             return
-    raise AssertionError("neither way lifts the tip by 5 cm")
+    raise AssertionError("neither change lifts the tip by 5 cm")
 
 
-def test_the_puck_lies_where_it_did_if_a_joint_has_the_name_of_the_tip(hit: Plans) -> None:
+def test_the_puck_is_placed_by_the_tip_frame_if_a_joint_has_the_same_name(hit: Plans) -> None:
     urdf = hit.problem.urdf.replace('joint name="world_F_base_joint"', 'joint name="striker_tip"')
     assert urdf != hit.problem.urdf
     same = replace(hit, problem=replace(hit.problem, urdf=urdf))
@@ -96,7 +96,7 @@ def test_the_puck_lies_where_it_did_if_a_joint_has_the_name_of_the_tip(hit: Plan
     np.testing.assert_array_equal(simulator_scene(same, PLANTS["nominal"]).puck, puck)
 
 
-def test_a_puck_in_the_way_is_touched_early(hit: Plans) -> None:
+def test_a_puck_on_the_path_is_touched_early(hit: Plans) -> None:
     scene, reference, execution = execute_plan(hit, PLANTS["nominal"])
     goal = hit.columns["goal_xyz"][0]
     halfway = execution.tip[reference.ticks // 2, :2]
@@ -126,29 +126,29 @@ def test_an_object_dragged_through_a_pedestal_collides() -> None:
 
 
 @pytest.mark.slow
-def test_two_processes_execute_as_one_does(hit: Plans) -> None:
+def test_two_processes_give_the_results_of_one(hit: Plans) -> None:
     plans = concatenate([hit] * 3)
     one, two = (simulate_plans(plans, workers=workers).executed for workers in (1, 2))
-    assert [each.to_dict() for each in one] == [each.to_dict() for each in two]
-    assert one[0].to_dict() == one[2].to_dict()  # nothing of a plan is left in the world of the next
+    assert [result.to_dict() for result in one] == [result.to_dict() for result in two]
+    assert one[0].to_dict() == one[2].to_dict()  # executions are independent
 
 
-def test_a_plan_that_is_none_is_not_executed_and_the_others_are(hit: Plans) -> None:
+def test_an_invalid_plan_does_not_affect_the_others(hit: Plans) -> None:
     good = hit
     bad = replace(good, rate_control_points=-good.rate_control_points)
-    found = simulate_plans(concatenate([bad, good]), workers=1)
-    assert "cannot be executed" in found.executed[0].failure
-    assert not found.executed[0].success
-    assert found.executed[1].success
-    assert found.summary()["success"] == 1
-    assert found.summary()["plans"] == 2
+    simulation = simulate_plans(concatenate([bad, good]), workers=1)
+    assert "cannot be executed" in simulation.executed[0].failure
+    assert not simulation.executed[0].success
+    assert simulation.executed[1].success
+    assert simulation.summary()["success"] == 1
+    assert simulation.summary()["plans"] == 2
 
 
-def test_a_plan_that_ends_too_fast_to_be_stopped_is_not_executed(hit: Plans) -> None:
+def test_a_plan_that_cannot_be_stopped_is_not_executed(hit: Plans) -> None:
     rate = hit.rate_control_points.copy()
     rate[:, -1] = 1e9
-    (found,) = simulate_plans(replace(hit, rate_control_points=rate), workers=1).executed
-    assert "s to stop cannot be executed" in found.failure
+    (executed,) = simulate_plans(replace(hit, rate_control_points=rate), workers=1).executed
+    assert "s to stop cannot be executed" in executed.failure
 
 
 def test_an_unknown_plant_is_refused_by_name() -> None:
@@ -162,16 +162,16 @@ def test_the_robot_stops_after_a_hit_within_its_limits(hit: Plans) -> None:
     after = slice(reference.ticks, None)
     assert np.abs(reference.dq[-1]).max() == 0
     assert np.all(np.abs(reference.ddq[after]) <= limit * (1 + 1e-12))
-    step = np.diff(reference.q, axis=0) - TICK * (reference.dq[1:] + reference.dq[:-1]) / 2
-    assert np.abs(step).max() < 1e-5  # positions and velocities belong together, across the end of the plan as well
+    step = np.diff(reference.q, axis=0) - TICK_S * (reference.dq[1:] + reference.dq[:-1]) / 2
+    assert np.abs(step).max() < 1e-5  # consistent positions and velocities, also across the end of the plan
 
 
-def test_where_a_torque_saturates_the_arm_is_still_held_up() -> None:
-    """A jump of a tenth of a radian asks for more than the motors have; the robot arrives, late, and does not fall."""
+def test_holding_torque_has_priority_if_a_motor_saturates() -> None:
+    """Follow a jump of 0.1 rad, which exceeds the motors: the robot arrives late and does not fall."""
     scene, reference, _ = execute_plan(stored("transport"), PLANTS["nominal"])
     q = np.vstack([reference.q[-1:] - 0.1, np.repeat(reference.q[-1:], 2000, axis=0)])
     jump = Reference(q, np.zeros_like(q), np.zeros_like(q), 2.0)
-    away = replace(scene, obstacle_poses=scene.obstacle_poses - 2)
-    found = execute(away, jump, stored("transport").columns["goal_xyz"][0])
-    assert found.executed.torque_use == pytest.approx(1)
-    assert found.executed.finished
+    without_obstacles = replace(scene, obstacle_poses=scene.obstacle_poses - 2)
+    execution = execute(without_obstacles, jump, stored("transport").columns["goal_xyz"][0])
+    assert execution.executed.torque_use == pytest.approx(1)
+    assert execution.executed.finished

@@ -1,4 +1,4 @@
-"""The simulated arm is the URDF's: its dynamics are Pinocchio's, and it keeps its energy where nothing brakes it."""
+"""The simulated arm, compared with Pinocchio: dynamics, kinematics, energy and distances."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -34,7 +34,7 @@ def without_friction(simulated: SimulatorScene, step: float = 1e-4) -> "mujoco.M
 
 
 def with_tool() -> SimulatorScene:
-    """The heavy object held by a tool, with another body and other motors: all said in the problem, not in the URDF."""
+    """Define a tool, a payload and torque limits in the problem, not in the URDF."""
     shipped = PROBLEMS["heavy-object"]
     problem = replace(
         shipped,
@@ -49,14 +49,14 @@ def test_a_tool_and_a_payload_of_the_problem_are_simulated() -> None:
     compare_with_pinocchio(with_tool())
 
 
-def test_names_of_strangers_are_no_part_of_the_scene(tmp_path: Path) -> None:
-    """Joints and obstacles may be called anything; what MuJoCo reads names no other file."""
+def test_names_of_joints_and_obstacles_are_not_written(tmp_path: Path) -> None:
+    """Use names that would include a file if they were written to the MJCF text."""
     name = f'x"/><include file="{tmp_path / "private.xml"}"/><geom name="'
     shipped, robot = PROBLEMS["heavy-object"], ROBOTS["heavy-object"]
     problem = replace(
         shipped,
         robot=replace(shipped.robot, joints=(name, *shipped.robot.joints[1:])),
-        obstacle=tuple(replace(each, name=f"{name}{number}") for number, each in enumerate(shipped.obstacle)),
+        obstacle=tuple(replace(obstacle, name=f"{name}{number}") for number, obstacle in enumerate(shipped.obstacle)),
     )
     text = robot.urdf_text.replace('"joint_1"', quoteattr(name))
     urdf = tmp_path / "arm.urdf"
@@ -71,15 +71,15 @@ def test_motors_saturate_at_the_torques_of_the_problem() -> None:
     tool = with_tool()
     control = Controller(tool.problem, tool.robot, tool.plant)
     still = np.zeros(tool.robot.n)
-    pulled = [control(tool.robot.base, still, (tool.robot.base + way, still, still)) for way in 10 * np.eye(7)]
+    torques = [control(tool.robot.base, still, (tool.robot.base + offset, still, still)) for offset in 10 * np.eye(7)]
     assert tool.problem.limits.torque is not None
     limit = np.array(tool.problem.limits.torque.values)
-    for torque in pulled:
+    for torque in torques:
         assert np.max(np.abs(torque) / limit) == pytest.approx(1)
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
-def test_inverse_dynamics_and_tip_are_those_of_pinocchio(name: str) -> None:
+def test_inverse_dynamics_and_tip_equal_those_of_pinocchio(name: str) -> None:
     compare_with_pinocchio(scene(name))
 
 
@@ -100,7 +100,7 @@ def compare_with_pinocchio(simulated: SimulatorScene) -> None:
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
-def test_a_falling_arm_keeps_its_energy(name: str) -> None:
+def test_a_falling_arm_conserves_energy(name: str) -> None:
     robot, model = ROBOTS[name], without_friction(scene(name))
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
     data, other = mujoco.MjData(model), robot.model.createData()
@@ -108,11 +108,11 @@ def test_a_falling_arm_keeps_its_energy(name: str) -> None:
     first = pin.computeMechanicalEnergy(robot.model, other, data.qpos[: robot.n].copy(), np.zeros(robot.n))
     mujoco.mj_step(model, data, 4000)
     q, dq = data.qpos[: robot.n].copy(), data.qvel[: robot.n].copy()
-    assert pin.computeKineticEnergy(robot.model, other, q, dq) > 1  # it does fall
+    assert pin.computeKineticEnergy(robot.model, other, q, dq) > 1  # the arm moves
     assert pin.computeMechanicalEnergy(robot.model, other, q, dq) == pytest.approx(first, abs=1e-5)
 
 
-def test_friction_takes_energy_from_a_falling_arm() -> None:
+def test_friction_dissipates_energy() -> None:
     robot = ROBOTS["airhockey"]
     model = mujoco.MjModel.from_xml_string(scene_xml(scene("airhockey")))
     data, other = mujoco.MjData(model), robot.model.createData()
@@ -134,21 +134,21 @@ def test_a_heavier_plant_has_a_tenth_more_mass() -> None:
 
 
 @pytest.mark.parametrize("restitution", [0.5, 0.75, 0.95])
-def test_a_bounce_is_as_strong_as_it_was_asked_to_be(restitution: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The puck meets a band, which cannot move: it comes back with so many times its speed, ten steps long."""
+def test_a_bounce_has_the_given_restitution(restitution: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compare the speeds of a puck before and after a band, which cannot move."""
     k, b = hockey.bounce(restitution)
     monkeypatch.setattr(hockey, "bounce", lambda: (k, b))
     hit = SimulatorScene(PROBLEMS["airhockey"], ROBOTS["airhockey"], PLANTS["nominal"], np.empty(0), np.zeros(2))
     model = mujoco.MjModel.from_xml_string(scene_xml(hit))
     model.dof_damping[-2:] = 0
     data = mujoco.MjData(model)
-    data.qpos[-2:], data.qvel[-2:] = (1.5, hockey.WIDTH / 2 - hockey.PUCK_RADIUS - 0.05), (0.0, 2.0)
+    data.qpos[-2:], data.qvel[-2:] = (1.5, hockey.WIDTH_M / 2 - hockey.PUCK_RADIUS_M - 0.05), (0.0, 2.0)
     mujoco.mj_step(model, data, 400)
     assert -data.qvel[-1] == pytest.approx(2.0 * restitution, abs=0.07)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_obstacles_of_every_kind_are_as_far_away_as_judges_say(kind: str) -> None:
+def test_distances_to_obstacles_of_every_kind_equal_those_of_the_judge(kind: str) -> None:
     problem, robot = PROBLEMS["heavy-object"], ROBOTS["heavy-object"]
     random = np.random.default_rng(6)
     obstacles = tuple(draw_obstacle(kind, random, spread=0.5) for _ in range(3))
@@ -163,6 +163,6 @@ def test_obstacles_of_every_kind_are_as_far_away_as_judges_say(kind: str) -> Non
         mujoco.mj_kinematics(model, data)
         for index, expected in enumerate(world.object_distances()):
             geom = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, f"obstacle {index + 1}")
-            found = mujoco.mj_geomDistance(model, data, held, geom, 10.0, None)
-            if expected > 0.01:  # the object is 2 mm smaller on every side than it is judged
-                assert 0 <= found - expected < 0.004
+            distance = mujoco.mj_geomDistance(model, data, held, geom, 10.0, None)
+            if expected > 0.01:  # the simulated object is 2 mm smaller on every side
+                assert 0 <= distance - expected < 0.004

@@ -1,6 +1,6 @@
-"""Ways to read a dataset in batches: cnpgen's, the ceiling, and what people write with torch and h5py.
+"""Methods of reading a dataset in batches: cnpgen, an array in memory as upper bound, torch and h5py.
 
-A way gives float32 tables of shape (B, D), normalised, C-contiguous, one after the other: all deliver the same bytes.
+A method yields normalized, C-contiguous float32 tables of shape (B, D); all yield the same rows.
 """
 
 from collections.abc import Callable, Iterator
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.loader import in_memory_rows as kept
+from cnpgen.loader import in_memory_rows
 from cnpgen.loader.batches import Batches
 from cnpgen.loader.dataset import Dataset
 
@@ -19,15 +19,15 @@ Tables = Iterator[NDArray[np.float32]]
 
 
 @dataclass
-class Way:
-    """One way, and what was measured of it.
+class Method:
+    """One method with its measurements.
 
     Attributes:
-        name: What it is.
-        order: How thoroughly it shuffles; only ways of the same order can be compared.
-        read: Gives the tables.
-        rows: Rows that are read per repetition, for slow ways not all of them.
-        tolerance: How far the mean of a column may be from that of all rows [standard deviations]; None if it is raw.
+        name: Description.
+        order: Extent of the shuffling; only methods of the same order are comparable.
+        read: Function that yields the tables.
+        rows: Rows per repetition; fewer than all for slow methods.
+        tolerance: Maximum error of the mean of a column [standard deviations]; None for raw rows.
         walls: Rows per second, one per repetition.
         cpus: Rows per second of CPU time of all processes.
     """
@@ -43,7 +43,7 @@ class Way:
 
 @dataclass(eq=False)
 class Reader:
-    """The training rows of a dataset, read in several ways.
+    """The training rows of a dataset, read by several methods.
 
     Attributes:
         dataset: The dataset.
@@ -55,13 +55,13 @@ class Reader:
 
     @cached_property
     def rows(self) -> int:
-        """Rows that fill whole batches."""
+        """Number of rows in complete batches."""
         rows = self.dataset.splits["train"]
         return rows - rows % self.batch_size
 
     @cached_property
     def table(self) -> NDArray[np.float32]:
-        """All rows, packed and normalised, shape (rows, D)."""
+        """All rows, packed and normalized, shape (rows, D)."""
         arrays = self.dataset.arrays("train", normalize=True, dtype="float32")
         return np.concatenate([values.reshape(len(values), -1) for values in arrays.values()], axis=1)
 
@@ -71,13 +71,13 @@ class Reader:
         return list(self.dataset["train"][0])
 
     def take(self) -> Tables:
-        """Take rows of the table in memory: the ceiling."""
+        """Take rows of the table in memory, an upper bound."""
         order = np.random.default_rng(0).permutation(len(self.table))
         for first in range(0, self.rows, self.batch_size):
             yield self.table.take(order[first : first + self.batch_size], axis=0)
 
     def shards(self) -> Tables:
-        """Read whole shards with h5py, not even normalised: what the files give."""
+        """Read whole shards with h5py, not normalized."""
         import h5py
 
         for shard in self.dataset.shards["train"]:
@@ -85,21 +85,21 @@ class Reader:
                 yield np.concatenate([file[name][()].reshape(shard.rows, -1) for name in self.names], axis=1)
 
     @cached_property
-    def kept(self) -> Batches:
-        """Batches of a split that is kept in memory after its first epoch."""
+    def in_memory(self) -> Batches:
+        """Batches of a split that stays in memory after its first epoch."""
         return self.dataset.batches(self.batch_size)
 
     def batches(self) -> Tables:
         """Read the batches of the next epoch with cnpgen."""
-        return (batch.table for batch in self.kept)
+        return (batch.table for batch in self.in_memory)
 
     def streamed(self, **options: Any) -> Tables:
-        """Read batches with cnpgen as if the split were too large to be kept: its files in every epoch."""
-        limit, kept.MAX_IN_MEMORY_BYTES = kept.MAX_IN_MEMORY_BYTES, 0
+        """Read batches with cnpgen from the files in every epoch, as for a split that exceeds the memory limit."""
+        limit, in_memory_rows.MAX_IN_MEMORY_BYTES = in_memory_rows.MAX_IN_MEMORY_BYTES, 0
         try:
             yield from (batch.table for batch in self.dataset.batches(self.batch_size, **options))
         finally:
-            kept.MAX_IN_MEMORY_BYTES = limit
+            in_memory_rows.MAX_IN_MEMORY_BYTES = limit
 
     def torch_batches(self, workers: int) -> Tables:
         """Read cnpgen's batches through a torch DataLoader."""
@@ -107,7 +107,7 @@ class Reader:
 
         from cnpgen.interop.torch import BatchDataset
 
-        for batch in DataLoader(BatchDataset(self.kept), batch_size=None, num_workers=workers):
+        for batch in DataLoader(BatchDataset(self.in_memory), batch_size=None, num_workers=workers):
             yield batch.table.numpy()
 
     def torch_rows(self, workers: int) -> Tables:
@@ -122,7 +122,7 @@ class Reader:
         )
 
     def torch_per_row(self, workers: int) -> Tables:
-        """Read row by row with h5py from files that stay open, as most people's first data set does."""
+        """Read row by row with h5py from open files."""
         from torch.utils.data import DataLoader
 
         rows = PerRow(self.dataset, self.names)
@@ -130,13 +130,13 @@ class Reader:
 
     @staticmethod
     def _packed(loader: Any) -> Tables:
-        """Lay tensors side by side."""
+        """Concatenate the tensors of a batch."""
         for batch in loader:
             yield np.concatenate([values.numpy().reshape(len(values), -1) for values in batch.values()], axis=1)
 
 
 class PerRow:
-    """A map-style dataset of single rows, read with h5py and normalised one by one.
+    """A map-style dataset of single rows, read with h5py and normalized one by one.
 
     Args:
         dataset: The dataset.

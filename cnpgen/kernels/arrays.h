@@ -1,0 +1,17 @@
+/* Arrays of doubles and compiled kernels, for handwritten C source; vectors.h precedes this file. A spline and its
+derivatives at the phases of a grid are sums of basis functions times control points: calls of `add`. */
+
+#define EACH(i, from, to) for (long i = (from); i < (to); i++)
+
+typedef void kernel(long n, const double *const *in, const long *distances, double *const *out);
+
+I v at(const double *p) { return *(const vu *)p; }
+I void put(double *p, v x) { *(vu *)p = x; }
+
+/* a += f b */
+static void add(double *restrict a, double f, const double *restrict b, long n) {
+  long i = 0;
+  for (; i + W <= n; i += W) put(a + i, at(a + i) + f * at(b + i));
+  for (; i < n; i++) a[i] += f * b[i];
+}
+

@@ -1,0 +1,29 @@
+"""Estimates of memory: requests that exceed the available memory are refused before they start."""
+
+from cnpgen.errors import UsageError
+
+BYTES_PER_FLOAT = 8
+
+
+def check_memory(argument: str, value: int, n_floats: int) -> None:
+    """Refuse a request whose arrays do not fit into the available memory.
+
+    Args:
+        argument: Name of the argument that determines the size.
+        value: Its value, for the error.
+        n_floats: Lower bound of the number of floats in memory at a time.
+
+    Raises:
+        UsageError: The arrays need more than the available memory.
+    """
+    needed, available = n_floats * BYTES_PER_FLOAT, available_bytes()
+    if needed > available:
+        text = f"{needed / 1e9:,.3g} GB of memory, {available / 1e9:,.3g} GB are available"
+        raise UsageError(f"must be smaller: {value:,} needs at least {text}", argument=argument)
+
+
+def available_bytes() -> int:
+    """Return the memory that new arrays can use without swapping."""
+    import psutil
+
+    return int(psutil.virtual_memory().available)

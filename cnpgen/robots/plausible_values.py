@@ -1,0 +1,114 @@
+"""Ranges of plausible values: numbers far outside of them are probably in another unit, such as degrees."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import UsageError
+from cnpgen.robots.robot import Robot
+from cnpgen.store.joint_units import unit_of
+
+Array = NDArray[np.float64]
+
+MAX_RANGE_RATIO = 2.0  # distance from the center of a joint's range, in half ranges
+MAX_LIMIT_RATIO = (
+    10.0  # of velocities, accelerations and positions of the tip; deg/s is 57 times rad/s, mm 1,000 times m
+)
+MAX_ANGLE_RAD = 2 * np.pi  # of directions
+OTHER_UNITS = {"rad": ("deg", 180 / np.pi), "m": ("mm", 1000.0)}  # unit -> likely other unit, factor
+
+
+class UnitError(UsageError):
+    """A value that is so far outside of its range that it is probably in another unit."""
+
+
+@dataclass(frozen=True)
+class ImplausibleValue:
+    """The first value of an array outside of its plausible range.
+
+    Attributes:
+        row: Index of its row.
+        column: Index of its column.
+        value: The value.
+        low: Lower end of the range.
+        high: Upper end of the range.
+        unit: Unit in which it is read.
+    """
+
+    row: int
+    column: int
+    value: float
+    low: float
+    high: float
+    unit: str
+
+    def __str__(self) -> str:
+        value, unit = f"{self.value:.6g}", self.unit
+        text = f"must be from {self.low:.3g} to {self.high:.3g} {unit}, got {value} {unit}"
+        base, slash, per = unit.partition("/")
+        if base not in OTHER_UNITS:
+            return text
+        name, factor = OTHER_UNITS[base]
+        other, converted = f"{name}{slash}{per}", f"{self.value / factor:.3g} {unit}"
+        if base == "rad":
+            text = f"{text}; {value} {unit} is {self.value * factor:.0f} {other}"
+        return f"{text}; did you mean {value} {other} = {converted}?"
+
+
+def find_implausible_value(robot: Robot, name: str, values: NDArray[Any], unit: str) -> ImplausibleValue | None:
+    """Find the first value outside of the plausible range of its quantity; nan and infinite values are ignored.
+
+    Args:
+        robot: Robot of the problem.
+        name: Name of the column: "start_q", "hit_angle", ...
+        values: Values, shape (N, width).
+        unit: Unit of the columns, as ``Field.unit``.
+    """
+    low, high = (np.broadcast_to(bound, values.shape[1:]) for bound in _plausible_range(robot, name, unit))
+    outside = np.isfinite(values) & ((values < low) | (values > high))
+    if not outside.any():
+        return None
+    row, column = np.argwhere(outside)[0].tolist()
+    bounds = float(low[column]), float(high[column])
+    return ImplausibleValue(row, column, float(values[row, column]), *bounds, unit_of(unit, column))
+
+
+def check_plausible(robot: Robot, columns: Mapping[str, NDArray[Any]], units: Mapping[str, str], *, noun: str) -> None:
+    """Raise an error for the first value that is probably in another unit.
+
+    Args:
+        robot: Robot of the problem.
+        columns: Name -> values, shape (N, width).
+        units: Name -> unit.
+        noun: Noun of a row: "task" or "plan".
+
+    Raises:
+        UnitError: A value is far outside of its range.
+    """
+    for name, values in columns.items():
+        wrong = find_implausible_value(robot, name, values, units[name])
+        if wrong is not None:
+            joint = f" of {robot.joint_names[wrong.column]}" if name.endswith("q") else ""
+            text, mark, hint = str(wrong).partition(";")
+            raise UnitError(f"{text} in {noun} {wrong.row}{joint}{mark}{hint}", argument=name)
+
+
+def _plausible_range(robot: Robot, name: str, unit: str) -> tuple[Any, Any]:
+    """Return the ends of the plausible range of a quantity, scalars or one per joint."""
+    if name.endswith("_q"):
+        low, high = robot.position_lower, robot.position_upper
+        with np.errstate(invalid="ignore"):
+            center, half = (low + high) / 2, MAX_RANGE_RATIO * (high - low) / 2
+        bounded = np.isfinite(half)
+        return np.where(bounded, center - half, -np.inf), np.where(bounded, center + half, np.inf)
+    limits = {"_dq": robot.velocity_limit, "_ddq": robot.acceleration_limit}
+    for suffix, limit in limits.items():
+        if name.endswith(suffix):
+            return -MAX_LIMIT_RATIO * limit, MAX_LIMIT_RATIO * limit
+    speed = float(np.linalg.norm(robot.velocity_limit)) if unit == "m/s" else 1.0
+    lengths = MAX_LIMIT_RATIO * robot.reach * speed
+    bound = {"rad": MAX_ANGLE_RAD, "m": lengths, "m/s": lengths}.get(unit, np.inf)
+    return -bound, bound

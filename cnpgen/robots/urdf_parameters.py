@@ -1,0 +1,186 @@
+"""Parameters of the links and joints of a URDF, read from its XML without Pinocchio."""
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from xml.etree.ElementTree import Element
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import RecipeError, nearest
+from cnpgen.robots.shape.convex_part import turned
+from cnpgen.robots.urdf import number_in, numbers_in
+
+Array = NDArray[np.float64]
+
+_MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+_PARTS = {  # element -> the elements whose numbers are read
+    "link": ("inertial",),
+    "inertial": ("origin", "mass", "inertia"),
+    "joint": ("origin", "axis", "limit", "parent", "child"),
+}
+_LIMITED = ("revolute", "prismatic")
+_TURNING_OR_SLIDING = (*_LIMITED, "continuous")
+_ZERO = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Pose of a frame in another one.
+
+    Attributes:
+        rotation: Rotation matrix, shape (3, 3).
+        translation: Origin [m], shape (3,).
+    """
+
+    rotation: Array
+    translation: Array
+
+    def of(self, inner: "Placement") -> "Placement":
+        """Return a placement in this frame as a placement in the frame around it."""
+        return Placement(self.rotation @ inner.rotation, self.rotation @ inner.translation + self.translation)
+
+
+IDENTITY = Placement(np.eye(3), np.zeros(3))
+
+
+@dataclass(frozen=True)
+class LinkInertia:
+    """Inertial parameters of a link.
+
+    Attributes:
+        mass: Mass [kg].
+        com: Placement of the center of mass and of the axes of the inertia in the link.
+        inertia: Inertia about the center of mass [kg m^2], shape (3, 3).
+    """
+
+    mass: float
+    com: Placement
+    inertia: Array
+
+
+@dataclass(frozen=True)
+class UrdfJoint:
+    """Joint of a URDF.
+
+    Attributes:
+        name: Name of the joint.
+        kind: Type of the joint.
+        parent: Link that carries the joint.
+        child: Link that the joint moves.
+        origin: Placement of the child at position zero in the parent.
+        axis: Unit axis, shape (3,).
+        limits: Limit -> value [rad, rad/s, N m, or with m and N]: "lower", "upper", "velocity" and "effort".
+    """
+
+    name: str
+    kind: str
+    parent: str
+    child: str
+    origin: Placement
+    axis: Array
+    limits: dict[str, float]
+
+
+@dataclass(frozen=True)
+class UrdfParameters:
+    """Links and joints of a URDF.
+
+    Attributes:
+        inertias: Link -> inertial parameters; None for links without them.
+        joints: Child link -> joint that moves it.
+    """
+
+    inertias: dict[str, LinkInertia | None]
+    joints: dict[str, UrdfJoint]
+
+
+def urdf_parameters(tree: Element) -> UrdfParameters:
+    """Read the numbers of all links and joints.
+
+    Args:
+        tree: Parsed URDF.
+
+    Raises:
+        RecipeError: A number is missing, is not finite or is not a plain decimal; the error lists all of them.
+    """
+    mistakes: list[str] = []
+    inertias: dict[str, LinkInertia | None] = {}
+    joints: dict[str, UrdfJoint] = {}
+    for link in tree.findall("link"):
+        _read_named(link, lambda link: inertias.update({link.get("name", ""): _inertia(link)}), mistakes)
+    for element in tree.findall("joint"):
+        _read_named(element, lambda element: joints.update({(joint := _joint(element)).child: joint}), mistakes)
+    if mistakes:
+        raise RecipeError(mistakes)
+    return UrdfParameters(inertias, joints)
+
+
+def _read_named(element: Element, read: Callable[[Element], None], mistakes: list[str]) -> None:
+    """Read an element; add its error to the mistakes, with the name of the element."""
+    try:
+        for problem in _unread(element):
+            raise ValueError(problem)
+        read(element)
+    except ValueError as error:
+        mistakes.append(f"{element.tag} {element.get('name', '')!r}: {error}")
+
+
+def _unread(element: Element) -> Iterator[str]:
+    """Yield error messages for elements that a parser ignores: repeated or misspelled ones."""
+    parts = _PARTS.get(element.tag, ())
+    for tag in parts:
+        if (count := len(element.findall(tag))) > 1:
+            yield f"it has {count} elements <{tag}>, expected one"
+    for child in element:
+        if child.tag not in parts and child.tag.lower() in parts:
+            yield f"<{child.tag}> is not an element of a URDF{nearest(child.tag, parts)}"
+        if child.tag in parts:
+            yield from _unread(child)
+
+
+def _inertia(link: Element) -> LinkInertia | None:
+    element = link.find("inertial")
+    if element is None:
+        return None
+    mass, tensor = element.find("mass"), element.find("inertia")
+    if mass is None or mass.get("value") is None:
+        raise ValueError("its <inertial> has no <mass value=...>")
+    if tensor is None:
+        moments = dict.fromkeys(_MOMENTS, 0.0)
+    else:
+        if missing := [name for name in _MOMENTS if tensor.get(name) is None]:
+            raise ValueError(f"its <inertia> has no {', '.join(missing)}: all of its numbers would be ignored")
+        moments = {name: number_in(tensor, name, 0.0) for name in _MOMENTS}
+    rows = (("ixx", "ixy", "ixz"), ("ixy", "iyy", "iyz"), ("ixz", "iyz", "izz"))
+    matrix = np.array([[moments[name] for name in row] for row in rows])
+    return LinkInertia(number_in(mass, "value", 0.0), _placement(element), matrix)
+
+
+def _joint(element: Element) -> UrdfJoint:
+    limit, kind = element.find("limit"), element.get("type", "")
+    keys = ("velocity", "effort") if kind == "continuous" else ("lower", "upper", "velocity", "effort")
+    limits = {} if limit is None else {key: number_in(limit, key, 0.0) for key in keys}
+    ends = {tag: found.get("link", "") for tag in ("parent", "child") if (found := element.find(tag)) is not None}
+    axis = np.array(numbers_in(element.find("axis"), "xyz", (1.0, 0.0, 0.0)))
+    length = float(np.linalg.norm(axis))
+    if kind in _TURNING_OR_SLIDING and not math.isfinite(1 / length if length else math.inf):
+        raise ValueError(f"<axis xyz={element.find('axis').get('xyz')!r}> has no direction")  # type: ignore[union-attr]
+    return UrdfJoint(
+        name=element.get("name", ""),
+        kind=kind,
+        parent=ends.get("parent", ""),
+        child=ends.get("child", ""),
+        origin=_placement(element),
+        axis=axis / (length or 1.0),
+        limits=limits if kind in _TURNING_OR_SLIDING else {},
+    )
+
+
+def _placement(element: Element) -> Placement:
+    """Return the <origin> of an element."""
+    origin = element.find("origin")
+    if origin is not None and origin.get("quat_xyzw") is not None:
+        raise ValueError("<origin quat_xyzw=...> is not supported: give rpy, the angles of roll, pitch and yaw")
+    return Placement(turned(*numbers_in(origin, "rpy", _ZERO)), np.array(numbers_in(origin, "xyz", _ZERO)))

@@ -1,0 +1,247 @@
+"""Type checks of the arguments of public functions and of the fields of options, by their annotations."""
+
+import collections.abc
+import dataclasses
+import functools
+import inspect
+import math
+import os
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from types import UnionType
+from typing import Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from cnpgen.errors import CnpgenError, UsageError, either, nearest
+from cnpgen.schema.arguments import flag, integer, number, reject_masked
+
+P = ParamSpec("P")
+R = TypeVar("R")
+Check = Callable[[str, Any], Any]
+"""Returns a checked argument, by its name and value; raises UsageError."""
+
+NOUNS = {  # class name -> description for messages; arguments of these classes are checked before the call
+    "Plans": "Plans, as load_plans and make_plans return them",
+    "Boundary": "a Boundary, such as plans.boundary",
+    "Planner": "a Planner",
+    "Tasks": "Tasks, as BoundaryLayer.tasks returns them",
+    "Benchmark": "a Benchmark, as run_benchmark returns it",
+}
+_ARRAYS = set(get_args(ArrayLike))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Checks:
+    """Checks of the parameters of a function.
+
+    Attributes:
+        names: Names of the positional parameters.
+        first: Checks before the call, by name: of types that the function would accept or misread.
+        late: Checks after a call that raised another error than a ``CnpgenError``.
+    """
+
+    names: tuple[str, ...]
+    first: dict[str, Check]
+    late: dict[str, Check]
+
+    def run(self, checks: dict[str, Check], args: tuple[Any, ...], keywords: dict[str, Any]) -> None:
+        """Raise a UsageError for the first invalid argument."""
+        for name, value in (*zip(self.names, args, strict=False), *keywords.items()):
+            if name in checks:
+                checks[name](name, value)
+
+
+def checked_arguments(function: Callable[P, R]) -> Callable[P, R]:
+    """Check the types of the arguments of every call by the annotations.
+
+    Flags, texts, functions, masked arrays and the classes of ``NOUNS`` are checked first. The function itself checks
+    ranges and shapes. If it raises another error than a ``CnpgenError``, the types of all arguments are compared with
+    the annotations, and the first wrong one becomes a UsageError.
+    """
+
+    @functools.cache
+    def checks() -> _Checks:
+        parameters = inspect.signature(function).parameters.values()
+        names = tuple(p.name for p in parameters if p.kind in {p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD})
+        annotations = {p.name: p.annotation for p in parameters if p.kind != p.VAR_KEYWORD and p.annotation != p.empty}
+        hints = {name: _evaluated(function, hint) for name, hint in annotations.items()}
+        found = {name: _check_of(hint) for name, hint in hints.items()}
+        late = {name: check for name, check in found.items() if check is not None}
+        return _Checks(names, {name: check for name, check in late.items() if _is_first(hints[name])}, late)
+
+    @functools.wraps(function)
+    def call(*args: P.args, **keywords: P.kwargs) -> R:
+        known = checks()
+        known.run(known.first, args, keywords)
+        try:
+            return function(*args, **keywords)
+        except CnpgenError:
+            raise
+        except Exception:
+            known.run(known.late, args, keywords)
+            raise
+
+    return call
+
+
+def _is_first(hint: Any) -> bool:
+    """Whether a wrong type must be found before the call."""
+    present = _alternatives(hint)
+    if len(present) != 1:
+        return set(present) >= _ARRAYS
+    (kind,) = present
+    kind = get_origin(kind) or kind
+    return kind in {bool, str, collections.abc.Callable, np.ndarray} or getattr(kind, "__name__", kind) in NOUNS
+
+
+def _alternatives(hint: Any) -> tuple[Any, ...]:
+    """Return the alternatives of an annotation without None."""
+    options = get_args(hint) if get_origin(hint) in {Union, UnionType} else (hint,)
+    return tuple(option for option in options if option is not type(None))
+
+
+def _evaluated(function: Callable[..., Any], annotation: Any) -> Any:
+    """Evaluate a postponed annotation; return its text if a name in it is imported for type checkers only."""
+    if not isinstance(annotation, str):
+        return annotation
+    with suppress(NameError):
+        return eval(annotation, vars(collections.abc) | inspect.unwrap(function).__globals__)  # noqa: S307 - text of a source file of this package
+    return annotation
+
+
+def check_fields(options: Any) -> None:
+    """Check the fields of a frozen dataclass by their annotations; convert NumPy's scalars.
+
+    Raises:
+        UsageError: A field has the wrong type.
+    """
+    for name, check in _field_checks(type(options)):  # type: ignore[arg-type]
+        object.__setattr__(options, name, check(name, getattr(options, name)))
+
+
+@functools.cache
+def _field_checks(cls: type) -> tuple[tuple[str, Check], ...]:
+    hints = get_type_hints(cls)
+    found = ((entry.name, _check_of(hints[entry.name], strict=True)) for entry in dataclasses.fields(cls))
+    return tuple((name, check) for name, check in found if check is not None)
+
+
+def _check_of(hint: Any, *, strict: bool = False) -> Check | None:
+    """Return the check of an annotation; None if every value is accepted.
+
+    Args:
+        hint: The annotation.
+        strict: Whether arrays must be arrays of NumPy, and numbers may be infinite, as in fields.
+    """
+    options = _alternatives(hint)
+    arrays = set(options) >= _ARRAYS
+    present = [option for option in options if not (arrays and option in _ARRAYS)]
+    checks: list[Check] = [_masked] if arrays else []
+    if set(present) >= {str, Path}:
+        checks.append(_path)
+        present = [option for option in present if option not in {str, Path}]
+    for option in present:
+        check = _check_of_type(option, strict=strict)
+        if check is None:
+            return None
+        checks.append(check)
+    optional = hint != options[0] and type(None) in get_args(hint)
+
+    def check_options(name: str, value: Any) -> Any:
+        if optional and value is None:
+            return value
+        mistakes = []
+        for check in checks:
+            try:
+                return check(name, value)
+            except UsageError as error:
+                mistakes.append(error.args[0])
+        expected = either([mistake.partition(", got ")[0].removeprefix("must be ") for mistake in mistakes])
+        got = mistakes[0].partition(", got ")[2]
+        raise UsageError(f"must be {expected}, got {got}" if len(mistakes) > 1 else mistakes[0], argument=name)
+
+    return check_options if checks else None
+
+
+def _check_of_type(hint: Any, *, strict: bool) -> Check | None:
+    """Return the check of one alternative of an annotation."""
+    if isinstance(hint, str):
+        return functools.partial(_named, hint) if hint.isidentifier() else None
+    kind = get_origin(hint) or hint
+    if kind is Literal:
+        return functools.partial(_choice, get_args(hint))
+    known: dict[Any, Check] = {int: _whole, bool: flag, str: _text, float: _real if strict else number}
+    known |= {collections.abc.Callable: _callable, np.ndarray: _array if strict else _masked}
+    if kind in known:
+        return known[kind]
+    if not inspect.isclass(kind) or kind is object or getattr(kind, "_is_protocol", False):
+        return None
+    if kind in {collections.abc.Iterable, collections.abc.Sequence}:
+        return functools.partial(_collection, kind)
+    return functools.partial(_instance, kind)
+
+
+def _masked(name: str, value: Any) -> Any:
+    reject_masked(name, value)
+    return value
+
+
+def _array(name: str, value: Any) -> Any:
+    reject_masked(name, value)
+    if not isinstance(value, np.ndarray):
+        raise UsageError(f"must be an array of NumPy, got {type(value).__name__}", argument=name)
+    return value
+
+
+def _whole(name: str, value: Any) -> int:
+    return integer(name, value, least=None)
+
+
+def _real(name: str, value: Any) -> float:
+    """Return a number; accept infinity."""
+    return value if isinstance(value, float) and math.isinf(value) else number(name, value)
+
+
+def _text(name: str, value: Any) -> str:
+    if not isinstance(value, str):
+        raise UsageError(f"must be a text, got {value!r:.100}", argument=name)
+    return value
+
+
+def _path(name: str, value: Any) -> str | Path:
+    """Return a name or a path; reject empty ones, and null characters, which no operating system accepts."""
+    if not isinstance(value, str | os.PathLike) or not os.fspath(value) or "\0" in str(value):
+        raise UsageError(f"must be a name or a path, got {value!r:.100}", argument=name)
+    return value if isinstance(value, str) else Path(value)
+
+
+def _callable(name: str, value: Any) -> Any:
+    if not callable(value):
+        raise UsageError(f"must be a function, got {value!r:.100}", argument=name)
+    return value
+
+
+def _choice(choices: tuple[Any, ...], name: str, value: Any) -> Any:
+    if not isinstance(value, str) or value not in choices:
+        hint = nearest(value, choices) if isinstance(value, str) else ""
+        raise UsageError(f"must be one of {', '.join(map(str, choices))}, got {value!r:.100}{hint}", argument=name)
+    return value
+
+
+def _collection(kind: type, name: str, value: Any) -> Any:
+    if not isinstance(value, kind) or isinstance(value, str | bytes):
+        raise UsageError(f"must be a list, got {value!r:.100}", argument=name)
+    return value
+
+
+def _instance(kind: type, name: str, value: Any) -> Any:
+    return value if isinstance(value, kind) else _named(kind.__name__, name, value)
+
+
+def _named(kind: str, name: str, value: Any) -> Any:
+    if kind not in {base.__name__ for base in type(value).__mro__}:
+        raise UsageError(f"must be {NOUNS.get(kind, f'of type {kind}')}, got {type(value).__name__}", argument=name)
+    return value

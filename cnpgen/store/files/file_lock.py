@@ -1,0 +1,66 @@
+"""Locks of files, for one process at a time; a lock ends with its process."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import IO
+
+from cnpgen.errors import UsageError
+from cnpgen.store.files.atomic import machine_error
+
+
+def try_lock(file: IO[bytes]) -> bool:
+    """Lock an open file; return False if another process holds the lock, True where there are no locks."""
+    try:
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except (ImportError, OSError):  # Windows, and file systems without locks
+        return True
+    return True
+
+
+def unlock(file: IO[bytes]) -> None:
+    """Release the lock on a file, even if processes that were forked meanwhile have it open."""
+    with suppress(ImportError, OSError):
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_UN)
+
+
+@contextmanager
+def output_lock(out: Path, lock: Path) -> Iterator[None]:
+    """Refuse a second process that writes the same output, while the block runs.
+
+    Args:
+        out: The output, for the message.
+        lock: The lock file, which exists while the block runs.
+
+    Raises:
+        UsageError: Another process writes the output.
+        MachineError: The lock file cannot be created.
+    """
+    try:
+        file = lock.open("ab")
+    except OSError as error:
+        raise machine_error("write", lock, error) from error
+    with file:
+        if not try_lock(file) or not _is_present(file, lock):
+            raise UsageError(
+                f"another process is writing {out}: wait for it, or choose another {{out}}", remedies={"out": None}
+            )
+        try:
+            yield
+        finally:
+            lock.unlink(missing_ok=True)
+            unlock(file)
+
+
+def _is_present(file: IO[bytes], path: Path) -> bool:
+    """Return whether an open file still has its name; the previous owner of a lock removes its file."""
+    with suppress(OSError):
+        return os.path.samestat(os.fstat(file.fileno()), path.stat())
+    return False
