@@ -101,7 +101,9 @@ def _run(command: list[str], seconds: float, purpose: str) -> "subprocess.Comple
             _kill(process)
             if isinstance(error, subprocess.TimeoutExpired):
                 hint = "set CC to another compiler, or choose the NumPy backend"
-                raise MachineError(f"the C compiler {command[0]} took more than {seconds:g} s {purpose}: {hint}") from error
+                raise MachineError(
+                    f"the C compiler {command[0]} took more than {seconds:g} s {purpose}: {hint}"
+                ) from error
             raise
         finally:
             _running.discard(process)

@@ -95,6 +95,6 @@ class CompilerPool:
 
         if self._pool is not None:
             self._pool.shutdown(wait=False, cancel_futures=True)
-            while wait(self._jobs.values(), timeout=0).not_done:
+            while running := [job for job in self._jobs.values() if not job.done()]:  # canceled jobs are done
                 kill_compilers()
-                wait(self._jobs.values(), timeout=_KILL_INTERVAL_S)
+                wait(running, timeout=_KILL_INTERVAL_S)

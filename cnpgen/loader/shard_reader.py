@@ -34,7 +34,7 @@ class ShardReader:
     def __init__(self, *, verify: bool) -> None:
         self._verify = verify
         self._placements: dict[Path, dict[str, Placement]] = {}  # of the checked shards
-        self._checked: set[tuple[Path, str]] = set()  # fields whose values are checked
+        self._checked: dict[Path, dict[str, Field]] = {}  # name -> field whose shape, type and values are checked
         self._maps: dict[Path, mmap.mmap] = {}
 
     def __getstate__(self) -> dict[str, Any]:
@@ -56,8 +56,9 @@ class ShardReader:
         """
         placements = self._header(shard, fields)
         columns = read_columns(shard, placements, [field.name for field in fields])
-        check_values(shard, {name: item for name, item in columns.items() if (shard.path, name) not in self._checked})
-        self._checked.update((shard.path, name) for name in columns)
+        checked = self._checked.setdefault(shard.path, {})
+        check_values(shard, {name: item for name, item in columns.items() if name not in checked})
+        checked.update((field.name, field) for field in fields)
         return columns
 
     def map(self, shard: Shard, fields: Sequence[Field]) -> Rows:
@@ -79,7 +80,7 @@ class ShardReader:
         placements = self._header(shard, fields)
         selected = {field.name: placements[field.name] for field in fields}
         mapped = None
-        checked = all((shard.path, name) in self._checked for name in selected)
+        checked = self._checked.get(shard.path, {}).keys() >= selected.keys()
         if checked and all(place.offset is not None and place.dtype.isnative for place in selected.values()):
             mapped = self._map(shard)
         if mapped is None:
@@ -95,8 +96,10 @@ class ShardReader:
                 raise DatasetError(f"{digest_problem(shard.path)}; {RERUN_HINT}")
             self._placements[shard.path] = check_header(shard)
         placements = self._placements[shard.path]
+        checked = self._checked.get(shard.path, {})
         for field in fields:
-            check_field(shard, field, placements.get(field.name))
+            if checked.get(field.name) is not field:
+                check_field(shard, field, placements.get(field.name))
         return placements
 
     def _map(self, shard: Shard) -> mmap.mmap | None:

@@ -1,7 +1,14 @@
 """Clusters of dask and ray through their own interfaces; joblib's interface cannot report missing workers."""
 
 import importlib
+import importlib.metadata
+import importlib.util
 import logging
+import os
+import re
+import secrets
+import socket
+import sys
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
@@ -10,10 +17,18 @@ from functools import partial
 from itertools import islice
 from typing import Any, TypeVar
 
-from cnpgen.errors import MachineError, requires_extra
+from cnpgen.errors import MachineError, UsageError, requires_extra
 from cnpgen.machine.workers import DIED, signals_blocked
 
 POLL_INTERVAL_S = 1.0  # between two checks for finished tasks and workers
+CONNECTION_TIMEOUT_S = 10.0
+CLOSING_TIMEOUT_S = 3.0
+LOOPBACK = "127.0.0.1"
+MIN_RAY_VERSION = (2, 52)  # the first one with tokens
+_ADDRESSES = {  # name -> pattern of addresses, examples
+    "dask": (r"((tcp|tls|ws|wss|ucx|inproc)://)?[^\s/:]+:\d{1,5}|inproc://\S+", "tcp://host:8786 or tls://host:8786"),
+    "ray": (r"auto|(ray://)?[^\s/:]+:\d{1,5}", "host:6379 or auto"),
+}
 FIRST_WARNING_S = 10.0  # time without workers before the first warning; doubled for each further warning
 _LOG = logging.getLogger(__name__)
 
@@ -109,9 +124,13 @@ class _Dask(Cluster):
     def finished(self, tickets: Sequence[Any], seconds: float) -> Sequence[Any]:
         from distributed import wait
 
-        with suppress(TimeoutError), self._client.as_current():
-            return list(wait(tickets, timeout=seconds, return_when="FIRST_COMPLETED").done)
-        return []
+        try:
+            with self._client.as_current():
+                return list(wait(tickets, timeout=seconds, return_when="FIRST_COMPLETED").done)
+        except TimeoutError:
+            return []
+        except _lost_of_dask() as error:
+            raise MachineError(f"the connection to {self._name} is lost") from error
 
     def result(self, ticket: Any) -> Any:
         from distributed.scheduler import KilledWorker
@@ -129,22 +148,29 @@ class _Dask(Cluster):
 
 
 def _lost_of_dask() -> tuple[type[BaseException], ...]:
+    from asyncio import CancelledError as AsyncioCancelledError
     from concurrent.futures import CancelledError
 
-    from distributed.client import FutureCancelledError
+    from distributed import client
+    from distributed.comm import CommClosedError
 
-    return CancelledError, FutureCancelledError
+    names = ("FutureCancelledError", "FuturesCancelledError")
+    cancelled = [getattr(client, name) for name in names if hasattr(client, name)]
+    return CancelledError, AsyncioCancelledError, CommClosedError, *cancelled
 
 
 @contextmanager
 def _connection_errors(name: str) -> Iterator[None]:
+    lost: tuple[type[BaseException], ...] = (OSError, ValueError, *_lost_of_dask())
     try:
         yield
-    except OSError as error:  # includes time-outs and closed connections
+    except lost as error:  # includes time-outs and closed connections
         raise MachineError(f"the connection to {name} is lost: {error}") from error
 
 
 class _Ray(Cluster):
+    _checked_at = 0.0  # time of the last check of the head [s]
+
     def present(self) -> int:
         import ray
 
@@ -160,6 +186,11 @@ class _Ray(Cluster):
     def finished(self, tickets: Sequence[Any], seconds: float) -> Sequence[Any]:
         import ray
 
+        if (
+            time.monotonic() - self._checked_at > POLL_INTERVAL_S
+        ):  # without its head, ray ends this process after a minute
+            _check_reachable(ray.get_runtime_context().gcs_address, self._name)
+            self._checked_at = time.monotonic()
         done, _ = ray.wait(list(tickets), num_returns=1, timeout=seconds)
         return list(done)
 
@@ -201,8 +232,12 @@ def joined(name: str, address: str | None, workers: int | None) -> Iterator[Clus
     """
     module, join = {"dask": ("distributed", _dask), "ray": ("ray", _ray)}[name]
     with requires_extra(name, module):
+        if name == "ray" and address is None and importlib.util.find_spec(module) is not None:
+            _prepare_ray()
         importlib.import_module(module)
     what = f"the {name} cluster " + (f"at {address}" if address else "on this machine")
+    if address is not None:
+        _check_reachable(address, what)
     with join(address, workers, what) as cluster:
         yield cluster
 
@@ -211,16 +246,60 @@ def joined(name: str, address: str | None, workers: int | None) -> Iterator[Clus
 def _dask(address: str | None, workers: int | None, what: str) -> Iterator[Cluster]:
     from distributed import Client
 
-    quiet = logging.CRITICAL  # terminated workers log irrelevant errors
-    here: dict[str, Any] = {"n_workers": workers, "threads_per_worker": 1, "silence_logs": quiet}
-    here["dashboard_address"] = None
+    with _dask_silenced():
+        cluster = None
+        try:
+            if address is not None:
+                client = Client(address, set_as_default=False, timeout=CONNECTION_TIMEOUT_S)
+            else:
+                with signals_blocked():  # local workers do not receive the Ctrl-C of a terminal
+                    cluster = _local_dask(workers)
+                    client = Client(cluster, set_as_default=False, security=cluster.security)
+        except (OSError, ValueError, TypeError, RuntimeError) as error:
+            raise MachineError(f"cannot reach {what}: {error}") from error
+        try:
+            yield _Dask(client, what, workers)
+        finally:
+            for part in (client, cluster):
+                if part is not None:
+                    with suppress(OSError, RuntimeError):  # the scheduler is gone
+                        part.close(timeout=CLOSING_TIMEOUT_S)
+
+
+def _local_dask(workers: int | None) -> Any:
+    """Start a scheduler and workers on this machine that accept only processes with their temporary certificate."""
+    import dask
+    from distributed import LocalCluster
+    from distributed.security import Security
+
+    with requires_extra("dask", "cryptography"):
+        security = Security.temporary()
+    with dask.config.set({"distributed.scheduler.http.routes": []}):  # its HTTP server has no authentication
+        return LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            host=LOOPBACK,
+            protocol="tls",
+            security=security,
+            dashboard_address=f"{LOOPBACK}:0",
+            scheduler_kwargs={"dashboard": False},
+            silence_logs=logging.CRITICAL,  # terminated workers log irrelevant errors
+        )
+
+
+@contextmanager
+def _dask_silenced() -> Iterator[None]:
+    """Silence the logs of lost connections, which ``_Dask`` reports."""
+    known = list(logging.root.manager.loggerDict)
+    names = [name for name in known if name.partition(".")[0] in {"distributed", "tornado", "asyncio"}]
+    before = {name: logging.getLogger(name).level for name in names}
+    for name in names:
+        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
     try:
-        with nullcontext() if address else signals_blocked():  # local workers do not receive the Ctrl-C of a terminal
-            client = Client(address, set_as_default=False, **({} if address else here))
-    except (OSError, ValueError, TypeError) as error:
-        raise MachineError(f"cannot reach {what}: {error}") from error
-    with client:
-        yield _Dask(client, what, workers)
+        yield
+    finally:
+        for name, level in before.items():
+            logging.getLogger(name).setLevel(level)
 
 
 @contextmanager
@@ -229,9 +308,15 @@ def _ray(address: str | None, workers: int | None, what: str) -> Iterator[Cluste
 
     ours = not ray.is_initialized()
     if ours:
-        here: dict[str, Any] = {} if address else {"num_cpus": workers, "include_dashboard": False}
+        here = {"num_cpus": workers, "include_dashboard": False, "_node_ip_address": LOOPBACK}
         try:
-            ray.init(address or "local", log_to_driver=False, logging_level=logging.ERROR, **here)
+            with nullcontext() if address else signals_blocked(), nullcontext() if address else _on_loopback():
+                ray.init(
+                    address or "local",
+                    log_to_driver=False,
+                    logging_level=logging.CRITICAL,
+                    **({} if address else here),
+                )
         except Exception as error:
             raise MachineError(f"cannot reach {what}: {' '.join(str(error).split())}") from error
     try:
@@ -239,3 +324,64 @@ def _ray(address: str | None, workers: int | None, what: str) -> Iterator[Cluste
     finally:
         if ours:
             ray.shutdown()
+
+
+@contextmanager
+def _on_loopback() -> Iterator[None]:
+    """Let ray use the loopback interface, as it does on macOS; it replaces ``_node_ip_address`` otherwise."""
+    from ray._private import ray_constants
+
+    before = getattr(ray_constants, "ENABLE_RAY_CLUSTER", True)
+    ray_constants.ENABLE_RAY_CLUSTER = False
+    try:
+        yield
+    finally:
+        ray_constants.ENABLE_RAY_CLUSTER = before
+
+
+def _prepare_ray() -> None:
+    """Let local ray clusters of this process accept only processes with its token; ray reads it on import.
+
+    Raises:
+        MachineError: This version of ray has no tokens, or ray is already imported without a token.
+    """
+    version = importlib.metadata.version("ray")
+    if tuple(int(part) for part in version.split(".")[:2]) < MIN_RAY_VERSION:
+        least = ".".join(map(str, MIN_RAY_VERSION))
+        raise MachineError(f"ray {version} starts clusters without authentication: pip install 'ray>={least}'")
+    if os.environ.get("RAY_AUTH_MODE") == "token":
+        return
+    ray = sys.modules.get("ray")
+    if ray is None:
+        os.environ.update(RAY_AUTH_MODE="token", RAY_AUTH_TOKEN=secrets.token_hex(32))
+    elif not ray.is_initialized():
+        raise MachineError("ray was imported without a token: set RAY_AUTH_MODE=token and RAY_AUTH_TOKEN before")
+
+
+def check_address(name: str, address: str) -> None:
+    """Check the form of the address of a cluster.
+
+    Raises:
+        UsageError: It is no address of a cluster of this kind.
+    """
+    pattern, examples = _ADDRESSES[name]
+    if not re.fullmatch(pattern, address):
+        raise UsageError(
+            f"must be the address of a {name} cluster, such as {examples}, got {address!r}", argument="address"
+        )
+
+
+def _check_reachable(address: str, what: str) -> None:
+    """Connect once to the host and port of an address; the libraries wait longer, and report less.
+
+    Raises:
+        MachineError: Nobody listens there.
+    """
+    found = re.search(r"(?:^|//)([^/]+):(\d+)$", address)
+    if found is None:
+        return
+    host, port = found.group(1).strip("[]"), int(found.group(2))
+    try:
+        socket.create_connection((host, port), timeout=CONNECTION_TIMEOUT_S).close()
+    except OSError as error:
+        raise MachineError(f"cannot reach {what}: {error.strerror or error}") from error

@@ -46,6 +46,10 @@ class Engine:
                 f"the address {self.address!r} is that of a cluster: choose {{engine}} dask or ray",
                 remedies={"engine": None},
             )
+        if self.address is not None and self.name is not None:
+            from cnpgen.machine.clusters import check_address
+
+            check_address(self.name, self.address)
 
 
 class WorkerPool(Protocol):

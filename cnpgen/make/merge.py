@@ -17,7 +17,7 @@ from cnpgen.schema.catalogue import list_recipes
 from cnpgen.store.checked_shard import read_rows, shard_of_record
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, load_dataset_spec, shards
 from cnpgen.store.files.atomic import committing, file_sha256, read_file, write_file
-from cnpgen.store.intact import COPY_HINT, OUTSIDE, leads_outside, outside_links
+from cnpgen.store.intact import COPY_HINT, OUTSIDE, outside_links
 from cnpgen.store.layout import WORK
 from cnpgen.store.manifest import source_date
 from cnpgen.store.paths import require_folder
@@ -80,8 +80,7 @@ def _common_spec(folders: Sequence[Path]) -> DatasetSpec:
         raise UsageError("must name at least one folder, got none", argument="parts")
     for folder in folders:
         require_folder(folder, argument="parts")
-        if outside := outside_links(folder):
-            raise DatasetError(f"{folder / outside[0]} {OUTSIDE}; {COPY_HINT}")
+        _require_inside(folder, outside_links(folder))
     first, *rest = folders
     spec = load_dataset_spec(first)
     for folder in rest:
@@ -90,6 +89,12 @@ def _common_spec(folders: Sequence[Path]) -> DatasetSpec:
             changed = changed_settings(other, spec) or f"{dict(other.splits)} rows instead of {spec.splits}"
             raise UsageError(f"{folder} is of another dataset than {first}: {changed}")
     return spec
+
+
+def _require_inside(folder: Path, links: Sequence[str]) -> None:
+    """Raise an error for links that lead outside the folder of a part."""
+    if links:
+        raise DatasetError(f"{folder / links[0]} {OUTSIDE}; {COPY_HINT}")
 
 
 def _owners(folders: Sequence[Path], out: Path, spec: DatasetSpec) -> dict[ShardTask, Path]:
@@ -109,6 +114,7 @@ def _owners(folders: Sequence[Path], out: Path, spec: DatasetSpec) -> dict[Shard
             if holders and read_file(holders[0] / task.sidecar) != read_file(out / task.sidecar):
                 raise UsageError(f"{holders[0]} and {out} both have {task.file}: parts must not overlap")
         elif holders:
+            _require_inside(holders[0], outside_links(holders[0], (task.file, task.sidecar)))
             owners[task] = holders[0]
         else:
             missing.append(task.file)
@@ -121,8 +127,6 @@ def _owners(folders: Sequence[Path], out: Path, spec: DatasetSpec) -> dict[Shard
 def _copy(folder: Path, out: Path, task: ShardTask, spec: DatasetSpec) -> None:
     """Copy a shard and then its sidecar, which marks it as complete."""
     record = load_committed(folder, spec, task)
-    if outside := [name for name in (task.file, task.sidecar) if leads_outside(folder / name)]:
-        raise DatasetError(f"{folder / outside[0]} {OUTSIDE}; {COPY_HINT}")
     with committing(out / task.file, out / WORK) as temporary:
         shutil.copyfile(folder / task.file, temporary)
         if file_sha256(temporary) != record.sha256:

@@ -74,7 +74,7 @@ def load_model(name_or_path: str | Path) -> Model:
         MachineError: The operating system denies reading it.
     """
     path = find_model(name_or_path)
-    require_file(path, "a model")
+    require_file(path, "a model", argument="name_or_path")
     return model_from_content(path, read_with_checksum(path, kind=MODEL_KIND, version=MODEL_VERSION))
 
 

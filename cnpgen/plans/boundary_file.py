@@ -81,14 +81,19 @@ class BoundaryFile:
                 if task.file == name:
                     read_rows(recorded_shard(folder, spec, task, size=0, sha256=""))
 
-    def problem(self) -> ProblemRecord | None:
+    def problem(self, *, required: bool = True) -> ProblemRecord | None:
         """Return the problem named by the file or by the dataset that contains it; None if neither names one.
+
+        Args:
+            required: See ``stored_problem``.
 
         Raises:
             DatasetError: The named problem is damaged or cannot be found.
         """
         spec = self.spec()
-        return stored_problem(self.path, self.attributes) if spec is None else as_record(spec.problem)
+        return (
+            stored_problem(self.path, self.attributes, required=required) if spec is None else as_record(spec.problem)
+        )
 
     def boundary(self, robot: Robot, *, allow_large_angles: bool = False) -> Boundary:
         """Return the boundary conditions of motions of a robot, shape (N, n) each.

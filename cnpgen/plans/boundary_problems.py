@@ -111,7 +111,9 @@ def chosen_rows(folder: Path, spec: DatasetSpec, *, split: str, start: int, n: i
 def _of_file(path: Path, wanted: ProblemRecord | None, *, allow_large_angles: bool) -> Plans:
     """Return the boundary problems of a file."""
     file = read_boundary_file(path)
-    problem = agreed_problem(path, file.problem(), wanted, content="boundary problems", command="solve")
+    problem = agreed_problem(
+        path, file.problem(required=wanted is None), wanted, content="boundary problems", command="solve"
+    )
     if (said := file.text("problem_sha256")) and said != problem.comparable_sha256:
         raise DatasetError(f"{path} is of another problem than {problem.name!r}: its problem_sha256 is not this one's")
     boundary = file.boundary(open_problem(problem)[1], allow_large_angles=allow_large_angles)

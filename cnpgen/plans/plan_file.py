@@ -70,7 +70,9 @@ def load_plans(path: str | Path, *, problem: Problem | StoredProblem | str | Pat
         columns = _columns(path, file)
     if not has_checksum:
         refuse_misspelt(path, columns, CONDITIONS)
-    record = agreed_problem(path, stored_problem(path, attributes), wanted, content="plans", command="evaluate")
+    record = agreed_problem(
+        path, stored_problem(path, attributes, required=wanted is None), wanted, content="plans", command="evaluate"
+    )
     try:
         plans = _assembled(path, record, columns, attributes)
     except UsageError as error:
@@ -160,12 +162,13 @@ def agreed_problem(
     return wanted or found
 
 
-def stored_problem(path: Path, attributes: Mapping[str, Any]) -> ProblemRecord | None:
+def stored_problem(path: Path, attributes: Mapping[str, Any], *, required: bool = True) -> ProblemRecord | None:
     """Return the problem named by a file; None if it names none.
 
     Args:
         path: Path of the file.
         attributes: Attributes of the file: ``problem``, ``problem_recipe``, ``problem_urdf`` and ``problem_sha256``.
+        required: Whether a problem in another folder, which is not opened, is an error; otherwise it is ignored.
 
     Raises:
         DatasetError: The named problem is damaged, cannot be found or is in another folder than the file.
@@ -176,9 +179,11 @@ def stored_problem(path: Path, attributes: Mapping[str, Any]) -> ProblemRecord |
         return None
     name = _text(path, attributes, "problem")
     if not _is_beside(path, name):
+        if not required:
+            return None
         raise DatasetError(
-            f"{path}: the attribute 'problem' names {name!r:.200}, which is not in the folder of the file or below: pass"
-            " {problem} to use this file",
+            f"{path}: the attribute 'problem' names {name!r:.200}, which is not in the folder of the file or below:"
+            " pass {problem} to use this file",
             remedies={"problem": None},
         )
     try:

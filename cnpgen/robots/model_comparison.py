@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
 from cnpgen.robots.chain import LINK_SUFFIX
-from cnpgen.robots.urdf_parameters import IDENTITY, LinkInertia, Placement, UrdfJoint, UrdfParameters
+from cnpgen.robots.urdf_parameters import IDENTITY, LinkFrame, LinkInertia, UrdfJoint, UrdfParameters
 
 if TYPE_CHECKING:
     import pinocchio as pin
@@ -41,14 +41,14 @@ class _Comparison:
         self.joints = {name: index for index, name in enumerate(model.names) if index != WORLD}
         self.bodies = dict(self._bodies())
 
-    def _bodies(self) -> Iterator[tuple[str, tuple[int, Placement]]]:
+    def _bodies(self) -> Iterator[tuple[str, tuple[int, LinkFrame]]]:
         """Yield every link with the joint of the model that moves it and its placement in that joint."""
-        known: dict[str, tuple[int, Placement]] = {}
+        known: dict[str, tuple[int, LinkFrame]] = {}
         for link in self.parameters.inertias:
             known[link] = self._body(link, known)
             yield link, known[link]
 
-    def _body(self, link: str, known: Mapping[str, tuple[int, Placement]]) -> tuple[int, Placement]:
+    def _body(self, link: str, known: Mapping[str, tuple[int, LinkFrame]]) -> tuple[int, LinkFrame]:
         """Follow fixed joints from a link towards the root until a joint of the model."""
         inner = IDENTITY
         while link in self.parameters.joints:
@@ -123,20 +123,20 @@ class _Comparison:
                 yield _difference(f"link {link!r}", "its placement")
 
 
-def _dynamic_parameters(inertia: LinkInertia, link: Placement) -> Array:
+def _dynamic_parameters(inertia: LinkInertia, link: LinkFrame) -> Array:
     """Return the parameters of a link about the origin of the joint that moves it, shape (10,)."""
     com = link.of(inertia.com)
     return _parameters_about_origin(inertia.mass, com.translation, com.rotation @ inertia.inertia @ com.rotation.T)
 
 
 def _parameters_about_origin(mass: float, com: Array, inertia: Array) -> Array:
-    """Return mass, first moments and the six moments of inertia about the origin, which add up, shape (10,)."""
+    """Return mass, mass times center and inertia about the origin, which add up, shape (10,)."""
     with np.errstate(all="ignore"):  # overflow is a difference
         about_origin = inertia + mass * (com @ com * np.eye(3) - np.outer(com, com))
         return np.array([mass, *(mass * com), *about_origin[np.triu_indices(3)]])
 
 
-def _same_placement(actual: "pin.SE3", expected: Placement) -> bool:
+def _same_placement(actual: "pin.SE3", expected: LinkFrame) -> bool:
     return _same(actual.rotation, expected.rotation, scale=1.0) and _same(
         actual.translation, expected.translation, scale=max(np.abs(expected.translation).max(), 1e-3)
     )

@@ -84,9 +84,7 @@ def number_in(element: ElementTree.Element | None, attribute: str, default: floa
     return numbers_in(element, attribute, (default,))[0]
 
 
-def numbers_in(
-    element: ElementTree.Element | None, attribute: str, default: tuple[float, ...]
-) -> tuple[float, ...]:
+def numbers_in(element: ElementTree.Element | None, attribute: str, default: tuple[float, ...]) -> tuple[float, ...]:
     """Return the numbers in an attribute of an element.
 
     The accepted notation is that of URDF parsers, which drop an element with other numbers without an error.

@@ -14,7 +14,7 @@ from cnpgen.robots.urdf import number_in, numbers_in
 
 Array = NDArray[np.float64]
 
-_MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+_INERTIA_ENTRIES = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 _PARTS = {  # element -> the elements whose numbers are read
     "link": ("inertial",),
     "inertial": ("origin", "mass", "inertia"),
@@ -26,7 +26,7 @@ _ZERO = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
-class Placement:
+class LinkFrame:
     """Pose of a frame in another one.
 
     Attributes:
@@ -37,12 +37,12 @@ class Placement:
     rotation: Array
     translation: Array
 
-    def of(self, inner: "Placement") -> "Placement":
+    def of(self, inner: "LinkFrame") -> "LinkFrame":
         """Return a placement in this frame as a placement in the frame around it."""
-        return Placement(self.rotation @ inner.rotation, self.rotation @ inner.translation + self.translation)
+        return LinkFrame(self.rotation @ inner.rotation, self.rotation @ inner.translation + self.translation)
 
 
-IDENTITY = Placement(np.eye(3), np.zeros(3))
+IDENTITY = LinkFrame(np.eye(3), np.zeros(3))
 
 
 @dataclass(frozen=True)
@@ -51,12 +51,12 @@ class LinkInertia:
 
     Attributes:
         mass: Mass [kg].
-        com: Placement of the center of mass and of the axes of the inertia in the link.
+        com: LinkFrame of the center of mass and of the axes of the inertia in the link.
         inertia: Inertia about the center of mass [kg m^2], shape (3, 3).
     """
 
     mass: float
-    com: Placement
+    com: LinkFrame
     inertia: Array
 
 
@@ -69,7 +69,7 @@ class UrdfJoint:
         kind: Type of the joint.
         parent: Link that carries the joint.
         child: Link that the joint moves.
-        origin: Placement of the child at position zero in the parent.
+        origin: LinkFrame of the child at position zero in the parent.
         axis: Unit axis, shape (3,).
         limits: Limit -> value [rad, rad/s, N m, or with m and N]: "lower", "upper", "velocity" and "effort".
     """
@@ -78,7 +78,7 @@ class UrdfJoint:
     kind: str
     parent: str
     child: str
-    origin: Placement
+    origin: LinkFrame
     axis: Array
     limits: dict[str, float]
 
@@ -119,12 +119,13 @@ def urdf_parameters(tree: Element) -> UrdfParameters:
 
 def _read_named(element: Element, read: Callable[[Element], None], mistakes: list[str]) -> None:
     """Read an element; add its error to the mistakes, with the name of the element."""
+    problems = list(_unread(element))
     try:
-        for problem in _unread(element):
-            raise ValueError(problem)
-        read(element)
+        if not problems:
+            read(element)
     except ValueError as error:
-        mistakes.append(f"{element.tag} {element.get('name', '')!r}: {error}")
+        problems.append(str(error))
+    mistakes += [f"{element.tag} {element.get('name', '')!r}: {problem}" for problem in problems]
 
 
 def _unread(element: Element) -> Iterator[str]:
@@ -148,13 +149,13 @@ def _inertia(link: Element) -> LinkInertia | None:
     if mass is None or mass.get("value") is None:
         raise ValueError("its <inertial> has no <mass value=...>")
     if tensor is None:
-        moments = dict.fromkeys(_MOMENTS, 0.0)
+        entries = dict.fromkeys(_INERTIA_ENTRIES, 0.0)
     else:
-        if missing := [name for name in _MOMENTS if tensor.get(name) is None]:
+        if missing := [name for name in _INERTIA_ENTRIES if tensor.get(name) is None]:
             raise ValueError(f"its <inertia> has no {', '.join(missing)}: all of its numbers would be ignored")
-        moments = {name: number_in(tensor, name, 0.0) for name in _MOMENTS}
+        entries = {name: number_in(tensor, name, 0.0) for name in _INERTIA_ENTRIES}
     rows = (("ixx", "ixy", "ixz"), ("ixy", "iyy", "iyz"), ("ixz", "iyz", "izz"))
-    matrix = np.array([[moments[name] for name in row] for row in rows])
+    matrix = np.array([[entries[name] for name in row] for row in rows])
     return LinkInertia(number_in(mass, "value", 0.0), _placement(element), matrix)
 
 
@@ -178,9 +179,9 @@ def _joint(element: Element) -> UrdfJoint:
     )
 
 
-def _placement(element: Element) -> Placement:
+def _placement(element: Element) -> LinkFrame:
     """Return the <origin> of an element."""
     origin = element.find("origin")
     if origin is not None and origin.get("quat_xyzw") is not None:
         raise ValueError("<origin quat_xyzw=...> is not supported: give rpy, the angles of roll, pitch and yaw")
-    return Placement(turned(*numbers_in(origin, "rpy", _ZERO)), np.array(numbers_in(origin, "xyz", _ZERO)))
+    return LinkFrame(turned(*numbers_in(origin, "rpy", _ZERO)), np.array(numbers_in(origin, "xyz", _ZERO)))

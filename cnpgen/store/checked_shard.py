@@ -142,7 +142,7 @@ def read_columns(shard: Shard, placements: Mapping[str, Placement], names: Itera
             for name, place in selected.items():
                 columns[name] = np.empty(place.shape, place.dtype)
                 file.seek(place.offset or 0)
-                _fill(shard, file.readinto, memoryview(columns[name]).cast("B"))
+                _fill(shard, file.readinto, columns[name].data.cast("B"))
     except OSError as error:
         raise machine_error("read", shard.path, error) from error
     return columns

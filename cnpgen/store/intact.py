@@ -31,9 +31,9 @@ def leads_outside(path: Path, folder: Path | None = None) -> bool:
     return not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))  # resolve() refuses circular links
 
 
-def outside_links(folder: Path, splits: Iterable[str] = ()) -> list[str]:
+def outside_links(folder: Path, names: Iterable[str] = (*DOCUMENTS, WORK)) -> list[str]:
     """List the documents of a dataset and the folders in it that are links that lead outside its folder."""
-    return [name for name in (*DOCUMENTS, WORK, *splits) if leads_outside(folder / name, folder)]
+    return [name for name in names if leads_outside(folder / name, folder)]
 
 
 def size_problem(path: Path, size: int) -> str:

@@ -28,24 +28,25 @@ def require_folder(folder: str | Path, *, argument: str = "folder") -> Path:
     return folder
 
 
-def require_file(path: Path, expected: str, *, of_dataset: str = "") -> None:
+def require_file(path: Path, expected: str, *, of_dataset: str = "", argument: str = "path") -> None:
     """Raise an error if a path is not a file.
 
     Args:
         path: The path.
         expected: Expected content: "a file of plans".
         of_dataset: Hint in the case of the folder of a dataset.
+        argument: Name of the argument, for the error.
 
     Raises:
         UsageError: The path does not exist, or is a folder, a device or a pipe.
     """
     if path.is_dir():
         actual, hint = ("the folder of a dataset", of_dataset) if is_dataset(path) else ("a folder", "")
-        raise UsageError(f"{path} is {actual}, expected {expected}{hint and f': {hint}'}", concerns="path")
+        raise UsageError(f"{path} is {actual}, expected {expected}{hint and f': {hint}'}", concerns=argument)
     if not path.exists():
-        raise UsageError(f"{path} is not there, expected {expected}", concerns="path")
+        raise UsageError(f"{path} is not there, expected {expected}", concerns=argument)
     if not path.is_file():
-        raise UsageError(f"{path} is a device or a pipe, expected {expected}", concerns="path")
+        raise UsageError(f"{path} is a device or a pipe, expected {expected}", concerns=argument)
 
 
 def file_kind(path: Path) -> str:

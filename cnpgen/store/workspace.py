@@ -87,7 +87,7 @@ def check_place(workspace: Workspace) -> None:
             remedies={"out": None},
         )
     splits = () if workspace.spec is None else tuple(workspace.spec.splits)
-    if workspace.content == "a dataset" and (outside := outside_links(workspace.folder, splits)):
+    if workspace.content == "a dataset" and (outside := outside_links(workspace.folder, (WORK, *splits))):
         raise UsageError(f"{workspace.folder / outside[0]} {OUTSIDE}; {COPY_HINT}")
     if (workspace.folder / MANIFEST).is_file():
         return

@@ -19,16 +19,16 @@ class Body:
 
     Attributes:
         mass: Mass [kg].
-        first_moment: Mass times center of mass [kg m], shape (3,).
-        second_moment: Inertia about the origin of the joint [kg m^2], shape (3, 3).
+        mass_center: Mass times center of mass [kg m], shape (3,).
+        inertia: Inertia about the origin of the joint [kg m^2], shape (3, 3).
         placement: Pose of the joint in the previous planned joint at zero, shape (4, 4).
         axis: Unit axis, shape (3,).
         limits: Lower and upper position, velocity and effort, shape (4,).
     """
 
     mass: float
-    first_moment: np.ndarray
-    second_moment: np.ndarray
+    mass_center: np.ndarray
+    inertia: np.ndarray
     placement: np.ndarray
     axis: np.ndarray
     limits: np.ndarray
@@ -69,14 +69,14 @@ def differences(robot: Robot, bodies: Sequence[Body], *, rtol: float = 1e-9) -> 
         ]
         pairs = {
             "mass": (inertia.mass, body.mass),
-            "first moment": (inertia.mass * lever, body.first_moment),
-            "second moment": (about_origin, body.second_moment),
+            "mass times center": (inertia.mass * lever, body.mass_center),
+            "inertia about the origin": (about_origin, body.inertia),
             "placement": (placement.homogeneous, body.placement),
             "axis": (subspace[:3] if robot.sliding[index - 1] else subspace[3:], body.axis),
             "limits": (np.array(limits), body.limits),
         }
         for part, (actual, expected) in pairs.items():
-            scale = max(np.abs(expected).max(), 1e-9 if part.endswith("moment") else 0.0)
+            scale = max(np.abs(expected).max(), 1e-9 if part != "mass" else 0.0)
             if not np.allclose(actual, expected, rtol=0, atol=rtol * scale):
                 found.append(f"{model.names[index]}: {part}")
     return found
@@ -102,14 +102,15 @@ def _pose(element: Element) -> np.ndarray:
 
 
 def _lump(link: str, pose: np.ndarray, links: dict, joints: list[Element], planned: Sequence[str]) -> tuple:
-    """Add up mass and moments of a link and of all links that are fixed to it."""
+    """Add up mass and inertia of a link and of all links that are fixed to it."""
     mass, first, second = 0.0, np.zeros(3), np.zeros((3, 3))
     element = links[link].find("inertial")
     if element is not None:
         mass = float(element.find("mass").attrib["value"])
-        tensor = {key: float(value) for key, value in element.find("inertia").attrib.items()}
+        entries = element.find("inertia")
+        tensor = {key: float(value) for key, value in entries.attrib.items()} if entries is not None else {}
         rows = (("ixx", "ixy", "ixz"), ("ixy", "iyy", "iyz"), ("ixz", "iyz", "izz"))
-        matrix = np.array([[tensor[key] for key in row] for row in rows])
+        matrix = np.array([[tensor.get(key, 0.0) for key in row] for row in rows])
         center = pose @ _pose(element)
         com, rotation = center[:3, 3], center[:3, :3]
         first = mass * com

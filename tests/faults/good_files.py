@@ -5,8 +5,12 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import numpy as np
 
+from cnpgen.benchmark.results_file import answer_to_dict, open_results
+from cnpgen.benchmark.suite import list_suites
+from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.make.make_dataset import make_dataset
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.make.recipe_file import load_dataset_recipe
@@ -22,7 +26,7 @@ from tests.examples.models import boundary_of_columns, untrained_model
 from tests.examples.plan_files import plans_of, remove_checksum
 from tests.examples.plans import load as stored_plan
 
-IDENTITY = {"steps": 10}  # of the run of the checkpoint and the journal
+IDENTITY = {"steps": 10}  # of the run of the checkpoint, the journal and the results
 
 
 def tiny_recipe_of(name: str) -> DatasetRecipe:
@@ -42,6 +46,7 @@ def make_good_files(folder: Path) -> None:
     ):
         path = folder / "recipes" / name
         path.write_text(path.read_text(encoding="utf-8").replace(old, new), encoding="utf-8")
+    _make_task_files(folder)
     plan = stored_plan("hit")
     save_plans(folder / "plans.h5", plans_of(plan, plan))
     shutil.copy(folder / "plans.h5", folder / "without_checksum.h5")
@@ -57,3 +62,30 @@ def make_good_files(folder: Path) -> None:
     )
     journal.append([0], [attempt])
     journal.close()
+
+
+def _make_task_files(folder: Path) -> None:
+    """Make files of tasks and of a benchmark: a suite, boundary conditions, tables of tasks and results."""
+    suite = list_suites()["hits-81"].read_text(encoding="utf-8")
+    (folder / "recipes" / "suite.toml").write_text(
+        suite.replace('problem = "airhockey"', 'problem = "./problem.toml"').replace("= 9", "= 2"), encoding="utf-8"
+    )
+    plan = stored_plan("hit")
+    plans = plans_of(plan, plan)
+    with h5py.File(folder / "boundary.h5", "w") as file:
+        file.attrs["problem"] = "airhockey"
+        for name in ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq"):
+            file[name] = getattr(plans.boundary, name)
+        file["sample_id"] = np.arange(2)
+        file["hit_angle"] = np.zeros(2)
+    with h5py.File(folder / "tasks.h5", "w") as file:
+        file["goal_xyz"], file["hit_angle"] = np.array([[1.0, 0.1], [1.1, -0.1]]), np.zeros(2)
+    (folder / "tasks.csv").write_text("goal_xyz.x,goal_xyz.y,hit_angle\n1.0,0.1,0.0\n1.1,-0.1,0.1\n", encoding="utf-8")
+    results = open_results(folder / "results.jsonl", IDENTITY)
+    for index, answer in enumerate((plans[:1], Trajectory(t=np.arange(3.0), q=np.zeros((3, 6))), None)):
+        results.append(
+            {"problem": index, "ending": "answered", "planning_s": 0.1, "planning_cpu_s": 0.1, "error": ""}
+            | {"answer": None if answer is None else answer_to_dict(answer)}
+            | {"verdict": {"valid": True, "paper": {"valid": True, "finished": True}}}
+            | {"executed": {"nominal": {"scored": True}}}
+        )

@@ -22,6 +22,25 @@ TEXTS = (
     "a" * 5000,
     "\ud800",
 )
+URDF_NUMBERS = (
+    *("1,5", "nan", "inf", "-inf", "0x10", "", " ", "1.5 kg", "1_5", "1d3", "1e999", "1e-320", "1e308", "-1e308"),
+    *(
+        "-1",
+        "0",
+        "+2.5",
+        ".5",
+        "5.",
+        "1e3",
+        "1.5E-3",
+        "0 0 1",
+        "0,1 0 0",
+        "nan 0 0",
+        "1 0",
+        "0  0 1",
+        " 0 1 0 ",
+        "1;2;3",
+    ),
+)
 WORDS = (b"\0", b"\xff", b"\xff" * 8, b"\0" * 8, b"GCOL\x01\0\0\0", b"TREE", b"OHDR", b"[" * 5000, b"9" * 5000)
 
 
@@ -135,6 +154,20 @@ def change_urdf(text: str, draw: Random) -> str:
             others = [item.attrib[name] for item in tree.iter() if name in item.attrib]
             values = [*others, *map(str, NUMBERS), *(text for text in TEXTS if text.isprintable()), "0 0", "floating"]
             element.attrib[name] = draw.choice(values)
+    return ElementTree.tostring(tree, encoding="unicode")
+
+
+def changed_number(text: str, draw: Random) -> str:
+    """Change a numeric attribute of a link, a joint or an inertia."""
+    tree = ElementTree.fromstring(text)
+    parts = [*tree.iterfind("link/inertial/*"), *tree.iterfind("joint/*")]
+    numeric = [(item, name) for item in parts for name in item.attrib if item.tag not in ("parent", "child", "mimic")]
+    for _ in range(draw.choice((1, 1, 2))):
+        element, name = draw.choice(numeric)
+        if draw.random() < 0.1:
+            element.attrib.pop(name, None)
+        else:
+            element.set(name, draw.choice(URDF_NUMBERS))
     return ElementTree.tostring(tree, encoding="unicode")
 
 

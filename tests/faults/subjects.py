@@ -15,13 +15,18 @@ from typing import Any
 import h5py
 import numpy as np
 
+from cnpgen.benchmark.results_file import answer_from_dict, open_results
+from cnpgen.benchmark.suite import load_suite
 from cnpgen.cli.inspect_command import inspection_text
 from cnpgen.errors import CnpgenError
 from cnpgen.loader.load import load_dataset
 from cnpgen.make.recipe_file import load_dataset_recipe
+from cnpgen.make.task_table import read_tasks
 from cnpgen.planner.model_file import MODEL_KIND, MODEL_VERSION, load_model
+from cnpgen.planner.plan_requests import read_file
 from cnpgen.planner.planner import Planner
 from cnpgen.plans.boundary_file import read_boundary_file
+from cnpgen.plans.boundary_problems import load_boundary_problems
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.format import PLAN_FILE_VERSION
 from cnpgen.plans.plan_file import load_plans
@@ -31,6 +36,7 @@ from cnpgen.problems.problem_file import load_problem
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.refine.refinement_journal import open_journal
 from cnpgen.store.dataset_spec import from_json
+from cnpgen.store.field import Field
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.files.checksum_file import (
     HEADER_BYTES,
@@ -46,8 +52,14 @@ from cnpgen.store.shard import read_schema, read_shard
 from cnpgen.training.checkpoint import CHECKPOINT_KIND, CHECKPOINT_VERSION, Checkpoints
 from cnpgen.validate.validate_dataset import validate_dataset
 from tests.examples.documents import read_unverified
+from tests.examples.plan_files import plans_of
+from tests.examples.plans import load as stored_plan
+from tests.examples.urdf_reading import bodies_in, differences
 from tests.faults.good_files import IDENTITY
-from tests.faults.mutations import change_bytes, change_json, change_text, change_urdf
+from tests.faults.mutations import change_bytes, change_json, change_text, change_urdf, changed_number
+
+MAX_FUZZED_PUCKS = 100
+_PROBLEM = plans_of(stored_plan("hit"))
 
 DOCUMENTS = (
     "specification.json",
@@ -217,7 +229,7 @@ def _change_values(path: Path, draw: Random) -> None:
     """Change a dataset or an attribute of a file of plans as h5py does."""
     with h5py.File(path, "a") as file:
         name = draw.choice([*file])
-        if draw.random() < 0.5:
+        if draw.random() < 0.5 or not file.attrs:
             values = file[name][()]
             flat = values.reshape(-1)
             flat[draw.randrange(len(flat))] = draw.choice((0, 1, 100)) if values.dtype.kind in "iu" else draw.choice(
@@ -323,6 +335,124 @@ def _read_journal(folder: Path, draw: Random) -> None:
     open_journal(folder / "journal", json.dumps(IDENTITY)).close()
 
 
+def _suite_in(folder: Path, draw: Random) -> Path:
+    return folder / draw.choice(("suite.toml", "suite.toml", "problem.toml"))
+
+
+def _read_suite(folder: Path, draw: Random) -> None:
+    suite = load_suite(folder / "recipes" / "suite.toml")
+    str(suite)
+    if suite.pucks is not None and suite.pucks.rows * suite.pucks.columns <= MAX_FUZZED_PUCKS:
+        suite.problems(3)
+
+
+def _change_boundary(good: Path, folder: Path, draw: Random) -> None:
+    path = folder / "boundary.h5"
+    if draw.random() < 0.5:
+        shutil.copy(good / "boundary.h5", path)
+        _change_values(path, draw)
+    else:
+        path.write_bytes(_changed_hdf5((good / "boundary.h5").read_bytes(), draw))
+    shutil.copy(good / "model.h5", folder)
+
+
+def _read_boundary(folder: Path, draw: Random) -> None:
+    path = folder / "boundary.h5"
+    failures = []
+    for read in (
+        lambda: load_boundary_problems(path),
+        lambda: load_boundary_problems(path, problem="airhockey"),
+        lambda: read_file(path, load_model(folder / "model.h5")),
+    ):
+        try:
+            read()
+        except CnpgenError as error:
+            failures.append(error)
+    if failures:
+        raise failures[0]
+
+
+def _change_tasks(good: Path, folder: Path, draw: Random) -> None:
+    name = draw.choice(("tasks.h5", "tasks.csv"))
+    path, content = folder / "tasks", (good / name).read_bytes()
+    if draw.random() < 0.4:
+        path.write_bytes(change_bytes(content, draw))
+    elif name == "tasks.csv":
+        lines = change_text(content.decode().replace(",", "=,"), draw).replace("=,", ",")
+        path.write_text(lines, encoding="utf-8", errors="replace")
+    else:
+        path.write_bytes(content)
+        _change_values(path, draw)
+
+
+def _read_tasks(folder: Path, draw: Random) -> None:
+    fields = {name: Field(name, "m", name, 3, ("x", "y", "z")) for name in ("goal_xyz",)}
+    fields["hit_angle"] = Field("hit_angle", "rad", "angle")
+    read_tasks(folder / "tasks", fields, flat=True)
+
+
+def _change_results(good: Path, folder: Path, draw: Random) -> None:
+    lines = (good / "results.jsonl").read_text(encoding="utf-8").splitlines()
+    if draw.random() < 0.2:
+        (folder / "results.jsonl").write_bytes(change_bytes("\n".join(lines).encode(), draw))
+        return
+    index = draw.randrange(1, len(lines))
+    lines[index] = json.dumps(change_json(json.loads(lines[index]), draw))
+    (folder / "results.jsonl").write_text("\n".join(lines) + "\n", encoding="utf-8", errors="replace")
+
+
+def _read_results(folder: Path, draw: Random) -> None:
+    results = open_results(folder / "results.jsonl", IDENTITY)
+    for row in results.rows.values():
+        if row.get("answer") is not None:
+            answer_from_dict(_PROBLEM[:1], row["answer"])
+
+
+def _change_embedded(good: Path, folder: Path, draw: Random) -> None:
+    """Change a number, an attribute or an element of the URDF in a plan file or in a model."""
+    name = draw.choice(("plans.h5", "model.h5"))
+    change = changed_number if draw.random() < 0.5 else change_urdf
+    if name == "plans.h5":
+        shutil.copy(good / "without_checksum.h5", folder / name)
+        with h5py.File(folder / name, "r+") as file:
+            urdf = file.attrs["problem_urdf"]
+            changed = change(urdf.decode() if isinstance(urdf, bytes) else urdf, draw)
+            file.attrs["problem_urdf"] = changed.replace("\0", " ").encode(errors="replace")
+            recipe = file.attrs["problem_recipe"]
+            text = recipe.decode() if isinstance(recipe, bytes) else recipe
+            with suppress(CnpgenError, ValueError):
+                file.attrs["problem_sha256"] = _comparable(text, file.attrs["problem_urdf"])
+        return
+    content = read_with_checksum(good / name, kind=MODEL_KIND, version=MODEL_VERSION)
+    key = next(key for key, text in content.texts.items() if "<robot" in text)
+    changed_content = Content(content.arrays, {**content.texts, key: _with_urdf(content.texts[key], change, draw)})
+    (folder / name).write_bytes(encode_with_checksum(changed_content, kind=MODEL_KIND, version=MODEL_VERSION))
+
+
+def _with_urdf(text: str, change: Callable[[str, Random], str], draw: Random) -> str:
+    """Change a text that is a URDF, or a JSON document with one."""
+    if text.lstrip().startswith("<"):
+        return change(text, draw).encode(errors="replace").decode()
+    document = json.loads(text)
+    key = next(key for key, value in document.items() if isinstance(value, str) and "<robot" in value)
+    return json.dumps({**document, key: change(document[key], draw)})
+
+
+def _read_embedded(folder: Path, draw: Random) -> None:
+    """Read a robot; its model has the numbers of an independent reading of the XML."""
+    if (folder / "plans.h5").exists():
+        plans = load_plans(folder / "plans.h5")
+        record, robot = plans.problem, open_problem(plans.problem)[1]
+        if draw.random() < 0.2:
+            evaluate_plans(plans, workers=1)
+    else:
+        model = load_model(folder / "model.h5")
+        record, robot = model.problem, open_problem(model.problem)[1]
+        if draw.random() < 0.2:
+            Planner(model, backend="numpy").plan(robot.base, robot.base + 0.1)
+    assert differences(robot, bodies_in(record.urdf, robot.joint_names)) == []
+
+
 SUBJECTS: dict[str, Subject] = {
     "recipe": Subject(_change_text_of(_recipe_in, change_text), _read_recipe),
     "urdf": Subject(_change_text_of(_urdf_in, change_urdf), _read_urdf),
@@ -332,6 +462,11 @@ SUBJECTS: dict[str, Subject] = {
     "model": Subject(_change_with_checksum("model.h5", MODEL_KIND, MODEL_VERSION), _read_model),
     "checkpoint": Subject(_change_with_checksum("checkpoint", CHECKPOINT_KIND, CHECKPOINT_VERSION), _read_checkpoint),
     "journal": Subject(_change_journal, _read_journal),
+    "embedded": Subject(_change_embedded, _read_embedded),
+    "suite": Subject(_change_text_of(_suite_in, change_text), _read_suite),
+    "boundary": Subject(_change_boundary, _read_boundary),
+    "tasks": Subject(_change_tasks, _read_tasks),
+    "results": Subject(_change_results, _read_results),
 }
 
 

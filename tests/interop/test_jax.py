@@ -196,7 +196,7 @@ MISTAKES = {
     "rate must have shape (2, 20), got (1, 20)": {"rate": np.ones((1, 20))},
     "weights must have shape (5,) for joint-position": {"weights": np.ones(3)},
     "weights must be an array of numbers, got str": {"weights": "abc"},
-    "weights: there is no constraint 'tabel' (did you mean 'table'?)": {"weights": {"tabel": 1.0}},
+    "there is no constraint 'tabel' (did you mean 'table'?)": {"weights": {"tabel": 1.0}},
     "start_tip must have shape (2, 3), got (3,)": {"start_tip": np.zeros(3)},
     "the shift of the quadrature nodes must be in [0, 1), got 1.5": {"shift": 1.5},
     "shift must be a finite number, got None": {"shift": None},
@@ -312,24 +312,24 @@ def test_a_layer_learns_through_control_points_and_loss_despite_an_overflow(
     obstacle_poses = tasks.scene.poses
 
     @jax.jit
-    def step(layer: Any, tasks: Any) -> Any:
-        def mean(layer: Any) -> Any:
-            phi, log_rate = jnp.split(layer, [layer.path_outputs], axis=1)
+    def step(network: Any, tasks: Any) -> Any:
+        def mean(network: Any) -> Any:
+            phi, log_rate = jnp.split(network, [layer.path_outputs], axis=1)
             path, rate = control_points(layer, tasks, jnp.tanh(phi), log_rate + overflow)
             total, _ = plan_loss(
                 loss, path, rate, weights=loss.weights0, obstacle_poses=obstacle_poses, start_tip=tasks.start_xyz
             )
             return total.mean(), total
 
-        (_, total), gradient = jax.value_and_grad(mean, has_aux=True)(layer)
-        return layer - 1e-2 * gradient / jnp.linalg.norm(gradient), total
+        (_, total), gradient = jax.value_and_grad(mean, has_aux=True)(network)
+        return network - 1e-2 * gradient / jnp.linalg.norm(gradient), total
 
-    layer, totals = jnp.zeros((4, layer.path_outputs + layer.rate_outputs)), []
+    network, totals = jnp.zeros((4, layer.path_outputs + layer.rate_outputs)), []
     for _ in range(4):
-        layer, total = step(layer, tasks)
+        network, total = step(network, tasks)
         assert np.isfinite(total).tolist() == [True, True, True, False]
         totals.append(float(total[:3].sum()))
-    assert np.isfinite(layer).all()
+    assert np.isfinite(network).all()
     assert totals[-1] < totals[0]
 
 

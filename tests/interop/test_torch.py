@@ -467,7 +467,7 @@ MISTAKES = {
     "rate must have shape (2, 20), got (1, 20)": {"rate": torch.ones(1, 20)},
     "weights must have shape (5,) for joint-position": {"weights": np.ones(3)},
     "weights must be an array of numbers, got str": {"weights": "abc"},
-    "weights: there is no constraint 'tabel' (did you mean 'table'?)": {"weights": {"tabel": 1.0}},
+    "there is no constraint 'tabel' (did you mean 'table'?)": {"weights": {"tabel": 1.0}},
     "path must be real numbers, got torch.complex64": {"path": torch.ones(2, 15, 6, dtype=torch.complex64)},
     "start_tip must have shape (2, 3), got (3,)": {"start_tip": torch.zeros(3)},
     "shift must be a finite number, got None": {"shift": None},

@@ -93,7 +93,7 @@ def test_invalid_inputs_do_not_change_the_other_verdicts(label):
     ],
 )
 def test_shapes_that_do_not_match_raise_a_usage_error(change):
-    with pytest.raises(UsageError, match=r"shape|control points"):
+    with pytest.raises(UsageError, match=r"shape|control points|scene must have"):
         change(load("hit")).judged()
 
 

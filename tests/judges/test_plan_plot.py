@@ -13,6 +13,7 @@ from cnpgen.errors import MachineError, UsageError
 from cnpgen.judges.plans.plan_plot import plot_plan
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
+from cnpgen.robots.scene import Scene
 from cnpgen.robots.solid import place_obstacles, solids_of
 from cnpgen.trajectory.spline_motion import Motion
 from tests.conftest import some
@@ -181,7 +182,7 @@ def test_obstacles_are_drawn_at_the_poses_of_the_task_and_the_note_is_in_the_tit
         plan.motion,
         0,
         Path("plan.png"),
-        obstacle_poses=np.array([0.1, 0.2]),
+        scene=Scene(tuple(plan.problem.obstacle), np.array([[0.1, 0.2]])),
         note="not valid",
     )
     assert [bounding_box(patch).y1 for patch in axes_of(drawn[0])["side view"].patches] == pytest.approx([0.1, 0.2])

@@ -28,6 +28,7 @@ from cnpgen.kernels.interpreted_kernel import POINTS_PER_BLOCK, InterpretedKerne
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary, choose_backend
 from cnpgen.kernels.mapped_kernel import MappedKernel
+from cnpgen.kernels.parallel_compilation import CompilerPool
 from cnpgen.kernels.tape import CODES, NAMES, Loop, Tape, tape_from_function
 from tests.conftest import HANGING, Prepare, needs_compiler, some
 from tests.machine.test_workers import alive
@@ -731,18 +732,18 @@ def test_a_compilation_that_hangs_is_announced_and_killed(own_cache, monkeypatch
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc")
 def test_an_interruption_ends_the_compilers_of_all_threads(root, own_cache, monkeypatch, tmp_path):
     child = hanging_compiler(tmp_path, monkeypatch)
-    library = KernelLibrary("compiled", own_cache, "test")
+    pool, tape = CompilerPool(own_cache), tape_from_function(root, ROOT)
 
     def interrupted() -> None:
-        library.load(lambda: root, ROOT)
-        deadline = time.monotonic() + HANGING
-        while not (child.exists() and child.read_text()) and time.monotonic() < deadline:
+        pool.kernel(tape)
+        (job,) = pool._jobs.values()
+        while not (child.exists() and child.read_text()):
             time.sleep(0.01)
+            assert not job.done(), job.result()
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(KernelLibrary, "_tape", lambda *_, **__: tape_from_function(root, ROOT))
     begun = time.monotonic()
-    with pytest.raises(KeyboardInterrupt), library.compile_in_parallel():
+    with pytest.raises(KeyboardInterrupt), pool:
         interrupted()
     assert time.monotonic() - begun < HANGING / 10
     assert ended(child)

@@ -5,16 +5,20 @@ import os
 import pickle
 import re
 import signal
+import socket
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 
 import cnpgen
@@ -179,6 +183,58 @@ def test_a_machine_elsewhere_needs_nothing_but_the_folder_and_refuses_to_make_ot
             list(make_shards(other, shards(job.spec)[-1:]))
 
 
+@pytest.mark.parametrize(
+    ("engine", "address"),
+    [
+        ("dask", "nonsense"),
+        ("dask", ""),
+        ("dask", "tcp://host"),
+        ("dask", "http://host:1"),
+        ("ray", "tcp://host:1"),
+        ("ray", ""),
+    ],
+)
+def test_an_address_of_another_form_is_refused_at_once(engine, address):
+    with pytest.raises(UsageError, match=rf"address must be the address of a {engine} cluster, such as") as caught:
+        Engine(engine, address)
+    assert caught.value.argument == "address"
+    for valid in {"dask": ("tcp://a:1", "tls://10.0.0.1:8786", "a:1"), "ray": ("auto", "a.b:6379", "ray://a:1")}[
+        engine
+    ]:
+        Engine(engine, valid)
+
+
+@pytest.mark.parametrize("engine", ["dask", "ray"])
+def test_an_address_where_nobody_listens_is_one_sentence_within_seconds(engine, monkeypatch):
+    monkeypatch.setattr(clusters.importlib, "import_module", lambda _name: None)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    begun = time.monotonic()
+    with (
+        pytest.raises(MachineError, match=rf"^cannot reach the {engine} cluster at {address}: Connection refused$"),
+        assembled(Engine(engine, address), 1),
+    ):
+        pass
+    assert time.monotonic() - begun < clusters.CONNECTION_TIMEOUT_S
+
+
+def test_ray_without_tokens_is_refused_for_local_clusters(monkeypatch):
+    monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
+    monkeypatch.setenv("RAY_AUTH_TOKEN", "replaced below, and restored after the test")
+    monkeypatch.setattr(clusters.importlib.metadata, "version", lambda _name: "2.51.3")
+    with pytest.raises(MachineError, match=r"^ray 2.51.3 starts clusters without authentication: .* 'ray>=2.52'"):
+        clusters._prepare_ray()
+    monkeypatch.setattr(clusters.importlib.metadata, "version", lambda _name: "2.52.0rc1")
+    monkeypatch.setitem(sys.modules, "ray", SimpleNamespace(is_initialized=lambda: False))
+    with pytest.raises(MachineError, match="ray was imported without a token"):
+        clusters._prepare_ray()
+    monkeypatch.delitem(sys.modules, "ray")
+    clusters._prepare_ray()
+    assert os.environ["RAY_AUTH_MODE"] == "token"
+    assert len(os.environ["RAY_AUTH_TOKEN"]) == 64
+
+
 # --- real ones --------------------------------------------------------------------------------------------------------
 
 
@@ -195,6 +251,7 @@ def start(tmp_path) -> Iterator[Callable[..., subprocess.Popen]]:
             started.append(subprocess.Popen([*command, *options], cwd=elsewhere, env=environment, stderr=log))
         return started[-1]
 
+    run.started = started
     yield run
     for process in started:
         process.kill()
@@ -212,6 +269,13 @@ def scheduler(start, tmp_path) -> str:
     while not (tmp_path / "file").exists() and time.monotonic() < deadline:
         time.sleep(0.05)
     return json.loads((tmp_path / "file").read_text())["address"]
+
+
+def require(name: str) -> None:
+    """Skip a test without a package, and do not import it: ray reads its token on import."""
+    package = {"dask": "distributed"}.get(name, name)
+    if find_spec(package) is None:
+        pytest.skip(f"{package} is not installed")
 
 
 WORKER = ("worker", "--nthreads", "1", "--no-nanny", "--no-dashboard", "--host", "127.0.0.1")
@@ -270,12 +334,128 @@ def end_workers(_task: int) -> None:
 @pytest.mark.filterwarnings("default")
 @pytest.mark.parametrize("name", ["dask", "ray"])
 def test_a_task_that_ends_every_worker_is_a_machine_error(name):
-    pytest.importorskip({"dask": "distributed"}.get(name, name))
+    require(name)
     with (
         assembled(Engine(name, None, 2), 3) as pool,
         pytest.raises(MachineError, match=r"^a worker died .*: try again$"),
     ):
         list(pool.distribute(end_workers, range(3), hint=": try again"))
+
+
+STRANGERS = {  # programs of another process of this machine that try to run a task
+    "dask": """
+from distributed import Client
+from distributed.security import Security
+for options in ({"address": "tcp://" + ADDRESS}, {"address": "tls://" + ADDRESS, "security": Security.temporary()}):
+    try:
+        print("ran", Client(timeout=3, **options).submit(sum, [1, 2]).result(timeout=3))
+    except OSError as error:
+        print("refused", type(error).__name__)
+""",
+    "ray": """
+import ray
+try:
+    ray.init(ADDRESS, log_to_driver=False)
+    print("ran", ray.get(ray.remote(lambda: 3).remote()))
+except Exception as error:
+    print("refused", type(error).__name__)
+""",
+}
+STRANGER_TIME_S = 20  # after it, a stranger is ended: ray repeats refused calls for minutes
+
+
+@pytest.mark.extended
+@pytest.mark.filterwarnings("default")
+@pytest.mark.parametrize("name", ["dask", "ray"])
+def test_a_local_cluster_is_on_loopback_and_runs_no_task_of_another_process(name):
+    require(name)
+    with assembled(Engine(name, None, 1), 3) as pool:
+        assert list(pool.distribute(abs, [-3])) == [3]
+        processes = [psutil.Process(), *psutil.Process().children(recursive=True)]
+        listening = {c.laddr for p in processes for c in p.net_connections("tcp") if c.status == psutil.CONN_LISTEN}
+        assert {laddr.ip.removeprefix("::ffff:") for laddr in listening} == {"127.0.0.1"}
+        if name == "dask":
+            address = pool._client.scheduler.address
+            assert address.startswith("tls://")
+        else:
+            address = sys.modules["ray"].get_runtime_context().gcs_address
+        program = f"ADDRESS = {address.rpartition('/')[2]!r}\n{STRANGERS[name]}"
+        environment = {key: value for key, value in os.environ.items() if not key.startswith("RAY_")}
+        stranger = subprocess.Popen(
+            [sys.executable, "-c", program],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            env=environment,
+            text=True,
+        )
+        try:
+            said, _ = stranger.communicate(timeout=STRANGER_TIME_S)
+        except subprocess.TimeoutExpired:
+            stranger.kill()
+            said, _ = stranger.communicate()
+        assert "ran" not in said
+        assert list(pool.distribute(abs, [-4])) == [4]
+
+
+def command_of(name: str, out: Path, *options: str) -> subprocess.Popen:
+    """Start a command that takes long, on an engine."""
+    words = ["make-dataset", "airhockey-hit", "--n", "4e7", "--shard-size", "4096", "--engine", name, *options]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
+    return subprocess.Popen(
+        [sys.executable, "-m", "cnpgen", *words, "--quiet", "--out", str(out)],
+        stderr=subprocess.PIPE,
+        env=environment,
+        text=True,
+    )
+
+
+def wait_for_shards(out: Path) -> None:
+    deadline = time.monotonic() + HANGING
+    while not list(out.glob("train/*.json")) and time.monotonic() < deadline:
+        time.sleep(0.1)
+
+
+def error_of(process: subprocess.Popen) -> str:
+    """Return what a process printed until its end."""
+    try:
+        return process.communicate(timeout=HANGING)[1]
+    finally:
+        process.kill()
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize("name", ["loky", "dask", "ray"])
+def test_sigterm_ends_a_command_with_143_under_each_engine(tmp_path, name):
+    if name != "loky":
+        require(name)
+    process = command_of(name, tmp_path / "out", "--workers", "2")
+    wait_for_shards(tmp_path / "out")
+    process.terminate()
+    assert error_of(process).splitlines()[-1].startswith("cnpgen: terminated: finished shards are kept")
+    assert process.returncode == 143
+
+
+@pytest.mark.extended
+@pytest.mark.filterwarnings("default")
+def test_a_killed_scheduler_of_dask_is_one_sentence(tmp_path, start, scheduler):
+    start(*WORKER)
+    process = command_of("dask", tmp_path / "out", "--address", scheduler)
+    wait_for_shards(tmp_path / "out")
+    start.started[0].kill()
+    (line,) = error_of(process).splitlines()
+    assert line.startswith(f"cnpgen: error: the connection to the dask cluster at {scheduler} is lost: the shards")
+    assert process.returncode == MachineError.exit_code
+
+
+@pytest.mark.extended
+def test_a_killed_head_of_ray_is_one_sentence(tmp_path):
+    require("ray")
+    process = command_of("ray", tmp_path / "out", "--workers", "2")
+    wait_for_shards(tmp_path / "out")
+    (head,) = [p for p in psutil.Process(process.pid).children(recursive=True) if p.name() == "gcs_server"]
+    head.kill()
+    assert error_of(process).splitlines()[-1].startswith("cnpgen: error: cannot reach the ray cluster on this machine")
+    assert process.returncode == MachineError.exit_code
 
 
 def refuse(_task: int) -> None:
@@ -285,14 +465,14 @@ def refuse(_task: int) -> None:
 @pytest.mark.extended
 @pytest.mark.filterwarnings("default")
 def test_ray_makes_the_same_bytes_and_gives_the_task_of_a_dead_worker_to_another(tiny, tmp_path):
-    ray = pytest.importorskip("ray")
+    require("ray")
     with assembled(Engine("ray", None, 2), 6) as pool:
         assert sorted(pool.distribute(partial(die_once, tmp_path / "died"), range(6))) == list(range(6))
         assert (tmp_path / "died").exists()
         with pytest.raises(UsageError, match=r"^not this one$"):
             list(pool.distribute(refuse, range(3)))
         made = make_tiny(tmp_path / "out", engine="ray", workers=2)
-    assert not ray.is_initialized()
+    assert not sys.modules["ray"].is_initialized()
     assert made.complete
     assert digests(tmp_path / "out") == digests(tiny("airhockey-hit"))
 
@@ -301,7 +481,7 @@ def test_ray_makes_the_same_bytes_and_gives_the_task_of_a_dead_worker_to_another
 @pytest.mark.filterwarnings("default")
 @pytest.mark.parametrize("name", ["dask", "ray"])
 def test_plans_are_the_same_whichever_engine_makes_them(tmp_path, name):
-    pytest.importorskip({"dask": "distributed"}.get(name, name))
+    require(name)
     problems = cnpgen.draw_boundary_problems("airhockey-hit", 6, seed=3)
     here = cnpgen.solve_plans(problems, workers=1)
     there = cnpgen.solve_plans(problems, workers=2, engine=name, journal=tmp_path / "journal")

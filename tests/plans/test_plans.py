@@ -802,3 +802,26 @@ def test_joint_positions_that_are_only_outside_are_not_suspicious(value: float) 
     boundary = replace(plans.boundary, start_q=q)
     points = {name: getattr(plans, name) for name in ("path_control_points", "rate_control_points")}
     assert len(make_plans(AIRHOCKEY, boundary, **points)) == N  # warnings are errors in tests
+
+
+@pytest.mark.parametrize(
+    "problem", ["../heavy/problem.toml", "{tmp}/heavy/problem.toml", "link/problem.toml", "/dev/zero", "/etc/passwd"]
+)
+def test_a_problem_in_another_folder_is_not_opened(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, problem: str
+) -> None:
+    shutil.copytree(HEAVY.path.parent, tmp_path / "heavy")
+    (tmp_path / "theirs").mkdir()
+    (tmp_path / "theirs" / "link").symlink_to(tmp_path / "heavy")
+    fields = {name: np.zeros((3, 7)) for name in ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq")}
+    fields |= {"path_control_points": np.zeros((3, 15, 7))}
+    attributes = {"problem": problem.format(tmp=tmp_path)}
+    path = write_minimal(tmp_path / "theirs" / "a.h5", **fields, attributes=attributes)
+    with monkeypatch.context() as patch:
+        patch.setattr("cnpgen.plans.plan_file.load_problem", lambda *_, **__: pytest.fail("opened"))
+        for read in (load_plans, load_boundary_problems):
+            with pytest.raises(
+                DatasetError, match=r"attribute 'problem' names .*, which is not in the folder of the file"
+            ):
+                read(path)
+    assert load_plans(path, problem=HEAVY).problem == record_problem(HEAVY)

@@ -30,8 +30,7 @@ LABELS = ("hit", "replan", "transport")
 
 def explain(plan: Plan, **changes: np.ndarray) -> Explanation:
     boundary = replace(plan.boundary, **changes)
-    ends = {"start_xyz": plan.start_xyz[0], "goal_xyz": plan.goal_xyz[0]}
-    return explain_failure(plan.problem, plan.robot, boundary, **ends)
+    return explain_failure(plan.problem, plan.robot, boundary, plan.scene)
 
 
 @cache
@@ -211,8 +210,7 @@ def test_an_end_at_rest_near_the_edge_is_not_on_the_verge() -> None:
 
 
 def explain_case(plan: Plan) -> Explanation:
-    ends = {"start_xyz": plan.start_xyz[0], "goal_xyz": plan.goal_xyz[0]}
-    return explain_failure(plan.problem, plan.robot, plan.boundary, **ends)
+    return explain_failure(plan.problem, plan.robot, plan.boundary, plan.scene)
 
 
 def test_a_motion_that_starts_off_the_table_may_be_off_at_any_time() -> None:
@@ -279,8 +277,7 @@ def test_a_joint_that_cannot_brake_before_its_limit_is_named() -> None:
     limit = float(plan.robot.position_upper[5])
     q[0, 5], dq[0, 5] = limit - 1e-3, plan.robot.velocity_limit[5]
     only = replace(plan.problem, constraint=plan.problem.constraint[:3])
-    ends = {"start_xyz": plan.start_xyz[0], "goal_xyz": plan.goal_xyz[0]}
-    finding = explain_failure(only, plan.robot, replace(plan.boundary, start_q=q, start_dq=dq), **ends)
+    finding = explain_failure(only, plan.robot, replace(plan.boundary, start_q=q, start_dq=dq), plan.scene)
     assert finding.kind is Feasibility.INFEASIBLE
     assert "joint_6 is" in finding.text
 

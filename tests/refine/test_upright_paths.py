@@ -39,7 +39,7 @@ def violations(problems: Plans, states: np.ndarray) -> Iterator[float]:
     problem, robot = open_problem(problems.problem)
     (task,), world = tasks_of(problems), World(robot, problem.obstacle, problem.object_size)
     for q in states:
-        world.set_state(q, 0 * q, 0 * q, task.obstacle_poses)
+        world.set_state(q, 0 * q, 0 * q, task.scene.poses[0])
         for constraint in problem.constraint:
             for condition in constraint.measured(world):
                 violation = np.maximum(condition.lower - condition.g, condition.g - condition.upper)

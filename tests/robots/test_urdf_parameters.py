@@ -72,7 +72,7 @@ def test_every_notation_that_pinocchio_reads_is_accepted(value: str) -> None:
     _, robot = open_problem(record_of(changed("link/inertial/mass", "value", value)))
     _, usual = open_problem(record_problem(SHIPPED))
     tree = ElementTree.fromstring(SHIPPED.urdf_text)
-    mass = float([item for item in tree.iterfind("link/inertial/mass")][-1].attrib["value"])
+    mass = float(list(tree.iterfind("link/inertial/mass"))[-1].attrib["value"])
     total, before = (sum(inertia.mass for inertia in each.model.inertias) for each in (robot, usual))
     assert total == pytest.approx(before - mass + float(value))
 

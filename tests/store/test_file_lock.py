@@ -27,9 +27,9 @@ def test_a_second_process_is_refused_until_the_first_has_ended(tmp_path: Path) -
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == "locked\n"
-        with pytest.raises(UsageError, match=r"^another process is writing .*out\.h5: wait for it"):
-            with output_lock(tmp_path / "out.h5", lock):
-                pass
+        refused = pytest.raises(UsageError, match=r"^another process is writing .*out\.h5: wait for it")
+        with refused, output_lock(tmp_path / "out.h5", lock):
+            pass
         process.kill()
     assert lock.exists()
     with output_lock(tmp_path / "out.h5", lock):
@@ -44,5 +44,8 @@ def test_an_error_of_the_block_is_raised_unchanged(tmp_path: Path) -> None:
 
 
 def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
-    with pytest.raises(MachineError, match="cannot write"), output_lock(tmp_path / "out.h5", tmp_path / "no" / "out.lock"):
+    with (
+        pytest.raises(MachineError, match="cannot write"),
+        output_lock(tmp_path / "out.h5", tmp_path / "no" / "out.lock"),
+    ):
         pass

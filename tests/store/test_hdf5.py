@@ -210,7 +210,7 @@ def test_heaps_at_the_end_of_a_file_are_checked(tmp_path: Path, monkeypatch: pyt
     content = bytearray(path.read_bytes())
     content[content.index(b"GCOL\x01\0\0\0") + 9] ^= 0x20
     path.write_bytes(content)
-    monkeypatch.setattr("cnpgen.store.files.heaps._CHUNK_WORDS", 7)
+    monkeypatch.setattr("cnpgen.store.files.heaps._CHUNK_BYTES", 56)
     with pytest.raises(DatasetError, match="its texts at byte"), opened_hdf5(path):
         pass
 

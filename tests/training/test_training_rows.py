@@ -28,7 +28,7 @@ def test_rows_prepared_in_blocks_equal_those_prepared_at_once(tiny, monkeypatch,
     assert max(seen) == 16
     np.testing.assert_allclose(again.mean, features.mean, rtol=1e-12, atol=1e-14)
     np.testing.assert_allclose(parts.features, whole.features, atol=1e-5)
-    np.testing.assert_array_equal(parts.obstacle_poses, whole.obstacle_poses)
+    np.testing.assert_array_equal(parts.tasks.scene.poses, whole.tasks.scene.poses)
     for part in ("start_xyz", "goal_xyz", "expected_time", "correction"):
         np.testing.assert_array_equal(getattr(parts.tasks, part), getattr(whole.tasks, part))
     np.testing.assert_array_equal(parts.tasks.boundary.goal_dq, whole.tasks.boundary.goal_dq)

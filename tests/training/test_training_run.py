@@ -353,3 +353,27 @@ train_model({str(tiny("airhockey-hit"))!r}, {str(tmp_path / "cut.h5")!r}, steps=
     cut = train("cut.h5", steps=300, begin=lambda state, run: begun.append(state.adam.step))
     assert 0 < begun[0] < 300
     np.testing.assert_array_equal(cut.model.parameters, train("whole.h5", steps=300).model.parameters)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there are no locks")
+@pytest.mark.parametrize("force", [False, True])
+def test_a_second_training_of_the_same_file_is_refused(train, tiny, tmp_path, force):
+    """The log of the first run stays as it is; the command line ends with exit code 2."""
+    results = []
+
+    def train_again(record: Any) -> None:
+        if not results:
+            before = (tmp_path / "model.jsonl").read_bytes()
+            command = ["train", str(tiny("airhockey-hit")), "-o", str(tmp_path / "model.h5"), "--steps", "3"]
+            options = ["--force"] if force else []
+            done = subprocess.run(
+                [sys.executable, "-m", "cnpgen", *command, *options], capture_output=True, text=True, check=False
+            )
+            assert (tmp_path / "model.jsonl").read_bytes() == before
+            results.append((done.returncode, done.stderr))
+
+    train(watch=train_again)
+    ((code, text),) = results
+    assert code == 2, text
+    assert f"another process is writing {tmp_path / 'model.h5'}: wait for it, or choose another" in text
+    assert not (tmp_path / "model.lock").exists()

@@ -16,12 +16,12 @@ from cnpgen.make.make_dataset import make_dataset
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.store.check import REMAKE_HINT
-from cnpgen.store.dataset_spec import ShardTask, load_dataset_spec, shards
+from cnpgen.store.dataset_spec import load_dataset_spec, shards
 from cnpgen.store.layout import MANIFEST
 from cnpgen.store.shard import read_shard
 from cnpgen.validate.validate_dataset import ValidationReport, validate_dataset
 from tests.conftest import SHIPPED, TINY_SHARD, Arm, needs_compiler, some, tiny_recipe
-from tests.examples.forged_shards import edit, task_of
+from tests.examples.forged_shards import edit
 
 Tiny = Callable[[str], Path]
 FILES = [
@@ -281,9 +281,7 @@ def put_nan(column: str) -> Callable[[h5py.File], None]:
 def test_values_that_are_not_finite_are_named(damaged: Path, column: str, options: dict[str, Any]):
     edit(damaged, "train/shard-00000.h5", put_nan(column))
     report = validate_dataset(damaged, **options)
-    assert named(report) == {
-        "train/shard-00000.h5": f"field '{column}' is not finite in 1 rows, first in row 5"
-    }
+    assert named(report) == {"train/shard-00000.h5": f"field '{column}' is not finite in 1 rows, first in row 5"}
 
 
 def test_sample_ids_of_other_rows_are_named(damaged: Path):

@@ -16,7 +16,7 @@ from cnpgen.pipelines.stages.ik import GoalIK, StartIK
 from cnpgen.pipelines.stages.stage import Stage
 from cnpgen.pipelines.stages.torque import GravityTorque
 from cnpgen.problems.constraints.constraint import Constraint
-from cnpgen.problems.constraints.joint import JointAcceleration, JointPosition, JointTorque, JointVelocity
+from cnpgen.problems.constraints.joint import JointAcceleration, JointJerk, JointPosition, JointTorque, JointVelocity
 from cnpgen.problems.constraints.self_clearance import SelfClearance
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
@@ -25,6 +25,7 @@ from cnpgen.robots.robot_spec import LimitSpec, RobotSpec
 from cnpgen.schema.keys import PerJoint, Range
 
 GUESS_RANGE_RAD, GUESS_RANGE_M = 0.5, 0.1  # range of inverse kinematics guesses around the base configuration
+JERK_RATE = 100.0  # jerk limits per acceleration limit [1/s]; Franka Research 3: 500 (docs/references.md)
 TORQUE_STATES = 1000  # random states that determine placeholders of missing torque limits
 
 
@@ -48,10 +49,10 @@ def dataset_of(arm: Arm, name: str, folder: Path, packages: tuple[Path, ...]) ->
     provisional = with_torques(arm, [1.0] * len(arm.planned))
     robot = load_robot(_problem(provisional, name, folder, places))
     arm = with_torques(arm, _torques(robot))
-    problem = _problem(arm, name, folder, places)
+    problem = _with_jerk_limits(_problem(arm, name, folder, places), robot)
     if _has_masses(robot):
         limit = JointTorque(tolerance=5e-3, budget=6e-2)
-        problem = replace(problem, constraint=(*problem.constraint[:3], limit, *problem.constraint[3:]))
+        problem = replace(problem, constraint=(*problem.constraint[:4], limit, *problem.constraint[4:]))
     base = comfortable_base(problem, load_robot(problem))
     problem = replace(problem, robot=replace(problem.robot, base=base))
     pipeline = Pipeline(
@@ -101,6 +102,15 @@ def _problem(arm: Arm, name: str, folder: Path, packages: tuple[str, ...]) -> Pr
         constraints = (*constraints, SelfClearance(tolerance=1e-3, budget=1e-6))
     path, title = folder / "problem.toml", f"Move {arm.urdf.stem} within its limits"
     return Problem(name=name, title=title, robot=robot, limits=limits, constraint=constraints, path=path.absolute())
+
+
+def _with_jerk_limits(problem: Problem, robot: Robot) -> Problem:
+    """Return the problem with jerk limits in proportion to the acceleration limits; URDFs have none."""
+    jerks = tuple(float(f"{JERK_RATE * limit:.3g}") for limit in robot.acceleration_limit)
+    limits = replace(problem.limits, jerk=PerJoint(jerks))
+    *others, acceleration = problem.constraint[:3]
+    constraints = (*others, acceleration, JointJerk(tolerance=5e-3, budget=6e-2), *problem.constraint[3:])
+    return replace(problem, limits=limits, constraint=constraints)
 
 
 def _has_masses(robot: Robot) -> bool:

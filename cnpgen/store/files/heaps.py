@@ -67,7 +67,7 @@ def _is_consistent(file: BinaryIO, begin: int, size: int) -> bool:
 
 
 def _unpack(file: BinaryIO, position: int, form: str) -> tuple[int, ...]:
-    """Read integers; those beyond the end of a file that was cut off are zero."""
+    """Read integers; those after the end of a truncated file are zero."""
     size = struct.calcsize(form)
     file.seek(position)
     return struct.unpack(form, file.read(size).ljust(size, b"\0"))
