@@ -88,7 +88,7 @@ def checked_arguments(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def _is_first(hint: Any) -> bool:
-    """Whether a wrong type must be found before the call."""
+    """Return whether a wrong type must be found before the call."""
     present = _alternatives(hint)
     if len(present) != 1:
         return set(present) >= _ARRAYS

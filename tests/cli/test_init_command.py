@@ -9,9 +9,11 @@ import pytest
 
 import cnpgen
 from cnpgen.cli.describe_keys import part_of
+from cnpgen.cli.init.initial_recipes import INITIAL_JERK_RATE
 from cnpgen.cli.init.text import toml
 from cnpgen.cli.main import main
 from cnpgen.make.recipe_file import load_dataset_recipe
+from cnpgen.problems.constraints.joint import JointJerk
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import resolved
 from cnpgen.problems.problem_file import load_problem
@@ -86,7 +88,7 @@ def test_every_key_is_there_with_what_it_means(crane):
 def test_what_is_left_out_is_at_its_default(crane):
     with (crane / "problem.toml").open("rb") as file:
         said = tomllib.load(file)
-    assert said["limits"] == {"velocity_scale": 0.8, "torque_scale": 0.8}
+    assert said["limits"] == {"velocity_scale": 0.8, "torque_scale": 0.8, "jerk": said["limits"]["jerk"]}
     assert said["robot"]["joints"] == ["swing", "lift", "elbow", "roll"]
     assert {"object", "payload", "obstacle"}.isdisjoint(said)
 
@@ -143,6 +145,15 @@ def test_limits_that_are_missing_are_put_in_and_said(tmp_path):
     assert min(limits.torque.values) >= 1
 
 
+def test_jerks_are_limited_in_proportion_to_the_accelerations(crane):
+    problem = load_problem(crane / "problem.toml")
+    robot = load_robot(problem)
+    assert JointJerk in map(type, problem.constraint)
+    np.testing.assert_allclose(robot.jerk_limit, INITIAL_JERK_RATE * robot.acceleration_limit, rtol=5e-3)
+    text = (crane / "problem.toml").read_text(encoding="utf-8")
+    assert "100/s times the acceleration limits" in " ".join(text.replace("\n#", " ").split())
+
+
 def test_without_masses_and_shapes_their_constraints_are_left_out(tmp_path):
     urdf = write_arm(tmp_path / "arm.urdf", ELBOW, mass=0.0)
     assert main(["init", str(tmp_path / "light"), "--urdf", str(urdf)]) == 0
@@ -151,6 +162,7 @@ def test_without_masses_and_shapes_their_constraints_are_left_out(tmp_path):
         "JointPosition",
         "JointVelocity",
         "JointAcceleration",
+        "JointJerk",
     ]
     text = (tmp_path / "light" / "problem.toml").read_text(encoding="utf-8")
     assert "'joint-torque' is left out" in text

@@ -18,6 +18,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from cnpgen.planner.model_file import load_model
 from cnpgen.validate.validate_dataset import validate_dataset
 from tests.cli.test_interruption import descendants
 from tests.examples.tiny_datasets import digests
@@ -88,6 +89,20 @@ def _solve(folder: Path, workers: int) -> list[str]:
     return ["solve", "airhockey-hit", *options, "-o", str(folder / "plans.h5")]
 
 
+def _unrefined(shared: Path, folder: Path) -> None:
+    shutil.copy(shared / "unrefined.h5", folder / "unrefined.h5")
+
+
+def _refine(folder: Path, workers: int) -> list[str]:
+    options = ["--workers", str(workers), "--quiet"]
+    return ["refine", str(folder / "unrefined.h5"), *options, "-o", str(folder / "plans.h5")]
+
+
+def _train(folder: Path, _workers: int) -> list[str]:
+    options = ["--steps", "60", "--hidden", "16", "--layers", "2", "--batch-size", "32", "--check", "2", "--quiet"]
+    return ["train", str(folder.parent / "shared" / "small"), *options, "-o", str(folder / "model.h5")]
+
+
 def _dataset(folder: Path) -> object:
     """Return the digests of the shards of a dataset, which must be valid and without temporary files."""
     assert validate_dataset(folder / "out").ok
@@ -100,11 +115,24 @@ def _plans(folder: Path) -> object:
     return (folder / "plans.h5").read_bytes()
 
 
+def _refined(folder: Path) -> object:
+    assert sorted(path.name for path in folder.iterdir()) == ["plans.h5", "unrefined.h5"]
+    return (folder / "plans.h5").read_bytes()
+
+
+def _model(folder: Path) -> object:
+    """Return the parameters of a model; its file also has the times of the run."""
+    assert not {".checkpoint", ".tmp", ".lock"} & {path.suffix for path in folder.iterdir()}
+    return load_model(folder / "model.h5").parameters.tobytes()
+
+
 KINDS = {
     "make": Kind(_nothing, _make, _dataset),
     "extend": Kind(_small, _extend, _dataset),
     "merge": Kind(_nothing, _merge, _dataset),
     "solve": Kind(_nothing, _solve, _plans, (0, 1)),
+    "refine": Kind(_unrefined, _refine, _refined, (0, 1)),
+    "train": Kind(_nothing, _train, _model),
 }
 
 
@@ -144,6 +172,8 @@ def _share(shared: Path) -> None:
     shared.mkdir()
     make = ["make-dataset", "airhockey-hit", *SETTINGS, "--workers", "1"]
     _finish([*make, "--n", "330", "--out", str(shared / "small")], (0,))
+    plan = ["plan", str(shared / "small"), "--model", "airhockey-hit", "--n", "12", "-o", str(shared / "unrefined.h5")]
+    _finish(plan, (0, 1))
     for k in range(2):
         _finish([*make, "--n", "660", "--part", f"{k}/2", "--out", str(shared / f"part{k}")], (0,))
 
@@ -172,7 +202,9 @@ def _killed(kind: Kind, folder: Path, chosen: random.Random, uninterrupted: tupl
                 n_signals += 1
             code = process.wait(MAX_RUN_TIME_S)
         assert code in {0, 1, 3, 130, 143, -signal.SIGKILL, -signal.SIGTERM, -signal.SIGINT}, f"it ended with {code}"
-        if (folder / "plans.h5").exists():  # the run finished before the signal, and would refuse to replace its plans
+        if (folder / "plans.h5").exists() or (
+            folder / "model.h5"
+        ).exists():  # the run finished before the signal, and would refuse to replace its plans
             break
     else:
         _finish(kind.words(folder, 2), kind.codes)

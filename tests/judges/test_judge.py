@@ -96,8 +96,7 @@ def violations(plan: Plan, seen: ReferenceTrajectory) -> dict[str, np.ndarray]:
         open_for = np.clip((0.3 - seen.s) / 0.2, 0, 1) * abs(seen.tip[0, 2] - 0.16)
         found["table height"] = (np.abs(seen.tip[:, 2] - 0.16) - open_for)[:, None]
     else:
-        found["tilt"] = np.abs(seen.rotation[:, :2, 2])
-        found["upright"] = -seen.rotation[:, 2:, 2]
+        found["tilt"] = np.arctan2(np.linalg.norm(seen.rotation[:, :2, 2], axis=1), seen.rotation[:, 2, 2])[:, None]
     return found
 
 

@@ -533,10 +533,21 @@ def test_tolerances_of_limits_are_relative_and_others_absolute():
 @pytest.mark.parametrize("name", sorted(KINDS.keys() - {"tip-speed"}))
 def test_tolerance_of_a_motion_is_absolute_or_a_fraction_of_the_limit(benches, name):
     kind = KINDS[name]
-    for condition in kind.measured(benches["heavy-object"].state(0.1)):
+    for condition in kind.judged(benches["heavy-object"].state(0.1)):
         fraction = name in {"joint-velocity", "joint-acceleration", "joint-torque"}
         expected = kind.tolerance * condition.upper if fraction else np.full(len(condition.g), kind.tolerance)
         np.testing.assert_array_equal(kind.allowed(condition), expected)
+
+
+def test_the_verdict_limits_the_angle_of_a_tilt_and_not_its_components(benches):
+    world = benches["heavy-object"].state(benches["heavy-object"].robot.base)
+    tilted = pin.exp3(np.deg2rad(1.6) * np.array([1.0, 1.0, 0.0]))[:, 2]  # 2.26 deg, 1.6 deg about x and about y
+    aligned = Axis(direction=tuple(world.tip_rotation @ tilted), tolerance=np.deg2rad(1.8))
+    (angle,) = aligned.judged(world)
+    assert np.rad2deg(angle.g[0]) == pytest.approx(1.6 * np.sqrt(2), rel=1e-6)
+    assert angle.violation() > aligned.allowed(angle)[0]
+    components, _ = aligned.measured(world)
+    assert np.linalg.norm(aligned.allowed(components)) == pytest.approx(aligned.tolerance)
 
 
 def test_the_time_varying_bound_admits_only_motions_down_to_the_table(benches):

@@ -197,7 +197,7 @@ def after(module, name):
 def before(module, name):
     original = getattr(module, name)
     def both(*arguments, **options):
-        if path in arguments:
+        if arguments[0] == path:
             truncate()
         return original(*arguments, **options)
     setattr(module, name, both)

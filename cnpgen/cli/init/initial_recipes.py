@@ -25,7 +25,7 @@ from cnpgen.robots.robot_spec import LimitSpec, RobotSpec
 from cnpgen.schema.keys import PerJoint, Range
 
 GUESS_RANGE_RAD, GUESS_RANGE_M = 0.5, 0.1  # range of inverse kinematics guesses around the base configuration
-JERK_RATE = 100.0  # jerk limits per acceleration limit [1/s]; Franka Research 3: 500 (docs/references.md)
+INITIAL_JERK_RATE = 100.0  # jerk limits per acceleration limit [1/s]; Franka Research 3: 500 (docs/references.md)
 TORQUE_STATES = 1000  # random states that determine placeholders of missing torque limits
 
 
@@ -106,7 +106,7 @@ def _problem(arm: Arm, name: str, folder: Path, packages: tuple[str, ...]) -> Pr
 
 def _with_jerk_limits(problem: Problem, robot: Robot) -> Problem:
     """Return the problem with jerk limits in proportion to the acceleration limits; URDFs have none."""
-    jerks = tuple(float(f"{JERK_RATE * limit:.3g}") for limit in robot.acceleration_limit)
+    jerks = tuple(float(f"{INITIAL_JERK_RATE * limit:.3g}") for limit in robot.acceleration_limit)
     limits = replace(problem.limits, jerk=PerJoint(jerks))
     *others, acceleration = problem.constraint[:3]
     constraints = (*others, acceleration, JointJerk(tolerance=5e-3, budget=6e-2), *problem.constraint[3:])

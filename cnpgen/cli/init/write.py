@@ -7,7 +7,7 @@ from typing import Any
 
 from cnpgen.cli.describe import table, with_units
 from cnpgen.cli.init.arm import DEFAULT_RANGE_M, DEFAULT_RANGE_RAD, DEFAULT_SPEED, Arm
-from cnpgen.cli.init.initial_recipes import TORQUE_STATES
+from cnpgen.cli.init.initial_recipes import INITIAL_JERK_RATE, TORQUE_STATES
 from cnpgen.cli.init.text import recipe_text
 from cnpgen.cli.shape_rows import link_rows, pair_rows
 from cnpgen.make.recipe import DatasetRecipe
@@ -69,7 +69,8 @@ def _notes(arm: Arm) -> Mapping[str, str]:
     torques = f"the largest of {TORQUE_STATES:,} random states, at speeds and accelerations within the limits"
     put = {"position": ranges, "velocity": f"{DEFAULT_SPEED:g} rad/s or m/s", "torque": torques}
     base = "Found by sampling: in front of the robot, far from its limits, with high manipulability."
-    notes = {"robot.base": base}
+    jerk = f"{INITIAL_JERK_RATE:.0f}/s times the acceleration limits; a Franka Research 3 has 500/s. Look them up."
+    notes = {"robot.base": base, "limits.jerk": jerk}
     for what, instead in put.items():
         without = [joint.name for joint in arm.planned if what in joint.missing]
         if without:

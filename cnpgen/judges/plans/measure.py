@@ -80,7 +80,7 @@ class MeasuredCondition:
 
     Attributes:
         constraint: Constraint that states the condition.
-        condition: Result of the constraint's measurement at K samples.
+        condition: Judged values of the constraint at K samples.
         g: Values [unit of the condition], shape (m, K).
         relaxation: Distance by which the bounds are relaxed [unit of the condition], shape (K,).
         tolerance: Accepted violation, shape (m,).
@@ -132,7 +132,7 @@ def measure(constraint: Constraint, world: PathWorld, s: Array, start_tip: Array
         start_tip: Tip position at the start of the motion [m], shape (3,).
     """
     measured = []
-    for condition in constraint.measured(cast("World", world)):  # PathWorld has the interface of World for K states
+    for condition in constraint.judged(cast("World", world)):  # PathWorld has the interface of World for K states
         if condition.g:
             g = np.empty((len(condition.g), len(s)))
             for row, value in zip(g, condition.g, strict=True):

@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -24,8 +24,9 @@ Array = NDArray[np.float64]
 class TipAxis(Constraint):
     """Base class: the tip's axis a is along the world direction d: ``e1 . R a = e2 . R a = 0`` and ``d . R a > 0``.
 
-    e1 and e2 are orthogonal to d: ``1 - d . R a`` has no gradient at the solution, and these two are the tilt [rad] to
-    first order.
+    e1 and e2 are orthogonal to d: ``1 - d . R a`` has no gradient at the solution. The two values are the components of
+    the tilt [rad] to first order. The verdict limits the angle between both, so the tolerance of each component is that
+    of the angle divided by the square root of 2.
     """
 
     training_weight = 300.0
@@ -48,6 +49,16 @@ class TipAxis(Constraint):
     def measured(self, world: "World") -> tuple[Condition, ...]:
         """Evaluate the tilt of Pinocchio's tip frame [rad]."""
         return self._held(list(world.tip_rotation))
+
+    def judged(self, world: "World") -> tuple[Condition, ...]:
+        """Evaluate the angle between axis and direction [rad]."""
+        tilt, upright = self.measured(world)
+        angle = np.arctan2(np.hypot(*tilt.g), upright.g[0])
+        return (replace(tilt, g=[angle], lower=np.zeros(1), upper=np.zeros(1), parts=()),)
+
+    def allowed(self, condition: Condition) -> Array:
+        """Return the tolerance of the angle, or of each of its components."""
+        return np.asarray(super().allowed(condition) / np.sqrt(len(condition.g)))
 
     def _held(self, rotation: Sequence[Any]) -> tuple[Condition, ...]:
         axis, direction = self.directions
@@ -89,6 +100,10 @@ class Axis(TipAxis):
         if not self.angle:
             return super().allowed(condition)
         return np.full(len(condition.g), np.cos(self.angle) - np.cos(min(self.angle + self.tolerance, np.pi)))
+
+    def judged(self, world: "World") -> tuple[Condition, ...]:
+        """Evaluate the angle between axis and direction [rad], or its cosine for a range of angles."""
+        return self.measured(world) if self.angle else super().judged(world)
 
     def symbolic_at(self, state: "SymbolicState", end: End) -> tuple[Condition, ...]:
         """State the tilt and, for an aligned axis, its rates."""

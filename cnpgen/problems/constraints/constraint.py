@@ -161,6 +161,13 @@ class Constraint(ABC):
         not depend on the state.
         """
 
+    def judged(self, world: World) -> tuple[Condition, ...]:
+        """Evaluate the conditions whose violations the verdict limits, by default ``measured``.
+
+        Override it if solvers need several values of one quantity, such as the components of an angle.
+        """
+        return self.measured(world)
+
     def met(self, path: PathWorld, tolerance: float) -> NDArray[np.bool_] | None:  # noqa: ARG002
         """Return a mask of the K states that satisfy ``measured`` up to a tolerance, or None without a fast check.
 

@@ -1,7 +1,7 @@
 """Constraint: the tip with a fixed orientation in a box, a task space region (Berenson, 2011) without rotation."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -23,8 +23,9 @@ Array = NDArray[np.float64]
 class Pose(TipManifold):
     """Constraint: fixed orientation ``R = R_wanted`` in a box of the world, without rotation at the ends.
 
-    A range of a single point fixes that coordinate. The three values of the orientation are the axis times the
-    sine of the angle of ``R_wanted^T R``: angles [rad] to first order, and 0 at half a turn, too, which is excluded.
+    A range of a single point fixes that coordinate. The three values of the orientation are the axis times the sine of
+    the angle of ``R_wanted^T R``: angles [rad] to first order, and 0 at half a turn, too, which is excluded. The
+    verdict limits this angle, so the tolerance of each value is that of the angle divided by the square root of 3.
     """
 
     reason = "not in its pose"
@@ -64,6 +65,17 @@ class Pose(TipManifold):
     def measured(self, world: "World") -> tuple[Condition, ...]:
         """Evaluate Pinocchio's tip frame."""
         return (*super().measured(world), *self._turned(list(world.tip_rotation)))
+
+    def judged(self, world: "World") -> tuple[Condition, ...]:
+        """Evaluate the position [m] and the angle of the orientation [rad]."""
+        *position, sines, cosine = self.measured(world)
+        angle = np.arctan2(np.sqrt(sum(sine**2 for sine in sines.g)), cosine.g[0])
+        return (*position, replace(sines, g=[angle], lower=np.zeros(1), upper=np.zeros(1), parts=()))
+
+    def allowed(self, condition: Condition) -> Array:
+        """Return the tolerance of an offset, of the angle, or of each component of the angle."""
+        allowed = super().allowed(condition)
+        return allowed / np.sqrt(len(condition.g)) if condition.name == "orientation" else allowed
 
     def symbolic_at(self, state: "SymbolicState", end: End) -> tuple[Condition, ...]:  # noqa: ARG002
         """State position, orientation and their rates."""

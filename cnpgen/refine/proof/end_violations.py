@@ -41,15 +41,13 @@ def end_violations(problem: Problem, robot: Robot, boundary: Boundary, scene: Sc
         "start": (boundary.start_q[0], boundary.start_dq[0], boundary.start_ddq[0]),
         "goal": (boundary.goal_q[0], boundary.goal_dq[0], goal_ddq),
     }
-    orders = measured_needs([constraint.measured for constraint in problem.constraint], world)
+    orders = measured_needs([constraint.judged for constraint in problem.constraint], world)
     world.set_state(*ends["start"], obstacle_poses)
     tip = world.tip_position
     for end, state in ends.items():
         world.set_state(*state, obstacle_poses)
         free = end == "goal" and boundary.goal_ddq is None
-        pairs = [
-            (constraint, condition) for constraint in problem.constraint for condition in constraint.measured(world)
-        ]
+        pairs = [(constraint, condition) for constraint in problem.constraint for condition in constraint.judged(world)]
         for (constraint, condition), order in zip(pairs, orders, strict=True):
             if not (free and order == 2):
                 yield from _violation(constraint, condition, tip, end, BOUNDARY_MARGIN[order])
