@@ -203,7 +203,6 @@ OPTIONAL = {  # package that cnpgen imports -> extra that installs it, function 
     "coacd": ("decompose", decomposition),
     "meshcat": ("view", page._viewer),
     "distributed": ("dask", lambda: cluster("dask")),
-    "dask": ("dask", lambda: cluster("dask")),
     "ray": ("ray", lambda: cluster("ray")),
     "polars": ("polars", lambda: frame("polars")),
     "pandas": ("pandas", lambda: frame("pandas")),

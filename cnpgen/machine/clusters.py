@@ -268,13 +268,13 @@ def _dask(address: str | None, workers: int | None, what: str) -> Iterator[Clust
 
 def _local_dask(workers: int | None) -> Any:
     """Start a scheduler and workers on this machine that accept only processes with their temporary certificate."""
-    import dask
     from distributed import LocalCluster
     from distributed.security import Security
 
     with requires_extra("dask", "cryptography"):
         security = Security.temporary()
-    with dask.config.set({"distributed.scheduler.http.routes": []}):  # its HTTP server has no authentication
+    config = importlib.import_module("dask.config")
+    with config.set({"distributed.scheduler.http.routes": []}):  # its HTTP server has no authentication
         return LocalCluster(
             n_workers=workers,
             threads_per_worker=1,

@@ -1,7 +1,7 @@
 """Parameters of the links and joints of a URDF, read from its XML without Pinocchio."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from xml.etree.ElementTree import Element
 
@@ -112,9 +112,24 @@ def urdf_parameters(tree: Element) -> UrdfParameters:
         _read_named(link, lambda link: inertias.update({link.get("name", ""): _inertia(link)}), mistakes)
     for element in tree.findall("joint"):
         _read_named(element, lambda element: joints.update({(joint := _joint(element)).child: joint}), mistakes)
+    mistakes += [f"link {link!r}: its joints form a cycle" for link in _links_in_cycles(joints)]
     if mistakes:
         raise RecipeError(mistakes)
     return UrdfParameters(inertias, joints)
+
+
+def _links_in_cycles(joints: Mapping[str, UrdfJoint]) -> list[str]:
+    """List a link of every cycle of joints; the parser ignores cycles that no root moves."""
+    rooted, found = set[str](), list[str]()
+    for first in joints:
+        link, path = first, set[str]()
+        while link in joints and link not in rooted and link not in path:
+            path.add(link)
+            link = joints[link].parent
+        if link in path:
+            found.append(link)
+        rooted |= path
+    return found
 
 
 def _read_named(element: Element, read: Callable[[Element], None], mistakes: list[str]) -> None:

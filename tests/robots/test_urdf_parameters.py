@@ -128,3 +128,16 @@ def test_joints_and_links_are_read_by_name() -> None:
     parameters = urdf_parameters(tree)
     assert set(parameters.inertias) == {link.get("name") for link in tree.findall("link")}
     assert {joint.name for joint in parameters.joints.values()} == {each.get("name") for each in tree.findall("joint")}
+
+
+@pytest.mark.parametrize("length", [1, 3])
+def test_a_cycle_that_no_root_moves_is_refused(length: int) -> None:
+    """Pinocchio builds a model without these links."""
+    links = "".join(f'<link name="c{k}"/>' for k in range(length))
+    joints = "".join(
+        f'<joint name="cycle{k}" type="fixed"><parent link="c{k}"/><child link="c{(k + 1) % length}"/></joint>'
+        for k in range(length)
+    )
+    urdf = SHIPPED.urdf_text.replace("</robot>", f"{links}{joints}</robot>")
+    with pytest.raises(RecipeError, match=r"link 'c\d': its joints form a cycle"):
+        open_problem(record_of(urdf))
