@@ -75,7 +75,8 @@ def test_via_points_repair_plans_and_keep_those_without_violation(model: Model, 
     repaired = np.flatnonzero((before > 1) & (after <= 1))
     assert len(repaired) >= 3
     assert evaluate_plans(found[repaired], workers=1).valid.mean() > 0.5
-    assert not evaluate_plans(straight[repaired], workers=1).valid.any()
+    certain = repaired[before[repaired] > np.sqrt(2)]  # the planner limits the components of the tilt, conservatively
+    assert not evaluate_plans(straight[certain], workers=1).valid.any()
 
 
 @needs_compiler
