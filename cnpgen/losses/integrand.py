@@ -14,7 +14,6 @@ from cnpgen.losses.published_conditions import published_conditions
 from cnpgen.losses.terms import Term, constraint_term, task_term
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.problem import Problem
-from cnpgen.robots.solid import pose_width
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
@@ -108,7 +107,7 @@ def _stage(robot: "Robot", problem: Problem, form: str) -> tuple[Inputs, FrozenS
     orders = problem.path_orders
     path = tuple(sym("d" * order + "p", n) for order in range(orders))
     rate = sym("rate", orders - 1)
-    obstacle_poses, size = sym("obstacle_poses", pose_width(problem.obstacle)), problem.object_size
+    obstacle_poses, size = sym("obstacle_poses", problem.scene_width), problem.object_size
     q, *derivatives = (ca.vertsplit(column) for column in path)
     dq, ddq, jerk = time_derivatives(derivatives, ca.vertsplit(rate))
     state = FrozenState(robot, q, dq, ddq, ca.vertsplit(obstacle_poses), problem.obstacle, size, jerk)

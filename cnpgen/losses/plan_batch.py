@@ -9,7 +9,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.problems.problem import Problem
-from cnpgen.robots.solid import pose_width
 from cnpgen.schema.arguments import numbers
 
 Array = NDArray[Any]
@@ -103,7 +102,7 @@ def check_shapes(problem: Problem, shapes: Mapping[str, tuple[int, ...]]) -> Non
     Raises:
         UsageError: A shape is wrong, or the obstacle poses are missing.
     """
-    spec, width = problem.trajectory, pose_width(problem.obstacle)
+    spec, width = problem.trajectory, problem.scene_width
     if width and "obstacle_poses" not in shapes:
         names = ", ".join(box.name for box in problem.obstacle)
         raise UsageError(

@@ -11,7 +11,6 @@ from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
 from cnpgen.losses.integrand import has_time_varying_bound, penalized_conditions
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.problem import Problem
-from cnpgen.robots.solid import pose_width
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
@@ -59,7 +58,7 @@ def make_time_varying_bound(problem: Problem, robot: "Robot", form: str) -> Time
     import casadi as ca
 
     q, dq, ddq = (ca.vertsplit(ca.SX.sym(name, robot.n)) for name in ("q", "dq", "ddq"))
-    obstacle_poses = ca.vertsplit(ca.SX.sym("obstacle_poses", pose_width(problem.obstacle)))
+    obstacle_poses = ca.vertsplit(ca.SX.sym("obstacle_poses", problem.scene_width))
     size = problem.object_size
     state = SymbolicState(robot, q, dq, ddq, obstacle_poses, problem.obstacle, size)
     pairs = penalized_conditions(filter(has_time_varying_bound, problem.constraint), state, form)

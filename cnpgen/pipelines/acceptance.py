@@ -17,7 +17,6 @@ from cnpgen.pipelines.stages.stage import CandidateBatch, StageFunction
 from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES, End
 from cnpgen.problems.constraints.needs import symbolic_needs
 from cnpgen.problems.problem import Problem
-from cnpgen.robots.solid import pose_width
 from cnpgen.store.field import Field
 
 if TYPE_CHECKING:
@@ -107,7 +106,7 @@ def boundary_unmet(
         ("q", robot.n),
         ("dq", robot.n),
         ("ddq", robot.n),
-        ("obstacle_poses", pose_width(problem.obstacle)),
+        ("obstacle_poses", problem.scene_width),
         ("p", 3),
     )
     (q_sx, q), (dq_sx, dq), (ddq_sx, ddq), (poses_sx, obstacle_poses), (p_sx, p) = (

@@ -9,11 +9,10 @@ start_q, start_dq, start_ddq, goal_q, goal_dq, and goal_ddq if the goal fixes th
 
 from typing import TYPE_CHECKING, Any
 
-from cnpgen.kernels.symbolic.kinematics import forward_kinematics
+from cnpgen.kernels.symbolic.kinematics import forward_kinematics, tip_velocity
 from cnpgen.kernels.symbolic.linalg import Vec, symbols
 from cnpgen.planner.gauss_newton import projection_change
 from cnpgen.problems.problem import Problem
-from cnpgen.robots.solid import pose_width
 from cnpgen.trajectory.spline import end_derivatives
 
 if TYPE_CHECKING:
@@ -21,13 +20,16 @@ if TYPE_CHECKING:
     from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
 
-def tips_at_ends(robot: "Robot", *, fixed_at_goal: int) -> Any:
-    """Build ``ends -> (start position, goal position)`` of the tip [m]."""
+def tips_at_ends(robot: "Robot", problem: Problem, *, fixed_at_goal: int) -> Any:
+    """Build ``ends -> (start position, goal position)`` of the tip [m], and its velocity at the goal if it is used."""
     import casadi as ca
 
     ends_sx, ends = symbols("ends", (3 + fixed_at_goal) * robot.n)
-    q, _, _, goal_q, *_ = _split(ends, robot.n)
-    tips = [ca.vertcat(*forward_kinematics(robot.chain, position).tip) for position in (q, goal_q)]
+    q, _, _, goal_q, goal_dq, *_ = _split(ends, robot.n)
+    start, goal = (forward_kinematics(robot.chain, position) for position in (q, goal_q))
+    tips = [ca.vertcat(*kinematics.tip) for kinematics in (start, goal)]
+    if problem.scene_constraint is not None:
+        tips.append(ca.vertcat(*tip_velocity(goal, goal_dq)))
     return ca.Function("tips_at_ends", [ends_sx], tips)
 
 
@@ -41,7 +43,7 @@ def line_change(
     import casadi as ca
 
     (ends_sx, ends), rate, spec = symbols("ends", (3 + fixed_at_goal) * robot.n), ca.SX.sym("rate"), problem.trajectory
-    poses_sx, obstacle_poses = symbols("obstacle_poses", pose_width(problem.obstacle))
+    poses_sx, obstacle_poses = symbols("obstacle_poses", problem.scene_width)
     points = _points(_split(ends, robot.n), [rate] * spec.rate_control_points, spec)
     interior = slice(3, -fixed_at_goal)
     offsets_sx, scalars = symbols("offsets", len(points[interior]) * robot.n if with_offsets else 0)
@@ -63,7 +65,7 @@ def projected_path(robot: "Robot", problem: Problem, *, steps: int, fixed_at_goa
     spec, n = problem.trajectory, robot.n
     (ends_sx, ends), (poses_sx, obstacle_poses) = (
         symbols("ends", (3 + fixed_at_goal) * n),
-        symbols("obstacle_poses", pose_width(problem.obstacle)),
+        symbols("obstacle_poses", problem.scene_width),
     )
     rates_sx, rates = symbols("rates", spec.rate_control_points)
     offsets_sx, offsets = symbols("offsets", (spec.path_control_points - 3 - fixed_at_goal) * n)
@@ -109,7 +111,7 @@ def _path_change(
     points = problem.trajectory.path_control_points
     (path_sx, path), (poses_sx, obstacle_poses) = (
         symbols("path", points * robot.n),
-        symbols("obstacle_poses", pose_width(problem.obstacle)),
+        symbols("obstacle_poses", problem.scene_width),
     )
     change = projection_change(
         robot,

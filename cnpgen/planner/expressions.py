@@ -13,7 +13,6 @@ from cnpgen.kernels.symbolic.symbolic_state import SymbolicState, time_derivativ
 from cnpgen.problems.constraints.constraint import MIN_TOLERANCE, Condition
 from cnpgen.problems.constraints.needs import symbolic_needs
 from cnpgen.problems.problem import Problem
-from cnpgen.robots.solid import pose_width
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
@@ -27,7 +26,7 @@ def equality_residuals(robot: "Robot", problem: Problem) -> Any:
 
     (q_sx, q), (poses_sx, obstacle_poses) = (
         symbols("q", robot.n),
-        symbols("obstacle_poses", pose_width(problem.obstacle)),
+        symbols("obstacle_poses", problem.scene_width),
     )
     rows = [
         value - float(target)
@@ -49,7 +48,7 @@ def speed_residuals(robot: "Robot", problem: Problem) -> Any:
 
     (q_sx, q), (poses_sx, obstacle_poses) = (
         symbols("q", robot.n),
-        symbols("obstacle_poses", pose_width(problem.obstacle)),
+        symbols("obstacle_poses", problem.scene_width),
     )
     state = _moving(problem, q)
     rows = [
@@ -120,7 +119,7 @@ def static_violation(robot: "Robot", problem: Problem) -> Any:
 
     (q_sx, q), (poses_sx, obstacle_poses) = (
         symbols("q", robot.n),
-        symbols("obstacle_poses", pose_width(problem.obstacle)),
+        symbols("obstacle_poses", problem.scene_width),
     )
     zero = [0.0] * robot.n
     jerk = zero if problem.uses_jerk else None
@@ -167,7 +166,7 @@ def speed_bounds(robot: "Robot", problem: Problem) -> SpeedBounds:
     """Return the bounds of the rows of ``speed_residuals``."""
     state, obstacle_poses = (
         _moving(problem, symbols("q", robot.n)[1]),
-        symbols("obstacle_poses", pose_width(problem.obstacle))[1],
+        symbols("obstacle_poses", problem.scene_width)[1],
     )
     rows = [
         (low, high, needs == 3, needs == 1 and _is_proportional(value, state.moving[0], low, high))
@@ -190,7 +189,7 @@ def _on_path(robot: "Robot", problem: Problem) -> tuple[list[Any], list[Vec]]:
     """Return p, p', p'', ..., r, r', ... and obstacle poses, as SX columns and as lists of their scalars."""
     orders = problem.path_orders
     names = (*(f"p{order}" for order in range(orders)), "rates", "obstacle_poses")
-    widths = (*[robot.n] * orders, orders - 1, pose_width(problem.obstacle))
+    widths = (*[robot.n] * orders, orders - 1, problem.scene_width)
     columns, scalars = zip(*map(symbols, names, widths), strict=True)
     return list(columns), list(scalars)
 

@@ -25,6 +25,8 @@ from cnpgen.planner.planner import Planner
 from cnpgen.plans.boundary_file import CONTEXT
 from cnpgen.plans.format import BOUNDARY, CONDITIONS
 from cnpgen.plans.plans import Plans
+from cnpgen.problems.constraints.puck_contact import PuckContact
+from cnpgen.problems.problem_record import ProblemRecord, as_problem
 from cnpgen.robots.plausible_values import check_plausible
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import number, numbers
@@ -69,7 +71,7 @@ def plan_hits(
     puck: ArrayLike,
     target: ArrayLike,
     *,
-    contact_distance: float = CONTACT_DISTANCE_M,
+    contact_distance: float | None = None,
     speed_share: ArrayLike = 1.0,
 ) -> PlannedHits:
     """Plan hits from a state of the arm that send a puck towards a target.
@@ -83,22 +85,37 @@ def plan_hits(
             as returned by ``Plans.states_at``; the distance to the table must be within the tolerance of plans.
         puck: Position of the puck's centre, x and y [m], shape (2,) or (N, 2); x, y and z for problems without table.
         target: Position to hit the puck towards, x and y [m], shape (2,) or (N, 2).
-        contact_distance: Distance from the puck's centre to the mallet's at contact [m].
+        contact_distance: Distance from the puck's centre to the mallet's at the goal [m]; by default that of the
+            problem's constraint ``puck-contact``, or 0.07 without one.
         speed_share: Speed of the hit as a fraction of the highest possible one, a number or shape (N,).
 
     Returns:
         Plans of the hits that have an answer, not checked yet, and the reasons why the others have none.
 
     Raises:
-        UsageError: A shape is wrong, a value is not finite, or the model was not trained on hits.
+        UsageError: A shape is wrong, a value is not finite, the contact distance differs from that of the problem, or
+            the model was not trained on hits.
     """
     completion = _COMPLETIONS.get(planner)
     if completion is None:
         completion = _COMPLETIONS[planner] = load_completion(planner.model, planner.backend)
-    tasks = hit_tasks(completion, state, puck, target, contact_distance=contact_distance, share=speed_share)
+    distance = _contact_distance(planner.model.problem, contact_distance)
+    tasks = hit_tasks(completion, state, puck, target, contact_distance=distance, share=speed_share)
     columns = {name: tasks[name][0] for name in CONTEXT}
     boundary = boundary_of_tasks(tasks, planner.model.fixed_at_goal)
     return PlannedHits(planner.plan_batch(boundary, sample_id=tasks.alive, columns=columns), tasks.why())
+
+
+def _contact_distance(problem: ProblemRecord, given: float | None) -> float:
+    """Return the contact distance of a problem [m]; it must equal the given one, if there is any."""
+    constraint = as_problem(problem).first(PuckContact)
+    if given is None:
+        return CONTACT_DISTANCE_M if constraint is None else constraint.contact_distance
+    distance = number("contact_distance", given)
+    if constraint is not None and distance != constraint.contact_distance:
+        expected = f"{constraint.contact_distance:g} m, as in the problem's constraint puck-contact"
+        raise UsageError(f"must be {expected}, got {distance:g} m", argument="contact_distance")
+    return distance
 
 
 def load_completion(model: Model, backend: str | None) -> Completion:
@@ -140,7 +157,7 @@ def hit_tasks(
     angle = np.arctan2(direction[1:], direction[:1])
     shares = _lanes("speed_share", np.reshape(numbers("speed_share", share), (-1, 1)), {1})
     _check_distance(completion, contact_distance, {"puck": centre, "target": goal})
-    columns = [*parts, behind(centre, angle, number("contact_distance", contact_distance)), angle, shares]
+    columns = [*parts, behind(centre, angle, contact_distance), angle, shares]
     counts = {name: values.shape[1] for name, values in zip(HIT_COLUMNS, columns, strict=True)}
     largest = max(counts.values())
     for column, count in counts.items():
@@ -154,7 +171,7 @@ def hit_tasks(
 
 def _check_distance(completion: Completion, contact_distance: float, positions: Mapping[str, Array]) -> None:
     """Check that lengths are not in millimetres."""
-    lengths = {"contact_distance": np.array([[number("contact_distance", contact_distance)]])}
+    lengths = {"contact_distance": np.array([[contact_distance]])}
     lengths |= {name: values.T for name, values in positions.items()}
     if max(np.abs(values).max(initial=0) for values in lengths.values()) < completion.context.robot.reach:
         return  # the usual case: the check takes 50 microseconds

@@ -69,8 +69,8 @@ class TaskPreprocessor:
             ends: Result of ``ends_of``, if already computed.
         """
         ends = ends_of(boundary) if ends is None else ends
-        start_xyz, goal_xyz = (tip.T for tip in self.tips(ends))
-        scene = scene_of(self.problem, start_xyz, goal_xyz)
+        start_xyz, goal_xyz, *velocity = (tip.T for tip in self.tips(ends))
+        scene = scene_of(self.problem, start_xyz, goal_xyz, *velocity)
         reaching = self.reaching_time
         time = expected_time(boundary, self.velocity_limit) if reaching is None else reaching(ends)[0][0]
         correction = None if via_point is None else self._via_offsets(boundary, via_point)

@@ -16,7 +16,7 @@ from cnpgen.errors import UsageError, counted
 from cnpgen.plans.format import FLOATS, INTEGERS, NOTES
 from cnpgen.plans.plausible import warn_of_far_joints
 from cnpgen.plans.status import PlanStatus
-from cnpgen.problems.obstacles import scene_of
+from cnpgen.problems.obstacles import goal_velocities, scene_of
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import ProblemRecord, as_record, open_problem
 from cnpgen.robots.scene import Scene
@@ -111,7 +111,9 @@ class Plans:
         Raises:
             RecipeError: The problem needs a plug-in that is not installed.
         """
-        return scene_of(open_problem(self.problem)[0], self.columns["start_xyz"], self.columns["goal_xyz"])
+        problem, robot = open_problem(self.problem)
+        velocity = goal_velocities(problem, robot, self.boundary.goal_q, self.boundary.goal_dq)
+        return scene_of(problem, self.columns["start_xyz"], self.columns["goal_xyz"], velocity)
 
     @cached_property
     def duration(self) -> Array:

@@ -1,17 +1,26 @@
-"""Scenes of samples: some obstacles stand below the object at the start or at the goal."""
+"""Scenes of samples: obstacles below the object at the start or at the goal, and values that depend on the goal."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.errors import UsageError
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.scene import Scene
 from cnpgen.robots.solid import place_obstacles
+from cnpgen.world.path import PathWorld
+
+if TYPE_CHECKING:
+    from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
 
 
-def scene_of(problem: Problem, start_xyz: Array, goal_xyz: Array) -> Scene:
-    """Place the obstacles of N samples.
+def scene_of(problem: Problem, start_xyz: Array, goal_xyz: Array, goal_velocity: Array | None = None) -> Scene:
+    """Place the obstacles of N samples and compute the values that a constraint depends on.
 
     An obstacle with ``below`` ends at the bottom of the object (at the tip without an object) at that end.
 
@@ -19,7 +28,37 @@ def scene_of(problem: Problem, start_xyz: Array, goal_xyz: Array) -> Scene:
         problem: The problem.
         start_xyz: Tip positions at the start [m], shape (N, 3).
         goal_xyz: Tip positions at the goal [m], shape (N, 3).
+        goal_velocity: Tip velocities at the goal [m/s], shape (N, 3), for problems with a ``scene_constraint``.
+
+    Raises:
+        UsageError: The problem needs the velocities, and they are missing.
     """
     half = 0.0 if problem.object is None else problem.object.size[2] / 2
     bottoms = {"start": np.asarray(start_xyz)[..., 2] - half, "goal": np.asarray(goal_xyz)[..., 2] - half}
-    return Scene(tuple(problem.obstacle), place_obstacles(problem.obstacle, bottoms))
+    poses, constraint = place_obstacles(problem.obstacle, bottoms), problem.scene_constraint
+    if constraint is not None:
+        if goal_velocity is None:
+            raise UsageError(f"is missing: the problem {problem.name!r} needs it", argument="goal_velocity")
+        shapes = [np.shape(xyz) for xyz in (start_xyz, goal_xyz, goal_velocity)]
+        if len(set(shapes)) > 1 or shapes[0][1:] != (3,):
+            raise UsageError(f"positions and velocities must have one shape (N, 3), got {shapes}")
+        poses = np.concatenate([poses, constraint.scene_values(np.asarray(goal_xyz), goal_velocity)], axis=1)
+    return Scene(tuple(problem.obstacle), poses)
+
+
+def goal_velocities(problem: Problem, robot: Robot, goal_q: Array, goal_dq: Array) -> Array | None:
+    """Compute tip velocities at the goals with Pinocchio [m/s], shape (N, 3); None if the problem needs none.
+
+    Args:
+        problem: The problem.
+        robot: Its robot.
+        goal_q: Joint positions at the goal [rad], shape (N, n).
+        goal_dq: Joint velocities at the goal [rad/s], shape (N, n).
+    """
+    if problem.scene_constraint is None:
+        return None
+    if not len(goal_q):
+        return np.empty((0, 3))
+    world = PathWorld(robot)
+    world.set_path(goal_q.T, goal_dq.T, np.zeros(goal_q.T.shape), np.empty(0))
+    return world.tip_velocity.T

@@ -17,6 +17,7 @@ from cnpgen.robots.robot_spec import HeldObject, LimitSpec, Payload, RobotSpec
 from cnpgen.robots.shape.inline import with_inline_meshes
 from cnpgen.robots.shape.mesh_files import find_urdf
 from cnpgen.robots.shape.srdf import with_disabled_pairs
+from cnpgen.robots.solid import pose_width
 from cnpgen.robots.urdf import read_urdf
 from cnpgen.schema import registry
 from cnpgen.schema.argument_types import checked_arguments
@@ -78,6 +79,8 @@ class Problem:
         for key in ("obstacle", "constraint"):
             if (count := len(getattr(self, key))) > MAX_TABLES:
                 yield key, f"there are {count:,} of them, expected at most {MAX_TABLES}: kernels grow with each"
+        if sum(constraint.scene_width > 0 for constraint in self.constraint) > 1:
+            yield "constraint", "more than one of them has values of each motion, such as a puck, expected one"
         depth = max((item.depth for item in self.constraint if isinstance(item, ObjectContact)), default=0.0)
         if self.object is not None and min(self.object.size) <= 2 * depth:
             yield (
@@ -90,6 +93,17 @@ class Problem:
     def object_size(self) -> tuple[float, float, float] | None:
         """Edge lengths of the held object [m], None if nothing is held."""
         return None if self.object is None else self.object.size
+
+    @property
+    def scene_constraint(self) -> Constraint | None:
+        """The constraint that depends on values of each motion (``Constraint.scene_values``), or None."""
+        return next((constraint for constraint in self.constraint if constraint.scene_width), None)
+
+    @property
+    def scene_width(self) -> int:
+        """Number of values of a scene: poses and sizes of the obstacles, and those of the constraint above."""
+        constraint = self.scene_constraint
+        return pose_width(self.obstacle) + (0 if constraint is None else constraint.scene_width)
 
     @property
     def uses_jerk(self) -> bool:

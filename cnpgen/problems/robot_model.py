@@ -14,7 +14,6 @@ from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import as_problem
 from cnpgen.robots.scene import Scene
-from cnpgen.robots.solid import place_obstacles, pose_width
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import numbers
 from cnpgen.store.dataset_spec import StoredProblem
@@ -157,21 +156,24 @@ class RobotModel:
         return torque.T.copy()
 
     @checked_arguments
-    def scene(self, start_xyz: ArrayLike, goal_xyz: ArrayLike) -> Scene:
+    def scene(self, start_xyz: ArrayLike, goal_xyz: ArrayLike, goal_velocity: ArrayLike | None = None) -> Scene:
         """Place the obstacles of N samples; some stand below the object at the start or at the goal.
 
         Args:
             start_xyz: Tip positions at the start [m], shape (N, 3) or (3,).
             goal_xyz: Tip positions at the goal [m], shape (N, 3) or (3,).
+            goal_velocity: Tip velocities at the goal [m/s], shape (N, 3) or (3,), from which the pucks of hits follow;
+                zero by default.
         """
         from cnpgen.problems.obstacles import scene_of
 
-        places = {"start_xyz": start_xyz, "goal_xyz": goal_xyz}
-        start, goal = (np.atleast_2d(numbers(name, xyz)) for name, xyz in places.items())
-        for name, xyz in zip(places, (start, goal), strict=True):
+        vectors = {"start_xyz": start_xyz, "goal_xyz": goal_xyz, "goal_velocity": goal_velocity}
+        given = {name: np.atleast_2d(numbers(name, xyz)) for name, xyz in vectors.items() if xyz is not None}
+        start, goal = given["start_xyz"], given["goal_xyz"]
+        for name, xyz in given.items():
             if xyz.shape != (len(start), 3):
                 raise UsageError(f"must have shape ({len(start)}, 3) or (3,), got {xyz.shape}", argument=name)
-        return scene_of(self.problem, start, goal)
+        return scene_of(self.problem, start, goal, given.get("goal_velocity", np.zeros(goal.shape)))
 
     @checked_arguments
     def constraint_values(
@@ -246,7 +248,10 @@ class RobotModel:
     def _lanes(self, scene: Scene | None, n: int) -> Array:
         """Return poses of obstacles for n states, shape (width, n)."""
         if scene is None:
-            return np.repeat(place_obstacles(self.problem.obstacle)[:, None], n, axis=1)
+            from cnpgen.problems.obstacles import scene_of
+
+            scene = scene_of(self.problem, *np.zeros((3, 1, 3)))
+            return np.repeat(scene.lanes, n, axis=1)
         if len(scene) not in {1, n}:
             raise UsageError(f"must have one sample or {n}, got {len(scene)}", argument="scene")
         return scene.lanes if len(scene) == n else np.repeat(scene.lanes, n, axis=1)
@@ -335,7 +340,7 @@ def _symbolic_conditions(robot: Robot, problem: Problem) -> tuple[FrozenState, l
     from cnpgen.kernels.symbolic.linalg import symbols
     from cnpgen.kernels.symbolic.symbolic_state import FrozenState
 
-    widths = {"q": robot.n, "dq": robot.n, "ddq": robot.n, "poses": pose_width(problem.obstacle)}
+    widths = {"q": robot.n, "dq": robot.n, "ddq": robot.n, "poses": problem.scene_width}
     q, dq, ddq, poses = (symbols(name, width)[1] for name, width in widths.items())
     state = FrozenState(robot, q, dq, ddq, poses, problem.obstacle, problem.object_size)
     pairs = [

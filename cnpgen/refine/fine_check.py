@@ -11,7 +11,6 @@ from cnpgen.refine.solver.bounds import NO_TIGHTENING, BoundsTemplate
 from cnpgen.refine.solver.grid import make_grid
 from cnpgen.refine.solver.transcription import ResidualKernels, Transcription, cache_last
 from cnpgen.refine.task import RefinementTask
-from cnpgen.robots.solid import pose_width
 
 if TYPE_CHECKING:
     from cnpgen.world.world import World
@@ -171,7 +170,7 @@ def _powers_of_rate(problem: Problem, world: "World", kernels: ResidualKernels) 
     w = np.zeros((orders * n + orders - 1, 2))
     w[: 2 * n] = random.uniform(0.1, 1.0, (2 * n, 1))
     w[orders * n] = 1.0, 2.0
-    (g,) = kernels.values(w, np.zeros((pose_width(problem.obstacle), 2)))
+    (g,) = kernels.values(w, np.zeros((problem.scene_width, 2)))
     with np.errstate(divide="ignore", invalid="ignore"):
         powers = np.log2(g[:, 1] / g[:, 0]).round()
     return np.asarray(np.maximum(np.nan_to_num(powers, nan=1.0, posinf=1.0), 1.0))

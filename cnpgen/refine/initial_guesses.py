@@ -1,16 +1,24 @@
 """Initial guesses without a plan: lines, a quintic polynomial, and fits to joint-space paths."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.robots.solid import place_obstacles
 from cnpgen.trajectory.boundary import Boundary, anchor_line, assemble
 from cnpgen.trajectory.spline import basis
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
+
+if TYPE_CHECKING:
+    from cnpgen.world.world import World
 
 Array = NDArray[np.float64]
 RISING_FRACTION, RISING_PHASE = 0.3, 0.3  # first value of a rising rate; fraction of its rising control points
 MIN_GUESS_DURATION_S = 0.3  # of motions between close configurations
 PATH_DURATION_FACTOR = 2.0  # of the duration at the velocity limits, for motions along joint-space paths
+TIP_PATH_STATES, TIP_PATH_STEPS = 24, 4  # states along a tip path; Gauss-Newton steps for each
+TIP_PATH_CONDITION = 1e-3  # singular values below this fraction of the largest are ignored
 SAMPLES_PER_CONTROL_POINT = 20  # of the fit to a joint-space path
 
 
@@ -95,6 +103,31 @@ def fit_to_path(states: Array, boundary: Boundary, velocity_limit: Array, spec: 
     table = basis(s, spec.path_control_points, spec.degree)
     inner = slice(3, 3 + count)
     return np.linalg.lstsq(table[:, inner], q - table @ fixed, rcond=None)[0], rate
+
+
+def along_tip_path(world: "World", start_q: Array, goal_q: Array, tip_path: Array) -> Array:
+    """Return joint positions along a tip path: Gauss-Newton steps from the joint-space line, of minimum norm.
+
+    Args:
+        world: World of the robot; it is moved.
+        start_q: Joint positions at the start [rad], shape (n,).
+        goal_q: Joint positions at the goal [rad], shape (n,).
+        tip_path: Polyline from the tip at the start to the tip at the goal [m], shape (K, 3).
+
+    Returns:
+        Joint positions [rad], shape (TIP_PATH_STATES, n).
+    """
+    lengths, rest = _arc_lengths(tip_path), np.zeros(len(start_q))
+    along = np.linspace(0, 1, TIP_PATH_STATES)
+    tips = np.stack([np.interp(along * lengths[-1], lengths, values) for values in tip_path.T], axis=1)
+    states = start_q + along[:, None] * (goal_q - start_q)
+    obstacle_poses = place_obstacles(world.obstacles)
+    for k in range(1, TIP_PATH_STATES - 1):
+        for _ in range(TIP_PATH_STEPS):
+            world.set_state(states[k], rest, rest, obstacle_poses)
+            error = tips[k] - world.tip_position
+            states[k] += np.linalg.lstsq(world.tip_jacobian, error, rcond=TIP_PATH_CONDITION)[0]
+    return states
 
 
 def _arc_lengths(states: Array) -> Array:

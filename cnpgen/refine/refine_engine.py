@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cnpgen.kernels.library import KernelLibrary, choose_backend, problem_kernels
 from cnpgen.plans.plans import Plans
-from cnpgen.problems.obstacles import scene_of
+from cnpgen.problems.obstacles import goal_velocities, scene_of
 from cnpgen.problems.problem_record import ProblemRecord, open_problem
 from cnpgen.refine.grid_levels import GridLevels
 from cnpgen.refine.options import DEFAULT_OPTIONS, RefineOptions
@@ -90,7 +90,9 @@ def load_solver(problem: "Problem", robot: "Robot", kernels: KernelLibrary) -> S
 
     def solve(columns: Mapping[str, Array], initial_guess: Motion | None = None) -> tuple[Motion, NDArray[np.bool_]]:
         ends = columns["start_xyz"], columns["goal_xyz"]
-        tasks = _tasks(Boundary.from_batch(columns, None), scene_of(problem, *ends), *ends)
+        boundary = Boundary.from_batch(columns, None)
+        scene = scene_of(problem, *ends, goal_velocities(problem, robot, boundary.goal_q, boundary.goal_dq))
+        tasks = _tasks(boundary, scene, *ends)
         if initial_guess is not None:
             tasks = [
                 replace(task, path=initial_guess.path[i], rate=initial_guess.rate[i]) for i, task in enumerate(tasks)

@@ -22,6 +22,7 @@ from cnpgen.refine.solver.residuals import stage_jacobian, stage_values
 from cnpgen.refine.solver.sqp import DEFAULT_SETTINGS, Result, Settings, minimize
 from cnpgen.refine.solver.transcription import ResidualKernels, Transcription
 from cnpgen.refine.task import Attempt, Outcome, RefinementTask
+from cnpgen.robots.solid import pose_width
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
@@ -75,6 +76,7 @@ class Refiner:
             load_step_library(kernels),
         )
         self.levels = default_grid_levels(problem, settings) if levels is None else levels
+        self._world = world
         self.check = FineCheck(problem, world, self.residual_kernels)
         every, orders = tuple(vars(self.levels).values()), problem.path_orders
         self._grids = {points: make_grid(self.spec, points, orders) for points in {level.points for level in every}}
@@ -161,8 +163,20 @@ class Refiner:
         )
 
     def line_guess(self, task: RefinementTask) -> Array:
-        """Return the variables of the straight line, the initial guess of the coarse level."""
-        return self.slow_guess(task, initial_guesses.rising_line(*self._guess_arguments(task)))
+        """Return the variables of the initial guess of the coarse level: a detour if there is one, or a line."""
+        detours = self.detours(task)
+        return (
+            detours[0] if detours else self.slow_guess(task, initial_guesses.rising_line(*self._guess_arguments(task)))
+        )
+
+    def detours(self, task: RefinementTask) -> list[Array]:
+        """Return the variables of motions along the detours of the problem's constraint, the first one first."""
+        constraint, values = self.problem.scene_constraint, task.scene.poses[0, pose_width(self.problem.obstacle) :]
+        if constraint is None:
+            return []
+        paths = constraint.detours(values, task.start_xyz)
+        ends = task.boundary.start_q[0], task.boundary.goal_q[0]
+        return [self.path_guess(task, initial_guesses.along_tip_path(self._world, *ends, path)) for path in paths]
 
     def even_line_guess(self, task: RefinementTask) -> Array:
         """Return the variables of the straight line at constant rate."""
@@ -177,7 +191,7 @@ class Refiner:
             initial_guesses.quintic(*arguments),
             initial_guesses.line_through(*arguments, configuration=self._range_center),
         ]
-        return [self.slow_guess(task, guess) for guess in guesses]
+        return [*self.detours(task), *(self.slow_guess(task, guess) for guess in guesses)]
 
     def path_guess(self, task: RefinementTask, states: Array) -> Array:
         """Return the variables of a motion along a joint-space path, shape (K, n)."""

@@ -66,6 +66,7 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "robot-clearance": "cnpgen.problems.constraints.clearance:RobotClearance",
         "self-clearance": "cnpgen.problems.constraints.self_clearance:SelfClearance",
         "object-contact": "cnpgen.problems.constraints.clearance:ObjectContact",
+        "puck-contact": "cnpgen.problems.constraints.puck_contact:PuckContact",
     },
     PLANNERS: {
         "cnp-b": "cnpgen.benchmark.planners.learned:CNPB",

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
 from cnpgen.robots.shape.hull import CUBE
-from cnpgen.robots.solid import place_obstacles, solids_of
+from cnpgen.robots.solid import place_obstacles, pose_width, solids_of
 from cnpgen.world.collision_world import CollisionWorld
 from cnpgen.world.forward_kinematics import ForwardKinematics
 from cnpgen.world.pair_distances import PairDistances
@@ -80,7 +80,8 @@ class PathWorld:
             q: Joint positions [rad], shape (n, K), K > 0.
             dq: Joint velocities [rad/s], shape (n, K).
             ddq: Joint accelerations [rad/s^2], shape (n, K).
-            obstacle_poses: Poses and sizes of the obstacles (``cnpgen.robots.solid``), shape (width,).
+            obstacle_poses: Poses and sizes of the obstacles (``cnpgen.robots.solid``), then values for a constraint,
+                shape (width,).
             jerk: Joint jerks [rad/s^3], shape (n, K), or None if no constraint needs them.
             exact: Whether the smallest distance must be exact even if bounds prove that all distances are sufficient.
         """
@@ -91,6 +92,7 @@ class PathWorld:
         self._segments: Array | None = None
         self._pairs: dict[str, PairDistances] = {}
         self._solids = solids_of(self.obstacles, obstacle_poses)
+        self.scene_values = obstacle_poses[pose_width(self.obstacles) :]
         self._collisions.place(self._solids)
         self._move()
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
-from cnpgen.robots.solid import place_obstacles, solids_of
+from cnpgen.robots.solid import place_obstacles, pose_width, solids_of
 from cnpgen.world.collision_world import CollisionWorld
 from cnpgen.world.rigid_bodies import NO_SHAPE, RigidBodies
 
@@ -39,6 +39,7 @@ class World:
         dq: Joint velocities [rad/s], shape (n,).
         ddq: Joint accelerations [rad/s^2], shape (n,).
         jerk: Joint jerks [rad/s^3], shape (n,); None at a boundary state or if no constraint needs them.
+        scene_values: Values for a constraint (``Constraint.scene_values``); empty if none were given.
     """
 
     def __init__(
@@ -67,7 +68,8 @@ class World:
             q: Joint positions [rad], shape (n,).
             dq: Joint velocities [rad/s], shape (n,).
             ddq: Joint accelerations [rad/s^2], shape (n,).
-            obstacle_poses: Poses and sizes of the obstacles (``cnpgen.robots.solid``), shape (width,).
+            obstacle_poses: Poses and sizes of the obstacles (``cnpgen.robots.solid``), then values for a constraint,
+                shape (width,).
             jerk: Joint jerks [rad/s^3], shape (n,), if the state has any.
         """
         import pinocchio as pin
@@ -76,6 +78,7 @@ class World:
         pin.forwardKinematics(self._model, self._data, q, dq, ddq)
         self._T_world_tip = pin.updateFramePlacement(self._model, self._data, self._tip)
         self._solids, self._placed = solids_of(self.obstacles, obstacle_poses), False
+        self.scene_values = obstacle_poses[pose_width(self.obstacles) :]
         self._collisions.place(self._solids)
         self._distances: list[float] | None = None
 

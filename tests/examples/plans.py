@@ -13,7 +13,7 @@ from scipy.interpolate import BSpline
 from cnpgen.judges.plans import Verdict
 from cnpgen.judges.plans.judge import Judge
 from cnpgen.problems.load_robot import load_robot
-from cnpgen.problems.obstacles import scene_of
+from cnpgen.problems.obstacles import goal_velocities, scene_of
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.robots.robot import Robot
@@ -40,7 +40,8 @@ class Plan:
 
     @property
     def scene(self) -> Scene:
-        return scene_of(self.problem, self.start_xyz, self.goal_xyz)
+        velocity = goal_velocities(self.problem, self.robot, self.boundary.goal_q, self.boundary.goal_dq)
+        return scene_of(self.problem, self.start_xyz, self.goal_xyz, velocity)
 
     def judged(self, *, early_exit: bool = False, **options: Any) -> Verdict:
         arguments = self.motion, self.boundary, self.scene, self.goal_xyz

@@ -72,10 +72,8 @@ def test_verdicts_do_not_depend_on_the_order_of_plans():
 def test_an_empty_batch_has_no_verdicts():
     empty = Boundary(*(np.zeros((0, 6)) for _ in range(5)))
     motion, xyz = Motion(np.zeros((0, 15, 6)), np.zeros((0, 20))), np.zeros((0, 3))
-    assert (
-        judge(PROBLEMS["airhockey"], ROBOTS["airhockey"], motion, empty, scene_of(PROBLEMS["airhockey"], xyz, xyz), xyz)
-        == []
-    )
+    scene = scene_of(PROBLEMS["airhockey"], xyz, xyz, xyz)
+    assert judge(PROBLEMS["airhockey"], ROBOTS["airhockey"], motion, empty, scene, xyz) == []
 
 
 # --- violations ------------------------------------------------------------------------------------------------------

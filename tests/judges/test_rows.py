@@ -170,6 +170,7 @@ def test_valid_hits_pass(hits):
         "table height",
         "vertical velocity",
         "vertical acceleration",
+        "puck distance",
         "hit direction",
         "hit speed",
     ]

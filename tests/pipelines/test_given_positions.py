@@ -9,9 +9,12 @@ from cnpgen.errors import RecipeError, UsageError
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.make.make_dataset import make_dataset
 from cnpgen.make.recipe_file import load_dataset_recipe
+from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.pipeline_file import load_pipeline
 from cnpgen.pipelines.stages.behind_puck import BehindPuck
 from cnpgen.pipelines.stages.stage import CandidateBatch
+from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.problem_file import load_problem
 from cnpgen.store.dataset_spec import shards
 from cnpgen.store.reader import open_dataset
 from cnpgen.store.shard_record import load_record
@@ -150,5 +153,12 @@ def test_the_mallet_is_behind_the_puck_on_the_line_of_the_hit():
         np.array([[1.0, 1.0], [0.0, 0.1], [0.16, 0.16]]),
         np.array([[0.0, np.pi / 2]]),
     )
-    BehindPuck(distance=0.07).prepare(None)(candidates, np.random.default_rng(0))
+    problem = load_problem("airhockey")
+    BehindPuck(distance=0.07).prepare(Context(problem, load_robot(problem), None))(candidates, np.random.default_rng(0))
     np.testing.assert_allclose(candidates["goal_xyz"].T, [[0.93, 0, 0.16], [1.0, 0.03, 0.16]], atol=1e-15)
+
+
+def test_another_distance_than_that_of_the_problem_is_a_mistake():
+    problem = load_problem("airhockey")
+    with pytest.raises(RecipeError, match=r"distance: expected 0.07 m, as in puck-contact, got 0.06 m"):
+        BehindPuck(distance=0.06).prepare(Context(problem, load_robot(problem), None))

@@ -48,14 +48,14 @@ def test_a_hit_equals_pipeline_completion_and_planning(planner, state):
 
 
 def test_the_mallet_meets_the_puck_on_the_line_to_the_target(planner, state):
-    found = plan_hits(planner, state, PUCKS, TARGET, contact_distance=0.05, speed_share=0.5)
+    found = plan_hits(planner, state, PUCKS, TARGET, speed_share=0.5)
     arm = Arm(open_problem(planner.model.problem)[1])
     for row, number in enumerate(found.plans.sample_id):
         q, dq = found.plans.boundary.goal_q[row].copy(), found.plans.boundary.goal_dq[row].copy()
         away = PUCKS[number] - arm.pose(q).translation[:2]
-        assert np.linalg.norm(away) == pytest.approx(0.05, abs=1e-7)
+        assert np.linalg.norm(away) == pytest.approx(0.07, abs=1e-7)
         line = (TARGET - PUCKS[number]) / np.linalg.norm(TARGET - PUCKS[number])
-        np.testing.assert_allclose(away / 0.05, line, atol=1e-6)
+        np.testing.assert_allclose(away / 0.07, line, atol=1e-6)
         velocity = arm.velocity(q, dq)
         np.testing.assert_allclose(velocity / np.linalg.norm(velocity), [*line, 0], atol=1e-8)
 
@@ -120,3 +120,13 @@ def test_a_missing_direction_and_numbers_that_are_not_finite_raise_errors(planne
         plan_hits(planner, state, PUCKS, TARGET, speed_share=np.nan)
     with pytest.raises(UsageError, match="contact_distance must be a finite number, got nan"):
         plan_hits(planner, state, PUCKS, TARGET, contact_distance=np.nan)
+    with pytest.raises(UsageError, match=r"contact_distance must be 0.07 m, as in the problem's constraint"):
+        plan_hits(planner, state, PUCKS, TARGET, contact_distance=0.05)
+
+
+def test_a_start_that_touches_the_puck_has_this_reason(planner, state):
+    one = tuple(np.atleast_2d(values)[0].astype(float) for values in state)
+    tip = Arm(open_problem(planner.model.problem)[1]).pose(one[0]).translation[:2]
+    touching = plan_hits(planner, one, np.add(tip, [0.079, 0.0]), TARGET)
+    assert touching.reasons == ("early contact with the puck",)
+    assert not len(touching.plans)

@@ -21,6 +21,7 @@ from cnpgen.problems.constraints.line import Line
 from cnpgen.problems.constraints.needs import measured_needs, symbolic_needs
 from cnpgen.problems.constraints.plane import Plane
 from cnpgen.problems.constraints.pose import Pose
+from cnpgen.problems.constraints.puck_contact import PuckContact
 from cnpgen.problems.constraints.self_clearance import SelfClearance
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.constraints.tip_speed import TipSpeed
@@ -154,7 +155,7 @@ def values(form: tuple[Condition, ...]) -> np.ndarray:
 
 def test_every_shipped_kind_is_tested_here():
     built_in = [name for name in names(CONSTRAINTS) if load(CONSTRAINTS, name).__module__.startswith("cnpgen.")]
-    elsewhere = {"self-clearance": SelfClearance, "joint-jerk": JointJerk}  # test_shapes.py, test_jerk.py
+    elsewhere = {"self-clearance": SelfClearance, "joint-jerk": JointJerk, "puck-contact": PuckContact}  # own files
     kinds = {name: type(kind) for name, kind in KINDS.items()} | elsewhere
     assert {name: load(CONSTRAINTS, name) for name in built_in} == kinds
 
@@ -562,3 +563,16 @@ def test_the_time_varying_bound_admits_only_motions_down_to_the_table(benches):
     for name, kind in KINDS.items():
         for condition in kind.measured(benches["heavy-object"].state(0.1)) if name != "table" else (rectangle,):
             np.testing.assert_array_equal(kind.bound_relaxation(condition, s, start), np.zeros(5))
+
+
+@pytest.mark.parametrize(("constraint", "expected"), [
+    (RobotClearance(tolerance=1e-3), 1e-4),
+    (RobotClearance(tolerance=1e-3, distance=5e-4), 6e-4),
+    (RobotClearance(tolerance=1e-3, distance=2e-3), 1e-3),
+    (RobotClearance(tolerance=1e-2, radius=0.14), 1e-2),  # the paper's capsules are not the links
+    (SelfClearance(tolerance=1e-3), 1e-4),
+    (SelfClearance(tolerance=1e-3, distance=2e-3), 1e-3),
+])  # fmt: skip
+def test_tolerances_of_clearances_permit_no_penetration_of_links(constraint, expected):
+    condition = Condition("clearance", "m", [0.0, 0.0], np.zeros(2), np.full(2, np.inf), "position")
+    np.testing.assert_allclose(constraint.allowed(condition), expected, rtol=1e-12)

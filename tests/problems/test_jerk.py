@@ -118,8 +118,8 @@ def test_a_boundary_state_has_no_jerk_and_meets_the_limits() -> None:
 def test_what_depends_on_the_jerk_is_found_out() -> None:
     problem, robot = jerk_limited("airhockey")
     forms = [constraint.measured for constraint in problem.constraint]
-    assert measured_needs(forms, World(robot), jerk=True) == [0, 1, 2, 2, *[0] * 2, 3]
-    assert measured_needs(forms, World(robot)) == [0, 1, 2, 2, *[0] * 2]
+    assert measured_needs(forms, World(robot), jerk=True) == [0, 1, 2, 2, *[0] * 3, 3]
+    assert measured_needs(forms, World(robot)) == [0, 1, 2, 2, *[0] * 3]
 
 
 def test_residuals_of_a_motion_have_the_jerk_and_its_derivatives() -> None:

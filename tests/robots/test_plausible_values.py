@@ -69,7 +69,7 @@ def test_boundary_files_in_degrees_are_refused_unless_large_angles_are_allowed(
 def test_hits_in_millimetres_are_refused() -> None:
     planner = cnpgen.Planner("airhockey-hit")
     state = (BASE, np.zeros(6), np.zeros(6))
-    for wrong in ({"puck": [1000.0, 100.0]}, {"target": [2400.0, 0.0]}, {"contact_distance": 70.0}):
+    for wrong in ({"puck": [1000.0, 100.0]}, {"target": [2400.0, 0.0]}):
         with pytest.raises(UnitError, match=r"in hit 0; did you mean .* mm = ") as caught:
             cnpgen.plan_hits(planner, state, **{"puck": [1.0, 0.1], "target": [2.4, 0.0], **wrong})
         assert caught.value.argument in wrong

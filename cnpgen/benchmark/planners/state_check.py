@@ -12,7 +12,6 @@ from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.shape.hull import CUBE
-from cnpgen.robots.solid import pose_width
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
@@ -69,7 +68,7 @@ def tip_and_violation(robot: "Robot", problem: Problem) -> Any:
     """Build ``(q, dq, ddq, obstacle_poses) -> (tip, violation)`` with the largest violation, in its own unit."""
     import casadi as ca
 
-    names = (("q", robot.n), ("dq", robot.n), ("ddq", robot.n), ("obstacle_poses", pose_width(problem.obstacle)))
+    names = (("q", robot.n), ("dq", robot.n), ("ddq", robot.n), ("obstacle_poses", problem.scene_width))
     (q_sx, q), (dq_sx, dq), (ddq_sx, ddq), (poses_sx, obstacle_poses) = (symbols(name, width) for name, width in names)
     state = SymbolicState(robot, q, dq, ddq, obstacle_poses, problem.obstacle, problem.object_size)
     tip, table = state.kinematics.tip, problem.first(Table)

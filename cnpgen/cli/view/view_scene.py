@@ -110,7 +110,7 @@ def _scene(
         robot=tuple(bodies[0]),
         kind=bodies[1],
         capsules=tuple(capsule_bodies(robot)),
-        world=tuple(_world(problem, scene_of(problem, tip[:1], tip[-1:]))),
+        world=tuple(_world(problem, scene_of(problem, tip[:1], tip[-1:], np.zeros((1, 3))))),
         path=(tube("path of the tip", tip, LINE),) if shares else (),
         held=() if size is None else (wrapped("object", robot.n + 1, CUBE * np.array(size), 0.0),),
         joints=robot.joint_names,

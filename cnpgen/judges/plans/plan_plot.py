@@ -63,7 +63,8 @@ def plot_plan(
     with np.errstate(all="ignore"):
         world, s, t = along(problem, robot, one, index)
     if scene is None:
-        scene = scene_of(problem, world.tip_position[:, :1].T, world.tip_position[:, -1:].T)
+        ends = world.tip_position[:, :1].T, world.tip_position[:, -1:].T
+        scene = scene_of(problem, *ends, world.tip_velocity[:, -1:].T)
     figure = new_figure(15, 9)
     figure.suptitle(f"{problem.name}, plan {index}: {t[-1]:.3f} s" + (f"\n{note}" if note else ""))
     joints, tip = figure.subfigures(1, 2, width_ratios=[1.15, 1.0], squeeze=False)[0]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.judges.plans.judge import judge
-from cnpgen.problems.obstacles import scene_of
+from cnpgen.problems.obstacles import goal_velocities, scene_of
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.boundary import Boundary
@@ -44,7 +44,8 @@ def check_plans(problem: Problem, robot: Robot, columns: Mapping[str, NDArray[An
     path = columns["path_control_points"].reshape(rows, spec.path_control_points, robot.n)
     motion = Motion(path, columns["rate_control_points"], spec.degree)
     boundary = Boundary.from_batch(columns, None)
-    scene = scene_of(problem, columns["start_xyz"], columns["goal_xyz"])
+    velocity = goal_velocities(problem, robot, boundary.goal_q, boundary.goal_dq)
+    scene = scene_of(problem, columns["start_xyz"], columns["goal_xyz"], velocity)
     verdicts = judge(problem, robot, motion, boundary, scene, columns["goal_xyz"])
     invalid = [(row, verdict.reason) for row, verdict in enumerate(verdicts) if not verdict.valid]
     problems = []

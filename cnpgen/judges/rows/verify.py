@@ -16,7 +16,7 @@ from cnpgen.judges.rows.hits import HitRule, highest_speed, judge_goals
 from cnpgen.judges.rows.row_report import ENDS, Array, Check, Index, RowReport, compare, merge
 from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES, Condition
 from cnpgen.problems.constraints.needs import measured_needs
-from cnpgen.problems.obstacles import scene_of
+from cnpgen.problems.obstacles import goal_velocities, scene_of
 from cnpgen.world.world import World
 
 if TYPE_CHECKING:
@@ -154,7 +154,8 @@ def _verify_block(problem: "Problem", world: World, columns: dict[str, Array], d
 def _measure(problem: "Problem", world: World, columns: dict[str, Array], finite: Index) -> _Measurements:
     """Move the world to both ends of every finite row and record the measurements."""
     rows = len(columns["start_q"])
-    poses = scene_of(problem, columns["start_xyz"], columns["goal_xyz"]).poses
+    velocity = goal_velocities(problem, world.robot, columns["goal_q"], columns["goal_dq"])
+    poses = scene_of(problem, columns["start_xyz"], columns["goal_xyz"], velocity).poses
     position, velocity, jacobian = (np.full((rows, *shape), np.nan) for shape in ((2, 3), (3,), (3, world.robot.n)))
     measurements = _Measurements(position, velocity, jacobian, stored_diagnostics(problem, columns))
     for index, end in enumerate(ENDS):

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from cnpgen.kernels.symbolic.dynamics import inverse_dynamics
 from cnpgen.kernels.symbolic.kinematics import Kinematics, bias_acceleration, forward_kinematics, tip_velocity
 from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, constants, cross, scale, times
+from cnpgen.robots.solid import pose_width
 
 if TYPE_CHECKING:
     from cnpgen.robots.obstacle import Obstacle
@@ -24,7 +25,7 @@ class SymbolicState:
         q: Joint positions [rad], n scalars.
         dq: Joint velocities [rad/s].
         ddq: Joint accelerations [rad/s^2].
-        obstacle_poses: Poses and sizes of the obstacles (``cnpgen.robots.solid``), heights of upright boxes included.
+        obstacle_poses: Poses and sizes of the obstacles (``cnpgen.robots.solid``), then values for a constraint.
         obstacles: The obstacles.
         object_size: Edge lengths of the held object [m], or None.
         jerk: Joint jerks [rad/s^3], or None.
@@ -38,6 +39,11 @@ class SymbolicState:
     obstacles: "tuple[Obstacle, ...]"
     object_size: tuple[float, float, float] | None
     jerk: Vec | None = None
+
+    @property
+    def scene_values(self) -> Vec:
+        """Values of the motion for a constraint (``Constraint.scene_values``)."""
+        return self.obstacle_poses[pose_width(self.obstacles) :]
 
     @cached_property
     def kinematics(self) -> Kinematics:

@@ -4,9 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cnpgen.errors import RecipeError
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.draw import position_field
 from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Stage, StageFunction
+from cnpgen.problems.constraints.puck_contact import PuckContact
 from cnpgen.problems.constraints.table import Table
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
@@ -32,8 +34,16 @@ class BehindPuck(Stage):
         return (position_field("goal", low, high),)
 
     def prepare(self, context: Context) -> StageFunction:
-        """Return the stage function."""
-        del context
+        """Return the stage function.
+
+        Raises:
+            RecipeError: The distance differs from that of the problem's constraint ``puck-contact``.
+        """
+        contact = context.problem.first(PuckContact)
+        if contact is not None and contact.contact_distance != self.distance:
+            raise RecipeError(
+                [f"distance: expected {contact.contact_distance:g} m, as in puck-contact, got {self.distance:g} m"]
+            )
 
         def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
             candidates["goal_xyz"] = behind(candidates["goal_xyz"], candidates["hit_angle"], self.distance)

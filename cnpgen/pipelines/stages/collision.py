@@ -25,7 +25,7 @@ from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.shape.hull import coal_hull
 from cnpgen.robots.shape.shape import Shape
-from cnpgen.robots.solid import Box, Solid, height_places, place_obstacles, pose_width, solids_of
+from cnpgen.robots.solid import Box, Solid, height_places, place_obstacles, solids_of
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
 
@@ -119,8 +119,13 @@ class Collision(Stage):
 
 
 def candidate_poses(problem: Problem, candidates: CandidateBatch) -> Array:
-    """Return the obstacle poses of every candidate, shape (width, n)."""
-    return scene_of(problem, candidates["start_xyz"].T, candidates["goal_xyz"].T).lanes
+    """Return the scene of every candidate, shape (width, n): poses of the obstacles, and the puck of a hit."""
+    goal, angle = candidates["goal_xyz"].T, candidates.columns.get("hit_angle")
+    direction = np.zeros(goal.shape)
+    if angle is not None:
+        with np.errstate(invalid="ignore"):  # columns that are not finite are rejected
+            direction[:, :2] = np.concatenate([np.cos(angle), np.sin(angle)]).T
+    return scene_of(problem, candidates["start_xyz"].T, goal, direction).lanes
 
 
 def capsule_axes_distance(robot: "Robot", problem: Problem) -> Any:
@@ -129,7 +134,7 @@ def capsule_axes_distance(robot: "Robot", problem: Problem) -> Any:
 
     (q_sx, q), (poses_sx, obstacle_poses) = (
         symbols("q", robot.n),
-        symbols("obstacle_poses", pose_width(problem.obstacle)),
+        symbols("obstacle_poses", problem.scene_width),
     )
     zero = [0.0] * robot.n
     state = SymbolicState(robot, q, zero, zero, obstacle_poses, problem.obstacle, None)
@@ -146,7 +151,7 @@ def capsule_clearance(robot: "Robot", problem: Problem) -> Any:
 
     (q_sx, q), (poses_sx, obstacle_poses) = (
         symbols("q", robot.n),
-        symbols("obstacle_poses", pose_width(problem.obstacle)),
+        symbols("obstacle_poses", problem.scene_width),
     )
     zero = [0.0] * robot.n
     state = SymbolicState(robot, q, zero, zero, obstacle_poses, problem.obstacle, None)

@@ -15,7 +15,6 @@ from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
 from cnpgen.pipelines.context import Context
 from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES, Condition, Constraint, End
 from cnpgen.problems.problem import Problem
-from cnpgen.robots.solid import pose_width
 from cnpgen.world.path import PathWorld
 from cnpgen.world.world import World
 
@@ -71,7 +70,7 @@ def narrow_phase_of(context: Context, end: End, *, exact: bool = True) -> Decide
 def _tolerance(constraint: Constraint, dtype: str, *, exact: bool) -> float:
     """Return the tolerance of a boundary state for conditions in units of length [m]."""
     tolerance = BOUNDARY_TOLERANCES[dtype]["position"]
-    return tolerance if exact else max(tolerance, constraint.tolerance)
+    return tolerance if exact else max(tolerance, constraint.effective_tolerance)
 
 
 def _violates(constraint: Constraint, world: World, end: End, dtype: str, *, exact: bool) -> bool:
@@ -88,9 +87,7 @@ def narrow_phase(robot: "Robot", problem: Problem, *, end: End, dtype: str) -> A
     """Build ``(q, dq, ddq, obstacle_poses) -> unmet``: number of unmet conservative values of every constraint."""
     import casadi as ca
 
-    columns = [symbols(name, robot.n) for name in ("q", "dq", "ddq")] + [
-        symbols("obstacle_poses", pose_width(problem.obstacle))
-    ]
+    columns = [symbols(name, robot.n) for name in ("q", "dq", "ddq")] + [symbols("obstacle_poses", problem.scene_width)]
     (q, dq, ddq, obstacle_poses), size = [scalars for _, scalars in columns], problem.object_size
     state = SymbolicState(robot, q, dq, ddq, obstacle_poses, problem.obstacle, size)
     rows: list[Scalar] = []

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from cnpgen.world.path import PathWorld
     from cnpgen.world.world import World
 
+MAX_LEGAL_PENETRATION_M = 1e-4  # of links in a valid motion: the accuracy of distances, no tolerance for collisions
+
 
 @dataclass(frozen=True, kw_only=True)
 class RobotClearance(Constraint):
@@ -35,7 +37,13 @@ class RobotClearance(Constraint):
     distance: float = field(
         "minimum distance of the robot from obstacles", unit="m", low=0.0, default=0.0, since_version=2
     )
-    tolerance: float = field("penetration depth that a valid motion may have", unit="m", low=0.0)
+    tolerance: float = field("violation that a valid motion may have", unit="m", low=0.0)
+
+    @property
+    def effective_tolerance(self) -> float:
+        """Tolerance up to a penetration of ``MAX_LEGAL_PENETRATION_M``; with the paper's capsules all of it."""
+        limit = np.inf if self.radius is not None else self.distance + MAX_LEGAL_PENETRATION_M
+        return min(self.tolerance, limit)
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the signed distance of every moving segment, or capsule's axis, from every obstacle [m]."""

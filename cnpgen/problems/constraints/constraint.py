@@ -104,6 +104,8 @@ class Constraint(ABC):
         training_weight: Initial weight of the violation in training; None for ``WEIGHT_FACTOR`` times ``weight``.
         training_factor: Factor of the limits during training, in (0, 1].
         training_inset: Distance by which other bounds are moved inwards during training [unit of the condition].
+        has_solver_margin: Whether ``solved`` has a margin for states between grid points; otherwise solvers add one.
+        scene_width: Number of values that it needs for each motion, see ``scene_values``.
         tolerance: Maximum violation of a valid motion.
         budget: Acceptable violation in training.
         weight: Initial weight of the violation in training, before scaling.
@@ -115,6 +117,8 @@ class Constraint(ABC):
     training_weight: ClassVar[float | None] = None
     training_factor: ClassVar[float] = 1.0
     training_inset: ClassVar[float] = 0.0
+    has_solver_margin: ClassVar[bool] = False
+    scene_width: ClassVar[int] = 0
 
     tolerance: float
     budget: float = field("accepted violation during training (the paper's C-bar^2)", low=0.0, default=0.0)
@@ -122,7 +126,12 @@ class Constraint(ABC):
 
     def allowed(self, condition: Condition) -> NDArray[np.float64]:
         """Return the tolerance of a condition for valid motions, in its unit, shape (m,)."""
-        return np.full(len(condition.g), self.tolerance)
+        return np.full(len(condition.g), self.effective_tolerance)
+
+    @property
+    def effective_tolerance(self) -> float:
+        """Violation that a valid motion may have: ``tolerance``, or less where it would permit penetration."""
+        return self.tolerance
 
     def bound_relaxation(
         self, condition: Condition, s: NDArray[np.float64], start_tip: NDArray[np.float64]
@@ -138,6 +147,29 @@ class Constraint(ABC):
         """
         del condition
         return np.zeros((*start_tip.shape[:-1], len(s)))
+
+    def scene_values(self, goal_xyz: NDArray[np.float64], goal_velocity: NDArray[np.float64]) -> NDArray[np.float64]:  # noqa: ARG002
+        """Return the values of N motions that the constraint depends on, shape (N, scene_width).
+
+        The forms read them as ``scene_values`` of states and worlds. One constraint of a problem may have them.
+
+        Args:
+            goal_xyz: Tip positions at the goal [m], shape (N, 3).
+            goal_velocity: Tip velocities at the goal [m/s], shape (N, 3).
+        """
+        return np.empty((len(goal_xyz), 0))
+
+    def detours(self, values: NDArray[np.float64], start_xyz: NDArray[np.float64]) -> list[NDArray[np.float64]]:  # noqa: ARG002
+        """Return tip paths for initial guesses where the straight line violates the constraint, by default none.
+
+        Args:
+            values: ``scene_values`` of one motion, shape (scene_width,).
+            start_xyz: Tip position at the start [m], shape (3,).
+
+        Returns:
+            Polylines from start to goal [m], shape (K, 3) each, in the order of their use.
+        """
+        return []
 
     @abstractmethod
     def symbolic(self, state: SymbolicState) -> tuple[Condition, ...]:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.problems.constraints.clearance import MAX_LEGAL_PENETRATION_M
 from cnpgen.problems.constraints.constraint import Condition, Constraint, End
 from cnpgen.schema.keys import field
 
@@ -28,7 +29,12 @@ class SelfClearance(Constraint):
 
     reason = "robot in collision with itself"
     distance: float = field("minimum distance of links", unit="m", low=0.0, default=0.0)
-    tolerance: float = field("penetration depth of links that a valid motion may have", unit="m", low=0.0)
+    tolerance: float = field("violation that a valid motion may have", unit="m", low=0.0)
+
+    @property
+    def effective_tolerance(self) -> float:
+        """Tolerance up to a penetration of ``MAX_LEGAL_PENETRATION_M``."""
+        return min(self.tolerance, self.distance + MAX_LEGAL_PENETRATION_M)
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the distances of the capsules' axes [m] of the pairs for solvers."""

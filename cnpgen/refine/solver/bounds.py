@@ -248,7 +248,7 @@ def _bounds(
     elif condition.is_equality:
         band = tightening.band * constraint.tolerance / scale
         lower, upper = lower - band, upper + band
-    else:
+    elif not constraint.has_solver_margin:
         inside = _added_clearance(s, tightening)[:, None] / scale
         lower, upper = lower + inside, upper - inside
     if order < 2:  # fixed by the boundary conditions

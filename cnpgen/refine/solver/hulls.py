@@ -68,7 +68,7 @@ class Hulls:
                 uncovered = [frozenset((names[a], names[b])) not in covered for a, b in pairs.tolist()]
                 self._uncovered.append((pairs[np.array(uncovered, bool)], indices, constraint.distance))
         self.min_distances = np.array([min_distances[column] for column in range(len(columns))])
-        self.tolerance = max(constraint.tolerance for constraint in constraints)
+        self.tolerance = max(constraint.effective_tolerance for constraint in constraints)
         supports = [list(joints) for joints in self._model.supports]
         self._moves = np.array([[joint in above for joint in range(1, robot.n + 1)] for above in supports])
 

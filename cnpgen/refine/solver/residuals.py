@@ -9,7 +9,6 @@ from cnpgen.kernels.symbolic.linalg import symbols
 from cnpgen.kernels.symbolic.symbolic_state import FrozenState, time_derivatives
 from cnpgen.problems.constraints.constraint import MIN_TOLERANCE
 from cnpgen.problems.problem import Problem
-from cnpgen.robots.solid import pose_width
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
@@ -45,7 +44,7 @@ def _stage(robot: "Robot", problem: Problem) -> tuple[list[Any], FrozenState, li
     n, orders = robot.n, problem.path_orders
     (w_sx, w), (poses_sx, obstacle_poses) = (
         symbols("w", orders * n + orders - 1),
-        symbols("obstacle_poses", pose_width(problem.obstacle)),
+        symbols("obstacle_poses", problem.scene_width),
     )
     p, *path = (w[order * n : (order + 1) * n] for order in range(orders))
     dq, ddq, jerk = time_derivatives(path, w[orders * n :])

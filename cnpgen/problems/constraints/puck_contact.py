@@ -1,0 +1,210 @@
+"""Contact of the mallet with the puck: only at the end of a hit, and from behind.
+
+The puck of a motion follows from its goal: its centre is ``contact_distance`` ahead of the tip there, along the tip's
+velocity. At this distance the bodies would overlap, so that the mallet touches the puck shortly before the goal.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.problems.constraints.constraint import Condition, Constraint, End
+from cnpgen.schema.keys import field
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
+    from cnpgen.world.world import World
+
+Array = NDArray[np.float64]
+
+ADDED_RADIUS_M = 1e-4  # so that motions do not touch the puck within a tolerance of this size
+ROUNDING = 0.02  # of the relaxation near the goal, relative to the overlap
+SOLVER_MARGIN_M, SOLVER_SLACK_M = 1e-3, 1e-4  # from the puck; of straight hits
+TRAINING_MARGIN_M = 2e-3
+TRAINING_KNEE_M = 5e-4  # larger violations are penalized linearly
+PUCK_OUT_OF_REACH_M = 1e3  # coordinates of the puck of a motion whose goal is no hit
+MIN_HIT_SPEED_M_S = 1e-6
+MIN_SQUARED_DISTANCE_M2 = 1e-12  # keeps the derivative of a distance finite
+DETOUR_CLEARANCE_M = 0.015  # of initial guesses around the puck
+APPROACH_LENGTH_M = 0.04  # straight end of these guesses
+ARC_STEP_RAD = 0.2
+ARC_END_RAD = 0.4  # from the direction opposite to the hit
+
+
+@dataclass(frozen=True, kw_only=True)
+class PuckContact(Constraint):
+    """Constraint: the mallet touches the puck only on the last part of a hit, behind the puck.
+
+    The distance of the centres is at least ``ADDED_RADIUS_M`` above the sum of the radii. The exception is a disc whose
+    diameter of length ``last`` ends at the goal, opposite to the hit. With 10 mm, the mallet is then within 4 degrees
+    of the direction of the hit.
+    """
+
+    reason = "early contact with the puck"
+    training_weight = 3e6
+    has_solver_margin = True
+    scene_width = 4
+    mallet_radius: float = field("radius of the mallet", unit="m", low=1e-6)
+    puck_radius: float = field("radius of the puck", unit="m", low=1e-6)
+    contact_distance: float = field("distance of the centres of mallet and puck at the goal", unit="m", low=0.0)
+    last: float = field("length of the end of the path on which contact is allowed", unit="m", low=1e-6)
+    tolerance: float = field("violation that a valid motion may have", unit="m", low=0.0)
+
+    def find_mistakes(self) -> Iterator[tuple[str, str]]:
+        """Yield (key, mistake) pairs."""
+        if not 0 < self.overlap < self.last - ADDED_RADIUS_M:
+            yield (
+                "contact_distance",
+                f"is {self.contact_distance:g} m, expected less than the sum of the radii, {self.contact_range:g} m,"
+                f" by less than 'last', {self.last:g} m",
+            )
+
+    @property
+    def contact_range(self) -> float:
+        """Distance of the centres at which mallet and puck touch [m]."""
+        return self.mallet_radius + self.puck_radius
+
+    @property
+    def overlap(self) -> float:
+        """Planned overlap of mallet and puck at the goal [m]."""
+        return self.contact_range - self.contact_distance
+
+    def scene_values(self, goal_xyz: Array, goal_velocity: Array) -> Array:
+        """Return the goal and the puck of N motions: x and y of both [m], shape (N, 4); out of reach if at rest.
+
+        Args:
+            goal_xyz: Tip positions at the goal [m], shape (N, 3).
+            goal_velocity: Tip velocities at the goal [m/s], shape (N, 3).
+        """
+        goal, velocity = goal_xyz[:, :2], goal_velocity[:, :2]
+        speed = np.hypot(velocity[:, 0], velocity[:, 1])[:, None]
+        is_hit = speed > MIN_HIT_SPEED_M_S
+        puck = goal + self.contact_distance * velocity / np.where(is_hit, speed, 1.0)
+        return np.where(is_hit, np.concatenate([goal, puck], axis=1), PUCK_OUT_OF_REACH_M)
+
+    def symbolic(self, state: SymbolicState) -> tuple[Condition, ...]:
+        """State the distance of the centres [m] in the form for solvers."""
+        return self._symbolic(state, SOLVER_MARGIN_M)
+
+    def penalized(self, state: SymbolicState) -> tuple[Condition, ...]:
+        """State the distance for the training loss: the square of a large violation grows linearly."""
+        import casadi as ca
+
+        (condition,) = self._symbolic(state, TRAINING_MARGIN_M)
+        violation = ca.fmax(0, condition.lower[0] - condition.g[0])
+        return (replace(condition, g=[condition.lower[0] - violation / ca.sqrt(1 + violation / TRAINING_KNEE_M)]),)
+
+    def symbolic_at(self, state: SymbolicState, end: End) -> tuple[Condition, ...]:
+        """State the distance at the start [m]; the goal is in contact."""
+        return self._symbolic(state, None) if end == "start" else ()
+
+    def measured(self, world: World) -> tuple[Condition, ...]:
+        """Evaluate the distance of the centres with Pinocchio's tip position [m]."""
+        return self._measured(world, None)
+
+    def measured_at(self, world: World, end: End) -> tuple[Condition, ...]:
+        """Evaluate the distance at the start; the goal is in contact."""
+        return self.measured(world) if end == "start" else ()
+
+    def solved(self, world: World) -> tuple[Condition, ...]:
+        """Return the form for solvers."""
+        return self._measured(world, SOLVER_MARGIN_M)
+
+    def _symbolic(self, state: SymbolicState, margin: float | None) -> tuple[Condition, ...]:
+        import casadi as ca
+
+        tip, values = state.kinematics.tip, state.scene_values
+        from_goal, from_puck = ((tip[0] - x) ** 2 + (tip[1] - y) ** 2 for x, y in (values[:2], values[2:]))
+        distance = ca.sqrt(from_puck + MIN_SQUARED_DISTANCE_M2)
+        return self._condition(from_goal, distance) if margin is None else self._cone(from_goal, distance, margin)
+
+    def _measured(self, world: World, margin: float | None) -> tuple[Condition, ...]:
+        values = world.scene_values if len(world.scene_values) else [PUCK_OUT_OF_REACH_M] * self.scene_width
+        (x, y), (goal_x, goal_y, puck_x, puck_y) = world.tip_position[:2], values
+        from_goal, distance = (x - goal_x) ** 2 + (y - goal_y) ** 2, np.hypot(x - puck_x, y - puck_y)
+        return self._condition(from_goal, distance) if margin is None else self._cone(from_goal, distance, margin)
+
+    def _condition(self, from_goal: Any, distance: Any) -> tuple[Condition, ...]:
+        """State the distance of the centres, larger by a relaxation near the goal.
+
+        The relaxation ``h max(1 - rho^2 / (h l), 0)`` at a distance rho from the goal, for the overlap h and the length
+        l, permits contact in the disc of diameter l. The maximum is rounded, so that the verdict finds local maxima.
+
+        Args:
+            from_goal: Squared distance of the tip from the goal [m^2].
+            distance: Distance of the centres [m].
+        """
+        overlap = self.overlap + ADDED_RADIUS_M
+        relaxation = overlap * _positive_part(1 - from_goal / (overlap * self.last), ROUNDING)
+        return _at_least(self.contact_range + ADDED_RADIUS_M, distance + relaxation)
+
+    def _cone(self, from_goal: Any, distance: Any, margin: float) -> tuple[Condition, ...]:
+        """State a stricter condition that limits all of the last states and not only the first contact.
+
+        The relaxation decreases linearly with the distance from the goal, so that every straight hit has the same
+        slack. Solvers, which check grid points only, would miss the first contact.
+
+        Args:
+            from_goal: Squared distance of the tip from the goal [m^2].
+            distance: Distance of the centres [m].
+            margin: Distance from the puck in addition to that of ``_condition`` [m].
+        """
+        overlap = self.overlap + ADDED_RADIUS_M + margin
+        rho = (from_goal + MIN_SQUARED_DISTANCE_M2) ** 0.5
+        relaxation = overlap * _positive_part(1 + (SOLVER_SLACK_M - rho) / overlap, ROUNDING)
+        return _at_least(self.contact_range + ADDED_RADIUS_M + margin, distance + relaxation)
+
+    def detours(self, values: Array, start_xyz: Array) -> list[Array]:
+        """Return tip paths around the puck on either side, the shorter one first; none if it is not in the way.
+
+        Args:
+            values: Goal and puck, see ``scene_values``, shape (4,).
+            start_xyz: Tip position at the start [m], shape (3,).
+
+        Returns:
+            Polylines from start to goal [m], shape (K, 3) each.
+        """
+        goal, puck, start = values[:2], values[2:], start_xyz[:2]
+        hit = (puck - goal) / self.contact_distance
+        entry = puck - (self.contact_range + self.overlap) * hit
+        if _distance_from_segment(puck, start, entry) >= self.contact_range:
+            return []
+        radius = self.contact_range + DETOUR_CLEARANCE_M
+        offset = start - puck
+        distance = max(float(np.hypot(*offset)), radius)
+        angle = math.atan2(-hit[0] * offset[1] + hit[1] * offset[0], -float(hit @ offset))  # 0 behind the puck
+        paths = []
+        for begin in (angle, angle - math.copysign(2 * math.pi, angle)):
+            side = math.copysign(1.0, begin)
+            tangent = abs(begin) - math.acos(radius / distance)
+            angles = side * np.linspace(
+                max(tangent, ARC_END_RAD), ARC_END_RAD, max(2, math.ceil((tangent - ARC_END_RAD) / ARC_STEP_RAD))
+            )
+            across = np.array([-hit[1], hit[0]])
+            arc = puck - radius * (np.cos(angles)[:, None] * hit + np.sin(angles)[:, None] * across)
+            path = np.stack([start, *arc, goal - APPROACH_LENGTH_M * hit, goal])
+            paths.append(np.column_stack([path, np.full(len(path), start_xyz[2])]))
+        return sorted(paths, key=lambda path: float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()))
+
+
+def _positive_part(value: Any, rounding: float) -> Any:
+    """Return ``max(value, 0)``, rounded."""
+    return (value + (value * value + rounding**2) ** 0.5) / 2
+
+
+def _at_least(bound: float, distance: Any) -> tuple[Condition, ...]:
+    return (Condition("puck distance", "m", [distance], np.array([bound]), np.array([np.inf]), "position"),)
+
+
+def _distance_from_segment(point: Array, first: Array, second: Array) -> float:
+    """Return the distance of a point from a segment [m]."""
+    along = second - first
+    share = np.clip((point - first) @ along / max(float(along @ along), 1e-12), 0.0, 1.0)
+    return float(np.hypot(*(point - first - share * along)))

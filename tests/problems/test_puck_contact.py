@@ -1,0 +1,141 @@
+"""The constraint between mallet and puck: its forms, the geometry of legal contacts, and detours around the puck."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from cnpgen.errors import RecipeError, UsageError
+from cnpgen.kernels.symbolic.linalg import symbols
+from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
+from cnpgen.problems.constraints.puck_contact import PUCK_OUT_OF_REACH_M, PuckContact
+from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.obstacles import goal_velocities, scene_of
+from cnpgen.problems.problem_file import load_problem
+from cnpgen.world.path import PathWorld
+from cnpgen.world.world import World
+
+AIRHOCKEY = load_problem("airhockey")
+ROBOT = load_robot(AIRHOCKEY)
+CONTACT = AIRHOCKEY.first(PuckContact)
+assert CONTACT is not None
+RADII = CONTACT.contact_range
+HIT = np.array([np.cos(0.3), np.sin(0.3)])  # direction of the hit
+GOAL = np.array([1.0, 0.1])
+SCENE = np.array([*GOAL, *(GOAL + 0.07 * HIT)])
+
+
+def violation(points: np.ndarray) -> np.ndarray:
+    """Return the violation [m] of tip positions, shape (K, 2), by the measured form of a stand-in for the world."""
+
+    class Tip:
+        tip_position = np.column_stack([points, np.full(len(points), 0.16)]).T
+        scene_values = SCENE
+
+    (condition,) = CONTACT.measured(Tip())
+    return condition.lower[0] - condition.g[0]
+
+
+@pytest.mark.parametrize("form", ["motion", "start"])
+def test_symbolic_and_measured_forms_agree(form):
+    names = [symbols(name, 6) for name in ("q", "dq", "ddq")] + [symbols("obstacle_poses", 4)]
+    columns, (q, dq, ddq, values) = [column for column, _ in names], [scalars for _, scalars in names]
+    state = SymbolicState(ROBOT, q, dq, ddq, values, (), None)
+    (symbolic,) = CONTACT.symbolic(state) if form == "motion" else CONTACT.symbolic_at(state, "start")
+    function, world = ca.Function("g", columns, symbolic.g), World(ROBOT)
+    random, rest = np.random.default_rng(5), np.zeros(6)
+    for _ in range(50):
+        q_now = ROBOT.base + random.normal(scale=0.1, size=6)
+        world.set_state(q_now, rest, rest, np.empty(0))
+        goal = world.tip_position[:2] + random.normal(scale=0.02, size=2)
+        values_now = np.concatenate([goal, goal + 0.07 * HIT])
+        world.set_state(q_now, rest, rest, values_now)
+        (measured,) = CONTACT.solved(world) if form == "motion" else CONTACT.measured_at(world, "start")
+        np.testing.assert_allclose(float(function(q_now, rest, rest, values_now)), measured.g[0], atol=1e-9)
+        np.testing.assert_array_equal(symbolic.lower, measured.lower)
+    assert CONTACT.symbolic_at(state, "goal") == CONTACT.measured_at(world, "goal") == ()
+
+
+def test_a_straight_hit_is_legal_from_any_distance():
+    lengths = np.concatenate([np.linspace(0, 0.02, 2001), np.linspace(0.02, 0.5, 100)])
+    assert violation(GOAL - lengths[:, None] * HIT).max() <= 1e-12
+
+
+def test_legal_contacts_are_near_the_goal_and_behind_the_puck():
+    offsets = np.stack(np.meshgrid(*[np.linspace(-0.02, 0.02, 801)] * 2), axis=-1).reshape(-1, 2)
+    points, puck = GOAL + offsets, SCENE[2:]
+    legal_contact = (violation(points) <= 0) & (np.linalg.norm(points - puck, axis=1) < RADII)
+    assert legal_contact.sum() > 100
+    from_goal = np.linalg.norm(offsets[legal_contact], axis=1)
+    deep = (violation(points) <= CONTACT.tolerance) & (np.linalg.norm(points - puck, axis=1) < RADII - 5e-5)
+    assert np.linalg.norm(offsets[deep], axis=1).max() <= CONTACT.last
+    assert from_goal.max() <= CONTACT.last + 1e-3
+    towards = (puck - points[legal_contact]) / np.linalg.norm(puck - points[legal_contact], axis=1)[:, None]
+    assert np.arccos(np.clip(towards @ HIT, -1, 1)).max() < np.deg2rad(4)
+
+
+def test_an_oblique_approach_and_a_motion_through_the_puck_are_violations():
+    for angle, depth in ((0.3, 2e-4), (1.5, 5e-3), (np.pi, 0.05)):
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        points = GOAL - np.linspace(0, 0.2, 2001)[:, None] * (turn @ HIT)
+        assert violation(points).max() > depth
+
+
+def test_the_puck_follows_from_the_goal_and_is_out_of_reach_without_a_hit():
+    goal, velocity = np.array([[1.0, 0.1, 0.16]] * 2), np.array([[0.6, -0.8, 0.0], [0.0, 0.0, 0.0]])
+    scene = scene_of(AIRHOCKEY, goal, goal, velocity)
+    np.testing.assert_allclose(scene.poses[0], [1.0, 0.1, 1.0 + 0.07 * 0.6, 0.1 - 0.07 * 0.8])
+    np.testing.assert_array_equal(scene.poses[1], PUCK_OUT_OF_REACH_M)
+    with pytest.raises(UsageError, match="goal_velocity is missing: the problem 'airhockey' needs it"):
+        scene_of(AIRHOCKEY, goal, goal)
+
+
+def test_goal_velocities_equal_finite_differences():
+    random = np.random.default_rng(2)
+    q, dq = ROBOT.base + random.normal(scale=0.2, size=(5, 6)), random.normal(size=(5, 6))
+    world, step = PathWorld(ROBOT), 1e-6
+    tips = []
+    for moved in (q + step * dq, q - step * dq):
+        world.set_path(moved.T, moved.T, moved.T, np.empty(0))
+        tips.append(world.tip_position.T.copy())
+    np.testing.assert_allclose(goal_velocities(AIRHOCKEY, ROBOT, q, dq), (tips[0] - tips[1]) / (2 * step), atol=1e-7)
+
+
+def test_detours_go_around_the_puck_and_end_along_the_hit():
+    puck = SCENE[2:]
+    for angle in np.linspace(-np.pi, np.pi, 40):
+        start = puck + 0.25 * np.array([np.cos(angle), np.sin(angle)])
+        paths = CONTACT.detours(SCENE, np.array([*start, 0.16]))
+        behind = np.cos(angle - 0.3) < -0.5  # more than 120 degrees from the hit
+        assert len(paths) == 0 if behind else len(paths) in {0, 2}
+        for path in paths:
+            dense = np.concatenate([np.linspace(a, b, 50) for a, b in pairwise(path)])[:, :2]
+            outside = np.linalg.norm(dense - GOAL, axis=1) > 0.011
+            assert np.linalg.norm(dense[outside] - puck, axis=1).min() > RADII - 1e-4
+            np.testing.assert_allclose(path[0], [*start, 0.16])
+            np.testing.assert_allclose(path[-1, :2], GOAL)
+            last = path[-1, :2] - path[-2, :2]
+            np.testing.assert_allclose(last / np.linalg.norm(last), HIT, atol=1e-9)
+    beyond = CONTACT.detours(SCENE, np.array([*(puck + 0.2 * HIT + 0.01), 0.16]))
+    lengths = [np.linalg.norm(np.diff(path, axis=0), axis=1).sum() for path in beyond]
+    assert len(lengths) == 2
+    assert lengths[0] <= lengths[1]
+
+
+@pytest.mark.parametrize(("old", "new", "expected"), [
+    ('contact_distance = "7 cm"', 'contact_distance = "8 cm"', "expected less than the sum of the radii, 0.0798 m"),
+    ('contact_distance = "7 cm"', 'contact_distance = "6 cm"', "by less than 'last', 0.01 m"),
+])  # fmt: skip
+def test_inconsistent_distances_are_refused(tmp_path, old, new, expected):
+    text = AIRHOCKEY.path.read_text(encoding="utf-8").replace(old, new)
+    (tmp_path / "problem.toml").write_text(text, encoding="utf-8")
+    (tmp_path / "iiwa14_striker.urdf").write_bytes(AIRHOCKEY.urdf_path.read_bytes())
+    with pytest.raises(RecipeError, match=expected):
+        load_problem(tmp_path / "problem.toml")
+
+
+def test_a_problem_has_at_most_one_constraint_with_values_of_each_motion(tmp_path):
+    twice = replace(AIRHOCKEY, constraint=(*AIRHOCKEY.constraint, CONTACT))
+    assert [key for key, _ in twice.find_mistakes()] == ["constraint"]
