@@ -30,7 +30,7 @@ decide what is valid, as in 'cnpgen evaluate'. What is finished is written to OU
 fours: after Ctrl-C, kill -9 or a full disk the same command goes on. An existing OUT is replaced only with --force,
 and only if it is a file of plans. The exit code is 0 if every plan is valid, and 1 if any is not; the file is written
 in either case.
-docs/refiner.md has the formulation.
+'cnpgen docs refiner' has the formulation.
 """
 
 
