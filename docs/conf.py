@@ -3,7 +3,7 @@
     python -m sphinx -W --keep-going -c docs . build/site                  # the site: build/site/index.html
     python -m sphinx -W --keep-going -b linkcheck -c docs . build/links    # external links, with a network
 
-The source folder is the repository, so that links to SECURITY.md or to data cards work on the site and in the repository.
+The source folder is the repository: links to SECURITY.md or to data cards work on the site and in the repository.
 The navigation follows the order of the links in index.md. Pages of the API are written before the build to
 reference/api/, a folder that git ignores.
 """
@@ -57,7 +57,7 @@ def toctree(entries: list[str], *options: str) -> str:
     return "\n".join(["", "```{toctree}", ":hidden:", *options, "", *entries, "```", ""])
 
 
-def add_navigation(app: Sphinx, docname: str, source: list[str]) -> None:
+def add_navigation(_: Sphinx, docname: str, source: list[str]) -> None:
     """Append tables of contents to the pages that list others."""
     if docname == root_doc:
         links = re.findall(r"\]\(([\w-]+)/([\w-]+)\.md\)", source[0])
@@ -78,12 +78,20 @@ def write_api_pages(app: Sphinx) -> None:
     for name, value in public_objects().items():
         kind = "class" if inspect.isclass(value) else "function" if inspect.isroutine(value) else "data"
         kind = "exception" if inspect.isclass(value) and issubclass(value, BaseException) else kind
-        members = "\n   :members:\n   :inherited-members: Exception, tuple" if kind == "class" else ""
+        members = "\n   :members:\n   :inherited-members: Exception, tuple, int, str" if kind == "class" else ""
         text = f"{name}\n{'=' * len(name)}\n\n.. auto{kind}:: {name}{members}\n"
         (folder / f"{name}.rst").write_text(text, encoding="utf-8")
 
 
+def escape_bars(_: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:  # noqa: ARG001
+    """Escape |x| outside of code: it is an absolute value, and reStructuredText has substitutions there."""
+    for number, line in enumerate(lines):
+        parts = re.split(r"(``.*?``)", line)
+        lines[number] = "".join(part if part.startswith("``") else part.replace("|", r"\|") for part in parts)
+
+
 def setup(app: Sphinx) -> None:
-    """Register the two functions above."""
+    """Register the functions above."""
     app.connect("source-read", add_navigation)
     app.connect("builder-inited", write_api_pages)
+    app.connect("autodoc-process-docstring", escape_bars)

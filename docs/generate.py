@@ -26,7 +26,7 @@ COMMANDS_INTRODUCTION = """\
 All commands with their arguments and options. `python docs/generate.py` writes this page from the parsers.
 `cnpgen --help` and `cnpgen COMMAND --help` print the same texts.
 
-Every command writes data to stdout and everything else to stderr. The option `--debug` shows the traceback of an error."""
+Every command writes data to stdout and everything else to stderr. `--debug` shows the traceback of an error."""
 
 NAMES_INTRODUCTION = """\
 # Python interface
@@ -55,10 +55,12 @@ def describe_commands() -> str:
     parts = [COMMANDS_INTRODUCTION]
     for name, command in commands.choices.items():
         parts += [f"## `cnpgen {name}`", _escaped(command.description), *_tables(command)]
-        parts += [_escaped(" ".join(command.epilog.split()))] if command.epilog else []
+        parts += [f"```\n{command.epilog.strip()}\n```"] if command.epilog else []
     codes = parser.epilog.partition("Exit codes:\n")[2]
     rows = [" ".join(row.split()).partition(" ") for row in re.split(r"\n(?=  \d)", codes.strip("\n"))]
-    return "\n\n".join([*parts, "## Exit codes", _table(("code", "meaning"), [(code, text) for code, _, text in rows])])
+    return "\n\n".join(
+        [*parts, "## Exit codes", _table(("code", "definition"), [(code, text) for code, _, text in rows])]
+    )
 
 
 def _tables(command: argparse.ArgumentParser) -> Iterator[str]:
@@ -93,7 +95,9 @@ def describe_names() -> str:
     groups: dict[str, list[tuple[str, str]]] = {}
     for name, value in public_objects().items():
         documented = inspect.isclass(value) or inspect.isroutine(value)
-        summary = re.split(r"(?<=\.)\s", (inspect.getdoc(value) or "").replace("``", "`"))[0] if documented else "Constant."
+        summary = (
+            re.split(r"(?<=\.)\s", (inspect.getdoc(value) or "").replace("``", "`"))[0] if documented else "Constant."
+        )
         module, _, short = name.rpartition(".")
         groups.setdefault(module, []).append((f"`{short}`", " ".join(summary.split())))
     parts = [NAMES_INTRODUCTION]

@@ -38,6 +38,7 @@ STRAY = (  # files that were left lying about
     "pipelines/airhockey-hit.toml.orig",
     "problems/airhockey/mesh.stl",
     "cnpgen/notes.txt",
+    "docs/notes.txt",
 )
 
 
@@ -47,7 +48,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
     pytest.importorskip("build")
     pytest.importorskip("hatchling")
     copy, out = tmp_path_factory.mktemp("copy"), tmp_path_factory.mktemp("wheel")
-    for name in ("cnpgen", "problems", "pipelines", "datasets"):
+    for name in ("cnpgen", "problems", "pipelines", "datasets", "docs"):
         shutil.copytree(ROOT / name, copy / name, ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, copy)
@@ -70,6 +71,8 @@ def test_the_wheel_carries_every_recipe_and_robot(wheel: zipfile.ZipFile) -> Non
             if path.is_file():
                 assert f"cnpgen/_recipes/{path.relative_to(ROOT).as_posix()}" in wheel.namelist()
     assert "cnpgen/py.typed" in wheel.namelist()
+    pages = {f"cnpgen/_recipes/{path.relative_to(ROOT).as_posix()}" for path in (ROOT / "docs").rglob("*.md")}
+    assert pages == {name for name in wheel.namelist() if name.startswith("cnpgen/_recipes/docs/")}
     sources = [path.relative_to(ROOT).as_posix() for path in (ROOT / "cnpgen").rglob("*.[ch]")]
     assert "cnpgen/refine/solver/step.c" in sources
     assert set(sources) <= set(wheel.namelist())
@@ -79,7 +82,9 @@ def test_the_wheel_carries_nothing_that_was_left_lying_about(wheel: zipfile.ZipF
     shipped = {name.removeprefix("cnpgen/_recipes/") for name in wheel.namelist()}
     assert not shipped.intersection(STRAY)
     tracked = (
-        path for folder in ("cnpgen", "problems", "pipelines", "datasets") for path in (ROOT / folder).rglob("*")
+        path
+        for folder in ("cnpgen", "problems", "pipelines", "datasets", "docs")
+        for path in (ROOT / folder).rglob("*")
     )
     expected = {path.relative_to(ROOT).as_posix() for path in tracked if path.is_file() and path.suffix != ".pyc"}
     assert {name for name in shipped if ".dist-info/" not in name} <= expected
@@ -99,6 +104,8 @@ for name in cnpgen.recipes.list_recipes("dataset"):
         assert recipe.pipeline.problem.urdf_path.is_relative_to(sys.argv[1])
 (script,) = entry_points(group="console_scripts", name="cnpgen")
 assert callable(script.load())
+from cnpgen.cli.docs_command import docs_folder, list_pages
+assert docs_folder().is_relative_to(sys.argv[1]) and len(list_pages()) > 30
 print(version("cnpgen"), len(cnpgen.recipes.list_recipes("dataset")))
 """
 

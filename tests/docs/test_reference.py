@@ -1,0 +1,81 @@
+"""The reference pages follow the code, and every page has its place."""
+
+import importlib.util
+import re
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from cnpgen.cli.docs_command import KINDS, list_pages
+from cnpgen.cli.main import build_parser
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+MAX_BYTES = 500_000  # of all Markdown in the wheel
+
+
+@pytest.fixture(scope="module")
+def generator() -> ModuleType:
+    """Load docs/generate.py."""
+    spec = importlib.util.spec_from_file_location("docs_generate", DOCS / "generate.py")
+    assert spec
+    assert spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("name", ["keys.md", "cli.md", "api.md"])
+def test_a_generated_page_is_what_the_code_says(generator: ModuleType, name: str) -> None:
+    page = (DOCS / "reference" / name).read_text(encoding="utf-8")
+    assert page == generator.PAGES[name]() + "\n", "run: python docs/generate.py"
+
+
+def test_every_option_of_every_command_is_on_the_page(generator: ModuleType) -> None:
+    page = generator.describe_commands()
+    commands = next(action.choices for action in build_parser()._actions if isinstance(action.choices, dict))
+    assert len(commands) >= 20
+    for name, command in commands.items():
+        section = page.split(f"## `cnpgen {name}`\n")[1].split("\n## ")[0]
+        for option in set(command._option_string_actions) - {"-h", "--help", "--debug"}:
+            assert re.search(rf"`([^`]*, )?{option}[ `,]", section), (name, option)
+
+
+def test_every_public_name_has_a_summary_of_one_sentence(generator: ModuleType) -> None:
+    rows = re.findall(r"^\| `(\w+)` \| (.*) \|$", generator.describe_names(), re.M)
+    assert len(rows) > 120
+    assert [name for name, summary in rows if not summary.endswith(".")] == []
+
+
+def test_every_page_is_of_one_kind_and_in_the_index() -> None:
+    index = (DOCS / "index.md").read_text(encoding="utf-8")
+    pages = {path.relative_to(DOCS) for path in DOCS.rglob("*.md")} - {Path("index.md")}
+    assert {page.parts[0] for page in pages} == set(KINDS), "a page belongs to one of the folders"
+    assert all(len(page.parts) == 2 for page in pages)
+    missing = [page.as_posix() for page in pages if f"]({page.as_posix()})" not in index]
+    assert missing == [], "link the page in docs/index.md"
+    names = [page.stem for page in pages if page.parts[0] != "benchmarks"]
+    assert len(names) == len(set(names)), "'cnpgen docs NAME' needs unique names"
+
+
+def test_concepts_have_a_picture_and_all_pictures_have_a_text() -> None:
+    for name in ("splines", "constraint-manifold", "certification", "verdict", "scenes"):
+        assert re.search(
+            r"!\[[^\]]{20,}\]\(\.\./images/", (DOCS / "concepts" / f"{name}.md").read_text(encoding="utf-8")
+        )
+    for page in [ROOT / "README.md", *DOCS.rglob("*.md")]:
+        assert "![](" not in page.read_text(encoding="utf-8"), f"{page.name}: a picture without alternative text"
+
+
+def test_the_pages_are_small_enough_for_the_wheel() -> None:
+    assert sum(path.stat().st_size for path in DOCS.rglob("*.md")) <= MAX_BYTES
+
+
+def test_help_texts_and_docstrings_name_pages_that_exist_and_no_files() -> None:
+    pages = list_pages()
+    for path in (ROOT / "cnpgen").rglob("*.py"):
+        text = " ".join(path.read_text(encoding="utf-8").split())
+        assert not re.search(r"docs/[\w/-]+\.md", text), f"{path}: the wheel has no such file, name 'cnpgen docs PAGE'"
+        for name in re.findall(r"['`]cnpgen docs ([a-z][\w/-]*)['`]", text):
+            assert name in pages, f"{path}: no page {name!r}"
