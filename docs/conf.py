@@ -5,7 +5,7 @@
 
 The source folder is the repository: links to SECURITY.md or to data cards work on the site and in the repository.
 The navigation follows the order of the links in index.md. Pages of the API are written before the build to
-reference/api/, a folder that git ignores.
+reference/api/, a folder that git ignores. Notebooks of the tutorials are written to the folder notebooks of the site.
 """
 
 import inspect
@@ -16,9 +16,10 @@ from pathlib import Path
 from sphinx.application import Sphinx
 
 DOCS = Path(__file__).resolve().parent
-sys.path[:0] = [str(DOCS.parent), str(DOCS)]  # the package of this checkout; generate.py
+sys.path[:0] = [str(DOCS.parent), str(DOCS)]  # the package of this checkout; the scripts beside this file
 
 from generate import public_objects  # noqa: E402
+from notebooks import write_notebooks  # noqa: E402
 
 from cnpgen.machine.versions import DOCUMENTATION_URL, __version__  # noqa: E402
 
@@ -31,6 +32,7 @@ include_patterns = ["*.md", "docs/**", "datasets/**/*.md", "pipelines/*.md", "pr
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
 myst_heading_anchors = 4  # the anchors of headings are GitHub's
+smartquotes = False  # they would change --n
 highlight_language = "none"  # blocks without a language
 autodoc_typehints_format = "short"
 napoleon_use_ivar = True  # attributes in docstrings describe those that autodoc lists
@@ -60,11 +62,15 @@ def toctree(entries: list[str], *options: str) -> str:
 def add_navigation(_: Sphinx, docname: str, source: list[str]) -> None:
     """Append tables of contents to the pages that list others."""
     if docname == root_doc:
-        links = re.findall(r"\]\(([\w-]+)/([\w-]+)\.md\)", source[0])
+        lists = source[0].partition("## Tutorials")[2]  # the table above it repeats some links
+        links = re.findall(r"\]\(([\w-]+)/([\w-]+)\.md\)", lists)
         for folder, caption in CAPTIONS.items():
             pages = list(dict.fromkeys(f"{kind}/{page}" for kind, page in links if kind == folder))
             source[0] += toctree(pages, f":caption: {caption}")
         source[0] += toctree([f"/{name}" for name in OTHERS], ":caption: Project", ":glob:")
+    if docname.startswith("docs/tutorials/"):
+        file = f"../../notebooks/{docname.rpartition('/')[2]}.ipynb"
+        source[0] += f'\n<p><a href="{file}" download>This page as a notebook</a></p>\n'
     if docname == "docs/reference/api":
         source[0] += toctree(["api/*"], ":glob:")
 
@@ -90,8 +96,15 @@ def escape_bars(_: Sphinx, what: str, name: str, obj: object, options: object, l
         lines[number] = "".join(part if part.startswith("``") else part.replace("|", r"\|") for part in parts)
 
 
+def write_downloads(app: Sphinx, error: Exception | None) -> None:
+    """Write the notebooks into a site that was built."""
+    if error is None and app.builder.name == "html":
+        write_notebooks(Path(app.outdir) / "notebooks")
+
+
 def setup(app: Sphinx) -> None:
     """Register the functions above."""
     app.connect("source-read", add_navigation)
     app.connect("builder-inited", write_api_pages)
+    app.connect("build-finished", write_downloads)
     app.connect("autodoc-process-docstring", escape_bars)

@@ -20,7 +20,7 @@ GOAL = np.array([[0.025, 0.884, 0.185, -0.505, 0.112, 1.189]])
 
 def figure(width: float, height: float) -> Figure:
     """Return an empty figure with a size [inch]."""
-    return Figure(figsize=(width, height), layout="constrained", dpi=100)
+    return Figure(figsize=(width, height), layout="constrained", dpi=150)
 
 
 def save(drawn: Figure, name: str) -> None:
@@ -55,8 +55,9 @@ def draw_splines(plans: cnpgen.Plans) -> None:
     """Draw path and rate over the phase, and their composition over time."""
     motion, joint, degree = plans.motion, 2, plans.motion.degree
     s = np.linspace(0, 1, 400)
-    drawn = figure(9.6, 3.0)
-    path, rate, result = drawn.subplots(1, 3)
+    drawn = figure(6.4, 5.2)
+    parts = drawn.subplot_mosaic([["path", "rate"], ["motion", "motion"]])
+    path, rate, result = parts["path"], parts["rate"], parts["motion"]
     for axes, points, color in ((path, motion.path[0, :, joint], BLUE), (rate, motion.rate[0], RED)):
         basis = BSpline(knots(len(points), degree), np.eye(len(points)), degree)(s)
         low, high = points.min(), points.max()
@@ -74,7 +75,7 @@ def draw_splines(plans: cnpgen.Plans) -> None:
     result.plot(t, states.ddq[0, :, joint] / 10, color=RED, label="ddq / 10 [rad/s²]")
     result.set_title("motion q(t) = p(s(t))")
     result.set_xlabel("t [s]")
-    result.legend(fontsize=7)
+    result.legend()
     save(drawn, "splines")
 
 
@@ -90,15 +91,15 @@ def draw_manifold(plans: cnpgen.Plans) -> None:
         "line, projected onto T": (projected.motion.at(s).q[0], GREEN),
         "valid plan": (plans.motion.at(s).q[0], BLUE),
     }
-    drawn = figure(9.6, 3.2)
+    drawn = figure(6.4, 3.2)
     side, top = drawn.subplots(1, 2)
     for name, (q, color) in paths.items():
         x, y, z = robot.forward_kinematics(q)[0].T
         side.plot(s, 1000 * z, color=color, label=name)
         top.plot(y, x, color=color)
     side.axhspan(159, 161, color=GRAY, alpha=0.4, linewidth=0)
-    side.set(title="height of the tip [mm], with the tolerance of T", xlabel="phase s")
-    side.legend(fontsize=8)
+    side.set(title="height of the tip [mm]", xlabel="phase s")
+    side.legend(fontsize=9)
     top.add_patch(Rectangle((-0.45, 0.6), 0.9, 1.4, fill=False, color=GRAY))
     top.set(title="the tip seen from above [m]", xlabel="y", ylabel="x", xlim=(0.5, -0.5), ylim=(0.55, 1.25))
     save(drawn, "manifold")
@@ -110,7 +111,7 @@ def draw_verdict(plans: cnpgen.Plans) -> None:
     t = np.linspace(0, motion.duration()[0], 25 * step + 1)
     limit = np.asarray(cnpgen.RobotModel("airhockey").acceleration_limit)
     use = motion.at(motion.phase_at(t[None])).ddq[0] / limit
-    drawn = figure(9.6, 3.2)
+    drawn = figure(6.4, 3.2)
     limits, between = drawn.subplots(1, 2)
     limits.plot(t, np.abs(use), color=GRAY, linewidth=0.7)
     limits.plot(t, np.abs(use).max(axis=1), color=BLUE)
@@ -127,8 +128,8 @@ def draw_verdict(plans: cnpgen.Plans) -> None:
     for axes in (limits, between):
         axes.axhline(1, color=RED, linewidth=0.8)
         axes.set_xlabel("t [s]")
-    limits.set(title="accelerations of all joints / limit", ylim=(0, 1.15))
-    between.set(title="joint 4 near its limit: samples, chord bounds, value", xlim=(0.03, 0.16), ylim=(-0.35, 1.15))
+    limits.set(title="accelerations / limit", ylim=(0, 1.15))
+    between.set(title="joint 4: samples, bounds, value", xlim=(0.03, 0.16), ylim=(-0.35, 1.15))
     save(drawn, "verdict")
 
 
@@ -137,7 +138,7 @@ def draw_scenes() -> None:
     problems = cnpgen.draw_boundary_problems("heavy-object", 3, seed=1)
     plans = cnpgen.solve_plans(problems, workers=1).plans
     robot = cnpgen.RobotModel("heavy-object")
-    drawn = figure(9.6, 3.0)
+    drawn = figure(6.4, 1.9)
     for sample, axes in enumerate(drawn.subplots(1, 3, sharey=True)):
         for body in plans.scene.bodies(sample):
             low, high = body.position + body.corners.min(axis=0), body.position + body.corners.max(axis=0)
@@ -175,7 +176,7 @@ def main() -> None:
     """Draw all pictures."""
     import matplotlib as mpl
 
-    mpl.rcParams.update({"font.size": 9, "axes.titlesize": 9})
+    mpl.rcParams.update({"font.size": 10, "axes.titlesize": 10})
     plans = solved_plan()
     draw_splines(plans)
     draw_manifold(plans)

@@ -188,7 +188,7 @@ def _explain(error: BaseException, options: Container[str]) -> tuple[Sequence[st
         return [" ".join(error.text(shell_spelling(options)).split())], error.exit_code
     code = MachineError.exit_code
     if isinstance(error, ImportError):
-        return [f"{error}; 'cnpgen doctor' checks this installation"], code
+        return [f"{error}; 'cnpgen doctor' checks this installation, 'cnpgen docs troubleshooting' lists causes"], code
     if isinstance(error, MemoryError):
         return ["out of memory; fewer --workers need less"], code
     if isinstance(error, OSError) and error.strerror:

@@ -1,6 +1,7 @@
 """The reference pages follow the code, and every page has its place."""
 
 import importlib.util
+import json
 import re
 from pathlib import Path
 from types import ModuleType
@@ -9,21 +10,27 @@ import pytest
 
 from cnpgen.cli.docs_command import KINDS, list_pages
 from cnpgen.cli.main import build_parser
+from tests.docs.test_blocks import blocks
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 MAX_BYTES = 500_000  # of all Markdown in the wheel
 
 
-@pytest.fixture(scope="module")
-def generator() -> ModuleType:
-    """Load docs/generate.py."""
-    spec = importlib.util.spec_from_file_location("docs_generate", DOCS / "generate.py")
+def script(name: str) -> ModuleType:
+    """Load a script of docs/."""
+    spec = importlib.util.spec_from_file_location(f"docs_{name}", DOCS / f"{name}.py")
     assert spec
     assert spec.loader
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture(scope="module")
+def generator() -> ModuleType:
+    """Load docs/generate.py."""
+    return script("generate")
 
 
 @pytest.mark.parametrize("name", ["keys.md", "cli.md", "api.md"])
@@ -79,3 +86,26 @@ def test_help_texts_and_docstrings_name_pages_that_exist_and_no_files() -> None:
         assert not re.search(r"docs/[\w/-]+\.md", text), f"{path}: the wheel has no such file, name 'cnpgen docs PAGE'"
         for name in re.findall(r"['`]cnpgen docs ([a-z][\w/-]*)['`]", text):
             assert name in pages, f"{path}: no page {name!r}"
+
+
+@pytest.mark.parametrize("page", sorted((DOCS / "tutorials").glob("*.md")), ids=lambda page: page.stem)
+def test_the_notebook_of_a_tutorial_has_every_block_as_a_cell(page: Path, tmp_path: Path) -> None:
+    script("notebooks").write_notebooks(tmp_path)
+    notebook = json.loads((tmp_path / f"{page.stem}.ipynb").read_text(encoding="utf-8"))
+    assert (notebook["nbformat"], notebook["nbformat_minor"]) == (4, 5)
+    assert len({cell["id"] for cell in notebook["cells"]}) == len(notebook["cells"])
+    runnable = [(marks, language, text) for marks, language, text in blocks(page) if language]
+    cells = [cell["source"] for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    assert len(cells) == len(runnable) > 3
+    for (marks, language, text), cell in zip(runnable, cells, strict=True):
+        first, _, rest = cell.partition("\n")
+        if "file" in marks:
+            assert first == f"%%writefile {marks['file']}"
+        elif language == "bash":
+            assert first == "%%bash"
+        else:
+            rest = cell
+        assert rest == text.strip("\n")
+    prose = "\n".join(cell["source"] for cell in notebook["cells"] if cell["cell_type"] == "markdown")
+    headings = [line for line in page.read_text(encoding="utf-8").splitlines() if re.match(r"#+ [A-Z0-9]", line)]
+    assert [line for line in headings if line not in prose] == []

@@ -66,6 +66,16 @@ def test_every_page_is_on_the_site_at_its_address_and_in_the_navigation(site: Pa
 
 
 @pytest.mark.extended
+def test_every_tutorial_links_to_its_notebook(site: Path) -> None:
+    tutorials = sorted((ROOT / "docs" / "tutorials").glob("*.md"))
+    assert len(tutorials) >= 5
+    for page in tutorials:
+        text = (site / "docs" / "tutorials" / f"{page.stem}.html").read_text(encoding="utf-8")
+        assert f'href="../../notebooks/{page.stem}.ipynb"' in text
+        assert (site / "notebooks" / f"{page.stem}.ipynb").is_file()
+
+
+@pytest.mark.extended
 def test_every_public_name_has_a_page_with_its_signature(site: Path) -> None:
     names = re.findall(r"^\| `(\w+)` \|", (ROOT / "docs" / "reference" / "api.md").read_text(encoding="utf-8"), re.M)
     pages = {path.stem.rpartition(".")[2]: path for path in (site / "docs" / "reference" / "api").glob("*.html")}
