@@ -1,7 +1,7 @@
 """``cnpgen docs``: the documentation of this version, without a network."""
 
 import argparse
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from cnpgen.cli.parser import Commands, Parser, add_command, add_json
@@ -69,16 +69,16 @@ def list_pages() -> dict[str, Path]:
 
 
 def page_name(text: str, pages: dict[str, Path]) -> str:
-    """Return the name of a page from its name or its path.
+    """Return the name of a page from its name, its path, or a link to it on another page.
 
     Raises:
         UsageError: There is no such page.
     """
-    name = text.removesuffix(".md").removeprefix("docs/")
-    kind, _, stem = name.partition("/")
-    name = stem if kind in KINDS and kind != "benchmarks" else name
-    if name not in pages:
-        raise UsageError(f"documentation {lacks('page', name, pages)}")
+    path = PurePosixPath(text.partition("#")[0].removesuffix(".md"))
+    folder = path.parent.name
+    name = f"benchmarks/{path.name}" if folder == "benchmarks" else path.name
+    if name not in pages or folder not in {"", "..", pages[name].parent.name}:
+        raise UsageError(f"documentation {lacks('page', text, pages)}")
     return name
 
 

@@ -23,7 +23,9 @@ def test_all_pages_are_listed_by_kind(capsys):
     assert len(rows) == len(list(DOCS.rglob("*.md"))) - 1
 
 
-@pytest.mark.parametrize("name", ["verdict", "verdict.md", "concepts/verdict", "docs/concepts/verdict.md"])
+@pytest.mark.parametrize(
+    "name", ["verdict", "verdict.md", "docs/concepts/verdict.md", "../concepts/verdict.md#between-samples"]
+)
 def test_a_page_is_printed_as_it_is(name, capsys):
     assert main(["docs", name]) == 0
     assert capsys.readouterr().out == (DOCS / "concepts" / "verdict.md").read_text(encoding="utf-8")
@@ -35,6 +37,9 @@ def test_pages_of_benchmarks_have_names_of_their_own(capsys):
 
 
 def test_an_unknown_page_is_refused_with_the_nearest_one(capsys):
+    assert main(["docs", "tutorials/verdict"]) == 2
+    assert main(["docs", ""]) == 2
+    capsys.readouterr()
     assert main(["docs", "verdct"]) == 2
     assert "has no page 'verdct' (did you mean 'verdict'?)" in capsys.readouterr().err
 
