@@ -109,3 +109,20 @@ def test_the_notebook_of_a_tutorial_has_every_block_as_a_cell(page: Path, tmp_pa
     prose = "\n".join(cell["source"] for cell in notebook["cells"] if cell["cell_type"] == "markdown")
     headings = [line for line in page.read_text(encoding="utf-8").splitlines() if re.match(r"#+ [A-Z0-9]", line)]
     assert [line for line in headings if line not in prose] == []
+
+
+@pytest.mark.slow
+def test_the_pictures_of_the_concepts_are_drawn_from_computed_plans(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("matplotlib")
+    pictures = script("pictures")
+    monkeypatch.setattr(pictures, "FOLDER", tmp_path)
+    pictures.main()
+    drawn = {path.name for path in tmp_path.iterdir()}
+    assert len(drawn) == 5
+    text = "".join(page.read_text(encoding="utf-8") for page in (DOCS / "concepts").glob("*.md"))
+    for name in drawn:
+        assert f"../images/{name}" in text
+        assert (DOCS / "images" / name).is_file()
+        assert (tmp_path / name).stat().st_size > 5_000
