@@ -25,6 +25,7 @@ from cnpgen.cli.view import page
 from cnpgen.errors import MissingExtraError
 from cnpgen.loader.frame import make_frame
 from cnpgen.machine.clusters import joined
+from cnpgen.machine.versions import DOCUMENTATION_URL
 from cnpgen.robots.shape.decomposition import convex_parts
 from cnpgen.store.files.figure_file import new_figure
 
@@ -164,13 +165,16 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
         cnpgen.make_datset  # noqa: B018
 
 
-def test_the_version_is_the_same_everywhere() -> None:
+def test_the_version_and_the_address_are_the_same_everywhere() -> None:
     citation = re.search(r"^version: (\S+)$", (ROOT / "CITATION.cff").read_text(encoding="utf-8"), re.M)
     changelog = re.search(r"^## \[(\d\S*)\]", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.M)
     assert citation is not None
     assert changelog is not None
     assert citation[1] == changelog[1] == cnpgen.__version__
-    assert tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["dynamic"] == ["version"]
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert project["dynamic"] == ["version"]
+    assert project["urls"]["Homepage"] == DOCUMENTATION_URL
+    assert all(url.startswith(DOCUMENTATION_URL) for url in project["urls"].values())
 
 
 def bridge(framework: str) -> Callable[[], object]:

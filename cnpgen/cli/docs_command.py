@@ -50,7 +50,7 @@ def docs_folder() -> Path:
 
 
 def list_pages() -> dict[str, Path]:
-    """List the pages, by kind and name; those of benchmarks are named with their folder.
+    """List the pages in the order of the index; those of benchmarks are named with their folder.
 
     Returns:
         Name -> file; the first is "index".
@@ -62,9 +62,11 @@ def list_pages() -> dict[str, Path]:
     if not (folder / "index.md").is_file():
         raise MachineError(f"{folder} has no pages of the documentation: reinstall cnpgen")
     pages = {"index": folder / "index.md"}
+    lists = _text(pages["index"]).partition("## Tutorials")[2]  # the table above it repeats some links
     for kind in KINDS:
         prefix = "benchmarks/" if kind == "benchmarks" else ""
-        pages |= {prefix + file.stem: file for file in sorted((folder / kind).glob("*.md"))}
+        files = sorted((folder / kind).glob("*.md"), key=lambda file: lists.find(f"{file.parent.name}/{file.name}"))
+        pages |= {prefix + file.stem: file for file in files}
     return pages
 
 

@@ -15,7 +15,8 @@ DOCS = Path(__file__).parents[2] / "docs"
 def test_all_pages_are_listed_by_kind(capsys):
     assert main(["docs"]) == 0
     printed = capsys.readouterr().out
-    assert printed.index("tutorials:") < printed.index("  hit-a-puck ") < printed.index("how-to:")
+    assert printed.index("tutorials:") < printed.index("  hit-a-puck ") < printed.index("  your-arm ")
+    assert printed.index("  your-arm ") < printed.index("  publish-a-dataset ") < printed.index("how-to:")
     assert main(["docs", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)
     assert {row["page"] for row in rows} == set(docs_command.list_pages()) - {"index"}
