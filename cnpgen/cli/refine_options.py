@@ -177,6 +177,8 @@ def _summary(facts: dict[str, Any], times: "Times", *, listed: int) -> list[str]
         lines += textwrap.wrap(_failure_text(failure), 110, subsequent_indent="  ")
     if len(facts["not_valid"]) > listed:
         lines.append(f"... and {len(facts['not_valid']) - listed} more: 'cnpgen evaluate' lists them with --list")
+    if any("finding" not in failure for failure in facts["not_valid"]):
+        lines.append("--explain checks whether a problem is infeasible; 'cnpgen docs troubleshooting' lists causes")
     return lines
 
 
