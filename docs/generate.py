@@ -38,7 +38,7 @@ Names that are not listed here may change in every version ([releases](releases.
 
 def public_objects() -> dict[str, Any]:
     """Return all public names with their objects; a name of the package is not repeated for its modules."""
-    objects = {f"cnpgen.{name}": getattr(cnpgen, name) for name in sorted(cnpgen.__all__) if name != "__version__"}
+    objects = {f"cnpgen.{name}": getattr(cnpgen, name) for name in sorted(dir(cnpgen)) if name != "__version__"}
     for part in MODULES:
         module = importlib.import_module(f"cnpgen.{part}")
         names = getattr(module, "__all__", [name for name in vars(module) if name.endswith("Error")])
@@ -56,7 +56,7 @@ def describe_commands() -> str:
     for name, command in commands.choices.items():
         parts += [f"## `cnpgen {name}`", _escaped(command.description), *_tables(command)]
         parts += [f"```\n{command.epilog.strip()}\n```"] if command.epilog else []
-    codes = parser.epilog.partition("Exit codes:\n")[2]
+    codes = str(parser.epilog).partition("Exit codes:\n")[2]
     rows = [" ".join(row.split()).partition(" ") for row in re.split(r"\n(?=  \d)", codes.strip("\n"))]
     return "\n\n".join(
         [*parts, "## Exit codes", _table(("code", "definition"), [(code, text) for code, _, text in rows])]

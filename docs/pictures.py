@@ -30,7 +30,8 @@ def save(drawn: Figure, name: str) -> None:
 
 def knots(count: int, degree: int) -> np.ndarray:
     """Return the clamped uniform knots of a B-spline."""
-    return np.r_[np.zeros(degree), np.linspace(0, 1, count - degree + 1), np.ones(degree)]
+    inner = np.linspace(0, 1, count - degree + 1)
+    return np.concatenate([np.zeros(degree), inner, np.ones(degree)])
 
 
 def rest_problem() -> cnpgen.Boundary:
