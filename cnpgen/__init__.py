@@ -25,7 +25,8 @@ Classes:
     ``Dataset``, ``Problem``, ``Scene``, ``RobotModel``, ``Boundary``, ``Motion``, ``Plans``, ``Planner``, ``Model``,
     ``BoundaryLayer``, ``PlanLoss``, ``TrainingSettings``, ``RefineOptions``, ``CnpgenError``.
 
-``help(cnpgen.Plans)`` documents one name. Other public names are in these modules:
+``help(cnpgen.Plans)`` documents one name, and the command ``cnpgen docs`` prints pages of the documentation. Other
+public names are in these modules:
 
 * ``cnpgen.recipes``: recipes of problems, pipelines and datasets, and their parts.
 * ``cnpgen.losses``: the loss of a plan, its metric and its margins.

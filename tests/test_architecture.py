@@ -14,7 +14,7 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "cnpgen"
 
-# Layers of packages, lowest first, as in docs/architecture.md: a package imports packages of lower layers only.
+# Layers of packages, lowest first, as in architecture.md: a package imports packages of lower layers only.
 LAYERS = (
     ("errors",),
     ("schema", "store"),
@@ -94,7 +94,7 @@ def test_a_module_imports_its_own_package_and_lower_layers_only() -> None:
 
 
 def test_the_docs_list_every_package_in_its_layer() -> None:
-    page = (PACKAGE.parent / "docs" / "architecture.md").read_text(encoding="utf-8")
+    page = (PACKAGE.parent / "docs" / "concepts" / "architecture.md").read_text(encoding="utf-8")
     block = page.split("## Import rules")[1].split("```")[1]
     layers = tuple(tuple(line.split("  ")[0].split(", ")) for line in block.splitlines() if line.strip())
     assert layers == LAYERS
@@ -137,7 +137,7 @@ def test_verdicts_evaluate_splines_by_their_own_code() -> None:
 
 def test_every_trace_of_the_docs_needs_at_most_nine_files_and_never_returns_to_one() -> None:
     """A file of a later step imports none of an earlier step, so that its calls lead forwards only."""
-    page = (PACKAGE.parent / "docs" / "architecture.md").read_text(encoding="utf-8")
+    page = (PACKAGE.parent / "docs" / "concepts" / "architecture.md").read_text(encoding="utf-8")
     traces = [re.findall(r"`([\w/]+)\.(?:py|c)`", section) for section in page.split("\n## ") if section[:2] == "A "]
     assert len(traces) == 3
     for files in traces:

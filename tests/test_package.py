@@ -25,6 +25,7 @@ from cnpgen.cli.view import page
 from cnpgen.errors import MissingExtraError
 from cnpgen.loader.frame import make_frame
 from cnpgen.machine.clusters import joined
+from cnpgen.machine.versions import DOCUMENTATION_URL
 from cnpgen.robots.shape.decomposition import convex_parts
 from cnpgen.store.files.figure_file import new_figure
 
@@ -38,6 +39,7 @@ STRAY = (  # files that were left lying about
     "pipelines/airhockey-hit.toml.orig",
     "problems/airhockey/mesh.stl",
     "cnpgen/notes.txt",
+    "docs/notes.txt",
 )
 
 
@@ -47,7 +49,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
     pytest.importorskip("build")
     pytest.importorskip("hatchling")
     copy, out = tmp_path_factory.mktemp("copy"), tmp_path_factory.mktemp("wheel")
-    for name in ("cnpgen", "problems", "pipelines", "datasets"):
+    for name in ("cnpgen", "problems", "pipelines", "datasets", "docs"):
         shutil.copytree(ROOT / name, copy / name, ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, copy)
@@ -70,6 +72,8 @@ def test_the_wheel_carries_every_recipe_and_robot(wheel: zipfile.ZipFile) -> Non
             if path.is_file():
                 assert f"cnpgen/_recipes/{path.relative_to(ROOT).as_posix()}" in wheel.namelist()
     assert "cnpgen/py.typed" in wheel.namelist()
+    pages = {f"cnpgen/_recipes/{path.relative_to(ROOT).as_posix()}" for path in (ROOT / "docs").rglob("*.md")}
+    assert pages == {name for name in wheel.namelist() if name.startswith("cnpgen/_recipes/docs/")}
     sources = [path.relative_to(ROOT).as_posix() for path in (ROOT / "cnpgen").rglob("*.[ch]")]
     assert "cnpgen/refine/solver/step.c" in sources
     assert set(sources) <= set(wheel.namelist())
@@ -79,7 +83,9 @@ def test_the_wheel_carries_nothing_that_was_left_lying_about(wheel: zipfile.ZipF
     shipped = {name.removeprefix("cnpgen/_recipes/") for name in wheel.namelist()}
     assert not shipped.intersection(STRAY)
     tracked = (
-        path for folder in ("cnpgen", "problems", "pipelines", "datasets") for path in (ROOT / folder).rglob("*")
+        path
+        for folder in ("cnpgen", "problems", "pipelines", "datasets", "docs")
+        for path in (ROOT / folder).rglob("*")
     )
     expected = {path.relative_to(ROOT).as_posix() for path in tracked if path.is_file() and path.suffix != ".pyc"}
     assert {name for name in shipped if ".dist-info/" not in name} <= expected
@@ -99,6 +105,8 @@ for name in cnpgen.recipes.list_recipes("dataset"):
         assert recipe.pipeline.problem.urdf_path.is_relative_to(sys.argv[1])
 (script,) = entry_points(group="console_scripts", name="cnpgen")
 assert callable(script.load())
+from cnpgen.cli.docs_command import docs_folder, list_pages
+assert docs_folder().is_relative_to(sys.argv[1]) and len(list_pages()) > 30
 print(version("cnpgen"), len(cnpgen.recipes.list_recipes("dataset")))
 """
 
@@ -157,13 +165,16 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
         cnpgen.make_datset  # noqa: B018
 
 
-def test_the_version_is_the_same_everywhere() -> None:
+def test_the_version_and_the_address_are_the_same_everywhere() -> None:
     citation = re.search(r"^version: (\S+)$", (ROOT / "CITATION.cff").read_text(encoding="utf-8"), re.M)
     changelog = re.search(r"^## \[(\d\S*)\]", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.M)
     assert citation is not None
     assert changelog is not None
     assert citation[1] == changelog[1] == cnpgen.__version__
-    assert tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["dynamic"] == ["version"]
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert project["dynamic"] == ["version"]
+    assert project["urls"]["Homepage"] == DOCUMENTATION_URL
+    assert all(url.startswith(DOCUMENTATION_URL) for url in project["urls"].values())
 
 
 def bridge(framework: str) -> Callable[[], object]:

@@ -68,7 +68,7 @@ def hits_from(pucks: Pucks, puck: Array, start: State) -> Plans:
     """Return the boundary problems of hitting N pucks, each from its own state.
 
     The goal configuration maximizes the speed of the tip along the hit, near the configuration of the start. The goal
-    velocity has the maximum speed (docs/references.md, 2).
+    velocity has the maximum speed ('cnpgen docs references', 2).
 
     Args:
         pucks: The problem and the target.

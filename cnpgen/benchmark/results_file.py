@@ -51,7 +51,7 @@ class Results:
 
     Attributes:
         path: The file.
-        rows: Index of the problem -> its row, see ``docs/benchmark.md``.
+        rows: Index of the problem -> its row, see ``cnpgen docs benchmark``.
     """
 
     path: Path

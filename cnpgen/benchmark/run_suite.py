@@ -53,7 +53,7 @@ class Benchmark:
         suite: The suite.
         problems: Its problems.
         prefix: Of replanning scenarios, the prefixes of the first motions.
-        results: Planner -> its rows, one for each problem, in their order (docs/benchmark.md).
+        results: Planner -> its rows, one for each problem, in their order ('cnpgen docs benchmark').
         plants: Plants that executed plans in this run.
     """
 

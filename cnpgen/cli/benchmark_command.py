@@ -18,8 +18,8 @@ Each planner solves one problem after the other, in its own process and on one t
 answers, and with --simulate MuJoCo executes them. Every finished problem is written to DIR at once, one file per
 planner. After an interruption the same command resumes; more --planners or --plant extend the results. If a planner
 crashes, times out or returns an invalid result, only that problem is marked as failed. With --engine several workers
-plan at once, so compare CPU times only. docs/benchmark.md describes suites and planners. The exit code is 0 if the
-benchmark is complete, also if planners failed.
+plan at once, so compare CPU times only. 'cnpgen docs benchmark' describes suites and planners. The exit code is 0 if
+the benchmark is complete, also if planners failed.
 """
 
 

@@ -19,7 +19,7 @@ _TEXT = """\
 The stages of the pipeline compute everything that the tasks do not give: 'goal_xyz.x,goal_xyz.y,hit_angle' is enough
 to hit a puck. Columns have the names of dataset fields, with components after a dot, in SI units. The start is given by
 joints (start_q.*, start_dq.*, start_ddq.*) or by position (start_xyz.*); the default is the problem's base at rest. The
-speed of a hit is the maximum unless hit_speed [m/s] or hit_speed_share is given. docs/tasks.md has examples.
+speed of a hit is the maximum unless hit_speed [m/s] or hit_speed_share is given. 'cnpgen docs tasks' has examples.
 The boundary problems are written to OUT, which is printed on stdout; 'cnpgen solve', 'refine' and 'plan' read it. Its
 sample_id is the index of the task. Tasks without an answer are left out, with the reason on stderr. The exit code is 1
 if no task has an answer.

@@ -13,7 +13,8 @@ if TYPE_CHECKING:
 
 _TEXT = """\
 Results are printed on stdout, warnings and problems with their remedies on stderr. The exit code is 3 if a required
-library does not work. Without a C compiler cnpgen works 10 to 20 times slower.
+library does not work. Without a C compiler cnpgen works 10 to 20 times slower. 'cnpgen docs troubleshooting' has
+more remedies.
 """
 
 

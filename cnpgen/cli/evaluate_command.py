@@ -15,8 +15,9 @@ if TYPE_CHECKING:
     from cnpgen.plans.evaluate import Evaluation
 
 _TEXT = """\
-Every plan is checked on a fine time grid and between its samples (docs/verdict.md). The exit code is 0 if every plan
-is valid, and 1 if a plan is invalid, if the file holds no plans, or if it is damaged. --workers changes only the time.
+Every plan is checked on a fine time grid and between its samples ('cnpgen docs verdict'). The exit code is 0 if every
+plan is valid, and 1 if a plan is invalid, if the file holds no plans, or if it is damaged. --workers changes only the
+time.
 """
 
 

@@ -19,7 +19,7 @@ MAX_LISTED_PLANS = 10  # invalid plans that are listed by number
 
 _TEXT = """\
 npz is one NumPy archive; csv and joint-trajectory (a message of ROS 2, as JSON) are a folder with one file per plan.
-'cnpgen list exporters' shows all formats, including those of installed packages. docs/plan-format.md shows how to
+'cnpgen list exporters' shows all formats, including those of installed packages. 'cnpgen docs plan-format' shows how to
 read them. The path of the output is printed on stdout. Plans that cannot be sampled are left out and listed on
 stderr; the exit code is then 1. With --join, positions, velocities and accelerations must be
 continuous from plan to plan (1e-9 in SI); otherwise nothing is written.

@@ -10,7 +10,7 @@ from cnpgen.cli.parser import Commands, Parser, add_command, add_engine
 _TEXT = """\
 The samples are those of a dataset that is made at once, every split in the proportion of the recipe. Existing shards
 do not change; statistics, card and manifest are written again. Until it is finished the dataset has no manifest; after
-an interruption the same command resumes (docs/dataset-format.md).
+an interruption the same command resumes ('cnpgen docs dataset-format').
 """
 
 

@@ -9,7 +9,7 @@ _TEXT = """\
 The command writes NAME/problem.toml, NAME/pipeline.toml and NAME/dataset.toml: motions from rest to rest between two
 boxes of positions in front of the robot, within its limits and without self-collision. Comments explain every key. The
 head of problem.toml lists findings about the robot: joints, masses, frames, link pairs, and placeholders for limits
-that the URDF lacks. docs/your-arm.md continues from there.
+that the URDF lacks. 'cnpgen docs your-arm' continues from there.
 """
 
 

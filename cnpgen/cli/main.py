@@ -14,6 +14,7 @@ from typing import Any, NoReturn
 from cnpgen.cli import (
     benchmark_command,
     complete_command,
+    docs_command,
     doctor_command,
     evaluate_command,
     export_command,
@@ -59,6 +60,7 @@ _COMMANDS = (
     benchmark_command,
     export_command,
     doctor_command,
+    docs_command,
 )
 
 _DESCRIPTION = "Generate and verify datasets for kinodynamic motion planning, train planners and optimize plans."
@@ -80,6 +82,7 @@ examples:
   cnpgen simulate plans.h5 --video plan.mp4          execute plans in MuJoCo
   cnpgen benchmark hits-81 --simulate                compare planners
   cnpgen export plans.h5 --to joint-trajectory       export plans for robots and simulators
+  cnpgen docs hit-a-puck                             read a page of the documentation
 
 stdout is data, stderr everything else. Exit codes:
   0    done
@@ -185,7 +188,7 @@ def _explain(error: BaseException, options: Container[str]) -> tuple[Sequence[st
         return [" ".join(error.text(shell_spelling(options)).split())], error.exit_code
     code = MachineError.exit_code
     if isinstance(error, ImportError):
-        return [f"{error}; 'cnpgen doctor' checks this installation"], code
+        return [f"{error}; 'cnpgen doctor' checks this installation, 'cnpgen docs troubleshooting' lists causes"], code
     if isinstance(error, MemoryError):
         return ["out of memory; fewer --workers need less"], code
     if isinstance(error, OSError) and error.strerror:

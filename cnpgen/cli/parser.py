@@ -89,7 +89,7 @@ def add_debug(parser: Parser, *, default: Any = False) -> None:
 
 def add_engine(parser: Options) -> None:
     """Add ``--engine`` and ``--address``."""
-    text = "engine of the workers: local processes (loky, default), or a cluster (docs/scale.md)"
+    text = "engine of the workers: local processes (loky, default), or a cluster ('cnpgen docs scale')"
     parser.add_argument("--engine", choices=("loky", "dask", "ray"), help=text)
     text = "address of the cluster, such as tcp://host:8786; without it a local cluster is started"
     parser.add_argument("--address", metavar="A", help=text)

@@ -10,7 +10,7 @@ from cnpgen.cli.refine_options import TEXT, add_options, refine_and_save
 
 _TEXT = (
     """\
-The plans may come from any planner; docs/plan-format.md shows how to write a plan file, and how trajectories
+The plans may come from any planner; 'cnpgen docs plan-format' shows how to write a plan file, and how trajectories
 that are sampled in time become plans. No plan comes back worse than it was given: violations count first, then the
 objective. Plans whose control points are no numbers, or that take longer than a minute, are made from nothing.
 """

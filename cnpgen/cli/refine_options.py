@@ -30,7 +30,7 @@ decide what is valid, as in 'cnpgen evaluate'. What is finished is written to OU
 fours: after Ctrl-C, kill -9 or a full disk the same command goes on. An existing OUT is replaced only with --force,
 and only if it is a file of plans. The exit code is 0 if every plan is valid, and 1 if any is not; the file is written
 in either case.
-docs/refiner.md has the formulation.
+'cnpgen docs refiner' has the formulation.
 """
 
 
@@ -177,6 +177,8 @@ def _summary(facts: dict[str, Any], times: "Times", *, listed: int) -> list[str]
         lines += textwrap.wrap(_failure_text(failure), 110, subsequent_indent="  ")
     if len(facts["not_valid"]) > listed:
         lines.append(f"... and {len(facts['not_valid']) - listed} more: 'cnpgen evaluate' lists them with --list")
+    if any("finding" not in failure for failure in facts["not_valid"]):
+        lines.append("--explain checks whether a problem is infeasible; 'cnpgen docs troubleshooting' lists causes")
     return lines
 
 

@@ -36,7 +36,7 @@ def add(commands: "Commands[Parser]") -> None:
     )
     what.add_argument("--stage", metavar="KIND", help="describe a kind of stage and its keys")
     what.add_argument("--constraint", metavar="KIND", help="describe a kind of constraint and its keys")
-    text = "all keys of problem, pipeline, dataset and suite files, in Markdown (docs/keys.md); WHAT is one of these"
+    text = "all keys of problem, pipeline, dataset and suite files, in Markdown ('cnpgen docs keys'); WHAT is one kind"
     what.add_argument("--keys", metavar="WHAT", nargs="?", choices=("all", *MARKS), const="all", help=text)
     parser.add_argument("--kind", choices=KINDS, help="kind of the recipe, if several have the same name")
     add_json(parser)

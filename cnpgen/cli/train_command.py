@@ -20,7 +20,7 @@ The loss is the problem's objective and constraints along every motion; no demon
 writes a log (.jsonl), a picture of it (.png, if matplotlib is installed) and, until the end, a checkpoint. After Ctrl-C
 (exit code 130), SIGTERM (143), kill -9 or a full disk the same command resumes from the checkpoint and gives the same
 parameters. The best of ten models on validation samples is kept; its score is measured on other samples. The model file
-is printed on stdout. docs/training.md explains the options.
+is printed on stdout. 'cnpgen docs training' explains the options.
 """
 
 _CHECK = "validation rows to compare models by, half of all at most (default: 200)"

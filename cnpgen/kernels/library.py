@@ -254,7 +254,8 @@ def choose_backend(requested: str | None = None) -> tuple[Backend, Path]:
     except MachineError as error:
         if requested == "compiled":
             raise
-        warnings.warn(f"{error}; running on the NumPy backend, {NUMPY_SLOWDOWN}", RuntimeWarning, stacklevel=2)
+        text = f"{error}; running on the NumPy backend, {NUMPY_SLOWDOWN} ('cnpgen docs troubleshooting')"
+        warnings.warn(text, RuntimeWarning, stacklevel=2)
         return "numpy", folder
     return "compiled", folder
 

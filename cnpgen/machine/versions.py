@@ -4,6 +4,8 @@ from functools import cache
 
 __version__ = "0.1.0"
 
+DOCUMENTATION_URL = "https://cnpgen.example.org/"  # the publisher replaces this address, also in pyproject.toml
+
 
 @cache
 def versions() -> dict[str, str]:

@@ -67,7 +67,7 @@ def complete(
 
     Args:
         recipe: Name of a shipped pipeline or dataset, path of a recipe file, or a loaded recipe.
-        table: Path of a table of tasks, CSV or HDF5, in place of the columns; see docs/tasks.md.
+        table: Path of a table of tasks, CSV or HDF5, in place of the columns; see 'cnpgen docs tasks'.
         columns: Name of a dataset column -> values in SI units, shape (w,) for one task or (N, w); scalars have shape
             () or (N,). The value of one task applies to all.
 

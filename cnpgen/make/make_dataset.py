@@ -85,7 +85,7 @@ def make_dataset(
     """Generate a dataset, or finish an interrupted one.
 
     Existing shards are compared with their recorded sha256. Damaged shards are generated again, after a warning.
-    Workers are processes of this machine by default, or of a cluster (docs/scale.md); the bytes are the same.
+    Workers are processes of this machine by default, or of a cluster ('cnpgen docs scale'); the bytes are the same.
 
     Args:
         recipe: Name of a shipped dataset or pipeline, path of a recipe file, or a loaded recipe.

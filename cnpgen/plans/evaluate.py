@@ -65,7 +65,7 @@ class Evaluation:
         return np.array([_STATUS.get(verdict.reason, PlanStatus.INVALID) for verdict in self.verdicts], np.uint8)
 
     def summary(self) -> dict[str, Any]:
-        """Return the summary of all plans for JSON (docs/verdict.md)."""
+        """Return the summary of all plans for JSON ('cnpgen docs verdict')."""
         record = self.plans.problem
         return {
             "format": FORMAT,
@@ -78,7 +78,7 @@ class Evaluation:
         }
 
     def rows(self) -> Iterator[dict[str, Any]]:
-        """Yield the result of each plan for JSON (docs/verdict.md)."""
+        """Yield the result of each plan for JSON ('cnpgen docs verdict')."""
         for index, (sample, verdict) in enumerate(zip(self.plans.sample_id.tolist(), self.verdicts, strict=True)):
             yield {"plan": index, "sample_id": sample, **verdict.to_dict()}
 

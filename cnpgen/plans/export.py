@@ -65,9 +65,9 @@ def export_plans(
     """Sample plans in time and write them; existing files are replaced.
 
     Formats are "npz" (one file), "csv" and "joint-trajectory" (a folder with one file per plan, ``plan_00000.csv``),
-    and those of installed packages; docs/plan-format.md has their content. Folders do not contain unplanned joints. If
-    the robot has movable ones, ``held_joints.yaml`` contains their positions. Plans that cannot be sampled are omitted
-    and reported.
+    and those of installed packages; 'cnpgen docs plan-format' has their content. Folders do not contain unplanned
+    joints. If the robot has movable ones, ``held_joints.yaml`` contains their positions. Plans that cannot be sampled
+    are omitted and reported.
 
     Args:
         plans: Plans, or joined plans of ``join_plans``.

@@ -1,4 +1,4 @@
-"""Plan file format: names, units and definitions of its datasets (docs/plan-format.md)."""
+"""Plan file format: names, units and definitions of its datasets ('cnpgen docs plan-format')."""
 
 import difflib
 from collections.abc import Collection

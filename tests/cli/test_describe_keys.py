@@ -1,4 +1,4 @@
-"""The keys of recipe files: every one is described, in docs/keys.md as on the command line."""
+"""The keys of recipe files: every one is described, in docs/reference/keys.md as on the command line."""
 
 import dataclasses
 import json
@@ -23,7 +23,7 @@ from cnpgen.schema.keys import keys
 from cnpgen.schema.toml import MARKS
 from cnpgen.store.files.documents import plain
 
-PAGE = Path(__file__).parents[2] / "docs" / "keys.md"
+PAGE = Path(__file__).parents[2] / "docs" / "reference" / "keys.md"
 KINDS = [(group, name) for group in (registry.STAGES, registry.CONSTRAINTS) for name in registry.names(group)]
 
 
@@ -57,7 +57,7 @@ def test_a_summary_is_the_first_line_without_markup():
 
 def test_the_page_of_all_keys_is_what_the_command_prints(capsys):
     assert main(["show", "--keys"]) == 0
-    assert PAGE.read_text(encoding="utf-8") == capsys.readouterr().out, "run: cnpgen show --keys > docs/keys.md"
+    assert PAGE.read_text(encoding="utf-8") == capsys.readouterr().out, "run: python docs/generate.py"
 
 
 def test_every_key_of_every_table_is_on_the_page_with_a_sentence():

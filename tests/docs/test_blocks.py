@@ -24,7 +24,8 @@ from tests.conftest import HANGING
 
 ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"
-PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [README, *sorted((ROOT / "docs").rglob("*.md"))]
+PLUG_INS = ROOT / "docs" / "how-to" / "plug-ins.md"
 BLOCK = re.compile(r"((?:<!-- [^\n]* -->\n)*)```(\w*)\n(.*?)```", re.S)
 RUNNABLE = {"bash", "python", "toml"}
 
@@ -117,7 +118,7 @@ def test_no_two_pages_write_the_same_file_so_that_all_can_run_in_one_folder() ->
 
 @pytest.mark.slow
 def test_the_plug_in_of_the_docs_works_when_installed(tmp_path: Path) -> None:
-    files = {marks["file"]: text for marks, _, text in blocks(ROOT / "docs" / "plug-ins.md") if "file" in marks}
+    files = {marks["file"]: text for marks, _, text in blocks(PLUG_INS) if "file" in marks}
     source = tmp_path / "src"
     source.mkdir()
     (source / "my_hockey.py").write_text(files["src/my_hockey.py"], encoding="utf-8")
@@ -157,7 +158,7 @@ def test_the_plug_in_of_the_docs_works_when_installed(tmp_path: Path) -> None:
 
 
 def test_the_constraint_of_the_docs_is_measured_along_a_path_as_at_single_states() -> None:
-    files = {marks["file"]: text for marks, _, text in blocks(ROOT / "docs" / "plug-ins.md") if "file" in marks}
+    files = {marks["file"]: text for marks, _, text in blocks(PLUG_INS) if "file" in marks}
     module: dict[str, Any] = {"__name__": "my_hockey"}
     exec(compile(files["src/my_hockey.py"], "my_hockey.py", "exec"), module)
     keep_out = module["KeepOut"](x=1.0, y=0.0, radius=0.1, tolerance=1e-3)

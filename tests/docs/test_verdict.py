@@ -9,7 +9,7 @@ from cnpgen.plans.evaluate import evaluate_plans
 from tests.examples.plan_files import plans_of
 from tests.examples.plans import load
 
-PAGE = (Path(__file__).parents[2] / "docs" / "verdict.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "verdict-format.md").read_text(encoding="utf-8")
 
 
 def documented(after: str) -> set[str]:

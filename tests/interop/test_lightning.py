@@ -1,4 +1,4 @@
-"""The recipe of docs/loading.md for Lightning, interrupted within an epoch; in the extended run only."""
+"""The recipe of docs/how-to/loading.md for Lightning, interrupted within an epoch; in the extended run only."""
 
 import re
 import warnings
@@ -18,7 +18,7 @@ from cnpgen.loader.load import load_dataset
 
 pytestmark = [pytest.mark.extended, pytest.mark.filterwarnings("ignore")]  # warnings of Lightning
 
-LOADING = Path(__file__).parents[2] / "docs" / "loading.md"
+LOADING = Path(__file__).parents[2] / "docs" / "how-to" / "loading.md"
 EPOCHS, BATCHES = 3, 6  # of 8 rows out of 50
 
 

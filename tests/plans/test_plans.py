@@ -42,7 +42,7 @@ from cnpgen.store.files.checksum_file import with_checksum
 from cnpgen.trajectory.boundary import Boundary, anchor_line, assemble
 from tests.examples.plan_files import remove_checksum
 
-DOCS = Path(__file__).parents[2] / "docs" / "plan-format.md"
+DOCS = Path(__file__).parents[2] / "docs" / "reference" / "plan-format.md"
 AIRHOCKEY, HEAVY = load_problem("airhockey"), load_problem("heavy-object")
 RECORD = record_problem(AIRHOCKEY)
 N = 7

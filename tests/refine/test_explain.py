@@ -308,3 +308,7 @@ def test_the_commands_explain_plans_that_are_not_valid(tmp_path: Path, capsys: p
     assert (failure["plan"], failure["finding"]) == (1, "infeasible")
     assert failure["explanation"].startswith("at the goal joint velocity is")
     assert "infeasible: at the goal joint velocity is" in " ".join(err.split())
+    assert "cnpgen docs troubleshooting" not in err
+    words.remove("--explain")
+    assert main([*words, "--force"]) == 1
+    assert capsys.readouterr().err.endswith("is infeasible; 'cnpgen docs troubleshooting' lists causes\n")

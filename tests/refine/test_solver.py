@@ -119,7 +119,7 @@ def test_the_objective_is_an_integral_over_time_as_pinocchio_evaluates_it(kind: 
         density[i] = {
             "effort": np.sum((np.array(world.torque) / plan.robot.torque_limit) ** 2),
             "jerk": np.sum((states.jerk[0, i] / plan.robot.jerk_limit) ** 2),
-            "centrifugal": np.hypot(across, 0.5) - 0.5,  # smoothed as in docs/refiner.md
+            "centrifugal": np.hypot(across, 0.5) - 0.5,  # smoothed as in docs/concepts/refiner.md
         }[kind]
     tolerance = 2e-3 if kind == "centrifugal" else 1e-3  # the smoothed norm is less smooth than sums of squares
     assert added == pytest.approx(np.trapezoid(density / states.rate[0], s), rel=tolerance)

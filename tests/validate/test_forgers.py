@@ -1,4 +1,4 @@
-"""Forged datasets with valid digests and statistics: the checks of docs/dataset-format.md that detect them."""
+"""Forged datasets with valid digests and statistics: the checks of dataset-format.md that detect them."""
 
 import re
 import shutil
@@ -24,7 +24,7 @@ from tests.conftest import some
 
 ROBOT = load_robot(load_problem("airhockey"))
 FRAME = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-PAGE = Path(__file__).parents[2] / "docs" / "dataset-format.md"
+PAGE = Path(__file__).parents[2] / "docs" / "reference" / "dataset-format.md"
 Columns = dict[str, np.ndarray]
 
 

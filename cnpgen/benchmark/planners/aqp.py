@@ -1,4 +1,4 @@
-"""Anchored quadratic programming (docs/references.md, 2), a baseline of the paper for hits.
+"""Anchored quadratic programming ('cnpgen docs references', 2), a baseline of the paper for hits.
 
 The planner first computes a path of the tip in the plane, two lines and an arc, with constant acceleration up to the
 hit. At each sample, a quadratic program then computes the joint velocity that follows the path. It moves the arm

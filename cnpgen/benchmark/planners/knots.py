@@ -1,4 +1,4 @@
-"""Constraints of TrajOpt at its knots, with analytic derivatives by Pinocchio (docs/benchmark.md)."""
+"""Constraints of TrajOpt at its knots, with analytic derivatives by Pinocchio ('cnpgen docs benchmark')."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""TrajOpt as the paper's authors ran it: direct collocation by SciPy's SLSQP (docs/benchmark.md).
+"""TrajOpt as the paper's authors ran it: direct collocation by SciPy's SLSQP ('cnpgen docs benchmark').
 
 The program has 15 knots and explicit Euler steps of ``T / 15`` between them. SLSQP minimizes T in at most 100
 iterations. The initial guess is a cubic whose derivatives are not scaled by T. The knots are sent with a spacing of

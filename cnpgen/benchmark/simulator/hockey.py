@@ -1,6 +1,6 @@
 """Air-hockey table in the robot's frame, its puck, and the contact parameters.
 
-Sizes are those of the real table (docs/references.md). Mallet and puck are two discs. They touch if the mallet's axis
+Sizes are those of the real table (references, 15). Mallet and puck are two discs. They touch if the mallet's axis
 enters a disc with the sum of both radii around the puck, which is the shape for MuJoCo.
 """
 

@@ -1,7 +1,7 @@
 """Plants: deviations of the simulated robot from the nominal model, such as friction, other masses and a delay.
 
 Dry and viscous friction of the iiwa's joints are those of the Air Hockey Challenge (2023), which simulates the same
-arm (docs/references.md). The friction of other joints is a fraction of their rated torque.
+arm ('cnpgen docs references'). The friction of other joints is a fraction of their rated torque.
 """
 
 from dataclasses import dataclass

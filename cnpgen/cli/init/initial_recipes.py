@@ -25,7 +25,7 @@ from cnpgen.robots.robot_spec import LimitSpec, RobotSpec
 from cnpgen.schema.keys import PerJoint, Range
 
 GUESS_RANGE_RAD, GUESS_RANGE_M = 0.5, 0.1  # range of inverse kinematics guesses around the base configuration
-INITIAL_JERK_RATE = 100.0  # jerk limits per acceleration limit [1/s]; Franka Research 3: 500 (docs/references.md)
+INITIAL_JERK_RATE = 100.0  # jerk limits per acceleration limit [1/s]; Franka Research 3: 500 ('cnpgen docs references')
 TORQUE_STATES = 1000  # random states that determine placeholders of missing torque limits
 
 

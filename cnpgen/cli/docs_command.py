@@ -1,0 +1,140 @@
+"""``cnpgen docs``: the documentation of this version, without a network."""
+
+import argparse
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from cnpgen.cli.parser import Commands, Parser, add_command, add_json
+from cnpgen.errors import MachineError, UsageError, lacks
+
+KINDS = ("tutorials", "how-to", "concepts", "reference", "benchmarks")
+
+_TEXT = """\
+Without PAGE it lists all pages. --search lists the lines that contain TEXT. Pictures are on the site and in the
+repository only.
+"""
+
+
+def add(commands: "Commands[Parser]") -> None:
+    """Add the command."""
+    parser = add_command(commands, "docs", run, title="print a page of the documentation as Markdown", text=_TEXT)
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument("page", metavar="PAGE", nargs="?", help="name of a page, such as hit-a-puck")
+    what.add_argument("--search", metavar="TEXT", help="list the lines with TEXT on all pages, in any case")
+    parser.add_argument("--url", action="store_true", help="print the address of PAGE on the site")
+    add_json(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command."""
+    pages = list_pages()
+    name = None if arguments.page is None else page_name(arguments.page, pages)
+    if arguments.search is not None:
+        return _search(arguments.search, pages, as_json=arguments.json)
+    if arguments.url:
+        print(page_url(pages[name] if name else pages["index"]))
+    elif name is None:
+        _list(pages, as_json=arguments.json)
+    elif arguments.json:
+        _print_json({"page": name, "url": page_url(pages[name]), "markdown": _text(pages[name])})
+    else:
+        print(_text(pages[name]), end="")
+    return 0
+
+
+def docs_folder() -> Path:
+    """Return the folder of the pages: in the installed package, or in a checkout."""
+    from cnpgen.schema.catalogue import recipes_root
+
+    return recipes_root() / "docs"
+
+
+def list_pages() -> dict[str, Path]:
+    """List the pages in the order of the index; those of benchmarks are named with their folder.
+
+    Returns:
+        Name -> file; the first is "index".
+
+    Raises:
+        MachineError: The installation lacks the pages.
+    """
+    folder = docs_folder()
+    if not (folder / "index.md").is_file():
+        raise MachineError(f"{folder} has no pages of the documentation: reinstall cnpgen")
+    pages = {"index": folder / "index.md"}
+    lists = _text(pages["index"]).partition("## Tutorials")[2]  # the table above it repeats some links
+    for kind in KINDS:
+        prefix = "benchmarks/" if kind == "benchmarks" else ""
+        files = sorted((folder / kind).glob("*.md"), key=lambda file: lists.find(f"{file.parent.name}/{file.name}"))
+        pages |= {prefix + file.stem: file for file in files}
+    return pages
+
+
+def page_name(text: str, pages: dict[str, Path]) -> str:
+    """Return the name of a page from its name, its path, or a link to it on another page.
+
+    Raises:
+        UsageError: There is no such page.
+    """
+    path = PurePosixPath(text.partition("#")[0].removesuffix(".md"))
+    folder = path.parent.name
+    name = f"benchmarks/{path.name}" if folder == "benchmarks" else path.name
+    if name not in pages or folder not in {"", "..", pages[name].parent.name}:
+        raise UsageError(f"documentation {lacks('page', text, pages)}")
+    return name
+
+
+def page_title(page: Path) -> str:
+    """Return the heading of a page."""
+    return _text(page).partition("\n")[0].removeprefix("# ")
+
+
+def page_url(page: Path) -> str:
+    """Return the address of a page on the site."""
+    from cnpgen.machine.versions import DOCUMENTATION_URL
+
+    return f"{DOCUMENTATION_URL}docs/{page.relative_to(docs_folder()).with_suffix('.html').as_posix()}"
+
+
+def _text(page: Path) -> str:
+    return page.read_text(encoding="utf-8")
+
+
+def _list(pages: dict[str, Path], *, as_json: bool) -> None:
+    rows = [
+        {"page": name, "kind": file.parent.name, "title": page_title(file)}
+        for name, file in pages.items()
+        if name != "index"
+    ]
+    if as_json:
+        _print_json(rows)
+        return
+    width = max(map(len, pages))
+    for kind in KINDS:
+        print(f"{kind}:")
+        print(
+            *(f"  {row['page']:<{width}}  {row['title']}" for row in rows if row["kind"] == kind), sep="\n", end="\n\n"
+        )
+    print("'cnpgen docs PAGE' prints a page, 'cnpgen docs --search TEXT' searches all pages.")
+
+
+def _search(text: str, pages: dict[str, Path], *, as_json: bool) -> int:
+    """Print the lines that contain a text; return 1 if there are none."""
+    rows = [
+        {"page": name, "line": number, "text": line.strip()}
+        for name, file in pages.items()
+        for number, line in enumerate(_text(file).splitlines(), 1)
+        if text.casefold() in line.casefold()
+    ]
+    if as_json:
+        _print_json(rows)
+    else:
+        for row in rows:
+            print(f"{row['page']}:{row['line']}: {row['text']}")
+    return 0 if rows else 1
+
+
+def _print_json(content: Any) -> None:
+    from cnpgen.store.files.documents import render
+
+    print(render(content))

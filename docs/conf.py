@@ -1,0 +1,110 @@
+"""Settings of the documentation site, for Sphinx.
+
+    python -m sphinx -W --keep-going -c docs . build/site                  # the site: build/site/index.html
+    python -m sphinx -W --keep-going -b linkcheck -c docs . build/links    # external links, with a network
+
+The source folder is the repository: links to SECURITY.md or to data cards work on the site and in the repository.
+The navigation follows the order of the links in index.md. Pages of the API are written before the build to
+reference/api/, a folder that git ignores. Notebooks of the tutorials are written to the folder notebooks of the site.
+"""
+
+import inspect
+import re
+import sys
+from pathlib import Path
+
+from sphinx.application import Sphinx
+
+DOCS = Path(__file__).resolve().parent
+sys.path[:0] = [str(DOCS.parent), str(DOCS)]  # the package of this checkout; the scripts beside this file
+
+from generate import public_objects  # noqa: E402
+from notebooks import write_notebooks  # noqa: E402
+
+from cnpgen.machine.versions import DOCUMENTATION_URL, __version__  # noqa: E402
+
+project = "cnpgen"
+author = "The cnpgen developers"
+copyright = author  # noqa: A001 - Sphinx reads this name
+version = release = __version__
+root_doc = "docs/index"
+include_patterns = ["*.md", "docs/**", "datasets/**/*.md", "pipelines/*.md", "problems/*.md"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
+myst_heading_anchors = 4  # the anchors of headings are GitHub's
+smartquotes = False  # they would change --n
+highlight_language = "none"  # blocks without a language
+autodoc_typehints_format = "short"
+napoleon_use_ivar = True  # attributes in docstrings describe those that autodoc lists
+linkcheck_ignore = [re.escape(DOCUMENTATION_URL)]
+
+html_theme = "furo"
+html_title = f"cnpgen {__version__}"
+html_baseurl = DOCUMENTATION_URL
+html_extra_path = ["site"]  # index.html forwards to docs/index.html
+html_copy_source = False
+
+CAPTIONS = {
+    "tutorials": "Tutorials",
+    "how-to": "How-to guides",
+    "concepts": "Concepts",
+    "reference": "Reference",
+    "benchmarks": "Benchmarks",
+}
+OTHERS = ("README", "CHANGELOG", "CONTRIBUTING", "SECURITY", "datasets/**", "pipelines/**", "problems/**")
+
+
+def toctree(entries: list[str], *options: str) -> str:
+    """Return a hidden table of contents in MyST."""
+    return "\n".join(["", "```{toctree}", ":hidden:", *options, "", *entries, "```", ""])
+
+
+def add_navigation(_: Sphinx, docname: str, source: list[str]) -> None:
+    """Append tables of contents to the pages that list others."""
+    if docname == root_doc:
+        lists = source[0].partition("## Tutorials")[2]  # the table above it repeats some links
+        links = re.findall(r"\]\(([\w-]+)/([\w-]+)\.md\)", lists)
+        for folder, caption in CAPTIONS.items():
+            pages = list(dict.fromkeys(f"{kind}/{page}" for kind, page in links if kind == folder))
+            source[0] += toctree(pages, f":caption: {caption}")
+        source[0] += toctree([f"/{name}" for name in OTHERS], ":caption: Project", ":glob:")
+    if docname.startswith("docs/tutorials/"):
+        file = f"../../notebooks/{docname.rpartition('/')[2]}.ipynb"
+        source[0] += f'\n<p><a href="{file}" download>This page as a notebook</a></p>\n'
+    if docname == "docs/reference/api":
+        source[0] += toctree(["api/*"], ":glob:")
+
+
+def write_api_pages(app: Sphinx) -> None:
+    """Write one page for each public name."""
+    folder = Path(app.srcdir) / "docs" / "reference" / "api"
+    folder.mkdir(exist_ok=True)
+    for old in folder.glob("*.rst"):
+        old.unlink()
+    for name, value in public_objects().items():
+        kind = "class" if inspect.isclass(value) else "function" if inspect.isroutine(value) else "data"
+        kind = "exception" if inspect.isclass(value) and issubclass(value, BaseException) else kind
+        members = "\n   :members:\n   :inherited-members: Exception, tuple, int, str" if kind == "class" else ""
+        text = f"{name}\n{'=' * len(name)}\n\n.. auto{kind}:: {name}{members}\n"
+        (folder / f"{name}.rst").write_text(text, encoding="utf-8")
+
+
+def escape_bars(_: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:  # noqa: ARG001
+    """Escape |x| outside of code: it is an absolute value, and reStructuredText has substitutions there."""
+    for number, line in enumerate(lines):
+        parts = re.split(r"(``.*?``)", line)
+        lines[number] = "".join(part if part.startswith("``") else part.replace("|", r"\|") for part in parts)
+
+
+def write_downloads(app: Sphinx, error: Exception | None) -> None:
+    """Write the notebooks into a site that was built."""
+    if error is None and app.builder.name == "html":
+        write_notebooks(Path(app.outdir) / "notebooks")
+
+
+def setup(app: Sphinx) -> None:
+    """Register the functions above."""
+    app.connect("source-read", add_navigation)
+    app.connect("builder-inited", write_api_pages)
+    app.connect("build-finished", write_downloads)
+    app.connect("autodoc-process-docstring", escape_bars)

@@ -1,0 +1,72 @@
+"""``cnpgen docs``: pages are listed, found by name or path, searched, and refused with the nearest name."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from cnpgen.cli import docs_command
+from cnpgen.cli.main import main
+from cnpgen.machine.versions import DOCUMENTATION_URL
+
+DOCS = Path(__file__).parents[2] / "docs"
+
+
+def test_all_pages_are_listed_by_kind(capsys):
+    assert main(["docs"]) == 0
+    printed = capsys.readouterr().out
+    assert printed.index("tutorials:") < printed.index("  hit-a-puck ") < printed.index("  your-arm ")
+    assert printed.index("  your-arm ") < printed.index("  publish-a-dataset ") < printed.index("how-to:")
+    assert main(["docs", "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)
+    assert {row["page"] for row in rows} == set(docs_command.list_pages()) - {"index"}
+    assert all(row["title"] for row in rows)
+    assert len(rows) == len(list(DOCS.rglob("*.md"))) - 1
+
+
+@pytest.mark.parametrize(
+    "name", ["verdict", "verdict.md", "docs/concepts/verdict.md", "../concepts/verdict.md#between-samples"]
+)
+def test_a_page_is_printed_as_it_is(name, capsys):
+    assert main(["docs", name]) == 0
+    assert capsys.readouterr().out == (DOCS / "concepts" / "verdict.md").read_text(encoding="utf-8")
+
+
+def test_pages_of_benchmarks_have_names_of_their_own(capsys):
+    assert main(["docs", "benchmarks/verdict"]) == 0
+    assert capsys.readouterr().out == (DOCS / "benchmarks" / "verdict.md").read_text(encoding="utf-8")
+
+
+def test_an_unknown_page_is_refused_with_the_nearest_one(capsys):
+    assert main(["docs", "tutorials/verdict"]) == 2
+    assert main(["docs", ""]) == 2
+    capsys.readouterr()
+    assert main(["docs", "verdct"]) == 2
+    assert "has no page 'verdct' (did you mean 'verdict'?)" in capsys.readouterr().err
+
+
+def test_the_address_of_a_page_begins_with_that_of_the_site(capsys):
+    assert main(["docs", "verdict", "--url"]) == 0
+    assert capsys.readouterr().out == f"{DOCUMENTATION_URL}docs/concepts/verdict.html\n"
+    assert main(["docs", "--url"]) == 0
+    assert capsys.readouterr().out == f"{DOCUMENTATION_URL}docs/index.html\n"
+
+
+def test_a_search_prints_lines_and_reports_if_there_are_none(capsys):
+    assert main(["docs", "--search", "BERNSTEIN"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert any(line.startswith("verdict:") for line in lines)
+    assert all("bernstein" in line.casefold() for line in lines)
+    assert main(["docs", "--search", "no such words anywhere"]) == 1
+    assert capsys.readouterr().out == ""
+
+
+def test_a_search_and_a_page_exclude_each_other(capsys):
+    assert main(["docs", "verdict", "--search", "chord"]) == 2
+    assert "--search" in capsys.readouterr().err
+
+
+def test_an_installation_without_pages_is_an_error_of_the_machine(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(docs_command, "docs_folder", lambda: tmp_path)
+    assert main(["docs", "verdict"]) == 3
+    assert "reinstall cnpgen" in capsys.readouterr().err

@@ -1,0 +1,128 @@
+"""The reference pages follow the code, and every page has its place."""
+
+import importlib.util
+import json
+import re
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from cnpgen.cli.docs_command import KINDS, list_pages
+from cnpgen.cli.main import build_parser
+from tests.docs.test_blocks import blocks
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+MAX_BYTES = 500_000  # of all Markdown in the wheel
+
+
+def script(name: str) -> ModuleType:
+    """Load a script of docs/."""
+    spec = importlib.util.spec_from_file_location(f"docs_{name}", DOCS / f"{name}.py")
+    assert spec
+    assert spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def generator() -> ModuleType:
+    """Load docs/generate.py."""
+    return script("generate")
+
+
+@pytest.mark.parametrize("name", ["keys.md", "cli.md", "api.md"])
+def test_a_generated_page_is_what_the_code_says(generator: ModuleType, name: str) -> None:
+    page = (DOCS / "reference" / name).read_text(encoding="utf-8")
+    assert page == generator.PAGES[name]() + "\n", "run: python docs/generate.py"
+
+
+def test_every_option_of_every_command_is_on_the_page(generator: ModuleType) -> None:
+    page = generator.describe_commands()
+    commands = next(action.choices for action in build_parser()._actions if isinstance(action.choices, dict))
+    assert len(commands) >= 20
+    for name, command in commands.items():
+        section = page.split(f"## `cnpgen {name}`\n")[1].split("\n## ")[0]
+        for option in set(command._option_string_actions) - {"-h", "--help", "--debug"}:
+            assert re.search(rf"`([^`]*, )?{option}[ `,]", section), (name, option)
+
+
+def test_every_public_name_has_a_summary_of_one_sentence(generator: ModuleType) -> None:
+    rows = re.findall(r"^\| `(\w+)` \| (.*) \|$", generator.describe_names(), re.M)
+    assert len(rows) > 120
+    assert [name for name, summary in rows if not summary.endswith(".")] == []
+
+
+def test_every_page_is_of_one_kind_and_in_the_index() -> None:
+    index = (DOCS / "index.md").read_text(encoding="utf-8")
+    pages = {path.relative_to(DOCS) for path in DOCS.rglob("*.md")} - {Path("index.md")}
+    assert {page.parts[0] for page in pages} == set(KINDS), "a page belongs to one of the folders"
+    assert all(len(page.parts) == 2 for page in pages)
+    missing = [page.as_posix() for page in pages if f"]({page.as_posix()})" not in index]
+    assert missing == [], "link the page in docs/index.md"
+    names = [page.stem for page in pages if page.parts[0] != "benchmarks"]
+    assert len(names) == len(set(names)), "'cnpgen docs NAME' needs unique names"
+
+
+def test_concepts_have_a_picture_and_all_pictures_have_a_text() -> None:
+    for name in ("splines", "constraint-manifold", "certification", "verdict", "scenes"):
+        assert re.search(
+            r"!\[[^\]]{20,}\]\(\.\./images/", (DOCS / "concepts" / f"{name}.md").read_text(encoding="utf-8")
+        )
+    for page in [ROOT / "README.md", *DOCS.rglob("*.md")]:
+        assert "![](" not in page.read_text(encoding="utf-8"), f"{page.name}: a picture without alternative text"
+
+
+def test_the_pages_are_small_enough_for_the_wheel() -> None:
+    assert sum(path.stat().st_size for path in DOCS.rglob("*.md")) <= MAX_BYTES
+
+
+def test_help_texts_and_docstrings_name_pages_that_exist_and_no_files() -> None:
+    pages = list_pages()
+    for path in (ROOT / "cnpgen").rglob("*.py"):
+        text = " ".join(path.read_text(encoding="utf-8").split())
+        assert not re.search(r"docs/[\w/-]+\.md", text), f"{path}: the wheel has no such file, name 'cnpgen docs PAGE'"
+        for name in re.findall(r"['`]cnpgen docs ([a-z][\w/-]*)['`]", text):
+            assert name in pages, f"{path}: no page {name!r}"
+
+
+@pytest.mark.parametrize("page", sorted((DOCS / "tutorials").glob("*.md")), ids=lambda page: page.stem)
+def test_the_notebook_of_a_tutorial_has_every_block_as_a_cell(page: Path, tmp_path: Path) -> None:
+    script("notebooks").write_notebooks(tmp_path)
+    notebook = json.loads((tmp_path / f"{page.stem}.ipynb").read_text(encoding="utf-8"))
+    assert (notebook["nbformat"], notebook["nbformat_minor"]) == (4, 5)
+    assert len({cell["id"] for cell in notebook["cells"]}) == len(notebook["cells"])
+    runnable = [(marks, language, text) for marks, language, text in blocks(page) if language]
+    cells = [cell["source"] for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    assert len(cells) == len(runnable) > 3
+    for (marks, language, text), cell in zip(runnable, cells, strict=True):
+        first, _, rest = cell.partition("\n")
+        if "file" in marks:
+            assert first == f"%%writefile {marks['file']}"
+        elif language == "bash":
+            assert first == "%%bash"
+        else:
+            rest = cell
+        assert rest == text.strip("\n")
+    prose = "\n".join(cell["source"] for cell in notebook["cells"] if cell["cell_type"] == "markdown")
+    headings = [line for line in page.read_text(encoding="utf-8").splitlines() if re.match(r"#+ [A-Z0-9]", line)]
+    assert [line for line in headings if line not in prose] == []
+
+
+@pytest.mark.slow
+def test_the_pictures_of_the_concepts_are_drawn_from_computed_plans(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("matplotlib")
+    pictures = script("pictures")
+    monkeypatch.setattr(pictures, "FOLDER", tmp_path)
+    pictures.main()
+    drawn = {path.name for path in tmp_path.iterdir()}
+    assert len(drawn) == 5
+    text = "".join(page.read_text(encoding="utf-8") for page in (DOCS / "concepts").glob("*.md"))
+    for name in drawn:
+        assert f"../images/{name}" in text
+        assert (DOCS / "images" / name).is_file()
+        assert (tmp_path / name).stat().st_size > 5_000
