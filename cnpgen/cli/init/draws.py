@@ -1,5 +1,6 @@
 """The workspace of an arm: a base configuration in front of it, and two boxes of reachable positions."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -24,23 +25,23 @@ LIMIT_SHARE = 0.1  # share of a joint's range at either end that is left out
 MAX_LOAD = 0.7  # share of the torque limits that the base configuration may use at rest
 MIN_LINK_CLEARANCE_M = 5e-3  # between links at the base configuration
 BOX_SIZES = (0.3, 0.22, 0.16, 0.11, 0.08, 0.05)  # edge of the boxes / reach, the largest first
+MIN_BOX_DISTANCE = 0.15  # distance of the boxes / reach, so that no task is trivial
 GOOD_YIELD = 0.5  # share of accepted candidates at which the search for a box ends
 MIN_YIELD = 0.02  # share below which no box is usable
 YIELD_ROWS = 512  # samples that measure the share
+ROUNDING_M = 1e-3  # of the corners of boxes
 MIN_TIP_TRAVEL_M = 1e-6  # a tip that moves less along an axis does not move along it
 
 
-def comfortable_base(problem: Problem, robot: Robot) -> tuple[float, ...]:
+def comfortable_base(problem: Problem, robot: Robot) -> tuple[tuple[float, ...], tuple[str, ...]]:
     """Find a configuration with the tip in front of the robot, far from its limits and with high manipulability.
 
     Random states with the tip ahead along x and above the ground are preferred. The best one has the largest product of
-    the singular values of the tip's Jacobian and the distance from the nearest limit.
+    the singular values of the tip's Jacobian and the distance from the nearest limit. If no state is free of collisions
+    and within the torque limits, the best of the others is taken.
 
     Returns:
-        Joint positions [rad], rounded.
-
-    Raises:
-        RecipeError: In all states links collide, or gravity needs too much torque.
+        Joint positions [rad], rounded, and notes about conditions that it does not meet.
     """
     world, states = World(robot), _states(robot)
     tips, values, load = _measure_states(world, states)
@@ -52,12 +53,15 @@ def comfortable_base(problem: Problem, robot: Robot) -> tuple[float, ...]:
     score = values[:, moves].prod(axis=1) * margin
     ahead = tips - robot.chain.joints[0].translation
     front = (ahead[:, 0] > 0) & (np.abs(ahead[:, 1]) <= 0.2 * ahead[:, 0]) & (tips[:, 2] >= 0)
-    for group in (front, np.ones(len(states), bool)):
-        for k in sorted(np.flatnonzero(group & (load <= MAX_LOAD)), key=lambda k: -score[k]):
+    everywhere = np.ones(len(states), bool)
+    for group in (front & (load <= MAX_LOAD), load <= MAX_LOAD, load <= 1):
+        for k in sorted(np.flatnonzero(group), key=lambda k: -score[k]):
             if _is_free(world, states[k]):
-                return tuple(states[k].tolist())
+                return tuple(states[k].tolist()), ()
+    group = next(group for group in (front & (load <= 1), load <= 1, everywhere) if group.any())
+    best = max(np.flatnonzero(group), key=lambda k: score[k])
     text = f"in all of {BASE_CANDIDATES:,} random states links collide or gravity needs too much torque"
-    raise RecipeError([f"{robot.urdf}: {text}"])
+    return tuple(states[best].tolist()), (f"{text}: choose the base configuration by hand",)
 
 
 def _states(robot: Robot) -> Array:
@@ -109,7 +113,8 @@ def find_boxes(pipeline: Pipeline) -> tuple[Pipeline, float]:
     moves = np.ptp(tips, axis=0) > MIN_TIP_TRAVEL_M
     found: list[tuple[float, Pipeline]] = []
     for size in BOX_SIZES:
-        candidate = replace(pipeline, stage=(_boxes(centre, size * reach, moves), *pipeline.stage[1:]))
+        boxes = _boxes(centre, size * reach, moves, MIN_BOX_DISTANCE * reach)
+        candidate = replace(pipeline, stage=(boxes, *pipeline.stage[1:]))
         found.append((_accepted(candidate), candidate))
         if found[-1][0] >= GOOD_YIELD:
             break
@@ -121,10 +126,17 @@ def find_boxes(pipeline: Pipeline) -> tuple[Pipeline, float]:
     return best, share
 
 
-def _boxes(centre: Array, edge: float, moves: NDArray[np.bool_]) -> DrawPositions:
-    """Return two boxes side by side, along y if the tip moves along it; flat along axes along which it does not."""
+def _boxes(centre: Array, edge: float, moves: NDArray[np.bool_], distance: float) -> DrawPositions:
+    """Return two boxes side by side, along y if the tip moves along it; flat along axes along which it does not.
+
+    Args:
+        centre: Point in the middle between the boxes [m], shape (3,).
+        edge: Edge of the boxes [m].
+        moves: Mask of the axes along which the tip moves, shape (3,).
+        distance: Distance between the boxes [m].
+    """
     aside = next((axis for axis in (1, 2, 0) if moves[axis]), 1)
-    shift = np.where(np.arange(3) == aside, 0.75 * edge, 0.0)
+    shift = np.where(np.arange(3) == aside, (edge + distance) / 2 + ROUNDING_M, 0.0)
 
     def box(position: Array) -> tuple[Range, Range, Range]:
         x, y, z = (
@@ -133,7 +145,11 @@ def _boxes(centre: Array, edge: float, moves: NDArray[np.bool_]) -> DrawPosition
         )
         return x, y, z
 
-    return DrawPositions(start=box(centre - shift), goal=box(centre + shift))
+    horizontal = aside < 2
+    floor = math.floor(1e3 * distance) / 1e3
+    return DrawPositions(
+        start=box(centre - shift), goal=box(centre + shift), min_distance=floor if horizontal else 0.0
+    )
 
 
 def _accepted(pipeline: Pipeline) -> float:

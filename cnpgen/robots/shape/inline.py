@@ -13,7 +13,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import RecipeError
+from cnpgen.errors import RecipeError, nearest
 from cnpgen.robots.shape.decomposition import convex_parts
 from cnpgen.robots.shape.hull import MAX_COORDINATE_M, MAX_CORNERS, hull_corners
 from cnpgen.robots.shape.mesh_files import find_named_file
@@ -31,7 +31,13 @@ _CAPSULES = "1.2"  # first version of URDF with capsules
 
 
 def with_inline_meshes(
-    urdf: str, path: Path, packages: Sequence[Path] = (), *, most: int = 1, keep: Path | None = None
+    urdf: str,
+    path: Path,
+    packages: Sequence[Path] = (),
+    *,
+    most: int = 1,
+    links: Sequence[str] = (),
+    keep: Path | None = None,
 ) -> str:
     """Return a URDF with inline hulls of its collision meshes; a URDF without such meshes is returned unchanged.
 
@@ -40,10 +46,11 @@ def with_inline_meshes(
         path: File of the URDF, the base of relative mesh paths.
         packages: Folders of packages.
         most: Maximum number of convex parts of a mesh; 1 for its hull.
+        links: Links whose meshes are decomposed; by default all.
         keep: Cache folder of convex parts; None for no cache.
 
     Raises:
-        RecipeError: Meshes are missing or cannot be read; the error lists all of them.
+        RecipeError: Links or meshes are missing or cannot be read; the error lists all of them.
         MachineError: A decomposition is requested, but CoACD is not installed.
     """
     try:
@@ -52,11 +59,12 @@ def with_inline_meshes(
         return urdf
     elements = [(link, element) for link in tree.iter("link") for element in link.findall("collision")]
     meshes = [(link, element, mesh) for link, element in elements if (mesh := _mesh_file(element)) is not None]
-    mistakes: list[str] = []
+    mistakes = _unknown_links(tree, links)
     for link, element, mesh in meshes:
+        parts = most if not links or link.get("name") in links else 1
         try:
             file = find_named_file(mesh.get("filename", ""), path, packages)
-            addresses = [address_of(part) for part in _parts_of_file(file, scale_of(mesh), most, keep)]
+            addresses = [address_of(part) for part in _parts_of_file(file, scale_of(mesh), parts, keep)]
         except RecipeError as error:
             mistakes += error.mistakes
         else:
@@ -68,6 +76,13 @@ def with_inline_meshes(
     if unversioned:  # the URDF parser would ignore capsules, with warnings on stderr
         tree.set("version", _CAPSULES)
     return ElementTree.tostring(tree, encoding="unicode") if meshes or unversioned else urdf
+
+
+def _unknown_links(robot: ElementTree.Element, links: Sequence[str]) -> list[str]:
+    names = [link.get("name", "") for link in robot.iter("link")]
+    return [
+        f"robot.decomposed: the URDF has no link {link!r}{nearest(link, names)}" for link in links if link not in names
+    ]
 
 
 def _mesh_file(collision: ElementTree.Element) -> ElementTree.Element | None:
@@ -96,6 +111,18 @@ def mesh_files(urdf: str) -> list[str]:
     meshes = urdf_tree(urdf).iterfind(".//collision/geometry/mesh")
     names = dict.fromkeys(mesh.get("filename", "") for mesh in meshes)
     return [name for name in names if not name.startswith(_INLINE)]
+
+
+def mesh_links(urdf: str) -> frozenset[str]:
+    """Return the links with mesh files in their collision geometry.
+
+    Raises:
+        ValueError: The text is not a URDF.
+    """
+    links = urdf_tree(urdf).iter("link")
+    return frozenset(
+        link.get("name", "") for link in links if any(_mesh_file(each) is not None for each in link.iter("collision"))
+    )
 
 
 def points_of(mesh: ElementTree.Element) -> Array:
