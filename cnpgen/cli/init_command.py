@@ -11,7 +11,7 @@ The command writes NAME/problem.toml, NAME/pipeline.toml and NAME/dataset.toml: 
 boxes of positions in front of the robot, within its limits and without self-collision. Comments explain every key. The
 head of problem.toml lists findings about the robot: joints, masses, frames, link pairs, the free space that convex
 parts of links reject, and placeholders for limits that the URDF lacks. Links whose convex hulls reject much free space
-are decomposed (pip install 'cnpgen[decompose]'). docs/your-arm.md continues from there.
+are decomposed. docs/your-arm.md continues from there.
 """
 
 

@@ -130,7 +130,7 @@ def _boxes(centre: Array, edge: float, moves: NDArray[np.bool_], distance: float
     """Return two boxes side by side, along y if the tip moves along it; flat along axes along which it does not.
 
     Args:
-        centre: Point in the middle between the boxes [m], shape (3,).
+        centre: Midpoint between the boxes [m], shape (3,).
         edge: Edge of the boxes [m].
         moves: Mask of the axes along which the tip moves, shape (3,).
         distance: Distance between the boxes [m].
@@ -147,9 +147,7 @@ def _boxes(centre: Array, edge: float, moves: NDArray[np.bool_], distance: float
 
     horizontal = aside < 2
     floor = math.floor(1e3 * distance) / 1e3
-    return DrawPositions(
-        start=box(centre - shift), goal=box(centre + shift), min_distance=floor if horizontal else 0.0
-    )
+    return DrawPositions(start=box(centre - shift), goal=box(centre + shift), min_distance=floor if horizontal else 0.0)
 
 
 def _accepted(pipeline: Pipeline) -> float:

@@ -26,7 +26,7 @@ from cnpgen.problems.constraints.joint import JointAcceleration, JointJerk, Join
 from cnpgen.problems.constraints.self_clearance import SelfClearance
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
-from cnpgen.robots.plausible_sizes import find_implausible_sizes
+from cnpgen.robots.plausible_sizes import check_plausible_sizes
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.robot_spec import LimitSpec, RobotSpec
 from cnpgen.schema.keys import PerJoint, Range
@@ -71,25 +71,22 @@ def problem_of(arm: Arm, name: str, folder: Path, packages: tuple[Path, ...], sr
         RecipeError: The arm cannot be planned for.
     """
     problem = _problem(with_torques(arm, [1.0] * len(arm.planned)), name, folder, packages, srdf)
-    overlaps = None
-    if arm.has_shape:
-        with warnings_as_notes() as warned:
-            load_robot(problem)
-            overlaps = resolve_overlaps(problem)
-    else:
-        warned = list[str]()
-    problem = overlaps.problem if overlaps else problem
-    robot = load_robot(problem)
-    notes = [*warned, *find_implausible_sizes(robot), *(overlaps.notes if overlaps else ())]
+    with _warnings_as_notes() as notes:
+        check_plausible_sizes(load_robot(problem))
+        overlaps = resolve_overlaps(problem) if arm.has_shape else None
+        problem = overlaps.problem if overlaps else problem
+        robot = load_robot(problem)
+    notes += overlaps.notes if overlaps else ()
     arm, overloaded = _with_torque_limits(arm, robot)
     limits = replace(problem.limits, **_replaced_limits(arm))
     problem = _with_jerk_limits(replace(problem, limits=limits), robot)
     if _has_masses(robot):
         limit = JointTorque(tolerance=5e-3, budget=6e-2)
         problem = replace(problem, constraint=(*problem.constraint[:4], limit, *problem.constraint[4:]))
-    base, note = comfortable_base(problem, load_robot(problem))
+    with _warnings_as_notes():
+        base, base_notes = comfortable_base(problem, load_robot(problem))
     problem = replace(problem, robot=replace(problem.robot, base=base))
-    return InitialProblem(problem, arm, overlaps, (*notes, *overloaded, *note))
+    return InitialProblem(problem, arm, overlaps, (*notes, *overloaded, *base_notes))
 
 
 def dataset_of(initial: InitialProblem, folder: Path) -> tuple[DatasetRecipe, float]:
@@ -150,7 +147,7 @@ def _problem(arm: Arm, name: str, folder: Path, packages: tuple[Path, ...], srdf
 
 
 @contextmanager
-def warnings_as_notes() -> Iterator[list[str]]:
+def _warnings_as_notes() -> Iterator[list[str]]:
     """Collect the warnings of the block, such as those about simplified meshes, in a list without repetitions."""
     notes: list[str] = []
     with warnings.catch_warnings(record=True) as caught:

@@ -1,10 +1,9 @@
-"""Convex parts of an arm's links, chosen by the free space that they reject, and pairs of links in permanent contact."""
+"""Convex parts of an arm's links, chosen by the free space that they reject, and pairs in permanent contact."""
 
 import sys
 from dataclasses import dataclass, replace
 from itertools import takewhile
 
-from cnpgen.errors import MissingExtraError, RecipeError
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.shape.hull_gap import GAP_STATES, HullGap, PairGap, measure_hull_gap
@@ -45,14 +44,14 @@ def resolve_overlaps(problem: Problem) -> LinkOverlaps:
         RecipeError: A mesh is missing or cannot be read.
     """
     hulls = _gap(problem)
-    problem, parts, notes = _decompose(problem, hulls)
+    problem, parts = _decompose(problem, hulls)
     problem, parts, contacts = _ignore_contacts(problem, parts)
     always = [pair for pair in load_robot(problem).shape.pairs if pair.left_out == "always"]  # type: ignore[union-attr]
     if always:
         names = "; ".join(f"{pair.first}, {pair.second}" for pair in always)
         contacts.append(f"not checked, since they are always in contact: {names}")
     problem = replace(problem, robot=replace(problem.robot, hull_gap=round(parts.fraction, 4)))
-    return LinkOverlaps(problem, hulls, parts, (*_gap_notes(problem, hulls, parts), *notes, *contacts))
+    return LinkOverlaps(problem, hulls, parts, (*_gap_notes(problem, hulls, parts), *contacts))
 
 
 def _gap(problem: Problem) -> HullGap:
@@ -62,7 +61,7 @@ def _gap(problem: Problem) -> HullGap:
     return measure_hull_gap(read_urdf(path), path, problem.packages, model=robot.model, shape=robot.shape)
 
 
-def _decompose(problem: Problem, gap: HullGap) -> tuple[Problem, HullGap, list[str]]:
+def _decompose(problem: Problem, gap: HullGap) -> tuple[Problem, HullGap]:
     """Decompose links, into more parts each time, until the gap is small."""
     meshes = mesh_links(read_urdf(problem.urdf_path))
     chosen: list[str] = []
@@ -76,15 +75,9 @@ def _decompose(problem: Problem, gap: HullGap) -> tuple[Problem, HullGap, list[s
             break
         print(f"cnpgen: decomposing {', '.join(chosen)} into at most {count} convex parts each", file=sys.stderr)
         robot = replace(problem.robot, convex_parts=count, decomposed=tuple(chosen))
-        try:
-            candidate = replace(problem, robot=robot)
-            measured = _gap(candidate)
-        except MissingExtraError:
-            return problem, gap, ["links were not decomposed: pip install 'cnpgen[decompose]', then init with --force"]
-        except RecipeError as error:
-            return problem, gap, [f"links were not decomposed: {' '.join(error.mistakes)}"]
-        problem, gap = candidate, measured
-    return problem, gap, []
+        problem = replace(problem, robot=robot)
+        gap = _gap(problem)
+    return problem, gap
 
 
 def _ignore_contacts(problem: Problem, gap: HullGap) -> tuple[Problem, HullGap, list[str]]:
@@ -95,7 +88,11 @@ def _ignore_contacts(problem: Problem, gap: HullGap) -> tuple[Problem, HullGap, 
         pairs = tuple((pair.first, pair.second) for pair in ignored)
         problem = replace(problem, robot=replace(problem.robot, ignored_pairs=pairs))
         gap = _gap(problem)
-    return problem, gap, [f"ignored, since otherwise no state is free of collisions: {_overlap(pair)}" for pair in ignored]
+    return (
+        problem,
+        gap,
+        [f"ignored, since otherwise no state is free of collisions: {_overlap(pair)}" for pair in ignored],
+    )
 
 
 def _overlap(pair: PairGap) -> str:

@@ -1,36 +1,47 @@
-"""Convex decomposition of a mesh: its triangles are assigned to the parts that CoACD finds.
+"""Convex decomposition of a mesh by planes: each cut reduces the total volume of the convex hulls most.
 
-CoACD (Wei et al. 2022, ACM Transactions on Graphics 41(4)) remeshes its input, so its parts miss points of the original
-mesh. Its parts therefore only group the triangles: each part is the convex hull of its triangles and contains them.
+A plane across an axis of the mesh cuts the triangles of a part in two, as in the search of CoACD (Wei et al. 2022, ACM
+Transactions on Graphics 41(4)), which chooses by concavity. A part is the convex hull of its triangles, so the parts
+together cover the mesh.
 """
 
 import hashlib
 import io
-import subprocess
-import sys
-import tempfile
 from collections.abc import Sequence
 from contextlib import suppress
-from importlib import metadata
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import MachineError, RecipeError, requires_extra
+from cnpgen.errors import MachineError
 from cnpgen.robots.shape.hull import hull_corners
 from cnpgen.store.files.atomic import write_file
 
 Array = NDArray[np.float64]
 
-MAX_CONVEX_VOLUME_RATIO = 1.05  # hull volume / mesh volume up to which the hull is used without decomposition
-MIN_VOLUME_REDUCTION = 0.95  # total volume of the parts / hull volume below which the decomposition is used
-MAX_TRIANGLE_OVERHANG_M = 5e-3  # a triangle that extends further out of every part is cut in two
-MAX_CUTS = 12  # per triangle
-COACD_TIMEOUT_S = 900.0  # CoACD takes about ten seconds for a link
-SEED = 1
-DECOMPOSITION_REVISION = 1  # of the assignment of triangles; cached parts of another revision are ignored
+CUTS_PER_AXIS = 9  # planes that are tried between both ends of a part along each axis
+MIN_VOLUME_REDUCTION = 0.005  # by a cut, as a fraction of the hull volume of the mesh; smaller cuts are not made
+DECOMPOSITION_REVISION = 2  # of the decomposition; cached parts of another revision are ignored
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Triangles of a part, with its best cut.
+
+    Attributes:
+        triangles: Corners of the triangles [m], shape (T, 3, 3).
+        reduction: Volume by which the best cut reduces the hulls [m^3]; 0 if no cut does.
+        below: Triangles on one side of the best cut.
+        above: Triangles on its other side.
+    """
+
+    triangles: Array
+    reduction: float
+    below: Array
+    above: Array
 
 
 def convex_parts(points: Array, triangles: NDArray[np.int64], most: int, keep: Path | None) -> list[Array]:
@@ -40,28 +51,16 @@ def convex_parts(points: Array, triangles: NDArray[np.int64], most: int, keep: P
         points: Points of the mesh [m], shape (N, 3).
         triangles: Triangles as indices of points, shape (T, 3).
         most: Maximum number of parts.
-        keep: Cache folder, since a decomposition takes up to a minute; None for no cache.
+        keep: Cache folder, since a decomposition takes seconds; None for no cache.
 
     Returns:
-        Corners of each part [m], shape (V, 3); those of the hull if the parts are hardly smaller.
-
-    Raises:
-        MissingExtraError: CoACD is not installed.
-        RecipeError: CoACD cannot decompose the mesh.
+        Corners of each part [m], shape (V, 3); those of the hull if no cut reduces its volume.
     """
-    whole = hull_corners(points)
-    if _volume_of_hull(whole) <= MAX_CONVEX_VOLUME_RATIO * abs(np.linalg.det(points[triangles]).sum()) / 6:
-        return [whole]
-    points, same = np.unique(points, axis=0, return_inverse=True)  # STL repeats the points of every triangle
-    triangles = same.reshape(-1)[triangles]
-    name = f"parts-{_identity(points, triangles, most)}.npz"
-    kept = None if keep is None else keep / name
+    kept = None if keep is None else keep / f"parts-{_identity(points, triangles, most)}.npz"
     if kept is not None:
         with suppress(OSError, ValueError, KeyError):
             return _read(kept)
-    parts = assign_triangles(points[triangles], [hull_corners(part) for part in _run_coacd(points, triangles, most)])
-    if sum(map(_volume_of_hull, parts)) >= MIN_VOLUME_REDUCTION * _volume_of_hull(whole):
-        parts = [whole]
+    parts = [hull_corners(part.reshape(-1, 3)) for part in cut_parts(points[triangles], most)]
     if kept is not None:
         with suppress(MachineError):
             write_file(kept, _written(parts))
@@ -70,68 +69,83 @@ def convex_parts(points: Array, triangles: NDArray[np.int64], most: int, keep: P
 
 def _identity(points: Array, triangles: NDArray[np.int64], most: int) -> str:
     """Return a digest of the inputs of a decomposition."""
-    with requires_extra("decompose", "CoACD (for robot.convex_parts)"):
-        version = metadata.version("coacd")
     numbers = b"".join(np.ascontiguousarray(each).tobytes() for each in (points, triangles.astype("<i8")))
-    about = f"{DECOMPOSITION_REVISION} {version} {most} {SEED} {len(points)} "
+    about = f"{DECOMPOSITION_REVISION} {most} {len(points)} "
     return hashlib.sha256(about.encode() + numbers).hexdigest()[:32]
 
 
-def assign_triangles(triangles: Array, parts: list[Array]) -> list[Array]:
-    """Assign triangles to the nearest parts and return the convex hulls, which together cover all triangles.
+def cut_parts(triangles: Array, most: int) -> list[Array]:
+    """Cut triangles into parts whose convex hulls have a small total volume.
 
     Args:
         triangles: Corners of the triangles [m], shape (T, 3, 3).
-        parts: Corners of the convex parts [m], shapes (V, 3).
+        most: Maximum number of parts.
 
     Returns:
-        Corners of the hulls [m] of parts with triangles.
+        Corners of the triangles of each part [m], shape (T, 3, 3); triangles across a cut are cut in two.
     """
-    from scipy.spatial import ConvexHull
-
-    planes = [ConvexHull(part).equations for part in parts]
-    dealt: list[list[Array]] = [[] for _ in parts]
-    for cut in range(MAX_CUTS + 1):
-        if not len(triangles):
+    least = MIN_VOLUME_REDUCTION * _hull_volume(triangles)
+    parts = [_with_best_cut(triangles)]
+    while len(parts) < most:
+        best = max(range(len(parts)), key=lambda index: parts[index].reduction)
+        if parts[best].reduction <= least:
             break
-        outside = np.array([(triangles @ each[:, :3].T + each[:, 3]).max(axis=(1, 2)) for each in planes])
-        done = (outside.min(axis=0) <= MAX_TRIANGLE_OVERHANG_M) | (cut == MAX_CUTS)
-        for part, mine in enumerate(outside.argmin(axis=0)[done] == np.arange(len(parts))[:, None]):
-            dealt[part].append(triangles[done][mine].reshape(-1, 3))
-        triangles = _cut_in_two(triangles[~done])
-    points = [np.concatenate(each) for each in dealt]
-    return [hull_corners(each) for each in points if len(each)]
+        part = parts.pop(best)
+        parts += [_with_best_cut(part.below), _with_best_cut(part.above)]
+    return [part.triangles for part in parts]
 
 
-def _cut_in_two(triangles: Array) -> Array:
-    """Bisect triangles, shape (T, 3, 3), at the midpoint of their maximum side, shape (2 T, 3, 3)."""
-    side = np.linalg.norm(triangles - np.roll(triangles, -1, axis=1), axis=2).argmax(axis=1)
-    order = (side[:, None] + np.arange(3)) % 3
-    a, b, c = (np.take_along_axis(triangles, order[:, k, None, None], axis=1)[:, 0] for k in range(3))
-    midpoint = (a + b) / 2
-    return np.concatenate([np.stack([a, midpoint, c], axis=1), np.stack([midpoint, b, c], axis=1)])
+def _with_best_cut(triangles: Array) -> _Part:
+    best = _Part(triangles, 0.0, triangles[:0], triangles[:0])
+    volume = _hull_volume(triangles)
+    for axis in range(3):
+        low, high = triangles[..., axis].min(), triangles[..., axis].max()
+        for position in np.linspace(low, high, CUTS_PER_AXIS + 2)[1:-1]:
+            below, above = cut_triangles(triangles, axis, float(position))
+            reduction = volume - _hull_volume(below) - _hull_volume(above)
+            if reduction > best.reduction:
+                best = _Part(triangles, reduction, below, above)
+    return best
 
 
-def _volume_of_hull(corners: Array) -> float:
-    from scipy.spatial import ConvexHull
+def cut_triangles(triangles: Array, axis: int, position: float) -> tuple[Array, Array]:
+    """Cut triangles by a plane across an axis.
 
-    return float(ConvexHull(corners).volume)
+    Args:
+        triangles: Corners of the triangles [m], shape (T, 3, 3).
+        axis: 0, 1 or 2 for x, y or z.
+        position: Position of the plane along the axis [m].
+
+    Returns:
+        Triangles below and above the plane, which together cover the given ones.
+    """
+    height = triangles[..., axis] - position
+    below, above = (height <= 0).all(axis=1), (height > 0).all(axis=1)
+    crossing = ~below & ~above
+    upper = height[crossing] > 0
+    alone = np.where(upper.sum(axis=1) == 1, upper.argmax(axis=1), (~upper).argmax(axis=1))  # corner on its side
+    order = (alone[:, None] + np.arange(3)) % 3
+    a, b, c = (np.take_along_axis(triangles[crossing], order[:, k, None, None], axis=1)[:, 0] for k in range(3))
+    of_a, of_b, of_c = (np.take_along_axis(height[crossing], order[:, k, None], axis=1) for k in range(3))
+    on_ab, on_ac = a + of_a / (of_a - of_b) * (b - a), a + of_a / (of_a - of_c) * (c - a)
+    tips = np.stack([a, on_ab, on_ac], axis=1)
+    rests = np.concatenate([np.stack([on_ab, b, c], axis=1), np.stack([on_ab, c, on_ac], axis=1)])
+    is_upper = of_a[:, 0] > 0
+    rest_is_upper = np.tile(~is_upper, 2)
+    return (
+        np.concatenate([triangles[below], tips[~is_upper], rests[~rest_is_upper]]),
+        np.concatenate([triangles[above], tips[is_upper], rests[rest_is_upper]]),
+    )
 
 
-def _run_coacd(points: Array, triangles: NDArray[np.int64], most: int) -> list[Array]:
-    """Return the points of CoACD's parts [m]; CoACD runs in a separate process, since it conflicts with Pinocchio."""
-    with tempfile.TemporaryDirectory(prefix="cnpgen-") as folder:
-        mesh, answer = Path(folder) / "mesh.npz", Path(folder) / "parts.npz"
-        np.savez(mesh, points=points, triangles=triangles, most=most)
-        command = [sys.executable, "-m", "cnpgen.robots.shape.decomposition", str(mesh), str(answer)]
-        try:
-            done = subprocess.run(command, capture_output=True, text=True, timeout=COACD_TIMEOUT_S, check=False)
-            return _read(answer)
-        except subprocess.TimeoutExpired as error:
-            raise RecipeError([f"CoACD did not decompose a mesh in {COACD_TIMEOUT_S:g} s"]) from error
-        except (OSError, ValueError, KeyError) as error:
-            said = (done.stderr or done.stdout).strip().splitlines()[-1:]
-            raise RecipeError([f"CoACD cannot decompose a mesh: {' '.join(said)}"]) from error
+def _hull_volume(triangles: Array) -> float:
+    """Return the volume of the convex hull of triangles [m^3]; 0 for coplanar ones."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        return float(ConvexHull(triangles.reshape(-1, 3)).volume)
+    except (QhullError, ValueError):
+        return 0.0
 
 
 def _written(parts: Sequence[Array]) -> bytes:
@@ -149,18 +163,3 @@ def _read(file: Path) -> list[Array]:
     if not parts or not all(np.isfinite(part).all() for part in parts):
         raise ValueError("no parts")
     return parts
-
-
-def _main(mesh: str, answer: str) -> None:
-    """Decompose the mesh of a file, in a process that imports only CoACD."""
-    import coacd
-
-    coacd.set_log_level("off")
-    with np.load(mesh) as content:
-        given = coacd.Mesh(content["points"], content["triangles"])
-        parts = coacd.run_coacd(given, max_convex_hull=int(content["most"]), seed=SEED)
-    Path(answer).write_bytes(_written([points for points, _ in parts]))
-
-
-if __name__ == "__main__":
-    _main(*sys.argv[1:])
