@@ -1,6 +1,8 @@
 """``cnpgen init``: write a problem, a pipeline and a dataset for an arm, from its URDF."""
 
 import argparse
+import sys
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -44,9 +46,12 @@ def run(arguments: argparse.Namespace) -> int:
     _refuse(there if not arguments.force else [])
     arm = read_arm(arguments.urdf, arguments.tip)
     packages = (*arguments.packages, *packages_of_environment(arm.meshes, arm.urdf, arguments.packages))
-    initial = problem_of(arm, folder.name, folder, packages, arguments.srdf)
-    _write(folder, {FILES[0]: problem_text(initial, folder)})
-    recipe, share = dataset_of(initial, folder)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # about the robot, which are in the notes
+        initial = problem_of(arm, folder.name, folder, packages, arguments.srdf)
+        _write(folder, {FILES[0]: problem_text(initial, folder)})
+        sys.stderr.writelines(f"note: {note}\n" for note in initial.notes)
+        recipe, share = dataset_of(initial, folder)
     _write(folder, sampling_texts(recipe, share))
     _say_next(folder)
     return 0
@@ -82,8 +87,6 @@ def _refuse(there: list[str]) -> None:
 
 
 def _say_next(folder: Path) -> None:
-    import sys
-
     lines = [
         f"cnpgen show {folder}/dataset.toml               what is in them",
         f"cnpgen make-dataset {folder}/dataset.toml --n 1000",

@@ -16,28 +16,7 @@ from cnpgen.problems.problem_record import open_problem, record_problem
 from cnpgen.robots.shape import decomposition, link_pairs
 from cnpgen.robots.shape.decomposition import convex_parts, cut_parts, cut_triangles
 from cnpgen.robots.shape.hull import hull_corners
-from tests.examples.shaped_robot import stl, write_problem
-
-# A channel along x: a floor and two walls [m], lowest and highest corners.
-BOXES = np.array(
-    [
-        [[0, -0.05, 0], [0.3, 0.05, 0.01]],
-        [[0, -0.05, 0.01], [0.3, -0.04, 0.08]],
-        [[0, 0.04, 0.01], [0.3, 0.05, 0.08]],
-    ]
-)
-
-
-def box(low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """The triangles of a box, shape (12, 3, 3), facing outwards."""
-    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * (high - low) + low
-    hull = ConvexHull(corners)
-    inwards = np.linalg.det(corners[hull.simplices] - (low + high) / 2) < 0
-    sides = np.where(inwards[:, None], hull.simplices[:, ::-1], hull.simplices)
-    return corners[sides]
-
-
-CHANNEL = np.concatenate([box(*each) for each in BOXES])
+from tests.examples.shaped_robot import CHANNEL, box, stl, write_problem
 
 
 def covered(points: np.ndarray, parts: list[np.ndarray]) -> np.ndarray:

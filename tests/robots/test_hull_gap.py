@@ -7,14 +7,12 @@ import pytest
 
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.problem_file import load_problem
 from cnpgen.robots.shape import hull_gap, link_pairs
 from cnpgen.robots.shape.hull_gap import HullGap, measure_hull_gap
 from cnpgen.robots.urdf import read_urdf
 from cnpgen.world.world import World
 from tests.examples.meshes import Meshes
-from tests.examples.shaped_robot import stl, write_problem
-from tests.robots.test_decomposition import CHANNEL
+from tests.examples.shaped_robot import arm_of_channels
 
 STATES = 400
 
@@ -24,19 +22,6 @@ def few_states(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(hull_gap, "GAP_STATES", STATES)
     monkeypatch.setattr(link_pairs, "SAMPLED_STATES", STATES)
     monkeypatch.setenv("CNPGEN_CACHE", str(tmp_path / "cache"))
-
-
-def arm_of_channels(folder: Path, robot: str = "") -> Problem:
-    """The small arm; its forearm is an open channel around the base, which its hull fills."""
-    file = write_problem(folder, robot=robot, obstacles="")
-    corners = (CHANNEL * [1.5, 4, 4] - [0.1, 0, 0.1]).reshape(-1, 3)
-    sides = [(k, k + 1, k + 2) for k in range(0, len(corners), 3)]
-    (folder / "crane" / "channel.stl").write_bytes(stl(corners, sides))
-    urdf = folder / "crane" / "crane.urdf"
-    wedge = 'package://crane/meshes/wedge.stl" scale="0.001 0.001 0.001"'
-    urdf.write_text(urdf.read_text().replace(wedge, 'channel.stl"'))
-    file.write_text(file.read_text().replace('use = "robot-clearance"', 'use = "joint-velocity"'))
-    return load_problem(file)
 
 
 def gap_of(problem: Problem) -> HullGap:

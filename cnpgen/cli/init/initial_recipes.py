@@ -36,7 +36,7 @@ Array = NDArray[np.float64]
 GUESS_RANGE_RAD, GUESS_RANGE_M = 0.5, 0.1  # range of inverse kinematics guesses around the base configuration
 INITIAL_JERK_RATE = 100.0  # jerk limits per acceleration limit [1/s]; Franka Research 3: 500 (docs/references.md)
 TORQUE_SCALE = 0.8  # planning limit / URDF limit of joint torques
-MIN_HOLDING_FRACTION = 0.05  # of the random states in which a joint's torque limit must suffice to hold the arm
+MIN_HOLDING_FRACTION = 0.25  # of the random states in which a joint's torque limit must suffice to hold the arm
 TORQUE_STATES = 1000  # random states that determine placeholders of missing torque limits
 
 
@@ -83,8 +83,7 @@ def problem_of(arm: Arm, name: str, folder: Path, packages: tuple[Path, ...], sr
     if _has_masses(robot):
         limit = JointTorque(tolerance=5e-3, budget=6e-2)
         problem = replace(problem, constraint=(*problem.constraint[:4], limit, *problem.constraint[4:]))
-    with _warnings_as_notes():
-        base, base_notes = comfortable_base(problem, load_robot(problem))
+    base, base_notes = comfortable_base(problem, load_robot(problem))
     problem = replace(problem, robot=replace(problem.robot, base=base))
     return InitialProblem(problem, arm, overlaps, (*notes, *overloaded, *base_notes))
 
