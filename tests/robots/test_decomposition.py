@@ -14,7 +14,7 @@ from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.problems.problem_record import open_problem, record_problem
 from cnpgen.robots.shape import decomposition, link_pairs
-from cnpgen.robots.shape.decomposition import convex_parts, cut_parts, cut_triangles
+from cnpgen.robots.shape.decomposition import TriangleMesh, convex_parts, cut_mesh, cut_parts
 from cnpgen.robots.shape.hull import hull_corners
 from tests.examples.shaped_robot import CHANNEL, box, stl, write_problem
 
@@ -35,6 +35,11 @@ def on_triangles(triangles: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return (shares @ triangles).reshape(-1, 3)
 
 
+def as_mesh(triangles: np.ndarray) -> TriangleMesh:
+    """A mesh of triangles that share no points."""
+    return TriangleMesh(triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3))
+
+
 def slanted(angle: float) -> np.ndarray:
     """The triangles of the channel, turned about x and z."""
     return CHANNEL @ Rotation.from_euler("xz", [angle, angle]).as_matrix().T
@@ -42,7 +47,7 @@ def slanted(angle: float) -> np.ndarray:
 
 @pytest.mark.parametrize("triangles", [CHANNEL, slanted(0.5)], ids=["along the axes", "slanted"])
 def test_every_point_of_a_mesh_is_in_a_part(triangles):
-    parts = [hull_corners(part.reshape(-1, 3)) for part in cut_parts(triangles, 8)]
+    parts = [hull_corners(part.used_points) for part in cut_parts(as_mesh(triangles), 8)]
     assert 3 <= len(parts) <= 8
     assert covered(on_triangles(triangles, np.random.default_rng(1)), parts).all()
     assert volume(parts) < 0.75 * ConvexHull(triangles.reshape(-1, 3)).volume
@@ -51,7 +56,7 @@ def test_every_point_of_a_mesh_is_in_a_part(triangles):
 def test_a_cut_keeps_every_triangle_on_its_side():
     rng = np.random.default_rng(2)
     triangles = np.concatenate([rng.normal(size=(500, 3, 3)), np.round(rng.normal(size=(500, 3, 3)))])
-    below, above = cut_triangles(triangles, 1, 0.0)
+    below, above = (half.points[half.triangles] for half in cut_mesh(as_mesh(triangles), 1, 0.0))
     assert below[..., 1].max() <= 1e-12
     assert above[..., 1].min() >= -1e-12
     areas = [np.linalg.norm(np.cross(t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]), axis=1).sum() for t in (below, above)]

@@ -28,20 +28,48 @@ DECOMPOSITION_REVISION = 2  # of the decomposition; cached parts of another revi
 
 
 @dataclass(frozen=True)
-class _Part:
-    """Triangles of a part, with its best cut.
+class TriangleMesh:
+    """Triangles of a mesh or of a part of it.
 
     Attributes:
-        triangles: Corners of the triangles [m], shape (T, 3, 3).
-        reduction: Volume by which the best cut reduces the hulls [m^3]; 0 if no cut does.
-        below: Triangles on one side of the best cut.
-        above: Triangles on its other side.
+        points: Points [m], shape (N, 3).
+        triangles: Triangles as indices of points, shape (T, 3).
     """
 
-    triangles: Array
-    reduction: float
-    below: Array
-    above: Array
+    points: Array
+    triangles: NDArray[np.int64]
+
+    @property
+    def used_points(self) -> Array:
+        """The points of the triangles [m], shape (M, 3)."""
+        used = np.zeros(len(self.points), bool)
+        used[self.triangles] = True
+        return self.points[used]
+
+    @property
+    def hull_volume(self) -> float:
+        """Volume of the convex hull [m^3]; 0 for coplanar triangles."""
+        from scipy.spatial import ConvexHull, QhullError
+
+        try:
+            return float(ConvexHull(self.used_points).volume)
+        except (QhullError, ValueError):
+            return 0.0
+
+
+@dataclass(frozen=True)
+class _Cut:
+    """Best cut of a part.
+
+    Attributes:
+        part: The part.
+        reduction: Volume by which the cut reduces the hulls [m^3]; 0 if no cut does.
+        halves: The triangles below and above the cut.
+    """
+
+    part: TriangleMesh
+    reduction: float = 0.0
+    halves: tuple[TriangleMesh, ...] = ()
 
 
 def convex_parts(points: Array, triangles: NDArray[np.int64], most: int, keep: Path | None) -> list[Array]:
@@ -60,7 +88,7 @@ def convex_parts(points: Array, triangles: NDArray[np.int64], most: int, keep: P
     if kept is not None:
         with suppress(OSError, ValueError, KeyError):
             return _read(kept)
-    parts = [hull_corners(part.reshape(-1, 3)) for part in cut_parts(points[triangles], most)]
+    parts = [hull_corners(part.used_points) for part in cut_parts(TriangleMesh(points, triangles), most)]
     if kept is not None:
         with suppress(MachineError):
             write_file(kept, _written(parts))
@@ -74,78 +102,68 @@ def _identity(points: Array, triangles: NDArray[np.int64], most: int) -> str:
     return hashlib.sha256(about.encode() + numbers).hexdigest()[:32]
 
 
-def cut_parts(triangles: Array, most: int) -> list[Array]:
-    """Cut triangles into parts whose convex hulls have a small total volume.
+def cut_parts(mesh: TriangleMesh, most: int) -> list[TriangleMesh]:
+    """Cut a mesh into parts whose convex hulls have a small total volume.
 
     Args:
-        triangles: Corners of the triangles [m], shape (T, 3, 3).
+        mesh: The mesh.
         most: Maximum number of parts.
 
     Returns:
-        Corners of the triangles of each part [m], shape (T, 3, 3); triangles across a cut are cut in two.
+        The triangles of each part; triangles across a cut are cut, too.
     """
-    least = MIN_VOLUME_REDUCTION * _hull_volume(triangles)
-    parts = [_with_best_cut(triangles)]
-    while len(parts) < most:
-        best = max(range(len(parts)), key=lambda index: parts[index].reduction)
-        if parts[best].reduction <= least:
+    least = MIN_VOLUME_REDUCTION * mesh.hull_volume
+    cuts = [_best_cut(mesh)]
+    while len(cuts) < most:
+        best = max(range(len(cuts)), key=lambda index: cuts[index].reduction)
+        if cuts[best].reduction <= least:
             break
-        part = parts.pop(best)
-        parts += [_with_best_cut(part.below), _with_best_cut(part.above)]
-    return [part.triangles for part in parts]
+        cuts += map(_best_cut, cuts.pop(best).halves)
+    return [cut.part for cut in cuts]
 
 
-def _with_best_cut(triangles: Array) -> _Part:
-    best = _Part(triangles, 0.0, triangles[:0], triangles[:0])
-    volume = _hull_volume(triangles)
+def _best_cut(part: TriangleMesh) -> _Cut:
+    best, volume, points = _Cut(part), part.hull_volume, part.used_points
     for axis in range(3):
-        low, high = triangles[..., axis].min(), triangles[..., axis].max()
+        low, high = points[:, axis].min(), points[:, axis].max()
         for position in np.linspace(low, high, CUTS_PER_AXIS + 2)[1:-1]:
-            below, above = cut_triangles(triangles, axis, float(position))
-            reduction = volume - _hull_volume(below) - _hull_volume(above)
+            halves = cut_mesh(part, axis, float(position))
+            reduction = volume - sum(half.hull_volume for half in halves)
             if reduction > best.reduction:
-                best = _Part(triangles, reduction, below, above)
+                best = _Cut(part, reduction, halves)
     return best
 
 
-def cut_triangles(triangles: Array, axis: int, position: float) -> tuple[Array, Array]:
-    """Cut triangles by a plane across an axis.
+def cut_mesh(mesh: TriangleMesh, axis: int, position: float) -> tuple[TriangleMesh, TriangleMesh]:
+    """Cut a mesh by a plane across an axis.
 
     Args:
-        triangles: Corners of the triangles [m], shape (T, 3, 3).
+        mesh: The mesh.
         axis: 0, 1 or 2 for x, y or z.
         position: Position of the plane along the axis [m].
 
     Returns:
-        Triangles below and above the plane, which together cover the given ones.
+        The triangles below and above the plane, which together cover the mesh.
     """
-    height = triangles[..., axis] - position
-    below, above = (height <= 0).all(axis=1), (height > 0).all(axis=1)
-    crossing = ~below & ~above
-    upper = height[crossing] > 0
-    alone = np.where(upper.sum(axis=1) == 1, upper.argmax(axis=1), (~upper).argmax(axis=1))  # corner on its side
-    order = (alone[:, None] + np.arange(3)) % 3
-    a, b, c = (np.take_along_axis(triangles[crossing], order[:, k, None, None], axis=1)[:, 0] for k in range(3))
-    of_a, of_b, of_c = (np.take_along_axis(height[crossing], order[:, k, None], axis=1) for k in range(3))
-    on_ab, on_ac = a + of_a / (of_a - of_b) * (b - a), a + of_a / (of_a - of_c) * (c - a)
-    tips = np.stack([a, on_ab, on_ac], axis=1)
-    rests = np.concatenate([np.stack([on_ab, b, c], axis=1), np.stack([on_ab, c, on_ac], axis=1)])
-    is_upper = of_a[:, 0] > 0
-    rest_is_upper = np.tile(~is_upper, 2)
-    return (
-        np.concatenate([triangles[below], tips[~is_upper], rests[~rest_is_upper]]),
-        np.concatenate([triangles[above], tips[is_upper], rests[rest_is_upper]]),
+    height = mesh.points[:, axis] - position
+    upper = height[mesh.triangles] > 0
+    crossing = upper.any(axis=1) & ~upper.all(axis=1)
+    is_tip_upper = upper[crossing].sum(axis=1) == 1
+    tip = np.where(is_tip_upper, upper[crossing].argmax(axis=1), upper[crossing].argmin(axis=1))  # alone on its side
+    order = (tip[:, None] + np.arange(3)) % 3
+    a, b, c = np.take_along_axis(mesh.triangles[crossing], order, axis=1).T
+    on_ab, on_ac = (
+        mesh.points[a] + (height[a] / (height[a] - height[end]))[:, None] * (mesh.points[end] - mesh.points[a])
+        for end in (b, c)
     )
-
-
-def _hull_volume(triangles: Array) -> float:
-    """Return the volume of the convex hull of triangles [m^3]; 0 for coplanar ones."""
-    from scipy.spatial import ConvexHull, QhullError
-
-    try:
-        return float(ConvexHull(triangles.reshape(-1, 3)).volume)
-    except (QhullError, ValueError):
-        return 0.0
+    points, count = np.concatenate([mesh.points, on_ab, on_ac]), len(mesh.points)
+    ab, ac = count + np.arange(len(a)), count + len(a) + np.arange(len(a))
+    tips = np.stack([a, ab, ac], axis=1)
+    rests = np.concatenate([np.stack([ab, b, c], axis=1), np.stack([ab, c, ac], axis=1)])
+    is_rest_upper = np.tile(~is_tip_upper, 2)
+    below = np.concatenate([mesh.triangles[~upper.any(axis=1)], tips[~is_tip_upper], rests[~is_rest_upper]])
+    above = np.concatenate([mesh.triangles[upper.all(axis=1)], tips[is_tip_upper], rests[is_rest_upper]])
+    return TriangleMesh(points, below), TriangleMesh(points, above)
 
 
 def _written(parts: Sequence[Array]) -> bytes:
