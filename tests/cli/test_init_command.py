@@ -156,7 +156,7 @@ def test_jerks_are_limited_in_proportion_to_the_accelerations(crane):
     assert "100/s times the acceleration limits" in " ".join(text.replace("\n#", " ").split())
 
 
-def test_start_and_goal_boxes_are_apart(crane):
+def test_start_and_goal_boxes_have_a_minimum_distance(crane):
     draw = load_dataset_recipe(crane / "dataset.toml").pipeline.stage[0]
     reach = load_robot(load_problem(crane / "problem.toml")).chain.reach
     gaps = [max(one.low - other.high, other.low - one.high) for one, other in zip(draw.start, draw.goal, strict=True)]

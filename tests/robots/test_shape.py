@@ -77,6 +77,17 @@ def test_a_mesh_is_found_in_any_of_the_places(tmp_path, monkeypatch, place):
     assert find_named_file("package://meshes/hand/palm.stl", file, [tmp_path / "named"]) == mesh
 
 
+def test_a_package_whose_folder_has_another_name_is_found_around_the_urdf(tmp_path):
+    mesh = tmp_path / "renamed" / "meshes" / "palm.stl"
+    mesh.parent.mkdir(parents=True)
+    mesh.touch()
+    name = "package://arm_description/meshes/palm.stl"
+    for urdf in ("arm.urdf", "urdf/arm.urdf", "urdf/left/arm.urdf"):
+        assert find_named_file(name, tmp_path / "renamed" / urdf) == mesh
+    with pytest.raises(RecipeError, match="missing; looked for at"):
+        find_named_file(name, tmp_path / "renamed" / "a" / "b" / "c" / "arm.urdf")
+
+
 def test_addresses_of_files_and_relative_paths_are_read_and_others_refused(tmp_path):
     (tmp_path / "a.stl").touch()
     for name in ("a.stl", f"file://{tmp_path}/a.stl", str(tmp_path / "a.stl")):
