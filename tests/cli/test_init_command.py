@@ -10,7 +10,8 @@ import pytest
 import cnpgen
 from cnpgen.cli.describe_keys import part_of
 from cnpgen.cli.init import link_overlaps
-from cnpgen.cli.init.initial_recipes import INITIAL_JERK_RATE
+from cnpgen.cli.init.arm import read_arm
+from cnpgen.cli.init.initial_recipes import INITIAL_JERK_RATE, problem_of
 from cnpgen.cli.init.text import toml
 from cnpgen.cli.main import main
 from cnpgen.make.recipe_file import load_dataset_recipe
@@ -23,6 +24,7 @@ from cnpgen.schema.keys import PerJoint, Range, keys
 from cnpgen.world.world import World
 from tests.examples.example_robots import folder as robots
 from tests.examples.example_robots import needs_robots
+from tests.examples.meshes import Meshes
 from tests.examples.shaped_robot import LINKS, arm_of_channels, write_crane
 
 IIWA = Path(__file__).parents[2] / "problems" / "airhockey" / "iiwa14_striker.urdf"
@@ -131,6 +133,44 @@ def test_the_recipes_of_arms_that_people_have_work_as_they_are(file, tip, tmp_pa
     assert main(["init", str(tmp_path / "arm"), "--urdf", str(urdf), "--tip", tip]) == 0
     proved(tmp_path / "arm")
     solved(tmp_path / "arm", 8)
+
+
+ARMS = {  # URDF, tip
+    "ur5": ("ur_description/urdf/ur5_robot.urdf", "tool0"),
+    "ur10": ("ur_description/urdf/ur10_robot.urdf", "tool0"),
+    "panda": ("panda_description/urdf/panda.urdf", "panda_hand_tcp"),
+    "jaco": ("kinova_description/robots/kinova.urdf", "j2s6s200_end_effector"),
+    "tiago": ("tiago_description/robots/tiago.urdf", "arm_tool_link"),
+    "xarm7": ("xarm_description/urdf/xarm7.urdf", None),
+    "z1": ("z1_description/urdf/z1.urdf", None),
+    "baxter": ("baxter_description/urdf/baxter.urdf", "left_gripper"),
+}
+
+
+@needs_robots
+@pytest.mark.extended  # the claim about arms of channels, for arms that people have
+@pytest.mark.parametrize("name", ARMS)
+def test_convex_parts_reject_less_than_two_percent_of_the_free_states(name, tmp_path):
+    file, tip = ARMS[name]
+    urdf = robots() / "example-robot-data" / "robots" / file
+    initial = problem_of(read_arm(urdf, tip), name, tmp_path, (), None)
+    problem = initial.problem
+    assert problem.robot.hull_gap < 0.02
+    robot, still = load_robot(problem), np.zeros(len(problem.robot.joints))
+    world, meshes, free, rejected = World(robot), Meshes(problem, robot, robots()), 0, 0
+    count = 4000 if name == "baxter" else 1000  # of Baxter's states 9 % are free
+    for q in np.random.default_rng(1).uniform(robot.position_lower, robot.position_upper, (count, robot.n)):
+        if not meshes.touches(q):  # by Pinocchio's own reading of the URDF
+            world.set_state(q, still, still, np.zeros(0))
+            touches = min(world.self_distances()) < 0
+            if not touches or meshes.distances(q)[1] > 0:  # the fast check misses overlaps of cylinders
+                free, rejected = free + 1, rejected + touches
+    print(f"{name}: {rejected} of {free} free states are rejected")
+    assert rejected < 0.02 * free
+    assert not meshes.touches(robot.base)
+    for pair in robot.shape.pairs:
+        if pair.left_out == "always":
+            assert any(f"{pair.first}, {pair.second}" in note for note in initial.notes)
 
 
 def test_limits_that_are_missing_are_put_in_and_said(tmp_path):

@@ -82,8 +82,8 @@ def test_a_package_whose_folder_has_another_name_is_found_around_the_urdf(tmp_pa
     mesh.parent.mkdir(parents=True)
     mesh.touch()
     name = "package://arm_description/meshes/palm.stl"
-    for urdf in ("arm.urdf", "urdf/arm.urdf", "urdf/left/arm.urdf"):
-        assert find_named_file(name, tmp_path / "renamed" / urdf) == mesh
+    for place in ("arm.urdf", "urdf/arm.urdf", "urdf/left/arm.urdf"):
+        assert find_named_file(name, tmp_path / "renamed" / place) == mesh
     with pytest.raises(RecipeError, match="missing; looked for at"):
         find_named_file(name, tmp_path / "renamed" / "a" / "b" / "c" / "arm.urdf")
 

@@ -15,6 +15,7 @@ from cnpgen.problems.constraints.joint import JointTorque
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
+from cnpgen.robots.shape.link_pairs import LinkContact, body_of_part, joint_poses
 from cnpgen.schema.keys import Range
 from cnpgen.world.world import World
 
@@ -23,7 +24,8 @@ Array = NDArray[np.float64]
 BASE_CANDIDATES = 4000  # random states; the base configuration is one of them
 LIMIT_SHARE = 0.1  # share of a joint's range at either end that is left out
 MAX_LOAD = 0.7  # share of the torque limits that the base configuration may use at rest
-MIN_LINK_CLEARANCE_M = 5e-3  # between links at the base configuration
+MIN_LINK_CLEARANCE_M = 5e-3  # between links at the base configuration, if a state has it
+MAX_CLEARANCE_CHECKS = 500  # free states whose clearance is measured
 BOX_SIZES = (0.3, 0.22, 0.16, 0.11, 0.08, 0.05)  # edge of the boxes / reach, the largest first
 MIN_BOX_DISTANCE = 0.15  # distance of the boxes / reach, so that no task is trivial
 GOOD_YIELD = 0.5  # share of accepted candidates at which the search for a box ends
@@ -38,7 +40,7 @@ def comfortable_base(problem: Problem, robot: Robot) -> tuple[tuple[float, ...],
 
     Random states with the tip ahead along x and above the ground are preferred. The best one has the largest product of
     the singular values of the tip's Jacobian and the distance from the nearest limit. If no state is free of collisions
-    and within the torque limits, the best of the others is taken.
+    and within the torque limits, the best of the others is returned.
 
     Returns:
         Joint positions [rad], rounded, and notes about conditions that it does not meet.
@@ -53,15 +55,18 @@ def comfortable_base(problem: Problem, robot: Robot) -> tuple[tuple[float, ...],
     score = values[:, moves].prod(axis=1) * margin
     ahead = tips - robot.chain.joints[0].translation
     front = (ahead[:, 0] > 0) & (np.abs(ahead[:, 1]) <= 0.2 * ahead[:, 0]) & (tips[:, 2] >= 0)
-    everywhere = np.ones(len(states), bool)
-    for group in (front & (load <= MAX_LOAD), load <= MAX_LOAD, load <= 1):
-        for k in sorted(np.flatnonzero(group), key=lambda k: -score[k]):
-            if _is_free(world, states[k]):
+    free, order = _free_states(robot, states), np.argsort(-score, kind="stable")
+    groups = [front & (load <= MAX_LOAD), load <= MAX_LOAD, load <= 1, np.ones(len(states), bool)]
+    for group in groups[:3]:
+        for k in order[(group & free)[order]][:MAX_CLEARANCE_CHECKS]:
+            if _clearance(world, states[k]) > MIN_LINK_CLEARANCE_M:
                 return tuple(states[k].tolist()), ()
-    group = next(group for group in (front & (load <= 1), load <= 1, everywhere) if group.any())
-    best = max(np.flatnonzero(group), key=lambda k: score[k])
-    text = f"in all of {BASE_CANDIDATES:,} random states links collide or gravity needs too much torque"
-    return tuple(states[best].tolist()), (f"{text}: choose the base configuration by hand",)
+    notes: tuple[str, ...] = ()
+    if not (groups[2] & free).any():
+        text = f"in all of {BASE_CANDIDATES:,} random states links collide or gravity needs too much torque"
+        notes = (f"{text}: choose the base configuration by hand",)
+    best = next(group for group in [*(group & free for group in groups[:3]), *groups] if group.any())
+    return tuple(states[order[best[order]][0]].tolist()), notes
 
 
 def _states(robot: Robot) -> Array:
@@ -81,13 +86,25 @@ def _measure_states(world: World, states: Array) -> tuple[Array, Array, Array]:
     return np.array(tips), np.array(values), np.array(load)
 
 
-def _is_free(world: World, q: Array) -> bool:
-    """Return whether the links keep their clearance at a state."""
+def _free_states(robot: Robot, states: Array) -> NDArray[np.bool_]:
+    """Return a mask of the states without collisions of links, shape (N,)."""
+    free, shape = np.ones(len(states), bool), robot.shape
+    if shape is not None:
+        poses = joint_poses(robot.model, states)
+        contact = LinkContact(poses, map(body_of_part, shape.convex_parts), shape.joints)
+        for pair in shape.pairs:
+            if not pair.left_out:
+                free &= ~contact.of(pair.first, pair.second, among=free)
+    return free
+
+
+def _clearance(world: World, q: Array) -> float:
+    """Return the minimum distance of the links at a state [m]."""
     if world.robot.shape is None:
-        return True
+        return np.inf
     still = np.zeros(world.robot.n)
     world.set_state(q, still, still, np.zeros(0))
-    return min(world.self_distances(), default=np.inf) > MIN_LINK_CLEARANCE_M
+    return min(world.self_distances(), default=np.inf)
 
 
 def find_boxes(pipeline: Pipeline) -> tuple[Pipeline, float]:

@@ -71,7 +71,7 @@ def _decompose(problem: Problem, gap: HullGap) -> tuple[Problem, HullGap]:
         large = [*gap.hidden, *takewhile(lambda pair: pair.rejected > MAX_PAIR_GAP, gap.pairs)]
         links = dict.fromkeys(link for pair in large for link in (pair.first, pair.second) if link in meshes)
         chosen = list(dict.fromkeys([*chosen, *links]))
-        if not chosen:
+        if not links:
             break
         print(f"cnpgen: decomposing {', '.join(chosen)} into at most {count} convex parts each", file=sys.stderr)
         robot = replace(problem.robot, convex_parts=count, decomposed=tuple(chosen))

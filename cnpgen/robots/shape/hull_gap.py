@@ -1,7 +1,8 @@
 """Gap of convex parts: the free space of the triangle meshes that the convex parts of links reject.
 
-A hull contains the free space of its mesh's hollows. The reference is the collision geometry as it stands in the files:
-triangle meshes in bounding volume hierarchies of Coal, and exact boxes, spheres, cylinders and capsules.
+A hull contains the free space of its mesh's hollows. The reference is the collision geometry of the files: triangle
+meshes in bounding volume hierarchies of Coal, and the other geometry as the judge checks it. Cylinders are prisms:
+Coal's check of two cylinders missed overlaps of 37 mm.
 """
 
 from collections.abc import Sequence

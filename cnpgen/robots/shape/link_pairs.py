@@ -98,11 +98,23 @@ def sample_poses(model: "pin.Model", count: int) -> tuple[Array, Array]:
     Returns:
         Rotations, shape (joints, K, 3, 3), and positions [m], shape (joints, K, 3).
     """
+    random = np.random.default_rng(0)
+    return joint_poses(model, random.uniform(model.lowerPositionLimit, model.upperPositionLimit, (count, model.nq)))
+
+
+def joint_poses(model: "pin.Model", states: Array) -> tuple[Array, Array]:
+    """Return poses of all joints at K states.
+
+    Args:
+        model: Pinocchio model.
+        states: Joint positions [rad], shape (K, n).
+
+    Returns:
+        Rotations, shape (joints, K, 3, 3), and positions [m], shape (joints, K, 3).
+    """
     import pinocchio as pin
 
-    data, random = model.createData(), np.random.default_rng(0)
-    states = random.uniform(model.lowerPositionLimit, model.upperPositionLimit, (count, model.nq))
-    poses = np.empty((model.njoints, count, 4, 3))
+    data, poses = model.createData(), np.empty((model.njoints, len(states), 4, 3))
     for k, q in enumerate(states):
         pin.forwardKinematics(model, data, q)
         for joint, pose in enumerate(data.oMi):
