@@ -12,6 +12,7 @@ from cnpgen.robots.urdf import read_urdf
 
 MAX_GAP = 0.01  # fraction of the free states that convex parts may reject without further decomposition
 MAX_PAIR_GAP = 1e-3  # of a pair whose links are not decomposed further
+LARGE_PAIR_GAP = 0.02  # of a pair that a note names
 PART_COUNTS = (4, 8, 16)  # maximum numbers of convex parts of a mesh, in the order in which they are tried
 MIN_FREE_FRACTION = 0.01  # of the sampled states, below which pairs in contact are ignored
 MAX_IGNORED_PAIRS = 20
@@ -107,6 +108,9 @@ def _gap_notes(problem: Problem, hulls: HullGap, parts: HullGap) -> list[str]:
     if problem.robot.decomposed:
         links = ", ".join(problem.robot.decomposed)
         notes.append(f"{parts.fraction:.2%} {text} convex parts; decomposed: {links}")
+    for pair in takewhile(lambda pair: pair.rejected > LARGE_PAIR_GAP, parts.pairs):
+        rejected = f"the pair {pair.first}, {pair.second} rejects {pair.rejected:.2%} of them"
+        notes.append(f"{rejected}: finer convex parts of its links or 'ignored_pairs' would accept them")
     if parts.hidden:
         hidden = "; ".join(map(_overlap, parts.hidden))
         notes.append(f"not checked, although their meshes are not always in contact: {hidden}")

@@ -22,7 +22,8 @@ from cnpgen.store.files.atomic import write_file
 
 Array = NDArray[np.float64]
 
-CUTS_PER_AXIS = 9  # planes that are tried between both ends of a part along each axis
+CUTS_PER_AXIS = 9  # planes between both ends of a part along each axis that are tried, and as many at faces
+FACE_TOLERANCE_M = 1e-4  # of the coordinates of points on a face
 MIN_VOLUME_REDUCTION = 0.005  # by a cut, as a fraction of the hull volume of the mesh; smaller cuts are not made
 DECOMPOSITION_REVISION = 2  # of the decomposition; cached parts of another revision are ignored
 
@@ -125,13 +126,25 @@ def cut_parts(mesh: TriangleMesh, most: int) -> list[TriangleMesh]:
 def _best_cut(part: TriangleMesh) -> _Cut:
     best, volume, points = _Cut(part), part.hull_volume, part.used_points
     for axis in range(3):
-        low, high = points[:, axis].min(), points[:, axis].max()
-        for position in np.linspace(low, high, CUTS_PER_AXIS + 2)[1:-1]:
+        for position in _cut_positions(points[:, axis]):
             halves = cut_mesh(part, axis, float(position))
             reduction = volume - sum(half.hull_volume for half in halves)
             if reduction > best.reduction:
                 best = _Cut(part, reduction, halves)
     return best
+
+
+def _cut_positions(coordinates: Array) -> list[float]:
+    """Return positions of planes: evenly between both ends, and those of most points, such as faces across the axis.
+
+    Args:
+        coordinates: Coordinates of the points along the axis [m], shape (N,).
+    """
+    low, high = float(coordinates.min()), float(coordinates.max())
+    even = np.linspace(low, high, CUTS_PER_AXIS + 2)[1:-1]
+    faces, counts = np.unique(np.round(coordinates / FACE_TOLERANCE_M), return_counts=True)
+    common = faces[np.argsort(-counts, kind="stable")[:CUTS_PER_AXIS]] * FACE_TOLERANCE_M
+    return sorted({float(position) for position in [*even, *common] if low < position < high})
 
 
 def cut_mesh(mesh: TriangleMesh, axis: int, position: float) -> tuple[TriangleMesh, TriangleMesh]:
