@@ -14,7 +14,6 @@ from email.parser import Parser
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 import cnpgen
@@ -26,7 +25,6 @@ from cnpgen.errors import MissingExtraError
 from cnpgen.loader.frame import make_frame
 from cnpgen.machine.clusters import joined
 from cnpgen.machine.versions import DOCUMENTATION_URL
-from cnpgen.robots.shape.decomposition import convex_parts
 from cnpgen.store.files.figure_file import new_figure
 
 ROOT = Path(__file__).parents[1]
@@ -199,10 +197,6 @@ def frame(library: str) -> Any:
     return make_frame({}, (), library=library)
 
 
-def decomposition() -> object:
-    return convex_parts(np.zeros((4, 3)), np.zeros((4, 3), int), 2, None)
-
-
 OPTIONAL = {  # package that cnpgen imports -> extra that installs it, function that needs it
     "torch": ("torch", bridge("torch")),
     "jax": ("jax", bridge("jax")),
@@ -211,7 +205,6 @@ OPTIONAL = {  # package that cnpgen imports -> extra that installs it, function 
     "mujoco": ("benchmark", load_mujoco),
     "imageio": ("benchmark", rendering._imageio),
     "ompl": ("benchmark", cbirrt._ompl),
-    "coacd": ("decompose", decomposition),
     "meshcat": ("view", page._viewer),
     "distributed": ("dask", lambda: cluster("dask")),
     "ray": ("ray", lambda: cluster("ray")),

@@ -94,7 +94,7 @@ def describe_problem(problem: Problem) -> str:
             "",
             "  planning limits",
             *table(_limit_rows(problem, robot), indent="    "),
-            *_shape(robot),
+            *_shape(problem, robot),
             "",
             "  constraints",
             *table(constraints or [("none", "")], indent="    "),
@@ -111,12 +111,14 @@ def _obstacle(obstacle: Obstacle) -> str:
     return f"{text}, the hull of {len(corners_of(obstacle.mesh))} corners"
 
 
-def _shape(robot: Robot) -> list[str]:
-    """Describe the robot's shape: its links, and its pairs of links."""
+def _shape(problem: Problem, robot: Robot) -> list[str]:
+    """Describe the robot's shape: its links, its pairs of links, and the free space that its convex parts reject."""
     if robot.shape is None:
         return []
     links, pairs = link_rows(robot.shape), pair_rows(robot.shape)
     numbers_of_links, numbers_of_pairs = range(1, 6), (2, 3)
+    gap = problem.robot.hull_gap
+    states = "of the random states in which no triangle meshes overlap are rejected by the convex parts"
     return [
         "",
         "  link geometry: collision geometry of the URDF, and capsules that enclose it",
@@ -124,6 +126,7 @@ def _shape(robot: Robot) -> list[str]:
         "",
         "  pairs of links, by random states",
         *table(pairs, indent="    ", right=numbers_of_pairs),
+        *([] if gap is None else ["", f"  gap: {gap:.2%} {states}"]),
     ]
 
 
@@ -211,7 +214,7 @@ def recipe_to_dict(recipe: Recipe) -> dict[str, Any]:
         content["stages"] = [{"use": kind_name(stage), "text": stage.describe()} for stage in pipeline.stage]
     content["joints"] = list(robot.joint_names)
     if robot.shape:
-        content["shape"] = shape_to_dict(robot.shape)
+        content["shape"] = shape_to_dict(robot.shape) | {"hull_gap": problem.robot.hull_gap}
     content["limits"] = {
         name: {"unit": robot.units(unit), "values": list(getattr(robot, name))} for name, unit in LIMITS.items()
     }

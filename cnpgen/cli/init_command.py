@@ -1,6 +1,9 @@
 """``cnpgen init``: write a problem, a pipeline and a dataset for an arm, from its URDF."""
 
 import argparse
+import sys
+import warnings
+from collections.abc import Mapping
 from pathlib import Path
 
 from cnpgen.cli.parser import Commands, Parser, add_command
@@ -8,8 +11,9 @@ from cnpgen.cli.parser import Commands, Parser, add_command
 _TEXT = """\
 The command writes NAME/problem.toml, NAME/pipeline.toml and NAME/dataset.toml: motions from rest to rest between two
 boxes of positions in front of the robot, within its limits and without self-collision. Comments explain every key. The
-head of problem.toml lists findings about the robot: joints, masses, frames, link pairs, and placeholders for limits
-that the URDF lacks. 'cnpgen docs your-arm' continues from there.
+head of problem.toml lists findings about the robot: joints, masses, frames, link pairs, the free space that convex
+parts of links reject, and placeholders for limits that the URDF lacks. Links whose convex hulls reject much free space
+are decomposed. 'cnpgen docs your-arm' continues from there.
 """
 
 
@@ -25,29 +29,41 @@ def add(commands: "Commands[Parser]") -> None:
         " ROS_PACKAGE_PATH and AMENT_PREFIX_PATH, and those above the URDF; what is used of the former is written down"
     )
     option("--packages", metavar="DIR", type=Path, action="append", default=[], help=text)
+    text = "an SRDF file, whose disabled pairs of links are not checked for collisions"
+    option("--srdf", metavar="FILE", type=Path, help=text)
     option("--force", action="store_true", help="overwrite existing files")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     from cnpgen.cli.init.arm import read_arm
-    from cnpgen.cli.init.initial_recipes import dataset_of
-    from cnpgen.cli.init.write import FILES, texts_of
+    from cnpgen.cli.init.initial_recipes import dataset_of, problem_of
+    from cnpgen.cli.init.write import FILES, problem_text, sampling_texts
     from cnpgen.robots.shape.mesh_files import packages_of_environment
-    from cnpgen.store.files.atomic import write_file
 
     folder = _folder(arguments.name)
     there = [str(folder / name) for name in FILES if (folder / name).exists()]
     _refuse(there if not arguments.force else [])
     arm = read_arm(arguments.urdf, arguments.tip)
     packages = (*arguments.packages, *packages_of_environment(arm.meshes, arm.urdf, arguments.packages))
-    recipe, arm, share = dataset_of(arm, folder.name, folder, packages)
-    for name, text in texts_of(recipe, arm, share, folder).items():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # about the robot, which are in the notes
+        initial = problem_of(arm, folder.name, folder, packages, arguments.srdf)
+        _write(folder, {FILES[0]: problem_text(initial, folder)})
+        sys.stderr.writelines(f"note: {note}\n" for note in initial.notes)
+        recipe, share = dataset_of(initial, folder)
+    _write(folder, sampling_texts(recipe, share))
+    _say_next(folder)
+    return 0
+
+
+def _write(folder: Path, texts: Mapping[str, str]) -> None:
+    from cnpgen.store.files.atomic import write_file
+
+    for name, text in texts.items():
         folder.mkdir(parents=True, exist_ok=True)
         write_file(folder / name, text)
         print(folder / name)
-    _say_next(folder)
-    return 0
 
 
 def _folder(name: str) -> Path:
@@ -71,8 +87,6 @@ def _refuse(there: list[str]) -> None:
 
 
 def _say_next(folder: Path) -> None:
-    import sys
-
     lines = [
         f"cnpgen show {folder}/dataset.toml               what is in them",
         f"cnpgen make-dataset {folder}/dataset.toml --n 1000",

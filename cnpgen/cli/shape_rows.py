@@ -9,7 +9,7 @@ from cnpgen.robots.shape.shape import Shape
 _LEFT_OUT = {
     "adjacent": "not looked at: joined by a joint",
     "always": "not looked at: always in contact",
-    "disabled": "not looked at: disabled by the SRDF",
+    "disabled": "not looked at: disabled by the SRDF or by ignored_pairs",
 }
 
 

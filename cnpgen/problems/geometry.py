@@ -60,8 +60,9 @@ def _paper_mistakes(table: dict[str, Any], where: RecipeLocation) -> Iterator[st
         yield (where / "constraint" / place).message(text)
     if _robot(table).get("convex_parts", 1) != 1:
         yield (where / "robot" / "convex_parts").message('meshes matter with geometry = "urdf" only')
-    if _robot(table).get("srdf"):
-        yield (where / "robot" / "srdf").message('pairs of links matter with geometry = "urdf" only')
+    for key in ("srdf", "ignored_pairs"):
+        if _robot(table).get(key):
+            yield (where / "robot" / key).message('pairs of links matter with geometry = "urdf" only')
 
 
 def _missing_files(

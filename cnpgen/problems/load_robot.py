@@ -99,8 +99,9 @@ def _shape(problem: Problem, robot: Robot) -> Shape:
         shape = load_shape(robot.urdf_text, robot.model, kept_folder())
     except RecipeError as error:
         raise RecipeError([f"{problem.path}: {mistake}" for mistake in error.mistakes]) from error
+    ignored = set(map(frozenset, problem.robot.ignored_pairs))
     for pair in shape.pairs if problem.robot.srdf else ():
-        if pair.left_out == "disabled" and pair.colliding:
+        if pair.left_out == "disabled" and pair.colliding and {pair.first, pair.second} not in ignored:
             warnings.warn(
                 f"{problem.robot.srdf} disables the pair {pair.first}, {pair.second}, which collides in"
                 f" {pair.colliding:.1%} of random states: these collisions are not noticed",

@@ -16,7 +16,7 @@ from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot_spec import HeldObject, LimitSpec, Payload, RobotSpec
 from cnpgen.robots.shape.inline import with_inline_meshes
 from cnpgen.robots.shape.mesh_files import find_urdf
-from cnpgen.robots.shape.srdf import with_disabled_pairs
+from cnpgen.robots.shape.srdf import with_disabled_pairs, with_ignored_pairs
 from cnpgen.robots.solid import pose_width
 from cnpgen.robots.urdf import read_urdf
 from cnpgen.schema import registry
@@ -122,10 +122,11 @@ class Problem:
         Raises:
             PluginError: The URDF belongs to a package that is not installed.
         """
-        return find_urdf(self.robot.urdf, self.path, self._packages)
+        return find_urdf(self.robot.urdf, self.path, self.packages)
 
     @property
-    def _packages(self) -> list[Path]:
+    def packages(self) -> list[Path]:
+        """Folders that are searched for packages of the URDF."""
         return [self.path.parent / each for each in self.robot.packages]
 
     @cached_property
@@ -141,8 +142,11 @@ class Problem:
         if spec.geometry != "urdf":
             return text
         keep = kept_folder() if spec.convex_parts > 1 else None
-        text = with_inline_meshes(text, self.urdf_path, self._packages, most=spec.convex_parts, keep=keep)
-        return with_disabled_pairs(text, self.path.parent / spec.srdf) if spec.srdf else text
+        text = with_inline_meshes(
+            text, self.urdf_path, self.packages, most=spec.convex_parts, links=spec.decomposed, keep=keep
+        )
+        text = with_disabled_pairs(text, self.path.parent / spec.srdf) if spec.srdf else text
+        return with_ignored_pairs(text, spec.ignored_pairs) if spec.ignored_pairs else text
 
     @cached_property
     def identity(self) -> str:
@@ -154,8 +158,8 @@ class Problem:
         return hashlib.sha256(content.encode() + self.urdf_text.encode()).hexdigest()
 
 
-# Keys of [robot] that only locate or read files; their results are in the text of the URDF.
-FILES = ("urdf", "packages", "srdf", "convex_parts")
+# Keys of [robot] that only locate, read or describe files; their results are in the text of the URDF.
+FILES = ("urdf", "packages", "srdf", "ignored_pairs", "convex_parts", "decomposed", "hull_gap")
 
 
 def kept_folder() -> Path | None:

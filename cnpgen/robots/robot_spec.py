@@ -48,11 +48,25 @@ class RobotSpec:
         high=64,
         since_version=2,
     )
+    decomposed: tuple[str, ...] = field(
+        "links whose collision meshes are decomposed into convex parts; by default all", default=(), since_version=2
+    )
+    hull_gap: float | None = field(
+        "fraction of the random states without overlap of the links' triangle meshes in which their convex parts"
+        " overlap, as 'cnpgen init' measured it",
+        default=None,
+        low=0.0,
+        high=1.0,
+        since_version=2,
+    )
     srdf: str = field(
         "SRDF file, relative to the problem file, whose disabled pairs of links are not checked; without it they are"
         " found by sampling",
         default="",
         since_version=2,
+    )
+    ignored_pairs: tuple[tuple[str, str], ...] = field(
+        "pairs of links whose collisions are not checked, besides those of the SRDF", default=(), since_version=2
     )
 
     def find_mistakes(self) -> Iterator[tuple[str, str]]:
@@ -62,6 +76,8 @@ class RobotSpec:
             yield "joints", f"each joint can be planned once, got {', '.join(twice)} more than once"
         if len(self.base) != len(self.joints):
             yield "base", f"expected {len(self.joints)} numbers, one per planned joint, got {len(self.base)}"
+        if self.decomposed and self.convex_parts == 1:
+            yield "decomposed", "links are decomposed into more than one part only: set 'convex_parts', such as 4"
 
 
 @dataclass(frozen=True, kw_only=True)

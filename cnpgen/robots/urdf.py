@@ -4,6 +4,8 @@ import math
 import re
 from pathlib import Path
 from xml.etree import ElementTree
+from xml.parsers.expat import ExpatError, ParserCreate
+from xml.parsers.expat.errors import XML_ERROR_UNBOUND_PREFIX, codes
 
 from cnpgen.errors import RecipeError
 from cnpgen.schema.texts import read_at_most, utf8_text
@@ -68,11 +70,25 @@ def urdf_tree(text: str) -> ElementTree.Element:
         parser.feed(text.encode())
         tree: ElementTree.Element = parser.close()
     except ElementTree.ParseError as error:
-        raise ValueError(f"it is not XML: {error}") from error
+        if error.code != codes[XML_ERROR_UNBOUND_PREFIX]:
+            raise ValueError(f"it is not XML: {error}") from error
+        tree = _tree_without_namespaces(text)
     for part in ("link", "joint"):
         if (count := sum(1 for _ in tree.iter(part))) > MAX_URDF_ELEMENTS:
             raise ValueError(f"it has {count:,} {part}s, expected at most {MAX_URDF_ELEMENTS:,}")
     return tree
+
+
+def _tree_without_namespaces(text: str) -> ElementTree.Element:
+    """Parse the text of a URDF with undeclared prefixes, such as those of Gazebo, as other URDF parsers do."""
+    parser, builder = ParserCreate("utf-8"), _Builder()
+    parser.StartElementHandler, parser.EndElementHandler = builder.start, builder.end
+    parser.CharacterDataHandler, parser.StartDoctypeDeclHandler = builder.data, builder.doctype
+    try:
+        parser.Parse(text.encode(), True)
+    except ExpatError as error:
+        raise ValueError(f"it is not XML: {error}") from error
+    return builder.close()
 
 
 def number_in(element: ElementTree.Element | None, attribute: str, default: float) -> float:

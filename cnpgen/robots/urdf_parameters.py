@@ -171,7 +171,9 @@ def _inertia(link: Element) -> LinkInertia | None:
         entries = {name: number_in(tensor, name, 0.0) for name in _INERTIA_ENTRIES}
     rows = (("ixx", "ixy", "ixz"), ("ixy", "iyy", "iyz"), ("ixz", "iyz", "izz"))
     matrix = np.array([[entries[name] for name in row] for row in rows])
-    return LinkInertia(number_in(mass, "value", 0.0), _placement(element), matrix)
+    if (value := number_in(mass, "value", 0.0)) < 0:
+        raise ValueError(f"<mass value={mass.get('value')!r}> must not be negative: give the mass of the link in kg")
+    return LinkInertia(value, _placement(element), matrix)
 
 
 def _joint(element: Element) -> UrdfJoint:

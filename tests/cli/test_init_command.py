@@ -9,7 +9,9 @@ import pytest
 
 import cnpgen
 from cnpgen.cli.describe_keys import part_of
-from cnpgen.cli.init.initial_recipes import INITIAL_JERK_RATE
+from cnpgen.cli.init import link_overlaps
+from cnpgen.cli.init.arm import read_arm
+from cnpgen.cli.init.initial_recipes import INITIAL_JERK_RATE, problem_of
 from cnpgen.cli.init.text import toml
 from cnpgen.cli.main import main
 from cnpgen.make.recipe_file import load_dataset_recipe
@@ -17,11 +19,13 @@ from cnpgen.problems.constraints.joint import JointJerk
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import resolved
 from cnpgen.problems.problem_file import load_problem
+from cnpgen.robots.shape import hull_gap
 from cnpgen.schema.keys import PerJoint, Range, keys
 from cnpgen.world.world import World
 from tests.examples.example_robots import folder as robots
 from tests.examples.example_robots import needs_robots
-from tests.examples.shaped_robot import write_crane
+from tests.examples.meshes import Meshes
+from tests.examples.shaped_robot import LINKS, arm_of_channels, write_crane
 
 IIWA = Path(__file__).parents[2] / "problems" / "airhockey" / "iiwa14_striker.urdf"
 _INERTIA = '<inertia ixx="0.01" ixy="0" ixz="0" iyy="0.02" iyz="0" izz="0.02"/>'
@@ -131,6 +135,44 @@ def test_the_recipes_of_arms_that_people_have_work_as_they_are(file, tip, tmp_pa
     solved(tmp_path / "arm", 8)
 
 
+ARMS = {  # URDF, tip
+    "ur5": ("ur_description/urdf/ur5_robot.urdf", "tool0"),
+    "ur10": ("ur_description/urdf/ur10_robot.urdf", "tool0"),
+    "panda": ("panda_description/urdf/panda.urdf", "panda_hand_tcp"),
+    "jaco": ("kinova_description/robots/kinova.urdf", "j2s6s200_end_effector"),
+    "tiago": ("tiago_description/robots/tiago.urdf", "arm_tool_link"),
+    "xarm7": ("xarm_description/urdf/xarm7.urdf", None),
+    "z1": ("z1_description/urdf/z1.urdf", None),
+    "baxter": ("baxter_description/urdf/baxter.urdf", "left_gripper"),
+}
+
+
+@needs_robots
+@pytest.mark.extended  # the claim about arms of channels, for arms that people have
+@pytest.mark.parametrize("name", ARMS)
+def test_convex_parts_reject_less_than_two_percent_of_the_free_states(name, tmp_path):
+    file, tip = ARMS[name]
+    urdf = robots() / "example-robot-data" / "robots" / file
+    initial = problem_of(read_arm(urdf, tip), name, tmp_path, (), None)
+    problem = initial.problem
+    assert problem.robot.hull_gap < 0.02
+    robot, still = load_robot(problem), np.zeros(len(problem.robot.joints))
+    world, meshes, free, rejected = World(robot), Meshes(problem, robot, robots()), 0, 0
+    count = 4000 if name == "baxter" else 1000  # of Baxter's states 9 % are free
+    for q in np.random.default_rng(1).uniform(robot.position_lower, robot.position_upper, (count, robot.n)):
+        if not meshes.touches(q):  # by Pinocchio's own reading of the URDF
+            world.set_state(q, still, still, np.zeros(0))
+            touches = min(world.self_distances()) < 0
+            if not touches or meshes.distances(q)[1] > 0:  # the fast check misses overlaps of cylinders
+                free, rejected = free + 1, rejected + touches
+    print(f"{name}: {rejected} of {free} free states are rejected")
+    assert rejected < 0.02 * free
+    assert not meshes.touches(robot.base)
+    for pair in robot.shape.pairs:
+        if pair.left_out == "always":
+            assert any(f"{pair.first}, {pair.second}" in note for note in initial.notes)
+
+
 def test_limits_that_are_missing_are_put_in_and_said(tmp_path):
     joints = [("continuous", "0 0 1", ""), ELBOW[1], ("revolute", "0 1 0", '<limit velocity="0" effort="0"/>')]
     urdf = write_arm(tmp_path / "arm.urdf", joints)
@@ -152,6 +194,134 @@ def test_jerks_are_limited_in_proportion_to_the_accelerations(crane):
     np.testing.assert_allclose(robot.jerk_limit, INITIAL_JERK_RATE * robot.acceleration_limit, rtol=5e-3)
     text = (crane / "problem.toml").read_text(encoding="utf-8")
     assert "100/s times the acceleration limits" in " ".join(text.replace("\n#", " ").split())
+
+
+def test_start_and_goal_boxes_have_a_minimum_distance(crane):
+    draw = load_dataset_recipe(crane / "dataset.toml").pipeline.stage[0]
+    reach = load_robot(load_problem(crane / "problem.toml")).chain.reach
+    gaps = [max(one.low - other.high, other.low - one.high) for one, other in zip(draw.start, draw.goal, strict=True)]
+    assert max(gaps) >= draw.min_distance > 0.1 * reach
+
+
+def head_of(problem: Path) -> str:
+    """The findings about an arm on one line."""
+    text = problem.read_text(encoding="utf-8")
+    return " ".join(line.removeprefix("#").strip() for line in text[: text.index("\nname = ")].splitlines())
+
+
+def test_hulls_that_reject_free_space_are_decomposed_and_the_gap_is_shown(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(hull_gap, "GAP_STATES", 400)
+    monkeypatch.setattr(link_overlaps, "GAP_STATES", 400)
+    monkeypatch.setattr(link_overlaps, "PART_COUNTS", (4,))
+    urdf = arm_of_channels(tmp_path).urdf_path
+    assert main(["init", str(tmp_path / "arm"), "--urdf", str(urdf), "--tip", "hand"]) == 0
+    assert "decomposing base, fore, turret into at most 4 convex parts each" not in capsys.readouterr().out
+    robot = load_problem(tmp_path / "arm" / "problem.toml").robot
+    assert (robot.convex_parts, robot.decomposed, robot.hull_gap) == (4, ("fore",), 0.0)
+    head = head_of(tmp_path / "arm" / "problem.toml")
+    assert "1.65% of the random states in which no meshes overlap are rejected by the convex hulls" in head
+    assert re.search(r"turret fore +14.25% +3.00% +3.00% +0.00%", re.sub(" +", " ", head))
+    assert main(["show", str(tmp_path / "arm" / "problem.toml")]) == 0
+    text = "gap: 0.00% of the random states in which no triangle meshes overlap are rejected by the convex parts"
+    assert text in capsys.readouterr().out
+
+
+STUCK = '<origin xyz="0 0 0.15"/><geometry><sphere radius="0.42"/></geometry>'
+HALF = '<origin xyz="0.25 0 0.1"/><geometry><box size="0.5 1.5 1.5"/></geometry>'
+
+
+def test_pairs_in_permanent_contact_are_named(tmp_path):
+    urdf = write_crane(tmp_path, {**LINKS, "base": [STUCK]})
+    assert main(["init", str(tmp_path / "arm"), "--urdf", str(urdf), "--tip", "hand"]) == 0
+    head = head_of(tmp_path / "arm" / "problem.toml")
+    assert "not checked, since they are always in contact: base, arm" in head
+
+
+def test_pairs_that_leave_no_free_state_are_ignored_with_a_note(tmp_path, monkeypatch):
+    monkeypatch.setattr(link_overlaps, "MIN_FREE_FRACTION", 0.6)
+    urdf = write_crane(tmp_path, {**LINKS, "base": [HALF]})
+    assert main(["init", str(tmp_path / "arm"), "--urdf", str(urdf), "--tip", "hand"]) == 0
+    problem = load_problem(tmp_path / "arm" / "problem.toml")
+    pairs = problem.robot.ignored_pairs
+    assert pairs
+    shape = load_robot(problem).shape
+    assert {(pair.first, pair.second) for pair in shape.pairs if pair.left_out == "disabled"} == set(pairs)
+    head = head_of(tmp_path / "arm" / "problem.toml")
+    for first, second in pairs:
+        text = f"no state is free of collisions: {first}, {second} (their convex parts overlap in"
+        assert f"ignored, since otherwise {text}" in head
+
+
+def test_an_srdf_is_used_and_named_from_the_recipes(tmp_path):
+    urdf = write_crane(tmp_path)
+    srdf = tmp_path / "crane.srdf"
+    srdf.write_text('<robot name="crane"><disable_collisions link1="hand" link2="base"/></robot>')
+    assert main(["init", str(tmp_path / "arm"), "--urdf", str(urdf), "--tip", "hand", "--srdf", str(srdf)]) == 0
+    problem = load_problem(tmp_path / "arm" / "problem.toml")
+    assert problem.robot.srdf == "../crane.srdf"
+    with pytest.warns(RuntimeWarning, match="disables the pair base, hand, which collides"):
+        pairs = load_robot(problem).shape.pairs
+    assert [(pair.first, pair.second) for pair in pairs if pair.left_out == "disabled"] == [("base", "hand")]
+    assert "disables the pair base, hand" in head_of(tmp_path / "arm" / "problem.toml")
+
+
+def test_a_torque_limit_below_what_gravity_needs_is_replaced(tmp_path):
+    weak = '<limit lower="-2" upper="2" velocity="2" effort="3"/>'
+    urdf = write_arm(tmp_path / "arm.urdf", [ELBOW[0], ("revolute", "0 1 0", weak), ELBOW[2]], mass=8.0)
+    assert main(["init", str(tmp_path / "arm"), "--urdf", str(urdf)]) == 0
+    assert re.search(
+        r"joint_2: gravity needs [\d.]+ N m, where the URDF allows 3 N m", head_of(tmp_path / "arm/problem.toml")
+    )
+    torque = load_problem(tmp_path / "arm" / "problem.toml").limits.torque.values
+    assert (torque[0], torque[2]) == (90, 90)
+    assert torque[1] > 30
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (('lower="-2" upper="2"', 'lower="2" upper="-2"'), "'joint_2': its limits lower=2 and upper=-2 are swapped"),
+        (('axis xyz="0 1 0"', 'axis xyz="0 0 0"'), "joint 'joint_2': <axis xyz='0 0 0'> has no direction"),
+        (('mass value="2.0"', 'mass value="-2.0"'), "<mass value='-2.0'> must not be negative: give the mass"),
+        (('xyz="0.3 0 0.0"', 'xyz="300 0 0"'), "m long, expected 0.01 to 100 m; lengths of a URDF are in m, not in mm"),
+        (('xyz="0.3 0 0', 'xyz="0.00003 0 0'), "the arm is 0.000"),
+    ],
+    ids=["swapped limits", "zero axis", "negative mass", "joints in mm", "tiny arm"],
+)  # fmt: skip
+def test_implausible_input_is_refused_with_a_remedy(tmp_path, capsys, change, message):
+    urdf = write_arm(tmp_path / "arm.urdf", ELBOW)
+    first, *others = urdf.read_text().split('<link name="link_2">')
+    tail = '<link name="link_2">' + "".join(others)
+    whole = "0.00003" in change[1]
+    urdf.write_text(
+        (first + tail).replace(*change).replace('0.3"', '0.00003"') if whole else first + tail.replace(*change)
+    )
+    assert message in refused(capsys, 2, tmp_path / "arm", "--urdf", urdf)
+
+
+@pytest.mark.parametrize(
+    ("mesh", "scale", "message"),
+    [
+        ("claw.obj", "1000 1000 1000", "link 'claw': its collision geometry is 60 m large, the arm 1.02 m"),
+        ("wedge.stl", "1 1 1", "link 'fore': its collision geometry is 250 m large, the arm 1.02 m"),
+    ],
+)
+def test_meshes_in_millimetres_are_refused_with_a_remedy(tmp_path, capsys, mesh, scale, message):
+    urdf = write_crane(tmp_path)
+    text = re.sub(rf'{mesh}"( scale="[^"]*")?', f'{mesh}" scale="{scale}"', urdf.read_text())
+    urdf.write_text(text)
+    said = refused(capsys, 2, tmp_path / "arm", "--urdf", urdf, "--tip", "hand")
+    assert message in said
+    assert 'write scale="0.001 0.001 0.001" in the <mesh> of a file in mm' in said
+
+
+def test_meshes_that_are_tiny_are_refused_with_a_remedy(tmp_path, capsys):
+    tiny = {link: [] for link in LINKS} | {
+        "claw": ['<geometry><mesh filename="meshes/claw.obj" scale="1e-3 1e-3 1e-3"/></geometry>']
+    }
+    urdf = write_crane(tmp_path, tiny)
+    said = refused(capsys, 2, tmp_path / "arm", "--urdf", urdf, "--tip", "hand")
+    assert re.search(r"no moving link is larger than 6e-05 m, where the arm is 1.02 m long; remove the scale", said)
 
 
 def test_without_masses_and_shapes_their_constraints_are_left_out(tmp_path):
@@ -276,6 +446,7 @@ def test_a_tip_that_reaches_no_box_is_refused(tmp_path, capsys):
     urdf = write_arm(tmp_path / "arm.urdf", pan_tilt)
     said = refused(capsys, 2, tmp_path / "arm", "--urdf", urdf)
     assert "the tip reaches less than 2 % of every box of positions near" in said
+    assert load_problem(tmp_path / "arm" / "problem.toml").name == "arm"  # the problem is written none the less
 
 
 def test_an_arm_of_one_joint_is_looked_at_like_any_other(tmp_path, capsys):

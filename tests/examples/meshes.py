@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from cnpgen.plans import Plans
 from cnpgen.problems.problem import Problem
+from cnpgen.robots.chain import LINK_SUFFIX, name_links_uniquely
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot import Robot
 from tests.examples.obstacles import coal_obstacle
@@ -30,10 +31,13 @@ class Meshes:
         text = re.sub(r'filename="(?!package:|/)', beside, problem.urdf_path.read_text())
         full = pin.buildModelFromXML(text)
         geometry = pin.buildGeomFromUrdfString(full, text, pin.COLLISION, package_dirs=[str(packages)])
+        name_links_uniquely(full)
         locked = [full.getJointId(name) for name in full.names[1:] if name not in robot.joint_names]
         self.model, (self.geometry,) = pin.buildReducedModel(full, [geometry], locked, pin.neutral(full))
         objects = self.geometry.geometryObjects  # places of memory that are given up when objects are added
-        links = [(each.parentJoint, self.model.frames[each.parentFrame].name) for each in objects]
+        links = [
+            (each.parentJoint, self.model.frames[each.parentFrame].name.removesuffix(LINK_SUFFIX)) for each in objects
+        ]
         moving = [i for i, (joint, _) in enumerate(links) if joint > 0]
         moving += [] if problem.object is None else [self._hold(problem)]
         for obstacle in problem.obstacle:
@@ -65,13 +69,17 @@ class Meshes:
 
     def distances(self, q: np.ndarray) -> tuple[float, float]:
         """The smallest distance from obstacles, and between links, at a state [m]."""
-        pin.computeDistances(self.model, self.data, self.geometry, self.results, q)
+        pin.computeDistances(self.model, self.data, self.geometry, self.results, self._state(q))
         found = [result.min_distance for result in self.results.distanceResults]
         return min(found[: self.with_obstacles], default=np.inf), min(found[self.with_obstacles :], default=np.inf)
 
     def touches(self, q: np.ndarray) -> bool:
         """Return whether any pair collides at a state."""
-        return bool(pin.computeCollisions(self.model, self.data, self.geometry, self.results, q, True))
+        return bool(pin.computeCollisions(self.model, self.data, self.geometry, self.results, self._state(q), True))
+
+    def _state(self, q: np.ndarray) -> np.ndarray:
+        """Return joint positions as Pinocchio's, which are cosine and sine for continuous joints."""
+        return np.asarray(pin.integrate(self.model, pin.neutral(self.model), q))
 
 
 def states(plans: Plans, index: int, step: float = 1e-3) -> np.ndarray:

@@ -4,6 +4,10 @@ import struct
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import ConvexHull
+
+from cnpgen.problems.problem import Problem
+from cnpgen.problems.problem_file import load_problem
 
 _LYING = 'rpy="0 1.5707963267948966 0"'  # along x
 _WEDGE = '<mesh filename="package://crane/meshes/wedge.stl" scale="0.001 0.001 0.001"/>'
@@ -177,3 +181,38 @@ def write_pipeline(
     file = folder / "pipeline.toml"
     file.write_text(_PIPELINE.format(name=name, start=start, goal=goal, guess=guess, collision=collision, stop=stop))
     return file
+
+
+# A channel along x: a floor and two walls [m], lowest and highest corners.
+BOXES = np.array(
+    [
+        [[0, -0.05, 0], [0.3, 0.05, 0.01]],
+        [[0, -0.05, 0.01], [0.3, -0.04, 0.08]],
+        [[0, 0.04, 0.01], [0.3, 0.05, 0.08]],
+    ]
+)
+
+
+def box(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """The triangles of a box, shape (12, 3, 3), facing outwards."""
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * (high - low) + low
+    hull = ConvexHull(corners)
+    inwards = np.linalg.det(corners[hull.simplices] - (low + high) / 2) < 0
+    sides = np.where(inwards[:, None], hull.simplices[:, ::-1], hull.simplices)
+    return corners[sides]
+
+
+CHANNEL = np.concatenate([box(*each) for each in BOXES])
+
+
+def arm_of_channels(folder: Path, robot: str = "") -> Problem:
+    """Write the arm without obstacles; its forearm is an open channel, which its hull fills."""
+    file = write_problem(folder, robot=robot, obstacles="")
+    corners = (CHANNEL * [1.5, 4, 4] - [0.1, 0, 0.1]).reshape(-1, 3)
+    sides = [(k, k + 1, k + 2) for k in range(0, len(corners), 3)]
+    (folder / "crane" / "channel.stl").write_bytes(stl(corners, sides))
+    urdf = folder / "crane" / "crane.urdf"
+    wedge = 'package://crane/meshes/wedge.stl" scale="0.001 0.001 0.001"'
+    urdf.write_text(urdf.read_text().replace(wedge, 'channel.stl"'))
+    file.write_text(file.read_text().replace('use = "robot-clearance"', 'use = "joint-velocity"'))
+    return load_problem(file)

@@ -85,6 +85,19 @@ def pair_at(heavy: PreparedPipeline, change: Callable[[CandidateBatch], None]) -
     return again
 
 
+def test_without_a_held_object_coal_agrees_with_the_segment_test(heavy):
+    problem = replace(heavy.context.problem, object=None, constraint=(heavy.context.constraint(RobotClearance),))
+    context, kept = replace(heavy.context, problem=problem), []
+    for judge in ("coal", "segments"):
+        candidates = run_stages(heavy, 1500, seed=96, until="StartIK")
+        for end in ("start", "goal"):  # without an object, the pedestals would end at the tip
+            candidates[f"{end}_xyz"] = candidates[f"{end}_xyz"] - [[0.0], [0.0], [0.15]]
+        Collision(end="start", judge=judge).prepare(context)(candidates, random_generator(0, "train", 0))
+        kept.append(np.isin(np.arange(1500), candidates.alive))
+    assert (kept[0] == kept[1]).mean() > 0.999  # Coal's capsules have its usual tolerance
+    assert 0.05 < kept[0].mean() < 0.95
+
+
 def test_an_object_that_stands_on_its_pedestal_is_no_collision(heavy):
     candidates = pair_at(heavy, lambda _: None)
     assert len(candidates.alive) == candidates.size > 20

@@ -100,10 +100,11 @@ def test_a_robot_without_a_shape_needs_no_narrow_phase(prepare: Prepare):
     assert narrow_phase_of(prepare("heavy-object").context, "start") is None
 
 
-def test_the_collision_stage_keeps_states_without_collision_of_convex_parts(context, drawn):
+@pytest.mark.parametrize("judge", ["segments", "coal"])  # the arm holds nothing
+def test_the_collision_stage_keeps_states_without_collision_of_convex_parts(context, drawn, judge):
     candidates = CandidateBatch(drawn.shape[1])
     candidates["start_q"], candidates["start_xyz"], candidates["goal_xyz"] = drawn, drawn[:3], drawn[:3]
-    Collision(end="start", judge="segments").prepare(context)(candidates, random_generator(0, "train", 0))
+    Collision(end="start", judge=judge).prepare(context)(candidates, random_generator(0, "train", 0))
     distance = measured(context, drawn)[0]
     sure = np.abs(distance) > 5e-4  # Coal's answer with its usual tolerance is not exact
     kept = np.isin(np.arange(drawn.shape[1]), candidates.alive)

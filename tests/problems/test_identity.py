@@ -23,8 +23,8 @@ from tests.examples.constraints import TipSpeed
 from tests.examples.models import untrained_model
 
 SHIPPED = {name: load_problem(name) for name in ("airhockey", "heavy-object")}
-# What it is called, where files lie and how they are read: what is in them counts.
-LABELS = {"title", "robot.urdf", "robot.srdf", "robot.convex_parts"}
+# Names, locations of files, how they are read and what was measured: only their content counts.
+LABELS = {"title", "robot.urdf", "robot.srdf", "robot.convex_parts", "robot.hull_gap"}
 
 
 PROBLEMS = {

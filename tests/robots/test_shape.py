@@ -8,6 +8,7 @@ from pathlib import Path
 import coal
 import numpy as np
 import pytest
+from scipy.spatial import ConvexHull, KDTree
 
 from cnpgen.errors import RecipeError
 from cnpgen.problems.load_robot import load_robot
@@ -18,12 +19,25 @@ from cnpgen.robots.shape import link_pairs as pairs
 from cnpgen.robots.shape import shape as module
 from cnpgen.robots.shape.capsule import covering_capsule
 from cnpgen.robots.shape.convex_part import PRISM_SIDES, ConvexPart, link_convex_parts
-from cnpgen.robots.shape.hull import coal_hull, hull_corners
-from cnpgen.robots.shape.inline import with_inline_meshes
+from cnpgen.robots.shape.hull import coal_hull, enclosing_hull, hull_corners
+from cnpgen.robots.shape.inline import corners_of, inline_mesh, with_inline_meshes
 from cnpgen.robots.shape.mesh_files import find_named_file
 from cnpgen.robots.shape.shape import Shape, load_shape
 from cnpgen.robots.shape.srdf import disabled_pairs, with_disabled_pairs
-from tests.examples.shaped_robot import CLAW, LINKS, PLANNED, WEDGE, urdf, write_crane, write_problem
+from tests.examples.shaped_robot import CLAW, LINKS, PLANNED, WEDGE, stl, urdf, write_crane, write_problem
+
+DAE = """<?xml version="1.0"?>
+<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+<asset><unit meter="0.0254" name="inch"/></asset>
+<library_geometries><geometry id="g"><mesh>
+<source id="p"><float_array id="a" count="12">0 0 0 1 0 0 0 2 0 0 0 3</float_array>
+<technique_common><accessor source="#a" count="4" stride="3"><param name="X" type="float"/>
+<param name="Y" type="float"/><param name="Z" type="float"/></accessor></technique_common></source>
+<vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
+<triangles count="4"><input semantic="VERTEX" source="#v" offset="0"/><p>0 2 1 0 1 3 0 3 2 1 2 3</p></triangles>
+</mesh></geometry></library_geometries>
+<library_visual_scenes><visual_scene id="s"><node id="n"><instance_geometry url="#g"/></node></visual_scene>
+</library_visual_scenes><scene><instance_visual_scene url="#s"/></scene></COLLADA>"""
 
 
 def load(file: Path, keep: Path) -> Shape:
@@ -61,6 +75,17 @@ def test_a_mesh_is_found_in_any_of_the_places(tmp_path, monkeypatch, place):
     mesh.touch()
     file = tmp_path / "arm" / "urdf" / "arm.urdf"
     assert find_named_file("package://meshes/hand/palm.stl", file, [tmp_path / "named"]) == mesh
+
+
+def test_a_package_whose_folder_has_another_name_is_found_around_the_urdf(tmp_path):
+    mesh = tmp_path / "renamed" / "meshes" / "palm.stl"
+    mesh.parent.mkdir(parents=True)
+    mesh.touch()
+    name = "package://arm_description/meshes/palm.stl"
+    for place in ("arm.urdf", "urdf/arm.urdf", "urdf/left/arm.urdf"):
+        assert find_named_file(name, tmp_path / "renamed" / place) == mesh
+    with pytest.raises(RecipeError, match="missing; looked for at"):
+        find_named_file(name, tmp_path / "renamed" / "a" / "b" / "c" / "arm.urdf")
 
 
 def test_addresses_of_files_and_relative_paths_are_read_and_others_refused(tmp_path):
@@ -142,11 +167,32 @@ def test_only_meshes_of_a_bounded_size_are_given_to_their_reader(tmp_path, monke
         with_inline_meshes(text, file)
 
 
-def test_a_mesh_too_fine_to_be_worked_with_is_refused(tmp_path, monkeypatch):
-    file = write_crane(tmp_path)
-    monkeypatch.setattr("cnpgen.robots.shape.inline.MAX_CORNERS", 5)
-    with pytest.raises(RecipeError, match=r"wedge.stl: the mesh's hull has 6 corners, expected at most 5: simplify"):
-        with_inline_meshes(file.read_text(), file)
+def test_a_mesh_too_fine_is_replaced_by_a_body_that_contains_it(tmp_path):
+    fine = np.random.default_rng(1).normal(size=(12_000, 3))
+    fine *= [[0.05, 0.03, 0.1]] / np.linalg.norm(fine, axis=1, keepdims=True)
+    assert len(ConvexHull(fine).vertices) > 10_000
+    (tmp_path / "fine.stl").write_bytes(stl(fine, [tuple(side) for side in ConvexHull(fine).simplices.tolist()]))
+    with pytest.warns(RuntimeWarning, match=r"fine.stl: a hull of the mesh has 12,000 corners.* at most 0.\d+ mm"):
+        corners = corners_of(inline_mesh(tmp_path / "fine.stl", np.ones(3)))
+    equations = ConvexHull(corners).equations
+    assert (fine @ equations[:, :3].T + equations[:, 3]).max() < 1e-8  # STL has numbers of 32 bits
+    assert len(corners) <= 4_000
+    body, bound = enclosing_hull(fine)
+    distance = np.linalg.norm(body - fine[KDTree(fine).query(body)[1]], axis=1).max()
+    assert np.linalg.norm(body / [0.05, 0.03, 0.1], axis=1).max() - 1 < 3e-3
+    assert 0 < bound < min(distance, 3e-4)
+
+
+def test_flat_meshes_and_units_of_dae_files_are_reported(tmp_path):
+    square = np.array([[0, 0, 0], [1, 0, 0.3], [0, 1, 0.1], [1, 1, 0.4]])
+    (tmp_path / "flat.stl").write_bytes(stl(square, [(0, 1, 2), (1, 3, 2)]))
+    with pytest.warns(RuntimeWarning, match=r"flat.stl: the mesh is flat, and a body of 0.002 mm replaces it"):
+        inline_mesh(tmp_path / "flat.stl", np.ones(3))
+    (tmp_path / "inches.dae").write_text(DAE)
+    with pytest.warns(RuntimeWarning, match=r'unit of 0.0254 m, which is ignored.* write scale="0.0254 0.0254 0.0254"'):
+        corners = corners_of(inline_mesh(tmp_path / "inches.dae", np.ones(3)))
+    assert corners.max() == 3.0
+    inline_mesh(tmp_path / "inches.dae", np.full(3, 0.0254))  # no warning
 
 
 @pytest.mark.parametrize(

@@ -154,3 +154,21 @@ def test_a_tree_as_deep_as_robots_are_is_read() -> None:
     inside = "<x>" * (MAX_DEPTH - 1) + "</x>" * (MAX_DEPTH - 1)
     assert urdf_tree(f"<robot>{inside}</robot>").tag == "robot"
     assert pin.buildModelFromXML(chain(1000 - 1)).nframes == 2 * 999 + 2
+
+
+GAZEBO = '<gazebo reference="l1"><sensor:camera name="rgb"/></gazebo>'
+
+
+def test_undeclared_prefixes_are_read_as_pinocchio_reads_them(tmp_path: Path) -> None:
+    text = shipped_with(("</robot>", f"{GAZEBO}</robot>"))
+    assert [element.tag for element in urdf_tree(text).iter("gazebo")] == ["gazebo"]
+    assert record_problem(load(problem_with(tmp_path, text))).urdf == text
+    deep = "<x>" * MAX_DEPTH + "</x>" * MAX_DEPTH
+    for wrong, message in (
+        (f"<robot>{GAZEBO}{deep}</robot>", "nested elements"),
+        (f'<!DOCTYPE robot [<!ENTITY a "b">]><robot>{GAZEBO}&a;</robot>', "document type"),
+        (f"<robot>{GAZEBO}", "it is not XML: no element found"),
+        (f'<robot>{GAZEBO}<link name="a&#10;b"/></robot>', "control characters"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            urdf_tree(wrong)

@@ -154,6 +154,9 @@ def _joint(urdf: Path, joint: ElementTree.Element) -> ArmJoint:
     """Read a joint, and fill in missing limits."""
     limit, kind = joint.find("limit"), joint.get("type", "")
     lower, upper, velocity, effort = (_number(urdf, limit, key) for key in ("lower", "upper", "velocity", "effort"))
+    if lower > upper and kind in ("revolute", "prismatic"):
+        text = f"its limits lower={lower:g} and upper={upper:g} are swapped: exchange them"
+        raise RecipeError([f"{urdf}: joint {joint.get('name', '')!r}: {text}"])
     missing = {"position": kind == "continuous" or not lower < upper, "velocity": velocity <= 0, "torque": effort <= 0}
     half = DEFAULT_RANGE_M if kind == "prismatic" else DEFAULT_RANGE_RAD
     return ArmJoint(

@@ -1,5 +1,6 @@
 """The workspace of an arm: a base configuration in front of it, and two boxes of reachable positions."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from cnpgen.problems.constraints.joint import JointTorque
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
+from cnpgen.robots.shape.link_pairs import LinkContact, body_of_part, joint_poses
 from cnpgen.schema.keys import Range
 from cnpgen.world.world import World
 
@@ -22,25 +24,26 @@ Array = NDArray[np.float64]
 BASE_CANDIDATES = 4000  # random states; the base configuration is one of them
 LIMIT_SHARE = 0.1  # share of a joint's range at either end that is left out
 MAX_LOAD = 0.7  # share of the torque limits that the base configuration may use at rest
-MIN_LINK_CLEARANCE_M = 5e-3  # between links at the base configuration
+MIN_LINK_CLEARANCE_M = 5e-3  # between links at the base configuration, if a state has it
+MAX_CLEARANCE_CHECKS = 500  # free states whose clearance is measured
 BOX_SIZES = (0.3, 0.22, 0.16, 0.11, 0.08, 0.05)  # edge of the boxes / reach, the largest first
+MIN_BOX_DISTANCE = 0.15  # distance of the boxes / reach, so that no task is trivial
 GOOD_YIELD = 0.5  # share of accepted candidates at which the search for a box ends
 MIN_YIELD = 0.02  # share below which no box is usable
 YIELD_ROWS = 512  # samples that measure the share
+ROUNDING_M = 1e-3  # of the corners of boxes
 MIN_TIP_TRAVEL_M = 1e-6  # a tip that moves less along an axis does not move along it
 
 
-def comfortable_base(problem: Problem, robot: Robot) -> tuple[float, ...]:
+def comfortable_base(problem: Problem, robot: Robot) -> tuple[tuple[float, ...], tuple[str, ...]]:
     """Find a configuration with the tip in front of the robot, far from its limits and with high manipulability.
 
     Random states with the tip ahead along x and above the ground are preferred. The best one has the largest product of
-    the singular values of the tip's Jacobian and the distance from the nearest limit.
+    the singular values of the tip's Jacobian and the distance from the nearest limit. If no state is free of collisions
+    and within the torque limits, the best of the others is returned.
 
     Returns:
-        Joint positions [rad], rounded.
-
-    Raises:
-        RecipeError: In all states links collide, or gravity needs too much torque.
+        Joint positions [rad], rounded, and notes about conditions that it does not meet.
     """
     world, states = World(robot), _states(robot)
     tips, values, load = _measure_states(world, states)
@@ -52,12 +55,18 @@ def comfortable_base(problem: Problem, robot: Robot) -> tuple[float, ...]:
     score = values[:, moves].prod(axis=1) * margin
     ahead = tips - robot.chain.joints[0].translation
     front = (ahead[:, 0] > 0) & (np.abs(ahead[:, 1]) <= 0.2 * ahead[:, 0]) & (tips[:, 2] >= 0)
-    for group in (front, np.ones(len(states), bool)):
-        for k in sorted(np.flatnonzero(group & (load <= MAX_LOAD)), key=lambda k: -score[k]):
-            if _is_free(world, states[k]):
-                return tuple(states[k].tolist())
-    text = f"in all of {BASE_CANDIDATES:,} random states links collide or gravity needs too much torque"
-    raise RecipeError([f"{robot.urdf}: {text}"])
+    free, order = _free_states(robot, states), np.argsort(-score, kind="stable")
+    groups = [front & (load <= MAX_LOAD), load <= MAX_LOAD, load <= 1, np.ones(len(states), bool)]
+    for group in groups[:3]:
+        for k in order[(group & free)[order]][:MAX_CLEARANCE_CHECKS]:
+            if _clearance(world, states[k]) > MIN_LINK_CLEARANCE_M:
+                return tuple(states[k].tolist()), ()
+    notes: tuple[str, ...] = ()
+    if not (groups[2] & free).any():
+        text = f"in all of {BASE_CANDIDATES:,} random states links collide or gravity needs too much torque"
+        notes = (f"{text}: choose the base configuration by hand",)
+    best = next(group for group in [*(group & free for group in groups[:3]), *groups] if group.any())
+    return tuple(states[order[best[order]][0]].tolist()), notes
 
 
 def _states(robot: Robot) -> Array:
@@ -77,13 +86,25 @@ def _measure_states(world: World, states: Array) -> tuple[Array, Array, Array]:
     return np.array(tips), np.array(values), np.array(load)
 
 
-def _is_free(world: World, q: Array) -> bool:
-    """Return whether the links keep their clearance at a state."""
+def _free_states(robot: Robot, states: Array) -> NDArray[np.bool_]:
+    """Return a mask of the states without collisions of links, shape (N,)."""
+    free, shape = np.ones(len(states), bool), robot.shape
+    if shape is not None:
+        poses = joint_poses(robot.model, states)
+        contact = LinkContact(poses, map(body_of_part, shape.convex_parts), shape.joints)
+        for pair in shape.pairs:
+            if not pair.left_out:
+                free &= ~contact.of(pair.first, pair.second, among=free)
+    return free
+
+
+def _clearance(world: World, q: Array) -> float:
+    """Return the minimum distance of the links at a state [m]."""
     if world.robot.shape is None:
-        return True
+        return np.inf
     still = np.zeros(world.robot.n)
     world.set_state(q, still, still, np.zeros(0))
-    return min(world.self_distances(), default=np.inf) > MIN_LINK_CLEARANCE_M
+    return min(world.self_distances(), default=np.inf)
 
 
 def find_boxes(pipeline: Pipeline) -> tuple[Pipeline, float]:
@@ -109,7 +130,8 @@ def find_boxes(pipeline: Pipeline) -> tuple[Pipeline, float]:
     moves = np.ptp(tips, axis=0) > MIN_TIP_TRAVEL_M
     found: list[tuple[float, Pipeline]] = []
     for size in BOX_SIZES:
-        candidate = replace(pipeline, stage=(_boxes(centre, size * reach, moves), *pipeline.stage[1:]))
+        boxes = _boxes(centre, size * reach, moves, MIN_BOX_DISTANCE * reach)
+        candidate = replace(pipeline, stage=(boxes, *pipeline.stage[1:]))
         found.append((_accepted(candidate), candidate))
         if found[-1][0] >= GOOD_YIELD:
             break
@@ -121,10 +143,17 @@ def find_boxes(pipeline: Pipeline) -> tuple[Pipeline, float]:
     return best, share
 
 
-def _boxes(centre: Array, edge: float, moves: NDArray[np.bool_]) -> DrawPositions:
-    """Return two boxes side by side, along y if the tip moves along it; flat along axes along which it does not."""
+def _boxes(centre: Array, edge: float, moves: NDArray[np.bool_], distance: float) -> DrawPositions:
+    """Return two boxes side by side, along y if the tip moves along it; flat along axes along which it does not.
+
+    Args:
+        centre: Midpoint between the boxes [m], shape (3,).
+        edge: Edge of the boxes [m].
+        moves: Mask of the axes along which the tip moves, shape (3,).
+        distance: Distance between the boxes [m].
+    """
     aside = next((axis for axis in (1, 2, 0) if moves[axis]), 1)
-    shift = np.where(np.arange(3) == aside, 0.75 * edge, 0.0)
+    shift = np.where(np.arange(3) == aside, (edge + distance) / 2 + ROUNDING_M, 0.0)
 
     def box(position: Array) -> tuple[Range, Range, Range]:
         x, y, z = (
@@ -133,7 +162,9 @@ def _boxes(centre: Array, edge: float, moves: NDArray[np.bool_]) -> DrawPosition
         )
         return x, y, z
 
-    return DrawPositions(start=box(centre - shift), goal=box(centre + shift))
+    horizontal = aside < 2
+    floor = math.floor(1e3 * distance) / 1e3
+    return DrawPositions(start=box(centre - shift), goal=box(centre + shift), min_distance=floor if horizontal else 0.0)
 
 
 def _accepted(pipeline: Pipeline) -> float:

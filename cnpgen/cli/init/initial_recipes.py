@@ -1,13 +1,19 @@
 """Problem, pipeline and dataset of an arm: from rest to rest between two boxes of positions, within its limits."""
 
 import math
-from dataclasses import replace
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cnpgen.cli.init.arm import Arm, ArmJoint, with_torques
-from cnpgen.cli.init.draws import comfortable_base, find_boxes
+from cnpgen.cli.init.draws import MAX_LOAD, comfortable_base, find_boxes
+from cnpgen.cli.init.link_overlaps import LinkOverlaps, resolve_overlaps
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.stages.boundary_motion import AtRest
@@ -20,46 +26,87 @@ from cnpgen.problems.constraints.joint import JointAcceleration, JointJerk, Join
 from cnpgen.problems.constraints.self_clearance import SelfClearance
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
+from cnpgen.robots.plausible_sizes import check_plausible_sizes
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.robot_spec import LimitSpec, RobotSpec
 from cnpgen.schema.keys import PerJoint, Range
 
+Array = NDArray[np.float64]
+
 GUESS_RANGE_RAD, GUESS_RANGE_M = 0.5, 0.1  # range of inverse kinematics guesses around the base configuration
 INITIAL_JERK_RATE = 100.0  # jerk limits per acceleration limit [1/s]; Franka Research 3: 500 ('cnpgen docs references')
+TORQUE_SCALE = 0.8  # planning limit / URDF limit of joint torques
+MIN_HOLDING_FRACTION = 0.25  # of the random states in which a joint's torque limit must suffice to hold the arm
 TORQUE_STATES = 1000  # random states that determine placeholders of missing torque limits
 
 
-def dataset_of(arm: Arm, name: str, folder: Path, packages: tuple[Path, ...]) -> tuple[DatasetRecipe, Arm, float]:
-    """Make the recipes of an arm.
+@dataclass(frozen=True)
+class InitialProblem:
+    """Problem of an arm, with findings about its input.
+
+    Attributes:
+        problem: The problem.
+        arm: The arm, with placeholders of missing limits.
+        overlaps: Convex parts and ignored pairs of its links; None without link geometry.
+        notes: Sentences about the input.
+    """
+
+    problem: Problem
+    arm: Arm
+    overlaps: LinkOverlaps | None
+    notes: tuple[str, ...]
+
+
+def problem_of(arm: Arm, name: str, folder: Path, packages: tuple[Path, ...], srdf: Path | None) -> InitialProblem:
+    """Make the problem of an arm.
 
     Args:
         arm: The arm.
-        name: Name of all three recipes.
-        folder: Folder of the recipes.
+        name: Name of the problem.
+        folder: Folder of the problem.
         packages: Folders that are searched for packages.
-
-    Returns:
-        The dataset with its pipeline and its problem, the arm with torques in the place of missing ones, and which
-        share of its draws was accepted.
+        srdf: SRDF file with disabled pairs of links.
 
     Raises:
-        RecipeError: The arm cannot be planned for, or no positions were found that it reaches.
+        RecipeError: The arm cannot be planned for.
     """
-    places = tuple(str(each.absolute()) for each in packages)
-    provisional = with_torques(arm, [1.0] * len(arm.planned))
-    robot = load_robot(_problem(provisional, name, folder, places))
-    arm = with_torques(arm, _torques(robot))
-    problem = _with_jerk_limits(_problem(arm, name, folder, places), robot)
+    problem = _problem(with_torques(arm, [1.0] * len(arm.planned)), name, folder, packages, srdf)
+    with _warnings_as_notes() as notes:
+        check_plausible_sizes(load_robot(problem))
+        overlaps = resolve_overlaps(problem) if arm.has_shape else None
+        problem = overlaps.problem if overlaps else problem
+        robot = load_robot(problem)
+    notes += overlaps.notes if overlaps else ()
+    arm, overloaded = _with_torque_limits(arm, robot)
+    limits = replace(problem.limits, **_replaced_limits(arm))
+    problem = _with_jerk_limits(replace(problem, limits=limits), robot)
     if _has_masses(robot):
         limit = JointTorque(tolerance=5e-3, budget=6e-2)
         problem = replace(problem, constraint=(*problem.constraint[:4], limit, *problem.constraint[4:]))
-    base = comfortable_base(problem, load_robot(problem))
+    base, base_notes = comfortable_base(problem, load_robot(problem))
     problem = replace(problem, robot=replace(problem.robot, base=base))
+    return InitialProblem(problem, arm, overlaps, (*notes, *overloaded, *base_notes))
+
+
+def dataset_of(initial: InitialProblem, folder: Path) -> tuple[DatasetRecipe, float]:
+    """Make the pipeline and the dataset of a problem.
+
+    Args:
+        initial: The problem of an arm.
+        folder: Folder of the recipes.
+
+    Returns:
+        The dataset with its pipeline and its problem, and the share of accepted candidates.
+
+    Raises:
+        RecipeError: No positions were found that the arm reaches.
+    """
+    problem, name = initial.problem, initial.problem.name
     pipeline = Pipeline(
         name=name,
         title=f"From rest to rest: {name}",
         problem=problem,
-        stage=_stages(arm, problem),
+        stage=_stages(initial.arm, problem),
         path=folder / "pipeline.toml",
     )
     pipeline, share = find_boxes(pipeline)
@@ -71,12 +118,11 @@ def dataset_of(arm: Arm, name: str, folder: Path, packages: tuple[Path, ...]) ->
         splits=splits,
         path=folder / "dataset.toml",
     )
-    return dataset, arm, share
+    return dataset, share
 
 
-def _problem(arm: Arm, name: str, folder: Path, packages: tuple[str, ...]) -> Problem:
+def _problem(arm: Arm, name: str, folder: Path, packages: tuple[Path, ...], srdf: Path | None) -> Problem:
     """Return the problem without torques, with the base configuration at the centre of all limits."""
-    missing = {what for joint in arm.planned for what in joint.missing}
     centre = tuple((joint.lower + joint.upper) / 2 for joint in arm.planned)
     robot = RobotSpec(
         urdf=str(arm.urdf.absolute()),
@@ -84,15 +130,10 @@ def _problem(arm: Arm, name: str, folder: Path, packages: tuple[str, ...]) -> Pr
         tip=arm.tip,
         base=centre,
         geometry="urdf" if arm.has_shape else "paper-capsules",
-        packages=packages,
+        packages=tuple(str(each.absolute()) for each in packages),
+        srdf="" if srdf is None else str(srdf.absolute()),
     )
-    limits = LimitSpec(
-        velocity_scale=0.8,
-        torque_scale=0.8,
-        position=tuple(Range(each.lower, each.upper) for each in arm.planned) if "position" in missing else None,
-        velocity=PerJoint(tuple(each.velocity for each in arm.planned)) if "velocity" in missing else None,
-        torque=PerJoint(tuple(each.effort for each in arm.planned)) if "torque" in missing else None,
-    )
+    limits = LimitSpec(velocity_scale=0.8, torque_scale=TORQUE_SCALE, **_replaced_limits(arm))
     constraints: tuple[Constraint, ...] = (
         JointPosition(tolerance=1e-3),
         JointVelocity(tolerance=2e-3, budget=6e-3),
@@ -102,6 +143,43 @@ def _problem(arm: Arm, name: str, folder: Path, packages: tuple[str, ...]) -> Pr
         constraints = (*constraints, SelfClearance(tolerance=1e-3, budget=1e-6))
     path, title = folder / "problem.toml", f"Move {arm.urdf.stem} within its limits"
     return Problem(name=name, title=title, robot=robot, limits=limits, constraint=constraints, path=path.absolute())
+
+
+@contextmanager
+def _warnings_as_notes() -> Iterator[list[str]]:
+    """Collect the warnings of the block, such as those about simplified meshes, in a list without repetitions."""
+    notes: list[str] = []
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        yield notes
+    notes += dict.fromkeys(str(each.message) for each in caught)
+
+
+def _replaced_limits(arm: Arm) -> dict[str, Any]:
+    """Return the limits that the problem states in place of the URDF's."""
+    missing = {name for joint in arm.planned for name in joint.missing}
+    return {
+        "position": tuple(Range(each.lower, each.upper) for each in arm.planned) if "position" in missing else None,
+        "velocity": PerJoint(tuple(each.velocity for each in arm.planned)) if "velocity" in missing else None,
+        "torque": PerJoint(tuple(each.effort for each in arm.planned)) if "torque" in missing else None,
+    }
+
+
+def _with_torque_limits(arm: Arm, robot: Robot) -> tuple[Arm, list[str]]:
+    """Replace torque limits that are missing or below the torques that gravity needs; return notes about the latter."""
+    moving, at_rest = _torques(robot)
+    notes, planned = [], []
+    for joint, load in zip(arm.planned, np.quantile(at_rest, MIN_HOLDING_FRACTION, axis=0).tolist(), strict=True):
+        if 0 < MAX_LOAD * TORQUE_SCALE * joint.effort < load:
+            unit = "N" if joint.kind == "prismatic" else "N m"
+            text = f"{joint.name}: gravity needs {load:.4g} {unit}, where the URDF allows {joint.effort:g} {unit}"
+            notes.append(f"{text}; the placeholder of a missing limit replaces it in [limits]")
+            missing = tuple(dict.fromkeys((*joint.missing, "torque")))
+            planned.append(replace(joint, effort=0.0, missing=missing))
+        else:
+            planned.append(joint)
+    torques = [float(max(1, math.ceil(each))) for each in moving.max(axis=0)]
+    return with_torques(replace(arm, planned=tuple(planned)), torques), notes
 
 
 def _with_jerk_limits(problem: Problem, robot: Robot) -> Problem:
@@ -118,19 +196,19 @@ def _has_masses(robot: Robot) -> bool:
     return robot.chain.joints[-1].mass > 0
 
 
-def _torques(robot: Robot) -> list[float]:
-    """Return the largest torques [N m] at random states, at speeds and accelerations within the limits."""
+def _torques(robot: Robot) -> tuple[Array, Array]:
+    """Return absolute torques [N m] at random states within the limits, in motion and at rest, both of shape (K, n)."""
     import pinocchio as pin
 
     model, random = robot.model, np.random.default_rng(0)
-    data = model.createData()
+    data, still = model.createData(), np.zeros(robot.n)
     q = random.uniform(robot.position_lower, robot.position_upper, (TORQUE_STATES, robot.n))
     dq, ddq = (
         random.uniform(-limit, limit, (TORQUE_STATES, robot.n))
         for limit in (robot.velocity_limit, robot.acceleration_limit)
     )
-    most = np.abs([pin.rnea(model, data, *state) for state in zip(q, dq, ddq, strict=True)]).max(axis=0)
-    return [float(max(1, math.ceil(each))) for each in most]
+    moving = [pin.rnea(model, data, *state) for state in zip(q, dq, ddq, strict=True)]
+    return np.abs(moving), np.abs([pin.rnea(model, data, each, still, still) for each in q])
 
 
 def _stages(arm: Arm, problem: Problem) -> tuple[Stage, ...]:

@@ -3,12 +3,14 @@
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from textwrap import wrap
 from typing import Any
 
 from cnpgen.cli.describe import table, with_units
 from cnpgen.cli.init.arm import DEFAULT_RANGE_M, DEFAULT_RANGE_RAD, DEFAULT_SPEED, Arm
-from cnpgen.cli.init.initial_recipes import INITIAL_JERK_RATE, TORQUE_STATES
-from cnpgen.cli.init.text import recipe_text
+from cnpgen.cli.init.initial_recipes import INITIAL_JERK_RATE, TORQUE_STATES, InitialProblem
+from cnpgen.cli.init.link_overlaps import MAX_PAIR_GAP, LinkOverlaps
+from cnpgen.cli.init.text import RECIPE_LINE_WIDTH, recipe_text
 from cnpgen.cli.shape_rows import link_rows, pair_rows
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.problems.load_robot import load_robot
@@ -22,33 +24,42 @@ _KEYS = "Every key is explained above it; one that is left out stands there as a
 _WHERE = "constraints and stages: 'cnpgen show --keys'."
 
 
-def texts_of(recipe: DatasetRecipe, arm: Arm, share: float, folder: Path) -> dict[str, str]:
-    """Write the recipes of an arm.
+def problem_text(initial: InitialProblem, folder: Path) -> str:
+    """Write the problem of an arm.
 
     Args:
-        recipe: The dataset, with its pipeline and its problem.
-        arm: The arm.
-        share: Which share of draws is accepted.
-        folder: The folder that the files are for.
+        initial: The problem, with findings about the arm.
+        folder: Folder of the file.
+    """
+    problem, arm = initial.problem, initial.arm
+    places: dict[str, Any] = {"robot.urdf": _from(folder, problem.robot.urdf)}
+    places["robot.packages"] = tuple(_from(folder, each) for each in problem.robot.packages)
+    if problem.robot.srdf:
+        places["robot.srdf"] = _from(folder, problem.robot.srdf)
+    head = [*_head(f"What a valid motion of {arm.urdf.name} is."), "#", *_about(initial, load_robot(problem))]
+    return "\n".join([*head, "", recipe_text(problem, places, _notes(arm))])
+
+
+def sampling_texts(recipe: DatasetRecipe, share: float) -> dict[str, str]:
+    """Write the pipeline and the dataset of an arm.
+
+    Args:
+        recipe: The dataset, with its pipeline.
+        share: Share of accepted candidates.
 
     Returns:
         Name of the file -> its text.
     """
-    problem = recipe.pipeline.problem
-    places: dict[str, Any] = {"robot.urdf": _from(folder, problem.robot.urdf)}
-    places["robot.packages"] = tuple(_from(folder, each) for each in problem.robot.packages)
-    draws = {
+    comments = {
         "stage.0.start": f"Found by sampling: of the draws {100 * share:.0f} % become samples.",
         "stage.1.guess": "About the base configuration of the problem.",
     }
     heads = {
-        FILES[0]: [*_head(f"What a valid motion of {arm.urdf.name} is."), "#", *_about(arm, load_robot(problem))],
         FILES[1]: _head("How starts and goals are drawn: positions, and joint angles that reach them."),
         FILES[2]: _head("How many samples there are, from which seed, split how."),
     }
     texts = (
-        recipe_text(problem, places, _notes(arm)),
-        recipe_text(recipe.pipeline, {"problem": FILES[0]}, draws),
+        recipe_text(recipe.pipeline, {"problem": FILES[0]}, comments),
         recipe_text(recipe, {"pipeline": FILES[1]}, {}),
     )
     return {name: "\n".join([*head, "", text]) for (name, head), text in zip(heads.items(), texts, strict=True)}
@@ -78,8 +89,9 @@ def _notes(arm: Arm) -> Mapping[str, str]:
     return notes
 
 
-def _about(arm: Arm, robot: Robot) -> Iterator[str]:
+def _about(initial: InitialProblem, robot: Robot) -> Iterator[str]:
     """Say what was found out about an arm."""
+    arm = initial.arm
     yield f"# What was found in {arm.urdf.name}"
     yield "#"
     yield from table(list(_joint_rows(arm)), indent="#   ", right=(2, 3, 4))
@@ -95,11 +107,28 @@ def _about(arm: Arm, robot: Robot) -> Iterator[str]:
     if robot.shape is None:
         facts += [("shape", "no link that moves has a <collision> element, so that 'self-clearance' is left out")]
     yield from table(facts, indent="#   ")
+    for note in initial.notes:
+        yield from ("#", *wrap(note, RECIPE_LINE_WIDTH, initial_indent="#   - ", subsequent_indent="#     "))
     if robot.shape is not None:
         yield from ("#", "#   Links: capsules round them are for solvers, judges look at the pieces", "#")
         yield from table(link_rows(robot.shape), indent="#   ", right=range(1, 6))
         yield from ("#", "#   Pairs of links, by random states", "#")
         yield from table(pair_rows(robot.shape), indent="#   ", right=(2, 3))
+    if initial.overlaps and (rows := _gap_rows(initial.overlaps)):
+        yield from ("#", "#   Links that overlap by their convex hulls or parts, but not by their meshes", "#")
+        yield from table(rows, indent="#   ", right=(2, 3, 4, 5))
+
+
+def _gap_rows(overlaps: LinkOverlaps) -> list[tuple[str, ...]]:
+    """List the pairs with a gap: shares of random states, and of those that all meshes accept."""
+    hulls = {(pair.first, pair.second): pair for pair in overlaps.hulls.pairs}
+    rows = [
+        (*pair, f"{hulls[pair].parts:.2%}", f"{after.parts:.2%}", f"{after.meshes:.2%}", f"{after.rejected:.2%}")
+        for after in overlaps.parts.pairs
+        if (pair := (after.first, after.second)) in hulls and hulls[pair].rejected > MAX_PAIR_GAP
+    ]
+    head = ("links", "", "hulls overlap", "parts overlap", "meshes overlap", "free states rejected")
+    return [head, *rows] if rows else []
 
 
 def _joint_rows(arm: Arm) -> Iterator[tuple[str, ...]]:

@@ -85,7 +85,7 @@ class Collision(Stage):
     def _by_convex_parts(self, context: Context, distance: float) -> StageFunction:
         kernel = context.kernels.load(capsule_clearance)
         with_object = self.judge == "coal"
-        depth = context.constraint(ObjectContact).depth if with_object else 0.0
+        depth = _contact_depth(context) if with_object else 0.0
         problem = context.problem if with_object else replace(context.problem, object=None)
         judge = coal_judge(problem, context.robot, distance, depth)
 
@@ -104,7 +104,7 @@ class Collision(Stage):
         return work
 
     def _by_coal(self, context: Context, radius: float) -> StageFunction:
-        depth = context.constraint(ObjectContact).depth
+        depth = _contact_depth(context)
         judge = coal_judge(context.problem, context.robot, radius, depth)
 
         def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
@@ -116,6 +116,11 @@ class Collision(Stage):
             candidates.reject(~hit.reshape(len(self._ends()), -1).any(0), "collision (Coal)")
 
         return work
+
+
+def _contact_depth(context: Context) -> float:
+    """Return the depth of legal contacts of the held object [m]; 0 if the problem has none."""
+    return 0.0 if context.problem.object is None else context.constraint(ObjectContact).depth
 
 
 def candidate_poses(problem: Problem, candidates: CandidateBatch) -> Array:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.robots.shape.convex_part import ConvexPart
-from cnpgen.robots.shape.hull import hull_corners
+from cnpgen.robots.shape.hull import half_sphere, hull_corners
 
 Array = NDArray[np.float64]
 
@@ -84,7 +84,7 @@ def _facets(corners: Array, thickness: Array) -> tuple[Array, Array]:
     """Return normals, shape (F, 3), and offsets [m] of the facets of a hull of balls around the corners."""
     from scipy.spatial import ConvexHull
 
-    half = _half_sphere(BALL_POINTS // 2)
+    half = half_sphere(BALL_POINTS // 2)
     directions = np.concatenate([half, -half])
     balls = [corner + size * directions for corner, size in zip(corners, thickness, strict=True) if size > 0]
     equations = ConvexHull(hull_corners(np.concatenate([corners, *balls]))).equations
@@ -94,14 +94,7 @@ def _facets(corners: Array, thickness: Array) -> tuple[Array, Array]:
 def _axes(corners: Array) -> Array:
     """Return the initial directions: principal axes, coordinate axes and 24 more, shape (30, 3)."""
     offsets = corners - corners.mean(axis=0)
-    return np.concatenate([np.linalg.eigh(offsets.T @ offsets)[1].T, np.eye(3), _half_sphere(24)])
-
-
-def _half_sphere(count: int) -> Array:
-    """Return unit vectors on a Fibonacci lattice over the upper half of the sphere, shape (count, 3)."""
-    z = (np.arange(count) + 0.5) / count
-    angle, level = np.arange(count) * np.pi * (3 - np.sqrt(5)), np.sqrt(1 - z**2)
-    return np.stack([level * np.cos(angle), level * np.sin(angle), z], axis=1)
+    return np.concatenate([np.linalg.eigh(offsets.T @ offsets)[1].T, np.eye(3), half_sphere(24)])
 
 
 def _along(axis: Array, corners: Array, thickness: Array) -> Array:

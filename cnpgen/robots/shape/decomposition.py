@@ -1,36 +1,76 @@
-"""Convex decomposition of a mesh: its triangles are assigned to the parts that CoACD finds.
+"""Convex decomposition of a mesh by planes: each cut reduces the total volume of the convex hulls most.
 
-CoACD (Wei et al. 2022, ACM Transactions on Graphics 41(4)) remeshes its input, so its parts miss points of the original
-mesh. Its parts therefore only group the triangles: each part is the convex hull of its triangles and contains them.
+A plane across an axis of the mesh cuts the triangles of a part in two, as in the search of CoACD (Wei et al. 2022, ACM
+Transactions on Graphics 41(4)), which chooses by concavity. A part is the convex hull of its triangles, so the parts
+together cover the mesh.
 """
 
 import hashlib
 import io
-import subprocess
-import sys
-import tempfile
 from collections.abc import Sequence
 from contextlib import suppress
-from importlib import metadata
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import MachineError, RecipeError, requires_extra
+from cnpgen.errors import MachineError
 from cnpgen.robots.shape.hull import hull_corners
 from cnpgen.store.files.atomic import write_file
 
 Array = NDArray[np.float64]
 
-MAX_CONVEX_VOLUME_RATIO = 1.05  # hull volume / mesh volume up to which the hull is used without decomposition
-MIN_VOLUME_REDUCTION = 0.95  # total volume of the parts / hull volume below which the decomposition is used
-MAX_TRIANGLE_OVERHANG_M = 5e-3  # a triangle that extends further out of every part is cut in two
-MAX_CUTS = 12  # per triangle
-COACD_TIMEOUT_S = 900.0  # CoACD takes about ten seconds for a link
-SEED = 1
-DECOMPOSITION_REVISION = 1  # of the assignment of triangles; cached parts of another revision are ignored
+CUTS_PER_AXIS = 9  # planes between both ends of a part along each axis that are tried, and as many at faces
+FACE_TOLERANCE_M = 1e-4  # of the coordinates of points on a face
+MIN_VOLUME_REDUCTION = 0.005  # by a cut, as a fraction of the hull volume of the mesh; smaller cuts are not made
+DECOMPOSITION_REVISION = 2  # of the decomposition; cached parts of another revision are ignored
+
+
+@dataclass(frozen=True)
+class TriangleMesh:
+    """Triangles of a mesh or of a part of it.
+
+    Attributes:
+        points: Points [m], shape (N, 3).
+        triangles: Triangles as indices of points, shape (T, 3).
+    """
+
+    points: Array
+    triangles: NDArray[np.int64]
+
+    @property
+    def used_points(self) -> Array:
+        """The points of the triangles [m], shape (M, 3)."""
+        used = np.zeros(len(self.points), bool)
+        used[self.triangles] = True
+        return self.points[used]
+
+    @property
+    def hull_volume(self) -> float:
+        """Volume of the convex hull [m^3]; 0 for coplanar triangles."""
+        from scipy.spatial import ConvexHull, QhullError
+
+        try:
+            return float(ConvexHull(self.used_points).volume)
+        except (QhullError, ValueError):
+            return 0.0
+
+
+@dataclass(frozen=True)
+class _Cut:
+    """Best cut of a part.
+
+    Attributes:
+        part: The part.
+        reduction: Volume by which the cut reduces the hulls [m^3]; 0 if no cut does.
+        halves: The triangles below and above the cut.
+    """
+
+    part: TriangleMesh
+    reduction: float = 0.0
+    halves: tuple[TriangleMesh, ...] = ()
 
 
 def convex_parts(points: Array, triangles: NDArray[np.int64], most: int, keep: Path | None) -> list[Array]:
@@ -40,28 +80,16 @@ def convex_parts(points: Array, triangles: NDArray[np.int64], most: int, keep: P
         points: Points of the mesh [m], shape (N, 3).
         triangles: Triangles as indices of points, shape (T, 3).
         most: Maximum number of parts.
-        keep: Cache folder, since a decomposition takes up to a minute; None for no cache.
+        keep: Cache folder, since a decomposition takes seconds; None for no cache.
 
     Returns:
-        Corners of each part [m], shape (V, 3); those of the hull if the parts are hardly smaller.
-
-    Raises:
-        MissingExtraError: CoACD is not installed.
-        RecipeError: CoACD cannot decompose the mesh.
+        Corners of each part [m], shape (V, 3); those of the hull if no cut reduces its volume.
     """
-    whole = hull_corners(points)
-    if _volume_of_hull(whole) <= MAX_CONVEX_VOLUME_RATIO * abs(np.linalg.det(points[triangles]).sum()) / 6:
-        return [whole]
-    points, same = np.unique(points, axis=0, return_inverse=True)  # STL repeats the points of every triangle
-    triangles = same.reshape(-1)[triangles]
-    name = f"parts-{_identity(points, triangles, most)}.npz"
-    kept = None if keep is None else keep / name
+    kept = None if keep is None else keep / f"parts-{_identity(points, triangles, most)}.npz"
     if kept is not None:
         with suppress(OSError, ValueError, KeyError):
             return _read(kept)
-    parts = assign_triangles(points[triangles], [hull_corners(part) for part in _run_coacd(points, triangles, most)])
-    if sum(map(_volume_of_hull, parts)) >= MIN_VOLUME_REDUCTION * _volume_of_hull(whole):
-        parts = [whole]
+    parts = [hull_corners(part.used_points) for part in cut_parts(TriangleMesh(points, triangles), most)]
     if kept is not None:
         with suppress(MachineError):
             write_file(kept, _written(parts))
@@ -70,68 +98,85 @@ def convex_parts(points: Array, triangles: NDArray[np.int64], most: int, keep: P
 
 def _identity(points: Array, triangles: NDArray[np.int64], most: int) -> str:
     """Return a digest of the inputs of a decomposition."""
-    with requires_extra("decompose", "CoACD (for robot.convex_parts)"):
-        version = metadata.version("coacd")
     numbers = b"".join(np.ascontiguousarray(each).tobytes() for each in (points, triangles.astype("<i8")))
-    about = f"{DECOMPOSITION_REVISION} {version} {most} {SEED} {len(points)} "
+    about = f"{DECOMPOSITION_REVISION} {most} {len(points)} "
     return hashlib.sha256(about.encode() + numbers).hexdigest()[:32]
 
 
-def assign_triangles(triangles: Array, parts: list[Array]) -> list[Array]:
-    """Assign triangles to the nearest parts and return the convex hulls, which together cover all triangles.
+def cut_parts(mesh: TriangleMesh, most: int) -> list[TriangleMesh]:
+    """Cut a mesh into parts whose convex hulls have a small total volume.
 
     Args:
-        triangles: Corners of the triangles [m], shape (T, 3, 3).
-        parts: Corners of the convex parts [m], shapes (V, 3).
+        mesh: The mesh.
+        most: Maximum number of parts.
 
     Returns:
-        Corners of the hulls [m] of parts with triangles.
+        The triangles of each part; triangles across a cut are cut, too.
     """
-    from scipy.spatial import ConvexHull
-
-    planes = [ConvexHull(part).equations for part in parts]
-    dealt: list[list[Array]] = [[] for _ in parts]
-    for cut in range(MAX_CUTS + 1):
-        if not len(triangles):
+    least = MIN_VOLUME_REDUCTION * mesh.hull_volume
+    cuts = [_best_cut(mesh)]
+    while len(cuts) < most:
+        best = max(range(len(cuts)), key=lambda index: cuts[index].reduction)
+        if cuts[best].reduction <= least:
             break
-        outside = np.array([(triangles @ each[:, :3].T + each[:, 3]).max(axis=(1, 2)) for each in planes])
-        done = (outside.min(axis=0) <= MAX_TRIANGLE_OVERHANG_M) | (cut == MAX_CUTS)
-        for part, mine in enumerate(outside.argmin(axis=0)[done] == np.arange(len(parts))[:, None]):
-            dealt[part].append(triangles[done][mine].reshape(-1, 3))
-        triangles = _cut_in_two(triangles[~done])
-    points = [np.concatenate(each) for each in dealt]
-    return [hull_corners(each) for each in points if len(each)]
+        cuts += map(_best_cut, cuts.pop(best).halves)
+    return [cut.part for cut in cuts]
 
 
-def _cut_in_two(triangles: Array) -> Array:
-    """Bisect triangles, shape (T, 3, 3), at the midpoint of their maximum side, shape (2 T, 3, 3)."""
-    side = np.linalg.norm(triangles - np.roll(triangles, -1, axis=1), axis=2).argmax(axis=1)
-    order = (side[:, None] + np.arange(3)) % 3
-    a, b, c = (np.take_along_axis(triangles, order[:, k, None, None], axis=1)[:, 0] for k in range(3))
-    midpoint = (a + b) / 2
-    return np.concatenate([np.stack([a, midpoint, c], axis=1), np.stack([midpoint, b, c], axis=1)])
+def _best_cut(part: TriangleMesh) -> _Cut:
+    best, volume, points = _Cut(part), part.hull_volume, part.used_points
+    for axis in range(3):
+        for position in _cut_positions(points[:, axis]):
+            halves = cut_mesh(part, axis, float(position))
+            reduction = volume - sum(half.hull_volume for half in halves)
+            if reduction > best.reduction:
+                best = _Cut(part, reduction, halves)
+    return best
 
 
-def _volume_of_hull(corners: Array) -> float:
-    from scipy.spatial import ConvexHull
+def _cut_positions(coordinates: Array) -> list[float]:
+    """Return positions of planes: evenly between both ends, and those of most points, such as faces across the axis.
 
-    return float(ConvexHull(corners).volume)
+    Args:
+        coordinates: Coordinates of the points along the axis [m], shape (N,).
+    """
+    low, high = float(coordinates.min()), float(coordinates.max())
+    even = np.linspace(low, high, CUTS_PER_AXIS + 2)[1:-1]
+    faces, counts = np.unique(np.round(coordinates / FACE_TOLERANCE_M), return_counts=True)
+    common = faces[np.argsort(-counts, kind="stable")[:CUTS_PER_AXIS]] * FACE_TOLERANCE_M
+    return sorted({float(position) for position in [*even, *common] if low < position < high})
 
 
-def _run_coacd(points: Array, triangles: NDArray[np.int64], most: int) -> list[Array]:
-    """Return the points of CoACD's parts [m]; CoACD runs in a separate process, since it conflicts with Pinocchio."""
-    with tempfile.TemporaryDirectory(prefix="cnpgen-") as folder:
-        mesh, answer = Path(folder) / "mesh.npz", Path(folder) / "parts.npz"
-        np.savez(mesh, points=points, triangles=triangles, most=most)
-        command = [sys.executable, "-m", "cnpgen.robots.shape.decomposition", str(mesh), str(answer)]
-        try:
-            done = subprocess.run(command, capture_output=True, text=True, timeout=COACD_TIMEOUT_S, check=False)
-            return _read(answer)
-        except subprocess.TimeoutExpired as error:
-            raise RecipeError([f"CoACD did not decompose a mesh in {COACD_TIMEOUT_S:g} s"]) from error
-        except (OSError, ValueError, KeyError) as error:
-            said = (done.stderr or done.stdout).strip().splitlines()[-1:]
-            raise RecipeError([f"CoACD cannot decompose a mesh: {' '.join(said)}"]) from error
+def cut_mesh(mesh: TriangleMesh, axis: int, position: float) -> tuple[TriangleMesh, TriangleMesh]:
+    """Cut a mesh by a plane across an axis.
+
+    Args:
+        mesh: The mesh.
+        axis: 0, 1 or 2 for x, y or z.
+        position: Position of the plane along the axis [m].
+
+    Returns:
+        The triangles below and above the plane, which together cover the mesh.
+    """
+    height = mesh.points[:, axis] - position
+    upper = height[mesh.triangles] > 0
+    crossing = upper.any(axis=1) & ~upper.all(axis=1)
+    is_tip_upper = upper[crossing].sum(axis=1) == 1
+    tip = np.where(is_tip_upper, upper[crossing].argmax(axis=1), upper[crossing].argmin(axis=1))  # alone on its side
+    order = (tip[:, None] + np.arange(3)) % 3
+    a, b, c = np.take_along_axis(mesh.triangles[crossing], order, axis=1).T
+    on_ab, on_ac = (
+        mesh.points[a] + (height[a] / (height[a] - height[end]))[:, None] * (mesh.points[end] - mesh.points[a])
+        for end in (b, c)
+    )
+    points, count = np.concatenate([mesh.points, on_ab, on_ac]), len(mesh.points)
+    ab, ac = count + np.arange(len(a)), count + len(a) + np.arange(len(a))
+    tips = np.stack([a, ab, ac], axis=1)
+    rests = np.concatenate([np.stack([ab, b, c], axis=1), np.stack([ab, c, ac], axis=1)])
+    is_rest_upper = np.tile(~is_tip_upper, 2)
+    below = np.concatenate([mesh.triangles[~upper.any(axis=1)], tips[~is_tip_upper], rests[~is_rest_upper]])
+    above = np.concatenate([mesh.triangles[upper.all(axis=1)], tips[is_tip_upper], rests[is_rest_upper]])
+    return TriangleMesh(points, below), TriangleMesh(points, above)
 
 
 def _written(parts: Sequence[Array]) -> bytes:
@@ -149,18 +194,3 @@ def _read(file: Path) -> list[Array]:
     if not parts or not all(np.isfinite(part).all() for part in parts):
         raise ValueError("no parts")
     return parts
-
-
-def _main(mesh: str, answer: str) -> None:
-    """Decompose the mesh of a file, in a process that imports only CoACD."""
-    import coacd
-
-    coacd.set_log_level("off")
-    with np.load(mesh) as content:
-        given = coacd.Mesh(content["points"], content["triangles"])
-        parts = coacd.run_coacd(given, max_convex_hull=int(content["most"]), seed=SEED)
-    Path(answer).write_bytes(_written([points for points, _ in parts]))
-
-
-if __name__ == "__main__":
-    _main(*sys.argv[1:])

@@ -18,6 +18,7 @@ MAX_PLANES = 24  # that approximate the faces of a hull
 SIMILAR_PLANES_COSINE = math.cos(math.radians(3))  # of the angle below which planes are equivalent
 MIN_THICKNESS_M = 1e-6  # coplanar points are extended by this on both sides, so that they have a hull
 MAX_CORNERS = 10_000  # of a body; finer meshes take minutes without benefit
+ENCLOSING_PLANES = 2_000  # of the body that replaces a finer one; it is about 0.1 % larger
 MAX_COORDINATE_M = 1e4  # larger coordinates are treated as mistakes of units
 
 
@@ -59,6 +60,41 @@ def hull_corners(points: Array) -> Array:
             points = np.concatenate([points - MIN_THICKNESS_M * axis, points + MIN_THICKNESS_M * axis])
     corners: Array = points[np.sort(ConvexHull(points).vertices)]
     return corners
+
+
+def enclosing_hull(corners: Array) -> tuple[Array, float]:
+    """Return a body with fewer corners that contains a convex hull.
+
+    Supporting planes in ``ENCLOSING_PLANES`` directions bound it, spread evenly after scaling all extents to one.
+
+    Args:
+        corners: Corners of the hull [m], shape (V, 3).
+
+    Returns:
+        Corners of the body [m], shape (W, 3), and their maximum distance from the hull [m].
+    """
+    import coal
+    from scipy.spatial import HalfspaceIntersection
+
+    center, extent = corners.mean(axis=0), np.ptp(corners, axis=0)
+    scaled, half = (corners - center) / extent, half_sphere(ENCLOSING_PLANES // 2)
+    normals = np.concatenate([half, -half])
+    offsets = (normals @ scaled.T).max(axis=1) + 1e-9
+    found = HalfspaceIntersection(np.column_stack([normals, -offsets]), np.zeros(3)).intersections
+    body = hull_corners(found * extent + center)
+    hull, point, place, request = coal_hull(corners), coal.Sphere(0.0), coal.Transform3s(), coal.DistanceRequest()
+    distances = []
+    for corner in body:
+        place.setTranslation(corner)
+        distances.append(coal.distance(hull, coal.Transform3s(), point, place, request, coal.DistanceResult()))
+    return body, max(0.0, *distances)
+
+
+def half_sphere(count: int) -> Array:
+    """Return unit vectors on a Fibonacci lattice over the upper half of the sphere, shape (count, 3)."""
+    z = (np.arange(count) + 0.5) / count
+    angle, level = np.arange(count) * np.pi * (3 - np.sqrt(5)), np.sqrt(1 - z**2)
+    return np.stack([level * np.cos(angle), level * np.sin(angle), z], axis=1)
 
 
 def supporting_planes(corners: Array) -> Array:

@@ -4,6 +4,8 @@ A plan, a dataset or a planner contains its problem as text, so the geometry of 
 """
 
 import base64
+import re
+import warnings
 from collections.abc import Sequence
 from copy import deepcopy
 from pathlib import Path
@@ -13,9 +15,9 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import RecipeError
+from cnpgen.errors import RecipeError, nearest
 from cnpgen.robots.shape.decomposition import convex_parts
-from cnpgen.robots.shape.hull import MAX_COORDINATE_M, MAX_CORNERS, hull_corners
+from cnpgen.robots.shape.hull import MAX_COORDINATE_M, MAX_CORNERS, MIN_THICKNESS_M, enclosing_hull, hull_corners
 from cnpgen.robots.shape.mesh_files import find_named_file
 from cnpgen.robots.urdf import urdf_tree
 
@@ -26,12 +28,19 @@ Array = NDArray[np.float64]
 
 _INLINE = "data:application/octet-stream;base64,"  # followed by corners x, y, z [m] as little-endian float64
 _MESHES = (".stl", ".dae", ".obj")
+MAX_DAE_HEAD_BYTES = 1 << 16  # in which a DAE file states its unit
 MAX_MESH_BYTES = 1 << 26  # of a mesh file
 _CAPSULES = "1.2"  # first version of URDF with capsules
 
 
 def with_inline_meshes(
-    urdf: str, path: Path, packages: Sequence[Path] = (), *, most: int = 1, keep: Path | None = None
+    urdf: str,
+    path: Path,
+    packages: Sequence[Path] = (),
+    *,
+    most: int = 1,
+    links: Sequence[str] = (),
+    keep: Path | None = None,
 ) -> str:
     """Return a URDF with inline hulls of its collision meshes; a URDF without such meshes is returned unchanged.
 
@@ -40,11 +49,11 @@ def with_inline_meshes(
         path: File of the URDF, the base of relative mesh paths.
         packages: Folders of packages.
         most: Maximum number of convex parts of a mesh; 1 for its hull.
+        links: Links whose meshes are decomposed; by default all.
         keep: Cache folder of convex parts; None for no cache.
 
     Raises:
-        RecipeError: Meshes are missing or cannot be read; the error lists all of them.
-        MachineError: A decomposition is requested, but CoACD is not installed.
+        RecipeError: Links or meshes are missing or cannot be read; the error lists all of them.
     """
     try:
         tree = urdf_tree(urdf)
@@ -52,11 +61,12 @@ def with_inline_meshes(
         return urdf
     elements = [(link, element) for link in tree.iter("link") for element in link.findall("collision")]
     meshes = [(link, element, mesh) for link, element in elements if (mesh := _mesh_file(element)) is not None]
-    mistakes: list[str] = []
+    mistakes = _unknown_links(tree, links)
     for link, element, mesh in meshes:
+        parts = most if not links or link.get("name") in links else 1
         try:
             file = find_named_file(mesh.get("filename", ""), path, packages)
-            addresses = [address_of(part) for part in _parts_of_file(file, scale_of(mesh), most, keep)]
+            addresses = [address_of(part) for part in _parts_of_file(file, scale_of(mesh), parts, keep)]
         except RecipeError as error:
             mistakes += error.mistakes
         else:
@@ -68,6 +78,13 @@ def with_inline_meshes(
     if unversioned:  # the URDF parser would ignore capsules, with warnings on stderr
         tree.set("version", _CAPSULES)
     return ElementTree.tostring(tree, encoding="unicode") if meshes or unversioned else urdf
+
+
+def _unknown_links(robot: ElementTree.Element, links: Sequence[str]) -> list[str]:
+    names = [link.get("name", "") for link in robot.iter("link")]
+    return [
+        f"robot.decomposed: the URDF has no link {link!r}{nearest(link, names)}" for link in links if link not in names
+    ]
 
 
 def _mesh_file(collision: ElementTree.Element) -> ElementTree.Element | None:
@@ -96,6 +113,18 @@ def mesh_files(urdf: str) -> list[str]:
     meshes = urdf_tree(urdf).iterfind(".//collision/geometry/mesh")
     names = dict.fromkeys(mesh.get("filename", "") for mesh in meshes)
     return [name for name in names if not name.startswith(_INLINE)]
+
+
+def mesh_links(urdf: str) -> frozenset[str]:
+    """Return the links with mesh files in their collision geometry.
+
+    Raises:
+        ValueError: The text is not a URDF.
+    """
+    links = urdf_tree(urdf).iter("link")
+    return frozenset(
+        link.get("name", "") for link in links if any(_mesh_file(each) is not None for each in link.iter("collision"))
+    )
 
 
 def points_of(mesh: ElementTree.Element) -> Array:
@@ -169,10 +198,46 @@ def _parts_of_file(path: Path, scale: Array, most: int, keep: Path | None) -> li
         parts = [hull_corners(points)] if most == 1 else convex_parts(points, sides_of(mesh), most, keep)
     except RecipeError as error:
         raise RecipeError([f"{path}: {text}" for text in error.mistakes]) from error
-    if (corners := max(map(len, parts))) > MAX_CORNERS:
-        found = f"the mesh's hull has {corners:,} corners"
-        raise RecipeError([f"{path}: {found}, expected at most {MAX_CORNERS:,}: simplify the mesh"])
-    return parts
+    _warn_about(path, points, scale)
+    return [_simplified(path, part) for part in parts]
+
+
+def _simplified(path: Path, corners: Array) -> Array:
+    """Return the corners of a body with at most ``MAX_CORNERS`` corners that contains a hull."""
+    if len(corners) <= MAX_CORNERS:
+        return corners
+    body, bound = enclosing_hull(corners)
+    warnings.warn(
+        f"{path}: a hull of the mesh has {len(corners):,} corners, more than {MAX_CORNERS:,}; a body with {len(body):,}"
+        f" corners contains it and is larger by at most {1e3 * bound:.2g} mm",
+        RuntimeWarning,
+        stacklevel=2,
+    )
+    return body
+
+
+def _warn_about(path: Path, points: Array, scale: Array) -> None:
+    """Warn about a mesh that is flat, and about the unit of a DAE file, which Coal ignores."""
+    offsets = points - points.mean(axis=0)
+    thickness = min(float(np.ptp(offsets @ axis)) for axis in np.linalg.eigh(offsets.T @ offsets)[1].T)
+    if thickness < MIN_THICKNESS_M:
+        text = f"the mesh is flat, and a body of {2e3 * MIN_THICKNESS_M:g} mm replaces it: is it a collision mesh?"
+        warnings.warn(f"{path}: {text}", RuntimeWarning, stacklevel=2)
+    unit = _unit_of_dae(path) if path.suffix.lower() == ".dae" else 1.0
+    if unit != 1.0 and (scale == 1.0).all():
+        text = f"the file states a unit of {unit:g} m, which is ignored as by Pinocchio: its numbers are read in m"
+        remedy = f'if they are not, write scale="{unit:g} {unit:g} {unit:g}" in its <mesh> element'
+        warnings.warn(f"{path}: {text}; {remedy}", RuntimeWarning, stacklevel=2)
+
+
+def _unit_of_dae(path: Path) -> float:
+    """Return the unit of a DAE file [m]; 1 if it states none."""
+    with path.open("rb") as file:
+        found = re.search(rb"<unit\b[^>]*\bmeter\s*=\s*[\"']([0-9.eE+-]{1,32})[\"']", file.read(MAX_DAE_HEAD_BYTES))
+    try:
+        return float(found.group(1)) if found else 1.0
+    except ValueError:
+        return 1.0
 
 
 def sides_of(mesh: "coal.BVHModelBase") -> NDArray[np.int64]:

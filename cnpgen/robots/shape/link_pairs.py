@@ -1,6 +1,6 @@
 """Link pairs that can collide, determined by sampling as in MoveIt's setup assistant, or read from an SRDF."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, product
 from typing import TYPE_CHECKING, Any
@@ -68,8 +68,8 @@ def find_pairs(
         adjacent: Pairs of links with only links without a shape between them.
         disabled: Disabled pairs of an SRDF, None without an SRDF.
     """
-    rotations, positions = _poses(model)
-    contact = _Contact(rotations, positions, convex_parts, joints)
+    rotations, positions = sample_poses(model, SAMPLED_STATES)
+    contact = LinkContact((rotations, positions), map(body_of_part, convex_parts), joints)
     found = []
     for first, second in combinations(capsules, 2):
         if joints[first] == joints[second]:
@@ -88,57 +88,116 @@ def find_pairs(
     return tuple(found)
 
 
-def _poses(model: "pin.Model") -> tuple[Array, Array]:
-    """Return rotations (joints, K, 3, 3) and positions [m] (joints, K, 3) of all joints in random states."""
+def sample_poses(model: "pin.Model", count: int) -> tuple[Array, Array]:
+    """Return poses of all joints at random states; fewer states are the first of more.
+
+    Args:
+        model: Pinocchio model; states are sampled within its position limits.
+        count: Number of states K.
+
+    Returns:
+        Rotations, shape (joints, K, 3, 3), and positions [m], shape (joints, K, 3).
+    """
+    random = np.random.default_rng(0)
+    return joint_poses(model, random.uniform(model.lowerPositionLimit, model.upperPositionLimit, (count, model.nq)))
+
+
+def joint_poses(model: "pin.Model", states: Array) -> tuple[Array, Array]:
+    """Return poses of all joints at K states.
+
+    Args:
+        model: Pinocchio model.
+        states: Joint positions [rad], shape (K, n).
+
+    Returns:
+        Rotations, shape (joints, K, 3, 3), and positions [m], shape (joints, K, 3).
+    """
     import pinocchio as pin
 
-    data, random = model.createData(), np.random.default_rng(0)
-    states = random.uniform(model.lowerPositionLimit, model.upperPositionLimit, (SAMPLED_STATES, model.nq))
-    found = np.empty((model.njoints, SAMPLED_STATES, 4, 3))
+    data, poses = model.createData(), np.empty((model.njoints, len(states), 4, 3))
     for k, q in enumerate(states):
         pin.forwardKinematics(model, data, q)
         for joint, pose in enumerate(data.oMi):
-            found[joint, k, :3], found[joint, k, 3] = pose.rotation, pose.translation
-    return found[:, :, :3], found[:, :, 3]
+            poses[joint, k, :3], poses[joint, k, 3] = pose.rotation, pose.translation
+    return poses[:, :, :3], poses[:, :, 3]
 
 
-class _Contact:
-    """Collision checks of links with Coal."""
+@dataclass(frozen=True)
+class CollisionBody:
+    """Collision geometry of Coal in the frame of a joint, with a ball that contains it.
+
+    Attributes:
+        center: Center of the ball [m], shape (3,).
+        radius: Radius of the ball [m].
+        geometry: Geometry of Coal.
+        placement: Pose of the geometry in the frame of the joint, a transform of Coal; None for the identity.
+    """
+
+    center: Array
+    radius: float
+    geometry: Any
+    placement: Any = None
+
+
+def body_of_part(part: ConvexPart) -> tuple[str, CollisionBody]:
+    """Return the link and the collision body of a convex part."""
+    hull = coal_hull(part.vertices)
+    hull.setSweptSphereRadius(part.radius)
+    return part.link, CollisionBody(*ball_round(part.vertices, part.radius), hull)
+
+
+class LinkContact:
+    """Collision checks of links with Coal at K states.
+
+    Args:
+        poses: Rotations and positions [m] of the joints, as ``sample_poses`` returns them.
+        bodies: Links and their bodies, in the frames of the joints that move them.
+        joints: Link -> index of the joint that moves it.
+    """
 
     def __init__(
-        self, rotations: Array, positions: Array, convex_parts: Sequence[ConvexPart], joints: Mapping[str, int]
+        self,
+        poses: tuple[Array, Array],
+        bodies: Iterable[tuple[str, CollisionBody]],
+        joints: Mapping[str, int],
     ) -> None:
         import coal
 
-        self._rotations, self._positions, self._joints = rotations, positions, joints
-        self._of_link: dict[str, list[tuple[Array, float, Any]]] = {}
-        for part in convex_parts:
-            shape = coal_hull(part.vertices)
-            shape.setSweptSphereRadius(part.radius)
-            self._of_link.setdefault(part.link, []).append((*ball_round(part.vertices, part.radius), shape))
+        (self._rotations, self._positions), self._joints = poses, joints
+        self._of_link: dict[str, list[CollisionBody]] = {}
+        for link, body in bodies:
+            self._of_link.setdefault(link, []).append(body)
         self._request, self._places = coal.CollisionRequest(), (coal.Transform3s(), coal.Transform3s())
 
-    def of(self, first: str, second: str) -> NDArray[np.bool_]:
-        """Return a mask of the states in which two links overlap, shape (K,)."""
+    def of(self, first: str, second: str, *, among: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
+        """Return a mask of the states in which two links overlap, shape (K,).
+
+        Args:
+            first: A link.
+            second: Another link.
+            among: Mask of the states that are checked, shape (K,); by default all.
+        """
         hit = np.zeros(self._positions.shape[1], bool)
         for one, other in product(self._of_link[first], self._of_link[second]):
-            spheres = [
-                self._rotations[self._joints[link]] @ centre + self._positions[self._joints[link]]
-                for link, (centre, _, _) in ((first, one), (second, other))
+            centers = [
+                self._rotations[self._joints[link]] @ body.center + self._positions[self._joints[link]]
+                for link, body in ((first, one), (second, other))
             ]
-            near = np.linalg.norm(spheres[0] - spheres[1], axis=1) < one[1] + other[1]
-            for k in np.flatnonzero(near & ~hit):
-                hit[k] = self._touch(first, one[2], second, other[2], int(k))
+            near = np.linalg.norm(centers[0] - centers[1], axis=1) < one.radius + other.radius
+            for k in np.flatnonzero(near & ~hit if among is None else near & ~hit & among):
+                hit[k] = self._touch((first, one), (second, other), int(k))
         return hit
 
-    def _touch(self, first: str, one: Any, second: str, other: Any, k: int) -> bool:
+    def _touch(self, first: tuple[str, CollisionBody], second: tuple[str, CollisionBody], k: int) -> bool:
         import coal
 
-        for link, place in zip((first, second), self._places, strict=True):
+        poses = []
+        for (link, body), place in zip((first, second), self._places, strict=True):
             place.setRotation(self._rotations[self._joints[link], k])
             place.setTranslation(self._positions[self._joints[link], k])
+            poses.append(place if body.placement is None else place * body.placement)
         result = coal.CollisionResult()
-        coal.collide(one, self._places[0], other, self._places[1], self._request, result)
+        coal.collide(first[1].geometry, poses[0], second[1].geometry, poses[1], self._request, result)
         return bool(result.isCollision())
 
 

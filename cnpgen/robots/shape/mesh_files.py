@@ -12,6 +12,7 @@ from cnpgen.schema.units import show
 
 _PACKAGE = ("package", "model")  # URI schemes that begin with the name of a package
 _SEARCHED = ("ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH")
+MAX_PACKAGE_DEPTH = 3  # folders above a URDF that may be its package under another name
 _EXTRAS = {"example-robot-data": "robots"}  # Python packages of robots -> cnpgen's extra that installs them
 
 
@@ -39,7 +40,8 @@ def find_named_file(name: str, urdf: Path, packages: Sequence[Path] = ()) -> Pat
 
     ``package://NAME/REST`` is looked for in the folders of ``packages``, in those of the environment variables
     ``ROS_PACKAGE_PATH`` and ``AMENT_PREFIX_PATH``, in the URDF's own folder and all above it, and where pip installs a
-    package of this name; each may hold the package or be it. What is no URI is relative to the URDF's folder.
+    package of this name; each may hold the package or be it. Finally the folders around the URDF are taken for the
+    package, whose folder may have another name. What is no URI is relative to the URDF's folder.
 
     Args:
         name: Name of the file in the URDF.
@@ -94,6 +96,8 @@ def _places(name: str, beside: Path, packages: Sequence[Path]) -> Iterator[Path]
             yield folder / package / rest
             if folder.name == package:
                 yield folder / rest
+        for folder in list(beside.parents)[:MAX_PACKAGE_DEPTH]:  # the package under another name
+            yield folder / rest
     elif parts.scheme == "file":
         yield Path(unquote(parts.path))
     elif not parts.scheme:

@@ -1,5 +1,6 @@
-"""Disabled link pairs of an SRDF, stored in the text of the URDF."""
+"""Disabled link pairs of an SRDF and of a problem, stored in the text of the URDF."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -23,18 +24,32 @@ def with_disabled_pairs(urdf: str, srdf: Path) -> str:
         entries = list(urdf_tree(read_urdf(srdf)).iter(_TAG))
     except ValueError as error:
         raise RecipeError([f"{srdf}: not an SRDF that can be read: {error}"]) from error
+    return _with_entries(urdf, [dict(entry.attrib) for entry in entries], str(srdf))
+
+
+def with_ignored_pairs(urdf: str, pairs: Iterable[tuple[str, str]]) -> str:
+    """Return a URDF with disabled link pairs of a problem.
+
+    Raises:
+        RecipeError: A pair names a link that the URDF does not have.
+    """
+    entries = [{"link1": first, "link2": second, "reason": "User"} for first, second in pairs]
+    return _with_entries(urdf, entries, "robot.ignored_pairs")
+
+
+def _with_entries(urdf: str, entries: list[dict[str, str]], source: str) -> str:
     robot = urdf_tree(urdf)
     links = {link.get("name") for link in robot.iter("link")}
     named = {entry.get(key) for entry in entries for key in ("link1", "link2")}
     if unknown := sorted(map(str, named - links)):
-        raise RecipeError([f"{srdf}: the URDF has no link {', '.join(unknown)}"])
+        raise RecipeError([f"{source}: the URDF has no link {', '.join(unknown)}"])
     for entry in entries:
-        robot.append(ElementTree.Element(_TAG, dict(entry.attrib)))
+        robot.append(ElementTree.Element(_TAG, entry))
     return ElementTree.tostring(robot, encoding="unicode")
 
 
 def disabled_pairs(urdf: str) -> frozenset[frozenset[str]] | None:
-    """Return the disabled link pairs; None without an SRDF."""
+    """Return the disabled link pairs; None without any."""
     entries = list(urdf_tree(urdf).iter(_TAG))
     pairs = frozenset(frozenset((entry.get("link1", ""), entry.get("link2", ""))) for entry in entries)
     return pairs or None

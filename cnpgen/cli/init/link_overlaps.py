@@ -1,0 +1,117 @@
+"""Convex parts of an arm's links, chosen by the free space that they reject, and pairs in permanent contact."""
+
+import sys
+from dataclasses import dataclass, replace
+from itertools import takewhile
+
+from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.problem import Problem
+from cnpgen.robots.shape.hull_gap import GAP_STATES, HullGap, PairGap, measure_hull_gap
+from cnpgen.robots.shape.inline import mesh_links
+from cnpgen.robots.urdf import read_urdf
+
+MAX_GAP = 0.01  # fraction of the free states that convex parts may reject without further decomposition
+MAX_PAIR_GAP = 1e-3  # of a pair whose links are not decomposed further
+LARGE_PAIR_GAP = 0.02  # of a pair that a note names
+PART_COUNTS = (4, 8, 16)  # maximum numbers of convex parts of a mesh, in the order in which they are tried
+MIN_FREE_FRACTION = 0.01  # of the sampled states, below which pairs in contact are ignored
+MAX_IGNORED_PAIRS = 20
+
+
+@dataclass(frozen=True)
+class LinkOverlaps:
+    """Choice of convex parts and ignored pairs of a problem.
+
+    Attributes:
+        problem: The problem with decomposed links, ignored pairs and the remaining gap.
+        hulls: Gap of the convex hulls.
+        parts: Gap of the convex parts of the problem.
+        notes: Sentences about the gap and the pairs.
+    """
+
+    problem: Problem
+    hulls: HullGap
+    parts: HullGap
+    notes: tuple[str, ...]
+
+
+def resolve_overlaps(problem: Problem) -> LinkOverlaps:
+    """Decompose the links whose hulls reject much free space, and ignore pairs in contact if no state is free.
+
+    Args:
+        problem: A problem with the link geometry of its URDF.
+
+    Raises:
+        RecipeError: A mesh is missing or cannot be read.
+    """
+    hulls = _gap(problem)
+    problem, parts = _decompose(problem, hulls)
+    problem, parts, contacts = _ignore_contacts(problem, parts)
+    always = [pair for pair in load_robot(problem).shape.pairs if pair.left_out == "always"]  # type: ignore[union-attr]
+    if always:
+        names = "; ".join(f"{pair.first}, {pair.second}" for pair in always)
+        contacts.append(f"not checked, since they are always in contact: {names}")
+    problem = replace(problem, robot=replace(problem.robot, hull_gap=round(parts.fraction, 4)))
+    return LinkOverlaps(problem, hulls, parts, (*_gap_notes(problem, hulls, parts), *contacts))
+
+
+def _gap(problem: Problem) -> HullGap:
+    """Measure the gap of a problem's convex parts."""
+    robot, path = load_robot(problem), problem.urdf_path
+    assert robot.shape is not None
+    return measure_hull_gap(read_urdf(path), path, problem.packages, model=robot.model, shape=robot.shape)
+
+
+def _decompose(problem: Problem, gap: HullGap) -> tuple[Problem, HullGap]:
+    """Decompose links, into more parts each time, until the gap is small."""
+    meshes = mesh_links(read_urdf(problem.urdf_path))
+    chosen: list[str] = []
+    for count in PART_COUNTS:
+        if gap.fraction <= MAX_GAP and not gap.hidden:
+            break
+        large = [*gap.hidden, *takewhile(lambda pair: pair.rejected > MAX_PAIR_GAP, gap.pairs)]
+        links = dict.fromkeys(link for pair in large for link in (pair.first, pair.second) if link in meshes)
+        chosen = list(dict.fromkeys([*chosen, *links]))
+        if not links:
+            break
+        print(f"cnpgen: decomposing {', '.join(chosen)} into at most {count} convex parts each", file=sys.stderr)
+        robot = replace(problem.robot, convex_parts=count, decomposed=tuple(chosen))
+        problem = replace(problem, robot=robot)
+        gap = _gap(problem)
+    return problem, gap
+
+
+def _ignore_contacts(problem: Problem, gap: HullGap) -> tuple[Problem, HullGap, list[str]]:
+    """Ignore the pairs that overlap most often until some sampled states are free."""
+    ignored: list[PairGap] = []
+    while gap.accepted < MIN_FREE_FRACTION * GAP_STATES and len(ignored) < MAX_IGNORED_PAIRS:
+        ignored.append(max(gap.pairs, key=lambda pair: pair.parts))
+        pairs = tuple((pair.first, pair.second) for pair in ignored)
+        problem = replace(problem, robot=replace(problem.robot, ignored_pairs=pairs))
+        gap = _gap(problem)
+    return (
+        problem,
+        gap,
+        [f"ignored, since otherwise no state is free of collisions: {_overlap(pair)}" for pair in ignored],
+    )
+
+
+def _overlap(pair: PairGap) -> str:
+    shares = f"their convex parts overlap in {pair.parts:.1%} of the random states, their meshes in {pair.meshes:.1%}"
+    return f"{pair.first}, {pair.second} ({shares})"
+
+
+def _gap_notes(problem: Problem, hulls: HullGap, parts: HullGap) -> list[str]:
+    """Report the gaps before and after the decomposition."""
+    text = "of the random states in which no meshes overlap are rejected by the"
+    notes = [f"{hulls.fraction:.2%} {text} convex hulls of the meshes"]
+    if problem.robot.decomposed:
+        links = ", ".join(problem.robot.decomposed)
+        notes.append(f"{parts.fraction:.2%} {text} convex parts; decomposed: {links}")
+    for pair in takewhile(lambda pair: pair.rejected > LARGE_PAIR_GAP, parts.pairs):
+        rejected = f"the pair {pair.first}, {pair.second} rejects {pair.rejected:.2%} of them"
+        notes.append(f"{rejected}: finer convex parts of its links or 'ignored_pairs' would accept them")
+    if parts.hidden:
+        hidden = "; ".join(map(_overlap, parts.hidden))
+        notes.append(f"not checked, although their meshes are not always in contact: {hidden}")
+    return notes
