@@ -6,6 +6,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
+
 from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import ProblemRecord
@@ -24,14 +26,24 @@ class Setting:
     Attributes:
         problem: Record of the problem.
         model: Name of the shipped model for problems of this kind, or empty.
-        time_limit: Planning time per problem [s]; a planner that takes much longer is stopped.
+        time_limit: Planning time per problem [s]; a planner that takes longer has no plan and is stopped.
         seed: Seed of random planners.
+        repetition: Number of the repetition, from 0.
     """
 
     problem: ProblemRecord
     model: str = ""
     time_limit: float = 60.0
     seed: int = 0
+    repetition: int = 0
+
+    def random(self, problem: Plans) -> np.random.Generator:
+        """Return the random generator of one boundary problem; it depends on no other problem.
+
+        Args:
+            problem: The boundary problem, which is known by its ``sample_id``.
+        """
+        return np.random.default_rng([self.seed, self.repetition, int(problem.sample_id[0])])
 
 
 class BenchmarkPlanner(ABC):

@@ -100,7 +100,7 @@ def succeeded(executed: Mapping[str, Any], plane_tolerance: float = PLANE_TOLERA
     if "scored" not in executed:
         return bool(executed["finished"]) and not executed.get("collided")
     errors = [executed.get(name, math.inf) for name in ("plane_error_mm", "commanded_plane_error_mm")]
-    return bool(executed["scored"]) and not executed["touched_early"] and max(errors) <= 1e3 * plane_tolerance
+    return bool(executed["scored"]) and not executed.get("touched_early") and max(errors) <= 1e3 * plane_tolerance
 
 
 def _is_nan(value: object) -> bool:
