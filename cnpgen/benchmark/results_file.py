@@ -141,6 +141,13 @@ def read_results(path: Path, shared: dict[str, Any]) -> tuple[dict[str, Any], Re
     return identity, _read_rows(Results(path), lines[1:])
 
 
+def holds_results(path: Path) -> bool:
+    """Return whether a file begins as the results of a planner, of any run."""
+    lines = _complete_lines(path)
+    head = json.loads(lines[0]) if lines else None
+    return isinstance(head, dict) and head.get("format") == RESULTS_FORMAT
+
+
 def _differences(line: str, head: str) -> str:
     """Name the keys in which two heads differ."""
     one, other = json.loads(line), json.loads(head)

@@ -16,7 +16,7 @@ from cnpgen.benchmark.hypothesis_tests import summarize_results
 from cnpgen.benchmark.judging import judge_answer
 from cnpgen.benchmark.process import PlannerProcess, PlanningOutcome
 from cnpgen.benchmark.replanning_scenario import ExecutedPrefix
-from cnpgen.benchmark.results_file import Results, answer_from_dict, open_results, read_results
+from cnpgen.benchmark.results_file import Results, answer_from_dict, holds_results, open_results, read_results
 from cnpgen.benchmark.run_record import RunRecord, describe_run, load_runs, save_runs
 from cnpgen.benchmark.simulator.challenge import challenge_plant, check_challenge
 from cnpgen.benchmark.simulator.execute import load_mujoco
@@ -215,9 +215,11 @@ def _names_in(folder: Path, shared: dict[str, Any], *, delete_others: bool) -> s
         results = read_results(path, shared)
         if results is not None:
             names.add(str(results[0]["planner"]))
+        elif not holds_results(path):
+            continue
         elif delete_others:
             path.unlink()
-        elif path.stat().st_size:
+        else:
             raise UsageError(
                 f"{path} holds results of another run (suite, version, time limit or seed differ);"
                 " {force} deletes them, another folder keeps them",

@@ -11,7 +11,8 @@ from cnpgen.schema import registry
 from tests.conftest import some
 
 pytest.importorskip("mujoco")
-ALL = tuple(name for name in registry.BUILT_IN[registry.PLANNERS] if name != "cbirrt" or find_spec("ompl"))
+MODULES = {"cbirrt": ("ompl",), "rrtconnect": ("ompl", "toppra"), "ruckig": ("ruckig",)}
+ALL = tuple(name for name in registry.BUILT_IN[registry.PLANNERS] if all(map(find_spec, MODULES.get(name, ()))))
 PLANTS = ("nominal", "heavier", "delayed")
 
 

@@ -394,6 +394,9 @@ def test_a_report_covers_the_folder_and_nothing_else(random: str, tmp_path: Path
         run_benchmark("hits-81", folder, planners=[random], n=1)
     run_benchmark("hits-81", folder, planners=[random], n=1, force=True)
     assert not (folder / "other.jsonl").exists()
+    (folder / "notes.jsonl").write_text('{"mine": 1}\n')  # not results of a benchmark
+    run_benchmark("hits-81", folder, planners=[random], n=1, force=True)
+    assert (folder / "notes.jsonl").read_text() == '{"mine": 1}\n'
 
 
 def test_a_damaged_record_of_runs_is_named(tmp_path: Path) -> None:

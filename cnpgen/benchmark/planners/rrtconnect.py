@@ -67,9 +67,9 @@ def timed_by_toppra(path: Array, robot: Robot, goal_dq: Array) -> Trajectory | N
     kept = np.append(True, steps > MIN_WAYPOINT_DISTANCE_RAD)
     kept[-1] = True
     points = path[kept]
-    if len(points) < 2:
-        return None
     length = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
+    if not np.all(np.diff(length, prepend=-1.0) > 0):  # start and goal coincide
+        return None
     spline = toppra.SplineInterpolator(length / length[-1], points)
     limits = [
         kind(np.stack([-limit, limit], axis=1))

@@ -61,7 +61,7 @@ def time_optimal_motion(ruckig: Any, robot: Robot, boundary: Boundary) -> Trajec
     motion = ruckig.Trajectory(robot.n)
     try:
         result = ruckig.Ruckig(robot.n).calculate(state, motion)
-    except RuntimeError:  # the input is outside the limits
+    except ruckig.RuckigError:  # the input is outside the limits
         return None
     if result != ruckig.Result.Working or not motion.duration > 0:
         return None
