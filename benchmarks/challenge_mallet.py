@@ -149,7 +149,7 @@ def measure(folder: Path, step: int) -> dict[str, dict[str, list[dict[str, float
 def draw(results: dict[str, dict[str, list[dict[str, float]]]], path: Path) -> None:
     """Draw the offset of the mallet at the contact over the planned lateral acceleration."""
     figure = new_figure(8.0, 3.2, dpi=100)
-    for place, change in enumerate(CHANGES[:2], start=1):
+    for place, change in enumerate((CHANGES[0], CHANGES[2]), start=1):
         axes = figure.add_subplot(1, 2, place)
         for name, marker in zip(PLANNERS, "os", strict=True):
             for scored, color in ((1.0, "tab:blue"), (0.0, "tab:red")):

@@ -35,17 +35,31 @@ class RRTConnect(BenchmarkPlanner):
     def prepare(self, setting: Setting) -> Plan:
         """Import OMPL and TOPP-RA."""
         ompl = load_ompl()
-        with requires_extra("benchmark", "TOPP-RA"):
-            import toppra
-        toppra.setup_logging("CRITICAL")
+        load_toppra()
         problem, robot = open_problem(setting.problem)
 
         def plan(task: Plans) -> Answer:
             seed_ompl(ompl, setting, task)
-            path = Search(problem, robot, task).solve(ompl, setting.time_limit, simplify_time=self.simplify_time)
+            simplify_time = min(self.simplify_time, setting.time_limit / 2)
+            search_time = setting.time_limit - simplify_time
+            path = Search(problem, robot, task).solve(ompl, search_time, simplify_time=simplify_time)
             return None if path is None else timed_by_toppra(path, robot, task.boundary.goal_dq[0])
 
         return plan
+
+
+def load_toppra() -> Any:
+    """Import TOPP-RA without its messages.
+
+    Raises:
+        MissingExtraError: TOPP-RA is missing.
+    """
+    with requires_extra("benchmark", "TOPP-RA"):
+        import toppra
+        import toppra.algorithm
+        import toppra.constraint
+    toppra.setup_logging("CRITICAL")
+    return toppra
 
 
 def timed_by_toppra(path: Array, robot: Robot, goal_dq: Array) -> Trajectory | None:
@@ -59,10 +73,7 @@ def timed_by_toppra(path: Array, robot: Robot, goal_dq: Array) -> Trajectory | N
     Returns:
         The trajectory from rest, or None if TOPP-RA finds no timing.
     """
-    import toppra
-    from toppra.algorithm import TOPPRA
-    from toppra.constraint import JointAccelerationConstraint, JointVelocityConstraint
-
+    toppra = load_toppra()
     steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
     kept = np.append(True, steps > MIN_WAYPOINT_DISTANCE_RAD)
     kept[-1] = True
@@ -74,11 +85,11 @@ def timed_by_toppra(path: Array, robot: Robot, goal_dq: Array) -> Trajectory | N
     limits = [
         kind(np.stack([-limit, limit], axis=1))
         for kind, limit in (
-            (JointVelocityConstraint, robot.velocity_limit),
-            (JointAccelerationConstraint, robot.acceleration_limit),
+            (toppra.constraint.JointVelocityConstraint, robot.velocity_limit),
+            (toppra.constraint.JointAccelerationConstraint, robot.acceleration_limit),
         )
     ]
-    timing = TOPPRA(limits, spline, parametrizer="ParametrizeConstAccel")
+    timing = toppra.algorithm.TOPPRA(limits, spline, parametrizer="ParametrizeConstAccel")
     tangent = spline(1.0, 1)
     end_rate = max(float(tangent @ goal_dq / (tangent @ tangent)), 0.0)
     for fraction in END_RATE_FRACTIONS:
