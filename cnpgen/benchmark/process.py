@@ -13,13 +13,12 @@ from enum import StrEnum
 from multiprocessing.connection import Connection
 from typing import Any
 
-from cnpgen.benchmark.benchmark_planner import Plan, Setting
+from cnpgen.benchmark.benchmark_planner import Plan, Setting, load_planner
 from cnpgen.benchmark.results_file import answer_from_dict, answer_to_dict
 from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.errors import CnpgenError, MachineError, UsageError
 from cnpgen.machine.threads import one_thread
 from cnpgen.plans.plans import Plans
-from cnpgen.schema import registry
 
 STOP_MARGIN_S = 1.0  # after its time limit a planner is stopped; an answer in between is not counted
 MAX_PREPARATION_TIME_S = 300.0  # including the compilation of kernels
@@ -170,7 +169,7 @@ def serve(descriptor: int) -> None:
     with Connection(descriptor) as pipe, suppress(EOFError, OSError):
         name, setting = pipe.recv()
         try:
-            plan = registry.load(registry.PLANNERS, name)().prepare(setting)
+            plan = load_planner(name, setting.parameters).prepare(setting)
         except Exception as error:  # noqa: BLE001 - a plug-in may raise any exception
             pipe.send((_refusal(error), _message(error)))
             return

@@ -1,6 +1,6 @@
 """Benchmark runs: every planner on every problem, judged and optionally executed; finished problems are kept."""
 
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.benchmark.benchmark_planner import Setting
+from cnpgen.benchmark.benchmark_planner import Setting, load_planner
 from cnpgen.benchmark.execution import execute_answer
 from cnpgen.benchmark.hypothesis_tests import summarize_results
 from cnpgen.benchmark.judging import judge_answer
@@ -23,7 +23,7 @@ from cnpgen.benchmark.simulator.execute import load_mujoco
 from cnpgen.benchmark.simulator.executed import PLANE_TOLERANCE_M
 from cnpgen.benchmark.simulator.plant import Plant, as_plant
 from cnpgen.benchmark.suite import Suite, load_suite
-from cnpgen.errors import CnpgenError, UsageError, nearest
+from cnpgen.errors import RecipeError, UsageError, nearest
 from cnpgen.judges.plans.verdict import Verdict
 from cnpgen.machine.engine import Engine, WorkerPool, assembled
 from cnpgen.machine.versions import __version__
@@ -108,6 +108,7 @@ def run_benchmark(
     repeat: int = 1,
     plane_tolerance: float = PLANE_TOLERANCE_M,
     reference: str | None = None,
+    parameters: Mapping[str, Mapping[str, Any]] | None = None,
     workers: int | None = None,
     engine: str | None = None,
     address: str | None = None,
@@ -134,6 +135,7 @@ def run_benchmark(
         repeat: Number of repetitions of every problem.
         plane_tolerance: Maximum distance of the mallet of a successful hit from the table plane [m].
         reference: Planner with which the others are compared; default ``cnp-b+refine``, or the first one without it.
+        parameters: Planner -> its field -> value, as in a recipe; the others have their defaults.
         workers: Processes that execute plans and, with an engine, plan; default one per available core.
         engine: Engine of the workers, see ``make_dataset``; by default planners run on this machine.
         address: Address of the engine, see ``make_dataset``.
@@ -151,6 +153,10 @@ def run_benchmark(
     with concerning("suite"):
         loaded = suite if isinstance(suite, Suite) else load_suite(suite)
     _check_planners(planners)
+    given = dict(parameters or {})
+    if unused := sorted(given.keys() - set(planners)):
+        raise UsageError(f"must be of planners of this run, got those of {', '.join(unused)}", argument="parameters")
+    settings = {name: _checked_parameters(name, given.get(name, {})) for name in planners}
     robots = tuple(as_plant(plant, argument="plants") for plant in plants)
     if environment is not None:
         robots += (challenge_plant(environment),)
@@ -179,12 +185,12 @@ def run_benchmark(
     report = progress or (lambda *_: None)
     with assembled(where, len(problems)) as pool:
         for name, repetition in product(planners, range(repeat)):
-            path, identity = _place_of(place, name, repetition), _identity(shared, name, repetition)
+            path, identity = _place_of(place, name, repetition), _identity(shared, name, repetition, settings[name])
             results = open_results(path, identity, overwrite=force, discard=replan)
             planned = partial(
                 _plan_locally if engine is None else partial(_plan_in_pool, pool),
                 name,
-                replace(setting, repetition=repetition),
+                replace(setting, repetition=repetition, parameters=given.get(name, {})),
             )
             label = name if repeat == 1 else f"{name}, repetition {repetition}"
             _plan_all(results, problems, planned, partial(report, f"{label} plans"))
@@ -274,12 +280,17 @@ def _shared_identity(suite: Suite, setting: Setting) -> dict[str, Any]:
     }
 
 
-def _identity(shared: dict[str, Any], planner: str, repetition: int) -> dict[str, Any]:
-    """Return the identity of the results of a planner: with its parameters and the version of its package."""
+def _checked_parameters(planner: str, parameters: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values of all fields of a planner."""
     try:
-        parameters = plain(asdict(registry.load(registry.PLANNERS, planner)()))
-    except CnpgenError:  # its own process reports the error
-        parameters = {}
+        loaded: Any = load_planner(planner, parameters)  # a dataclass, as its contract requires
+    except RecipeError:  # it cannot be imported; its own process reports the error
+        return {}
+    return dict(plain(asdict(loaded)))
+
+
+def _identity(shared: dict[str, Any], planner: str, repetition: int, parameters: dict[str, Any]) -> dict[str, Any]:
+    """Return the identity of the results of a planner: with its parameters and the version of its package."""
     packages = [entry.dist for entry in registry.installed(registry.PLANNERS) if entry.name == planner]
     version = next((package.version for package in packages if package is not None), __version__)
     return {

@@ -51,10 +51,26 @@ def add(commands: "Commands[Parser]") -> None:
     text = "largest distance of the mallet of a successful hit from the table plane (default: 20mm)"
     option("--plane-tolerance", metavar="M", type=values.meters, default=0.02, help=text)
     option("--reference", metavar="NAME", help="planner that p-values compare with (default: cnp-b+refine)")
+    text = "field of a planner, such as trajopt.iterations=50 or rrtconnect.simplify_time=0.5s"
+    option("--set", metavar="NAME.KEY=VALUE", nargs="+", default=[], type=parameter, help=text)
     option("--replan", action="store_true", help="discard earlier answers of these planners in DIR")
     text = "delete results of another suite, version, time limit, seed or planner parameters in DIR"
     option("--force", action="store_true", help=text)
     add_json(parser)
+
+
+def parameter(text: str) -> tuple[str, str, Any]:
+    """Read a field of a planner: its name, the key and the value, as in a recipe or as plain text."""
+    import tomllib
+
+    left, equals, value = text.partition("=")
+    name, dot, key = left.rpartition(".")
+    if not (equals and dot and name and key):
+        raise argparse.ArgumentTypeError(f"expected NAME.KEY=VALUE, such as trajopt.iterations=50, got {text!r}")
+    try:
+        return name, key, tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        return name, key, value
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -109,6 +125,7 @@ def _run(arguments: argparse.Namespace, folder: Path) -> "Benchmark":
             repeat=arguments.repeat,
             plane_tolerance=arguments.plane_tolerance,
             reference=arguments.reference,
+            parameters=_parameters(arguments.set),
             replan=arguments.replan,
             force=arguments.force,
             progress=progress,
@@ -118,6 +135,14 @@ def _run(arguments: argparse.Namespace, folder: Path) -> "Benchmark":
         raise type(interruption)(kept) from interruption
     finally:
         meter.close()
+
+
+def _parameters(fields: list[tuple[str, str, Any]]) -> dict[str, dict[str, Any]]:
+    """Group fields by planner."""
+    grouped: dict[str, dict[str, Any]] = {}
+    for name, key, value in fields:
+        grouped.setdefault(name, {})[key] = value
+    return grouped
 
 
 def _facts(found: "Benchmark", folder: Path) -> dict[str, Any]:

@@ -332,14 +332,20 @@ def test_earlier_answers_are_discarded_on_request(random: str, tmp_path: Path) -
     assert again[0]["planning_s"] < 77.0
 
 
-def test_other_parameters_of_a_planner_are_another_run(random: str, tmp_path: Path) -> None:
-    drawn(tmp_path / "results", random, n=1)
-    head = json.loads((tmp_path / "results" / "random.jsonl").read_text().splitlines()[0])
-    assert head["parameters"] == {"child": ""}
-    text = (tmp_path / "results" / "random.jsonl").read_text()
-    (tmp_path / "results" / "random.jsonl").write_text(text.replace('{"child": ""}', '{"child": "x"}'))
+def test_other_parameters_of_a_planner_are_another_run(tmp_path: Path) -> None:
+    few = run_benchmark("hits-81", tmp_path, planners=["trajopt"], n=1, parameters={"trajopt": {"iterations": 3}})
+    head = json.loads((tmp_path / "trajopt.jsonl").read_text().splitlines()[0])
+    assert head["parameters"] == {"iterations": 3}
     with pytest.raises(UsageError, match=r"another run \(other parameters\)"):
-        drawn(tmp_path / "results", random, n=1)
+        run_benchmark("hits-81", tmp_path, planners=["trajopt"], n=1)
+    more = run_benchmark(
+        "hits-81", tmp_path, planners=["trajopt"], n=1, parameters={"trajopt": {"iterations": 6}}, force=True
+    )
+    assert more.results["trajopt"][0]["answer"] != few.results["trajopt"][0]["answer"]
+    with pytest.raises(UsageError, match="trajopt: iterations: 0 is too small"):
+        run_benchmark("hits-81", tmp_path, planners=["trajopt"], n=1, parameters={"trajopt": {"iterations": 0}})
+    with pytest.raises(UsageError, match="parameters must be of planners of this run, got those of aqp"):
+        run_benchmark("hits-81", tmp_path, planners=["trajopt"], n=1, parameters={"aqp": {}})
 
 
 def test_children_of_a_planner_end_with_its_time_limit(
