@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 import cnpgen
-from cnpgen.benchmark.planners import cbirrt
+from cnpgen.benchmark.planners import cbirrt, rrtconnect, ruckig
 from cnpgen.benchmark.simulator import rendering
 from cnpgen.benchmark.simulator.execute import load_mujoco
 from cnpgen.cli.view import page
@@ -204,7 +204,9 @@ OPTIONAL = {  # package that cnpgen imports -> extra that installs it, function 
     "matplotlib": ("plot", lambda: new_figure(1, 1)),
     "mujoco": ("benchmark", load_mujoco),
     "imageio": ("benchmark", rendering._imageio),
-    "ompl": ("benchmark", cbirrt._ompl),
+    "ompl": ("benchmark", cbirrt.load_ompl),
+    "toppra": ("benchmark", rrtconnect.load_toppra),
+    "ruckig": ("benchmark", ruckig.load_ruckig),
     "meshcat": ("view", page._viewer),
     "distributed": ("dask", lambda: cluster("dask")),
     "ray": ("ray", lambda: cluster("ray")),

@@ -4,6 +4,8 @@ from cnpgen.benchmark.html_report import save_benchmark_report as save_benchmark
 from cnpgen.benchmark.pucks import Pucks as Pucks
 from cnpgen.benchmark.replanning_scenario import ExecutedPrefix as ExecutedPrefix
 from cnpgen.benchmark.replanning_scenario import ReplanningScenario as ReplanningScenario
+from cnpgen.benchmark.result_tables import save_benchmark_tables as save_benchmark_tables
+from cnpgen.benchmark.run_record import RunRecord as RunRecord
 from cnpgen.benchmark.run_suite import Benchmark as Benchmark
 from cnpgen.benchmark.run_suite import run_benchmark as run_benchmark
 from cnpgen.benchmark.simulator.executed import Executed as Executed

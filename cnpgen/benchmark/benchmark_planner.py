@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
 
 from cnpgen.benchmark.trajectory import Trajectory
+from cnpgen.errors import UsageError
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import ProblemRecord
+from cnpgen.schema import registry
+from cnpgen.schema.keys import RecipeLocation
+from cnpgen.schema.parsing import parse
 
 Answer = Plans | Trajectory | None
 """One plan, a trajectory sampled in time, or None if the planner found no plan."""
@@ -24,14 +31,26 @@ class Setting:
     Attributes:
         problem: Record of the problem.
         model: Name of the shipped model for problems of this kind, or empty.
-        time_limit: Planning time per problem [s]; a planner that takes much longer is stopped.
+        time_limit: Planning time per problem [s]; a planner that takes longer has no plan and is stopped.
         seed: Seed of random planners.
+        repetition: Number of the repetition, from 0.
+        parameters: Values of the planner's fields, as in a recipe; the others have their defaults.
     """
 
     problem: ProblemRecord
     model: str = ""
     time_limit: float = 60.0
     seed: int = 0
+    repetition: int = 0
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+
+    def random(self, problem: Plans) -> np.random.Generator:
+        """Return the random generator of one boundary problem; it depends on no other problem.
+
+        Args:
+            problem: The boundary problem, which is known by its ``sample_id``.
+        """
+        return np.random.default_rng([self.seed, self.repetition, int(problem.sample_id[0])])
 
 
 class BenchmarkPlanner(ABC):
@@ -57,3 +76,24 @@ class BenchmarkPlanner(ABC):
         Raises:
             UsageError: The planner does not support problems of this kind.
         """
+
+
+def load_planner(name: str, parameters: Mapping[str, Any]) -> BenchmarkPlanner:
+    """Load a planner by its name.
+
+    Args:
+        name: Its name.
+        parameters: Values of its fields, as in a recipe.
+
+    Raises:
+        RecipeError: The planner is unknown or cannot be imported.
+        UsageError: A parameter is unknown or invalid.
+    """
+    mistakes: list[str] = []
+    planner = parse(
+        registry.load(registry.PLANNERS, name), dict(parameters), where=RecipeLocation(name), mistakes=mistakes
+    )
+    if planner is None:
+        raise UsageError("; ".join(mistakes), concerns="parameters")
+    assert isinstance(planner, BenchmarkPlanner)
+    return planner

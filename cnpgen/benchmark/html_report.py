@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from cnpgen.benchmark.execution import Task, execution_of
-from cnpgen.benchmark.hypothesis_tests import FIGURES, FLAGS, reference_planner, values_of
+from cnpgen.benchmark.hypothesis_tests import FIGURES, values_of
+from cnpgen.benchmark.result_tables import failure_summaries, notes, table_rows
 from cnpgen.benchmark.run_suite import Benchmark
 from cnpgen.benchmark.simulator.plant import Plant
 from cnpgen.benchmark.simulator.rendering import save_film, save_picture
@@ -17,18 +18,6 @@ from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.store.files.atomic import write_file
 from cnpgen.store.files.figure_file import new_figure
 
-PRINTED: dict[str, dict[str, dict[str, str]]] = {  # suite -> planner -> figure -> value in the paper's text
-    "hits-81": {
-        "cnp-b": {"scored": "100 %", "planning_ms": "33", "z_error_mm_s": "< 5"},
-        "aqp": {"scored": "92.59 %", "planning_ms": "42"},
-        "trajopt": {"scored": "91.35 %", "planning_ms": "about 10,000"},
-    },
-    "heavy-100": {
-        "cnp-b": {"paper_finished": "100 %", "paper_valid": "95 %"},
-        "cbirrt": {"paper_finished": "88 %", "paper_valid": "74 %"},
-    },
-    "hits-110": {"cnp-b": {"scored": "78.2 % (real robot)"}, "aqp": {"scored": "52.7 % (real robot)"}},
-}
 MAX_FILM_FRAMES = 300  # less than 1 MB
 _STYLE = "body{font-family:sans-serif;max-width:75em;margin:2em auto}td,th{padding:.2em .8em;text-align:right}"
 _STYLE += "td:first-child,th:first-child{text-align:left}table{border-collapse:collapse}tr{border-top:1px solid #ccc}"
@@ -51,7 +40,7 @@ def save_benchmark_report(benchmark: Benchmark, path: str | Path, *, video: bool
     parts = [
         f"<h1>{escape(suite.name)} {suite.version}</h1><p>{escape(suite.title)}: {len(benchmark.problems)} problems</p>"
     ]
-    parts += [f"<p>{escape(text)}</p>" for text in failure_summaries(benchmark)]
+    parts += [f"<p>{escape(text)}</p>" for text in [*failure_summaries(benchmark), *notes(benchmark)]]
     for plant in benchmark.executions:
         title = f"executed by the {plant} plant" if plant else "planned"
         parts.append(f"<h2>{title}</h2>{_table(benchmark, plant)}{_boxes(benchmark, plant)}")
@@ -66,56 +55,15 @@ def _table(benchmark: Benchmark, plant: str) -> str:
     head, *rows = table_rows(benchmark, plant)
     lines = ["<table><tr>" + "".join(f"<th>{escape(cell)}</th>" for cell in head) + "</tr>"]
     lines += ["<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows]
-    other = reference_planner(benchmark.results)
-    note = f"Medians [quartiles]; p: p-value of the difference from {other}, if below 5 %."
-    return "\n".join([*lines, f"</table><p>{note}</p>"])
-
-
-def failure_summaries(benchmark: Benchmark) -> list[str]:
-    """Report the outcomes and the first error of every planner without a plan for some problems."""
-    texts = []
-    for name, rows in benchmark.results.items():
-        unplanned = [row for row in rows if row["answer"] is None]
-        for ending in dict.fromkeys(row["ending"] for row in unplanned):
-            failed = [row for row in unplanned if row["ending"] == ending]
-            detail = f", problem {failed[0]['problem']}: {failed[0]['error']}" if failed[0]["error"] else ""
-            texts.append(f"{name}: {len(failed)} of {len(rows)} {ending}{detail}")
-    return texts
-
-
-def table_rows(benchmark: Benchmark, plant: str) -> list[tuple[str, ...]]:
-    """Return the rows of the comparison: a head, then one row per ratio and figure, with the paper's values.
-
-    Args:
-        benchmark: Result of ``run_benchmark``.
-        plant: Name of the plant; empty for plans only.
-    """
-    summary = benchmark.summary(plant)
-    printed = PRINTED.get(benchmark.suite.name, {})
-    rows: list[tuple[str, ...]] = [(f"{plant} plant" if plant else "planned", *summary)]
-    for group, texts in (("ratios", FLAGS), ("figures", FIGURES)):
-        for key, text in texts.items():
-            cells = [cell_text(summary[name][group].get(key), printed.get(name, {}).get(key)) for name in summary]
-            if any(cells):
-                rows.append((text, *cells))
-    return rows
-
-
-def cell_text(statistic: dict[str, Any] | None, printed: str | None = None) -> str:
-    """Format a ratio or a figure with the paper's value."""
-    if statistic is None:
-        return f"paper: {printed}" if printed else ""
-    if "share" in statistic:
-        text = f"{statistic['count']} of {statistic['of']}"
-    else:
-        text = f"{statistic['median']:.3g} [{statistic['q1']:.3g}, {statistic['q3']:.3g}]"
-    text += f", p {statistic['p']:.1g}" if statistic["p"] < 0.05 else ""
-    return text + (f" (paper: {printed})" if printed else "")
+    return "\n".join([*lines, "</table>"])
 
 
 def _boxes(benchmark: Benchmark, plant: str) -> str:
     """Draw box plots of all figures."""
-    values = {name: [values_of(row, plant) for row in rows] for name, rows in benchmark.results.items()}
+    values = {
+        name: [values_of(row, plant, benchmark.plane_tolerance) for row in rows]
+        for name, rows in benchmark.results.items()
+    }
     keys = [key for key in FIGURES if any(key in row for rows in values.values() for row in rows)]
     figure = new_figure(4 * min(len(keys), 4), 3 * -(-len(keys) // 4), dpi=100)
     for place, key in enumerate(keys, start=1):
@@ -135,10 +83,11 @@ def _motions(benchmark: Benchmark, *, video: bool) -> list[str]:
     parts = []
     for name, rows in benchmark.results.items() if benchmark.plants else ():
         plant = benchmark.plants[0]
-        index = next((row["problem"] for row in rows if _was_executed(row, plant.name)), None)
-        if index is None:
+        row = next((row for row in rows if _was_executed(row, plant.name)), None)
+        if row is None:
             continue
-        task = benchmark.problems[index], rows[index]["answer"], benchmark.prefix and benchmark.prefix[index]
+        index = row["problem"]
+        task = benchmark.problems[index], row["answer"], benchmark.prefix and benchmark.prefix[index]
         label = f"{escape(name)}, problem {index}"
         try:
             element, caption = _render(task, plant, video=video)

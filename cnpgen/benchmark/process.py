@@ -1,26 +1,26 @@
 """Planner in its own process: a crash or a hang affects only the problem at which it happens."""
 
 import multiprocessing
+import os
+import resource
 import signal
 import subprocess
 import sys
 import time
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from multiprocessing.connection import Connection
 from typing import Any
 
-from cnpgen.benchmark.benchmark_planner import Plan, Setting
+from cnpgen.benchmark.benchmark_planner import Plan, Setting, load_planner
 from cnpgen.benchmark.results_file import answer_from_dict, answer_to_dict
 from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.errors import CnpgenError, MachineError, UsageError
 from cnpgen.machine.threads import one_thread
 from cnpgen.plans.plans import Plans
-from cnpgen.schema import registry
 
-# A planner is stopped after STOP_FACTOR times its time limit plus STOP_MARGIN_S.
-STOP_FACTOR, STOP_MARGIN_S = 2.0, 10.0
+STOP_MARGIN_S = 1.0  # after its time limit a planner is stopped; an answer in between is not counted
 MAX_PREPARATION_TIME_S = 300.0  # including the compilation of kernels
 STDERR = 2  # the file descriptor
 
@@ -32,6 +32,7 @@ class Ending(StrEnum):
     NO_PLAN = "no plan"
     FAILED = "failed"
     OUT_OF_TIME = "out of time"
+    NOT_APPLICABLE = "not applicable"
     CRASHED = "crashed"
 
 
@@ -43,7 +44,7 @@ class PlanningOutcome:
         ending: Outcome.
         answer: The plan or the trajectory in its stored form, if there is one.
         seconds: Wall time of planning [s].
-        cpu_seconds: CPU time of planning [s].
+        cpu_seconds: CPU time of planning, with that of ended child processes [s].
         error: Error message of the planner, or empty.
     """
 
@@ -72,7 +73,6 @@ class PlannerProcess:
         """Plan for one problem.
 
         Raises:
-            UsageError: The planner does not support problems of this kind.
             MachineError: This machine lacks a requirement of the planner.
         """
         if self._unprepared is None and self._pipe is None:
@@ -83,19 +83,24 @@ class PlannerProcess:
         try:
             assert self._pipe is not None
             self._pipe.send(problem)
-            if self._pipe.poll(STOP_FACTOR * self._setting.time_limit + STOP_MARGIN_S):
-                outcome: PlanningOutcome = self._pipe.recv()
-                return outcome
+            if self._pipe.poll(self._setting.time_limit + STOP_MARGIN_S):
+                return self._in_time(self._pipe.recv())
         except (EOFError, OSError):
             self.stop()
             return PlanningOutcome(Ending.CRASHED, seconds=time.perf_counter() - start, error="its process ended")
         self.stop()
         return PlanningOutcome(Ending.OUT_OF_TIME, seconds=time.perf_counter() - start, error="stopped: no answer")
 
+    def _in_time(self, outcome: PlanningOutcome) -> PlanningOutcome:
+        """Return an outcome, without an answer that is late."""
+        if outcome.answer is None or outcome.seconds <= self._setting.time_limit:
+            return outcome
+        return replace(outcome, ending=Ending.OUT_OF_TIME, answer=None, error="answered after the time limit")
+
     def stop(self) -> None:
-        """End the process."""
+        """End the process and its child processes."""
         if self._process is not None:
-            self._process.kill()
+            end_processes(self._process.pid)
             self._process.wait()
         if self._pipe is not None:
             self._pipe.close()
@@ -111,7 +116,7 @@ class PlannerProcess:
             )
             command = [sys.executable, "-c", program]
             self._process = subprocess.Popen(  # output of planners is not data
-                command, pass_fds=[child_end.fileno()], stdin=subprocess.DEVNULL, stdout=STDERR
+                command, pass_fds=[child_end.fileno()], stdin=subprocess.DEVNULL, stdout=STDERR, start_new_session=True
             )
         refusal, message = None, "its process ended or was not ready in time"
         with suppress(EOFError, OSError):
@@ -121,11 +126,37 @@ class PlannerProcess:
         if not message:
             return None
         self.stop()
+        if refusal is MachineError:
+            raise MachineError(f"planner {self._name!r} cannot plan here: {message}")
         if refusal is not None:
-            raise refusal(f"planner {self._name!r} cannot plan here: {message}")
+            return PlanningOutcome(Ending.NOT_APPLICABLE, error=message)
         return PlanningOutcome(
             Ending.CRASHED, seconds=time.perf_counter() - start, error=f"before the first problem: {message}"
         )
+
+
+def end_processes(root: int) -> None:
+    """End a process that leads its own session, and all processes that it started.
+
+    Args:
+        root: Its number.
+    """
+    import psutil
+
+    with suppress(psutil.NoSuchProcess):
+        descendants = psutil.Process(root).children(recursive=True)  # also those with a session of their own
+        with suppress(ProcessLookupError):
+            os.killpg(root, signal.SIGKILL)
+        for process in descendants:
+            with suppress(psutil.NoSuchProcess):
+                process.kill()
+        psutil.wait_procs(descendants, timeout=STOP_MARGIN_S)
+
+
+def _cpu_time() -> float:
+    """Return the CPU time of this process and of its ended child processes [s]."""
+    children = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return time.process_time() + children.ru_utime + children.ru_stime
 
 
 def serve(descriptor: int) -> None:
@@ -138,7 +169,7 @@ def serve(descriptor: int) -> None:
     with Connection(descriptor) as pipe, suppress(EOFError, OSError):
         name, setting = pipe.recv()
         try:
-            plan = registry.load(registry.PLANNERS, name)().prepare(setting)
+            plan = load_planner(name, setting.parameters).prepare(setting)
         except Exception as error:  # noqa: BLE001 - a plug-in may raise any exception
             pipe.send((_refusal(error), _message(error)))
             return
@@ -149,13 +180,14 @@ def serve(descriptor: int) -> None:
 
 def _plan_once(plan: Plan, problem: Plans) -> PlanningOutcome:
     """Plan for one problem and measure the time."""
-    start, cpu = time.perf_counter(), time.process_time()
+    start, cpu = time.perf_counter(), _cpu_time()
     try:
-        try:
-            with one_thread():
+        with one_thread():
+            start, cpu = time.perf_counter(), _cpu_time()
+            try:
                 answer = plan(problem)
-        finally:
-            seconds, cpu = time.perf_counter() - start, time.process_time() - cpu
+            finally:
+                seconds, cpu = time.perf_counter() - start, _cpu_time() - cpu
         content = _content(answer, problem)
     except Exception as error:  # noqa: BLE001 - a plug-in may raise any exception
         return PlanningOutcome(Ending.FAILED, None, seconds, cpu, _message(error))

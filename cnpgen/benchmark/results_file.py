@@ -31,7 +31,7 @@ from cnpgen.store.files.journal import append_line
 from cnpgen.store.paths import require_file
 
 RESULTS_FORMAT = "cnpgen-benchmark"
-RESULTS_VERSION = 1
+RESULTS_VERSION = 2
 _POINTS = [Nullable(FINITE)]
 _PLAN = {"degree": WHOLE, "path_control_points": [_POINTS], "rate_control_points": _POINTS}
 _REQUIRED = {"t": _POINTS, "q": [_POINTS]}
@@ -74,7 +74,7 @@ class Results:
     def unexecuted(self, plant: str, count: int) -> Iterator[int]:
         """Yield the problems whose plans a plant has not executed."""
         for index in range(count):
-            row = self.rows[index]
+            row = self.rows.get(index, {})
             if row.get("answer") is not None and plant not in row.get("executed", {}):
                 yield index
 
@@ -86,13 +86,14 @@ class Results:
             known["executed"] = executed
 
 
-def open_results(path: Path, identity: dict[str, Any], *, overwrite: bool = False) -> Results:
+def open_results(path: Path, identity: dict[str, Any], *, overwrite: bool = False, discard: bool = False) -> Results:
     """Open the results of a planner with the rows of earlier runs.
 
     Args:
         path: The file.
         identity: Identity of the run; results of another run are refused.
         overwrite: Whether to overwrite results of another run.
+        discard: Whether to discard the earlier results of this run.
 
     Raises:
         UsageError: The file belongs to another run.
@@ -107,19 +108,63 @@ def open_results(path: Path, identity: dict[str, Any], *, overwrite: bool = Fals
         lines = _complete_lines(path)
         if lines and lines[0] != head and not overwrite:
             raise UsageError(
-                f"{path} holds results of another run (suite, version or time limit differ);"
+                f"{path} holds results of another run ({_differences(lines[0], head)});"
                 " {force} overwrites them, another folder keeps them",
                 remedies={"force": True},
             )
-        lines = lines[1:] if lines and lines[0] == head else []
+        lines = lines[1:] if lines and lines[0] == head and not discard else []
+    _read_rows(results, lines)
+    write_file(path, "".join(f"{line}\n" for line in (head, *lines)).encode())
+    return results
+
+
+def read_results(path: Path, shared: dict[str, Any]) -> tuple[dict[str, Any], Results] | None:
+    """Read the results of a planner.
+
+    Args:
+        path: The file.
+        shared: The part of the identity that all planners of a folder share.
+
+    Returns:
+        The head and the results; None if the file is incomplete or belongs to another suite, version or time limit.
+
+    Raises:
+        DatasetError: The file is damaged.
+        MachineError: The file cannot be read.
+    """
+    lines = _complete_lines(path)
+    head = json.loads(lines[0]) if lines else None
+    common = {"format": RESULTS_FORMAT, "format_version": RESULTS_VERSION, **shared}
+    if not isinstance(head, dict) or any(head.get(key) != value for key, value in common.items()):
+        return None
+    identity = {key: value for key, value in head.items() if key not in {"format", "format_version"}}
+    return identity, _read_rows(Results(path), lines[1:])
+
+
+def holds_results(path: Path) -> bool:
+    """Return whether a file begins as the results of a planner, of any run."""
+    lines = _complete_lines(path)
+    head = json.loads(lines[0]) if lines else None
+    return isinstance(head, dict) and head.get("format") == RESULTS_FORMAT
+
+
+def _differences(line: str, head: str) -> str:
+    """Name the keys in which two heads differ."""
+    one, other = json.loads(line), json.loads(head)
+    if not isinstance(one, dict):
+        return "it has no head"
+    keys = [key for key in other if one.get(key) != other[key] and key != "suite_sha256"]
+    return f"other {', '.join(keys) or 'problems'}".replace("_", " ")
+
+
+def _read_rows(results: Results, lines: list[str]) -> Results:
     for number, line in enumerate(lines, start=2):
         row = json.loads(line)
         try:
             _check_row(row)
         except ValueError as error:
-            raise DatasetError(f"{path} is damaged: line {number}: {error}; delete that line") from error
+            raise DatasetError(f"{results.path} is damaged: line {number}: {error}; delete that line") from error
         results._merge(row)
-    write_file(path, "".join(f"{line}\n" for line in (head, *lines)).encode())
     return results
 
 

@@ -1,26 +1,29 @@
 """Benchmark runs: every planner on every problem, judged and optionally executed; finished problems are kept."""
 
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from cnpgen.benchmark.benchmark_planner import Setting
+from cnpgen.benchmark.benchmark_planner import Setting, load_planner
 from cnpgen.benchmark.execution import execute_answer
 from cnpgen.benchmark.hypothesis_tests import summarize_results
 from cnpgen.benchmark.judging import judge_answer
 from cnpgen.benchmark.process import PlannerProcess, PlanningOutcome
 from cnpgen.benchmark.replanning_scenario import ExecutedPrefix
-from cnpgen.benchmark.results_file import Results, answer_from_dict, open_results
+from cnpgen.benchmark.results_file import Results, answer_from_dict, holds_results, open_results, read_results
+from cnpgen.benchmark.run_record import RunRecord, describe_run, load_runs, save_runs
 from cnpgen.benchmark.simulator.challenge import challenge_plant, check_challenge
 from cnpgen.benchmark.simulator.execute import load_mujoco
+from cnpgen.benchmark.simulator.executed import PLANE_TOLERANCE_M
 from cnpgen.benchmark.simulator.plant import Plant, as_plant
 from cnpgen.benchmark.suite import Suite, load_suite
-from cnpgen.errors import UsageError, nearest
+from cnpgen.errors import RecipeError, UsageError, nearest
 from cnpgen.judges.plans.verdict import Verdict
 from cnpgen.machine.engine import Engine, WorkerPool, assembled
 from cnpgen.machine.versions import __version__
@@ -31,6 +34,7 @@ from cnpgen.schema import registry
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import concerning, integer, number
 from cnpgen.store.files.documents import canonical_sha256, plain
+from cnpgen.store.paths import require_file
 
 PROBLEMS_PER_TASK = 4  # of a worker; starting a planner takes some seconds
 FASTEST = ("cnp-b", "cnp-b+refine", "solve")  # default; the others take longer
@@ -53,8 +57,12 @@ class Benchmark:
         suite: The suite.
         problems: Its problems.
         prefix: Of replanning scenarios, the prefixes of the first motions.
-        results: Planner -> its rows, one for each problem, in their order ('cnpgen docs benchmark').
+        results: Planner -> its rows, ordered by repetition and problem ('cnpgen docs benchmark'). They cover all results
+            in the folder, also those of earlier runs.
         plants: Plants that executed plans in this run.
+        runs: Date, machine, versions and seed of the runs that wrote into the folder; the last one is this run.
+        reference: Planner with which the others are compared, or None for the default.
+        plane_tolerance: Maximum distance of the mallet of a successful hit from the table plane [m].
     """
 
     suite: Suite
@@ -62,14 +70,19 @@ class Benchmark:
     prefix: ExecutedPrefix | None
     results: dict[str, list[dict[str, Any]]]
     plants: tuple[Plant, ...] = ()
+    runs: tuple[RunRecord, ...] = ()
+    reference: str | None = None
+    plane_tolerance: float = PLANE_TOLERANCE_M
 
     def __repr__(self) -> str:
         return f"<{self.suite.name}: {len(self.problems)} problems, {', '.join(self.results)}>"
 
     @property
     def executions(self) -> tuple[str, ...]:
-        """Names of the plants; one empty name without execution."""
-        return tuple(plant.name for plant in self.plants) or ("",)
+        """Names of the plants that executed any plan; one empty name without execution."""
+        known = dict.fromkeys(plant.name for plant in self.plants)
+        known |= {name: None for rows in self.results.values() for row in rows for name in row.get("executed", {})}
+        return tuple(known) or ("",)
 
     @checked_arguments
     def summary(self, plant: str = "") -> dict[str, dict[str, dict[str, dict[str, Any]]]]:
@@ -78,7 +91,7 @@ class Benchmark:
         Args:
             plant: Name of the plant; empty for plans only.
         """
-        return summarize_results(self.results, plant)
+        return summarize_results(self.results, plant, reference=self.reference, plane_tolerance=self.plane_tolerance)
 
 
 @checked_arguments
@@ -91,9 +104,15 @@ def run_benchmark(
     plants: Sequence[str | Plant] = (),
     environment: str | Path | None = None,
     time_limit: float = 60.0,
+    seed: int = 0,
+    repeat: int = 1,
+    plane_tolerance: float = PLANE_TOLERANCE_M,
+    reference: str | None = None,
+    parameters: Mapping[str, Mapping[str, Any]] | None = None,
     workers: int | None = None,
     engine: str | None = None,
     address: str | None = None,
+    replan: bool = False,
     force: bool = False,
     progress: Progress | None = None,
 ) -> Benchmark:
@@ -111,11 +130,17 @@ def run_benchmark(
         plants: Plants that execute plans; none by default.
         environment: A clone of the Air Hockey Challenge's environment, which also executes plans, as the plant
             "challenge".
-        time_limit: Planning time per problem [s]; planners that ignore it may take longer.
+        time_limit: Planning time per problem [s]; later answers are not counted, and the planner's processes are ended.
+        seed: Seed of random planners. Each problem and repetition has its own random generator.
+        repeat: Number of repetitions of every problem.
+        plane_tolerance: Maximum distance of the mallet of a successful hit from the table plane [m].
+        reference: Planner with which the others are compared; default ``cnp-b+refine``, or the first one without it.
+        parameters: Planner -> its field -> value, as in a recipe; the others have their defaults.
         workers: Processes that execute plans and, with an engine, plan; default one per available core.
         engine: Engine of the workers, see ``make_dataset``; by default planners run on this machine.
         address: Address of the engine, see ``make_dataset``.
-        force: Whether to overwrite results of another suite, version or time limit.
+        replan: Whether to discard the earlier answers of these planners.
+        force: Whether to delete results of another suite, version, time limit or planner parameters in the folder.
         progress: Called after every problem.
 
     Raises:
@@ -128,6 +153,10 @@ def run_benchmark(
     with concerning("suite"):
         loaded = suite if isinstance(suite, Suite) else load_suite(suite)
     _check_planners(planners)
+    given = dict(parameters or {})
+    if unused := sorted(given.keys() - set(planners)):
+        raise UsageError(f"must be of planners of this run, got those of {', '.join(unused)}", argument="parameters")
+    settings = {name: _checked_parameters(name, given.get(name, {})) for name in planners}
     robots = tuple(as_plant(plant, argument="plants") for plant in plants)
     if environment is not None:
         robots += (challenge_plant(environment),)
@@ -136,27 +165,92 @@ def run_benchmark(
     limit = number("time_limit", time_limit)
     if limit <= 0:
         raise UsageError(f"must be above 0 s, got {time_limit:g} s", argument="time_limit")
+    if not 0 <= plane_tolerance < np.inf:
+        raise UsageError(f"must not be negative, got {plane_tolerance:g} m", argument="plane_tolerance")
+    seed, repeat = integer("seed", seed, least=0), integer("repeat", repeat, least=1)
     problems, prefix = loaded.problems(None if n is None else integer("n", n, least=1))
     if environment is not None:
         check_challenge(*open_problem(problems.problem))
-    setting = Setting(problems.problem, loaded.model, limit)
+    setting = Setting(problems.problem, loaded.model, limit, seed)
     place = Path(folder)
     if place.exists() and not place.is_dir():
         raise UsageError(f"must be a folder, {place} is a file", argument="folder")
     place.mkdir(parents=True, exist_ok=True)
+    shared = _shared_identity(loaded, setting)
+    names = {*_names_in(place, shared, delete_others=force), *planners}
+    if reference is not None and reference not in names:
+        raise UsageError(f"must be one of {', '.join(sorted(names))}, got {reference!r}", argument="reference")
+    runs = (*load_runs(place), describe_run(seed, planners))
+    save_runs(place, runs)
     report = progress or (lambda *_: None)
-    rows = {}
     with assembled(where, len(problems)) as pool:
-        for name in planners:
-            results = open_results(place / f"{name}.jsonl", _identity(loaded, name, limit), overwrite=force)
-            planned = _plan_locally if engine is None else partial(_plan_in_pool, pool)
-            _plan_all(results, problems, partial(planned, name, setting), partial(report, f"{name} plans"))
+        for name, repetition in product(planners, range(repeat)):
+            path, identity = _place_of(place, name, repetition), _identity(shared, name, repetition, settings[name])
+            results = open_results(path, identity, overwrite=force, discard=replan)
+            planned = partial(
+                _plan_locally if engine is None else partial(_plan_in_pool, pool),
+                name,
+                replace(setting, repetition=repetition, parameters=given.get(name, {})),
+            )
+            label = name if repeat == 1 else f"{name}, repetition {repetition}"
+            _plan_all(results, problems, planned, partial(report, f"{label} plans"))
             for plant in robots:
-                _execute_all(
-                    results, plant, problems, prefix, pool=pool, report=partial(report, f"{name}, {plant.name} plant")
-                )
-            rows[name] = [results.rows[index] for index in range(len(problems))]
-    return Benchmark(loaded, problems, prefix, rows, robots)
+                activity = f"{label}, {plant.name} plant"
+                _execute_all(results, plant, problems, prefix, pool=pool, report=partial(report, activity))
+    rows = _read_folder(place, shared, planners)
+    count = max((row["problem"] + 1 for part in rows.values() for row in part), default=0)
+    if count > len(problems):
+        problems, prefix = loaded.problems(count)
+    return Benchmark(loaded, problems, prefix, rows, robots, runs, reference, plane_tolerance)
+
+
+def _place_of(folder: Path, planner: str, repetition: int) -> Path:
+    """Return the results file of a planner and a repetition."""
+    return folder / (f"{planner}.jsonl" if repetition == 0 else f"{planner}.repetition-{repetition}.jsonl")
+
+
+def _names_in(folder: Path, shared: dict[str, Any], *, delete_others: bool) -> set[str]:
+    """Return the planners with results in a folder.
+
+    Raises:
+        UsageError: There are results of another run, and they are not to be deleted.
+    """
+    names = set()
+    for path in sorted(folder.glob("*.jsonl")):
+        require_file(path, "the results of a planner")
+        results = read_results(path, shared)
+        if results is not None:
+            names.add(str(results[0]["planner"]))
+        elif not holds_results(path):
+            continue
+        elif delete_others:
+            path.unlink()
+        else:
+            raise UsageError(
+                f"{path} holds results of another run (suite, version, time limit or seed differ);"
+                " {force} deletes them, another folder keeps them",
+                remedies={"force": True},
+            )
+    return names
+
+
+def _read_folder(folder: Path, shared: dict[str, Any], first: Sequence[str]) -> dict[str, list[dict[str, Any]]]:
+    """Return planner -> rows of all results in a folder, the given planners first."""
+    parts: dict[str, dict[int, Results]] = {name: {} for name in first}
+    for path in sorted(folder.glob("*.jsonl")):
+        loaded = read_results(path, shared)
+        if loaded is not None:
+            identity, results = loaded
+            parts.setdefault(identity["planner"], {})[identity["repetition"]] = results
+    return {
+        name: [
+            {**row, "repetition": repetition}
+            for repetition, results in sorted(repetitions.items())
+            for _, row in sorted(results.rows.items())
+            if "ending" in row
+        ]
+        for name, repetitions in parts.items()
+    }
 
 
 def _check_planners(planners: Sequence[str]) -> None:
@@ -173,16 +267,38 @@ def _check_planners(planners: Sequence[str]) -> None:
             )
 
 
-def _identity(suite: Suite, planner: str, time_limit: float) -> dict[str, Any]:
-    """Return the identity of the results of a planner."""
+def _shared_identity(suite: Suite, setting: Setting) -> dict[str, Any]:
+    """Return the identity that all results of a folder share."""
     digest = canonical_sha256(plain(resolved(suite)))
     return {
         "suite": suite.name,
         "suite_version": suite.version,
         "suite_sha256": digest,
-        "planner": planner,
         "cnpgen": __version__,
-        "time_limit_s": time_limit,
+        "time_limit_s": setting.time_limit,
+        "seed": setting.seed,
+    }
+
+
+def _checked_parameters(planner: str, parameters: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values of all fields of a planner."""
+    try:
+        loaded: Any = load_planner(planner, parameters)  # a dataclass, as its contract requires
+    except RecipeError:  # it cannot be imported; its own process reports the error
+        return {}
+    return dict(plain(asdict(loaded)))
+
+
+def _identity(shared: dict[str, Any], planner: str, repetition: int, parameters: dict[str, Any]) -> dict[str, Any]:
+    """Return the identity of the results of a planner: with its parameters and the version of its package."""
+    packages = [entry.dist for entry in registry.installed(registry.PLANNERS) if entry.name == planner]
+    version = next((package.version for package in packages if package is not None), __version__)
+    return {
+        **shared,
+        "planner": planner,
+        "planner_version": version,
+        "parameters": parameters,
+        "repetition": repetition,
     }
 
 

@@ -3,6 +3,7 @@
 import argparse
 import json
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -45,13 +46,37 @@ def add(commands: "Commands[Parser]") -> None:
     text = "processes for execution, and with --engine for planning; default one per available core"
     option("--workers", metavar="W", type=values.positive, help=text)
     add_engine(parser)
-    option("--force", action="store_true", help="discard results of another suite, version or time limit in DIR")
+    option("--seed", metavar="SEED", type=values.seed, default=0, help="seed of random planners (default: 0)")
+    option("--repeat", metavar="K", type=values.positive, default=1, help="repetitions of every problem (default: 1)")
+    text = "largest distance of the mallet of a successful hit from the table plane (default: 20mm)"
+    option("--plane-tolerance", metavar="M", type=values.meters, default=0.02, help=text)
+    option("--reference", metavar="NAME", help="planner that p-values compare with (default: cnp-b+refine)")
+    text = "field of a planner, such as trajopt.iterations=50 or rrtconnect.simplify_time=0.5s"
+    option("--set", metavar="NAME.KEY=VALUE", nargs="+", default=[], type=parameter, help=text)
+    option("--replan", action="store_true", help="discard earlier answers of these planners in DIR")
+    text = "delete results of another suite, version, time limit, seed or planner parameters in DIR"
+    option("--force", action="store_true", help=text)
     add_json(parser)
+
+
+def parameter(text: str) -> tuple[str, str, Any]:
+    """Read a field of a planner: its name, the key and the value, as in a recipe or as plain text."""
+    import tomllib
+
+    left, equals, value = text.partition("=")
+    name, dot, key = left.rpartition(".")
+    if not (equals and dot and name and key):
+        raise argparse.ArgumentTypeError(f"expected NAME.KEY=VALUE, such as trajopt.iterations=50, got {text!r}")
+    try:
+        return name, key, tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        return name, key, value
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     from cnpgen.benchmark.html_report import save_benchmark_report
+    from cnpgen.benchmark.result_tables import save_benchmark_tables
     from cnpgen.errors import UsageError
 
     if arguments.list:
@@ -66,6 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError("--video needs --simulate")
     folder = arguments.out or Path(f"{Path(arguments.suite).stem}-results")
     found = _run(arguments, folder)
+    save_benchmark_tables(found, folder)
     report = save_benchmark_report(found, folder / "report.html", video=arguments.video)
     print(json.dumps(_facts(found, folder), indent=2) if arguments.json else _text(found))
     print(f"report: {report}", file=sys.stderr)
@@ -95,6 +121,12 @@ def _run(arguments: argparse.Namespace, folder: Path) -> "Benchmark":
             workers=arguments.workers,
             engine=arguments.engine,
             address=arguments.address,
+            seed=arguments.seed,
+            repeat=arguments.repeat,
+            plane_tolerance=arguments.plane_tolerance,
+            reference=arguments.reference,
+            parameters=_parameters(arguments.set),
+            replan=arguments.replan,
             force=arguments.force,
             progress=progress,
         )
@@ -105,8 +137,17 @@ def _run(arguments: argparse.Namespace, folder: Path) -> "Benchmark":
         meter.close()
 
 
+def _parameters(fields: list[tuple[str, str, Any]]) -> dict[str, dict[str, Any]]:
+    """Group fields by planner."""
+    grouped: dict[str, dict[str, Any]] = {}
+    for name, key, value in fields:
+        grouped.setdefault(name, {})[key] = value
+    return grouped
+
+
 def _facts(found: "Benchmark", folder: Path) -> dict[str, Any]:
     """Return the results of all planners for JSON."""
+    from cnpgen.benchmark.hypothesis_tests import reference_planner
     from cnpgen.benchmark.results_file import RESULTS_FORMAT, RESULTS_VERSION
 
     return {
@@ -116,19 +157,22 @@ def _facts(found: "Benchmark", folder: Path) -> dict[str, Any]:
         "suite_version": found.suite.version,
         "problems": len(found.problems),
         "folder": str(folder),
+        "runs": [asdict(run) for run in found.runs],
+        "reference": reference_planner(found.results, found.reference),
+        "plane_tolerance_m": found.plane_tolerance,
         "planners": {plant or "planned": found.summary(plant) for plant in found.executions},
     }
 
 
 def _text(found: "Benchmark") -> str:
     """Format one table per plant with a column per planner."""
-    from cnpgen.benchmark.html_report import failure_summaries, table_rows
+    from cnpgen.benchmark.result_tables import failure_summaries, notes, table_rows
     from cnpgen.cli.describe import table
 
     head = f"{found.suite.name} {found.suite.version}: {len(found.problems)} problems"
     tables = [table([(*row, "") for row in table_rows(found, plant)], indent="  ") for plant in found.executions]
     return "\n\n".join(
-        [head, *("\n".join(lines) for lines in tables), *filter(None, ["\n".join(failure_summaries(found))])]
+        [head, *("\n".join(lines) for lines in tables), "\n".join([*failure_summaries(found), *notes(found)])]
     )
 
 

@@ -103,6 +103,11 @@ def seconds(text: str) -> float:
     return _quantity(text, "s", "a time above 0, such as 0.001 or 1ms")
 
 
+def meters(text: str) -> float:
+    """Read a length above 0: ``0.02`` or ``20mm``."""
+    return _quantity(text, "m", "a length above 0, such as 0.02 or 20mm")
+
+
 def hertz(text: str) -> float:
     """Read a rate above 0: ``1000`` or ``1000Hz``."""
     return _quantity(text, "1/s", "a rate above 0, such as 1000 or 1000Hz")

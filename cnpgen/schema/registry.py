@@ -75,6 +75,8 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "trajopt": "cnpgen.benchmark.planners.trajopt:TrajOpt",
         "aqp": "cnpgen.benchmark.planners.aqp:AQP",
         "cbirrt": "cnpgen.benchmark.planners.cbirrt:CBiRRT",
+        "rrtconnect": "cnpgen.benchmark.planners.rrtconnect:RRTConnect",
+        "ruckig": "cnpgen.benchmark.planners.ruckig:Ruckig",
         "sst": "cnpgen.benchmark.planners.sst:SST",
         "mpc-mpnet": "cnpgen.benchmark.planners.mpc_mpnet:MPCMPNet",
     },

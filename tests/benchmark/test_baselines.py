@@ -1,6 +1,7 @@
 """TrajOpt, AQP and CBiRRT, compared with finite differences, SciPy and Pinocchio."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pinocchio as pin
@@ -8,11 +9,14 @@ import pytest
 from scipy.integrate import quad
 from scipy.optimize import LinearConstraint, minimize
 
-from cnpgen.benchmark.benchmark_planner import Setting
+from cnpgen.benchmark.benchmark_planner import BenchmarkPlanner, Setting
 from cnpgen.benchmark.judging import judge_answer
 from cnpgen.benchmark.planners.aqp import AQP, nearest_in_null_space
+from cnpgen.benchmark.planners.cbirrt import CBiRRT
 from cnpgen.benchmark.planners.knots import knot_constraints
 from cnpgen.benchmark.planners.obstacle_boxes import boxes_of
+from cnpgen.benchmark.planners.rrtconnect import RRTConnect, timed_by_toppra
+from cnpgen.benchmark.planners.ruckig import Ruckig, time_optimal_motion
 from cnpgen.benchmark.planners.table_plane import (
     MAX_MALLET_XY_M,
     MIN_MALLET_XY_M,
@@ -29,6 +33,7 @@ from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.errors import UsageError
 from cnpgen.plans import Plans, open_problem
 from cnpgen.robots.obstacle import Obstacle
+from cnpgen.trajectory.boundary import Boundary
 from tests.conftest import some
 
 
@@ -189,3 +194,80 @@ def test_baselines_refuse_obstacles_that_are_not_upright_boxes() -> None:
     ball = Obstacle(name="ball", kind="sphere", position=(0.4, 0.1, 0.5), radius=0.1)
     with pytest.raises(UsageError, match="supported are upright boxes only, 'heavy-object' has ball"):
         boxes_of(replace(problem, obstacle=(*problem.obstacle, ball)), one_of("heavy-100").scene)
+
+
+def at_rest(joints: int, distance: np.ndarray) -> Boundary:
+    still = np.zeros((1, joints))
+    return Boundary(still, still, still, distance[None], still)
+
+
+def test_ruckig_returns_its_own_motion_within_the_limits_and_in_the_known_time() -> None:
+    ruckig = pytest.importorskip("ruckig")
+    robot = open_problem(one_of("hits-81").problem)[1]
+    limited = SimpleNamespace(
+        n=robot.n,
+        velocity_limit=np.full(robot.n, 1.0),
+        acceleration_limit=np.full(robot.n, 5.0),
+        jerk_limit=np.full(robot.n, 50.0),
+    )
+    distance = np.array([1.5, 0.2, -0.4, 0.0, 0.1, -0.3])
+    motion = time_optimal_motion(ruckig, limited, at_rest(robot.n, distance))
+    assert isinstance(motion, Trajectory)
+    assert motion.duration == pytest.approx(1.5 / 1.0 + 1.0 / 5.0 + 5.0 / 50.0)  # d / v + v / a + a / j
+    t = np.linspace(0, motion.duration, 3001)
+    q, dq, ddq = motion.states(t)
+    np.testing.assert_allclose(q[[0, -1]], [np.zeros(6), distance], atol=1e-9)
+    assert np.abs(dq).max() == pytest.approx(1.0)
+    assert np.abs(ddq).max() == pytest.approx(5.0)
+    assert np.abs(np.diff(ddq, axis=0)).max() / t[1] < 50.0 * (1 + 1e-6)
+    np.testing.assert_allclose(np.gradient(q, t, axis=0)[1:-1], dq[1:-1], atol=1e-4)
+
+
+def test_ruckig_meets_the_boundary_conditions_of_a_hit_and_refuses_an_impossible_one() -> None:
+    ruckig = pytest.importorskip("ruckig")
+    task = one_of("hits-81", 3)
+    robot = open_problem(task.problem)[1]
+    motion = Ruckig().prepare(Setting(task.problem))(task)
+    assert isinstance(motion, Trajectory)
+    q, dq, ddq = motion.states(np.array([0.0, motion.duration]))
+    boundary = task.boundary
+    np.testing.assert_allclose(q, [boundary.start_q[0], boundary.goal_q[0]], atol=1e-9)
+    np.testing.assert_allclose(dq, [boundary.start_dq[0], boundary.goal_dq[0]], atol=1e-9)
+    np.testing.assert_allclose(ddq, 0.0, atol=1e-6)
+    verdict = judge_answer(task, motion)
+    assert not verdict.valid  # it leaves the plane of the table
+    assert verdict.metrics.z_error > 1e-4
+    too_fast = replace(boundary, goal_dq=boundary.goal_dq + 2 * robot.velocity_limit)
+    assert time_optimal_motion(ruckig, robot, too_fast) is None
+
+
+def test_toppra_times_a_line_in_the_known_time_and_reaches_the_speed_of_the_goal() -> None:
+    pytest.importorskip("toppra")
+    limited = SimpleNamespace(velocity_limit=np.array([1.0, 2.0]), acceleration_limit=np.array([4.0, 8.0]))
+    line = np.linspace([0.0, 0.0], [1.5, 0.5], 20)
+    motion = timed_by_toppra(line, limited, np.zeros(2))
+    assert isinstance(motion, Trajectory)
+    assert motion.duration == pytest.approx(1.5 / 1.0 + 1.0 / 4.0, rel=1e-3)  # d / v + v / a of the first joint
+    moving = timed_by_toppra(line, limited, np.array([0.6, 0.2]))
+    assert isinstance(moving, Trajectory)
+    np.testing.assert_allclose(moving.states(np.array([moving.duration]))[1][0], [0.6, 0.2], rtol=1e-3)
+    too_fast = timed_by_toppra(line, limited, np.array([1.2, 0.4]))
+    assert isinstance(too_fast, Trajectory)
+    np.testing.assert_allclose(too_fast.states(np.array([too_fast.duration]))[1][0], [0.9, 0.3], rtol=1e-3)
+    assert timed_by_toppra(line[[0, 0]], limited, np.zeros(2)) is None
+
+
+@pytest.mark.parametrize("planner", some([CBiRRT(), RRTConnect()], 1, "slow"))
+def test_a_sampling_based_search_depends_on_its_own_problem_only(planner: BenchmarkPlanner) -> None:
+    for module in ("ompl", "toppra"):
+        pytest.importorskip(module)
+    problems = load_suite("heavy-100").problems(4)[0]
+    plan = planner.prepare(Setting(problems.problem, time_limit=20.0))
+    after_others = [plan(problem) for problem in problems]
+    alone = planner.prepare(Setting(problems.problem, time_limit=20.0))
+    other_seed = planner.prepare(Setting(problems.problem, time_limit=20.0, seed=1))
+    assert all(isinstance(answer, Trajectory) for answer in after_others)
+    np.testing.assert_array_equal(alone(problems[3]).q, after_others[3].q)
+    np.testing.assert_array_equal(alone(problems[1]).q, after_others[1].q)
+    changed = [other_seed(problem) for problem in problems]
+    assert any(a.q.shape != b.q.shape or (a.q != b.q).any() for a, b in zip(changed, after_others, strict=True))

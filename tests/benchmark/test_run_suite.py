@@ -1,15 +1,20 @@
 """Resumed runs; planners that crash, time out or return invalid results."""
 
+import csv
 import json
 import os
 import re
+import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from cnpgen.benchmark.html_report import failure_summaries, save_benchmark_report
+from cnpgen.benchmark.benchmark_planner import Setting
+from cnpgen.benchmark.html_report import save_benchmark_report
+from cnpgen.benchmark.process import Ending, PlannerProcess, PlanningOutcome
+from cnpgen.benchmark.result_tables import failure_summaries, save_benchmark_tables, table_rows
 from cnpgen.benchmark.results_file import answer_from_dict, answer_to_dict, open_results
 from cnpgen.benchmark.run_suite import run_benchmark
 from cnpgen.benchmark.suite import load_suite
@@ -115,7 +120,7 @@ def test_a_report_omits_the_image_of_a_damaged_line(tmp_path: Path) -> None:
     assert failure.startswith("path_control_points has 3 joints, but 'airhockey' plans 6")
     report = save_benchmark_report(benchmark, tmp_path / "report.html").read_text()
     assert "cnp-b, problem 0: no image: path_control_points has 3 joints" in report
-    assert "1 of 1 (paper: 100 %)" in report
+    assert "1 of 1 (20.7 to 100 %) (paper: 100 %)" in report
 
 
 @pytest.mark.slow
@@ -162,7 +167,7 @@ def test_a_run_resumes_and_adds_executions_and_problems(tmp_path: Path, monkeypa
     assert "<svg" in report
     assert "src='data:video/mp4;base64," in report or "No images: this machine cannot draw" in report
     assert not re.search("(src|href)=['\"](?!data:|#)", report)
-    assert [file.name for file in sorted(tmp_path.iterdir())] == ["cnp-b.jsonl", "report.html"]
+    assert [file.name for file in sorted(tmp_path.iterdir())] == ["cnp-b.jsonl", "report.html", "runs.json"]
 
 
 @pytest.mark.slow
@@ -240,9 +245,16 @@ def test_mistakes_are_reported_before_any_work(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_unsuitable_planner_is_refused_with_its_reason(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="planner 'aqp' cannot plan here: aqp plans hits on a table"):
-        run_benchmark("heavy-100", tmp_path, planners=["aqp"], n=1)
+def test_an_unsuitable_planner_is_reported_as_not_applicable(tmp_path: Path) -> None:
+    benchmark = run_benchmark("heavy-100", tmp_path, planners=["cnp-b", "aqp"], n=2)
+    assert [row["ending"] for row in benchmark.results["aqp"]] == ["not applicable"] * 2
+    assert failure_summaries(benchmark) == [
+        "aqp: 2 of 2 not applicable, problem 0: aqp plans hits on a table with up to 7 joints,"
+        " 'heavy-object' is another problem"
+    ]
+    rows = {head: cells for head, *cells in table_rows(benchmark, "")}
+    assert rows["applicability"] == ["", "not applicable"]
+    assert rows["a plan was found"] == ["2 of 2 (34.2 to 100 %)", ""]
 
 
 def test_answers_are_read_back_exactly(tmp_path: Path) -> None:
@@ -257,3 +269,143 @@ def test_answers_are_read_back_exactly(tmp_path: Path) -> None:
     assert (read.q == trajectory.q).all()
     assert (read.t == trajectory.t).all()
     assert read.dq is None
+
+
+RANDOM = """
+import os, subprocess, sys, time
+from dataclasses import dataclass
+import numpy as np
+from cnpgen.benchmark import BenchmarkPlanner, Trajectory
+from cnpgen.plugins import field
+
+@dataclass(frozen=True)
+class Random(BenchmarkPlanner):
+    "Draws a goal; it can start a child that outlives it."
+
+    child: str = field("file that the child touches after the time limit", default="")
+
+    def prepare(self, setting):
+        def plan(problem):
+            if self.child:
+                program = f"import time; time.sleep(3); open({self.child!r}, 'w')"
+                subprocess.Popen([sys.executable, "-c", program], start_new_session=True)
+                time.sleep(1000)
+            return Trajectory(np.array([0, 1.0]), setting.random(problem).normal(size=(2, 6)))
+        return plan
+"""
+
+
+def drawn(folder: Path, name: str, indices: slice = slice(None), **options: Any) -> list[Any]:
+    rows = run_benchmark("hits-81", folder, planners=[name], **options).results[name]
+    return [row["answer"]["q"] for row in rows[indices]]
+
+
+@pytest.fixture
+def random(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    (tmp_path / "random_planner.py").write_text(RANDOM, encoding="utf-8")
+    with installed_kind(tmp_path, "random", "random_planner:Random", monkeypatch):
+        yield "random"
+
+
+def test_every_problem_has_its_own_random_numbers(random: str, tmp_path: Path) -> None:
+    whole = drawn(tmp_path / "whole", random, n=3)
+    drawn(tmp_path / "resumed", random, n=1)
+    assert drawn(tmp_path / "resumed", random, n=3) == whole
+    assert drawn(tmp_path / "seed", random, n=3, seed=1) != whole
+    repeated = drawn(tmp_path / "repeated", random, n=3, repeat=2)
+    assert repeated[:3] == whole
+    assert len({str(answer) for answer in repeated}) == 6
+    with pytest.raises(UsageError, match="seed"):
+        run_benchmark("hits-81", tmp_path / "whole", planners=[random], n=1, seed=1)
+
+
+def test_earlier_answers_are_discarded_on_request(random: str, tmp_path: Path) -> None:
+    drawn(tmp_path / "results", random, n=3)
+    file = tmp_path / "results" / "random.jsonl"
+    head, *lines = file.read_text().splitlines()
+    changed = {**json.loads(lines[0]), "planning_s": 77.0}
+    file.write_text("\n".join([head, json.dumps(changed), *lines[1:]]) + "\n")
+    kept = run_benchmark("hits-81", tmp_path / "results", planners=[random], n=1).results[random]
+    assert [row["planning_s"] == 77.0 for row in kept] == [True, False, False]
+    again = run_benchmark("hits-81", tmp_path / "results", planners=[random], n=1, replan=True).results[random]
+    assert len(again) == 1
+    assert again[0]["planning_s"] < 77.0
+
+
+def test_other_parameters_of_a_planner_are_another_run(tmp_path: Path) -> None:
+    few = run_benchmark("hits-81", tmp_path, planners=["trajopt"], n=1, parameters={"trajopt": {"iterations": 3}})
+    head = json.loads((tmp_path / "trajopt.jsonl").read_text().splitlines()[0])
+    assert head["parameters"] == {"iterations": 3}
+    with pytest.raises(UsageError, match=r"another run \(other parameters\)"):
+        run_benchmark("hits-81", tmp_path, planners=["trajopt"], n=1)
+    more = run_benchmark(
+        "hits-81", tmp_path, planners=["trajopt"], n=1, parameters={"trajopt": {"iterations": 6}}, force=True
+    )
+    assert more.results["trajopt"][0]["answer"] != few.results["trajopt"][0]["answer"]
+    with pytest.raises(UsageError, match="trajopt: iterations: 0 is too small"):
+        run_benchmark("hits-81", tmp_path, planners=["trajopt"], n=1, parameters={"trajopt": {"iterations": 0}})
+    with pytest.raises(UsageError, match="parameters must be of planners of this run, got those of aqp"):
+        run_benchmark("hits-81", tmp_path, planners=["trajopt"], n=1, parameters={"aqp": {}})
+
+
+def test_children_of_a_planner_end_with_its_time_limit(
+    random: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module, touched = tmp_path / "random_planner.py", tmp_path / "touched"
+    module.write_text(module.read_text().replace('default=""', f"default={str(touched)!r}"))
+    monkeypatch.setattr("cnpgen.benchmark.process.STOP_MARGIN_S", 0.2)
+    start = time.monotonic()
+    (row,) = run_benchmark("hits-81", tmp_path / "results", planners=[random], n=1, time_limit=0.5).results[random]
+    assert row["ending"] == "out of time"
+    assert time.monotonic() - start < 60
+    time.sleep(3.5)
+    assert not touched.exists()
+
+
+def test_an_answer_after_the_time_limit_does_not_count() -> None:
+    process = PlannerProcess("cnp-b", Setting(load_suite("hits-81").problems(1)[0].problem, time_limit=1.0))
+    late = PlanningOutcome(Ending.PLANNED, {"t": []}, seconds=1.001)
+    assert process._in_time(late).ending == "out of time"
+    assert process._in_time(late).answer is None
+    in_time = PlanningOutcome(Ending.PLANNED, {"t": []}, seconds=0.999)
+    assert process._in_time(in_time) is in_time
+
+
+def test_a_report_covers_the_folder_and_nothing_else(random: str, tmp_path: Path) -> None:
+    folder = tmp_path / "results"
+    run_benchmark("hits-81", folder, planners=["cnp-b"], n=3)
+    benchmark = run_benchmark("hits-81", folder, planners=[random], n=2, reference="cnp-b")
+    assert {name: len(rows) for name, rows in benchmark.results.items()} == {random: 2, "cnp-b": 3}
+    assert len(benchmark.problems) == 3
+    assert [run.planners for run in benchmark.runs] == [("cnp-b",), (random,)]
+    save_benchmark_tables(benchmark, folder)
+    lines = (folder / "results.csv").read_text().splitlines()
+    csv_rows = list(csv.DictReader(line for line in lines if not line.startswith("#")))
+    assert [(row["planner"], row["problem"]) for row in csv_rows] == [
+        (random, "0"), (random, "1"), ("cnp-b", "0"), ("cnp-b", "1"), ("cnp-b", "2"),
+    ]  # fmt: skip
+    assert float(csv_rows[2]["planning_ms"]) == 1e3 * benchmark.results["cnp-b"][0]["planning_s"]
+    for name in ("results.csv", "tables.md", "tables.tex"):
+        text = (folder / name).read_text()
+        for needed in (benchmark.runs[-1].date, benchmark.runs[-1].processor, "seed 0", "numpy"):
+            assert needed in text, (name, needed)
+    assert "| planned | random | cnp-b |" in (folder / "tables.md").read_text()
+    latex = (folder / "tables.tex").read_text()
+    assert r"planned & random & cnp-b \\" in latex
+    assert re.search(r"(?<!\\)%", re.sub(r"^%.*$", "", latex, flags=re.M)) is None
+    with pytest.raises(UsageError, match="reference must be one of cnp-b, random, got 'solve'"):
+        run_benchmark("hits-81", folder, planners=[random], n=1, reference="solve")
+    (folder / "other.jsonl").write_text('{"format": "cnpgen-benchmark", "suite": "heavy-100"}\n')
+    with pytest.raises(UsageError, match=r"other.jsonl holds results of another run"):
+        run_benchmark("hits-81", folder, planners=[random], n=1)
+    run_benchmark("hits-81", folder, planners=[random], n=1, force=True)
+    assert not (folder / "other.jsonl").exists()
+    (folder / "notes.jsonl").write_text('{"mine": 1}\n')  # not results of a benchmark
+    run_benchmark("hits-81", folder, planners=[random], n=1, force=True)
+    assert (folder / "notes.jsonl").read_text() == '{"mine": 1}\n'
+
+
+def test_a_damaged_record_of_runs_is_named(tmp_path: Path) -> None:
+    (tmp_path / "runs.json").write_text('[{"date": 5}]')
+    with pytest.raises(DatasetError, match=r"runs.json is damaged: .*; delete it"):
+        run_benchmark("hits-81", tmp_path, planners=["cnp-b"], n=1)

@@ -51,3 +51,10 @@ def test_mistakes_are_said_in_a_line(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "--plant needs --simulate" in capsys.readouterr().err
     assert main(["benchmark", "hits-81", "--video", "-o", str(tmp_path)]) == 2
     assert "--video needs --simulate" in capsys.readouterr().err
+    assert main(["benchmark", "hits-81", "--set", "trajopt", "-o", str(tmp_path)]) == 2
+    assert "expected NAME.KEY=VALUE" in capsys.readouterr().err
+    command = ["benchmark", "hits-81", "--planners", "trajopt", "-o", str(tmp_path), "--set"]
+    assert main([*command, "trajopt.iteration=5"]) == 2
+    assert "did you mean 'iterations'" in capsys.readouterr().err
+    assert main(["benchmark", "hits-81", "--plane-tolerance", "20 s", "-o", str(tmp_path)]) == 2
+    assert "expected a length" in capsys.readouterr().err

@@ -34,6 +34,7 @@ Array = NDArray[np.float64]
 MANIFOLD_TOLERANCE = 0.01
 MAX_PROJECTIONS, DELTA, LAMBDA = 50, 0.05, 2.0  # defaults of OMPL
 MAX_GOAL_ERROR_RAD = 0.01
+SEEDS = 2**31  # number of seeds of OMPL
 STEP_PAUSE_S = 1e-4  # added to the time of every step
 
 
@@ -43,12 +44,11 @@ class CBiRRT(BenchmarkPlanner):
 
     def prepare(self, setting: Setting) -> Plan:
         """Import OMPL."""
-        ompl = _ompl()
-        ompl.util.RNG.setSeed(setting.seed + 1)
-        ompl.util.setLogLevel(ompl.util.LogLevel.LOG_NONE)
+        ompl = load_ompl()
         problem, robot = open_problem(setting.problem)
 
         def plan(task: Plans) -> Answer:
+            seed_ompl(ompl, setting, task)
             search = Search(problem, robot, task)
             path = search.solve(ompl, setting.time_limit)
             return None if path is None else timed(path, robot.velocity_limit)
@@ -56,12 +56,23 @@ class CBiRRT(BenchmarkPlanner):
         return plan
 
 
-def _ompl() -> Any:
+def load_ompl() -> Any:
+    """Import OMPL without its messages.
+
+    Raises:
+        MissingExtraError: OMPL is missing.
+    """
     with requires_extra("benchmark", "OMPL"):
         import ompl.base
         import ompl.geometric
         import ompl.util
+    ompl.util.setLogLevel(ompl.util.LogLevel.LOG_NONE)
     return ompl
+
+
+def seed_ompl(ompl: Any, setting: Setting, task: Plans) -> None:
+    """Seed the generators that OMPL constructs next, so that a search depends on its own problem only."""
+    ompl.util.RNG.setSeed(int(setting.random(task).integers(1, SEEDS)))
 
 
 def timed(path: Array, velocity_limit: Array) -> Trajectory:
@@ -117,8 +128,17 @@ class Search:
             for box in self._boxes
         )
 
-    def solve(self, ompl: Any, time_limit: float) -> Array | None:
-        """Search for a path: joint positions [rad], shape (K, n), or None."""
+    def solve(self, ompl: Any, time_limit: float, simplify_time: float = 0.0) -> Array | None:
+        """Search for a path.
+
+        Args:
+            ompl: The modules of OMPL.
+            time_limit: Time for the search [s].
+            simplify_time: Time for simplifying the path [s]; 0 keeps it as it was found.
+
+        Returns:
+            Joint positions [rad], shape (K, n), or None.
+        """
         base = ompl.base
         space = base.RealVectorStateSpace(self._robot.n)
         space.setBounds(_bounds(base, self._robot))
@@ -138,6 +158,8 @@ class Search:
         setup.solve(time_limit)
         if not setup.haveExactSolutionPath():
             return None
+        if simplify_time > 0:
+            setup.simplifySolution(simplify_time)
         path = setup.getSolutionPath()
         path.interpolate()
         return np.array([self._positions(state) for state in path.getStates()])

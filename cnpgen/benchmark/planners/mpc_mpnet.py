@@ -40,14 +40,13 @@ class MPCMPNet(BenchmarkPlanner):
                 f"the network that proposes configurations for {problem.name!r} is trained for another arm or scene"
             )
         spread = spread_of(problem)
-        random = np.random.default_rng(setting.seed)
 
         def plan(task: Plans) -> Answer:
             boundary = task.boundary
             start_xyz, goal_xyz = task.columns["start_xyz"][0], task.columns["goal_xyz"][0]
             start = np.concatenate([boundary.start_q[0], boundary.start_dq[0]])
             tree = Tree(start, start_xyz, radii_of(problem), STEERING_STEP_S)
-            steer = Steering(check, task.scene.poses[0], robot.acceleration_limit, spread, random)
+            steer = Steering(check, task.scene.poses[0], robot.acceleration_limit, spread, setting.random(task))
             extend = ProposedExtension(tree, network, steer, boundary.goal_q[0])
             return tree.grow(extend, goal_xyz, time_limit=setting.time_limit, max_iterations=MAX_PROPOSALS)
 

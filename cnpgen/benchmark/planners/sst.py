@@ -32,13 +32,13 @@ class SST(BenchmarkPlanner):
     def prepare(self, setting: Setting) -> Plan:
         """Load the kernel that checks states."""
         problem, robot = open_problem(setting.problem)
-        radii, check, random = radii_of(problem), StateCheck(problem, robot), np.random.default_rng(setting.seed)
+        radii, check = radii_of(problem), StateCheck(problem, robot)
 
         def plan(task: Plans) -> Answer:
             boundary = task.boundary
             start_xyz, goal_xyz = task.columns["start_xyz"][0], task.columns["goal_xyz"][0]
             tree = Tree(np.concatenate([boundary.start_q[0], boundary.start_dq[0]]), start_xyz, radii, CONTROL_STEP_S)
-            extend = RandomExtension(tree, robot, check, task.scene.poses[0], goal_xyz, random)
+            extend = RandomExtension(tree, robot, check, task.scene.poses[0], goal_xyz, setting.random(task))
             return tree.grow(extend, goal_xyz, time_limit=setting.time_limit, max_iterations=MAX_TREE_ITERATIONS)
 
         return plan

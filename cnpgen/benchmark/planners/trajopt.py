@@ -16,6 +16,7 @@ from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.robots.robot import Robot
+from cnpgen.schema.keys import field
 from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]
@@ -28,13 +29,15 @@ MIN_DURATION_S = 0.1
 class TrajOpt(BenchmarkPlanner):
     """Sequential quadratic programming over knots (SciPy's SLSQP), as the paper's authors ran it."""
 
+    iterations: int = field("largest number of iterations of SLSQP", default=100, low=1)
+
     def prepare(self, setting: Setting) -> Plan:
         """Choose the constraints at the knots."""
         problem, robot = open_problem(setting.problem)
 
         def plan(task: Plans) -> Answer:
             at_knots = knot_constraints(problem, robot, task.scene)
-            return TrajOptTranscription(robot, task.boundary, at_knots).solve()
+            return TrajOptTranscription(robot, task.boundary, at_knots).solve(self.iterations)
 
         return plan
 

@@ -1,12 +1,14 @@
 """Execution in a clone of the Air Hockey Challenge's environment (2023), with its own arm, table and controller.
 
 Two of its classes are used: the environment of one iiwa at the table, and the position controller at 1 kHz. The
-controller receives 20 ticks of positions, velocities and accelerations at a time.
+controller receives 20 ticks of positions, velocities and accelerations at a time, each for the end of its tick. The
+environment simulates no contact of mallet and table.
 """
 
 import importlib
 import sys
 from functools import lru_cache
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +29,9 @@ Array = NDArray[np.float64]
 MODULE = "air_hockey_challenge.environments.position_control_wrapper"
 JOINTS = tuple(f"joint_{number}" for number in range(1, 8))
 TICKS_PER_STEP = 20  # of the controller in one step of the environment
+LIBRARIES = ("numpy", "mujoco", "mushroom-rl")
+UNSUPPORTED = (AssertionError, AttributeError, KeyError, IndexError, TypeError, ValueError)
+"""Errors of the environment's code with other versions of itself or of its libraries."""
 
 
 def challenge_plant(folder: str | Path) -> Plant:
@@ -86,8 +91,8 @@ def execute_in_challenge(scene: SimulatorScene, reference: Reference, start_dq: 
         environment.record(np.zeros(len(JOINTS)))
     except RuntimeError as error:  # the environment turns warnings of MuJoCo into errors
         raise UsageError(f"the Air Hockey Challenge's environment aborted: {error}") from error
-    except (AttributeError, KeyError, TypeError) as error:
-        raise MachineError(f"{scene.plant.environment} has a version that cnpgen does not support: {error}") from error
+    except UNSUPPORTED as error:
+        raise _unsupported(scene.plant.environment, error) from error
     return _tick_record(scene, reference, environment)
 
 
@@ -99,8 +104,12 @@ def _all_joints(scene: SimulatorScene, values: Array) -> Array:
 
 
 def _action(scene: SimulatorScene, reference: Reference, tick: int) -> Array:
-    """Return the next 20 positions, velocities and accelerations, shape (20, 3, 7); then it stands still."""
-    ticks = np.arange(tick, tick + TICKS_PER_STEP)
+    """Return the positions, velocities and accelerations at the ends of the next 20 ticks, shape (20, 3, 7).
+
+    The environment's own interpolation begins at the end of the first tick, too. After the reference, the arm is to
+    stand still.
+    """
+    ticks = np.arange(tick + 1, tick + 1 + TICKS_PER_STEP)
     last = len(reference.q) - 1
     moving, rows = (ticks <= last)[:, None], np.minimum(ticks, last)
     parts = (reference.q[rows], reference.dq[rows] * moving, reference.ddq[rows] * moving)
@@ -112,7 +121,7 @@ def _tick_record(scene: SimulatorScene, reference: Reference, environment: Any) 
     import pinocchio as pin
 
     robot, planned = scene.robot, [JOINTS.index(name) for name in scene.robot.joint_names]
-    q, torque, puck, velocity = (np.array(column) for column in zip(*environment.recorded, strict=True))
+    q, torque, puck, velocity, touched = (np.array(column) for column in zip(*environment.recorded, strict=True))
     q, data, tips = q[:, planned], robot.model.createData(), []
     for positions in q:
         pin.framesForwardKinematics(robot.model, data, positions)
@@ -120,7 +129,24 @@ def _tick_record(scene: SimulatorScene, reference: Reference, environment: Any) 
     desired = reference.q[np.minimum(np.arange(len(q)), len(reference.q) - 1)]
     torque_use = torque[:, planned] / rated_torque(scene.problem, robot)
     tip, rotation = np.array([tip.translation for tip in tips]), np.array([tip.rotation for tip in tips])
-    return TickRecord(q, tip, rotation, desired, torque_use, puck, velocity)
+    unknown_force = np.full((len(q), 2), np.nan)
+    return TickRecord(q, tip, rotation, desired, torque_use, puck, velocity, touched, unknown_force)
+
+
+def _unsupported(folder: str, error: Exception) -> MachineError:
+    """Return the error for a version of the environment or of its libraries that does not work."""
+    return MachineError(
+        f"{folder} has a version that cnpgen does not support, or its libraries have: {type(error).__name__}: {error};"
+        f" installed: {', '.join(f'{name} {_version(name)}' for name in LIBRARIES)};"
+        " 'cnpgen docs benchmark' lists versions that work"
+    )
+
+
+def _version(project: str) -> str:
+    try:
+        return version(project)
+    except PackageNotFoundError:
+        return "missing"
 
 
 @lru_cache(maxsize=1)
@@ -137,9 +163,23 @@ def _environment(folder: str) -> Any:
         raise MachineError(f"{folder} is hidden by an installed copy: {control.__file__}")
     try:
         kind = type("Recorded", (_Recorder, control.PositionControlIIWA, iiwas.AirHockeySingle), {})
-        return kind(interpolation_order=None)
-    except (AttributeError, KeyError, TypeError) as error:
-        raise MachineError(f"{folder} has a version that cnpgen does not support: {error}") from error
+        environment = kind(interpolation_order=None)
+        still = np.zeros(len(JOINTS))
+        environment.begin(still, still, np.array([1.0, 0.0]))
+        environment.advance(np.zeros((TICKS_PER_STEP, 3, len(JOINTS))))
+    except UNSUPPORTED as error:
+        raise _unsupported(folder, error) from error
+    return environment
+
+
+class _ScalarItems(np.ndarray):
+    """Array whose items may be assigned arrays of one number, as NumPy before 2.4 allowed.
+
+    The environment does so with the velocities that it filters.
+    """
+
+    def __setitem__(self, key: Any, value: Any) -> None:
+        super().__setitem__(key, np.squeeze(value) if np.size(value) == 1 else value)
 
 
 class _Recorder:
@@ -162,6 +202,8 @@ class _Recorder:
             self._write_data(f"puck_{axis}_pos", value)
         for name, speed in zip(JOINTS, self._start.tolist(), strict=True):
             self._data.joint(f"iiwa_1/{name}").qvel = speed
+        if hasattr(self, "q_vel_prev"):
+            self.q_vel_prev = self.q_vel_prev.view(_ScalarItems)
         super().setup(obs)  # type: ignore[misc]
 
     def advance(self: Any, action: Array) -> bool:
@@ -187,7 +229,8 @@ class _Recorder:
     def record(self: Any, torque: Array) -> None:
         """Record the state and the torques that take effect [N m], shape (7,)."""
         q = np.array([float(np.squeeze(self._data.joint(f"iiwa_1/{name}").qpos)) for name in JOINTS])
-        self.recorded.append((q, torque, *self._puck_in_robot_frame()))
+        touched = np.array(self._check_collision("puck", "robot_1/ee"))  # in the last step of MuJoCo
+        self.recorded.append((q, torque, *self._puck_in_robot_frame(), touched))
 
     def _puck_in_robot_frame(self: Any) -> tuple[Array, Array]:
         """Return the puck's position [m] and velocity [m/s] in the robot's frame, shape (2,) each."""

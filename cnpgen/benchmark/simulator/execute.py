@@ -104,6 +104,7 @@ class _Run:
         self._tip = self._model.site("tip").id
         self._rows: list[tuple[Array, ...]] = []
         self._max_penetration = 0.0  # m
+        self._mallet, self._puck, self._table = (self._geometry(name) for name in ("mallet", "reach", "support"))
 
     def simulate(self, start_dq: Array) -> TickRecord:
         """Simulate to the end and return the record."""
@@ -116,14 +117,16 @@ class _Run:
         while not self._is_over(tick):
             self._step(tick)
             tick += 1
-        states, tip, rotation, reference, torque, speeds = (
+        states, tip, rotation, reference, torque, speeds, touched, force = (
             np.array(column) for column in zip(*self._rows, strict=True)
         )
         puck, velocity = states[:, n:], speeds[:, n:]
         if self._scene.puck is None:
             puck = velocity = np.full((len(states), 2), np.nan)
         use = torque / self._control.limit
-        return TickRecord(states[:, :n], tip, rotation, reference, use, puck, velocity, self._max_penetration)
+        return TickRecord(
+            states[:, :n], tip, rotation, reference, use, puck, velocity, touched, force, self._max_penetration
+        )
 
     def _step(self, tick: int) -> None:
         """Record the state, compute the torque, and simulate one tick."""
@@ -133,11 +136,28 @@ class _Run:
         desired = (reference.q[k], moving * reference.dq[k], moving * reference.ddq[k])
         torque = self._control(data.qpos[:n].copy(), data.qvel[:n].copy(), desired)
         tip, rotation = data.site_xpos[self._tip].copy(), data.site_xmat[self._tip].reshape(3, 3).copy()
-        self._rows.append((data.qpos.copy(), tip, rotation, desired[0], torque, data.qvel.copy()))
+        state = data.qpos.copy(), tip, rotation, desired[0], torque, data.qvel.copy()
         data.qfrc_applied[:n] = torque
         self._mujoco.mj_step(self._model, data, round(TICK_S / SIMULATION_STEP_S))
         if self._scene.puck is None and data.ncon:
             self._max_penetration = max(self._max_penetration, float(-data.contact.dist.min()))
+        self._rows.append((*state, *self._contacts()))
+
+    def _geometry(self, name: str) -> int:
+        """Return the number of a geometry; -1 if the scene does not have it."""
+        return int(self._mujoco.mj_name2id(self._model, self._mujoco.mjtObj.mjOBJ_GEOM, name))
+
+    def _contacts(self) -> tuple[Array, Array]:
+        """Return whether the mallet touches the puck, and its normal and friction force on the table [N]."""
+        touched, total, force = False, np.zeros(2), np.zeros(6)
+        for index in range(self._data.ncon):
+            contact = self._data.contact[index]
+            pair = {int(contact.geom1), int(contact.geom2)}
+            touched |= pair == {self._mallet, self._puck}
+            if pair == {self._mallet, self._table}:
+                self._mujoco.mj_contactForce(self._model, self._data, index, force)
+                total += force[0], np.linalg.norm(force[1:3])
+        return np.array(touched), total
 
     def _is_over(self, tick: int) -> bool:
         """Return whether the result is final."""

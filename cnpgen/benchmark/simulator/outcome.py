@@ -14,7 +14,7 @@ from cnpgen.judges.plans.paper import tilt
 Array = NDArray[np.float64]
 
 MAX_GOAL_DISTANCE_M = 0.01  # of a finished motion, as in the paper
-EARLY_CONTACT_M = 0.03  # a contact with more of the path left is early
+EARLY_CONTACT_M = hockey.PATH_LEFT_AT_CONTACT_M + 0.01  # a contact with more of the planned path left is early
 MIN_PUCK_SPEED_M_S = 0.02  # a slower puck counts as stopped
 MAX_LEGAL_PENETRATION_M = 1e-3
 MAX_PUCK_TIME_S = 4.0  # until the puck arrives
@@ -32,6 +32,8 @@ class TickRecord:
         torque_use: Torques as fractions of the rated torques, shape (K, n).
         puck: Positions of the puck over the table [m], shape (K, 2); nan without one.
         puck_velocity: Its velocities [m/s], shape (K, 2); nan without one.
+        puck_contact: Whether mallet and puck touch, shape (K,).
+        table_force: Normal and friction force between mallet and table [N], shape (K, 2); nan if not simulated.
         max_penetration: Maximum penetration of an obstacle [m].
     """
 
@@ -42,6 +44,8 @@ class TickRecord:
     torque_use: Array
     puck: Array
     puck_velocity: Array
+    puck_contact: NDArray[np.bool_]
+    table_force: Array
     max_penetration: float = 0.0
 
 
@@ -70,8 +74,10 @@ def outcome_of(scene: SimulatorScene, reference: Reference, goal_xyz: Array, rec
     """
     ticks, height = min(reference.ticks, len(record.q)), scene.height
     during = slice(0, ticks)
+    goal_distance = float(np.linalg.norm(record.tip[ticks - 1] - goal_xyz))
     executed = Executed(
-        finished=bool(np.linalg.norm(record.tip[ticks - 1] - goal_xyz) < MAX_GOAL_DISTANCE_M),
+        finished=goal_distance < MAX_GOAL_DISTANCE_M,
+        goal_distance=goal_distance,
         z_error=np.nan if height is None else TICK_S * float(np.abs(record.tip[during, 2] - height).sum()),
         vertical_error=np.nan
         if height is not None
@@ -79,26 +85,60 @@ def outcome_of(scene: SimulatorScene, reference: Reference, goal_xyz: Array, rec
         tracking_error=TICK_S * float(np.abs(record.q[during] - record.reference[during]).sum()),
         torque_use=float(np.abs(record.torque_use).max()),
     )
+    planned_tip = _tip_positions(scene, reference.q[: reference.ticks])
+    if height is not None:
+        executed = _with_table(executed, record, planned_tip[:, 2] - height, record.tip[during, 2] - height)
     if scene.puck is None:
         return replace(executed, collided=record.max_penetration > MAX_LEGAL_PENETRATION_M)
-    return _with_puck(executed, record, record.tip[during])
+    return _with_puck(executed, record, planned_tip)
 
 
-def _with_puck(executed: Executed, record: TickRecord, tip: Array) -> Executed:
+def _tip_positions(scene: SimulatorScene, q: Array) -> Array:
+    """Return the positions of the tip [m] at K joint positions [rad] of shape (K, n), shape (K, 3)."""
+    import pinocchio as pin
+
+    robot, positions = scene.robot, []
+    data = robot.model.createData()
+    for joints in q:
+        pin.framesForwardKinematics(robot.model, data, joints)
+        positions.append(data.oMf[robot.tip_frame].translation.copy())
+    return np.array(positions)
+
+
+def _with_table(executed: Executed, record: TickRecord, commanded_height: Array, height: Array) -> Executed:
+    """Add the heights of the mallet over the plane [m], commanded and executed, and the forces of the table."""
+    executed = replace(
+        executed,
+        plane_error=float(np.abs(height).max()),
+        commanded_plane_error=float(np.abs(commanded_height).max()),
+    )
+    if np.isnan(record.table_force).any():
+        return executed
+    normal, friction = record.table_force.T
+    return replace(
+        executed,
+        table_force=float(normal.max()),
+        table_friction=float(friction.max()),
+        table_contact_time=TICK_S * int(np.sum(normal > 0)),
+    )
+
+
+def _with_puck(executed: Executed, record: TickRecord, planned_tip: Array) -> Executed:
     """Add the result of the puck."""
     speed = np.linalg.norm(record.puck_velocity, axis=1)
-    moved = np.flatnonzero(speed > MIN_PUCK_SPEED_M_S)
-    if not len(moved):
+    touched = np.flatnonzero(record.puck_contact)
+    if not len(touched):
         return replace(executed, hit=False, scored=False, touched_early=False)
-    first = int(moved[0])
-    steps = np.linalg.norm(np.diff(tip[first:], axis=0), axis=1)
+    first = int(touched[0])
+    left = float(np.linalg.norm(np.diff(planned_tip[first:], axis=0), axis=1).sum())
     speeds_after = speed[first : first + round(10 * hockey.CONTACT_TIME_S / TICK_S)]
     x, y = record.puck.T
     return replace(
         executed,
         hit=True,
         scored=bool(np.any((x > hockey.GOAL_LINE_M) & (np.abs(y) < hockey.GOAL_WIDTH_M / 2))),
-        touched_early=float(steps.sum()) > EARLY_CONTACT_M,
+        touched_early=left > EARLY_CONTACT_M,
+        contact_distance=left,
         hit_time=first * TICK_S,
         puck_speed=float(speeds_after.max()),
     )

@@ -1,7 +1,7 @@
 """Simulated world in MuJoCo's format (MJCF): the arm of the problem's URDF and its environment.
 
-Only listed pairs collide: mallet and puck, puck and bands, held object or links and obstacles. The puck moves in the
-plane of the table only. The table does not support the mallet, so that errors of its height are visible.
+Only listed pairs collide: mallet and puck, mallet and table, puck and bands, held object or links and obstacles. The
+puck moves in the plane of the table only. The mallet is rigid, so the table supports the tip at its height.
 
 Joints and obstacles have numbers as names, because their own names are untrusted input and MJCF can refer to files.
 """
@@ -29,7 +29,12 @@ LINK_RADIUS_M = 0.07  # of the iiwa's links, about half of the clearance of plan
 PUCK_INERTIA = 2.5e-6  # kg m^2; the puck does not turn
 MIN_LINK_LENGTH_M = 1e-3  # shorter links have no shape; the first link collides with nothing
 UNBOUNDED_DEPTH_M = 5.0  # depth of obstacles without lower end
+MALLET_POINT_RADIUS_M = 1e-3  # of the sphere at the tip that collides
+SUPPORT_DEPTH_M = 0.05  # half thickness of the body that supports the tip
 _SOFT = 'condim="3" solref="0.004 1" solimp="0.95 0.99 0.001"'  # contact of object and obstacles without bouncing
+_TABLE = (
+    'condim="3" friction="0.08 0.08" solref="0.0125 0.5" solimp="0.9 0.999 0.001"'  # as in the Air Hockey Challenge
+)
 _RIMS = {  # the bands and the four halves of both goals' sides: centre and half sizes over the table [m]
     "left": (
         hockey.HOME_M + hockey.LENGTH_M / 2,
@@ -121,7 +126,8 @@ def _arm(scene: SimulatorScene) -> Iterator[str]:
             yield f'<geom name="link {index + 1}" type="capsule" fromto="0 0 0 {_numbers(end)}" size="{radius}"'
             yield f' rgba="{color}"/>'
     yield f'<body name="tip" pos="{_numbers(chain.tip_translation)}" quat="{_quaternion(chain.tip_rotation)}">'
-    yield '<site name="tip" size="0.001"/><geom name="mallet" type="sphere" size="0.001"/>'
+    yield '<site name="tip" size="0.001"/>'
+    yield f'<geom name="mallet" type="sphere" size="{MALLET_POINT_RADIUS_M}"/>'
     if scene.problem.object_size is not None:
         size = _numbers(np.array(scene.problem.object_size) / 2 - _legal_depth(scene.problem))
         yield f'<geom name="object" type="box" size="{size}" rgba="0.2 0.4 0.8 1"/>'
@@ -153,6 +159,9 @@ def _environment(scene: SimulatorScene) -> Iterator[str]:
     center = hockey.HOME_M + hockey.LENGTH_M / 2
     yield f'<geom type="box" pos="{center} 0 {surface - 0.02}" size="{hockey.LENGTH_M / 2} {hockey.WIDTH_M / 2} 0.02"'
     yield ' rgba="0.97 0.97 1 1"/>'
+    support = scene.height - MALLET_POINT_RADIUS_M - SUPPORT_DEPTH_M
+    yield f'<geom name="support" type="box" pos="{center} 0 {support}" rgba="0 0 0 0"'
+    yield f' size="{hockey.LENGTH_M / 2} {hockey.WIDTH_M / 2} {SUPPORT_DEPTH_M}"/>'
     for name, (x, y, half_x, half_y) in _RIMS.items():
         yield f'<geom name="{name}" type="box" pos="{x} {y} {surface}" size="{half_x} {half_y} 0.015"'
         yield ' rgba="0.5 0.5 0.5 1"/>'
@@ -209,13 +218,15 @@ def _puck(surface: float, height: float) -> Iterator[str]:
     yield f'<geom name="puck" type="sphere" size="{hockey.PUCK_RADIUS_M}" rgba="0 0 0 0"/>'
     yield f'<geom type="cylinder" size="{hockey.PUCK_RADIUS_M} {hockey.PUCK_HEIGHT_M / 2}" rgba="0.85 0.1 0.1 1"'
     yield f' pos="0 0 {hockey.PUCK_HEIGHT_M / 2}"/>'
-    radius = hockey.PUCK_RADIUS_M + hockey.MALLET_RADIUS_M - 0.001
+    radius = hockey.PUCK_RADIUS_M + hockey.MALLET_RADIUS_M - MALLET_POINT_RADIUS_M
     yield f'<geom name="reach" type="cylinder" size="{radius} {(high - low) / 2}" rgba="0 0 0 0"'
     yield f' pos="0 0 {(low + high) / 2 - surface}"/></body>'
 
 
 def _pairs(scene: SimulatorScene) -> Iterator[str]:
     """Yield the colliding pairs."""
+    if scene.height is not None:
+        yield f'<pair geom1="mallet" geom2="support" {_TABLE}/>'
     if scene.puck is not None:
         k, b = hockey.bounce()
         bouncing = f'condim="1" solref="{-k} {-b}" solimp="0.9999 0.9999 0.001"'

@@ -4,12 +4,16 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
-from cnpgen.benchmark.simulator.execute import execute
-from cnpgen.benchmark.simulator.plant import PLANTS, as_plant
+from cnpgen.benchmark.planners.tip import Tip
+from cnpgen.benchmark.simulator.execute import _Run, execute
+from cnpgen.benchmark.simulator.executed import succeeded
+from cnpgen.benchmark.simulator.plant import PLANTS, as_plant, joint_friction, rated_torque
 from cnpgen.benchmark.simulator.reference import TICK_S, Reference
 from cnpgen.benchmark.simulator.simulate import execute_plan, simulate_plans, simulator_scene
+from cnpgen.benchmark.simulator.simulator_scene import SimulatorScene
 from cnpgen.errors import UsageError
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.plans import Plans, make_plans
@@ -131,6 +135,51 @@ def test_two_processes_give_the_results_of_one(hit: Plans) -> None:
     one, two = (simulate_plans(plans, workers=workers).executed for workers in (1, 2))
     assert [result.to_dict() for result in one] == [result.to_dict() for result in two]
     assert one[0].to_dict() == one[2].to_dict()  # executions are independent
+
+
+def lowered(reference: Reference, scene: SimulatorScene, depth: float) -> Reference:
+    """Command tip positions below the table, by differential inverse kinematics."""
+    tip, q = Tip(scene.robot), reference.q.copy()
+    for index in range(len(q)):
+        share = min(1.0, index / 100)
+        for _ in range(3):
+            position, _, J = tip.at(q[index])
+            target = tip.at(reference.q[index])[0] - [0.0, 0.0, share * depth]
+            q[index] += np.linalg.pinv(J[:3]) @ (target - position)
+    return replace(reference, q=q, dq=np.gradient(q, TICK_S, axis=0))
+
+
+def test_a_mallet_commanded_below_the_table_is_supported_and_fails_by_the_plane(hit: Plans) -> None:
+    scene, reference, execution = execute_plan(hit, PLANTS["nominal"])
+    goal = hit.columns["goal_xyz"][0]
+    low = execute(scene, lowered(reference, scene, 0.03), goal).executed
+    assert low.commanded_plane_error == pytest.approx(0.03, abs=1e-4)
+    assert low.plane_error < 0.02  # the table supports the mallet
+    assert low.table_force > 10 * execution.executed.table_force
+    assert low.table_friction == pytest.approx(0.08 * low.table_force, rel=0.2)
+    assert low.scored
+    assert not low.success
+    values = {**low.to_dict(), "touched_early": False}  # the executed path is shorter than the commanded one
+    assert not succeeded(values, 0.029)
+    assert succeeded(values, 0.031)
+
+
+def test_a_mallet_on_the_table_is_carried_by_it() -> None:
+    """Compare the normal force of a mallet at rest, commanded below the table, with the arm's static equilibrium."""
+    scene = simulator_scene(
+        solve_plans(draw_boundary_problems("airhockey-pucks", 1, seed=1), workers=1).plans, PLANTS["nominal"]
+    )
+    base = scene.robot.base
+    still = Reference(np.repeat(base[None], 500, axis=0), np.zeros((500, 6)), np.zeros((500, 6)), 0.499)
+    run = _Run(replace(scene, puck=np.array([2.0, 0.0])), lowered(still, scene, 0.002))
+    record = run.simulate(np.zeros(6))
+    J, force = Tip(scene.robot).at(record.q[499])[2][:3], record.table_force[499, 0]
+    holding = pin.computeGeneralizedGravity(scene.robot.model, scene.robot.model.createData(), record.q[499])
+    torque = record.torque_use[499] * rated_torque(scene.problem, scene.robot)
+    excess = np.linalg.lstsq(J.T, holding - torque, rcond=None)[0][2]
+    friction = np.abs(np.linalg.pinv(J.T)[2]) @ [item.dry for item in joint_friction(scene.problem, scene.robot)]
+    assert force > 10
+    assert force == pytest.approx(excess, abs=friction + 0.08 * force)
 
 
 def test_an_invalid_plan_does_not_affect_the_others(hit: Plans) -> None:

@@ -60,5 +60,10 @@ class AirHockeySingle:
         joint = self._data.joint(name.rpartition("_")[0])
         return joint.qvel.copy() if name.endswith("vel") else joint.qpos + BASE["xy".index(name[5])]
 
+    def _check_collision(self, one: str, other: str) -> bool:
+        assert (one, other) == ("puck", "robot_1/ee")
+        pair = {self._model.geom("mallet").id, self._model.geom("reach").id}
+        return any({contact.geom1, contact.geom2} == pair for contact in self._data.contact)
+
     def _write_data(self, name: str, value: float) -> None:
         self._data.joint(name.rpartition("_")[0]).qpos = value - BASE["xy".index(name[5])]

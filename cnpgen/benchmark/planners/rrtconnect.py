@@ -1,0 +1,106 @@
+"""RRT-Connect with path simplification (OMPL), timed by TOPP-RA (Pham and Pham, 2018).
+
+The search is that of CBiRRT. The simplified path becomes a cubic spline, which TOPP-RA times within the limits of
+velocity and acceleration. A goal in motion is met in speed along the path only, as far as this is feasible.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.benchmark.benchmark_planner import Answer, BenchmarkPlanner, Plan, Setting
+from cnpgen.benchmark.planners.cbirrt import Search, load_ompl, seed_ompl
+from cnpgen.benchmark.trajectory import Trajectory
+from cnpgen.errors import requires_extra
+from cnpgen.plans.plans import Plans
+from cnpgen.problems.problem_record import open_problem
+from cnpgen.robots.robot import Robot
+from cnpgen.schema.keys import field
+
+Array = NDArray[np.float64]
+
+OUTPUT_PERIOD_S = 0.005
+MIN_WAYPOINT_DISTANCE_RAD = 1e-4  # closer waypoints are joined
+END_RATE_FRACTIONS = (1.0, 0.75, 0.5, 0.25, 0.0)  # of the goal's speed, tried in this order
+
+
+@dataclass(frozen=True)
+class RRTConnect(BenchmarkPlanner):
+    """RRT-Connect on the constraint manifold with simplification (OMPL), timed by TOPP-RA."""
+
+    simplify_time: float = field("time for simplifying the path", unit="s", default=1.0, low=0.0)
+
+    def prepare(self, setting: Setting) -> Plan:
+        """Import OMPL and TOPP-RA."""
+        ompl = load_ompl()
+        load_toppra()
+        problem, robot = open_problem(setting.problem)
+
+        def plan(task: Plans) -> Answer:
+            seed_ompl(ompl, setting, task)
+            simplify_time = min(self.simplify_time, setting.time_limit / 2)
+            search_time = setting.time_limit - simplify_time
+            path = Search(problem, robot, task).solve(ompl, search_time, simplify_time=simplify_time)
+            return None if path is None else timed_by_toppra(path, robot, task.boundary.goal_dq[0])
+
+        return plan
+
+
+def load_toppra() -> Any:
+    """Import TOPP-RA without its messages.
+
+    Raises:
+        MissingExtraError: TOPP-RA is missing.
+    """
+    with requires_extra("benchmark", "TOPP-RA"):
+        import toppra
+        import toppra.algorithm
+        import toppra.constraint
+    toppra.setup_logging("CRITICAL")
+    return toppra
+
+
+def timed_by_toppra(path: Array, robot: Robot, goal_dq: Array) -> Trajectory | None:
+    """Time a path as fast as possible within the limits of velocity and acceleration.
+
+    Args:
+        path: Joint positions [rad], shape (K, n).
+        robot: The robot with its limits.
+        goal_dq: Joint velocities at the goal [rad/s], shape (n,).
+
+    Returns:
+        The trajectory from rest, or None if TOPP-RA finds no timing.
+    """
+    toppra = load_toppra()
+    steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
+    kept = np.append(True, steps > MIN_WAYPOINT_DISTANCE_RAD)
+    kept[-1] = True
+    points = path[kept]
+    length = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
+    if not np.all(np.diff(length, prepend=-1.0) > 0):  # start and goal coincide
+        return None
+    spline = toppra.SplineInterpolator(length / length[-1], points)
+    limits = [
+        kind(np.stack([-limit, limit], axis=1))
+        for kind, limit in (
+            (toppra.constraint.JointVelocityConstraint, robot.velocity_limit),
+            (toppra.constraint.JointAccelerationConstraint, robot.acceleration_limit),
+        )
+    ]
+    timing = toppra.algorithm.TOPPRA(limits, spline, parametrizer="ParametrizeConstAccel")
+    tangent = spline(1.0, 1)
+    end_rate = max(float(tangent @ goal_dq / (tangent @ tangent)), 0.0)
+    for fraction in END_RATE_FRACTIONS:
+        timed = timing.compute_trajectory(0.0, fraction * end_rate)
+        if timed is not None:
+            return _sampled(timed)
+    return None
+
+
+def _sampled(timed: Any) -> Trajectory:
+    """Sample a timed path; cubics interpolate positions and velocities."""
+    duration = float(timed.duration)
+    t = np.linspace(0.0, duration, max(int(np.ceil(duration / OUTPUT_PERIOD_S)), 1) + 1)
+    return Trajectory(t, np.asarray(timed(t)), np.asarray(timed(t, 1)))

@@ -1,0 +1,113 @@
+"""Record of benchmark runs: date, machine, versions and seed of every run that wrote results into a folder."""
+
+import json
+import os
+import platform
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from cnpgen.errors import DatasetError
+from cnpgen.machine.versions import versions
+from cnpgen.store.files.atomic import read_file, write_file
+from cnpgen.store.files.document_structure import ANY_KEY, TEXT, WHOLE, check_structure
+from cnpgen.store.files.documents import parse_json
+
+RUNS_FILE = "runs.json"
+MAX_RUNS_BYTES = 10_000_000
+LIBRARIES = ("scipy", "daqp", "mujoco", "ompl", "toppra", "ruckig")  # beside those of ``versions``
+_STRUCTURE = {
+    "date": TEXT,
+    "processor": TEXT,
+    "cores": WHOLE,
+    "seed": WHOLE,
+    "planners": [TEXT],
+    "versions": {ANY_KEY: TEXT},
+}
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """Date, machine, versions and seed of a run.
+
+    Attributes:
+        date: Start of the run, ISO 8601, UTC.
+        processor: Name of the processor.
+        cores: Number of its cores.
+        seed: Seed of random planners.
+        planners: Names of the planners.
+        versions: Versions of Python, cnpgen and libraries.
+    """
+
+    date: str
+    processor: str
+    cores: int
+    seed: int
+    planners: tuple[str, ...]
+    versions: dict[str, str]
+
+    def __str__(self) -> str:
+        libraries = ", ".join(f"{name} {number}" for name, number in self.versions.items())
+        return f"{self.date}: {self.processor}, {self.cores} cores; seed {self.seed}; {libraries}"
+
+
+def describe_run(seed: int, planners: Sequence[str]) -> RunRecord:
+    """Describe a run that begins now.
+
+    Args:
+        seed: Seed of random planners.
+        planners: Names of the planners.
+    """
+    libraries = {name: number for name in LIBRARIES if (number := _version(name))}
+    date = datetime.now(UTC).isoformat(timespec="seconds")
+    return RunRecord(date, _processor(), os.cpu_count() or 1, seed, tuple(planners), {**versions(), **libraries})
+
+
+def load_runs(folder: Path) -> tuple[RunRecord, ...]:
+    """Load the records of earlier runs in a folder.
+
+    Raises:
+        DatasetError: The file is damaged.
+    """
+    path = folder / RUNS_FILE
+    if not path.exists():
+        return ()
+    try:
+        documents = parse_json(read_file(path, max_bytes=MAX_RUNS_BYTES).decode())
+        check_structure(documents, [_STRUCTURE])
+    except ValueError as error:
+        raise DatasetError(f"{path} is damaged: {error}; delete it") from error
+    names = [field.name for field in fields(RunRecord)]
+    return tuple(
+        RunRecord(**{**{name: document[name] for name in names}, "planners": tuple(document["planners"])})
+        for document in documents
+    )
+
+
+def save_runs(folder: Path, runs: Sequence[RunRecord]) -> None:
+    """Write the records of all runs.
+
+    Raises:
+        MachineError: The file cannot be written.
+    """
+    documents: list[dict[str, Any]] = [asdict(run) for run in runs]
+    write_file(folder / RUNS_FILE, json.dumps(documents, indent=1) + "\n")
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        lines = []
+    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(names, platform.machine())
+
+
+def _version(project: str) -> str:
+    try:
+        return version(project)
+    except PackageNotFoundError:
+        return ""
