@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from cnpgen.benchmark.trajectory import Trajectory
+from cnpgen.trajectory.sampled_trajectory import Trajectory
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import ProblemRecord
 

@@ -13,7 +13,7 @@ from cnpgen.benchmark.simulator.plant import Plant
 from cnpgen.benchmark.simulator.reference import Reference, StatesAt, states_of
 from cnpgen.benchmark.simulator.simulate import execute_states
 from cnpgen.benchmark.simulator.simulator_scene import SimulatorScene
-from cnpgen.benchmark.trajectory import Trajectory
+from cnpgen.trajectory.sampled_trajectory import Trajectory
 from cnpgen.errors import UsageError
 from cnpgen.plans.plans import Plans
 

@@ -10,7 +10,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.benchmark.trajectory import Trajectory
+from cnpgen.trajectory.sampled_trajectory import Trajectory
 from cnpgen.judges.plans.evaluated_trajectory import EvaluatedTrajectory
 from cnpgen.judges.plans.judge import reason_of
 from cnpgen.judges.plans.measure import boundary_margins, by_name, measure

@@ -13,7 +13,7 @@ from typing import Any
 
 from cnpgen.benchmark.benchmark_planner import Plan, Setting
 from cnpgen.benchmark.results_file import answer_from_dict, answer_to_dict
-from cnpgen.benchmark.trajectory import Trajectory
+from cnpgen.trajectory.sampled_trajectory import Trajectory
 from cnpgen.errors import CnpgenError, MachineError, UsageError
 from cnpgen.machine.threads import one_thread
 from cnpgen.plans.plans import Plans

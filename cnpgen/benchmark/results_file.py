@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from cnpgen.benchmark.hypothesis_tests import FIGURES
-from cnpgen.benchmark.trajectory import Trajectory
+from cnpgen.trajectory.sampled_trajectory import Trajectory
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.store.files.atomic import machine_error, write_file

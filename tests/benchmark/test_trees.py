@@ -25,7 +25,7 @@ from cnpgen.benchmark.planners.state_check import MAX_TIP_HEIGHT_ERROR_M, MAX_UP
 from cnpgen.benchmark.planners.steering import STEERING_STEP_S, Steering, spread_of
 from cnpgen.benchmark.planners.tree import HIT_RADII, Tree
 from cnpgen.benchmark.suite import load_suite
-from cnpgen.benchmark.trajectory import Trajectory
+from cnpgen.trajectory.sampled_trajectory import Trajectory
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.planner.network.architecture import Architecture, initial_parameters
 from cnpgen.planner.network.forward import forward

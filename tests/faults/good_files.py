@@ -10,7 +10,7 @@ import numpy as np
 
 from cnpgen.benchmark.results_file import answer_to_dict, open_results
 from cnpgen.benchmark.suite import list_suites
-from cnpgen.benchmark.trajectory import Trajectory
+from cnpgen.trajectory.sampled_trajectory import Trajectory
 from cnpgen.make.make_dataset import make_dataset
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.make.recipe_file import load_dataset_recipe

@@ -20,7 +20,7 @@ from cnpgen.benchmark.planners.obstacle_boxes import (
     distance,
 )
 from cnpgen.benchmark.planners.tip import Tip
-from cnpgen.benchmark.trajectory import Trajectory
+from cnpgen.trajectory.sampled_trajectory import Trajectory
 from cnpgen.errors import requires_extra
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.constraints.table import Table

@@ -11,7 +11,7 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.benchmark.trajectory import Trajectory
+from cnpgen.trajectory.sampled_trajectory import Trajectory
 from cnpgen.problems.problem import Problem
 
 Array = NDArray[np.float64]
