@@ -6,9 +6,9 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from cnpgen.trajectory.sampled_trajectory import Trajectory
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import ProblemRecord
+from cnpgen.trajectory.sampled_trajectory import Trajectory
 
 Answer = Plans | Trajectory | None
 """One plan, a trajectory sampled in time, or None if the planner found no plan."""

@@ -13,11 +13,11 @@ from typing import Any
 
 from cnpgen.benchmark.benchmark_planner import Plan, Setting
 from cnpgen.benchmark.results_file import answer_from_dict, answer_to_dict
-from cnpgen.trajectory.sampled_trajectory import Trajectory
 from cnpgen.errors import CnpgenError, MachineError, UsageError
 from cnpgen.machine.threads import one_thread
 from cnpgen.plans.plans import Plans
 from cnpgen.schema import registry
+from cnpgen.trajectory.sampled_trajectory import Trajectory
 
 # A planner is stopped after STOP_FACTOR times its time limit plus STOP_MARGIN_S.
 STOP_FACTOR, STOP_MARGIN_S = 2.0, 10.0

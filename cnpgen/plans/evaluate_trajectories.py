@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError, counted
 from cnpgen.judges.plans.judge import check_step
-from cnpgen.judges.trajectories.interpolate import INTERPOLATIONS, bounded_jerk, interpolated
+from cnpgen.judges.trajectories.interpolate import bounded_jerk, interpolated
 from cnpgen.judges.trajectories.judge_family import FamilyJudge
 from cnpgen.judges.trajectories.trajectory_verdict import Decision, TrajectoryVerdict
 from cnpgen.machine.workers import distribute, worker_count

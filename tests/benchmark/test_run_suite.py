@@ -13,8 +13,8 @@ from cnpgen.benchmark.html_report import failure_summaries, save_benchmark_repor
 from cnpgen.benchmark.results_file import answer_from_dict, answer_to_dict, open_results
 from cnpgen.benchmark.run_suite import run_benchmark
 from cnpgen.benchmark.suite import load_suite
-from cnpgen.trajectory.sampled_trajectory import Trajectory
 from cnpgen.errors import DatasetError, UsageError
+from cnpgen.trajectory.sampled_trajectory import Trajectory
 from tests.conftest import some
 from tests.examples.installed import installed_kind
 

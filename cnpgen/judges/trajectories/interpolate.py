@@ -1,9 +1,9 @@
 """Families of curves through samples: a stated interpolation, or every curve whose jerk is bounded.
 
-Both begin with weights that map the data of a span to the Bernstein coefficients of its nominal polynomial. Noise of the
-data changes a derivative by at most the sum of the absolute weights. The difference between a polynomial and another
-curve through the same data is an integral of the curve's jerk against a kernel (Peano 1913), so a bound of the jerk
-bounds it.
+Both begin with weights that map the data of a span to the Bernstein coefficients of its nominal polynomial. Noise of
+the data changes a derivative by at most the sum of the absolute weights. The difference between a polynomial and
+another curve through the same data is an integral of the curve's jerk against a kernel (Peano 1913), so a bound of the
+jerk bounds it.
 """
 
 from dataclasses import replace
@@ -205,8 +205,8 @@ def _is_consistent(  # noqa: PLR0917 - the family with everything that it was ma
 ) -> bool:
     """Return whether a curve with bounded jerks can pass through the samples: a necessary condition.
 
-    The third derivative of a cubic through data is a mean of the jerks of every curve through the data. Accelerations of
-    samples change by at most the bound times the time between them.
+    The third derivative of a cubic through data is a mean of the jerks of every curve through the data. Accelerations
+    of samples change by at most the bound times the time between them.
     """
     h = np.diff(family.t)[:, None]
     limit = max_jerk * (1 + CONSISTENCY_TOLERANCE)
@@ -216,6 +216,8 @@ def _is_consistent(  # noqa: PLR0917 - the family with everything that it was ma
         return bool((change <= limit * h + 2 * noise[2] + rounding).all())
     if weights.shape[1] < STENCIL:
         return True
-    jerk = np.abs(family.polynomials.jerk[0])
+    third = family.polynomials.jerk
+    assert third is not None
+    jerk = np.abs(third[0])
     from_noise = (np.abs(_differentiated(weights, 3)) * scaled_noise[:, None]).sum(axis=2).max(axis=1)
     return bool((jerk <= limit + (from_noise[:, None] + 8 * rounding) / h**3).all())

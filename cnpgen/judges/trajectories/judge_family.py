@@ -100,7 +100,7 @@ def checked_phases(family: CurveFamily, step: float) -> Array:
 
 @dataclass(frozen=True)
 class _Entry:
-    """What is known of one condition.
+    """Findings on one condition.
 
     Attributes:
         margin: The worst margin of any curve.
@@ -205,7 +205,8 @@ def _violation_masks(
         low = float(np.max(required - condition.uncertainty, initial=-np.inf))
         high = float(np.max(required + condition.uncertainty, initial=-np.inf))
         return ~pairs.clear_states(low), ~pairs.clear_states(high)
-    return (_certain(condition) > 1).any(axis=0), (condition.relative_violation > 1).any(axis=0)
+    possible = condition.relative_violation > 1
+    return np.asarray((_certain(condition) > 1).any(axis=0)), np.asarray(possible.any(axis=0))
 
 
 def _error_at(context: EvaluationContext, condition: MeasuredCondition, margin: Margin) -> float:

@@ -1,5 +1,7 @@
 """The verdict on a sampled trajectory: valid, invalid or undecided, for every condition with its reason."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum

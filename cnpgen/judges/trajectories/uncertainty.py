@@ -128,12 +128,10 @@ def _changes(  # noqa: PLR0917 - as of uncertainty_of
                 offsets = [offset.copy() for offset in still]
                 offsets[order][joint] = sign * bound[joint]
                 changes.append([np.abs(g - g0) for g, g0 in zip(values(offsets), nominal, strict=True)])
-            for row, low, high in zip(total, *changes, strict=True):
-                row += np.maximum(low, high)
+            total = [row + np.maximum(low, high) for row, low, high in zip(total, *changes, strict=True)]
     random = np.random.default_rng(0)
     for _ in range(COMBINATIONS):
         offsets = [bound * random.choice([-1.0, 1.0], bound.shape) for bound in bounds]
         for row, g, g0 in zip(total, values(offsets), nominal, strict=True):
             np.maximum(row, np.abs(g - g0), out=row)
     return [CURVATURE_FACTOR * np.where(np.isfinite(row), row, UNDEFINED) for row in total]
-
