@@ -5,8 +5,11 @@ one limit by its tolerance and 1 %. With a bound of the jerk, the plan is one of
 contradicts the verdict on the plan is then wrong. The curve of an interpolation is another curve than the plan, so its
 decisions may differ.
 
+With ``--import``, sampled plans are imported and refined, and the valid ones are counted.
+
     cnpgen solve airhockey-hit --n 200 -o hits.h5
     python benchmarks/trajectories.py hits.h5
+    python benchmarks/trajectories.py hits.h5 --import
 """
 
 import argparse
@@ -24,6 +27,8 @@ from cnpgen.judges.trajectories.trajectory_verdict import Decision, TrajectoryVe
 from cnpgen.plans import Plans, load_plans, open_problem
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.exporter import SampledPlan, sample_plan
+from cnpgen.plans.import_trajectories import import_trajectories
+from cnpgen.refine.refine_plans import refine_plans
 from cnpgen.trajectory.sampled_trajectory import Trajectory
 from cnpgen.trajectory.spline_motion import Motion
 
@@ -77,6 +82,17 @@ CASES = (
     Case("q, 30 Hz, rounded to 1e-4, bound of jerk", 30, 0, decimals=4, jerk=True),
     Case("q, 30 Hz, noise of 1e-3, bound of jerk", 30, 0, noise=1e-3, jerk=True),
     Case("q, 500 Hz, noise of 1e-3, bound of jerk", 500, 0, noise=1e-3, jerk=True),
+)
+
+
+IMPORTS = (
+    Case("q, 30 Hz", 30, 0),
+    Case("q, 100 Hz", 100, 0),
+    Case("q dq, 100 Hz", 100, 1),
+    Case("q dq ddq, 500 Hz", 500, 2),
+    Case("q, 100 Hz, rounded to 1e-4", 100, 0, decimals=4),
+    Case("q, 30 Hz, noise of 1e-3", 30, 0, noise=1e-3),
+    Case("q, 100 Hz, noise of 1e-3", 100, 0, noise=1e-3),
 )
 
 
@@ -148,14 +164,61 @@ def measure(plans: Plans, case: Case, truths: tuple[Verdict, ...]) -> Counts:
     return counts
 
 
+def refined(plans: Plans, case: Case) -> tuple[str, ...]:
+    """Import and refine sampled plans; return a row of the table."""
+    random = np.random.default_rng(0)
+    sampled = [
+        trajectory_of(sample_plan(plans.motion[[index]], case.rate, index), case, random) for index in range(len(plans))
+    ]
+    imported = import_trajectories(plans.problem, sampled, noise=case.error)
+    valid = evaluate_plans(imported.plans, workers=1).valid
+    after = evaluate_plans(refine_plans(imported.plans, workers=1).plans, workers=1)
+    reasons = Counter(str(verdict.reason) for verdict in after.verdicts if not verdict.valid)
+    text = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common())
+    counts = str(len(plans)), f"{int(valid.sum())}", f"{int(after.valid.sum())}", f"{after.valid.mean():.1%}"
+    moved = float(np.nanmax(imported.snapped, initial=0.0))
+    return plans.problem.name, case.name, *counts, f"{imported.deviation.max():.1e}", f"{moved:.1e}", text
+
+
+def import_all(given: argparse.Namespace) -> None:
+    """Import and refine the plans of all files in all cases."""
+    head = (
+        "problem",
+        "samples",
+        "plans",
+        "valid before",
+        "valid after",
+        "share",
+        "fit [rad]",
+        "ends moved [rad]",
+        "reasons",
+    )
+    rows = []
+    for file in given.files:
+        plans = load_plans(file)
+        plans = plans[np.flatnonzero(evaluate_plans(plans, workers=1).valid)[: given.n]]
+        rows += [refined(plans, case) for case in IMPORTS]
+        progress(f"{file}: done")
+    results = {"rows": [dict(zip(head, row, strict=True)) for row in rows]}
+    report(results, [table("imported plans", head, rows, left=2)], as_json=given.json)
+
+
 def main() -> None:
-    """Judge the plans of all files in all cases."""
+    """Judge the plans of all files in all cases, or import them."""
 
     def add(parser: argparse.ArgumentParser) -> None:
         parser.add_argument("files", nargs="+", type=Path, help="files of plans")
         parser.add_argument("--n", type=int, default=200, help="valid plans of each file (default: 200)")
 
-    given, rows = arguments(__doc__, add), []
+        parser.add_argument("--import", dest="imports", action="store_true", help="import and refine instead")
+
+    given = arguments(__doc__, add)
+    import_all(given) if given.imports else judge_all(given)
+
+
+def judge_all(given: argparse.Namespace) -> None:
+    """Judge the plans of all files in all cases."""
+    rows = []
     for file in given.files:
         plans = load_plans(file)
         evaluation = evaluate_plans(plans, workers=1)

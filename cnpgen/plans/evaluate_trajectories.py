@@ -124,11 +124,11 @@ def evaluate_trajectories(
     check_step(step := number("step", step))
     record = as_record(problem)
     n = len(record.joint_names)
-    _check(trajectories, n)
+    check_trajectories(trajectories, n)
     if interpolation is not None and max_jerk is not None:
         raise UsageError("interpolation and max_jerk exclude each other", concerns="interpolation")
-    errors = _non_negative("noise", noise, 3)
-    jerk = None if max_jerk is None else _non_negative("max_jerk", max_jerk, n)
+    errors = non_negative("noise", noise, 3)
+    jerk = None if max_jerk is None else non_negative("max_jerk", max_jerk, n)
     parts = [
         list(trajectories[first : first + TRAJECTORIES_PER_TASK])
         for first in range(0, len(trajectories), TRAJECTORIES_PER_TASK)
@@ -143,7 +143,7 @@ def evaluate_trajectories(
     return TrajectoryEvaluation(record, tuple(trajectories), tuple(verdicts), step)
 
 
-def _check(trajectories: Sequence[Trajectory], n: int) -> None:
+def check_trajectories(trajectories: Sequence[Trajectory], n: int) -> None:
     """Check that there are trajectories of n joints."""
     if not len(trajectories):
         raise UsageError("there are no trajectories", concerns="trajectories")
@@ -157,7 +157,7 @@ def _check(trajectories: Sequence[Trajectory], n: int) -> None:
             )
 
 
-def _non_negative(name: str, value: ArrayLike, size: int) -> Array:
+def non_negative(name: str, value: ArrayLike, size: int) -> Array:
     """Return one number or several as an array of shape (size,)."""
     found = numbers(name, value)
     if found.shape not in {(), (size,)} or not (np.isfinite(found) & (found >= 0)).all():

@@ -177,7 +177,8 @@ def _measured_entries(context: EvaluationContext) -> list[_Entry]:
         certain[id(condition)] = float(_certain(condition).max())
     between = chain(check_continuous_collision(context, early_exit=False), check_local_maxima(context))
     for condition, margin in between:
-        key, error = id(condition), _error_at(context, condition, margin)
+        key = id(condition)
+        error = float(np.max(condition.uncertainty))  # that of the margin is at most as large
         worst[key] = max(worst[key], margin, key=lambda candidate: candidate.severity)
         if not condition.relaxation.any():
             certain[key] = max(certain[key], (margin.violation - 2 * error) / max(margin.tolerance, ZERO_TOLERANCE))
