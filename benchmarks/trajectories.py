@@ -177,6 +177,7 @@ def refined(plans: Plans, case: Case) -> tuple[str, ...]:
     text = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common())
     counts = str(len(plans)), f"{int(valid.sum())}", f"{int(after.valid.sum())}", f"{after.valid.mean():.1%}"
     moved = float(np.nanmax(imported.snapped, initial=0.0))
+    progress(f"{plans.problem.name}, {case.name}: {int(after.valid.sum())} of {len(plans)} valid; {text}")
     return plans.problem.name, case.name, *counts, f"{imported.deviation.max():.1e}", f"{moved:.1e}", text
 
 

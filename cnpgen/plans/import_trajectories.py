@@ -27,6 +27,8 @@ Array = NDArray[np.float64]
 
 MAX_FIT_ERROR_RAD = 2e-3  # of the positions at the samples, plus the noise, with more control points otherwise
 GROWTH = (1.0, 1.6, 2.6)  # of the number of control points of the path
+FIT_SAMPLES_PER_POINT = 4  # of the path, at most
+MIN_SAMPLES_PER_POINT = 2  # of the path, from which velocities of the samples are not needed
 REST_WINDOW_S = 0.05  # in which noise of the positions looks like a velocity
 MIN_SNAP_RAD = 1e-3  # distance by which positions may always be moved
 SNAP_FACTOR = 3.0  # largest change of positions by snapping, relative to the noise
@@ -124,6 +126,18 @@ def _at_rest_within(state: State, speed_error: float, acceleration_error: float)
     return q, np.where(np.abs(dq) <= speed_error, 0.0, dq), np.where(np.abs(ddq) <= acceleration_error, 0.0, ddq)
 
 
+def _fit_samples(trajectory: Trajectory, points: int) -> tuple[Array, Array, Array | None]:
+    """Return times, positions and, only if samples are few, velocities: enough of them for C control points."""
+    count = len(trajectory.t)
+    chosen = np.unique(np.linspace(0, count - 1, min(count, FIT_SAMPLES_PER_POINT * points)).round().astype(np.intp))
+    few = trajectory.dq is not None and count < MIN_SAMPLES_PER_POINT * points
+    return (
+        trajectory.t[chosen],
+        trajectory.q[chosen],
+        trajectory.dq[chosen] if few and trajectory.dq is not None else None,
+    )
+
+
 def _fitted(
     trajectories: Sequence[Trajectory], boundaries: Sequence[Boundary], spec: TrajectorySpec, max_error: float
 ) -> tuple[list[Motion], Array]:
@@ -132,7 +146,7 @@ def _fitted(
         points = min(round(factor * spec.path_control_points), MAX_CONTROL_POINTS)
         larger = replace(spec, path_control_points=points)
         motions = [
-            fit_motion(each.t, each.q, each.dq, spec=larger, boundary=boundary)
+            fit_motion(*_fit_samples(each, points), spec=larger, boundary=boundary)
             for each, boundary in zip(trajectories, boundaries, strict=True)
         ]
         pairs = zip(motions, trajectories, strict=True)
