@@ -9,9 +9,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cnpgen.machine.threads import one_thread
 from cnpgen.plans.evaluate_trajectories import check_trajectories, non_negative
 from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.plans.snap_boundary import State, StateSnapper
+from cnpgen.problems.constraints.constraint import End
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import as_record, open_problem
 from cnpgen.schema.argument_types import checked_arguments
@@ -51,6 +53,7 @@ class ImportedTrajectories:
 
 
 @checked_arguments
+@one_thread()
 def import_trajectories(
     problem: Problem | StoredProblem | str | Path,
     trajectories: Sequence[Trajectory],
@@ -113,11 +116,41 @@ def _boundary(trajectory: Trajectory, noise: Array, snapper: StateSnapper, *, at
     if at_rest:
         moving = [(state[0], still, still) for state in (start, goal)]
     allowed = max(MIN_SNAP_RAD, SNAP_FACTOR * float(noise[0]))
-    first, last = snapper(moving[0], "start"), snapper(moving[1], "goal")
-    change = max(float(np.abs(new[0] - old[0]).max()) for new, old in ((first, start), (last, goal)))
-    if not change <= allowed:
-        first, last, change = *moving, float("nan")
+    given = [trajectory.dq is not None, trajectory.ddq is not None]
+    first, moved_first = _snapped(snapper, moving[0], "start", given, allowed)
+    last, moved_last = _snapped(snapper, moving[1], "goal", given, allowed)
+    change = float(np.maximum(moved_first, moved_last))  # nan if one of them is
     return Boundary(*(part[None] for part in (*first, *last[:2]))), change
+
+
+def _snapped(
+    snapper: StateSnapper, state: State, end: End, given: Sequence[bool], allowed: float
+) -> tuple[State, float]:
+    """Snap a state, without its estimated derivatives if they prevent it; also return the change of the positions.
+
+    Args:
+        snapper: The constraints.
+        state: The state.
+        end: End of the motion.
+        given: Whether the velocities and the accelerations are those of the file, not estimates.
+        allowed: Largest change of the positions [rad].
+
+    Returns:
+        The state and its change [rad]; the state as it is and nan if a larger change is necessary.
+    """
+    q, dq, ddq = state
+    still = np.zeros_like(q)
+    candidates = [
+        state,
+        (q, dq, ddq if given[1] else still),
+        (q, dq if given[0] else still, ddq if given[1] else still),
+    ]
+    for candidate in candidates:
+        found = snapper(candidate, end)
+        change = float(np.abs(found[0] - q).max())
+        if change <= allowed:
+            return found, change
+    return state, float("nan")
 
 
 def _at_rest_within(state: State, speed_error: float, acceleration_error: float) -> State:

@@ -69,6 +69,16 @@ def test_a_state_is_moved_onto_the_manifold_and_into_the_limits() -> None:
     assert np.abs(q - plan.boundary.goal_q[0]).max() < 3e-3
 
 
+def test_estimated_accelerations_outside_the_limits_do_not_prevent_the_import() -> None:
+    original = plans_of(load("hit"))
+    trajectory = positions(original, 100)
+    jolted = trajectory.q + 2e-3 * np.exp(-trajectory.t / 0.02)[:, None] * np.array([1, -1, 1, -1, 1, -1])
+    imported = import_trajectories(original.problem, [Trajectory(trajectory.t, jolted)], noise=2e-3)
+    limit = ROBOTS["airhockey"].acceleration_limit
+    assert imported.snapped[0] <= 6e-3
+    assert (np.abs(imported.plans.boundary.start_ddq) <= limit * (1 + 1e-9)).all()
+
+
 def test_samples_far_from_the_manifold_keep_their_ends() -> None:
     original = plans_of(load("hit"))
     trajectory = positions(original, 100)
