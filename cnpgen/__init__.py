@@ -16,8 +16,8 @@ Functions:
     Datasets: ``make_dataset``, ``extend_dataset``, ``merge_datasets``, ``load_dataset``, ``inspect_dataset``,
     ``validate_dataset``.
     Problems: ``load_problem``, ``load_boundary_problems``, ``draw_boundary_problems``, ``complete``.
-    Plans: ``make_plans``, ``load_plans``, ``save_plans``, ``join_plans``, ``fit_motion``, ``solve_plans``,
-    ``refine_plans``, ``explain_plans``, ``evaluate_plans``, ``export_plans``.
+    Plans: ``make_plans``, ``load_plans``, ``save_plans``, ``join_plans``, ``solve_plans``,
+    ``refine_plans``, ``explain_plans``, ``evaluate_plans``, ``evaluate_trajectories``, ``export_plans``.
     Models: ``train_model``, ``load_model``, ``save_model``, ``plan_hits``.
     Machine: ``check_machine``.
 
@@ -31,6 +31,7 @@ public names are in these modules:
 * ``cnpgen.recipes``: recipes of problems, pipelines and datasets, and their parts.
 * ``cnpgen.losses``: the loss of a plan, its metric and its margins.
 * ``cnpgen.results``: classes that functions return.
+* ``cnpgen.trajectories``: sampled trajectories of other planners: load, import, fit, and their verdicts.
 * ``cnpgen.errors``: the exceptions.
 * ``cnpgen.plugins``: contracts of stages, constraints and exporters.
 * ``cnpgen.benchmark``: comparison of planners, and simulation of plans.
@@ -45,7 +46,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-_MODULES = ("benchmark", "errors", "losses", "plugins", "recipes", "results")
+_MODULES = ("benchmark", "errors", "losses", "plugins", "recipes", "results", "trajectories")
 
 
 def _lazy_exports(package: str, file: str) -> tuple[list[str], Callable[[str], Any], Callable[[], list[str]]]:

@@ -16,6 +16,7 @@ from cnpgen.planner.plan_hits import plan_hits as plan_hits
 from cnpgen.planner.planner import Planner as Planner
 from cnpgen.plans.boundary_problems import load_boundary_problems as load_boundary_problems
 from cnpgen.plans.evaluate import evaluate_plans as evaluate_plans
+from cnpgen.plans.evaluate_trajectories import evaluate_trajectories as evaluate_trajectories
 from cnpgen.plans.export import export_plans as export_plans
 from cnpgen.plans.join import join_plans as join_plans
 from cnpgen.plans.plan_file import load_plans as load_plans
@@ -34,7 +35,6 @@ from cnpgen.store.inspection import inspect_dataset as inspect_dataset
 from cnpgen.training.settings import TrainingSettings as TrainingSettings
 from cnpgen.training.train import train_model as train_model
 from cnpgen.trajectory.boundary import Boundary as Boundary
-from cnpgen.trajectory.fit import fit_motion as fit_motion
 from cnpgen.trajectory.spline_motion import Motion as Motion
 from cnpgen.validate.machine import check_machine as check_machine
 from cnpgen.validate.validate_dataset import validate_dataset as validate_dataset

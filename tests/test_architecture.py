@@ -26,7 +26,7 @@ LAYERS = (
     ("refine", "planner"),
     ("make", "training", "interop"),
     ("validate", "benchmark"),
-    ("cli", "plugins", "recipes", "results", "__init__"),
+    ("cli", "plugins", "recipes", "results", "trajectories", "__init__"),
     ("__main__",),
 )
 MAX_PACKAGES = 26
@@ -168,7 +168,15 @@ def test_every_module_is_imported_or_registered() -> None:
     used = {target for module in MODULES for target in modules_of(imports(module))} | modules_of(public_modules())
     by_name = {value.partition(":")[0].removeprefix("cnpgen.") for value in kinds_by_name()}
     unused = {own for own, module in NAMES.items() if own not in used | by_name and module.name != "__init__"}
-    assert unused <= {"__main__", "plugins", "recipes", "results", "training.select_via_points", *BRIDGES}
+    assert unused <= {
+        "__main__",
+        "plugins",
+        "recipes",
+        "results",
+        "trajectories",
+        "training.select_via_points",
+        *BRIDGES,
+    }
 
 
 def public_modules() -> set[str]:

@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tempfile
 import tomllib
 import zipfile
 from collections.abc import Callable
@@ -25,6 +26,7 @@ from cnpgen.errors import MissingExtraError
 from cnpgen.loader.frame import make_frame
 from cnpgen.machine.clusters import joined
 from cnpgen.machine.versions import DOCUMENTATION_URL
+from cnpgen.plans.trajectory_tables import read_trajectory_tables
 from cnpgen.store.files.figure_file import new_figure
 
 ROOT = Path(__file__).parents[1]
@@ -135,7 +137,7 @@ def test_every_library_that_is_imported_is_a_declared_dependency(wheel: zipfile.
     declared = Parser().parsestr(wheel.read(metadata).decode()).get_all("Requires-Dist") or []
     libraries = {re.split(r"[^A-Za-z0-9_.-]", text)[0] for text in declared}
     others = imported - set(sys.stdlib_module_names) - {"cnpgen"}
-    assert {{"pinocchio": "pin"}.get(name, name) for name in others} <= libraries
+    assert {{"pinocchio": "pin", "yaml": "pyyaml"}.get(name, name) for name in others} <= libraries
 
 
 def test_what_the_default_run_of_the_tests_leaves_out_is_run_before_a_change_lands() -> None:
@@ -197,6 +199,11 @@ def frame(library: str) -> Any:
     return make_frame({}, (), library=library)
 
 
+def trajectories(suffix: str) -> object:
+    with tempfile.NamedTemporaryFile(suffix=suffix) as file:
+        return read_trajectory_tables(Path(file.name))
+
+
 OPTIONAL = {  # package that cnpgen imports -> extra that installs it, function that needs it
     "torch": ("torch", bridge("torch")),
     "jax": ("jax", bridge("jax")),
@@ -212,7 +219,10 @@ OPTIONAL = {  # package that cnpgen imports -> extra that installs it, function 
     "ray": ("ray", lambda: cluster("ray")),
     "polars": ("polars", lambda: frame("polars")),
     "pandas": ("pandas", lambda: frame("pandas")),
+    "pyarrow": ("parquet", lambda: trajectories(".parquet")),
+    "yaml": ("ros", lambda: trajectories(".yaml")),
 }
+NAMES_IN_THE_INDEX = {"yaml": "pyyaml"}
 BY_NAME = {"meshcat", "polars", "pandas"}  # loaded by name, without an import statement
 SETTINGS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 
@@ -233,7 +243,10 @@ def test_the_error_without_an_optional_package_names_its_extra(package: str, mon
     with pytest.raises(MissingExtraError, match=rf"pip install 'cnpgen\[{extra}\]'") as caught:
         use()
     assert caught.value.exit_code == 3
-    assert any(re.match(rf"{package}\b", requirement) for requirement in SETTINGS["optional-dependencies"][extra])
+    assert any(
+        re.match(rf"{NAMES_IN_THE_INDEX.get(package, package)}\b", requirement)
+        for requirement in SETTINGS["optional-dependencies"][extra]
+    )
 
 
 def test_the_list_of_optional_packages_is_complete() -> None:

@@ -15,4 +15,4 @@ from cnpgen.benchmark.simulator.simulate import simulate_plans as simulate_plans
 from cnpgen.benchmark.suite import SampledProblems as SampledProblems
 from cnpgen.benchmark.suite import Suite as Suite
 from cnpgen.benchmark.suite import load_suite as load_suite
-from cnpgen.benchmark.trajectory import Trajectory as Trajectory
+from cnpgen.trajectory.sampled_trajectory import Trajectory as Trajectory

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.errors import UsageError
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import ProblemRecord
 from cnpgen.schema import registry
 from cnpgen.schema.keys import RecipeLocation
 from cnpgen.schema.parsing import parse
+from cnpgen.trajectory.sampled_trajectory import Trajectory
 
 Answer = Plans | Trajectory | None
 """One plan, a trajectory sampled in time, or None if the planner found no plan."""

@@ -13,9 +13,9 @@ from cnpgen.benchmark.simulator.plant import Plant
 from cnpgen.benchmark.simulator.reference import Reference, StatesAt, states_of
 from cnpgen.benchmark.simulator.simulate import execute_states
 from cnpgen.benchmark.simulator.simulator_scene import SimulatorScene
-from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.errors import UsageError
 from cnpgen.plans.plans import Plans
+from cnpgen.trajectory.sampled_trajectory import Trajectory
 
 Array = NDArray[np.float64]
 Task = tuple[Plans, dict[str, Any], ExecutedPrefix | None]

@@ -10,7 +10,6 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.judges.plans.evaluated_trajectory import EvaluatedTrajectory
 from cnpgen.judges.plans.judge import reason_of
 from cnpgen.judges.plans.measure import boundary_margins, by_name, measure
@@ -20,6 +19,7 @@ from cnpgen.judges.plans.verdict import Reason, Verdict
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import ProblemRecord, open_problem
+from cnpgen.trajectory.sampled_trajectory import Trajectory
 from cnpgen.world.path import PathWorld
 
 Array = NDArray[np.float64]

@@ -15,10 +15,10 @@ from typing import Any
 
 from cnpgen.benchmark.benchmark_planner import Plan, Setting, load_planner
 from cnpgen.benchmark.results_file import answer_from_dict, answer_to_dict
-from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.errors import CnpgenError, MachineError, UsageError
 from cnpgen.machine.threads import one_thread
 from cnpgen.plans.plans import Plans
+from cnpgen.trajectory.sampled_trajectory import Trajectory
 
 STOP_MARGIN_S = 1.0  # after its time limit a planner is stopped; an answer in between is not counted
 MAX_PREPARATION_TIME_S = 300.0  # including the compilation of kernels

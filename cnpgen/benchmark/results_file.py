@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from cnpgen.benchmark.hypothesis_tests import FIGURES
-from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.store.files.atomic import machine_error, write_file
@@ -29,6 +28,7 @@ from cnpgen.store.files.document_structure import (
 from cnpgen.store.files.documents import parse_json
 from cnpgen.store.files.journal import append_line
 from cnpgen.store.paths import require_file
+from cnpgen.trajectory.sampled_trajectory import Trajectory
 
 RESULTS_FORMAT = "cnpgen-benchmark"
 RESULTS_VERSION = 2

@@ -57,8 +57,8 @@ class Benchmark:
         suite: The suite.
         problems: Its problems.
         prefix: Of replanning scenarios, the prefixes of the first motions.
-        results: Planner -> its rows, ordered by repetition and problem ('cnpgen docs benchmark'). They cover all results
-            in the folder, also those of earlier runs.
+        results: Planner -> its rows, ordered by repetition and problem ('cnpgen docs benchmark'). They cover all
+            results in the folder, also those of earlier runs.
         plants: Plants that executed plans in this run.
         runs: Date, machine, versions and seed of the runs that wrote into the folder; the last one is this run.
         reference: Planner with which the others are compared, or None for the default.

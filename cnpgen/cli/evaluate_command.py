@@ -1,4 +1,4 @@
-"""``cnpgen evaluate``: judge the plans of a file with Pinocchio and Coal."""
+"""``cnpgen evaluate``: judge plans or sampled trajectories of a file with Pinocchio and Coal."""
 
 import argparse
 import json
@@ -10,6 +10,7 @@ from cnpgen.cli import values
 from cnpgen.cli.parser import Commands, Parser, add_command, add_json
 from cnpgen.cli.plan_files import read_plans
 from cnpgen.cli.progress import Meter
+from cnpgen.cli.trajectory_options import TRAJECTORY_OPTIONS, add_trajectory_options
 
 if TYPE_CHECKING:
     from cnpgen.plans.evaluate import Evaluation
@@ -18,14 +19,18 @@ _TEXT = """\
 Every plan is checked on a fine time grid and between its samples ('cnpgen docs verdict'). The exit code is 0 if every
 plan is valid, and 1 if a plan is invalid, if the file holds no plans, or if it is damaged. --workers changes only the
 time.
+
+With --problem, FILE may also hold sampled trajectories: CSV, JSON, YAML, NPZ, HDF5 or Parquet, messages of ROS and
+MoveIt, or a folder of such files ('cnpgen docs trajectories'). Each trajectory and condition is valid, invalid or
+undecided. The exit code is then 0 if all are valid, otherwise 1; 2 for files that cannot be read.
 """
 
 
 def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
-    parser = add_command(commands, "evaluate", run, title="judge the plans of a file", text=_TEXT)
+    parser = add_command(commands, "evaluate", run, title="judge plans or sampled trajectories", text=_TEXT)
     option = parser.add_argument
-    option("file", metavar="FILE", type=Path, help="plan file, .h5")
+    option("file", metavar="FILE", type=Path, help="plan file, .h5, or sampled trajectories")
     option("--problem", metavar="NAME|FILE", help="the problem of the plans; its tolerances are used")
     option(
         "--step",
@@ -44,6 +49,25 @@ def add(commands: "Commands[Parser]") -> None:
         help="plan to draw; default the first invalid one, or plan 0",
     )
     add_json(parser)
+    sampled = parser.add_argument_group("sampled trajectories")
+    add_trajectory_options(sampled)
+    sampled.add_argument(
+        "--interpolation",
+        choices=("hold", "linear", "cubic", "quintic"),
+        help="the controller's curve; default: linear for positions, cubic with velocities, quintic with accelerations",
+    )
+    sampled.add_argument(
+        "--max-jerk",
+        metavar="J,...",
+        type=values.amounts,
+        help="judge every curve through the samples whose jerks are at most J [rad/s^3]: one number, or one per joint",
+    )
+    sampled.add_argument(
+        "--noise",
+        metavar="E,...",
+        type=values.errors,
+        help="largest error of the samples in SI units: one number, or of positions, velocities and accelerations",
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -52,6 +76,9 @@ def run(arguments: argparse.Namespace) -> int:
 
     if arguments.plan is not None and not arguments.plot:
         raise UsageError("--plan needs --plot")
+    if _holds_trajectories(arguments.file):
+        return _run_trajectories(arguments)
+    _refuse_trajectory_options(arguments)
     found = _evaluate(arguments)
     if arguments.json:
         _write_json(arguments.file, found)
@@ -63,6 +90,56 @@ def run(arguments: argparse.Namespace) -> int:
             print(f"\n{listing_text(found)}")
     if arguments.plot:
         _draw(found, arguments.plot, arguments.plan)
+    return 0 if found.valid.all() else 1
+
+
+def _holds_trajectories(file: Path) -> bool:
+    """Return whether a file, or a folder, holds sampled trajectories instead of plans."""
+    from cnpgen.plans.trajectory_tables import holds_trajectories
+
+    return holds_trajectories(file)
+
+
+def _refuse_trajectory_options(arguments: argparse.Namespace) -> None:
+    """Refuse options of sampled trajectories for a plan file."""
+    from cnpgen.errors import UsageError
+
+    for name in (*TRAJECTORY_OPTIONS, "interpolation", "max_jerk", "noise"):
+        if getattr(arguments, name) is not None:
+            raise UsageError(f"--{name.replace('_', '-')} is for sampled trajectories, {arguments.file} holds plans")
+
+
+def _run_trajectories(arguments: argparse.Namespace) -> int:
+    """Judge sampled trajectories."""
+    from cnpgen.cli.trajectory_options import listing_text, load_file, summary_text, write_json
+    from cnpgen.errors import UsageError
+    from cnpgen.plans.evaluate_trajectories import evaluate_trajectories
+
+    if arguments.plot:
+        raise UsageError("--plot draws plans: 'cnpgen import' makes plans of sampled trajectories")
+    loaded = load_file(arguments)
+    meter = Meter(quiet=not sys.stderr.isatty(), noun="trajectory")
+    meter.begin(f"judging {arguments.file}", len(loaded.trajectories))
+    noise, jerk = arguments.noise or (0.0,), arguments.max_jerk
+    try:
+        found = evaluate_trajectories(
+            arguments.problem,
+            loaded.trajectories,
+            interpolation=arguments.interpolation,
+            noise=noise[0] if len(noise) == 1 else noise,
+            max_jerk=jerk[0] if jerk and len(jerk) == 1 else jerk,
+            step=arguments.step,
+            workers=arguments.workers or 1,
+            progress=meter,
+        )
+    finally:
+        meter.close()
+    if arguments.json:
+        write_json(arguments.file, found, loaded.labels)
+    else:
+        print(summary_text(arguments.file, found))
+        if arguments.list:
+            print(f"\n{listing_text(found, loaded.labels)}")
     return 0 if found.valid.all() else 1
 
 

@@ -1,5 +1,6 @@
 """The values of options: whole numbers as people write them, parts of a job array."""
 
+import math
 import re
 from argparse import ArgumentTypeError
 from decimal import Decimal
@@ -136,3 +137,35 @@ def numbers(text: str) -> tuple[int, ...]:
             raise ArgumentTypeError(f"expected whole numbers such as 0,3,10-12; got {text[:60]!r}")
         found += range(low, high + 1)
     return tuple(found)
+
+
+def names(text: str) -> tuple[str, ...]:
+    """Read names that are separated by commas: ``joint_1,joint_2``."""
+    found = tuple(name.strip() for name in text.split(","))
+    if not all(found):
+        raise ArgumentTypeError(f"expected names separated by commas, got {text[:60]!r}")
+    return found
+
+
+def errors(text: str) -> tuple[float, ...]:
+    """Read one number or three, at least 0: ``1e-3`` or ``1e-3,1e-2,0.5``."""
+    try:
+        found = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        found = ()
+    if len(found) not in {1, 3} or not all(0 <= value < math.inf for value in found):
+        raise ArgumentTypeError(
+            f"expected one number or three, at least 0, such as 1e-3 or 1e-3,1e-2,0.5; got {text[:60]!r}"
+        )
+    return found
+
+
+def amounts(text: str) -> tuple[float, ...]:
+    """Read positive numbers separated by commas: ``500`` or ``7500,3750,5000``."""
+    try:
+        found = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        found = ()
+    if not found or not all(0 < value < math.inf for value in found):
+        raise ArgumentTypeError(f"expected numbers above 0, such as 500 or 7500,3750; got {text[:60]!r}")
+    return found

@@ -1,6 +1,5 @@
 """Task tables: CSV or HDF5 files with dataset columns such as ``goal_xyz.x`` and ``hit_angle``."""
 
-import csv
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -11,9 +10,9 @@ from cnpgen.errors import DatasetError, UsageError, nearest
 from cnpgen.schema.arguments import numbers
 from cnpgen.store.field import Field
 from cnpgen.store.files.atomic import machine_error
+from cnpgen.store.files.csv_table import read_csv_table
 from cnpgen.store.files.hdf5 import opened_hdf5
 from cnpgen.store.files.kind import is_hdf5
-from cnpgen.store.files.size_limits import MAX_TABLE_BYTES, MAX_TABLE_COLUMNS
 from cnpgen.store.paths import require_file
 
 Array = NDArray[np.float64]
@@ -86,33 +85,5 @@ def _hdf5_columns(path: Path) -> dict[str, Array]:
 
 
 def _csv_columns(path: Path) -> dict[str, Array]:
-    if (size := path.stat().st_size) > MAX_TABLE_BYTES:
-        raise DatasetError(f"{path} has {size:,} bytes, expected a table of at most {MAX_TABLE_BYTES:,}")
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            lines = [(number, row) for number, row in enumerate(csv.reader(file), 1) if any(map(str.strip, row))]
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise DatasetError(f"{path} is not a CSV table in UTF-8: {error}") from error
-    if not lines:
-        raise DatasetError(f"{path} is empty: its first line must name columns, such as goal_xyz.x,goal_xyz.y")
-    names = [cell.strip() for cell in lines[0][1]]
-    if other := next((mark for mark in ";\t" if mark in "".join(names)), None):
-        raise DatasetError(f"{path}: line 1: columns are separated by ',', got {other!r}; numbers have '.', as in 0.5")
-    if len(names) > MAX_TABLE_COLUMNS:
-        raise DatasetError(f"{path}: line 1 names {len(names):,} columns, expected at most {MAX_TABLE_COLUMNS:,}")
-    if twice := [name for name in names if names.count(name) > 1]:
-        raise DatasetError(f"{path}: the column {twice[0]!r} is there more than once")
-    table = np.array([_numbers_of(path, number, row, names) for number, row in lines[1:]])
-    return dict(zip(names, table.reshape(-1, len(names)).T, strict=True))
-
-
-def _numbers_of(path: Path, line: int, row: list[str], names: list[str]) -> list[float]:
-    if len(row) != len(names):
-        raise DatasetError(f"{path}: line {line} has {len(row)} values, the first line names {len(names)} columns")
-    found = []
-    for name, cell in zip(names, row, strict=True):
-        try:
-            found.append(float(cell))
-        except ValueError as error:
-            raise DatasetError(f"{path}: line {line}: {name} must be a number, got {cell.strip()!r}") from error
-    return found
+    table = read_csv_table(path, example="goal_xyz.x,goal_xyz.y")
+    return {name: table.numbers(name) for name in table.names}

@@ -29,11 +29,11 @@ from cnpgen.benchmark.planners.trajopt import TrajOpt, TrajOptTranscription
 from cnpgen.benchmark.process import PlannerProcess
 from cnpgen.benchmark.results_file import answer_from_dict
 from cnpgen.benchmark.suite import load_suite
-from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.errors import UsageError
 from cnpgen.plans import Plans, open_problem
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.trajectory.boundary import Boundary
+from cnpgen.trajectory.sampled_trajectory import Trajectory
 from tests.conftest import some
 
 

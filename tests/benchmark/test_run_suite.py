@@ -18,8 +18,8 @@ from cnpgen.benchmark.result_tables import failure_summaries, save_benchmark_tab
 from cnpgen.benchmark.results_file import answer_from_dict, answer_to_dict, open_results
 from cnpgen.benchmark.run_suite import run_benchmark
 from cnpgen.benchmark.suite import load_suite
-from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.errors import DatasetError, UsageError
+from cnpgen.trajectory.sampled_trajectory import Trajectory
 from tests.conftest import some
 from tests.examples.installed import installed_kind
 

@@ -7,9 +7,9 @@ from cnpgen.benchmark.execution import execute_answer
 from cnpgen.benchmark.judging import judge_answer
 from cnpgen.benchmark.results_file import answer_to_dict
 from cnpgen.benchmark.simulator.plant import PLANTS
-from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.errors import UsageError
 from cnpgen.plans import Plans, make_plans
+from cnpgen.trajectory.sampled_trajectory import Trajectory
 from tests.examples.jerk_limits import jerk_limited_plan
 from tests.examples.plans import load
 

@@ -25,12 +25,12 @@ from cnpgen.benchmark.planners.state_check import MAX_TIP_HEIGHT_ERROR_M, MAX_UP
 from cnpgen.benchmark.planners.steering import STEERING_STEP_S, Steering, spread_of
 from cnpgen.benchmark.planners.tree import HIT_RADII, Tree
 from cnpgen.benchmark.suite import load_suite
-from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.planner.network.architecture import Architecture, initial_parameters
 from cnpgen.planner.network.forward import forward
 from cnpgen.plans import Plans, open_problem
 from cnpgen.refine.refine_plans import solve_plans
+from cnpgen.trajectory.sampled_trajectory import Trajectory
 from tests.conftest import some
 
 PROBLEM_OF = {"hits-81": "airhockey", "heavy-100": "heavy-object"}

@@ -10,7 +10,6 @@ import numpy as np
 
 from cnpgen.benchmark.results_file import answer_to_dict, open_results
 from cnpgen.benchmark.suite import list_suites
-from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.make.make_dataset import make_dataset
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.make.recipe_file import load_dataset_recipe
@@ -22,6 +21,7 @@ from cnpgen.schema.catalogue import recipes_root
 from cnpgen.store.shard import read_shard
 from cnpgen.training.checkpoint import Checkpoints
 from cnpgen.training.training_state import start_state
+from cnpgen.trajectory.sampled_trajectory import Trajectory
 from tests.examples.models import boundary_of_columns, untrained_model
 from tests.examples.plan_files import plans_of, remove_checksum
 from tests.examples.plans import load as stored_plan

@@ -9,6 +9,7 @@ import pinocchio as pin
 import pytest
 
 from cnpgen.judges.plans.continuous_collision import Intervals, chord_deviation_bounds
+from cnpgen.judges.plans.curve import SplineCurve
 from cnpgen.judges.plans.evaluated_trajectory import evaluate_trajectory
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
@@ -119,7 +120,7 @@ def assert_bounds_hold(problem: Problem, robot: Robot, motion: Motion, poses: np
     nearest = np.array([distances[8 * k : 8 * k + 9].min() for k in range(40)])
     pairs, motion_bounds = pairs_at(s), world.motion_bounds(np.abs(motion.path[0]).max(axis=0))
     displacements = motion_bounds @ np.abs(np.diff(world.q, axis=1))
-    deviations = chord_deviation_bounds(motion, s, motion_bounds)
+    deviations = chord_deviation_bounds(SplineCurve(motion), s, motion_bounds)
     pairs.smallest()  # its directions are reused
     for least in (np.median(nearest), nearest.min() - 0.03):
         bounds = pairs.interval_bounds(np.full(len(pairs.bounds), least), displacements, deviations)
@@ -148,7 +149,7 @@ def test_no_point_deviates_from_its_chord_by_more_than_the_bound(label: str) -> 
     model, robot = plan.robot.model, plan.robot
     data, s, parts = model.createData(), np.linspace(0, 1, 105), 9
     motion_bounds = PathWorld(robot, plan.problem.obstacle, plan.problem.object_size).motion_bounds(np.zeros(robot.n))
-    bounds = chord_deviation_bounds(plan.motion, s, motion_bounds)
+    bounds = chord_deviation_bounds(SplineCurve(plan.motion), s, motion_bounds)
     points, fraction = [], np.linspace(0, 1, parts)
     finer = np.concatenate([np.linspace(a, b, parts) for a, b in pairwise(s)])
     for q in evaluate_trajectory(plan.motion, finer).q.T:
@@ -164,5 +165,5 @@ def test_no_point_deviates_from_its_chord_by_more_than_the_bound(label: str) -> 
 def test_motions_at_rest_and_steps_back_have_no_chord_deviation() -> None:
     plan = load("hit")
     still = plan.changed(path=np.repeat(plan.motion.path[:, :1], plan.motion.path.shape[1], axis=1))
-    assert np.abs(chord_deviation_bounds(still.motion, np.linspace(0, 1, 60), np.ones(6))).max() < 1e-15
-    assert chord_deviation_bounds(plan.motion, np.array([0.5, 0.51, 0.3, 0.31]), np.ones(6))[1] == 0
+    assert np.abs(chord_deviation_bounds(SplineCurve(still.motion), np.linspace(0, 1, 60), np.ones(6))).max() < 1e-15
+    assert chord_deviation_bounds(SplineCurve(plan.motion), np.array([0.5, 0.51, 0.3, 0.31]), np.ones(6))[1] == 0

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from cnpgen.benchmark.benchmark_planner import Answer, BenchmarkPlanner, Plan, Setting
 from cnpgen.benchmark.planners.table_plane import PlanePath, stopping_path, striking_path
 from cnpgen.benchmark.planners.tip import Tip
-from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.errors import UsageError
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.robots.robot import Robot
+from cnpgen.trajectory.sampled_trajectory import Trajectory
 
 Array = NDArray[np.float64]
 

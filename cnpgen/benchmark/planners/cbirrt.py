@@ -20,7 +20,6 @@ from cnpgen.benchmark.planners.obstacle_boxes import (
     distance,
 )
 from cnpgen.benchmark.planners.tip import Tip
-from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.errors import requires_extra
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.constraints.table import Table
@@ -28,6 +27,7 @@ from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.hull import CUBE
+from cnpgen.trajectory.sampled_trajectory import Trajectory
 
 Array = NDArray[np.float64]
 

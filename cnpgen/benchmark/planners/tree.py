@@ -11,8 +11,8 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.benchmark.trajectory import Trajectory
 from cnpgen.problems.problem import Problem
+from cnpgen.trajectory.sampled_trajectory import Trajectory
 
 Array = NDArray[np.float64]
 

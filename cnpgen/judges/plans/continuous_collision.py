@@ -17,13 +17,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.judges.plans.bernstein import bernstein_coefficients
+from cnpgen.judges.plans.curve import Curve
 from cnpgen.judges.plans.measure import EvaluationContext, MeasuredCondition
 from cnpgen.judges.plans.verdict import Margin
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.constraints.self_clearance import SelfClearance
-from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.world.pair_distances import PairDistances
 from cnpgen.world.path import PathWorld
 
@@ -33,7 +32,6 @@ INTERVAL_PARTS = 8  # per subdivision
 MAX_INTERVALS = 256  # that are subdivided at a time
 MAX_LEVELS = 8  # of subdivision: 1 ms becomes 0.06 ns
 MINIMUM_LEVELS = 2  # of subdivision around the smallest margin, even if it cannot change the verdict
-BOUND_PARTS = 4  # of every span, over which derivatives are bounded
 
 
 def is_contact(constraint: Constraint) -> bool:
@@ -79,7 +77,7 @@ def check_continuous_collision(
     contacts = [condition for condition in context.measured if is_contact(condition.constraint)]
     if not contacts:
         return
-    motion_bounds = context.world.motion_bounds(np.abs(context.motion.path[0]).max(axis=0))
+    motion_bounds = context.world.motion_bounds(context.curve.max_positions())
     initial = _intervals(context, context.samples.s[None], contacts, motion_bounds)  # before the world is moved
     for contact, intervals in zip(contacts, initial, strict=True):
         for s, measured in _subdivisions(context, intervals, contact.constraint, motion_bounds, early_exit=early_exit):
@@ -114,21 +112,21 @@ def _intervals(
     world, last = context.world, s.shape[1] - 1
     displacements = motion_bounds @ np.abs(world.q[:, 1:] - world.q[:, :-1])
     displacements[last :: last + 1] = -np.inf  # between rows there is no interval
-    deviations = chord_deviation_bounds(context.motion, s.ravel(), motion_bounds)
+    deviations = chord_deviation_bounds(context.curve, s.ravel(), motion_bounds)
     results = []
     for contact in contacts:
-        min_distances = contact.condition.lower - contact.tolerance
+        min_distances = contact.condition.lower - contact.tolerance + contact.uncertainty
         margin = (contact.g - min_distances[:, None]).min(axis=0).reshape(s.shape)
         proven = np.full(s.size, np.nan)
         if margin.min() >= 0:
-            pairs = _pairs(world, contact.constraint)
+            pairs = pairs_of(world, contact.constraint)
             proven[:-1] = pairs.interval_bounds(min_distances, displacements, deviations)
         phases, margins = (np.stack([values[:, :-1], values[:, 1:]], axis=-1).reshape(-1, 2) for values in (s, margin))
         results.append(Intervals(phases, margins, proven.reshape(s.shape)[:, :-1].ravel()))
     return results
 
 
-def _pairs(world: PathWorld, constraint: Constraint) -> PairDistances:
+def pairs_of(world: PathWorld, constraint: Constraint) -> PairDistances:
     """Return the distances of a contact constraint, one pair for each of its values."""
     if isinstance(constraint, ObjectContact):
         return world.object_pairs()
@@ -137,22 +135,19 @@ def _pairs(world: PathWorld, constraint: Constraint) -> PairDistances:
     return world.segment_pairs() if world.robot.shape is None else world.shape_pairs()
 
 
-def chord_deviation_bounds(motion: Motion, s: Array, motion_bounds: Array) -> Array:
+def chord_deviation_bounds(curve: Curve, s: Array, motion_bounds: Array) -> Array:
     """Bound the deviation of points of the robot from the chords between neighboring phases.
 
     Args:
-        motion: One motion.
+        curve: One motion.
         s: Phases, ascending, at distances of at most a part of a span, shape (K,).
         motion_bounds: Motion bounds of the joints (``PathWorld.motion_bounds``) [m], shape (n,).
 
     Returns:
         Bounds [m], shape (K - 1,); 0 where a phase is below its predecessor.
     """
-    path, degree = motion.path[0], motion.degree
-    edges = np.linspace(0, 1, BOUND_PARTS * (len(path) - degree) + 1)
-    first, second = (
-        np.abs(coefficients).max(axis=0) for coefficients in bernstein_coefficients(path, degree, (1, 2), edges)
-    )
+    bounds = curve.derivative_bounds()
+    edges, first, second = bounds.edges, bounds.first, bounds.second
     proximal = np.cumsum(first, axis=1) - first
     curvature = (second + first * (first + 2 * proximal)) @ motion_bounds
     low, high = np.searchsorted(edges[1:-1], s[:-1], "right"), np.searchsorted(edges[1:-1], s[1:], "left")

@@ -32,6 +32,11 @@ def is_proven(constraint: Constraint) -> bool:
     return type(constraint) in _QUANTITIES
 
 
+def quantity_of(constraint: Constraint) -> str:
+    """Return the quantity that a proven constraint limits: "q", "dq", "ddq" or "jerk"."""
+    return _QUANTITIES[type(constraint)]
+
+
 @dataclass(frozen=True)
 class ProvenJointLimits:
     """L limits of n joints that are proven to hold or to be violated.
@@ -72,7 +77,7 @@ class ProvenJointLimits:
         """
         if not self.constraints:
             return []
-        names = [_QUANTITIES[type(constraint)] for constraint in self.constraints]
+        names = [quantity_of(constraint) for constraint in self.constraints]
         functions = [getattr(polynomials, name) for name in names]
         maxima = self._at_samples(np.array([getattr(world, name) for name in names]), s)
         upper_bounds = self._upper_bounds(functions)
@@ -82,7 +87,7 @@ class ProvenJointLimits:
             (rows,) = (~(upper_bounds[limit] <= threshold)).nonzero()
             maxima[limit] = self._maximum(limit, rows, functions[limit], polynomials.edges, maxima[limit], threshold)
         t = times(np.array([phase for *_, phase in maxima]), table).tolist()
-        return [self._margin(limit, maximum, t[limit]) for limit, maximum in enumerate(maxima)]
+        return [self.margin_at(limit, maximum, t[limit]) for limit, maximum in enumerate(maxima)]
 
     def _at_samples(self, values: Array, s: Array) -> list[Maximum]:
         """Return the maximum relative violation of each limit by values of shape (L, n, K) at phases s."""
@@ -113,7 +118,8 @@ class ProvenJointLimits:
         value, row, phase = find_maximum(violations, edges, (known[0], -1, known[2]), threshold=threshold, parts=parts)
         return value, known[1] if row < 0 else int(rows[row]), phase
 
-    def _margin(self, limit: int, maximum: Maximum, time: float) -> Margin:
+    def margin_at(self, limit: int, maximum: Maximum, time: float) -> Margin:
+        """Return the margin of a limit at its maximum relative violation and the time of it [s]."""
         (relative, row, phase), condition = maximum, self.conditions[limit]
         bound, offset, part = self.bounds[limit, row], relative * self.scale[limit, row], row % len(self.joints)
         return Margin(

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
-from cnpgen.judges.plans.bernstein import knots, polynomials
+from cnpgen.judges.plans.bernstein import PiecewisePolynomials, knots, polynomials
 from cnpgen.judges.plans.continuous_collision import check_continuous_collision
+from cnpgen.judges.plans.curve import SplineCurve
 from cnpgen.judges.plans.evaluated_trajectory import (
     EvaluatedTrajectory,
     Phases,
@@ -222,14 +223,17 @@ def _judge_plan(plan: _Plan, world: PathWorld, limits: ProvenJointLimits, step: 
     if not early_exit:
         metrics = metrics_of(plan.problem, world, samples, jerks(plan.motion, samples.s))
         paper = paper_rule(plan.problem, world, plan.obstacle_poses, plan.goal_xyz)
-    context = evaluation_context(plan.problem, plan.motion, plan.obstacle_poses, world, samples, table)
-    margins = [*ends, *_margins(context, limits, early_exit=early_exit)]
+    curve = SplineCurve(plan.motion)
+    context = evaluation_context(plan.problem, curve, plan.obstacle_poses, world, samples, table)
+    motion = polynomials(plan.motion, jerk=plan.problem.uses_jerk)
+    margins = [*ends, *_margins(context, motion, limits, early_exit=early_exit)]
     return Verdict(reason_of(margins), by_name(margins), metrics, paper, len(samples.s))
 
 
-def _margins(context: EvaluationContext, limits: ProvenJointLimits, *, early_exit: bool) -> list[Margin]:
+def _margins(
+    context: EvaluationContext, motion: PiecewisePolynomials, limits: ProvenJointLimits, *, early_exit: bool
+) -> list[Margin]:
     """Measure every constraint, at the samples and between them; the world of the context is moved."""
-    motion = polynomials(context.motion, jerk=context.problem.uses_jerk)
     proven = limits.margins(context.world, motion, context.samples.s, context.table, early_exit=early_exit)
     worst = {id(condition): condition.margin(context.problem, context.samples) for condition in context.measured}
     between_samples = chain(check_continuous_collision(context, early_exit=early_exit), check_local_maxima(context))

@@ -4,7 +4,7 @@ Each margin is taken where the motion comes closest to the bound or violates it 
 obstacle.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, cast
@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.judges.plans.evaluated_trajectory import EvaluatedTrajectory, evaluate_trajectory
+from cnpgen.judges.plans.curve import Curve
+from cnpgen.judges.plans.evaluated_trajectory import EvaluatedTrajectory
 from cnpgen.judges.plans.joint_limits import is_proven
 from cnpgen.judges.plans.sampling import Samples, times
 from cnpgen.judges.plans.verdict import ZERO_TOLERANCE, Margin, Reason
@@ -22,7 +23,6 @@ from cnpgen.problems.constraints.joint import JointAcceleration, JointJerk, Join
 from cnpgen.problems.problem import Problem
 from cnpgen.store.joint_units import unit_of
 from cnpgen.trajectory.boundary import Boundary
-from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.world.path import PathWorld
 
 if TYPE_CHECKING:
@@ -84,6 +84,7 @@ class MeasuredCondition:
         g: Values [unit of the condition], shape (m, K).
         relaxation: Distance by which the bounds are relaxed [unit of the condition], shape (K,).
         tolerance: Accepted violation, shape (m,).
+        uncertainty: Largest error of the values, shape (m, K), or one for all; 0 for a known motion.
     """
 
     constraint: Constraint
@@ -91,12 +92,13 @@ class MeasuredCondition:
     g: Array
     relaxation: Array
     tolerance: Array
+    uncertainty: Array | float = 0.0
 
     @cached_property
     def violation(self) -> Array:
-        """Signed distances of the values outside their bounds, negative inside, shape (m, K)."""
+        """Signed distances of the values outside their bounds at most, negative inside, shape (m, K)."""
         below, above = self.condition.lower[:, None] - self.g, self.g - self.condition.upper[:, None]
-        return np.asarray(np.maximum(below, above) - self.relaxation)
+        return np.asarray(np.maximum(below, above) - self.relaxation + self.uncertainty)
 
     @cached_property
     def relative_violation(self) -> Array:
@@ -177,32 +179,36 @@ class EvaluationContext:
 
     Attributes:
         problem: The problem.
-        motion: One motion.
+        curve: One motion.
         obstacle_poses: Poses and sizes of the obstacles, shape (width,).
         samples: Times and phases of the initial samples.
         table: Times of the motion (``time_table``).
         start_tip: Tip position at the start [m], shape (3,).
         world: The robot; ``move`` moves it.
         measured: Conditions at the samples.
+        with_uncertainty: Adds the errors of the values to conditions at phases, if the motion is not known exactly.
     """
 
     problem: Problem
-    motion: Motion
+    curve: Curve
     obstacle_poses: Array
     samples: Samples
     table: Array
     start_tip: Array
     world: PathWorld
     measured: Sequence[MeasuredCondition]
+    with_uncertainty: Callable[[MeasuredCondition, Array], MeasuredCondition] | None = None
 
     def move(self, s: Array) -> None:
         """Move the robot to phases s, shape (K,)."""
-        states = evaluate_trajectory(self.motion, s, jerk=self.problem.uses_jerk)
+        states = self.curve.evaluate(s, jerk=self.problem.uses_jerk)
         self.world.set_path(states.q, states.dq, states.ddq, self.obstacle_poses, states.jerk)
 
     def measure(self, constraint: Constraint, s: Array) -> list[MeasuredCondition]:
         """Measure a constraint at phases s, shape (K,), to which the robot was moved."""
-        return measure(constraint, self.world, s, self.start_tip)
+        measured = measure(constraint, self.world, s, self.start_tip)
+        add = self.with_uncertainty
+        return measured if add is None else [add(condition, s) for condition in measured]
 
     def margin(self, measured: MeasuredCondition, s: Array) -> Margin:
         """Return the margin of a condition that was measured at phases s."""
@@ -210,13 +216,13 @@ class EvaluationContext:
 
 
 def evaluation_context(  # noqa: PLR0917 - all of them are independent inputs
-    problem: Problem, motion: Motion, obstacle_poses: Array, world: PathWorld, samples: Samples, table: Array
+    problem: Problem, curve: Curve, obstacle_poses: Array, world: PathWorld, samples: Samples, table: Array
 ) -> EvaluationContext:
     """Measure all conditions of one motion that are not proven, at the samples where the robot is.
 
     Args:
         problem: The problem.
-        motion: One motion.
+        curve: One motion.
         obstacle_poses: Poses and sizes of the obstacles, shape (width,).
         world: The robot at the samples.
         samples: Times and phases of the samples.
@@ -227,4 +233,4 @@ def evaluation_context(  # noqa: PLR0917 - all of them are independent inputs
     measured = [
         condition for constraint in constraints for condition in measure(constraint, world, samples.s, start_tip)
     ]
-    return EvaluationContext(problem, motion, obstacle_poses, samples, table, start_tip, world, measured)
+    return EvaluationContext(problem, curve, obstacle_poses, samples, table, start_tip, world, measured)

@@ -1,0 +1,256 @@
+"""Verdicts on sampled plans: how many are decided, and whether a decision contradicts the verdict on the plan.
+
+Every plan is sampled at several rates, with and without derivatives, rounding and noise. A second set of plans exceeds
+one limit by its tolerance and 1 %. With a bound of the jerk, the plan is one of the judged curves: a decision that
+contradicts the verdict on the plan is then wrong. The curve of an interpolation is another curve than the plan, so its
+decisions may differ.
+
+With ``--import``, sampled plans are imported and refined, and the valid ones are counted.
+
+    cnpgen solve airhockey-hit --n 200 -o hits.h5
+    python benchmarks/trajectories.py hits.h5
+    python benchmarks/trajectories.py hits.h5 --import
+"""
+
+import argparse
+from collections import Counter
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from common import arguments, progress, report, table
+
+from cnpgen.judges.plans import Verdict
+from cnpgen.judges.trajectories.interpolate import bounded_jerk, interpolated
+from cnpgen.judges.trajectories.judge_family import FamilyJudge
+from cnpgen.judges.trajectories.trajectory_verdict import Decision, TrajectoryVerdict
+from cnpgen.plans import Plans, load_plans, open_problem
+from cnpgen.plans.evaluate import evaluate_plans
+from cnpgen.plans.exporter import SampledPlan, sample_plan
+from cnpgen.plans.import_trajectories import import_trajectories
+from cnpgen.refine.refine_plans import refine_plans
+from cnpgen.trajectory.sampled_trajectory import Trajectory
+from cnpgen.trajectory.spline_motion import Motion
+
+EXCESS = 0.01  # outside a limit with its tolerance, relative to the limit
+JERK_FACTOR = 1.01  # of the largest jerk of a plan: the stated bound
+JERK_SAMPLES = 20_000  # at which it is searched
+
+
+@dataclass(frozen=True)
+class Case:
+    """A way of sampling plans.
+
+    Attributes:
+        name: Name in the table.
+        rate: Samples per second.
+        orders: Number of derivatives beside the positions.
+        decimals: Decimals of the values, or None for all.
+        noise: Largest random error of the values in SI units.
+        jerk: Whether every curve under a bound of the jerk is judged, instead of an interpolation.
+    """
+
+    name: str
+    rate: float
+    orders: int
+    decimals: int | None = None
+    noise: float = 0.0
+    jerk: bool = False
+
+    @property
+    def error(self) -> float:
+        """Largest error of the values in SI units."""
+        return self.noise + (0.0 if self.decimals is None else 0.5 * 10.0**-self.decimals)
+
+    @property
+    def contains_plan(self) -> bool:
+        """Whether the plan is one of the judged curves."""
+        return self.jerk
+
+
+CASES = (
+    Case("q dq ddq, 500 Hz", 500, 2),
+    Case("q dq, 500 Hz", 500, 1),
+    Case("q dq, 100 Hz", 100, 1),
+    Case("q, 100 Hz", 100, 0),
+    Case("q dq ddq, 500 Hz, rounded to 1e-4", 500, 2, decimals=4),
+    Case("q dq ddq, 500 Hz, bound of jerk", 500, 2, jerk=True),
+    Case("q, 1 kHz, bound of jerk", 1000, 0, jerk=True),
+    Case("q, 100 Hz, bound of jerk", 100, 0, jerk=True),
+    Case("q, 30 Hz, bound of jerk", 30, 0, jerk=True),
+    Case("q dq ddq, 30 Hz, rounded to 1e-4, bound of jerk", 30, 2, decimals=4, jerk=True),
+    Case("q, 30 Hz, rounded to 1e-4, bound of jerk", 30, 0, decimals=4, jerk=True),
+    Case("q, 30 Hz, noise of 1e-3, bound of jerk", 30, 0, noise=1e-3, jerk=True),
+    Case("q, 500 Hz, noise of 1e-3, bound of jerk", 500, 0, noise=1e-3, jerk=True),
+)
+
+
+IMPORTS = (
+    Case("q, 30 Hz", 30, 0),
+    Case("q, 100 Hz", 100, 0),
+    Case("q dq, 100 Hz", 100, 1),
+    Case("q dq ddq, 500 Hz", 500, 2),
+    Case("q, 100 Hz, rounded to 1e-4", 100, 0, decimals=4),
+    Case("q, 30 Hz, noise of 1e-3", 30, 0, noise=1e-3),
+    Case("q, 100 Hz, noise of 1e-3", 100, 0, noise=1e-3),
+)
+
+
+@dataclass
+class Counts:
+    """Decisions of one case on plans of one file.
+
+    Attributes:
+        decisions: Decision on the whole trajectory -> number.
+        conditions: Condition -> decision -> number.
+        wrong: Decisions on conditions that contradict the verdict on the plan.
+    """
+
+    decisions: Counter[str] = field(default_factory=Counter)
+    conditions: dict[str, Counter[str]] = field(default_factory=dict)
+    wrong: int = 0
+
+    def add(self, verdict: TrajectoryVerdict, truth: Verdict) -> None:
+        """Count one verdict."""
+        self.decisions[str(verdict.decision)] += 1
+        for name, entry in verdict.conditions.items():
+            self.conditions.setdefault(name, Counter())[str(entry.decision)] += 1
+            ok = truth.margins[name].ok
+            self.wrong += entry.decision == (Decision.INVALID if ok else Decision.VALID)
+
+    def decided(self) -> str:
+        """Return the decided share of every condition that is not always decided."""
+        shares = {name: 1 - c[str(Decision.UNDECIDED)] / c.total() for name, c in self.conditions.items()}
+        return ", ".join(f"{name} {share:.0%}" for name, share in shares.items() if share < 1) or "all"
+
+
+def trajectory_of(plan: SampledPlan, case: Case, random: np.random.Generator) -> Trajectory:
+    """Return a sampled plan with the errors of a case."""
+    values = []
+    for array in (plan.q, plan.dq, plan.ddq)[: case.orders + 1]:
+        noisy = array + case.noise * random.uniform(-1, 1, array.shape)
+        values.append(noisy if case.decimals is None else noisy.round(case.decimals))
+    return Trajectory(plan.t, *values)
+
+
+def too_fast(motion: Motion, verdict: Verdict, name: str) -> Motion:
+    """Return a motion at a speed that exceeds one limit by its tolerance and 1 %."""
+    margin = verdict.margins[name]
+    target = 1 + margin.tolerance / abs(margin.bound) + EXCESS
+    share = abs(margin.value / margin.bound)
+    power = 1 if name == "joint velocity" else 2
+    return motion.time_scaled((share / target) ** (1 / power))
+
+
+def measure(plans: Plans, case: Case, truths: tuple[Verdict, ...]) -> Counts:
+    """Judge sampled plans."""
+    problem, robot = open_problem(plans.problem)
+    judge, counts, random = FamilyJudge(problem, robot), Counts(), np.random.default_rng(0)
+    error = np.full(3, case.error)
+    for index, truth in enumerate(truths):
+        motion = plans.motion[[index]]
+        sampled = trajectory_of(sample_plan(motion, case.rate, index), case, random)
+        if case.jerk:
+            t = np.linspace(0, float(motion.duration()[0]), JERK_SAMPLES)
+            bound = JERK_FACTOR * np.abs(motion.at_times(t[None]).jerk[0]).max(axis=0)
+            family = bounded_jerk(sampled, bound, error)
+        else:
+            family = interpolated(sampled, None, error)
+        if family is None:
+            counts.decisions["contradiction"] += 1
+            counts.wrong += 1  # the plan itself passes through the samples
+        else:
+            counts.add(judge(family), truth)
+    return counts
+
+
+def refined(plans: Plans, case: Case) -> tuple[str, ...]:
+    """Import and refine sampled plans; return a row of the table."""
+    random = np.random.default_rng(0)
+    sampled = [
+        trajectory_of(sample_plan(plans.motion[[index]], case.rate, index), case, random) for index in range(len(plans))
+    ]
+    imported = import_trajectories(plans.problem, sampled, noise=case.error)
+    valid = evaluate_plans(imported.plans, workers=1).valid
+    after = evaluate_plans(refine_plans(imported.plans, workers=1).plans, workers=1)
+    reasons = Counter(str(verdict.reason) for verdict in after.verdicts if not verdict.valid)
+    text = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common())
+    counts = str(len(plans)), f"{int(valid.sum())}", f"{int(after.valid.sum())}", f"{after.valid.mean():.1%}"
+    moved = float(np.nanmax(imported.snapped, initial=0.0))
+    progress(f"{plans.problem.name}, {case.name}: {int(after.valid.sum())} of {len(plans)} valid; {text}")
+    return plans.problem.name, case.name, *counts, f"{imported.deviation.max():.1e}", f"{moved:.1e}", text
+
+
+def import_all(given: argparse.Namespace) -> None:
+    """Import and refine the plans of all files in all cases."""
+    head = (
+        "problem",
+        "samples",
+        "plans",
+        "valid before",
+        "valid after",
+        "share",
+        "fit [rad]",
+        "ends moved [rad]",
+        "reasons",
+    )
+    rows = []
+    for file in given.files:
+        plans = load_plans(file)
+        plans = plans[np.flatnonzero(evaluate_plans(plans, workers=1).valid)[: given.n]]
+        rows += [refined(plans, case) for case in IMPORTS]
+        progress(f"{file}: done")
+    results = {"rows": [dict(zip(head, row, strict=True)) for row in rows]}
+    report(results, [table("imported plans", head, rows, left=2)], as_json=given.json)
+
+
+def main() -> None:
+    """Judge the plans of all files in all cases, or import them."""
+
+    def add(parser: argparse.ArgumentParser) -> None:
+        parser.add_argument("files", nargs="+", type=Path, help="files of plans")
+        parser.add_argument("--n", type=int, default=200, help="valid plans of each file (default: 200)")
+
+        parser.add_argument("--import", dest="imports", action="store_true", help="import and refine instead")
+
+    given = arguments(__doc__, add)
+    import_all(given) if given.imports else judge_all(given)
+
+
+def judge_all(given: argparse.Namespace) -> None:
+    """Judge the plans of all files in all cases."""
+    rows = []
+    for file in given.files:
+        plans = load_plans(file)
+        evaluation = evaluate_plans(plans, workers=1)
+        chosen = np.flatnonzero(evaluation.valid)[: given.n]
+        plans, truths = plans[chosen], tuple(evaluation.verdicts[index] for index in chosen.tolist())
+        names = ("joint velocity", "joint acceleration")
+        fast = [too_fast(plans.motion[[k]], truth, names[k % 2]) for k, truth in enumerate(truths)]
+        rates = np.concatenate([motion.rate for motion in fast])
+        faster = replace(plans, rate_control_points=rates)
+        sets = {"valid": (plans, truths), "too fast": (faster, evaluate_plans(faster, workers=1).verdicts)}
+        for label, (members, verdicts) in sets.items():
+            for case in CASES:
+                counts = measure(members, case, verdicts)
+                wrong = counts.wrong if case.contains_plan else None
+                found = {str(decision): counts.decisions[str(decision)] for decision in Decision}
+                rows.append(
+                    {
+                        "problem": plans.problem.name,
+                        "plans": f"{len(members)} {label}",
+                        "samples": case.name,
+                        **found,
+                        "wrong": wrong,
+                        "differs": counts.wrong,
+                        "decided": counts.decided(),
+                    }
+                )
+            progress(f"{file}: {label}: done")
+    head = ("problem", "plans", "samples", *map(str, Decision), "wrong", "other than the plan", "decided conditions")
+    cells = [["" if value is None else str(value) for value in row.values()] for row in rows]
+    report({"rows": rows}, [table("sampled plans", head, cells, left=3)], as_json=given.json)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,70 @@
+"""``cnpgen import``: fit plans to sampled trajectories of any planner."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from cnpgen.cli import values
+from cnpgen.cli.parser import Commands, Parser, add_command
+from cnpgen.cli.plan_files import check_suffix
+from cnpgen.cli.trajectory_options import add_trajectory_options, load_file
+
+_TEXT = """\
+The plans are initial guesses: 'cnpgen refine' optimizes them and keeps their ends, and 'cnpgen evaluate' judges them.
+Formats and columns are those of 'cnpgen evaluate' ('cnpgen docs trajectories'). The ends are moved onto the constraints by a
+change of positions of at most three times the noise, or 1 mrad. The plan file is printed on stdout.
+"""
+
+
+def add(commands: "Commands[Parser]") -> None:
+    """Add the command."""
+    parser = add_command(commands, "import", run, title="make plans of sampled trajectories", text=_TEXT)
+    option = parser.add_argument
+    option("file", metavar="FILE", type=Path, help="file of trajectories, or a folder of them")
+    option("--problem", metavar="NAME|FILE", required=True, help="the problem of the trajectories")
+    option("-o", "--out", metavar="PLANS", type=Path, required=True, help="plan file to write, .h5")
+    option("--force", action="store_true", help="replace PLANS")
+    add_trajectory_options(parser)
+    text = "largest error of the samples in SI units: one number, or of positions, velocities and accelerations"
+    option("--noise", metavar="E,...", type=values.errors, help=text)
+    option("--at-rest", action="store_true", help="all motions begin and end at rest")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command."""
+    import numpy as np
+
+    from cnpgen.errors import UsageError, counted
+    from cnpgen.plans.import_trajectories import import_trajectories
+    from cnpgen.plans.save import check_replaceable, save_plans
+
+    out = arguments.out
+    check_suffix(out)
+    check_replaceable(out)
+    if not out.absolute().parent.is_dir():
+        raise UsageError(f"{out} must be in a folder that exists")
+    if out.exists() and not arguments.force:
+        raise UsageError(f"{out} exists", remedies={"force": True})
+    loaded = load_file(arguments)
+    noise = arguments.noise or (0.0,)
+    imported = import_trajectories(
+        arguments.problem,
+        loaded.trajectories,
+        noise=noise[0] if len(noise) == 1 else noise,
+        at_rest=arguments.at_rest,
+        source=f"imported from {arguments.file.name}",
+    )
+    save_plans(out, imported.plans)
+    points = imported.plans.path_control_points.shape[1]
+    print(
+        f"imported {counted(len(imported.plans), 'plan')} with {points} control points of the path;"
+        f" largest distance from the samples {imported.deviation.max():.2g} rad",
+        file=sys.stderr,
+    )
+    failed = np.flatnonzero(np.isnan(imported.snapped)).tolist()
+    for index in failed:
+        print(f"plan {index}: the ends cannot be moved onto the constraints by a small change", file=sys.stderr)
+    largest = float(np.nanmax(imported.snapped)) if len(failed) < len(imported.plans) else 0.0
+    print(f"ends moved by at most {largest:.2g} rad to meet the constraints", file=sys.stderr)
+    print(out)
+    return 0

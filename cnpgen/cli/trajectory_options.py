@@ -1,0 +1,78 @@
+"""Options of commands that read sampled trajectories, and the output of their verdicts."""
+
+import argparse
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cnpgen.cli import values
+from cnpgen.cli.describe import table
+from cnpgen.cli.parser import Options
+
+if TYPE_CHECKING:
+    from cnpgen.plans.evaluate_trajectories import TrajectoryEvaluation
+    from cnpgen.plans.load_trajectories import LoadedTrajectories
+
+TRAJECTORY_OPTIONS = ("joints", "unit", "rate", "separate_by", "unwrap")  # of load_trajectories
+MAX_IGNORED = 8  # unused columns that are listed
+
+
+def add_trajectory_options(option: Options) -> None:
+    """Add the options that determine how a file is read."""
+    add = option.add_argument
+    add("--joints", metavar="A,B,...", type=values.names, help="names of the problem's joints in the file, in order")
+    add("--unit", choices=("rad", "deg"), help="unit of columns without a unit in their name (default: rad)")
+    add("--rate", metavar="HZ", type=values.hertz, help="samples per second of a file without times")
+    add("--separate-by", metavar="COLUMN", help="column whose value differs from trajectory to trajectory")
+    add("--unwrap", action="store_true", default=None, help="continue angles that jump by more than half a turn")
+
+
+def load_file(arguments: argparse.Namespace) -> "LoadedTrajectories":
+    """Load the trajectories of a command, and list the columns that are not used on stderr."""
+    import sys
+
+    from cnpgen.errors import UsageError
+    from cnpgen.plans.load_trajectories import load_trajectories
+
+    if arguments.problem is None:
+        raise UsageError("sampled trajectories need {problem}", remedies={"problem": None})
+    given = {name: getattr(arguments, name) for name in TRAJECTORY_OPTIONS if getattr(arguments, name) is not None}
+    loaded = load_trajectories(arguments.file, arguments.problem, **given)
+    if loaded.ignored:
+        more = f" and {len(loaded.ignored) - MAX_IGNORED} more" if len(loaded.ignored) > MAX_IGNORED else ""
+        print(f"columns that are not used: {', '.join(loaded.ignored[:MAX_IGNORED])}{more}", file=sys.stderr)
+    return loaded
+
+
+def write_json(file: Path, found: "TrajectoryEvaluation", labels: tuple[str, ...]) -> None:
+    """Write all verdicts as JSON."""
+    rows = [
+        {"trajectory": index, "place": label, **verdict.to_dict()}
+        for index, (label, verdict) in enumerate(zip(labels, found.verdicts, strict=True))
+    ]
+    print(json.dumps({"file": str(file), **found.summary(), "verdicts": rows}, indent=2, ensure_ascii=False))
+
+
+def summary_text(file: Path, found: "TrajectoryEvaluation") -> str:
+    """Return the counts, and for every condition the decisions with the worst margin."""
+    counts = ", ".join(f"{count:,} {decision}" for decision, count in found.counts.items())
+    lines = [f"{file}: trajectories of {found.problem.name}: {counts}", ""]
+    rows: list[tuple[str, ...]] = [
+        ("condition", "valid", "invalid", "undecided", "time violated", "time undecided", "trajectory", "worst margin")
+    ]
+    summary = found.summary()["conditions"]
+    for name, decisions in summary.items():
+        entries = [(index, v.conditions[name]) for index, v in enumerate(found.verdicts) if name in v.conditions]
+        worst, entry = max(entries, key=lambda item: item[1].margin.severity)
+        shares = [max(getattr(e, share) for _, e in entries) for share in ("violated_share", "undecided_share")]
+        counted = [f"{decisions[decision]:,}" for decision in ("valid", "invalid", "undecided")]
+        rows.append((name, *counted, *(f"{share:.1%}" for share in shares), str(worst), str(entry.margin)))
+    lines += table(rows, indent="  ", right=(1, 2, 3, 4, 5, 6)) if len(rows) > 1 else []
+    lines += ["", *(f"  {count:,} because of: {reason}" for reason, count in found.summary()["reasons"].items())]
+    return "\n".join(lines).rstrip()
+
+
+def listing_text(found: "TrajectoryEvaluation", labels: tuple[str, ...]) -> str:
+    """Return one line for each trajectory, with those that are not valid first."""
+    order = sorted(range(len(labels)), key=lambda index: found.verdicts[index].valid)
+    return "\n".join(f"{index}  {labels[index]}  {found.verdicts[index]}" for index in order)

@@ -1,0 +1,107 @@
+"""A family of curves around a piecewise polynomial: everything that samples and assumptions say about a motion.
+
+The nominal curve is a polynomial on every span between two knots. Every curve of the family differs from it by at most
+a bound that is constant on each span. A family with zero bounds is one known curve.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from math import comb
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.judges.plans.bernstein import PiecewisePolynomials
+from cnpgen.judges.plans.curve import DerivativeBounds
+from cnpgen.judges.plans.evaluated_trajectory import EvaluatedTrajectory
+
+Array = NDArray[np.float64]
+
+ORDERS = ("q", "dq", "ddq", "jerk")
+UNDEFINED = 1e6  # bound of a derivative that the curve does not have, in SI units; no real robot comes close
+
+
+@dataclass(frozen=True, eq=False)
+class CurveFamily:
+    """Curves of n joints on S spans.
+
+    Attributes:
+        t: Times of the knots [s], from 0 to the duration, shape (S + 1,).
+        coefficients: Bernstein coefficients of the nominal positions [rad], shape (d + 1, S, n).
+        bounds: Largest differences from the nominal positions, velocities, accelerations and jerks, one array of shape
+            (S, n) each; ``UNDEFINED`` for derivatives that do not exist at the knots.
+        has_jerk: Whether the nominal jerks are those of the polynomials; otherwise they are 0.
+    """
+
+    t: Array
+    coefficients: Array
+    bounds: tuple[Array, Array, Array, Array]
+    has_jerk: bool = True
+
+    @property
+    def duration(self) -> float:
+        """Duration [s]."""
+        return float(self.t[-1])
+
+    @cached_property
+    def edges(self) -> Array:
+        """Phases of the knots, the shares of the duration, shape (S + 1,)."""
+        return np.asarray(self.t / self.t[-1])
+
+    @cached_property
+    def polynomials(self) -> PiecewisePolynomials:
+        """The nominal curve and its time derivatives."""
+        found = [self.coefficients]
+        for _ in range(3):
+            found.append(_derivative(found[-1], np.diff(self.t)))
+        if not self.has_jerk:
+            found[3] = np.zeros_like(found[3])
+        return PiecewisePolynomials(self.edges, *found)
+
+    @cached_property
+    def is_known(self) -> bool:
+        """Whether the family is one curve with all derivatives."""
+        return not any(bound.any() for bound in self.bounds)
+
+    def evaluate(self, s: Array, *, jerk: bool) -> EvaluatedTrajectory:
+        """Evaluate the nominal curve at phases s in [0, 1], shape (K,); at a knot, the span after it."""
+        span, u = self._spans(s)
+        orders = ORDERS if jerk else ORDERS[:3]
+        return EvaluatedTrajectory(*(_values(getattr(self.polynomials, name), span, u) for name in orders))
+
+    def bounds_at(self, s: Array) -> list[Array]:
+        """Return the bounds of all orders at phases s, shape (n, K) each."""
+        span, _ = self._spans(s)
+        return [np.ascontiguousarray(bound[span].T) for bound in self.bounds]
+
+    def derivative_bounds(self) -> DerivativeBounds:
+        """Bound the derivatives of the nominal positions by the phase."""
+        first, second = (np.abs(values).max(axis=0) for values in (self.polynomials.dq, self.polynomials.ddq))
+        return DerivativeBounds(self.edges, first * self.duration, second * self.duration**2)
+
+    def max_positions(self) -> Array:
+        """Bound the absolute positions of all curves [rad], shape (n,)."""
+        return np.asarray((np.abs(self.coefficients).max(axis=0) + self.bounds[0]).max(axis=0))
+
+    def _spans(self, s: Array) -> tuple[NDArray[np.intp], Array]:
+        """Return the span of every phase and the position in it, from 0 to 1."""
+        span = np.clip(np.searchsorted(self.edges, s, "right") - 1, 0, len(self.t) - 2)
+        low = self.edges[span]
+        return span, np.asarray((s - low) / (self.edges[span + 1] - low))
+
+
+def _derivative(coefficients: Array, lengths: Array) -> Array:
+    """Differentiate polynomials by time, shape (d + 1, S, n) -> (max(d, 1), S, n)."""
+    if len(coefficients) == 1:
+        return np.zeros_like(coefficients)
+    return np.asarray((len(coefficients) - 1) * np.diff(coefficients, axis=0) / lengths[:, None])
+
+
+def _values(coefficients: Array, span: NDArray[np.intp], u: Array) -> Array:
+    """Evaluate polynomials in their spans, shape (n, K)."""
+    degree = len(coefficients) - 1
+    basis = [comb(degree, k) * u**k * (1 - u) ** (degree - k) for k in range(degree + 1)]
+    total = np.zeros((len(span), coefficients.shape[2]))
+    for weight, row in zip(basis, coefficients, strict=True):
+        total += weight[:, None] * row[span]
+    return np.ascontiguousarray(total.T)

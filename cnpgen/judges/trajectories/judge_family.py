@@ -1,0 +1,229 @@
+"""Verdict on a family of curves: valid if all of them are valid, invalid if none is, otherwise undecided.
+
+It is the verdict on plans (``cnpgen.judges.plans``) with a bound of the error of every value. Joint limits are proven
+from Bernstein coefficients, distances by interval subdivision, and smooth conditions at samples and local maxima. A
+sampled trajectory has no phase of its own: the phase is the share of its duration.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import chain
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.judges.plans.bernstein import find_maximum
+from cnpgen.judges.plans.continuous_collision import check_continuous_collision, is_contact, pairs_of
+from cnpgen.judges.plans.joint_limits import ProvenJointLimits, joint_limits, quantity_of
+from cnpgen.judges.plans.judge import check_step
+from cnpgen.judges.plans.local_maxima import check_local_maxima
+from cnpgen.judges.plans.measure import EvaluationContext, MeasuredCondition, by_name, evaluation_context
+from cnpgen.judges.plans.sampling import MAX_DURATION_S, MAX_TIME_SAMPLES, Samples, times
+from cnpgen.judges.plans.verdict import ZERO_TOLERANCE, Margin, Reason
+from cnpgen.judges.trajectories.curve_family import ORDERS, CurveFamily
+from cnpgen.judges.trajectories.trajectory_verdict import ConditionDecision, Decision, TrajectoryVerdict
+from cnpgen.judges.trajectories.uncertainty import uncertainty_of
+from cnpgen.problems.obstacles import scene_of
+from cnpgen.problems.problem import Problem
+from cnpgen.robots.robot import Robot
+from cnpgen.world.path import PathWorld
+
+Array = NDArray[np.float64]
+
+MIN_SPAN_PARTS = 2  # between two knots
+DECIDING_ERROR = 1e3  # an error this large, in SI units, is that of a missing derivative
+
+
+class FamilyJudge:
+    """Judges families of curves of one problem, and reuses the memory of Pinocchio and Coal between calls.
+
+    Args:
+        problem: The problem.
+        robot: Its robot.
+        step: Maximum time between checked times [s].
+
+    Raises:
+        UsageError: The step is not positive, or too long.
+    """
+
+    def __init__(self, problem: Problem, robot: Robot, *, step: float = 1e-3) -> None:
+        check_step(step)
+        self._problem, self._robot, self._step = problem, robot, step
+        self._world, self._moved = (PathWorld(robot, problem.obstacle, problem.object_size) for _ in range(2))
+        self._limits = joint_limits(problem, self._world)
+
+    def __call__(self, family: CurveFamily) -> TrajectoryVerdict:
+        """Judge one family; values that cannot be evaluated give an undecided verdict."""
+        if not family.duration < MAX_DURATION_S or len(family.t) > MAX_TIME_SAMPLES:
+            reason = f"{Reason.TOO_LONG}: at most {MAX_DURATION_S:g} s and {MAX_TIME_SAMPLES:,} samples are judged"
+            return TrajectoryVerdict(Decision.UNDECIDED, reason, duration=family.duration)
+        with np.errstate(all="ignore"):  # overflows give inf or nan, which are detected
+            return self._judge(family)
+
+    def _judge(self, family: CurveFamily) -> TrajectoryVerdict:
+        s = checked_phases(family, self._step)
+        table = np.array([[0.0, 1.0], [0.0, family.duration]])
+        samples = Samples(s, times(s, table))
+        states = family.evaluate(s, jerk=self._problem.uses_jerk)
+        if not states.is_finite():
+            return TrajectoryVerdict(Decision.UNDECIDED, Reason.NOT_FINITE, duration=family.duration, samples=len(s))
+        poses = self._obstacle_poses(states.q)
+        self._world.set_path(states.q, states.dq, states.ddq, poses, states.jerk)
+        context = evaluation_context(self._problem, family, poses, self._world, samples, table)
+        errors = uncertainty_of(self._problem, family, self._moved, poses, context.measured, s)
+        measured = [errors.add(condition, s) for condition in context.measured]
+        context = replace(context, measured=measured, with_uncertainty=errors.add)
+        entries = [*_limit_entries(self._limits, family, samples), *_measured_entries(context)]
+        names = list(by_name([entry.margin for entry in entries]))
+        conditions = dict(zip(names, (entry.decided() for entry in entries), strict=True))
+        return _verdict(conditions, family.duration, len(s))
+
+    def _obstacle_poses(self, q: Array) -> Array:
+        """Place the obstacles by the tip positions at both ends."""
+        ends, still, nowhere = np.ascontiguousarray(q[:, [0, -1]]), np.zeros((len(q), 2)), np.zeros((1, 3))
+        poses = scene_of(self._problem, nowhere, nowhere).poses[0]
+        self._world.set_path(ends, still, still, poses, still)
+        start, goal = self._world.tip_position.T[:, None].copy()
+        return np.asarray(scene_of(self._problem, start, goal).poses[0])
+
+
+def checked_phases(family: CurveFamily, step: float) -> Array:
+    """Return phases at and between the knots, with both sides of every knot, at steps of at most ``step`` [s]."""
+    count = max(1, int(np.ceil(MAX_TIME_SAMPLES / len(family.t))))
+    parts = np.clip(np.ceil(np.diff(family.t) / step).astype(np.intp), MIN_SPAN_PARTS, count + MIN_SPAN_PARTS)
+    first = np.repeat(np.cumsum(parts) - parts, parts)
+    share = (np.arange(parts.sum()) - first) / np.repeat(parts, parts)
+    low, high = (np.repeat(family.edges[k:][: len(parts)], parts) for k in (0, 1))
+    inner = low + share * (high - low)
+    return np.unique(np.concatenate([inner, np.nextafter(family.edges[1:-1], 0.0), family.edges]))
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """Findings on one condition.
+
+    Attributes:
+        margin: The worst margin of any curve.
+        error: Its uncertainty [unit of the margin].
+        certain: Largest violation that every curve has, in multiples of the tolerance.
+        violated: Share of time with a violation by every curve.
+        undecided: Share of time with a violation by some curves.
+    """
+
+    margin: Margin
+    error: float
+    certain: float
+    violated: float
+    undecided: float
+
+    def decided(self) -> ConditionDecision:
+        """Return the decision."""
+        if self.margin.ok:
+            decision, reason = Decision.VALID, ""
+        elif self.certain > 1:
+            decision, reason = Decision.INVALID, self.margin.reason
+        else:
+            decision, reason = Decision.UNDECIDED, self._doubt()
+        return ConditionDecision(decision, reason, self.margin, self.error, self.violated, self.undecided)
+
+    def _doubt(self) -> str:
+        """Return why the condition is undecided."""
+        unit, name = self.margin.unit, self.margin.name
+        if self.error >= DECIDING_ERROR:
+            return f"{name}: the curve lacks a derivative at its samples"
+        if self.error == 0:
+            return f"{name}: the bound depends on the phase, which samples do not have"
+        return f"{name}: known up to {self.error:.2g} {unit}, which some curves need to be valid"
+
+
+def _share(mask: NDArray[np.bool_], t: Array) -> float:
+    """Return the share of time in which a condition holds at both ends of the intervals between times."""
+    return float(np.diff(t) @ (mask[1:] & mask[:-1])) / float(t[-1])
+
+
+def _limit_entries(limits: ProvenJointLimits, family: CurveFamily, samples: Samples) -> list[_Entry]:
+    """Decide the joint limits."""
+    entries, states = [], family.evaluate(samples.s, jerk=True)
+    bounds_at = dict(zip(ORDERS, family.bounds_at(samples.s), strict=True))
+    bounds = dict(zip(ORDERS, family.bounds, strict=True))
+    for limit, constraint in enumerate(limits.constraints):
+        name = quantity_of(constraint)
+        values, n = getattr(family.polynomials, name), len(limits.joints)
+        rows = np.arange(2 * n)
+        nominal = (values[..., rows % n] - limits.bounds[limit]) / limits.scale[limit]
+        error = bounds[name][:, rows % n] / np.abs(limits.scale[limit])
+        possible = find_maximum(nominal + error, family.edges)
+        certain = find_maximum(nominal - error, family.edges)[0]
+        t = float(possible[2] * family.duration)
+        margin = limits.margin_at(limit, possible, t)
+        span = min(int(np.searchsorted(family.edges, possible[2], "right")) - 1, len(family.t) - 2)
+        at = (getattr(states, name)[rows % n] - limits.bounds[limit][:, None]) / limits.scale[limit][:, None]
+        error_at = bounds_at[name][rows % n] / np.abs(limits.scale[limit])[:, None]
+        highest, lowest = (at + error_at).max(axis=0), (at - error_at).max(axis=0)
+        violated = _share(lowest > 1, samples.t)
+        uncertainty = float(bounds[name][span, possible[1] % n])
+        entries.append(_Entry(margin, uncertainty, certain, violated, _share((highest > 1) & (lowest <= 1), samples.t)))
+    return entries
+
+
+def _measured_entries(context: EvaluationContext) -> list[_Entry]:
+    """Decide the measured conditions; the world of the context is moved."""
+    t, samples = context.samples.t, context.samples
+    worst = {id(condition): condition.margin(context.problem, samples) for condition in context.measured}
+    certain, masks = {}, {}
+    for condition in context.measured:
+        violated, possible = _violation_masks(context, condition)
+        masks[id(condition)] = _share(violated, t), _share(possible & ~violated, t)
+        certain[id(condition)] = float(_certain(condition).max())
+    between = chain(check_continuous_collision(context, early_exit=False), check_local_maxima(context))
+    for condition, margin in between:
+        key = id(condition)
+        error = float(np.max(condition.uncertainty))  # that of the margin is at most as large
+        worst[key] = max(worst[key], margin, key=lambda candidate: candidate.severity)
+        if not condition.relaxation.any():
+            certain[key] = max(certain[key], (margin.violation - 2 * error) / max(margin.tolerance, ZERO_TOLERANCE))
+    entries = []
+    for condition in context.measured:
+        key = id(condition)
+        error = _error_at(context, condition, worst[key])
+        entries.append(_Entry(worst[key], error, certain[key], *masks[key]))
+    return entries
+
+
+def _certain(condition: MeasuredCondition) -> Array:
+    """Return the relative violations that every curve has, at every phase of the motion, shape (m, K)."""
+    excess = condition.relaxation.max() - condition.relaxation  # bounds are widest at some phase
+    certain = condition.violation - 2 * condition.uncertainty - excess
+    return np.asarray(certain / np.maximum(condition.tolerance, ZERO_TOLERANCE)[:, None])
+
+
+def _violation_masks(
+    context: EvaluationContext, condition: MeasuredCondition
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return masks of the samples that every curve violates, and that some curve violates, shape (K,)."""
+    if is_contact(condition.constraint):
+        pairs, required = pairs_of(context.world, condition.constraint), condition.condition.lower - condition.tolerance
+        low = float(np.max(required - condition.uncertainty, initial=-np.inf))
+        high = float(np.max(required + condition.uncertainty, initial=-np.inf))
+        return ~pairs.clear_states(low), ~pairs.clear_states(high)
+    possible = condition.relative_violation > 1
+    return np.asarray((_certain(condition) > 1).any(axis=0)), np.asarray(possible.any(axis=0))
+
+
+def _error_at(context: EvaluationContext, condition: MeasuredCondition, margin: Margin) -> float:
+    """Return the error of a condition where a margin was measured."""
+    uncertainty = condition.uncertainty
+    if isinstance(uncertainty, float):
+        return uncertainty
+    k = int(np.abs(context.samples.s - margin.phase).argmin())
+    return float(np.asarray(uncertainty)[:, k].max())
+
+
+def _verdict(conditions: dict[str, ConditionDecision], duration: float, samples: int) -> TrajectoryVerdict:
+    """Combine the decisions on all conditions."""
+    for decision in (Decision.INVALID, Decision.UNDECIDED):
+        deciding: Sequence[ConditionDecision] = [c for c in conditions.values() if c.decision == decision]
+        if deciding:
+            worst = max(deciding, key=lambda entry: entry.margin.severity)
+            return TrajectoryVerdict(decision, worst.reason, conditions, duration, samples)
+    return TrajectoryVerdict(Decision.VALID, "", conditions, duration, samples)

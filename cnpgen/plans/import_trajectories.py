@@ -1,0 +1,189 @@
+"""Plans fitted to sampled trajectories of any planner, as initial guesses of the refiner."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cnpgen.machine.threads import one_thread
+from cnpgen.plans.evaluate_trajectories import check_trajectories, non_negative
+from cnpgen.plans.plans import Plans, make_plans
+from cnpgen.plans.snap_boundary import State, StateSnapper
+from cnpgen.problems.constraints.constraint import End
+from cnpgen.problems.problem import Problem
+from cnpgen.problems.problem_record import as_record, open_problem
+from cnpgen.schema.argument_types import checked_arguments
+from cnpgen.store.dataset_spec import StoredProblem
+from cnpgen.trajectory.boundary import Boundary
+from cnpgen.trajectory.fit import fit_motion, largest_error
+from cnpgen.trajectory.sampled_trajectory import Trajectory
+from cnpgen.trajectory.samples import sampled_boundary
+from cnpgen.trajectory.spline_motion import Motion
+from cnpgen.trajectory.trajectory_spec import MAX_CONTROL_POINTS, TrajectorySpec
+
+Array = NDArray[np.float64]
+
+MAX_FIT_ERROR_RAD = 2e-3  # of the positions at the samples, plus the noise, with more control points otherwise
+GROWTH = (1.0, 1.6, 2.6)  # of the number of control points of the path
+FIT_SAMPLES_PER_POINT = 4  # of the path, at most
+MIN_SAMPLES_PER_POINT = 2  # of the path, from which velocities of the samples are not needed
+REST_WINDOW_S = 0.05  # in which noise of the positions looks like a velocity
+MIN_SNAP_RAD = 1e-3  # distance by which positions may always be moved
+SNAP_FACTOR = 3.0  # largest change of positions by snapping, relative to the noise
+
+
+@dataclass(frozen=True, eq=False)
+class ImportedTrajectories:
+    """Plans of N sampled trajectories.
+
+    Attributes:
+        plans: The plans, with one number of control points for all.
+        deviation: Largest distance of a plan from its samples over all joints [rad], shape (N,).
+        snapped: Largest change of a boundary position [rad], shape (N,); nan where the constraints cannot be met by a
+            small change, so that the boundary conditions are those of the samples.
+    """
+
+    plans: Plans
+    deviation: Array
+    snapped: Array
+
+
+@checked_arguments
+@one_thread()
+def import_trajectories(
+    problem: Problem | StoredProblem | str | Path,
+    trajectories: Sequence[Trajectory],
+    *,
+    noise: ArrayLike = 0.0,
+    at_rest: bool = False,
+    source: str = "",
+) -> ImportedTrajectories:
+    """Fit plans to sampled trajectories.
+
+    Boundary conditions are those of the first and the last sample; derivatives that are not given are estimated, and
+    zero within the noise. The states are then moved onto the constraints of the problem, by a change of positions of at
+    most three times the noise or 1 mrad. The path has as many control points as the samples require.
+
+    Args:
+        problem: Problem, record, or name or path of a problem, pipeline or dataset.
+        trajectories: The trajectories, with the problem's joints in their order.
+        noise: Largest error of the samples in SI units: one number for positions, velocities and accelerations, or
+            three.
+        at_rest: Whether all motions begin and end at rest.
+        source: Source of the plans, a line of text.
+
+    Raises:
+        UsageError: An argument is invalid, or a trajectory has another number of joints.
+    """
+    record = as_record(problem)
+    check_trajectories(trajectories, len(record.joint_names))
+    errors = non_negative("noise", noise, 3)
+    snapper = StateSnapper(*open_problem(record))
+    ends = [_boundary(trajectory, errors, snapper, at_rest=at_rest) for trajectory in trajectories]
+    boundaries, snapped = [boundary for boundary, _ in ends], np.array([change for _, change in ends])
+    motions, deviation = _fitted(trajectories, boundaries, record.trajectory, MAX_FIT_ERROR_RAD + float(errors[0]))
+    plans = make_plans(
+        record,
+        Boundary(
+            *(np.concatenate(parts) for parts in zip(*(_parts(boundary) for boundary in boundaries), strict=True))
+        ),
+        path_control_points=np.concatenate([motion.path for motion in motions]),
+        rate_control_points=np.concatenate([motion.rate for motion in motions]),
+        source=source,
+    )
+    return ImportedTrajectories(plans, deviation, snapped)
+
+
+def _parts(boundary: Boundary) -> list[Array]:
+    return [part for part in vars(boundary).values() if part is not None]
+
+
+def _boundary(trajectory: Trajectory, noise: Array, snapper: StateSnapper, *, at_rest: bool) -> tuple[Boundary, float]:
+    """Return the boundary conditions of one trajectory and the change of their positions by snapping [rad]."""
+    estimate = sampled_boundary(trajectory.t, trajectory.q, trajectory.dq)
+    q, still = trajectory.q, np.zeros(trajectory.q.shape[1])
+    start: State = q[0], estimate.start_dq[0], estimate.start_ddq[0]
+    goal: State = q[-1], estimate.goal_dq[0], still
+    if trajectory.ddq is not None:
+        start, goal = (*start[:2], trajectory.ddq[0]), (*goal[:2], trajectory.ddq[-1])
+    speed_error = noise[1] if trajectory.dq is not None else 2 * noise[0] / REST_WINDOW_S
+    acceleration_error = noise[2] if trajectory.ddq is not None else 4 * speed_error / REST_WINDOW_S
+    moving = [_at_rest_within(state, speed_error, acceleration_error) for state in (start, goal)]
+    if at_rest:
+        moving = [(state[0], still, still) for state in (start, goal)]
+    allowed = max(MIN_SNAP_RAD, SNAP_FACTOR * float(noise[0]))
+    given = [trajectory.dq is not None, trajectory.ddq is not None]
+    first, moved_first = _snapped(snapper, moving[0], "start", given, allowed)
+    last, moved_last = _snapped(snapper, moving[1], "goal", given, allowed)
+    change = float(np.maximum(moved_first, moved_last))  # nan if one of them is
+    return Boundary(*(part[None] for part in (*first, *last[:2]))), change
+
+
+def _snapped(
+    snapper: StateSnapper, state: State, end: End, given: Sequence[bool], allowed: float
+) -> tuple[State, float]:
+    """Snap a state, without its estimated derivatives if they prevent it; also return the change of the positions.
+
+    Args:
+        snapper: The constraints.
+        state: The state.
+        end: End of the motion.
+        given: Whether the velocities and the accelerations are those of the file, not estimates.
+        allowed: Largest change of the positions [rad].
+
+    Returns:
+        The state and its change [rad]; the state as it is and nan if a larger change is necessary.
+    """
+    q, dq, ddq = state
+    still = np.zeros_like(q)
+    candidates = [
+        state,
+        (q, dq, ddq if given[1] else still),
+        (q, dq if given[0] else still, ddq if given[1] else still),
+    ]
+    for candidate in candidates:
+        found = snapper(candidate, end)
+        change = float(np.abs(found[0] - q).max())
+        if change <= allowed:
+            return found, change
+    return state, float("nan")
+
+
+def _at_rest_within(state: State, speed_error: float, acceleration_error: float) -> State:
+    """Return a state with derivatives of zero where they are within their errors."""
+    q, dq, ddq = state
+    return q, np.where(np.abs(dq) <= speed_error, 0.0, dq), np.where(np.abs(ddq) <= acceleration_error, 0.0, ddq)
+
+
+def _fit_samples(trajectory: Trajectory, points: int) -> tuple[Array, Array, Array | None]:
+    """Return times, positions and, only if samples are few, velocities: enough of them for C control points."""
+    count = len(trajectory.t)
+    chosen = np.unique(np.linspace(0, count - 1, min(count, FIT_SAMPLES_PER_POINT * points)).round().astype(np.intp))
+    few = trajectory.dq is not None and count < MIN_SAMPLES_PER_POINT * points
+    return (
+        trajectory.t[chosen],
+        trajectory.q[chosen],
+        trajectory.dq[chosen] if few and trajectory.dq is not None else None,
+    )
+
+
+def _fitted(
+    trajectories: Sequence[Trajectory], boundaries: Sequence[Boundary], spec: TrajectorySpec, max_error: float
+) -> tuple[list[Motion], Array]:
+    """Fit all trajectories with the smallest number of control points that meets the error; also return the errors."""
+    for factor in GROWTH:
+        points = min(round(factor * spec.path_control_points), MAX_CONTROL_POINTS)
+        larger = replace(spec, path_control_points=points)
+        motions = [
+            fit_motion(*_fit_samples(each, points), spec=larger, boundary=boundary)
+            for each, boundary in zip(trajectories, boundaries, strict=True)
+        ]
+        pairs = zip(motions, trajectories, strict=True)
+        errors = np.array([largest_error(motion, each.t, each.q) for motion, each in pairs])
+        if (errors <= max_error).all():
+            break
+    return motions, errors

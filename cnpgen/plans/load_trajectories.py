@@ -1,0 +1,290 @@
+"""Sampled trajectories of any planner, loaded in the order and the units of a problem."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import UsageError
+from cnpgen.plans.trajectory_tables import TrajectoryTable, read_trajectory_tables
+from cnpgen.problems.problem import Problem
+from cnpgen.problems.problem_record import ProblemRecord, as_record
+from cnpgen.schema.argument_types import checked_arguments
+from cnpgen.schema.arguments import number
+from cnpgen.schema.units import UNITS as KNOWN_UNITS
+from cnpgen.store.dataset_spec import StoredProblem
+from cnpgen.trajectory.sampled_trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+TIME_NAMES = ("t", "time", "timestamp", "time_from_start", "seconds")
+KIND_NAMES = {
+    "q": ("q", "position", "positions", "pos"),
+    "dq": ("dq", "qd", "velocity", "velocities", "vel"),
+    "ddq": ("ddq", "qdd", "acceleration", "accelerations", "acc"),
+}
+UNUSED_KINDS = ("jerk", "effort", "efforts")  # not reported as ignored
+_UNIT = re.compile(r"\s*\[([^\]]*)\]\s*$")
+_SEPARATORS = (" ", "_", ".", "/", ":", "")
+_DEGREE = float(np.pi / 180)
+
+
+@dataclass(frozen=True, eq=False)
+class LoadedTrajectories:
+    """Trajectories of a file, in the order of the problem's joints and in SI units.
+
+    Attributes:
+        trajectories: The trajectories.
+        labels: Places in the file, such as ``"plans/plan_00000.csv"``.
+        ignored: Names of columns that are not used, such as those of a gripper.
+    """
+
+    trajectories: tuple[Trajectory, ...]
+    labels: tuple[str, ...]
+    ignored: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Options:
+    """Options of reading a table; see ``load_trajectories``."""
+
+    record: ProblemRecord
+    joints: tuple[str, ...]
+    degrees: bool
+    rate: float | None
+    separate_by: str | None
+    unwrap: bool
+
+
+@checked_arguments
+def load_trajectories(
+    path: str | Path,
+    problem: Problem | StoredProblem | str | Path,
+    *,
+    joints: Sequence[str] | None = None,
+    unit: Literal["rad", "deg"] = "rad",
+    rate: float | None = None,
+    separate_by: str | None = None,
+    unwrap: bool = False,
+) -> LoadedTrajectories:
+    """Load sampled trajectories from a file or a folder ('cnpgen docs trajectories' lists formats and names of columns).
+
+    Args:
+        path: CSV, JSON, YAML, NPZ, HDF5 or Parquet file, or a folder of them.
+        problem: Problem, record, or name or path of a problem, pipeline or dataset.
+        joints: Names of the problem's joints in the file, in the problem's order; by default the same names. For arrays
+            without names: indices.
+        unit: Unit of revolute joints in columns without a unit in their name.
+        rate: Samples per second [Hz] of a file without times.
+        separate_by: Column whose value differs from trajectory to trajectory.
+        unwrap: Whether revolute joints that jump by more than half a turn have passed the end of the range of angles.
+
+    Raises:
+        UsageError: A column is missing, a value is not finite, times do not increase, or the file is damaged.
+        MissingExtraError: The format needs a package that is not installed.
+    """
+    record = as_record(problem)
+    names = record.joint_names if joints is None else tuple(joints)
+    if len(names) != len(record.joint_names) or not all(isinstance(name, str) for name in names):
+        expected = f"one for each of {', '.join(record.joint_names)}"
+        raise UsageError(f"must have {len(record.joint_names)} names, {expected}, got {list(names)}", argument="joints")
+    if rate is not None and not number("rate", rate) > 0:
+        raise UsageError(f"must be above 0, got {rate}", argument="rate")
+    options = _Options(record, names, unit == "deg", rate, separate_by, unwrap)
+    found = [
+        (part.place, *_trajectory(part, options))
+        for table in read_trajectory_tables(Path(path))
+        for part in _separated(table, separate_by)
+    ]
+    ignored = dict.fromkeys(name for *_, unused in found for name in unused)
+    return LoadedTrajectories(
+        tuple(trajectory for _, trajectory, _ in found), tuple(place for place, *_ in found), tuple(ignored)
+    )
+
+
+def _separated(table: TrajectoryTable, separate_by: str | None) -> Iterator[TrajectoryTable]:
+    """Yield the trajectories of a table: groups of rows, or the first axis of three."""
+    lengths = {len(values) for values in table.columns.values() if values.ndim}
+    stacked = {name: values for name, values in table.columns.items() if values.ndim == 3}
+    if separate_by is not None:
+        if separate_by not in table.columns or table.columns[separate_by].ndim != 1:
+            raise UsageError(f"{table.place}: there is no column {separate_by!r}, only {', '.join(table.columns)}")
+        if len(lengths) != 1:
+            raise UsageError(f"{table.place}: columns must have one value per row each, got {sorted(lengths)} values")
+        key = table.columns[separate_by]
+        for value in dict.fromkeys(key.tolist()):
+            rows = {name: values[key == value] for name, values in table.columns.items() if name != separate_by}
+            lines = tuple(np.array(table.lines)[key == value].tolist()) if table.lines else ()
+            yield TrajectoryTable(f"{table.place}: {separate_by} {value}", rows, table.joint_names, lines)
+    elif stacked:
+        count = len(next(iter(stacked.values())))
+        for index in range(count):
+            parts = {
+                name: values[index] if values.ndim == 3 or (values.ndim == 2 and len(values) == count) else values
+                for name, values in table.columns.items()
+                if values.ndim == 3 or _plain(name) in TIME_NAMES
+            }
+            yield TrajectoryTable(f"{table.place}: trajectory {index}", parts, table.joint_names)
+    else:
+        yield table
+
+
+def _trajectory(table: TrajectoryTable, options: _Options) -> tuple[Trajectory, list[str]]:
+    """Return one trajectory and the names of unused columns."""
+    used: set[str] = set()
+    columns = {kind: _kind(table, kind, options, used) for kind in KIND_NAMES}
+    q = columns["q"]
+    if q is None:
+        raise UsageError(f"{table.place}: {_missing(table, options)}")
+    t = _times(table, options, len(q), used)
+    for name, values in (("times", t), *columns.items()):
+        if values is not None and len(values) != len(q):
+            raise UsageError(f"{table.place}: {len(values)} {name} for {len(q)} positions")
+    if options.unwrap:
+        turning = [not sliding for sliding in options.record.sliding_joints]
+        q[:, turning] = np.unwrap(q[:, turning], axis=0)
+    try:
+        trajectory = Trajectory(t - t[0], q, columns["dq"], columns["ddq"])
+    except UsageError as error:
+        raise UsageError(f"{table.place}: {error}") from error
+    unused = [name for name in table.columns if name not in used and not _is_unused_kind(name)]
+    return trajectory, unused
+
+
+def _times(table: TrajectoryTable, options: _Options, count: int, used: set[str]) -> Array:
+    """Return the times of the samples [s]."""
+    name = next((name for name in table.columns if _plain(name).lower() in TIME_NAMES), None)
+    if name is not None:
+        used.add(name)
+    if options.rate is not None:
+        return np.asarray(np.arange(count) / options.rate)
+    if name is None:
+        raise UsageError(
+            f"{table.place}: no column of times ({', '.join(TIME_NAMES)}): state {{rate}}", remedies={"rate": 100}
+        )
+    return _numbers(table, name, ndim=1) * _factor(table, name, "s", 1.0)
+
+
+def _kind(table: TrajectoryTable, kind: str, options: _Options, used: set[str]) -> Array | None:
+    """Return positions, velocities or accelerations of the problem's joints, shape (K, n), or None."""
+    for name, values in table.columns.items():
+        if _plain(name).lower() in KIND_NAMES[kind] and values.ndim == 2:
+            used.add(name)
+            return _selected(table, name, options) * _factors(table, [name], kind, options)
+    names = _scalar_columns(table, kind, options)
+    if names is None:
+        return None
+    used.update(names)
+    values = np.stack([_numbers(table, name, ndim=1) for name in names], axis=1)
+    return np.asarray(values * _factors(table, names, kind, options))
+
+
+def _selected(table: TrajectoryTable, name: str, options: _Options) -> Array:
+    """Return the problem's joints of an array with one column per joint."""
+    values = _numbers(table, name, ndim=2)
+    width, named = values.shape[1], table.joint_names
+    if named and len(named) != width:
+        raise UsageError(f"{table.place}: {name} has {width} columns, joint_names has {len(named)}")
+    if named:
+        missing = [joint for joint in options.joints if joint not in named]
+        if missing:
+            raise UsageError(f"{table.place}: there is no joint {missing[0]!r}, only {', '.join(named)}")
+        return values[:, [named.index(joint) for joint in options.joints]]
+    if all(joint.isdecimal() and int(joint) < width for joint in options.joints):
+        return values[:, [int(joint) for joint in options.joints]]
+    if width != len(options.joints):
+        raise UsageError(f"{table.place}: {name} has {width} columns, the problem plans {len(options.joints)} joints")
+    return values
+
+
+def _scalar_columns(table: TrajectoryTable, kind: str, options: _Options) -> list[str] | None:
+    """Return the column of every joint, or None if there is none for any; positions may have the joint's name alone."""
+    plain = {_plain(name).lower(): name for name, values in table.columns.items() if values.ndim == 1}
+    naming = [list(options.joints)]
+    if not any(joint.isdecimal() for joint in options.joints):
+        naming += [[str(k + first) for k in range(len(options.joints))] for first in (0, 1)]
+    for joints in naming:
+        found = [_column_of(plain, joint.lower(), kind) for joint in joints]
+        if all(found):
+            return [name for name in found if name]
+        if any(found) and joints is naming[0]:
+            missing = joints[found.index(None)]
+            raise UsageError(f"{table.place}: no column with the {KIND_NAMES[kind][1]} of {missing!r}")
+    return None
+
+
+def _column_of(plain: dict[str, str], joint: str, kind: str) -> str | None:
+    """Return the column of a joint and a kind, such as ``"q joint_1 [rad]"`` or ``"joint_1_position"``."""
+    if kind == "q" and joint in plain and not joint.isdecimal():
+        return plain[joint]
+    for word in KIND_NAMES[kind]:
+        for separator in _SEPARATORS:
+            for name in (f"{word}{separator}{joint}", f"{joint}{separator}{word}"):
+                if name in plain:
+                    return plain[name]
+    return None
+
+
+def _numbers(table: TrajectoryTable, name: str, *, ndim: int) -> Array:
+    """Return a column as numbers."""
+    values = table.columns[name]
+    if values.ndim != ndim or values.dtype.kind not in "biuf":
+        if values.ndim != 1 or ndim != 1:
+            raise UsageError(f"{table.place}: {name} must have {ndim} dimensions of numbers, got shape {values.shape}")
+        row = next(k for k, value in enumerate(values.tolist()) if not _is_number(value))
+        place = f"line {table.lines[row]}" if table.lines else f"row {row}"
+        raise UsageError(f"{table.place}: {place}: {name} must be a number, got {values[row].item()!r:.60}")
+    return values.astype(float)
+
+
+def _is_number(value: Any) -> bool:
+    try:
+        float(value)
+    except (TypeError, ValueError):
+        return False
+    return True
+
+
+def _factors(table: TrajectoryTable, names: Sequence[str], kind: str, options: _Options) -> Array:
+    """Return the factors to SI units of the columns of a kind, shape (n,)."""
+    exponent = {"q": "", "dq": "/s", "ddq": "/s^2"}[kind]
+    sliding = options.record.sliding_joints
+    columns = [names[0]] * len(sliding) if len(names) == 1 else names
+    defaults = (1.0 if slides or not options.degrees else _DEGREE for slides in sliding)
+    parts = zip(columns, sliding, defaults, strict=True)
+    return np.array(
+        [_factor(table, name, ("m" if slides else "rad") + exponent, usual) for name, slides, usual in parts]
+    )
+
+
+def _factor(table: TrajectoryTable, name: str, unit: str, default: float) -> float:
+    """Return the factor to SI of a column by the unit in its name, such as ``[deg/s]``; a default without one."""
+    match = _UNIT.search(name)
+    if not match:
+        return default
+    si, factor = KNOWN_UNITS.get(match[1].strip(), ("", 1))
+    if si != unit:
+        raise UsageError(f"{table.place}: {name} must have a unit of {unit}, got {match[1]!r}")
+    return float(factor)
+
+
+def _plain(name: str) -> str:
+    """Return the name of a column without its unit."""
+    return _UNIT.sub("", name).strip()
+
+
+def _is_unused_kind(name: str) -> bool:
+    return _plain(name).lower().startswith(UNUSED_KINDS)
+
+
+def _missing(table: TrajectoryTable, options: _Options) -> str:
+    """Return the message for missing positions."""
+    columns = ", ".join(list(table.columns)[:12])
+    expected = f"q {options.joints[0]}, {options.joints[0]}_position, {options.joints[0]} and so on, or an array q"
+    return f"no columns with joint positions, expected {expected}; there are {columns or 'no columns'}"

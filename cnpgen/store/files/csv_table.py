@@ -1,0 +1,80 @@
+"""CSV tables of untrusted origin: named columns, read cell by cell with the place of every error."""
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import DatasetError
+from cnpgen.store.files.size_limits import MAX_TABLE_BYTES, MAX_TABLE_COLUMNS
+
+
+@dataclass(frozen=True)
+class CsvTable:
+    """Table with column names in its first line.
+
+    Attributes:
+        path: The file, for messages.
+        names: Names of the columns, all different.
+        lines: Number of the line in the file and its cells, for every row.
+    """
+
+    path: Path
+    names: tuple[str, ...]
+    lines: tuple[tuple[int, list[str]], ...]
+
+    def texts(self, name: str) -> list[str]:
+        """Return the cells of a column."""
+        index = self.names.index(name)
+        return [row[index].strip() for _, row in self.lines]
+
+    def numbers(self, name: str) -> NDArray[np.float64]:
+        """Return the numbers of a column, shape (rows,).
+
+        Raises:
+            DatasetError: A cell is not a number.
+        """
+        values = []
+        for (line, _), cell in zip(self.lines, self.texts(name), strict=True):
+            try:
+                values.append(float(cell))
+            except ValueError as error:
+                raise DatasetError(f"{self.path}: line {line}: {name} must be a number, got {cell!r:.60}") from error
+        return np.array(values, np.float64)
+
+
+def read_csv_table(path: Path, *, example: str) -> CsvTable:
+    """Read a CSV table.
+
+    Args:
+        path: The file.
+        example: Columns that such a table has, for messages.
+
+    Raises:
+        DatasetError: It is too large, not UTF-8, has no columns or equal ones, or rows of another length.
+        OSError: The file cannot be read.
+    """
+    if (size := path.stat().st_size) > MAX_TABLE_BYTES:
+        raise DatasetError(f"{path} has {size:,} bytes, expected a table of at most {MAX_TABLE_BYTES:,}")
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            lines = [(number, row) for number, row in enumerate(csv.reader(file), 1) if any(map(str.strip, row))]
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise DatasetError(f"{path} is not a CSV table in UTF-8: {error}") from error
+    if not lines:
+        raise DatasetError(f"{path} is empty: its first line must name columns, such as {example}")
+    names = [cell.strip() for cell in lines[0][1]]
+    if other := next((mark for mark in ";\t" if mark in "".join(names)), None):
+        raise DatasetError(f"{path}: line 1: columns are separated by ',', got {other!r}; numbers have '.', as in 0.5")
+    if len(names) > MAX_TABLE_COLUMNS:
+        raise DatasetError(f"{path}: line 1 names {len(names):,} columns, expected at most {MAX_TABLE_COLUMNS:,}")
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise DatasetError(f"{path}: the column {twice[0]!r} is there more than once")
+    for number, row in lines[1:]:
+        if len(row) != len(names):
+            raise DatasetError(
+                f"{path}: line {number} has {len(row)} values, the first line names {len(names)} columns"
+            )
+    return CsvTable(path, tuple(names), tuple(lines[1:]))
