@@ -1,4 +1,4 @@
-"""Sampled trajectories of other planners: files, motions fitted to them, and their verdicts ('cnpgen docs trajectories')."""
+"""Sampled trajectories of other planners: files, fitted motions and verdicts ('cnpgen docs trajectories')."""
 
 from cnpgen.judges.trajectories.trajectory_verdict import ConditionDecision, Decision, TrajectoryVerdict
 from cnpgen.plans.evaluate_trajectories import TrajectoryEvaluation

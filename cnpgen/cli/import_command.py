@@ -11,8 +11,8 @@ from cnpgen.cli.trajectory_options import add_trajectory_options, load_file
 
 _TEXT = """\
 The plans are initial guesses: 'cnpgen refine' optimizes them and keeps their ends, and 'cnpgen evaluate' judges them.
-Formats and columns are those of 'cnpgen evaluate' ('cnpgen docs trajectories'). The ends are moved onto the constraints by a
-change of positions of at most three times the noise, or 1 mrad. The plan file is printed on stdout.
+Formats and columns are those of 'cnpgen evaluate' ('cnpgen docs trajectories'). The ends are moved onto the
+constraints by a change of positions of at most three times the noise, or 1 mrad. The plan file is printed on stdout.
 """
 
 

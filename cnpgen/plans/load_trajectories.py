@@ -73,7 +73,7 @@ def load_trajectories(
     separate_by: str | None = None,
     unwrap: bool = False,
 ) -> LoadedTrajectories:
-    """Load sampled trajectories from a file or a folder ('cnpgen docs trajectories' lists formats and names of columns).
+    """Load sampled trajectories from a file or a folder; 'cnpgen docs trajectories' lists formats and columns.
 
     Args:
         path: CSV, JSON, YAML, NPZ, HDF5 or Parquet file, or a folder of them.
