@@ -11,7 +11,6 @@ from cnpgen.errors import UsageError
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.scene import Scene
 from cnpgen.robots.solid import place_obstacles
-from cnpgen.world.path import PathWorld
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
@@ -55,6 +54,8 @@ def goal_velocities(problem: Problem, robot: Robot, goal_q: Array, goal_dq: Arra
         goal_q: Joint positions at the goal [rad], shape (N, n).
         goal_dq: Joint velocities at the goal [rad/s], shape (N, n).
     """
+    from cnpgen.world.path import PathWorld
+
     if problem.scene_constraint is None:
         return None
     if not len(goal_q):

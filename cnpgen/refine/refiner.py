@@ -163,18 +163,18 @@ class Refiner:
         )
 
     def line_guess(self, task: RefinementTask) -> Array:
-        """Return the variables of the initial guess of the coarse level: a detour if there is one, or a line."""
-        detours = self.detours(task)
+        """Return the variables of the initial guess of the coarse level: along a tip path, or a line."""
+        guesses = self.tip_path_guesses(task)
         return (
-            detours[0] if detours else self.slow_guess(task, initial_guesses.rising_line(*self._guess_arguments(task)))
+            guesses[0] if guesses else self.slow_guess(task, initial_guesses.rising_line(*self._guess_arguments(task)))
         )
 
-    def detours(self, task: RefinementTask) -> list[Array]:
-        """Return the variables of motions along the detours of the problem's constraint, the first one first."""
+    def tip_path_guesses(self, task: RefinementTask) -> list[Array]:
+        """Return the variables of motions along the initial tip paths of the problem's constraint."""
         constraint, values = self.problem.scene_constraint, task.scene.poses[0, pose_width(self.problem.obstacle) :]
         if constraint is None:
             return []
-        paths = constraint.detours(values, task.start_xyz)
+        paths = constraint.initial_tip_paths(values, task.start_xyz)
         ends = task.boundary.start_q[0], task.boundary.goal_q[0]
         return [self.path_guess(task, initial_guesses.along_tip_path(self._world, *ends, path)) for path in paths]
 
@@ -191,7 +191,7 @@ class Refiner:
             initial_guesses.quintic(*arguments),
             initial_guesses.line_through(*arguments, configuration=self._range_center),
         ]
-        return [*self.detours(task), *(self.slow_guess(task, guess) for guess in guesses)]
+        return [*self.tip_path_guesses(task), *(self.slow_guess(task, guess) for guess in guesses)]
 
     def path_guess(self, task: RefinementTask, states: Array) -> Array:
         """Return the variables of a motion along a joint-space path, shape (K, n)."""

@@ -1,4 +1,4 @@
-"""The constraint between mallet and puck: its forms, the geometry of legal contacts, and detours around the puck."""
+"""The constraint between mallet and puck: its forms, the geometry of legal contacts, and tip paths around the puck."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -103,11 +103,11 @@ def test_goal_velocities_equal_finite_differences():
     np.testing.assert_allclose(goal_velocities(AIRHOCKEY, ROBOT, q, dq), (tips[0] - tips[1]) / (2 * step), atol=1e-7)
 
 
-def test_detours_go_around_the_puck_and_end_along_the_hit():
+def test_tip_paths_go_around_the_puck_and_end_along_the_hit():
     puck = SCENE[2:]
     for angle in np.linspace(-np.pi, np.pi, 40):
         start = puck + 0.25 * np.array([np.cos(angle), np.sin(angle)])
-        paths = CONTACT.detours(SCENE, np.array([*start, 0.16]))
+        paths = CONTACT.initial_tip_paths(SCENE, np.array([*start, 0.16]))
         behind = np.cos(angle - 0.3) < -0.5  # more than 120 degrees from the hit
         assert len(paths) == 0 if behind else len(paths) in {0, 2}
         for path in paths:
@@ -118,8 +118,8 @@ def test_detours_go_around_the_puck_and_end_along_the_hit():
             np.testing.assert_allclose(path[-1, :2], GOAL)
             last = path[-1, :2] - path[-2, :2]
             np.testing.assert_allclose(last / np.linalg.norm(last), HIT, atol=1e-9)
-    beyond = CONTACT.detours(SCENE, np.array([*(puck + 0.2 * HIT + 0.01), 0.16]))
-    lengths = [np.linalg.norm(np.diff(path, axis=0), axis=1).sum() for path in beyond]
+    both = CONTACT.initial_tip_paths(SCENE, np.array([*(puck + 0.2 * HIT + 0.01), 0.16]))
+    lengths = [np.linalg.norm(np.diff(path, axis=0), axis=1).sum() for path in both]
     assert len(lengths) == 2
     assert lengths[0] <= lengths[1]
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from cnpgen.world.path import PathWorld
     from cnpgen.world.world import World
 
-MAX_LEGAL_PENETRATION_M = 1e-4  # of links in a valid motion: the accuracy of distances, no tolerance for collisions
+MAX_LINK_PENETRATION_M = 1e-4  # of links in a valid motion: the accuracy of distances, no tolerance for collisions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,8 +41,8 @@ class RobotClearance(Constraint):
 
     @property
     def effective_tolerance(self) -> float:
-        """Tolerance up to a penetration of ``MAX_LEGAL_PENETRATION_M``; with the paper's capsules all of it."""
-        limit = np.inf if self.radius is not None else self.distance + MAX_LEGAL_PENETRATION_M
+        """Tolerance up to a penetration of ``MAX_LINK_PENETRATION_M``; with the paper's capsules all of it."""
+        limit = np.inf if self.radius is not None else self.distance + MAX_LINK_PENETRATION_M
         return min(self.tolerance, limit)
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:

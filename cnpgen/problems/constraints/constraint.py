@@ -159,7 +159,9 @@ class Constraint(ABC):
         """
         return np.empty((len(goal_xyz), 0))
 
-    def detours(self, values: NDArray[np.float64], start_xyz: NDArray[np.float64]) -> list[NDArray[np.float64]]:  # noqa: ARG002
+    def initial_tip_paths(
+        self, values: NDArray[np.float64], start_xyz: NDArray[np.float64]
+    ) -> list[NDArray[np.float64]]:
         """Return tip paths for initial guesses where the straight line violates the constraint, by default none.
 
         Args:

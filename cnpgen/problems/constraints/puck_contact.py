@@ -26,13 +26,13 @@ Array = NDArray[np.float64]
 
 ADDED_RADIUS_M = 1e-4  # so that motions do not touch the puck within a tolerance of this size
 ROUNDING = 0.02  # of the relaxation near the goal, relative to the overlap
-SOLVER_MARGIN_M, SOLVER_SLACK_M = 1e-3, 1e-4  # from the puck; of straight hits
+SOLVER_MARGIN_M, STRAIGHT_HIT_MARGIN_M = 1e-3, 1e-4  # from the puck; of straight hits
 TRAINING_MARGIN_M = 2e-3
 TRAINING_KNEE_M = 5e-4  # larger violations are penalized linearly
 PUCK_OUT_OF_REACH_M = 1e3  # coordinates of the puck of a motion whose goal is no hit
 MIN_HIT_SPEED_M_S = 1e-6
-MIN_SQUARED_DISTANCE_M2 = 1e-12  # keeps the derivative of a distance finite
-DETOUR_CLEARANCE_M = 0.015  # of initial guesses around the puck
+MIN_SQUARED_PUCK_DISTANCE_M2 = 1e-12  # keeps the derivative of a distance finite
+GUESS_CLEARANCE_M = 0.015  # of initial guesses around the puck
 APPROACH_LENGTH_M = 0.04  # straight end of these guesses
 ARC_STEP_RAD = 0.2
 ARC_END_RAD = 0.4  # from the direction opposite to the hit
@@ -122,7 +122,7 @@ class PuckContact(Constraint):
 
         tip, values = state.kinematics.tip, state.scene_values
         from_goal, from_puck = ((tip[0] - x) ** 2 + (tip[1] - y) ** 2 for x, y in (values[:2], values[2:]))
-        distance = ca.sqrt(from_puck + MIN_SQUARED_DISTANCE_M2)
+        distance = ca.sqrt(from_puck + MIN_SQUARED_PUCK_DISTANCE_M2)
         return self._condition(from_goal, distance) if margin is None else self._cone(from_goal, distance, margin)
 
     def _measured(self, world: World, margin: float | None) -> tuple[Condition, ...]:
@@ -148,8 +148,8 @@ class PuckContact(Constraint):
     def _cone(self, from_goal: Any, distance: Any, margin: float) -> tuple[Condition, ...]:
         """State a stricter condition that limits all of the last states and not only the first contact.
 
-        The relaxation decreases linearly with the distance from the goal, so that every straight hit has the same
-        slack. Solvers, which check grid points only, would miss the first contact.
+        The relaxation decreases linearly with the distance from the goal, so that a straight hit has the same margin
+        at all of them. Solvers, which check grid points only, would miss the first contact.
 
         Args:
             from_goal: Squared distance of the tip from the goal [m^2].
@@ -157,11 +157,11 @@ class PuckContact(Constraint):
             margin: Distance from the puck in addition to that of ``_condition`` [m].
         """
         overlap = self.overlap + ADDED_RADIUS_M + margin
-        rho = (from_goal + MIN_SQUARED_DISTANCE_M2) ** 0.5
-        relaxation = overlap * _positive_part(1 + (SOLVER_SLACK_M - rho) / overlap, ROUNDING)
+        rho = (from_goal + MIN_SQUARED_PUCK_DISTANCE_M2) ** 0.5
+        relaxation = overlap * _positive_part(1 + (STRAIGHT_HIT_MARGIN_M - rho) / overlap, ROUNDING)
         return _at_least(self.contact_range + ADDED_RADIUS_M + margin, distance + relaxation)
 
-    def detours(self, values: Array, start_xyz: Array) -> list[Array]:
+    def initial_tip_paths(self, values: Array, start_xyz: Array) -> list[Array]:
         """Return tip paths around the puck on either side, the shorter one first; none if it is not in the way.
 
         Args:
@@ -176,7 +176,7 @@ class PuckContact(Constraint):
         entry = puck - (self.contact_range + self.overlap) * hit
         if _distance_from_segment(puck, start, entry) >= self.contact_range:
             return []
-        radius = self.contact_range + DETOUR_CLEARANCE_M
+        radius = self.contact_range + GUESS_CLEARANCE_M
         offset = start - puck
         distance = max(float(np.hypot(*offset)), radius)
         angle = math.atan2(-hit[0] * offset[1] + hit[1] * offset[0], -float(hit @ offset))  # 0 behind the puck

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.problems.constraints.clearance import MAX_LEGAL_PENETRATION_M
+from cnpgen.problems.constraints.clearance import MAX_LINK_PENETRATION_M
 from cnpgen.problems.constraints.constraint import Condition, Constraint, End
 from cnpgen.schema.keys import field
 
@@ -33,8 +33,8 @@ class SelfClearance(Constraint):
 
     @property
     def effective_tolerance(self) -> float:
-        """Tolerance up to a penetration of ``MAX_LEGAL_PENETRATION_M``."""
-        return min(self.tolerance, self.distance + MAX_LEGAL_PENETRATION_M)
+        """Tolerance up to a penetration of ``MAX_LINK_PENETRATION_M``."""
+        return min(self.tolerance, self.distance + MAX_LINK_PENETRATION_M)
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the distances of the capsules' axes [m] of the pairs for solvers."""
