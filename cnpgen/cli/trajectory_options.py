@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cnpgen.cli import values
-from cnpgen.cli.describe import table
 from cnpgen.cli.parser import Options
 
 if TYPE_CHECKING:
@@ -55,6 +54,8 @@ def write_json(file: Path, found: "TrajectoryEvaluation", labels: tuple[str, ...
 
 def summary_text(file: Path, found: "TrajectoryEvaluation") -> str:
     """Return the counts, and for every condition the decisions with the worst margin."""
+    from cnpgen.cli.describe import table
+
     counts = ", ".join(f"{count:,} {decision}" for decision, count in found.counts.items())
     lines = [f"{file}: trajectories of {found.problem.name}: {counts}", ""]
     rows: list[tuple[str, ...]] = [

@@ -164,6 +164,11 @@ def _of_trajectories(plans: Any) -> list[ValidCall]:
         ValidCall("Motion.runs_forward", motion.runs_forward),
         ValidCall("Motion.time_at", motion.time_at, {"s": np.array([0.0, 0.5])}),
         ValidCall("Motion.time_scaled", motion.time_scaled, {"factor": 2.0}),
+        ValidCall(
+            "evaluate_trajectories",
+            cnpgen.evaluate_trajectories,
+            {"problem": "airhockey", "trajectories": [cnpgen.trajectories.Trajectory(t, q)], "noise": 1e-3},
+        ),
         ValidCall("fit_motion", cnpgen.trajectories.fit_motion, {"t": t, "q": q, "spec": recipes.TrajectorySpec()}),
     ]
 
