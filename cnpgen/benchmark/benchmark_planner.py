@@ -13,6 +13,7 @@ from cnpgen.errors import UsageError
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import ProblemRecord
 from cnpgen.schema import registry
+from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.keys import RecipeLocation
 from cnpgen.schema.parsing import parse
 from cnpgen.trajectory.sampled_trajectory import Trajectory
@@ -44,6 +45,7 @@ class Setting:
     repetition: int = 0
     parameters: Mapping[str, Any] = field(default_factory=dict)
 
+    @checked_arguments
     def random(self, problem: Plans) -> np.random.Generator:
         """Return the random generator of one boundary problem; it depends on no other problem.
 

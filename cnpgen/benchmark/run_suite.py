@@ -36,6 +36,7 @@ from cnpgen.schema.arguments import concerning, integer, number
 from cnpgen.store.files.documents import canonical_sha256, plain
 from cnpgen.store.paths import require_file
 
+MAX_REPETITIONS = 10_000
 PROBLEMS_PER_TASK = 4  # of a worker; starting a planner takes some seconds
 FASTEST = ("cnp-b", "cnp-b+refine", "solve")  # default; the others take longer
 
@@ -167,7 +168,7 @@ def run_benchmark(
         raise UsageError(f"must be above 0 s, got {time_limit:g} s", argument="time_limit")
     if not 0 <= plane_tolerance < np.inf:
         raise UsageError(f"must not be negative, got {plane_tolerance:g} m", argument="plane_tolerance")
-    seed, repeat = integer("seed", seed, least=0), integer("repeat", repeat, least=1)
+    seed, repeat = integer("seed", seed, least=0), integer("repeat", repeat, least=1, most=MAX_REPETITIONS)
     problems, prefix = loaded.problems(None if n is None else integer("n", n, least=1))
     if environment is not None:
         check_challenge(*open_problem(problems.problem))

@@ -104,7 +104,7 @@ def check_shapes(problem: Problem, shapes: Mapping[str, tuple[int, ...]]) -> Non
     """
     spec, width = problem.trajectory, problem.scene_width
     if width and "obstacle_poses" not in shapes:
-        names = ", ".join(box.name for box in problem.obstacle)
+        names = ", ".join(box.name for box in problem.obstacle) or "a puck for each hit"
         raise UsageError(
             f"obstacle_poses is missing: the problem {problem.name!r} has obstacles ({names});"
             " the scene of plans and tasks has their poses and sizes, scene.poses",

@@ -33,8 +33,7 @@ class StateSnapper:
     def __init__(self, problem: Problem, robot: Robot) -> None:
         self._constraints = [constraint for constraint in problem.constraint if not is_contact(constraint)]
         self._world = World(robot, problem.obstacle, problem.object_size)
-        nowhere = np.zeros((1, 3))
-        self._poses = scene_of(problem, nowhere, nowhere).poses[0]
+        self._poses = scene_of(problem, *np.zeros((3, 1, 3))).poses[0]
         self._scale = np.repeat(SCALES, robot.n)
 
     def __call__(self, state: State, end: End) -> State:

@@ -18,6 +18,7 @@ from cnpgen.store.files.csv_table import read_csv_table
 from cnpgen.store.files.documents import parse_json
 from cnpgen.store.files.hdf5 import opened_hdf5
 from cnpgen.store.files.size_limits import MAX_TABLE_BYTES
+from cnpgen.store.layout import SPECIFICATION
 
 Values = NDArray[Any]
 
@@ -79,7 +80,7 @@ def is_trajectory_file(path: Path) -> bool:
 def holds_trajectories(path: Path) -> bool:
     """Return whether a path holds sampled trajectories, not plans: by its suffix, HDF5 files by their content."""
     if path.is_dir():
-        return any(is_trajectory_file(file) for file in path.iterdir())
+        return not (path / SPECIFICATION).exists() and any(is_trajectory_file(file) for file in path.iterdir())
     if not path.is_file() or path.suffix.lower() not in _READERS:
         return False
     if path.suffix.lower() not in {".h5", ".hdf5"}:

@@ -23,6 +23,7 @@ EXCLUDED = {  # public callables without a valid call, and the reason
     "Executed": "made by simulate_plans",
     "Simulation": "made by simulate_plans",
     "Benchmark": "made by run_benchmark",
+    "RunRecord": "made by run_benchmark",
     "Model": "made by load_model and train_model",
     "Dataset": "made by load_dataset",
 }
@@ -257,7 +258,7 @@ def _of_losses(problem: Any, plans: Any) -> list[ValidCall]:
     loss = cnpgen.PlanLoss(problem)
     weights = loss.weights0
     control = {"path": plans.path_control_points, "rate": plans.rate_control_points}
-    poses = cnpgen.RobotModel(problem).scene(plans.columns["start_xyz"], plans.columns["goal_xyz"]).poses
+    poses = plans.scene.poses
     budgets = np.ones_like(weights)
     metric = losses.Metric(weights, budgets)
     margins = losses.suggested_margins(problem)
@@ -268,7 +269,7 @@ def _of_losses(problem: Any, plans: Any) -> list[ValidCall]:
         ValidCall(
             "PlanLoss.check_shapes",
             loss.check_shapes,
-            {name: values.shape for name, values in {**control, "weights": weights}.items()},
+            {name: values.shape for name, values in {**control, "obstacle_poses": poses, "weights": weights}.items()},
         ),
         ValidCall("PlanLoss.load_kernels", loss.load_kernels),
         ValidCall("PlanLoss.ordered_weights", loss.ordered_weights, {"weights": weights}),
@@ -308,6 +309,7 @@ def _of_benchmark(folder: Path, problem: Any, plans: Any) -> list[ValidCall]:
         ValidCall("Pucks.positions", suite.pucks.positions),
         ValidCall("Plant", benchmark.Plant, {"name": "mine", "title": "mine"}),
         ValidCall("Setting", benchmark.Setting, {"problem": plans.problem}),
+        ValidCall("Setting.random", benchmark.Setting(plans.problem).random, {"problem": plans}),
         ValidCall(
             "run_benchmark",
             benchmark.run_benchmark,
@@ -319,6 +321,9 @@ def _of_benchmark(folder: Path, problem: Any, plans: Any) -> list[ValidCall]:
             benchmark.save_benchmark_report,
             {"benchmark": ran, "path": folder / "report.html"},
             frozenset({"video"}),
+        ),
+        ValidCall(
+            "save_benchmark_tables", benchmark.save_benchmark_tables, {"benchmark": ran, "folder": folder / "ran"}
         ),
         ValidCall("simulate_plans", benchmark.simulate_plans, {"plans": plans[:0], "workers": 1}),
         ValidCall("Trajectory", benchmark.Trajectory, {"t": path.t, "q": path.q}),

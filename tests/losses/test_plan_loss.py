@@ -40,7 +40,8 @@ def test_terms_agree_with_the_quadrature_of_pinocchio_and_coal(label, rule, shif
     for k in range(len(found)):
         at = states(given.path[k], given.rate[k], s)
         expected = (weights / at.rate) @ step_losses(given.problem, at, given.obstacle_poses[k])
-        exact = np.array([name != "object-contact" for name in of.terms])  # a bound if the object is tilted
+        # object-contact is a bound if the object is tilted; puck-contact has a form for training
+        exact = np.array([name not in {"object-contact", "puck-contact"} for name in of.terms])
         np.testing.assert_allclose(found[k][exact], expected[exact], rtol=1e-9, atol=1e-14)
 
 
@@ -102,7 +103,14 @@ def test_the_total_is_the_task_loss_and_the_weighted_terms(name):
 
 def test_budgets_and_first_weights_come_from_the_problem_file():
     of, constraints = loss("airhockey"), PROBLEMS["airhockey"].constraint
-    assert of.terms[1:] == ("joint-position", "joint-velocity", "joint-acceleration", "joint-torque", "table")
+    assert of.terms[1:] == (
+        "joint-position",
+        "joint-velocity",
+        "joint-acceleration",
+        "joint-torque",
+        "table",
+        "puck-contact",
+    )
     assert of.budgets.tolist() == [constraint.budget for constraint in constraints]
     assert of.weights0.tolist() == [constraint.weight for constraint in constraints]
 
@@ -197,13 +205,13 @@ MISTAKES = {
     "path must have shape (N, 15, 6), got (15, 6)": {"path": np.zeros((15, 6))},
     "rate must have shape (3, 20), got (2, 20)": {"rate": np.ones((2, 20))},
     "rate must be an array of numbers, got str": {"rate": "fast"},
-    "obstacle_poses must have shape (3, 0), got (3, 2)": {"obstacle_poses": np.zeros((3, 2))},
+    "obstacle_poses must have shape (3, 4), got (3, 2)": {"obstacle_poses": np.zeros((3, 2))},
     "start_tip must have shape (3, 3), got (3,)": {"start_tip": np.zeros(3)},
     "rate must be an array of numbers, got ndarray: complex128 is no real type": {"rate": np.ones((3, 20)) * 1j},
     "weights must be an array of numbers, got str": {"weights": "abc"},
-    "weights must have shape (5,) for joint-position": {"weights": np.ones(6)},
-    "the weight of 'joint-torque' must be a number that is not negative, got -1.0": {"weights": [1, 1, 1, -1, 1]},
-    "the weight of 'table' must be a number that is not negative, got nan": {"weights": [1, 1, 1, 1, np.nan]},
+    "weights must have shape (6,) for joint-position": {"weights": np.ones(7)},
+    "the weight of 'joint-torque' must be a number that is not negative, got -1.0": {"weights": [1, 1, 1, -1, 1, 1]},
+    "the weight of 'table' must be a number that is not negative, got nan": {"weights": [1, 1, 1, 1, np.nan, 1]},
     "the shift of the quadrature nodes must be in [0, 1), got 1.5": {"shift": 1.5},
     "shift must be a finite number, got None": {"shift": None},
     "gradient must be True or False, got 'no'": {"gradient": "no"},
@@ -216,8 +224,8 @@ def test_invalid_arguments_are_refused(message):
     arguments = {
         "path": given.path,
         "rate": given.rate,
-        "weights": np.ones(5),
-        "obstacle_poses": None,
+        "weights": np.ones(6),
+        "obstacle_poses": given.obstacle_poses,
         **MISTAKES[message],
     }
     with pytest.raises(CnpgenError) as error:
@@ -297,7 +305,7 @@ def test_margins_have_the_effect_of_the_same_limits_in_the_problem_file():
 @pytest.mark.parametrize(("start", "allowed"), [(0.163, 0.003), (0.19, 0.005)], ids=["in the band", "outside the band"])
 def test_a_motion_that_starts_off_the_table_has_the_time_varying_bound(start: float, allowed: float):
     of, given = loss("airhockey", nodes=32), batch("hit", 2, by=0.1)
-    table, column = PROBLEMS["airhockey"].constraint[-1], -1
+    table, column = PROBLEMS["airhockey"].constraint[-2], -2
     tips = np.array([[0.65, 0.0, start], [0.65, 0.0, 0.16]])
     found = given.evaluated(of, start_tip=tips).terms
     at_once = given.evaluated(of).terms
@@ -308,7 +316,8 @@ def test_a_motion_that_starts_off_the_table_has_the_time_varying_bound(start: fl
     height = np.array([_tip(of, q)[2] for q in at.q])
     saved = huber(height - table.z) - huber(np.maximum(np.abs(height - table.z) - band, 0))
     assert at_once[0, column] - found[0, column] == pytest.approx((weights / at.rate) @ saved, rel=1e-9)
-    np.testing.assert_allclose(found[0, :column], at_once[0, :column], rtol=1e-13)
+    others = np.arange(len(of.terms)) != len(of.terms) + column
+    np.testing.assert_allclose(found[0, others], at_once[0, others], rtol=1e-13)
 
 
 def _tip(of: PlanLoss, q: np.ndarray) -> np.ndarray:
@@ -371,10 +380,12 @@ def test_a_constraint_without_training_attributes_is_a_term_with_a_gradient(monk
 def test_weights_may_be_given_by_name_with_the_problem_s_weights_for_others():
     of, some = loss("airhockey"), batch("hit", 3)
     given = some.path, some.rate
+    poses = some.obstacle_poses
     by_name = dict(zip(of.terms[1:], of.weights0.tolist(), strict=True)) | {"table": 3.0}
     ordered_weights = [by_name[name] for name in of.terms[1:]]
     for weights in ({"table": 3.0}, {"table": np.float32(3)}, by_name):
-        np.testing.assert_array_equal(of(*given, weights=weights).total, of(*given, weights=ordered_weights).total)
+        found, expected = (of(*given, weights=w, obstacle_poses=poses) for w in (weights, ordered_weights))
+        np.testing.assert_array_equal(found.total, expected.total)
     assert of.checked_weights({}).tolist() == of.checked_weights(of.weights0).tolist()
 
 

@@ -110,7 +110,7 @@ def spiked() -> Batch:
     rate = plan.motion.rate.copy()
     rate[:, -1] *= 10
     path = assemble(plan.boundary, plan.motion.path[:, 3:13], rate, plan.problem.trajectory)
-    return Batch("airhockey", path, rate, np.zeros((1, 0)))
+    return Batch("airhockey", path, rate, plan.scene.poses)
 
 
 def acceleration_loss(given: Batch, s: np.ndarray, weights: np.ndarray) -> tuple[float, np.ndarray]:

@@ -240,7 +240,7 @@ def test_a_tip_speed_limit_of_a_plug_in_scales_time_and_projects_no_line(tmp_pat
     boundary, rate = Boundary(q[:1], rest, rest, q[1:], rest), np.full((1, 20), 1.0)
     spec = problem.trajectory
     motion = Motion(assemble(boundary, anchor_line(boundary, rate, spec), rate, spec), rate, spec.degree)
-    factor = make_time_scaling(problem, given.robot, kernels).factor(motion, np.empty((1, 0)))
+    factor = make_time_scaling(problem, given.robot, kernels).factor(motion, np.zeros((1, 4)))
 
     def fastest(run: Motion) -> float:
         world, states, found = World(given.robot), run.at(np.linspace(0, 1, 400)), []

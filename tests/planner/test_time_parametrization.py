@@ -26,7 +26,7 @@ from tests.examples.models import boundary_of_columns, interpreted, loaded_probl
 from tests.planner.test_parts import LIMITS
 
 COUNT = 8
-OBSTACLE_POSES = np.empty((COUNT, 0))
+OBSTACLE_POSES = np.zeros((COUNT, 4))  # without effect on times
 
 
 @pytest.fixture(scope="module")
@@ -159,7 +159,7 @@ def test_coefficients_are_those_of_accelerations_torques_and_squared_velocity_fr
     data = robot.model.createData()
     column = random.normal(size=(3 * robot.n + 2, count))
     p, p1, p2, (r, r1) = *column[: 3 * robot.n].reshape(3, robot.n, count), np.abs(column[3 * robot.n :])
-    rest, square, mixed = time_parametrization.coefficients(column)
+    rest, square, mixed = time_parametrization.coefficients(np.concatenate([column, np.zeros((4, count))]))
     dq, ddq = p1 * r, p2 * r**2 + p1 * r1 * r
     torque = np.array([pin.rnea(robot.model, data, *state).copy() for state in zip(p.T, dq.T, ddq.T, strict=True)]).T
     share = (np.abs(dq) / robot.velocity_limit[:, None]).max(axis=0, keepdims=True)

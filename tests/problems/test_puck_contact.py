@@ -10,7 +10,13 @@ import pytest
 from cnpgen.errors import RecipeError, UsageError
 from cnpgen.kernels.symbolic.linalg import symbols
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
-from cnpgen.problems.constraints.puck_contact import PUCK_OUT_OF_REACH_M, PuckContact
+from cnpgen.problems.constraints.puck_contact import (
+    ADDED_RADIUS_M,
+    PUCK_OUT_OF_REACH_M,
+    TRAINING_KNEE_M,
+    TRAINING_MARGIN_M,
+    PuckContact,
+)
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.obstacles import goal_velocities, scene_of
 from cnpgen.problems.problem_file import load_problem
@@ -56,6 +62,25 @@ def test_symbolic_and_measured_forms_agree(form):
         np.testing.assert_allclose(float(function(q_now, rest, rest, values_now)), measured.g[0], atol=1e-9)
         np.testing.assert_array_equal(symbolic.lower, measured.lower)
     assert CONTACT.symbolic_at(state, "goal") == CONTACT.measured_at(world, "goal") == ()
+
+
+def test_the_training_form_grows_linearly_with_a_large_violation():
+    names = [symbols(name, 6) for name in ("q", "dq", "ddq")] + [symbols("obstacle_poses", 4)]
+    state = SymbolicState(ROBOT, *(scalars for _, scalars in names), (), None)
+    (penalized,) = CONTACT.penalized(state)
+    function, rest = ca.Function("g", [names[0][0], names[3][0]], penalized.g), np.zeros(6)
+    world = World(ROBOT)
+    world.set_state(ROBOT.base, rest, rest, np.empty(0))
+    tip = world.tip_position[:2]
+    violations = []
+    for distance in (0.03, 0.06, 0.2):
+        puck = np.add(tip, [0.0, distance])
+        found = float(function(ROBOT.base, np.concatenate([puck - 0.07 * HIT, puck])))
+        violations.append(max(0.0, penalized.lower[0] - found))
+        exact = max(0.0, RADII + ADDED_RADIUS_M + TRAINING_MARGIN_M - distance)
+        assert violations[-1] == pytest.approx(exact / np.sqrt(1 + exact / TRAINING_KNEE_M), abs=3e-4)
+    assert violations[0] > violations[1] > violations[2] == 0.0
+    assert violations[0] ** 2 / violations[1] ** 2 == pytest.approx(0.0519 / 0.0219, rel=0.1)
 
 
 def test_a_straight_hit_is_legal_from_any_distance():

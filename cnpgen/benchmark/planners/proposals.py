@@ -21,6 +21,7 @@ from cnpgen.planner.network.architecture import Architecture, Weights, initial_p
 from cnpgen.planner.network.forward import backward, forward
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import open_problem
+from cnpgen.robots.solid import pose_width
 from cnpgen.schema.catalogue import recipes_root
 from cnpgen.store.files.checksum_file import Content, read_with_checksum, write_with_checksum
 from cnpgen.training.adam import learning_rate, start_adam
@@ -64,7 +65,8 @@ class Proposals:
             obstacle_poses: Poses and sizes of the obstacles, shape (width,).
             random: Random generator.
         """
-        inputs = standardize(inputs_of(state[None], goal_q[None], obstacle_poses[None]), self.mean, self.scale)
+        poses = obstacle_poses[None, : len(self.mean) - 2 * len(state)]  # without the puck of a hit
+        inputs = standardize(inputs_of(state[None], goal_q[None], poses), self.mean, self.scale)
         prediction = forward(self._weights, inputs)
         change = random.normal(prediction.path[0], MIN_PROPOSAL_DEVIATION + np.exp(prediction.log_rate[0]))
         return np.asarray(state[: len(goal_q)] + self.reach * change)
@@ -163,7 +165,7 @@ def _training_rows(plans: Plans, ahead: float, random: np.random.Generator) -> t
     first = random.uniform(0, 1, (len(plans), STATES_PER_PLAN)) * plans.duration[:, None]
     now = plans.motion.at_times(first)
     later = plans.motion.at_times(np.minimum(first + ahead, plans.duration[:, None]))
-    ends = plans.boundary.goal_q, plans.scene.poses
+    ends = plans.boundary.goal_q, plans.scene.poses[:, : pose_width(plans.scene.obstacles)]
     goal_q, obstacle_poses = (np.repeat(values, STATES_PER_PLAN, axis=0) for values in ends)
     states = np.concatenate([now.q, now.dq], axis=2).reshape(len(goal_q), -1)
     return inputs_of(states, goal_q, obstacle_poses), (later.q - now.q).reshape(len(goal_q), -1)

@@ -67,7 +67,7 @@ class FamilyJudge:
         states = family.evaluate(s, jerk=self._problem.uses_jerk)
         if not states.is_finite():
             return TrajectoryVerdict(Decision.UNDECIDED, Reason.NOT_FINITE, duration=family.duration, samples=len(s))
-        poses = self._obstacle_poses(states.q)
+        poses = self._obstacle_poses(states.q, states.dq)
         self._world.set_path(states.q, states.dq, states.ddq, poses, states.jerk)
         context = evaluation_context(self._problem, family, poses, self._world, samples, table)
         errors = uncertainty_of(self._problem, family, self._moved, poses, context.measured, s)
@@ -78,13 +78,13 @@ class FamilyJudge:
         conditions = dict(zip(names, (entry.decided() for entry in entries), strict=True))
         return _verdict(conditions, family.duration, len(s))
 
-    def _obstacle_poses(self, q: Array) -> Array:
-        """Place the obstacles by the tip positions at both ends."""
-        ends, still, nowhere = np.ascontiguousarray(q[:, [0, -1]]), np.zeros((len(q), 2)), np.zeros((1, 3))
-        poses = scene_of(self._problem, nowhere, nowhere).poses[0]
-        self._world.set_path(ends, still, still, poses, still)
+    def _obstacle_poses(self, q: Array, dq: Array) -> Array:
+        """Place the obstacles, and the puck of a hit, by the tip at both ends."""
+        (ends, speeds), still = (np.ascontiguousarray(x[:, [0, -1]]) for x in (q, dq)), np.zeros((len(q), 2))
+        poses = scene_of(self._problem, *np.zeros((3, 1, 3))).poses[0]
+        self._world.set_path(ends, speeds, still, poses, still)
         start, goal = self._world.tip_position.T[:, None].copy()
-        return np.asarray(scene_of(self._problem, start, goal).poses[0])
+        return np.asarray(scene_of(self._problem, start, goal, self._world.tip_velocity[:, 1:].T).poses[0])
 
 
 def checked_phases(family: CurveFamily, step: float) -> Array:

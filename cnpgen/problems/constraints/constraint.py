@@ -171,6 +171,7 @@ class Constraint(ABC):
         Returns:
             Polylines from start to goal [m], shape (K, 3) each, in the order of their use.
         """
+        del values, start_xyz
         return []
 
     @abstractmethod

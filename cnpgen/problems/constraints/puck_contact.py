@@ -120,7 +120,8 @@ class PuckContact(Constraint):
     def _symbolic(self, state: SymbolicState, margin: float | None) -> tuple[Condition, ...]:
         import casadi as ca
 
-        tip, values = state.kinematics.tip, state.scene_values
+        tip = state.kinematics.tip
+        values = state.scene_values or [PUCK_OUT_OF_REACH_M] * self.scene_width
         from_goal, from_puck = ((tip[0] - x) ** 2 + (tip[1] - y) ** 2 for x, y in (values[:2], values[2:]))
         distance = ca.sqrt(from_puck + MIN_SQUARED_PUCK_DISTANCE_M2)
         return self._condition(from_goal, distance) if margin is None else self._cone(from_goal, distance, margin)
