@@ -85,7 +85,7 @@ def boundary() -> Boundary:
 def loss_call() -> None:
     loss = PlanLoss(AIRHOCKEY, nodes=8, backend="numpy")
     path, rate = np.zeros((2, 15, 6)), np.ones((2, 20))
-    loss(path, rate, weights=loss.weights0)
+    loss(path, rate, weights=loss.weights0, obstacle_poses=np.zeros((2, 4)))
 
 
 def omega_call() -> None:
