@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.judges.plans.curve import Curve
+from cnpgen.judges.plans.judged_curve import Curve
 from cnpgen.judges.plans.measure import EvaluationContext, MeasuredCondition
 from cnpgen.judges.plans.verdict import Margin
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from cnpgen.errors import UsageError
 from cnpgen.judges.plans.bernstein import PiecewisePolynomials, knots, polynomials
 from cnpgen.judges.plans.continuous_collision import check_continuous_collision
-from cnpgen.judges.plans.curve import SplineCurve
 from cnpgen.judges.plans.evaluated_trajectory import (
     EvaluatedTrajectory,
     Phases,
@@ -23,6 +22,7 @@ from cnpgen.judges.plans.evaluated_trajectory import (
     jerks,
 )
 from cnpgen.judges.plans.joint_limits import ProvenJointLimits, joint_limits
+from cnpgen.judges.plans.judged_curve import SplineCurve
 from cnpgen.judges.plans.local_maxima import check_local_maxima
 from cnpgen.judges.plans.measure import EvaluationContext, boundary_margins, by_name, evaluation_context, measure
 from cnpgen.judges.plans.paper import metrics_of, paper_rule

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.judges.plans.curve import Curve
 from cnpgen.judges.plans.evaluated_trajectory import EvaluatedTrajectory
 from cnpgen.judges.plans.joint_limits import is_proven
+from cnpgen.judges.plans.judged_curve import Curve
 from cnpgen.judges.plans.sampling import Samples, times
 from cnpgen.judges.plans.verdict import ZERO_TOLERANCE, Margin, Reason
 from cnpgen.problems.constraints.clearance import ObjectContact

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.judges.plans.bernstein import PiecewisePolynomials
-from cnpgen.judges.plans.curve import DerivativeBounds
 from cnpgen.judges.plans.evaluated_trajectory import EvaluatedTrajectory
+from cnpgen.judges.plans.judged_curve import DerivativeBounds
 
 Array = NDArray[np.float64]
 
