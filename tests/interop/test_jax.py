@@ -86,7 +86,8 @@ def plans(problem: str, count: int) -> dict[str, np.ndarray]:
         "rate": random.uniform(1.0, 2.0, (count, spec.rate_control_points)),
         "weights": random.uniform(0.5, 2.0, len(found.constraint)),
     }
-    return arrays | ({"obstacle_poses": random.uniform(0.2, 0.4, (count, 2))} if problem == "heavy-object" else {})
+    heights, puck = random.uniform(0.2, 0.4, (count, 2)), np.tile([1.0, 0.0, 1.07, 0.0], (count, 1))
+    return arrays | {"obstacle_poses": heights if problem == "heavy-object" else puck}
 
 
 @pytest.mark.parametrize("jitted", [True, False])
@@ -178,7 +179,8 @@ def test_an_invalid_plan_does_not_affect_others_through_grad(jitted: bool, cache
     def mean(reduction: Any, variables: Any, rate: Any) -> Any:
         layer, weights = variables
         path = (given["path"] + (jnp.eye(4) @ layer).reshape(4, 15, 6))[: len(rate)]
-        return reduction(plan_loss(loss, path, rate, weights=weights)[0]) * len(rate) / 4
+        poses = given["obstacle_poses"][: len(rate)]
+        return reduction(plan_loss(loss, path, rate, weights=weights, obstacle_poses=poses)[0]) * len(rate) / 4
 
     gradient = jax.grad(mean, argnums=1)
     gradient = jax.jit(gradient, static_argnums=0) if jitted else gradient
@@ -194,13 +196,13 @@ def test_an_invalid_plan_does_not_affect_others_through_grad(jitted: bool, cache
 
 MISTAKES = {
     "rate must have shape (2, 20), got (1, 20)": {"rate": np.ones((1, 20))},
-    "weights must have shape (5,) for joint-position": {"weights": np.ones(3)},
+    "weights must have shape (6,) for joint-position": {"weights": np.ones(3)},
     "weights must be an array of numbers, got str": {"weights": "abc"},
     "there is no constraint 'tabel' (did you mean 'table'?)": {"weights": {"tabel": 1.0}},
     "start_tip must have shape (2, 3), got (3,)": {"start_tip": np.zeros(3)},
     "the shift of the quadrature nodes must be in [0, 1), got 1.5": {"shift": 1.5},
     "shift must be a finite number, got None": {"shift": None},
-    "the weight of 'joint-torque' must be a number that is not negative": {"weights": [1, 1, 1, -1, 1]},
+    "the weight of 'joint-torque' must be a number that is not negative": {"weights": [1, 1, 1, -1, 1, 1]},
 }
 
 

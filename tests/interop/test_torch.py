@@ -333,8 +333,8 @@ def plans(problem: str, count: int, dtype: Any = torch.float64) -> dict[str, Any
         "rate": random.uniform(1.0, 2.0, (count, spec.rate_control_points)),
         "weights": random.uniform(0.5, 2.0, len(found.constraint)),
     }
-    if problem == "heavy-object":
-        tensors["obstacle_poses"] = random.uniform(0.2, 0.4, (count, 2))
+    heights, puck = random.uniform(0.2, 0.4, (count, 2)), np.tile([1.0, 0.0, 1.07, 0.0], (count, 1))
+    tensors["obstacle_poses"] = heights if problem == "heavy-object" else puck
     return {name: torch.tensor(values, dtype=dtype) for name, values in tensors.items()}
 
 
@@ -364,7 +364,7 @@ def test_gradients_reach_the_network_that_made_the_plans(loss: Any) -> None:
     log_rate = given["rate"].log().requires_grad_()
     values = []
     for _ in range(3):
-        total, _ = plan_loss(of, given["path"], log_rate.exp(), weights=given["weights"], shift=0.5)
+        total, _ = plan_loss(of, **given | {"rate": log_rate.exp()}, shift=0.5)
         assert total.dtype == torch.float32
         values.append(float(total.mean().detach()))
         (by_rate,) = torch.autograd.grad(total.mean(), [log_rate])
@@ -375,6 +375,7 @@ def test_gradients_reach_the_network_that_made_the_plans(loss: Any) -> None:
 def test_a_second_derivative_is_refused(loss: Any) -> None:
     of, given = loss("airhockey"), plans("airhockey", 2)
     path = given.pop("path").requires_grad_()
+    given["obstacle_poses"] = given["obstacle_poses"].numpy()
     (by_path,) = torch.autograd.grad((plan_loss(of, path, **given)[0] ** 2).sum(), [path], create_graph=True)
     with pytest.raises(UsageError, match="gradients of gradients of the loss"):
         by_path.sum().backward()
@@ -405,7 +406,8 @@ def test_an_invalid_plan_does_not_affect_others_through_autograd(loss: Any) -> N
 
     def gradients(reduction: str, rate: Any) -> list[Any]:
         path = given["path"] + 0.01 * network(inputs).reshape(4, 15, 6)
-        total, _ = plan_loss(of, path[: len(rate)], rate, weights=weights)
+        poses = given["obstacle_poses"][: len(rate)]
+        total, _ = plan_loss(of, path[: len(rate)], rate, weights=weights, obstacle_poses=poses)
         scale = len(rate) / 4  # means over three and over four
         return list(torch.autograd.grad(reductions[reduction](total) * scale, [*network.parameters(), weights]))
 
@@ -441,7 +443,8 @@ def test_it_works_under_autocast(loss: Any) -> None:
     with torch.autocast("cpu", torch.bfloat16):
         log_rate = network(torch.ones(4, 3))
         assert log_rate.dtype == torch.bfloat16
-        total, _ = plan_loss(of, given["path"], log_rate.exp(), weights=given["weights"].requires_grad_())
+        given["weights"].requires_grad_()
+        total, _ = plan_loss(of, **given | {"rate": log_rate.exp()})
         total.mean().backward()
     assert network.weight.grad.abs().sum() > 0
     assert given["weights"].grad.dtype == torch.float32
@@ -450,6 +453,7 @@ def test_it_works_under_autocast(loss: Any) -> None:
 def test_functional_gradients_are_the_same(loss: Any) -> None:
     of, given = loss("airhockey"), plans("airhockey", 3)
     path = given.pop("path")
+    given["obstacle_poses"] = given["obstacle_poses"].numpy()
     (expected,) = torch.autograd.grad(plan_loss(of, path.requires_grad_(), **given)[0].sum(), [path])
     found = torch.func.grad(lambda path: plan_loss(of, path, **given)[0].sum())(path.detach())
     torch.testing.assert_close(found, expected)
@@ -459,13 +463,13 @@ def test_without_gradients_only_terms_are_computed(loss: Any, monkeypatch: pytes
     of, given = loss("airhockey"), plans("airhockey", 2)
     monkeypatch.delitem(of.__dict__, "_gradient", raising=False)
     with torch.no_grad():
-        plan_loss(of, given["path"].requires_grad_(), given["rate"], weights=given["weights"])
+        plan_loss(of, **given | {"path": given["path"].requires_grad_()})
     assert "_gradient" not in of.__dict__
 
 
 MISTAKES = {
     "rate must have shape (2, 20), got (1, 20)": {"rate": torch.ones(1, 20)},
-    "weights must have shape (5,) for joint-position": {"weights": np.ones(3)},
+    "weights must have shape (6,) for joint-position": {"weights": np.ones(3)},
     "weights must be an array of numbers, got str": {"weights": "abc"},
     "there is no constraint 'tabel' (did you mean 'table'?)": {"weights": {"tabel": 1.0}},
     "path must be real numbers, got torch.complex64": {"path": torch.ones(2, 15, 6, dtype=torch.complex64)},

@@ -73,8 +73,8 @@ def plan_loss(
         path: Path control points [rad], shape (N, C, n), on any device, of any type.
         rate: Rate control points [1/s], shape (N, R), positive.
         weights: Weight of every constraint term (e^alpha), shape (m,); or term -> weight, see ``PlanLoss``.
-        obstacle_poses: Poses and sizes of the obstacles, shape (N, width); a constant.
-        start_tip: Positions of the tip at the start [m], shape (N, 3); a constant.
+        obstacle_poses: Poses and sizes of the obstacles, shape (N, width); a constant, within ``torch.func`` an array.
+        start_tip: Positions of the tip at the start [m], shape (N, 3); a constant, within ``torch.func`` an array.
         shift: Shift of the quadrature nodes, in [0, 1).
 
     Returns:
