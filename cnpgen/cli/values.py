@@ -147,12 +147,17 @@ def names(text: str) -> tuple[str, ...]:
     return found
 
 
+def _numbers(text: str) -> tuple[float, ...]:
+    """Read numbers separated by commas; none if one of them is no number."""
+    try:
+        return tuple(float(part) for part in text.split(","))
+    except ValueError:
+        return ()
+
+
 def errors(text: str) -> tuple[float, ...]:
     """Read one number or three, at least 0: ``1e-3`` or ``1e-3,1e-2,0.5``."""
-    try:
-        found = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        found = ()
+    found = _numbers(text)
     if len(found) not in {1, 3} or not all(0 <= value < math.inf for value in found):
         raise ArgumentTypeError(
             f"expected one number or three, at least 0, such as 1e-3 or 1e-3,1e-2,0.5; got {text[:60]!r}"
@@ -162,10 +167,7 @@ def errors(text: str) -> tuple[float, ...]:
 
 def amounts(text: str) -> tuple[float, ...]:
     """Read positive numbers separated by commas: ``500`` or ``7500,3750,5000``."""
-    try:
-        found = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        found = ()
+    found = _numbers(text)
     if not found or not all(0 < value < math.inf for value in found):
         raise ArgumentTypeError(f"expected numbers above 0, such as 500 or 7500,3750; got {text[:60]!r}")
     return found

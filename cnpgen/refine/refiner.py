@@ -1,5 +1,6 @@
 """Solver runs, fine checks and initial guesses of the refiner for one problem; ``strategy`` decides their order."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -164,19 +165,18 @@ class Refiner:
 
     def line_guess(self, task: RefinementTask) -> Array:
         """Return the variables of the initial guess of the coarse level: along a tip path, or a line."""
-        guesses = self.tip_path_guesses(task)
-        return (
-            guesses[0] if guesses else self.slow_guess(task, initial_guesses.rising_line(*self._guess_arguments(task)))
-        )
+        guess = next(self.tip_path_guesses(task), None)
+        if guess is not None:
+            return guess
+        return self.slow_guess(task, initial_guesses.rising_line(*self._guess_arguments(task)))
 
-    def tip_path_guesses(self, task: RefinementTask) -> list[Array]:
-        """Return the variables of motions along the initial tip paths of the problem's constraint."""
+    def tip_path_guesses(self, task: RefinementTask) -> Iterator[Array]:
+        """Yield the variables of motions along the initial tip paths of the problem's constraint."""
         constraint, values = self.problem.scene_constraint, task.scene.poses[0, pose_width(self.problem.obstacle) :]
-        if constraint is None:
-            return []
-        paths = constraint.initial_tip_paths(values, task.start_xyz)
-        ends = task.boundary.start_q[0], task.boundary.goal_q[0]
-        return [self.path_guess(task, initial_guesses.along_tip_path(self._world, *ends, path)) for path in paths]
+        paths = [] if constraint is None else constraint.initial_tip_paths(values, task.start_xyz)
+        for path in paths:
+            ends = task.boundary.start_q[0], task.boundary.goal_q[0]
+            yield self.path_guess(task, initial_guesses.along_tip_path(self._world, *ends, path))
 
     def even_line_guess(self, task: RefinementTask) -> Array:
         """Return the variables of the straight line at constant rate."""
