@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cnpgen.kernels.cache import exclusive_lock, make_private_folder
 from cnpgen.kernels.compiler import find_compiler
 from cnpgen.kernels.library import Backend, KernelLibrary, default_cache_folder
 from cnpgen.make.make_dataset import make_dataset
@@ -30,6 +29,7 @@ from cnpgen.pipelines.pipeline_file import load_pipeline
 from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
 from cnpgen.pipelines.stages.stage import CandidateBatch
 from cnpgen.robots.robot import Robot
+from cnpgen.store.files.cache_folder import exclusive_lock, make_private_folder
 from cnpgen.store.layout import MANIFEST
 
 SHIPPED = ("airhockey-hit", "airhockey-replan", "heavy-object")

@@ -39,6 +39,13 @@ def add(commands: "Commands[Parser]") -> None:
         default=1e-3,
         help="time between two samples (default: 1ms, at most 10ms)",
     )
+    option(
+        "--tracking-error",
+        metavar="E,...",
+        type=values.tracking_errors,
+        help="largest tracking error of the joints, such as 2deg: position limits, clearances and the manifold hold"
+        " within it; one number, or one per joint (default: exact tracking)",
+    )
     option("--workers", metavar="W", type=values.positive, help="processes; default one per available core")
     option("--list", action="store_true", help="also list the plans, one per line, invalid ones first")
     option("--plot", metavar="PICTURE", type=values.plot_file, help="draw one plan: .png, .pdf or .svg")
@@ -117,6 +124,8 @@ def _run_trajectories(arguments: argparse.Namespace) -> int:
 
     if arguments.plot:
         raise UsageError("--plot draws plans: 'cnpgen import' makes plans of sampled trajectories")
+    if arguments.tracking_error is not None:
+        raise UsageError("--tracking-error is for plans: --noise gives the error of sampled trajectories")
     loaded = load_file(arguments)
     meter = Meter(quiet=not sys.stderr.isatty(), noun="trajectory")
     meter.begin(f"judging {arguments.file}", len(loaded.trajectories))
@@ -153,7 +162,14 @@ def _evaluate(arguments: argparse.Namespace) -> "Evaluation":
     meter = Meter(quiet=not sys.stderr.isatty(), noun="plan")
     meter.begin(f"judging {arguments.file}", len(plans))
     try:
-        return evaluate_plans(plans, step=arguments.step, workers=arguments.workers, progress=meter)
+        error = arguments.tracking_error
+        return evaluate_plans(
+            plans,
+            step=arguments.step,
+            tracking_error=error[0] if error and len(error) == 1 else error,
+            workers=arguments.workers,
+            progress=meter,
+        )
     finally:
         meter.close()
 

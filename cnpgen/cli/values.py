@@ -3,6 +3,7 @@
 import math
 import re
 from argparse import ArgumentTypeError
+from contextlib import suppress
 from decimal import Decimal
 from pathlib import Path
 
@@ -163,6 +164,21 @@ def errors(text: str) -> tuple[float, ...]:
             f"expected one number or three, at least 0, such as 1e-3 or 1e-3,1e-2,0.5; got {text[:60]!r}"
         )
     return found
+
+
+def tracking_errors(text: str) -> tuple[float, ...]:
+    """Read angles or lengths of at least 0, separated by commas: ``2deg`` or ``1deg,1deg,5mm``."""
+    from cnpgen.schema.units import parse_number
+
+    found = []
+    for part in text.split(","):
+        for unit in ("rad", "m"):
+            with suppress(ValueError):
+                found.append(parse_number(part.strip(), unit))
+                break
+    if len(found) != text.count(",") + 1 or not all(0 <= value < math.inf for value in found):
+        raise ArgumentTypeError(f"expected angles of at least 0, such as 2deg or 1deg,1deg,0.01; got {text[:60]!r}")
+    return tuple(found)
 
 
 def amounts(text: str) -> tuple[float, ...]:

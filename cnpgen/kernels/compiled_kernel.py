@@ -13,7 +13,12 @@ from typing import Any
 import numpy as np
 
 from cnpgen.errors import MachineError
-from cnpgen.kernels.cache import (
+from cnpgen.kernels.compiler import compiler_version, flags_of, require_compiler, run_compiler, target
+from cnpgen.kernels.emit import VECTORS, emit, prelude
+from cnpgen.kernels.grid_kernel import GridKernel, check_grid
+from cnpgen.kernels.kernel import Array, Kernel, check_arguments
+from cnpgen.kernels.tape import Tape
+from cnpgen.store.files.cache_folder import (
     LIBRARIES,
     exclusive_lock,
     is_trusted,
@@ -22,11 +27,6 @@ from cnpgen.kernels.cache import (
     read_only_cache,
     require_trusted,
 )
-from cnpgen.kernels.compiler import compiler_version, flags_of, require_compiler, run_compiler, target
-from cnpgen.kernels.emit import VECTORS, emit, prelude
-from cnpgen.kernels.grid_kernel import GridKernel, check_grid
-from cnpgen.kernels.kernel import Array, Kernel, check_arguments
-from cnpgen.kernels.tape import Tape
 
 CALL_SOURCE = Path(__file__).with_name("call.c")
 CACHE_LINE_DOUBLES = 8

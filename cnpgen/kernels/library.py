@@ -15,15 +15,6 @@ from typing import Any, Literal, Protocol
 import numpy as np
 
 from cnpgen.errors import MachineError, UsageError
-from cnpgen.kernels.cache import (
-    TAPES,
-    default_cache_folder,
-    is_trusted,
-    make_private_folder,
-    make_read_only_for_others,
-    require_trusted,
-    usable_cache_folder,
-)
 from cnpgen.kernels.compiled_kernel import (
     CompiledGridKernel,
     CompiledKernel,
@@ -39,6 +30,15 @@ from cnpgen.kernels.parallel_compilation import CompilerPool
 from cnpgen.kernels.tape import CODES, Dtype, GridSpec, Loop, Tape, tape_from_function
 from cnpgen.schema.registry import package_digest
 from cnpgen.store.files.atomic import write_file
+from cnpgen.store.files.cache_folder import (
+    TAPES,
+    default_cache_folder,
+    is_trusted,
+    make_private_folder,
+    make_read_only_for_others,
+    require_trusted,
+    usable_cache_folder,
+)
 
 Backend = Literal["compiled", "numpy", "casadi"]
 BACKENDS: tuple[Backend, ...] = ("compiled", "numpy", "casadi")

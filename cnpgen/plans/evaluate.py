@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
@@ -21,7 +21,7 @@ from cnpgen.plans.status import PlanStatus
 from cnpgen.plans.tips import correct_tips
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.schema.argument_types import checked_arguments
-from cnpgen.schema.arguments import number
+from cnpgen.schema.arguments import number, numbers
 
 FORMAT = "cnpgen-evaluation"
 EVALUATION_VERSION = 2
@@ -44,11 +44,13 @@ class Evaluation:
         plans: Plans, with tip positions consistent with the joints.
         verdicts: Verdicts, in the same order.
         step: Maximum distance of checked times [s].
+        tracking_error: Largest tracking error of every joint [rad], or one for all; empty for exact tracking.
     """
 
     plans: Plans
     verdicts: tuple[Verdict, ...]
     step: float
+    tracking_error: tuple[float, ...] = ()
 
     def __repr__(self) -> str:
         plans = f"{counted(len(self.verdicts), 'plan')} of {self.plans.problem.name!r}"
@@ -74,6 +76,7 @@ class Evaluation:
             "problem_sha256": record.comparable_sha256,
             "checksum": self.plans.checksum,
             "step_s": self.step,
+            **({"tracking_error_rad": list(self.tracking_error)} if self.tracking_error else {}),
             **summarize_verdicts(self.verdicts),
         }
 
@@ -88,6 +91,7 @@ def evaluate_plans(
     plans: Plans,
     *,
     step: float = MAX_VERDICT_STEP_S,
+    tracking_error: float | Sequence[float] | None = None,
     workers: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Evaluation:
@@ -100,27 +104,41 @@ def evaluate_plans(
     Args:
         plans: Plans to judge.
         step: Maximum distance of checked times [s].
+        tracking_error: Largest tracking error of the joints [rad], one number or one per joint. Limits of positions,
+            clearances and the manifold must then hold for every state within it.
         workers: Number of processes; default one per available core, or one for few plans.
         progress: Called with the number of plans that were judged since the last call.
 
     Raises:
-        UsageError: There are no plans, the step is not positive, or there is less than one worker.
+        UsageError: There are no plans, the step is not positive, there is less than one worker, or a tracking error is
+            negative.
         RecipeError: A required plug-in is not installed.
         MachineError: A worker died.
     """
     check_step(step := number("step", step))
+    error = () if tracking_error is None else tuple(np.atleast_1d(numbers("tracking_error", tracking_error)).tolist())
     plans = correct_tips(plans)
     parts = [plans[first : first + PLANS_PER_VERDICT_TASK] for first in range(0, len(plans), PLANS_PER_VERDICT_TASK)]
     count = worker_count(1 if workers is None and len(plans) <= MAX_PLANS_OF_ONE_PROCESS else workers, len(parts))
     verdicts: list[list[Verdict]] = []
-    with closing(distribute(partial(_judge, step=step), parts, count, ordered=True)) as results:
+    with closing(distribute(partial(_judge, step=step, error=error), parts, count, ordered=True)) as results:
         for found in results:
             verdicts.append(found)
             if progress is not None:
                 progress(len(found))
-    return Evaluation(plans, tuple(chain.from_iterable(verdicts)), step)
+    return Evaluation(plans, tuple(chain.from_iterable(verdicts)), step, error)
 
 
-def _judge(plans: Plans, *, step: float) -> list[Verdict]:
+def _judge(plans: Plans, *, step: float, error: tuple[float, ...]) -> list[Verdict]:
     problem, robot = open_problem(plans.problem)
-    return judge(problem, robot, plans.motion, plans.boundary, plans.scene, plans.columns["goal_xyz"], step=step)
+    tracking_error = (error if len(error) > 1 else error[0]) if error else None
+    return judge(
+        problem,
+        robot,
+        plans.motion,
+        plans.boundary,
+        plans.scene,
+        plans.columns["goal_xyz"],
+        step=step,
+        tracking_error=tracking_error,
+    )

@@ -7,6 +7,9 @@ from xml.etree import ElementTree
 
 from cnpgen.errors import RecipeError
 from cnpgen.problems.checks import named_packages, tables
+from cnpgen.problems.constraints.constraint import Constraint
+from cnpgen.problems.constraints.object_clearance import ObjectClearance
+from cnpgen.problems.problem import Problem
 from cnpgen.robots.shape.mesh_files import find_named_file, find_urdf
 from cnpgen.robots.urdf import read_urdf, urdf_tree
 from cnpgen.schema.keys import RecipeLocation
@@ -28,9 +31,27 @@ def chosen_geometry(table: dict[str, Any], folder: Path) -> str:
     return "urdf" if something_to_hit and _collision_elements(table, folder) else "paper-capsules"
 
 
+def with_object_clearance(problem: Problem, table: dict[str, Any], folder: Path) -> tuple[Constraint, ...]:
+    """Return the constraints of a problem; a held object stays clear of the links by default if they have geometry.
+
+    Args:
+        problem: Problem of the file.
+        table: Table of the problem file.
+        folder: Folder of the problem file.
+    """
+    if problem.object is None or problem.first(ObjectClearance) or not _collision_elements(table, folder):
+        return problem.constraint
+    return (*problem.constraint, ObjectClearance())
+
+
 def geometry_mistakes(table: dict[str, Any], where: RecipeLocation, folder: Path) -> Iterator[str]:
     """Yield error messages for keys that are inconsistent with the robot geometry."""
     elements = _collision_elements(table, folder)
+    for place, _ in _constraints(table, "object-clearance"):
+        if "object" not in table:
+            yield (where / "constraint" / place).message("object-clearance needs [object], the held object")
+        elif elements is not None and not elements:
+            yield (where / "constraint" / place).message("object-clearance needs <collision> elements in the URDF")
     if chosen_geometry(table, folder) != "urdf":
         yield from _paper_mistakes(table, where)
     elif elements is not None:

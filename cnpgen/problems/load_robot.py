@@ -9,12 +9,14 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
 from cnpgen.problems.constraints.joint import JointTorque
+from cnpgen.problems.constraints.object_clearance import ObjectClearance
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem, kept_folder
 from cnpgen.robots.attached import Attached, PayloadBody
 from cnpgen.robots.chain import chain_from_model
 from cnpgen.robots.robot import Robot, reduced_model
 from cnpgen.robots.shape.convex_part import turned
+from cnpgen.robots.shape.held_object import HeldBody, load_held_shape
 from cnpgen.robots.shape.shape import Shape, load_shape
 from cnpgen.schema.keys import PerJoint
 from cnpgen.store.joint_units import unit_of
@@ -64,7 +66,8 @@ def load_robot(problem: Problem) -> Robot:
     )
     if mistakes := list(_mistakes(problem, robot)):
         raise RecipeError(mistakes)
-    return robot if spec.geometry != "urdf" else replace(robot, shape=_shape(problem, robot))
+    shape = _shape(problem, robot) if spec.geometry == "urdf" else None
+    return replace(robot, shape=shape, held_shape=_held_shape(problem, robot))
 
 
 def _attached(problem: Problem) -> Attached:
@@ -109,6 +112,17 @@ def _shape(problem: Problem, robot: Robot) -> Shape:
                 stacklevel=4,
             )
     return shape
+
+
+def _held_shape(problem: Problem, robot: Robot) -> Shape | None:
+    """Load the geometry for collisions of the held object with the robot, if a constraint needs it."""
+    if problem.object is None or problem.first(ObjectClearance) is None:
+        return None
+    held = HeldBody(problem.object.size, problem.object.touch_links, robot.tip_frame)
+    try:
+        return load_held_shape(robot.urdf_text, robot.model, held, kept_folder())
+    except RecipeError as error:
+        raise RecipeError([f"{problem.path}: {mistake}" for mistake in error.mistakes]) from error
 
 
 def _mistakes(problem: Problem, robot: Robot) -> Iterator[str]:

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 from cnpgen.errors import MachineError
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.constraints.constraint import Constraint
+from cnpgen.problems.constraints.object_clearance import ObjectClearance
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot_spec import HeldObject, LimitSpec, Payload, RobotSpec
 from cnpgen.robots.shape.inline import with_inline_meshes
@@ -22,6 +23,7 @@ from cnpgen.robots.urdf import read_urdf
 from cnpgen.schema import registry
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.keys import NAME, field, to_dict
+from cnpgen.store.files.cache_folder import default_cache_folder, make_private_folder, trust_problem
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
 Kind = TypeVar("Kind", bound=Constraint)
@@ -106,6 +108,11 @@ class Problem:
         return pose_width(self.obstacle) + (0 if constraint is None else constraint.scene_width)
 
     @property
+    def uses_link_geometry(self) -> bool:
+        """Whether obstacles, links or the held object must keep a distance from the links' geometry in the URDF."""
+        return self.robot.geometry == "urdf" or self.first(ObjectClearance) is not None
+
+    @property
     def uses_jerk(self) -> bool:
         """Whether a constraint limits jerks."""
         return any(constraint.uses_jerk for constraint in self.constraint)
@@ -133,13 +140,13 @@ class Problem:
     def urdf_text(self) -> str:
         """Text of the URDF, read once, so that robot, kernels and identity use the same text.
 
-        For robots with the URDF's geometry, the text includes the hulls of meshes and the pairs of an SRDF.
+        If constraints use the URDF's geometry, the text includes the hulls of meshes and the pairs of an SRDF.
 
         Raises:
             RecipeError: The URDF, a mesh or the SRDF cannot be read, or is not UTF-8.
         """
         text, spec = read_urdf(self.urdf_path), self.robot
-        if spec.geometry != "urdf":
+        if not self.uses_link_geometry:
             return text
         keep = kept_folder() if spec.convex_parts > 1 else None
         text = with_inline_meshes(
@@ -164,12 +171,6 @@ FILES = ("urdf", "packages", "srdf", "ignored_pairs", "convex_parts", "decompose
 
 def kept_folder() -> Path | None:
     """Return the cache folder of shapes; None if other users may write to it."""
-    from cnpgen.kernels.cache import (
-        default_cache_folder,
-        make_private_folder,
-        trust_problem,
-    )  # used only by robots with a shape
-
     try:
         folder = default_cache_folder()
         make_private_folder(folder)

@@ -12,7 +12,7 @@ import numpy as np
 from cnpgen.errors import PluginError, RecipeError
 from cnpgen.problems.checks import problem_mistakes, tables
 from cnpgen.problems.constraints.constraint import Constraint
-from cnpgen.problems.geometry import chosen_geometry, geometry_mistakes
+from cnpgen.problems.geometry import chosen_geometry, geometry_mistakes, with_object_clearance
 from cnpgen.problems.problem import FILES, Problem
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.inline import inline_mesh, is_inline, mesh_files
@@ -85,7 +85,8 @@ def read_problem(path: Path, mistakes: list[str]) -> Problem | None:
     if problem is None or len(mistakes) > before:
         return None
     spec = replace(problem.robot, geometry=chosen_geometry(table, path.parent))
-    return replace(problem, path=path.absolute(), robot=spec, obstacle=obstacles)
+    constraints = with_object_clearance(problem, table, path.parent)
+    return replace(problem, path=path.absolute(), robot=spec, obstacle=obstacles, constraint=constraints)
 
 
 def _with_meshes(problem: Problem, path: Path, where: RecipeLocation, mistakes: list[str]) -> tuple[Obstacle, ...]:
@@ -164,7 +165,7 @@ def _meshes_on_disk(problem: Problem, urdf: str, where: RecipeLocation) -> Itera
     """Yield error messages for meshes that are not inline."""
     text = "names the mesh {}, expected its corners in the text"
     with suppress(ValueError):  # loading the robot raises the error
-        for name in mesh_files(urdf)[:1] if problem.robot.geometry == "urdf" else ():
+        for name in mesh_files(urdf)[:1] if problem.uses_link_geometry else ():
             yield (where / "robot" / "urdf").message(text.format(show(name)))
     for index, each in enumerate(problem.obstacle):
         if each.mesh and not is_inline(each.mesh):

@@ -195,7 +195,7 @@ def as_record(problem: object) -> ProblemRecord:
 @lru_cache(maxsize=8)
 def _rebuilt(record: ProblemRecord) -> Problem:
     """Rebuild a problem in a folder that exists until this process ends, since its URDF is read lazily."""
-    from cnpgen.kernels.cache import temporary_folder
+    from cnpgen.store.files.cache_folder import temporary_folder
 
     return restore_problem(record.content, record.urdf, temporary_folder())
 

@@ -108,9 +108,9 @@ class FineCheck:
         return cost, GridViolation(worst, bool(violated[:, self._bounds.orders == 0].any()), time_scale)
 
     def rest_bounds(self, task: RefinementTask) -> RestBounds:
-        """Return the bounds halfway along the motion, relaxed by their tolerances except for clearances of capsules."""
+        """Return the bounds halfway along the motion, relaxed by their tolerances except for clearances."""
         bounds, half, capsules = self._bounds.bounds_for(task.start_xyz), FINE_POINTS // 2, self._bounds.capsules
-        tolerances = np.where(capsules, 0.0, self._bounds.tolerances)
+        tolerances = np.where(capsules | self._bounds.held_clearances, 0.0, self._bounds.tolerances)
         equal = self._bounds.equal & (self._bounds.orders == 0)
         return RestBounds(bounds.lower[half] - tolerances, bounds.upper[half] + tolerances, capsules, equal)
 

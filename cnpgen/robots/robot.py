@@ -47,6 +47,7 @@ class Robot:
         base: Base configuration [rad], shape (n,).
         chain: Parameters of the kinematic chain from the world to the tip.
         shape: Collision geometry; None for the paper's, a line through the joint origins.
+        held_shape: Link geometry and the held object, for collisions between the two; None if these are not checked.
     """
 
     urdf: Path
@@ -64,6 +65,7 @@ class Robot:
     base: Array
     chain: Chain
     shape: Shape | None = None
+    held_shape: Shape | None = None
 
     @property
     def n(self) -> int:

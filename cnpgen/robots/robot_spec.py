@@ -156,3 +156,6 @@ class HeldObject:
     """Upright cuboid held rigidly with its center at the tip frame."""
 
     size: tuple[float, float, float] = field("edge lengths along the tip frame's x, y, z", unit="m", low=1e-6)
+    touch_links: tuple[str, ...] = field(
+        "links that carry the object and may touch it (constraint 'object-clearance')", default=(), since_version=2
+    )

@@ -65,6 +65,7 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "tip-speed": "cnpgen.problems.constraints.tip_speed:TipSpeed",
         "robot-clearance": "cnpgen.problems.constraints.clearance:RobotClearance",
         "self-clearance": "cnpgen.problems.constraints.self_clearance:SelfClearance",
+        "object-clearance": "cnpgen.problems.constraints.object_clearance:ObjectClearance",
         "object-contact": "cnpgen.problems.constraints.clearance:ObjectContact",
         "puck-contact": "cnpgen.problems.constraints.puck_contact:PuckContact",
     },

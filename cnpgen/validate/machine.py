@@ -243,7 +243,7 @@ def _compiler() -> str:
 
 
 def _cache_folder() -> str:
-    from cnpgen.kernels.cache import default_cache_folder
+    from cnpgen.store.files.cache_folder import default_cache_folder
 
     return str(default_cache_folder())
 
@@ -269,7 +269,7 @@ def _check_backend(findings: _Findings, cache: str) -> tuple[str, str, bool]:
 
 def _check_cache(findings: _Findings, cache: str) -> bool:
     """Return whether cached kernels may be loaded, and note those that may not."""
-    from cnpgen.kernels.cache import trust_problem, untrusted_files
+    from cnpgen.store.files.cache_folder import trust_problem, untrusted_files
 
     if not cache or not Path(cache).is_dir() or trust_problem(Path(cache)):  # noted by the choice of the backend
         return False

@@ -13,7 +13,7 @@ from cnpgen.robots.solid import place_obstacles, pose_width, solids_of
 from cnpgen.world.collision_world import CollisionWorld
 from cnpgen.world.forward_kinematics import ForwardKinematics
 from cnpgen.world.pair_distances import PairDistances
-from cnpgen.world.rigid_bodies import NO_SHAPE, RigidBodies
+from cnpgen.world.rigid_bodies import NO_HELD_SHAPE, NO_SHAPE, RigidBodies
 from cnpgen.world.separation import cuboid_gaps, cuboid_separation, gaps, separation
 
 if TYPE_CHECKING:
@@ -68,6 +68,7 @@ class PathWorld:
         self._object_size = None if object_size is None else np.array(object_size)
         self._collisions = CollisionWorld(object_size, 1)
         self._bodies = None if robot.shape is None else RigidBodies(robot.shape, len(obstacles), robot.n)
+        self._held = None if robot.held_shape is None else RigidBodies(robot.held_shape, 0, robot.n)
         rest = np.zeros((robot.n, 1))
         self.set_path(robot.base[:, None], rest, rest, place_obstacles(obstacles), rest)
 
@@ -237,6 +238,27 @@ class PathWorld:
         """Return a mask of states: all parts of links that must not touch keep a distance [m], shape (K,)."""
         return self.self_pairs().clear_states(min_distance)
 
+    def held_object_distances(self, sufficient: float = np.inf) -> list[Array]:
+        """Measure the signed distance of the held object from parts of links [m]; see ``shape_distances``."""
+        return self._smallest(self.held_object_pairs(), sufficient)
+
+    def held_object_pairs(self) -> PairDistances:
+        """Return the signed distances of the held object from every part of the links that may not touch it.
+
+        Raises:
+            RecipeError: The robot has no geometry for it.
+        """
+        bodies = self._held
+        if bodies is None:
+            raise RecipeError([NO_HELD_SHAPE])
+        if "held" not in self._pairs:
+            bodies.place(self._rotations, self._origins, [])
+        return self._once("held", lambda: bodies.pair_distances(bodies.link_pairs))
+
+    def clear_of_held_object(self, min_distance: float) -> NDArray[np.bool_]:
+        """Return a mask of states: the links keep a distance [m] from the held object, shape (K,)."""
+        return self.held_object_pairs().clear_states(min_distance)
+
     def motion_bounds(self, max_positions: Array) -> Array:
         """Bound the displacement of any point of the robot or the held object per unit of motion of each joint [m].
 
@@ -251,8 +273,9 @@ class PathWorld:
     @cached_property
     def _extents(self) -> Array:
         """Largest distance of a point of each link from the origin of the base or of its joint [m], shape (n + 1,)."""
-        bodies = self._bodies
-        extents = np.array([bodies.extent(joint) if bodies else 0.0 for joint in range(self.robot.n + 1)])
+        groups = [bodies for bodies in (self._bodies, self._held) if bodies is not None]
+        joints = range(self.robot.n + 1)
+        extents = np.array([max((bodies.extent(joint) for bodies in groups), default=0.0) for joint in joints])
         held = 0.0 if self._object_size is None else np.linalg.norm(self._object_size) / 2
         extents[self._carrier] = max(extents[self._carrier], np.linalg.norm(self._offset) + held)
         return extents

@@ -17,6 +17,10 @@ Array = NDArray[np.float64]
 Pairs = NDArray[np.intp]
 
 NO_SHAPE = 'a constraint needs the link geometry of the robot, which has none: set geometry = "urdf" in [robot]'
+NO_HELD_SHAPE = (
+    "a constraint needs the geometry of the links and a held object: the problem needs [object], and <collision>"
+    " elements in its URDF"
+)
 
 
 @dataclass(frozen=True)

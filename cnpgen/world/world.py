@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from cnpgen.errors import RecipeError
 from cnpgen.robots.solid import place_obstacles, pose_width, solids_of
 from cnpgen.world.collision_world import CollisionWorld
-from cnpgen.world.rigid_bodies import NO_SHAPE, RigidBodies
+from cnpgen.world.rigid_bodies import NO_HELD_SHAPE, NO_SHAPE, RigidBodies
 
 if TYPE_CHECKING:
     from cnpgen.robots.obstacle import Obstacle
@@ -56,6 +56,7 @@ class World:
         self._object_size = object_size
         self._collisions = CollisionWorld(object_size, len(robot.capsule_axes))
         self._bodies = None if robot.shape is None else RigidBodies(robot.shape, len(obstacles), robot.n)
+        self._held = None if robot.held_shape is None else RigidBodies(robot.held_shape, 0, robot.n)
         self._segments = robot.capsule_axes
         self._joints = sorted({point for segment in robot.capsule_axes for point in segment} - {robot.n})
         zero = np.zeros(robot.n)
@@ -177,11 +178,26 @@ class World:
         if self._bodies is None:
             raise RecipeError([NO_SHAPE])
         if not self._placed:
-            poses = list(self._data.oMi)
-            rotations = np.array([pose.rotation for pose in poses])[..., None]
-            self._bodies.place(rotations, np.array([pose.translation for pose in poses])[..., None], self._solids)
+            self._bodies.place(*self._joint_poses(), self._solids)
             self._placed = True
         return self._bodies
+
+    def _joint_poses(self) -> tuple[Array, Array]:
+        """Return the rotations and positions [m] of the base and the joints, as ``RigidBodies.place`` takes them."""
+        poses = list(self._data.oMi)
+        rotations = np.array([pose.rotation for pose in poses])[..., None]
+        return rotations, np.array([pose.translation for pose in poses])[..., None]
+
+    def held_object_distances(self, sufficient: float = np.inf) -> list[float]:  # noqa: ARG002 - one state is always exact
+        """Measure the signed distance of the held object from parts of links [m]; see ``shape_distances``.
+
+        Raises:
+            RecipeError: The robot has no geometry for it.
+        """
+        if self._held is None:
+            raise RecipeError([NO_HELD_SHAPE])
+        self._held.place(*self._joint_poses(), [])
+        return [float(distances[0]) for distances in self._held.pair_distances(self._held.link_pairs).smallest()]
 
     def object_distances(self, sufficient: float = np.inf) -> list[float]:  # noqa: ARG002 - one state is always exact
         """Measure the signed distance of the held object from every obstacle [m], negative if they overlap.

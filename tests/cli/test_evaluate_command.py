@@ -170,6 +170,26 @@ def test_a_finer_step_evaluates_more_times(run: Run, saved: Callable[[Plans], Pa
     assert samples[1] > 1.5 * samples[0]
 
 
+def test_a_tracking_error_widens_the_margins_of_positions(run: Run, saved: Callable[[Plans], Path]) -> None:
+    plan = load("transport")
+    file = saved(plans_of(plan))
+    code, out, _ = run(file, "--tracking-error", "2deg", "--json")
+    (verdict,) = json.loads(out)["verdicts"]
+    expected = plan.judged(tracking_error=np.deg2rad(2))
+    assert (code, verdict["valid"]) == (1, expected.valid) == (1, False)
+    assert json.loads(out)["tracking_error_rad"] == [pytest.approx(np.deg2rad(2))]
+    code, out, _ = run(file, "--tracking-error", ",".join(["0"] * 7))
+    assert code == 0
+    for value, mistake in (
+        ("-1deg", "expected angles"),
+        ("2 deg of", "expected angles"),
+        ("1deg,1deg", "one per joint"),
+    ):
+        code, _, err = run(file, f"--tracking-error={value}")
+        assert code == 2
+        assert mistake in err
+
+
 def test_the_problem_that_is_given_decides_and_must_be_the_same(run: Run, saved: Callable[[Plans], Path]) -> None:
     file = saved(plans_of(load("hit")))
     assert run(file, "--problem", "airhockey")[0] == 0

@@ -20,7 +20,6 @@ import pytest
 from cnpgen.errors import MachineError, UsageError
 from cnpgen.kernels import compiled_kernel, compiler
 from cnpgen.kernels import library as library_module
-from cnpgen.kernels.cache import exclusive_lock, make_private_folder
 from cnpgen.kernels.compiled_kernel import CompiledKernel, compile_tape
 from cnpgen.kernels.compiler import find_compiler, vector_flags
 from cnpgen.kernels.emit import emit
@@ -30,6 +29,7 @@ from cnpgen.kernels.library import KernelLibrary, choose_backend
 from cnpgen.kernels.mapped_kernel import MappedKernel
 from cnpgen.kernels.parallel_compilation import CompilerPool
 from cnpgen.kernels.tape import CODES, NAMES, Loop, Tape, tape_from_function
+from cnpgen.store.files.cache_folder import exclusive_lock, make_private_folder
 from tests.conftest import HANGING, Prepare, needs_compiler, some
 from tests.machine.test_workers import alive
 
@@ -603,7 +603,7 @@ def test_the_wait_for_a_stopped_compilation_ends_at_the_time_limit(root, tmp_pat
     tape = tape_from_function(root, ROOT)
     lock = tmp_path / "lib" / f".{compiled_kernel.library_file_stem(tape, find_compiler())}.lock"
     make_private_folder(lock.parent)
-    monkeypatch.setattr("cnpgen.kernels.cache.MAX_LOCK_WAIT_S", 0.1)
+    monkeypatch.setattr("cnpgen.store.files.cache_folder.MAX_LOCK_WAIT_S", 0.1)
     with exclusive_lock(lock):
         began = time.monotonic()
         assert compile_tape(tape, tmp_path).exists()

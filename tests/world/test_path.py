@@ -78,7 +78,7 @@ def test_measured_constraints_agree_with_those_of_single_states(both):
             expected = np.array([conditions[index].g for conditions in one]).T
             found = np.array(condition.g)
             assert found.shape == expected.shape
-            if condition.name in ("robot clearance", "object contact"):
+            if condition.name in ("robot clearance", "object contact", "object clearance"):
                 assert found.min() == pytest.approx(expected.min(), abs=1e-9)
                 assert np.all(found <= expected + 1e-9)
             else:

@@ -22,6 +22,7 @@ from cnpgen.judges.plans.measure import EvaluationContext, MeasuredCondition
 from cnpgen.judges.plans.verdict import Margin
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.constraints.constraint import Constraint
+from cnpgen.problems.constraints.object_clearance import ObjectClearance
 from cnpgen.problems.constraints.self_clearance import SelfClearance
 from cnpgen.world.pair_distances import PairDistances
 from cnpgen.world.path import PathWorld
@@ -36,7 +37,7 @@ MINIMUM_LEVELS = 2  # of subdivision around the smallest margin, even if it cann
 
 def is_contact(constraint: Constraint) -> bool:
     """Return whether a constraint is about distances of bodies, which have kinks where the closest features change."""
-    return isinstance(constraint, ObjectContact | RobotClearance | SelfClearance)
+    return isinstance(constraint, ObjectClearance | ObjectContact | RobotClearance | SelfClearance)
 
 
 @dataclass(frozen=True)
@@ -115,7 +116,7 @@ def _intervals(
     deviations = chord_deviation_bounds(context.curve, s.ravel(), motion_bounds)
     results = []
     for contact in contacts:
-        min_distances = contact.condition.lower - contact.tolerance + contact.uncertainty
+        min_distances = contact.condition.lower - contact.tolerance + np.ravel(contact.uncertainty)  # one, or of each
         margin = (contact.g - min_distances[:, None]).min(axis=0).reshape(s.shape)
         proven = np.full(s.size, np.nan)
         if margin.min() >= 0:
@@ -132,6 +133,8 @@ def pairs_of(world: PathWorld, constraint: Constraint) -> PairDistances:
         return world.object_pairs()
     if isinstance(constraint, SelfClearance):
         return world.self_pairs()
+    if isinstance(constraint, ObjectClearance):
+        return world.held_object_pairs()
     return world.segment_pairs() if world.robot.shape is None else world.shape_pairs()
 
 

@@ -37,6 +37,7 @@ from cnpgen.judges.plans.sampling import (
     times,
 )
 from cnpgen.judges.plans.scipy_splines import is_positive
+from cnpgen.judges.plans.tracking_tube import TrackingError, TrackingTube
 from cnpgen.judges.plans.verdict import Margin, Metrics, PaperRule, Reason, Verdict
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
@@ -61,6 +62,7 @@ def judge(  # noqa: PLR0917 - all of them are needed to interpret a plan
     goal_xyz: Array,
     *,
     step: float = 1e-3,
+    tracking_error: TrackingError | None = None,
 ) -> list[Verdict]:
     """Judge N plans independently of each other.
 
@@ -79,11 +81,13 @@ def judge(  # noqa: PLR0917 - all of them are needed to interpret a plan
         scene: Obstacles of the N plans.
         goal_xyz: Tip positions at the goal [m], shape (N, 3).
         step: Time step [s].
+        tracking_error: Largest tracking error of the joints [rad], one number or shape (n,): position constraints must
+            hold for every state within it (``tracking_tube``). None for exact tracking.
 
     Raises:
-        UsageError: Shapes do not match, or the step is not positive or too long.
+        UsageError: Shapes do not match, the step is not positive or too long, or a tracking error is negative.
     """
-    return Judge(problem, robot, step=step)(motion, boundary, scene, goal_xyz)
+    return Judge(problem, robot, step=step, tracking_error=tracking_error)(motion, boundary, scene, goal_xyz)
 
 
 class Judge:
@@ -93,16 +97,22 @@ class Judge:
         problem: The problem.
         robot: Its robot.
         step: Time step of verdicts without early exit [s].
+        tracking_error: Largest tracking error of the joints, see ``judge``.
 
     Raises:
-        UsageError: The step is not positive, or above ``MAX_STEP_S``.
+        UsageError: The step is not positive, or above ``MAX_STEP_S``; or a tracking error is negative.
     """
 
-    def __init__(self, problem: Problem, robot: Robot, *, step: float = 1e-3) -> None:
+    def __init__(
+        self, problem: Problem, robot: Robot, *, step: float = 1e-3, tracking_error: TrackingError | None = None
+    ) -> None:
         check_step(step)
         self._problem, self._robot, self._step = problem, robot, step
         self._world = PathWorld(robot, problem.obstacle, problem.object_size)
         self._limits = joint_limits(problem, self._world)
+        self._tube = None if tracking_error is None else TrackingTube(problem, robot, tracking_error)
+        if self._tube is not None:
+            self._limits = self._tube.tighten(self._limits)
 
     def __call__(
         self, motion: Motion, boundary: Boundary, scene: Scene, goal_xyz: Array, *, early_exit: bool = False
@@ -114,7 +124,10 @@ class Judge:
         """
         plans = self._plans(motion, boundary, scene, goal_xyz)
         with np.errstate(all="ignore"):  # overflows give inf or nan, which are detected
-            return [_judge_plan(plan, self._world, self._limits, self._step, early_exit=early_exit) for plan in plans]
+            return [
+                _judge_plan(plan, self._world, self._limits, self._step, early_exit=early_exit, tube=self._tube)
+                for plan in plans
+            ]
 
     def refutes(self, motion: Motion, boundary: Boundary, scene: Scene, goal_xyz: Array) -> list[bool]:
         """Return for N plans whether a few samples prove that they are invalid; False proves nothing."""
@@ -206,7 +219,15 @@ def _check_shapes(robot: Robot, motion: Motion, boundary: Boundary, scene: Scene
             )
 
 
-def _judge_plan(plan: _Plan, world: PathWorld, limits: ProvenJointLimits, step: float, *, early_exit: bool) -> Verdict:
+def _judge_plan(
+    plan: _Plan,
+    world: PathWorld,
+    limits: ProvenJointLimits,
+    step: float,
+    *,
+    early_exit: bool,
+    tube: TrackingTube | None,
+) -> Verdict:
     """Judge one plan."""
     if reason := _invalid_reason(plan):
         return Verdict(reason)
@@ -225,6 +246,7 @@ def _judge_plan(plan: _Plan, world: PathWorld, limits: ProvenJointLimits, step: 
         paper = paper_rule(plan.problem, world, plan.obstacle_poses, plan.goal_xyz)
     curve = SplineCurve(plan.motion)
     context = evaluation_context(plan.problem, curve, plan.obstacle_poses, world, samples, table)
+    context = context if tube is None else tube.widen(context)
     motion = polynomials(plan.motion, jerk=plan.problem.uses_jerk)
     margins = [*ends, *_margins(context, motion, limits, early_exit=early_exit)]
     return Verdict(reason_of(margins), by_name(margins), metrics, paper, len(samples.s))

@@ -84,7 +84,7 @@ class MeasuredCondition:
         g: Values [unit of the condition], shape (m, K).
         relaxation: Distance by which the bounds are relaxed [unit of the condition], shape (K,).
         tolerance: Accepted violation, shape (m,).
-        uncertainty: Largest error of the values, shape (m, K), or one for all; 0 for a known motion.
+        uncertainty: Largest error of the values, shape (m, K), (m, 1) or one for all; 0 for a known motion.
     """
 
     constraint: Constraint

@@ -274,6 +274,12 @@ class SymbolicCylinder(SymbolicSolid):
         return best
 
 
+def held_cuboid(state: SymbolicState) -> SymbolicBox:
+    """Return the held object as a box with a pose."""
+    half = [edge / 2 for edge in state.object_size or (0.0, 0.0, 0.0)]
+    return SymbolicBox([0.0] * 3, half, state.kinematics.tip, state.kinematics.rotation)
+
+
 def symbolic_solids(state: SymbolicState) -> list[SymbolicSolid]:
     """Return the shapes of the obstacles around a robot."""
     slices = number_slices(state.obstacles)

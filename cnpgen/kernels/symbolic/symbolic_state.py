@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from cnpgen.robots.obstacle import Obstacle
     from cnpgen.robots.robot import Robot
     from cnpgen.robots.shape.capsule import Capsule
+    from cnpgen.robots.shape.shape import Shape
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,14 @@ class SymbolicState:
     @cached_property
     def capsules(self) -> dict[str, tuple[Vec, Vec, float]]:
         """Link -> ends [m] and radius [m] of its capsule; empty for a robot without link geometry."""
-        shape = self.robot.shape
+        return self._placed_capsules(self.robot.shape)
+
+    @cached_property
+    def held_capsules(self) -> dict[str, tuple[Vec, Vec, float]]:
+        """Link -> ends [m] and radius [m] of its capsule, for links that may not touch the held object."""
+        return self._placed_capsules(self.robot.held_shape)
+
+    def _placed_capsules(self, shape: "Shape | None") -> dict[str, tuple[Vec, Vec, float]]:
         if shape is None:
             return {}
         return {capsule.link: self._placed(capsule, shape.joints[capsule.link]) for capsule in shape.capsules}

@@ -38,7 +38,7 @@ def narrow_phase_of(context: Context, end: End, *, exact: bool = True) -> Decide
         states to check, shape (N,). It returns a mask of the violated constraints, shape (constraints, N).
     """
     problem, robot = context.problem, context.robot
-    if robot.shape is None and all(obstacle.upright for obstacle in problem.obstacle):
+    if robot.shape is None and robot.held_shape is None and all(obstacle.upright for obstacle in problem.obstacle):
         return None
     kernel = context.kernels.load(narrow_phase, end=end, dtype=context.dtype)
     world = World(robot, problem.obstacle, problem.object_size)
@@ -49,7 +49,10 @@ def narrow_phase_of(context: Context, end: End, *, exact: bool = True) -> Decide
     ) -> NDArray[np.bool_]:
         (unmet_counts,) = kernel(*state, obstacle_poses)
         remaining, violated = (unmet_counts > 0) & mask, np.zeros(unmet_counts.shape, bool)
-        for row in np.flatnonzero(remaining.any(axis=1)) if np.all(obstacle_poses == obstacle_poses[:, :1]) else ():
+        one_scene = bool(np.all(obstacle_poses == obstacle_poses[:, :1]))
+        for row in np.flatnonzero(remaining.any(axis=1)):
+            if problem.constraint[row].uses_obstacles and not one_scene:
+                continue
             candidates = np.flatnonzero(remaining[row])
             tolerance = _tolerance(problem.constraint[row], context.dtype, exact=exact)
             q, dq, ddq = (np.ascontiguousarray(values[:, candidates], float) for values in state)

@@ -105,6 +105,7 @@ class Constraint(ABC):
         training_factor: Factor of the limits during training, in (0, 1].
         training_inset: Distance by which other bounds are moved inwards during training [unit of the condition].
         has_solver_margin: Whether ``solved`` has a margin for states between grid points; otherwise solvers add one.
+        uses_obstacles: Whether ``measured`` depends on obstacles; otherwise ``met`` checks states of different scenes.
         scene_width: Number of values that it needs for each motion, see ``scene_values``.
         tolerance: Maximum violation of a valid motion.
         budget: Acceptable violation in training.
@@ -118,6 +119,7 @@ class Constraint(ABC):
     training_factor: ClassVar[float] = 1.0
     training_inset: ClassVar[float] = 0.0
     has_solver_margin: ClassVar[bool] = False
+    uses_obstacles: ClassVar[bool] = True
     scene_width: ClassVar[int] = 0
 
     tolerance: float

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.constraints.needs import measured_needs
+from cnpgen.problems.constraints.object_clearance import ObjectClearance
 from cnpgen.problems.constraints.self_clearance import SelfClearance
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.solver.residuals import DISTANCE_SCALE_M, residual_scale
@@ -124,6 +125,7 @@ class BoundsTemplate:
         orders: Highest derivative of q on which each residual depends, shape (m,).
         equal: Mask of equalities, shape (m,).
         capsules: Mask of clearances of capsules, those of the links or the paper's, shape (m,).
+        held_clearances: Mask of clearances of the held object from the links, shape (m,).
     """
 
     def __init__(self, problem: Problem, world: "World", s: Array, tightening: Tightening) -> None:
@@ -145,6 +147,8 @@ class BoundsTemplate:
         self.orders = np.repeat(orders, widths)
         clearances = [isinstance(constraint, RobotClearance | SelfClearance) for constraint, _ in pairs]
         self.capsules = np.repeat(clearances, widths)
+        held = [isinstance(constraint, ObjectClearance) for constraint, _ in pairs]
+        self.held_clearances = np.repeat(held, widths)
         self.equal = np.repeat([condition.is_equality for condition in self.conditions], widths)
         with np.errstate(invalid="ignore"):
             interval_tolerance = np.where(self.equal, PRECISE_FRACTION, 1.0) * self.tolerances + np.fmax(

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -72,38 +72,58 @@ def load_shape(urdf: str, model: "pin.Model", keep: Path | None) -> Shape:
     Raises:
         RecipeError: The URDF has no collision geometry, or some that cannot be read.
     """
-    convex_parts, joints = _placed(link_convex_parts(urdf), model)
+    convex_parts, joints = place_convex_parts(link_convex_parts(urdf), model)
     if not any(joints.values()):
         raise RecipeError(["no link that moves has a <collision> element, so that the robot has no shape"])
+
+    def compute() -> tuple[tuple[Capsule, ...], tuple[LinkPair, ...]]:
+        capsules = tuple(covering_capsule(parts_of(link, convex_parts)) for link in joints)
+        by_link = {capsule.link: capsule for capsule in capsules}
+        adjacent, disabled = _adjacent(urdf, set(joints)), disabled_pairs(urdf)
+        return capsules, find_pairs(model, convex_parts, by_link, joints=joints, adjacent=adjacent, disabled=disabled)
+
     numbers = [SHAPE_REVISION, urdf, list(model.names), list(model.lowerPositionLimit), list(model.upperPositionLimit)]
+    return Shape(convex_parts, joints, *cached_capsules(keep, numbers, convex_parts, compute))
+
+
+def cached_capsules(
+    keep: Path | None,
+    numbers: list[Any],
+    convex_parts: tuple[ConvexPart, ...],
+    compute: Callable[[], tuple[tuple[Capsule, ...], tuple[LinkPair, ...]]],
+) -> tuple[tuple[Capsule, ...], tuple[LinkPair, ...]]:
+    """Return capsules and link pairs from the cache, or compute and store them.
+
+    Args:
+        keep: Cache folder; None for no cache.
+        numbers: JSON values that determine the result.
+        convex_parts: Convex parts that the capsules must cover.
+        compute: Function that computes them.
+    """
     name = f"shape-{hashlib.sha256(json.dumps(numbers).encode()).hexdigest()[:32]}.json"
     if keep is not None:
         with suppress(OSError, ValueError, KeyError, TypeError):
-            return Shape(
-                convex_parts, joints, *_read(json.loads((keep / name).read_text(encoding="utf-8")), convex_parts)
-            )
-    capsules = tuple(covering_capsule(_of(link, convex_parts)) for link in joints)
-    by_link = {capsule.link: capsule for capsule in capsules}
-    pairs = find_pairs(
-        model,
-        convex_parts,
-        by_link,
-        joints=joints,
-        adjacent=_adjacent(urdf, set(joints)),
-        disabled=disabled_pairs(urdf),
-    )
+            return _read(json.loads((keep / name).read_text(encoding="utf-8")), convex_parts)
+    capsules, pairs = compute()
     if keep is not None:
         with suppress(MachineError):
             write_file(keep / name, json.dumps(_written(capsules, pairs)))
-    return Shape(convex_parts, joints, capsules, pairs)
+    return capsules, pairs
 
 
-def _of(link: str, convex_parts: tuple[ConvexPart, ...]) -> list[ConvexPart]:
+def parts_of(link: str, convex_parts: tuple[ConvexPart, ...]) -> list[ConvexPart]:
+    """Return the convex parts of a link."""
     return [part for part in convex_parts if part.link == link]
 
 
-def _placed(convex_parts: list[ConvexPart], model: "pin.Model") -> tuple[tuple[ConvexPart, ...], dict[str, int]]:
-    """Transform convex parts from the frames of their links to those of the joints that move them."""
+def place_convex_parts(
+    convex_parts: list[ConvexPart], model: "pin.Model"
+) -> tuple[tuple[ConvexPart, ...], dict[str, int]]:
+    """Transform convex parts from the frames of their links to those of the joints that move them.
+
+    Returns:
+        The convex parts, and link -> index of the joint that moves it; 0 for fixed links.
+    """
     placed, joints = [], {}
     for part in convex_parts:
         frame = model.frames[frame_of(model, part.link)]
@@ -142,6 +162,6 @@ def _read(
         Capsule(**each | {"first": np.array(each["first"]), "second": np.array(each["second"])})
         for each in content["capsules"]
     )
-    if not all(covers(capsule, _of(capsule.link, convex_parts)) for capsule in capsules):
+    if not all(covers(capsule, parts_of(capsule.link, convex_parts)) for capsule in capsules):
         raise ValueError("a capsule does not cover its link")
     return capsules, tuple(LinkPair(**pair) for pair in content["pairs"])

@@ -15,14 +15,14 @@ import pytest
 
 from cnpgen.cli.notices import notices
 from cnpgen.errors import MachineError
-from cnpgen.kernels.cache import (
+from cnpgen.kernels.library import KernelLibrary, choose_backend
+from cnpgen.store.files.cache_folder import (
     default_cache_folder,
     make_private_folder,
     trust_problem,
     untrusted_files,
     usable_cache_folder,
 )
-from cnpgen.kernels.library import KernelLibrary, choose_backend
 from tests.conftest import needs_compiler, some
 
 posix = pytest.mark.skipif(not hasattr(os, "geteuid"), reason="files have no owners here")
@@ -31,7 +31,7 @@ BUILT: list[str] = []  # names of functions that were built
 FALLBACK = """
 import os, sys, warnings
 from pathlib import Path
-from cnpgen.kernels.cache import usable_cache_folder
+from cnpgen.store.files.cache_folder import usable_cache_folder
 warnings.simplefilter("ignore")
 folder = usable_cache_folder(Path(sys.argv[1]))
 child = os.fork()

@@ -1,0 +1,153 @@
+"""Hits of random pucks from random moving states: validity, early contact and execution.
+
+Plans of the planner are refined. Early contacts are counted by SciPy and Pinocchio along the mallet's path, independent
+of the verdict: any contact with more than 10 mm of path left. With ``--simulate N``, N refined hits are executed in
+MuJoCo on the nominal and on the heavier plant. The last table compares hits of the 81-puck grid from rest with and
+without the constraint. The seed was not used for training or tuning.
+
+    python benchmarks/puck_contact.py
+    python benchmarks/puck_contact.py --hits 300 --seed 777 --simulate 60
+"""
+
+import argparse
+import time
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from common import arguments, median, progress, report, table, verdict
+from scipy.interpolate import BSpline
+
+from cnpgen.benchmark.simulator.simulate import simulate_plans
+from cnpgen.make.draw_boundary_problems import draw_boundary_problems
+from cnpgen.planner.plan_hits import PlannedHits, plan_hits
+from cnpgen.planner.planner import Planner
+from cnpgen.plans.evaluate import evaluate_plans
+from cnpgen.plans.plans import Plans
+from cnpgen.problems.constraints.puck_contact import PuckContact
+from cnpgen.problems.problem_file import load_problem
+from cnpgen.problems.problem_record import open_problem, record_problem
+from cnpgen.refine.refine_plans import refine_plans
+
+NAME, GRID = "airhockey-replan", "airhockey-pucks"
+TARGET = np.array([2.49, 0.0])  # m, of the pucks
+PUCKS = np.array([[0.75, -0.35], [1.2, 0.35]])  # m, range of the random pucks
+LAST_M = 0.01  # path length of the mallet on which contact is legal
+PHASES = np.linspace(0, 1, 2001)
+DEPTH_TOLERANCE_M = 1e-6
+
+
+def early_depth(plans: Plans, pucks: np.ndarray) -> np.ndarray:
+    """Return the largest penetration of the puck with more than ``LAST_M`` of path left [m], negative without contact."""
+    contact = load_problem("airhockey").first(PuckContact)
+    assert contact is not None
+    _, robot = open_problem(plans.problem)
+    data, depths = robot.model.createData(), []
+    for path, puck in zip(plans.path_control_points, pucks, strict=True):
+        degree = plans.motion.degree
+        knots = np.r_[np.zeros(degree), np.linspace(0, 1, len(path) - degree + 1), np.ones(degree)]
+        tip = np.empty((len(PHASES), 2))
+        for row, q in zip(tip, BSpline(knots, path, degree)(PHASES), strict=True):
+            pin.forwardKinematics(robot.model, data, q)
+            row[:] = pin.updateFramePlacement(robot.model, data, robot.tip_frame).translation[:2]
+        steps = np.linalg.norm(np.diff(tip, axis=0), axis=1)
+        left = np.append(np.cumsum(steps[::-1])[::-1], 0.0)
+        distance = np.linalg.norm(tip - puck, axis=1)[left > LAST_M]
+        depths.append(contact.mallet_radius + contact.puck_radius - distance.min(initial=np.inf))
+    return np.array(depths)
+
+
+def moving_hits(count: int, seed: int) -> tuple[PlannedHits, np.ndarray]:
+    """Plan hits of random pucks from random moving states; return them and the pucks [m], shape (count, 2)."""
+    start = draw_boundary_problems(NAME, count, seed=seed).boundary
+    pucks = np.random.default_rng(seed).uniform(PUCKS[0], PUCKS[1], (count, 2))
+    return plan_hits(Planner(NAME), (start.start_q, start.start_dq, start.start_ddq), pucks, TARGET), pucks
+
+
+def evaluated(plans: Plans, pucks: np.ndarray) -> dict[str, Any]:
+    """Count valid plans, and early contacts among them."""
+    valid, depth = evaluate_plans(plans).valid, early_depth(plans, pucks)
+    return {
+        "plans": len(plans),
+        "valid": int(valid.sum()),
+        "early contacts of valid plans": int((depth[valid] > DEPTH_TOLERANCE_M).sum()),
+        "deepest [mm]": float(1e3 * depth[valid].max(initial=-np.inf)),
+    }
+
+
+def executed(plans: Plans, count: int) -> dict[str, str]:
+    """Execute the first valid hits on two plants; return the successes."""
+    chosen = plans[evaluate_plans(plans).valid][:count]
+    results = {}
+    for plant in ("nominal", "heavier"):
+        successes = [one.success for one in simulate_plans(chosen, plant=plant).executed]
+        results[plant] = f"{sum(successes)} of {len(successes)}"
+    return results
+
+
+def grid() -> list[dict[str, Any]]:
+    """Refine the hits of the grid of pucks from rest, with and without the constraint."""
+    plans, records = Planner("airhockey-hit").plan_batch(draw_boundary_problems(GRID, 81, seed=0).boundary), []
+    problem = load_problem("airhockey")
+    others = tuple(item for item in problem.constraint if not isinstance(item, PuckContact))
+    without = record_problem(replace(problem, constraint=others))
+    for name, record in (("with puck-contact", plans.problem), ("without", without)):
+        start = time.process_time()
+        refined = refine_plans(replace(plans, problem=record), workers=1).plans
+        seconds = time.process_time() - start
+        valid = evaluate_plans(refined).valid
+        records.append(
+            {"problem": name, "valid": int(valid.sum()), "time": median(refined.duration.tolist()), "cpu": seconds}
+        )
+    return records
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--hits", type=int, default=300)
+    parser.add_argument("--seed", type=int, default=20261)
+    parser.add_argument("--simulate", type=int, default=0, help="refined hits that are executed")
+
+
+def main() -> None:
+    chosen = arguments(__doc__, options)
+    progress("planning")
+    planned, pucks = moving_hits(chosen.hits, chosen.seed)
+    plans, pucks = planned.plans, pucks[planned.plans.sample_id]
+    progress("refining")
+    results = {"planned": evaluated(plans, pucks)}
+    refined = refine_plans(plans).plans
+    results["refined"] = evaluated(refined, pucks)
+    reasons = {reason: planned.reasons.count(reason) for reason in sorted(set(planned.reasons)) if reason}
+    simulated = executed(refined, chosen.simulate) if chosen.simulate else {}
+    progress("the grid of pucks")
+    records = grid()
+    tables = [
+        f"{len(plans)} of {chosen.hits} hits have an answer; the others: {reasons or 'none'}",
+        table(
+            "hits from moving states",
+            ("", "plans", "valid", "early contacts of valid plans", "target", "", "deepest [mm]"),
+            [
+                (
+                    name,
+                    str(row["plans"]),
+                    str(row["valid"]),
+                    str(row["early contacts of valid plans"]),
+                    *verdict(row["early contacts of valid plans"], 0, at_most=True),
+                    f"{row['deepest [mm]']:.4f}",
+                )
+                for name, row in results.items()
+            ],
+        ),
+        *([table("executed hits that succeed", ("plant", ""), list(simulated.items()))] if simulated else []),
+        table(
+            "81 pucks from rest, refined",
+            ("problem", "valid", "time to hit [s]", "CPU time [s]"),
+            [(row["problem"], str(row["valid"]), f"{row['time']:.5f}", f"{row['cpu']:.2f}") for row in records],
+        ),
+    ]
+    report({"moving": results, "reasons": reasons, "executed": simulated, "grid": records}, tables, as_json=chosen.json)
+
+
+if __name__ == "__main__":
+    main()

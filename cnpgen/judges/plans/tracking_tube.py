@@ -1,0 +1,111 @@
+"""Tube of states around a plan, which a robot with a bounded tracking error may reach.
+
+The constraints on positions must hold for every state of the tube: limits of joint positions, clearances and the
+manifold. Velocities, accelerations, jerks and torques are judged on the plan itself. Limits of joints are exact.
+Distances change by at most the displacement of the robot's points, which motion bounds give (Schwarzer et al. 2005).
+Other conditions are measured again with every joint moved to both sides, one by one and in random combinations. The sum
+of the changes, times a factor for curvature, bounds their change.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import UsageError
+from cnpgen.judges.plans.continuous_collision import is_contact
+from cnpgen.judges.plans.joint_limits import ProvenJointLimits
+from cnpgen.judges.plans.measure import EvaluationContext, MeasuredCondition, measure
+from cnpgen.problems.constraints.clearance import ObjectContact
+from cnpgen.problems.constraints.constraint import Constraint
+from cnpgen.problems.constraints.joint import JointPosition
+from cnpgen.problems.constraints.needs import measured_needs
+from cnpgen.problems.problem import Problem
+from cnpgen.robots.robot import Robot
+from cnpgen.world.path import PathWorld
+from cnpgen.world.world import World
+
+Array = NDArray[np.float64]
+TrackingError = float | Sequence[float] | Array  # of every joint [rad], or one for all
+
+TUBE_CURVATURE_FACTOR = 1.5  # on the sum of changes
+TUBE_COMBINATIONS = 8  # random ones of all changes
+
+
+class TrackingTube:
+    """States within a tracking error of a plan.
+
+    Args:
+        problem: The problem.
+        robot: Its robot.
+        error: Largest tracking error of every joint [rad], shape (n,), or one for all.
+
+    Raises:
+        UsageError: The error is negative, not finite, or has a wrong shape.
+    """
+
+    def __init__(self, problem: Problem, robot: Robot, error: TrackingError) -> None:
+        values = np.asarray(error, float)
+        if values.shape not in ((), (robot.n,)) or not (np.isfinite(values).all() and (values >= 0).all()):
+            expected = f"one number [rad], or {robot.n}, one per joint, none below 0"
+            raise UsageError(f"must be {expected}, got {error!r}", argument="tracking_error")
+        self._problem, self._error = problem, np.broadcast_to(values, robot.n).copy()
+        self._world = PathWorld(robot, problem.obstacle, problem.object_size)
+        world = World(robot, problem.obstacle, problem.object_size)
+        self._position_conditions = {
+            (id(constraint), condition.name)
+            for constraint in problem.constraint
+            for condition, order in zip(constraint.judged(world), _orders(constraint, problem, world), strict=True)
+            if order == 0
+        }
+
+    def tighten(self, limits: ProvenJointLimits) -> ProvenJointLimits:
+        """Return joint limits whose position limits are moved inwards by the tracking error."""
+        inwards = np.concatenate([self._error, -self._error])
+        rows = [isinstance(constraint, JointPosition) for constraint in limits.constraints]
+        return replace(limits, bounds=limits.bounds + np.outer(rows, inwards))
+
+    def widen(self, context: EvaluationContext) -> EvaluationContext:
+        """Return the conditions of a plan with their largest change in the tube, at samples and between them."""
+        reach = context.world.motion_bounds(context.curve.max_positions() + self._error)
+        displacement = float(self._error @ reach)
+
+        def add(condition: MeasuredCondition, s: Array) -> MeasuredCondition:
+            if is_contact(condition.constraint):
+                return replace(condition, uncertainty=self._contact_error(condition, displacement))
+            if (id(condition.constraint), condition.condition.name) not in self._position_conditions:
+                return condition
+            return replace(condition, uncertainty=self._largest_change(context, condition, s))
+
+        measured = [add(condition, context.samples.s) for condition in context.measured]
+        return replace(context, measured=measured, with_uncertainty=add)
+
+    def _contact_error(self, condition: MeasuredCondition, displacement: float) -> "float | Array":
+        """Return the change of distances [m]; contact of the object with what it stands on is intended."""
+        if not isinstance(condition.constraint, ObjectContact):
+            return displacement
+        return np.array([[0.0 if obstacle.below else displacement] for obstacle in self._problem.obstacle])
+
+    def _largest_change(self, context: EvaluationContext, condition: MeasuredCondition, s: Array) -> Array:
+        """Return the largest change of the values of a smooth condition in the tube at phases s, shape (m, K)."""
+        states = context.curve.evaluate(s, jerk=self._problem.uses_jerk)
+
+        def values(offset: Array) -> Array:
+            self._world.set_path(states.q + offset[:, None], states.dq, states.ddq, context.obstacle_poses, states.jerk)
+            conditions = measure(condition.constraint, self._world, s, context.start_tip)
+            return next(each.g for each in conditions if each.condition.name == condition.condition.name)
+
+        nominal = values(np.zeros_like(self._error))
+        total = np.zeros_like(nominal)
+        for offset in np.diag(self._error):
+            total += np.max([np.abs(values(sign * offset) - nominal) for sign in (-1, 1)], axis=0)
+        random = np.random.default_rng(0)
+        for signs in random.choice([-1.0, 1.0], (TUBE_COMBINATIONS, len(self._error))):
+            np.maximum(total, np.abs(values(signs * self._error) - nominal), out=total)
+        return np.asarray(TUBE_CURVATURE_FACTOR * total)
+
+
+def _orders(constraint: Constraint, problem: Problem, world: World) -> list[int]:
+    """Return the derivative orders of the judged conditions of a constraint."""
+    return measured_needs([constraint.judged], world, jerk=problem.uses_jerk)

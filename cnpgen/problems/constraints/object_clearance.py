@@ -1,0 +1,81 @@
+"""Clearance constraint between the held object and the robot's links."""
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.problems.constraints.clearance import MAX_LINK_PENETRATION_M
+from cnpgen.problems.constraints.constraint import Condition, Constraint
+from cnpgen.schema.keys import field
+
+if TYPE_CHECKING:
+    from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
+    from cnpgen.robots.robot import Robot
+    from cnpgen.robots.shape.capsule import Capsule
+    from cnpgen.world.path import PathWorld
+    from cnpgen.world.world import World
+MAX_HELD_CAPSULE_ERROR_FRACTION = 0.1  # of the free states, in which the capsule of a usable link overlaps the object
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObjectClearance(Constraint):
+    """Constraint: the held object is further than ``distance`` from the links that may not touch it.
+
+    It requires the geometry of the URDF. ``touch_links`` in [object] may touch the object. Links that the joint of the
+    tip moves do not move relative to the object and are not checked. Judges measure the convex parts of the links.
+    Solvers use the capsules of links whose capsules hardly ever overlap the object unless the links do.
+    """
+
+    reason = "object in collision with the robot"
+    uses_obstacles = False
+    training_weight = 3000.0
+    distance: float = field("minimum distance of the object from the links", unit="m", low=0.0, default=0.0)
+    tolerance: float = field("violation that a valid motion may have", unit="m", low=0.0, default=0.0)
+
+    @property
+    def effective_tolerance(self) -> float:
+        """Tolerance up to a penetration of ``MAX_LINK_PENETRATION_M``."""
+        return min(self.tolerance, self.distance + MAX_LINK_PENETRATION_M)
+
+    def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
+        """State the distances of the capsules' axes from the object [m]."""
+        from cnpgen.kernels.symbolic.obstacle_distances import held_cuboid
+
+        cuboid, capsules = held_cuboid(state), _solver_capsules(state.robot)
+        axes = [state.held_capsules[capsule.link] for capsule in capsules]
+        distances = [cuboid.separation(first, second, state.freeze) for first, second, _ in axes]
+        return self._clear(distances, capsules)
+
+    def measured(self, world: "World") -> tuple[Condition, ...]:
+        """Measure the signed distances of the convex parts with Coal [m]."""
+        distances, shape = world.held_object_distances(self.distance), world.robot.held_shape
+        links = [part.link for part in shape.convex_parts] if shape else []
+        pairs = shape.checked_pairs if shape else ()
+        lower, upper = np.full(len(distances), self.distance), np.full(len(distances), np.inf)
+        parts = tuple(f"{links[first]}, {links[second]}" for first, second in pairs)
+        return (Condition("object clearance", "m", distances, lower, upper, "position", parts=parts),)
+
+    def met(self, path: "PathWorld", tolerance: float) -> NDArray[np.bool_]:
+        """Return a mask of the states with sufficient distances between the object and the links."""
+        return path.clear_of_held_object(self.distance - tolerance)
+
+    def solved(self, world: "World") -> tuple[Condition, ...]:
+        """Return the conditions of the capsules."""
+        capsules = _solver_capsules(world.robot)
+        (condition,) = self._clear([0.0] * len(capsules), capsules)
+        return (replace(condition, parts=tuple(capsule.link for capsule in capsules)),)
+
+    def _clear(self, distances: list[Any], capsules: "list[Capsule]") -> tuple[Condition, ...]:
+        lower = np.array([capsule.radius + self.distance for capsule in capsules])
+        upper = np.full(len(capsules), np.inf)
+        return (Condition("object clearance", "m", distances, lower, upper, "position", sufficient=True),)
+
+
+def _solver_capsules(robot: "Robot") -> "list[Capsule]":
+    """List the capsules of the links that solvers keep away from the object."""
+    shape = robot.held_shape
+    near = [pair for pair in shape.pairs if pair.colliding > 0] if shape else []
+    links = {pair.first for pair in near if pair.mistaken <= MAX_HELD_CAPSULE_ERROR_FRACTION}
+    return [capsule for capsule in shape.capsules if capsule.link in links] if shape else []

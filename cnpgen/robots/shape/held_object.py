@@ -1,0 +1,113 @@
+"""Link geometry of a robot together with the held object, for collisions between the two."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from cnpgen.errors import RecipeError, nearest
+from cnpgen.robots.shape.capsule import Capsule, covering_capsule
+from cnpgen.robots.shape.convex_part import ConvexPart, link_convex_parts
+from cnpgen.robots.shape.hull import CUBE, ball_round, coal_hull
+from cnpgen.robots.shape.link_pairs import (
+    ALWAYS_FRACTION,
+    CollisionBody,
+    LinkContact,
+    LinkPair,
+    body_of_part,
+    sample_poses,
+)
+from cnpgen.robots.shape.shape import SHAPE_REVISION, Shape, cached_capsules, parts_of, place_convex_parts
+
+if TYPE_CHECKING:
+    import pinocchio as pin
+
+HELD_OBJECT = "held object"  # takes the place of a link's name
+SAMPLED_HELD_STATES = 2000  # states in which the object and the links are compared
+
+
+@dataclass(frozen=True)
+class HeldBody:
+    """The held cuboid, with its center at the tip frame.
+
+    Attributes:
+        size: Edge lengths along the axes of the tip frame [m].
+        touch_links: Links that may touch it, such as a gripper.
+        tip_frame: Index of the tip frame in the model.
+    """
+
+    size: tuple[float, float, float]
+    touch_links: tuple[str, ...]
+    tip_frame: int
+
+
+def load_held_shape(urdf: str, model: "pin.Model", held: HeldBody, keep: Path | None) -> Shape:
+    """Load the link geometry for collisions with the held object.
+
+    Args:
+        urdf: Text of the URDF with inline meshes (``cnpgen.robots.shape.inline``).
+        model: Pinocchio model, reduced to the planned joints.
+        held: The held object.
+        keep: Cache folder of capsules and pairs; None for no cache.
+
+    Returns:
+        The convex parts of all links that may not touch the object, then the object; a capsule and a pair for each of
+        these links. Links that the joint of the tip moves do not move relative to the object and are omitted.
+
+    Raises:
+        RecipeError: The URDF has no such links or no collision geometry, or a link always overlaps the object.
+    """
+    convex_parts, joints = place_convex_parts(link_convex_parts(urdf), model)
+    if not joints:
+        raise RecipeError(
+            ["no link has a <collision> element, so that contacts with the held object cannot be checked"]
+        )
+    for link in held.touch_links:
+        if link not in joints:
+            raise RecipeError([f"object.touch_links: no link {link!r} has collision geometry{nearest(link, joints)}"])
+    tip = model.frames[held.tip_frame]
+    carrier = int(tip.parentJoint)
+    checked = [link for link in joints if link not in held.touch_links and joints[link] != carrier]
+    box = ConvexPart(HELD_OBJECT, CUBE * np.array(held.size))
+    box = box.moved(np.array(tip.placement.rotation), np.array(tip.placement.translation))
+    parts = (*(part for part in convex_parts if part.link in checked), box)
+    joints = {link: joints[link] for link in checked} | {HELD_OBJECT: carrier}
+
+    def compute() -> tuple[tuple[Capsule, ...], tuple[LinkPair, ...]]:
+        capsules = tuple(covering_capsule(parts_of(link, parts)) for link in checked)
+        return capsules, _compare(model, parts, capsules, joints)
+
+    numbers = [SHAPE_REVISION, urdf, list(model.names), list(model.lowerPositionLimit), list(model.upperPositionLimit)]
+    numbers += [HELD_OBJECT, list(held.size), list(held.touch_links), tip.placement.homogeneous.tolist()]
+    capsules, pairs = cached_capsules(keep, numbers, parts, compute)
+    if fixed := [pair.first for pair in pairs if pair.colliding > ALWAYS_FRACTION]:
+        text = f"the held object overlaps {', '.join(fixed)} in nearly all of {SAMPLED_HELD_STATES:,} random states"
+        raise RecipeError([f"object.touch_links: {text}: name the links that may touch it"])
+    return Shape(parts, joints, capsules, pairs)
+
+
+def _compare(
+    model: "pin.Model", parts: tuple[ConvexPart, ...], capsules: tuple[Capsule, ...], joints: dict[str, int]
+) -> tuple[LinkPair, ...]:
+    """Compare the object with all links and their capsules in random states."""
+    bodies = [*map(body_of_part, parts), *(_body_of_capsule(capsule) for capsule in capsules)]
+    all_joints = joints | {_capsule_name(capsule.link): joints[capsule.link] for capsule in capsules}
+    contact, pairs = LinkContact(sample_poses(model, SAMPLED_HELD_STATES), bodies, all_joints), []
+    for capsule in capsules:
+        overlap = contact.of(capsule.link, HELD_OBJECT)
+        near = contact.of(_capsule_name(capsule.link), HELD_OBJECT)
+        mistaken = float(near[~overlap].mean()) if not overlap.all() else 1.0
+        pairs.append(LinkPair(capsule.link, HELD_OBJECT, "", float(overlap.mean()), mistaken))
+    return tuple(pairs)
+
+
+def _capsule_name(link: str) -> str:
+    return f"capsule of {link}"
+
+
+def _body_of_capsule(capsule: Capsule) -> tuple[str, CollisionBody]:
+    ends = np.array([capsule.first, capsule.second])
+    hull = coal_hull(ends)
+    hull.setSweptSphereRadius(capsule.radius)
+    return _capsule_name(capsule.link), CollisionBody(*ball_round(ends, capsule.radius), hull)
