@@ -39,7 +39,7 @@ DEPTH_TOLERANCE_M = 1e-6
 
 
 def early_depth(plans: Plans, pucks: np.ndarray) -> np.ndarray:
-    """Return the largest penetration of the puck with more than ``LAST_M`` of path left [m], negative without contact."""
+    """Return the largest penetration of the puck [m] with more than ``LAST_M`` of path left; negative without one."""
     contact = load_problem("airhockey").first(PuckContact)
     assert contact is not None
     _, robot = open_problem(plans.problem)
