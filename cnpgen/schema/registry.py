@@ -69,8 +69,9 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "puck-contact": "cnpgen.problems.constraints.puck_contact:PuckContact",
     },
     PLANNERS: {
-        "cnp-b": "cnpgen.benchmark.planners.learned:CNPB",
-        "cnp-b+refine": "cnpgen.benchmark.planners.learned:RefinedCNPB",
+        "cnpgen": "cnpgen.benchmark.planners.learned:ShippedNetwork",
+        "cnpgen+refine": "cnpgen.benchmark.planners.learned:RefinedNetwork",
+        "cnp-b-paper": "cnpgen.benchmark.planners.learned:PaperNetwork",
         "solve": "cnpgen.benchmark.planners.solve:Solve",
         "trajopt": "cnpgen.benchmark.planners.trajopt:TrajOpt",
         "aqp": "cnpgen.benchmark.planners.aqp:AQP",
@@ -86,6 +87,8 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "joint-trajectory": "cnpgen.plans.formats:JointTrajectory",
     },
 }
+
+RENAMED: dict[str, dict[str, str]] = {PLANNERS: {"cnp-b": "cnpgen", "cnp-b+refine": "cnpgen+refine"}}  # old -> new
 
 
 def names(group: str) -> tuple[str, ...]:
@@ -115,13 +118,19 @@ def load(group: str, name: str) -> type[Any]:
     noun = noun_of(group)
     if not sources:
         known = names(group)
-        hint = nearest(name, known)
+        hint = name_hint(group, name)
         known_names = f"known: {', '.join(known)}, and those of packages with the entry point group {group!r}"
         raise RecipeError([f"unknown {noun} {name!r}{hint}; {known_names}"])
     if len(sources) > 1:
         raise RecipeError([f"{noun} {name!r} is defined more than once: by {' and by '.join(sources)}"])
     source, importer = next(iter(sources.items()))
     return _imported(importer, f"{noun} {name!r} of {source}", base=contract(group))
+
+
+def name_hint(group: str, name: str) -> str:
+    """Return the new name of a renamed kind, or the most similar name, in parentheses; empty if there is none."""
+    renamed = RENAMED.get(group, {}).get(name)
+    return nearest(name, names(group)) if renamed is None else f" (its name is now {renamed!r})"
 
 
 def contract(group: str) -> type[Any]:
