@@ -152,6 +152,30 @@ class ProblemRecord(StoredProblem):
         return found
 
 
+def with_control_points(record: ProblemRecord, path: int | None, rate: int | None) -> ProblemRecord:
+    """Return the record of a problem with other numbers of control points.
+
+    Args:
+        record: The record.
+        path: Number of control points of p(s); None for that of the problem.
+        rate: Number of control points of r(s); None for that of the problem.
+
+    Raises:
+        UsageError: A number does not suit the degree.
+    """
+    counts = {"path_control_points": path, "rate_control_points": rate}
+    changed = {key: count for key, count in counts.items() if count not in {None, record.content["trajectory"][key]}}
+    if not changed:
+        return record
+    content = {**record.content, "trajectory": {**record.content["trajectory"], **changed}}
+    found = ProblemRecord(json.dumps(content, ensure_ascii=False, allow_nan=False), record.urdf)
+    try:
+        found.trajectory  # noqa: B018 - checks the numbers
+    except RecipeError as error:
+        raise UsageError(f"{', '.join(changed)}: {error}", concerns=next(iter(changed))) from error
+    return found
+
+
 def record_problem(problem: Problem) -> ProblemRecord:
     """Return the record of a problem and its URDF."""
     recipe = json.dumps(plain(resolved(problem)), ensure_ascii=False, allow_nan=False)
