@@ -75,6 +75,7 @@ _OPTIONS: dict[str, _Setting] = {
     ),
     "nodes": _Setting(values.positive, "K", "quadrature nodes of the loss (default: 32)"),
     "shifts": _Setting(values.positive, "N", "shifted sets of these nodes, used in turn (default: 16)"),
+    "precision": _Setting(str, None, "precision of the loss (default: float32)", ("float32", "float64")),
     "batch_size": _Setting(values.positive, "B", "rows per step, or all there are (default: 64)"),
     "learning_rate": _Setting(_real, "X", "largest learning rate of Adam (default: 1e-3)"),
     "final_rate": _Setting(_real, "X", "last learning rate as a fraction of the largest one (default: 0.01)"),

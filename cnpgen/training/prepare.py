@@ -174,7 +174,14 @@ def _loss(loaded: LoadedProblem, settings: TrainingSettings) -> PlanLoss:
     backend = loaded.kernels.backend
     usual = suggested_margins(loaded.problem) if settings.usual_margins else Margins()
     margins = replace(usual, factors={**usual.factors, **settings.margins})
-    loss = PlanLoss(loaded.problem, nodes=settings.nodes, form=settings.form, backend=backend, margins=margins)
+    loss = PlanLoss(
+        loaded.problem,
+        nodes=settings.nodes,
+        form=settings.form,
+        backend=backend,
+        margins=margins,
+        dtype=settings.precision,
+    )
     loss.load_kernels()  # outside the timed steps
     return loss
 

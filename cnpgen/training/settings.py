@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 from cnpgen.errors import UsageError
 from cnpgen.losses.metric_settings import BOUNDED, PUBLISHED, MetricSettings
@@ -37,6 +37,7 @@ CHOICES: dict[str, tuple[str, ...]] = {
     "loss_form": ("", *FORMS),
     "constraint_terms": ("all", "budgeted"),
     "keep": ("best", "last"),
+    "precision": ("float32", "float64"),
 }
 
 
@@ -78,6 +79,7 @@ class TrainingSettings:
         path_control_points: Number of path control points; None for that of the problem.
         rate_control_points: Number of rate control points; None for that of the problem.
         keep: Model that is kept: the "best" of all validations, or the "last" one.
+        precision: Precision of the loss and its gradient; the network has float32.
         validations: Number of validations, evenly distributed over the run.
     """
 
@@ -112,6 +114,7 @@ class TrainingSettings:
     path_control_points: int | None = None
     rate_control_points: int | None = None
     keep: str = "best"
+    precision: Literal["float32", "float64"] = "float32"
     validations: int = 10
 
     def __post_init__(self) -> None:
