@@ -65,6 +65,10 @@ _OPTIONS: dict[str, _Setting] = {
     "time_parametrized": _Setting(None, None, "fit the rates to the limits after the network"),
     "path_control_points": _Setting(values.positive, "C", "control points of the path (default: those of the problem)"),
     "rate_control_points": _Setting(values.positive, "R", "control points of the rate (default: those of the problem)"),
+    "objective": _Setting(
+        str, "TERMS", "objective: the duration with terms such as effort=2 or effort=1,jerk=0.1; 'cnpgen list"
+        " objectives' has their names (default: that of the problem)",
+    ),
     "loss_form": _Setting(
         str, None, "form of orientation and collision losses (default: paper with --metric learned, else signed)",
         ("signed", "paper"),

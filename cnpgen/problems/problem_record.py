@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError, UsageError
-from cnpgen.problems.problem import FILES, Problem, resolved
+from cnpgen.problems.objectives import read_objective
+from cnpgen.problems.problem import FILES, Objective, Problem, resolved
 from cnpgen.problems.problem_file import load_problem_behind, restore_problem
 from cnpgen.robots.urdf import urdf_tree
 from cnpgen.schema.argument_types import checked_arguments
@@ -174,6 +175,23 @@ def with_control_points(record: ProblemRecord, path: int | None, rate: int | Non
     except RecipeError as error:
         raise UsageError(f"{', '.join(changed)}: {error}", concerns=next(iter(changed))) from error
     return found
+
+
+def with_objective(record: ProblemRecord, objective: str) -> ProblemRecord:
+    """Return the record of a problem with another objective.
+
+    Args:
+        record: The record.
+        objective: See ``read_objective``; empty or "time" for the objective of the problem.
+
+    Raises:
+        UsageError: The objective is invalid.
+    """
+    terms = read_objective(objective)
+    if terms is None:
+        return record
+    content = {**record.content, "objective": resolved(Objective(term=terms))}
+    return ProblemRecord(json.dumps(plain(content), ensure_ascii=False, allow_nan=False), record.urdf)
 
 
 def record_problem(problem: Problem) -> ProblemRecord:

@@ -1,4 +1,4 @@
-"""Registry of stages, constraints, planners and exporters: built-in kinds, and kinds of installed packages."""
+"""Registry of stages, constraints, objectives, planners and exporters, built-in and of installed packages."""
 
 import contextlib
 import dataclasses
@@ -16,12 +16,14 @@ from cnpgen.errors import RecipeError, nearest
 
 STAGES = "cnpgen.stages"
 CONSTRAINTS = "cnpgen.constraints"
+OBJECTIVES = "cnpgen.objectives"
 PLANNERS = "cnpgen.planners"
 EXPORTERS = "cnpgen.exporters"
 
 CONTRACTS: dict[str, str] = {  # base class of the kinds of a group
     STAGES: "cnpgen.pipelines.stages.stage:Stage",
     CONSTRAINTS: "cnpgen.problems.constraints.constraint:Constraint",
+    OBJECTIVES: "cnpgen.problems.objectives:ObjectiveTerm",
     PLANNERS: "cnpgen.benchmark.benchmark_planner:BenchmarkPlanner",
     EXPORTERS: "cnpgen.plans.exporter:Exporter",
 }
@@ -68,6 +70,13 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "object-contact": "cnpgen.problems.constraints.clearance:ObjectContact",
         "puck-contact": "cnpgen.problems.constraints.puck_contact:PuckContact",
     },
+    OBJECTIVES: {
+        "centrifugal": "cnpgen.problems.objectives:Centrifugal",
+        "effort": "cnpgen.problems.objectives:Effort",
+        "jerk": "cnpgen.problems.objectives:Jerk",
+        "path-length": "cnpgen.problems.objectives:PathLength",
+        "tip-reference": "cnpgen.problems.objectives:TipReference",
+    },
     PLANNERS: {
         "cnpgen": "cnpgen.benchmark.planners.learned:ShippedNetwork",
         "cnpgen+refine": "cnpgen.benchmark.planners.learned:RefinedNetwork",
@@ -95,7 +104,7 @@ def names(group: str) -> tuple[str, ...]:
     """List the kinds of a group: the built-in ones in their order, then those of installed packages by name.
 
     Args:
-        group: ``STAGES``, ``CONSTRAINTS``, ``PLANNERS`` or ``EXPORTERS``.
+        group: ``STAGES``, ``CONSTRAINTS``, ``OBJECTIVES``, ``PLANNERS`` or ``EXPORTERS``.
     """
     others = {entry.name for entry in installed(group)} - BUILT_IN[group].keys()
     return (*BUILT_IN[group], *sorted(others))
@@ -105,7 +114,7 @@ def load(group: str, name: str) -> type[Any]:
     """Import the class of a kind.
 
     Args:
-        group: ``STAGES``, ``CONSTRAINTS``, ``PLANNERS`` or ``EXPORTERS``.
+        group: ``STAGES``, ``CONSTRAINTS``, ``OBJECTIVES``, ``PLANNERS`` or ``EXPORTERS``.
         name: Name of the kind, as ``use`` has it in a recipe.
 
     Returns:
@@ -154,7 +163,7 @@ def name_of(group: str, kind: type) -> str:
     """Return the name under which a class is registered, or ``"module:Class"`` if it is not.
 
     Args:
-        group: ``STAGES``, ``CONSTRAINTS``, ``PLANNERS`` or ``EXPORTERS``.
+        group: ``STAGES``, ``CONSTRAINTS``, ``OBJECTIVES``, ``PLANNERS`` or ``EXPORTERS``.
         kind: The class.
     """
     spec = f"{kind.__module__}:{kind.__qualname__}"
@@ -201,7 +210,7 @@ def why_missing(group: str, use: str, package: str) -> str:
     """Return the missing package of a kind in a recipe; empty if the kind exists.
 
     Args:
-        group: ``STAGES``, ``CONSTRAINTS``, ``PLANNERS`` or ``EXPORTERS``.
+        group: ``STAGES``, ``CONSTRAINTS``, ``OBJECTIVES``, ``PLANNERS`` or ``EXPORTERS``.
         use: Name of the kind.
         package: The package that had it, empty if that is not known.
     """

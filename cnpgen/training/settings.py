@@ -11,6 +11,7 @@ from cnpgen.losses.plan_loss import FORMS
 from cnpgen.planner.model import ModelConfig
 from cnpgen.planner.network.features import FEATURE_SETS
 from cnpgen.planner.tasks import EXPECTED_TIMES
+from cnpgen.problems.objectives import read_objective
 from cnpgen.schema.argument_types import check_fields
 from cnpgen.schema.arguments import integer, number
 
@@ -79,6 +80,8 @@ class TrainingSettings:
         path_control_points: Number of path control points; None for that of the problem.
         rate_control_points: Number of rate control points; None for that of the problem.
         keep: Model that is kept: the "best" of all validations, or the "last" one.
+        objective: Objective in place of that of the problem, such as "effort" or "effort=2, jerk=0.1"
+            (``cnpgen.problems.objectives.read_objective``); empty for that of the problem.
         precision: Precision of the loss and its gradient; the network has float32.
         validations: Number of validations, evenly distributed over the run.
     """
@@ -114,6 +117,7 @@ class TrainingSettings:
     path_control_points: int | None = None
     rate_control_points: int | None = None
     keep: str = "best"
+    objective: str = ""
     precision: Literal["float32", "float64"] = "float32"
     validations: int = 10
 
@@ -126,6 +130,7 @@ class TrainingSettings:
         _within("growth", self.metric.growth, "(0, inf)")
         for term, factor in self.margins.items():
             _within("margins", factor, "(0, 1]", of=f" for {term!r}")
+        read_objective(self.objective)
         for name, choices in CHOICES.items():
             if getattr(self, name) not in choices:
                 known = ", ".join(filter(None, choices))
