@@ -76,11 +76,11 @@ def rows(curves: list[Curve]) -> list[tuple[str, ...]]:
         last, training = curve.steps[-1], curve.model.training
         ratios = [last["terms"][name] / last["budgets"][name] / factor(curve) for name in learned_terms(curve)]
         weights = [f"{last['weights'][name]:.3g}" for name in learned_terms(curve)]
-        score = training["score"]
+        score, met = training["score"], epoch_of_met_budgets(curve)
         cells.append(
             (
                 curve.name, str(curve.model.architecture), f"{last['epoch']:,.0f}", f"{training['cpu_seconds']:,.0f}",
-                epoch_of_met_budgets(curve), f"{factor(curve):g}", ", ".join(f"{ratio:.3g}" for ratio in ratios), ", ".join(weights),
+                met, f"{factor(curve):g}", ", ".join(f"{ratio:.3g}" for ratio in ratios), ", ".join(weights),
                 f"{100 * score['valid']:.1f} %", f"{100 * score['paper_valid']:.1f} %", f"{score['duration_s']:.3f}",
             )
         )  # fmt: skip
