@@ -29,7 +29,7 @@ from cnpgen.store.files.figure_file import new_figure, save_figure
 
 Array = NDArray[np.float64]
 
-PLANNERS = ("aqp", "cnp-b")
+PLANNERS = ("aqp", "cnpgen")
 MALLET, DISC = "iiwa_1/striker_mallet", "iiwa_1/ee"
 LIGHT_KG = 1e-3
 STIFFNESS_N_M_RAD, DAMPING_N_M_S_RAD, MAX_TORQUE_N_M = 200.0, 2.2, 10.0  # of a nearly rigid universal joint

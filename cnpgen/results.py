@@ -1,4 +1,4 @@
-"""Classes that public functions return, and the parts of these classes."""
+"""Classes that public functions return, the parts of these classes, and the values of objectives."""
 
 from cnpgen.judges.plans.verdict import Margin, Metrics, PaperRule, Reason, Verdict
 from cnpgen.judges.rows.row_report import Check, RowReport
@@ -22,6 +22,7 @@ from cnpgen.plans.join import JoinedPlans
 from cnpgen.plans.plans import PlanIndexError
 from cnpgen.plans.status import PlanStatus
 from cnpgen.problems.robot_model import ConstraintValues
+from cnpgen.refine.objective_values import objective_values
 from cnpgen.refine.proof.explain import Explanation, Feasibility
 from cnpgen.refine.refine_plans import Refinement
 from cnpgen.refine.task import Attempt, Outcome
@@ -90,4 +91,5 @@ __all__ = [
     "Trained",
     "ValidationReport",
     "Verdict",
+    "objective_values",
 ]

@@ -47,7 +47,7 @@ FIGURES = {
     "torque_use": "maximum torque / rated, executed",
 }
 TAILS = {"p99": 0.99, "p999": 0.999, "max": 1.0}
-REFERENCE_PLANNER = "cnp-b+refine"  # default reference of the comparison, if present
+REFERENCE_PLANNER = "cnpgen+refine"  # default reference of the comparison, if present
 NORMAL_QUANTILE_95 = 1.959963984540054  # two-sided
 NOT_APPLICABLE = "not applicable"
 

@@ -23,7 +23,7 @@ from cnpgen.benchmark.simulator.execute import load_mujoco
 from cnpgen.benchmark.simulator.executed import PLANE_TOLERANCE_M
 from cnpgen.benchmark.simulator.plant import Plant, as_plant
 from cnpgen.benchmark.suite import Suite, load_suite
-from cnpgen.errors import RecipeError, UsageError, nearest
+from cnpgen.errors import RecipeError, UsageError
 from cnpgen.judges.plans.verdict import Verdict
 from cnpgen.machine.engine import Engine, WorkerPool, assembled
 from cnpgen.machine.versions import __version__
@@ -38,7 +38,7 @@ from cnpgen.store.paths import require_file
 
 MAX_REPETITIONS = 10_000
 PROBLEMS_PER_TASK = 4  # of a worker; starting a planner takes some seconds
-FASTEST = ("cnp-b", "cnp-b+refine", "solve")  # default; the others take longer
+FASTEST = ("cnpgen", "cnpgen+refine", "solve")  # default; the others take longer
 
 Progress = Callable[[str, int, int], None]
 """Called with the activity, its number of steps, and the number of finished steps."""
@@ -135,7 +135,7 @@ def run_benchmark(
         seed: Seed of random planners. Each problem and repetition has its own random generator.
         repeat: Number of repetitions of every problem.
         plane_tolerance: Maximum distance of the mallet of a successful hit from the table plane [m].
-        reference: Planner with which the others are compared; default ``cnp-b+refine``, or the first one without it.
+        reference: Planner with which the others are compared; default ``cnpgen+refine``, or the first one without it.
         parameters: Planner -> its field -> value, as in a recipe; the others have their defaults.
         workers: Processes that execute plans and, with an engine, plan; default one per available core.
         engine: Engine of the workers, see ``make_dataset``; by default planners run on this machine.
@@ -264,7 +264,8 @@ def _check_planners(planners: Sequence[str]) -> None:
             raise UsageError(f"must be names of planners, got {name!r:.100}", argument="planners")
         if name not in known:
             raise UsageError(
-                f"unknown planner {name!r}{nearest(name, known)}; known: {', '.join(known)}", concerns="planners"
+                f"unknown planner {name!r}{registry.name_hint(registry.PLANNERS, name)}; known: {', '.join(known)}",
+                concerns="planners",
             )
 
 

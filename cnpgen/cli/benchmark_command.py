@@ -31,7 +31,7 @@ def add(commands: "Commands[Parser]") -> None:
     option("suite", metavar="SUITE", nargs="?", help="a suite (see --list), or a dataset for random problems")
     option("--list", action="store_true", help="list suites, planners and plants")
     option("-o", "--out", metavar="DIR", type=Path, help="folder of the results (default: SUITE-results)")
-    option("--planners", metavar="NAME", nargs="+", help="planners to compare (default: cnp-b cnp-b+refine solve)")
+    option("--planners", metavar="NAME", nargs="+", help="planners to compare (default: cnpgen cnpgen+refine solve)")
     option("--n", metavar="N", type=values.positive, help="number of problems; a random suite has any number")
     option("--simulate", action="store_true", help="also execute the plans")
     option("--plant", metavar="NAME", nargs="+", help="simulated robots that execute them (default: nominal)")
@@ -50,7 +50,7 @@ def add(commands: "Commands[Parser]") -> None:
     option("--repeat", metavar="K", type=values.positive, default=1, help="repetitions of every problem (default: 1)")
     text = "largest distance of the mallet of a successful hit from the table plane (default: 20mm)"
     option("--plane-tolerance", metavar="M", type=values.meters, default=0.02, help=text)
-    option("--reference", metavar="NAME", help="planner that p-values compare with (default: cnp-b+refine)")
+    option("--reference", metavar="NAME", help="planner that p-values compare with (default: cnpgen+refine)")
     text = "field of a planner, such as trajopt.iterations=50 or rrtconnect.simplify_time=0.5s"
     option("--set", metavar="NAME.KEY=VALUE", nargs="+", default=[], type=parameter, help=text)
     option("--replan", action="store_true", help="discard earlier answers of these planners in DIR")

@@ -11,6 +11,7 @@ from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.stages.stage import Stage
 from cnpgen.problems.constraints.constraint import Constraint
+from cnpgen.problems.objectives import ObjectiveTerm
 from cnpgen.problems.problem import Problem
 from cnpgen.schema import registry
 from cnpgen.schema.keys import Key, Range, keys
@@ -19,7 +20,7 @@ from cnpgen.schema.toml import Kind
 FILES: dict[Kind, type] = {"problem": Problem, "pipeline": Pipeline, "dataset": DatasetRecipe, "suite": Suite}
 """What the files of a kind are read as."""
 
-GROUPS = {Stage: registry.STAGES, Constraint: registry.CONSTRAINTS}
+GROUPS = {Stage: registry.STAGES, Constraint: registry.CONSTRAINTS, ObjectiveTerm: registry.OBJECTIVES}
 """Tables with a key ``use`` that names their kind -> registry of the kinds."""
 
 _INTRODUCTION = """\
@@ -43,10 +44,10 @@ def _first_line(kind: type) -> str:
 
 
 def describe_kind(group: str, name: str) -> str:
-    """Describe a kind of stage or constraint: its purpose, and the keys of its table.
+    """Describe a kind of stage, constraint or objective term: its purpose, and the keys of its table.
 
     Args:
-        group: ``registry.STAGES`` or ``registry.CONSTRAINTS``.
+        group: ``registry.STAGES``, ``registry.CONSTRAINTS`` or ``registry.OBJECTIVES``.
         name: Name of the kind.
 
     Raises:

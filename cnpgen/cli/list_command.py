@@ -1,11 +1,11 @@
-"""``cnpgen list``: the recipes and models that cnpgen ships, and the kinds of stages, constraints and exporters."""
+"""``cnpgen list``: shipped recipes and models, and the kinds of stages, constraints, objectives and exporters."""
 
 import argparse
 from typing import Any
 
 from cnpgen.cli.parser import Commands, Parser, add_command, add_json
 
-WHAT = ("datasets", "models", "pipelines", "problems", "stages", "constraints", "exporters")
+WHAT = ("datasets", "models", "pipelines", "problems", "stages", "constraints", "objectives", "exporters")
 
 _HOW = {
     "datasets": "cnpgen make-dataset NAME",
@@ -14,6 +14,7 @@ _HOW = {
     "problems": "cnpgen show NAME --kind problem",
     "stages": "cnpgen show --stage NAME",
     "constraints": "cnpgen show --constraint NAME",
+    "objectives": "cnpgen train DIR -o MODEL --objective NAME=WEIGHT",
     "exporters": "cnpgen export PLANS --to NAME",
 }
 
@@ -42,7 +43,12 @@ def list_all(what: str) -> list[dict[str, Any]]:
     """
     from cnpgen.schema import registry
 
-    groups = {"stages": registry.STAGES, "constraints": registry.CONSTRAINTS, "exporters": registry.EXPORTERS}
+    groups = {
+        "stages": registry.STAGES,
+        "constraints": registry.CONSTRAINTS,
+        "objectives": registry.OBJECTIVES,
+        "exporters": registry.EXPORTERS,
+    }
     if what in groups:
         return [{"name": name, "title": _summary(groups[what], name)} for name in registry.names(groups[what])]
     return {"datasets": _datasets, "models": _models, "pipelines": _pipelines, "problems": _problems}[what]()

@@ -49,11 +49,12 @@ def add_refining(parser: Options) -> None:
     option = parser.add_argument
     option(
         "--objective",
-        choices=("time", "effort", "jerk"),
+        metavar="TERMS",
         default="time",
-        help="cost term in addition to the duration: that of the problem file (default), effort or jerk",
+        help="objective: that of the problem file (time, default), or the duration with terms such as effort=0.5 or"
+        " effort=1,jerk=0.1 ('cnpgen list objectives')",
     )
-    option("--weight", metavar="X", type=float, help="weight of the cost term; default the problem's, 1 for others")
+    option("--weight", metavar="X", type=float, help="weight of these terms (default: as in the problem or 1)")
     option("--max-iterations", metavar="I", type=values.natural, help="steps of the coarse level (default: 40)")
     option(
         "--tolerance",

@@ -3,12 +3,12 @@
 import argparse
 import shlex
 import sys
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from cnpgen.cli import values
 from cnpgen.cli.parser import Commands, Parser, add_command
+from cnpgen.cli.train_options import add_settings, changed_settings, passed_settings
 from cnpgen.cli.train_text import Watch, summary
 
 if TYPE_CHECKING:
@@ -23,9 +23,13 @@ parameters. The best of ten models on validation samples is kept; its score is m
 is printed on stdout. 'cnpgen docs training' explains the options.
 """
 
+_LENGTHS = ("cpu_seconds", "steps", "epochs")
 _CHECK = "validation rows to compare models by, half of all at most (default: 200)"
-_STEPS, _FLAGS = ("line_projection_steps", "projection_steps"), ("within_limits", "time_parametrized")
 _SECONDS = "how long to train: CPU time of the steps; compiling and validations come on top (default: 2 min)"
+_PRESET = (
+    "settings of a published method, which other options override; 'paper': outputs, loss, metric and optimizer of the"
+    " paper, 2,048 units, 1300 epochs"
+)
 
 
 def add(commands: "Commands[Parser]") -> None:
@@ -50,60 +54,15 @@ def _add_length(parser: Parser) -> None:
 
 
 def _add_how(parser: Parser) -> None:
-    option, metrics = parser.add_argument, ("ramped", "fixed", "learned", "bounded")
-    option("--hidden", metavar="W", type=values.positive, help="width of the network's layers (default: 128)")
-    option("--layers", metavar="L", type=values.positive, help="depth of its trunk (default: 5)")
-    option("--batch-size", metavar="B", type=values.positive, help="rows per step, or all there are (default: 64)")
-    option("--learning-rate", metavar="X", type=float, help="largest learning rate of Adam (default: 1e-3)")
-    option("--metric", choices=metrics, help="weights of the constraints (default: ramped)")
-    option("--growth", metavar="X", type=float, help="factor by which ramped weights grow (default: 30)")
-    option(
-        "--margin",
-        metavar="TERM=X",
-        type=_margin,
-        action="append",
-        help="train with limits X times those of the problem, such as joint-acceleration=0.96 (default: 0.985; of"
-        " joint-velocity 0.99); may be repeated",
-    )
-    option(
-        "--expected-time",
-        choices=("distance", "reach"),
-        help="unit of the network's durations: the distance over the velocity limits, or the time in which joints"
-        " reach their goal states (default: distance)",
-    )
-    option(
-        "--rate-bias",
-        metavar="X",
-        type=float,
-        help="logarithm of the first guess of the duration factor (default: -0.5)",
-    )
-    option(
-        "--line-projection-steps",
-        metavar="N",
-        type=values.positive,
-        help="Gauss-Newton steps that project the line onto the manifold (default: 1)",
-    )
-    option("--projection-steps", metavar="N", type=values.positive, help="the same for the network's path (default: 1)")
-    option("--within-limits", action="store_true", help="keep control points within the joint limits in these steps")
-    option("--time-parametrized", action="store_true", help="fit the rates to the limits after the network")
-    option(
-        "--imitate",
-        metavar="X",
-        type=float,
-        help="fraction of the steps, such as 0.1, that imitate the plans of a dataset made with --certify (default: 0)",
-    )
+    option = parser.add_argument
+    option("--preset", choices=("paper",), help=_PRESET)
+    add_settings(parser)
     option(
         "--from",
         dest="start_from",
         metavar="MODEL",
-        help="start from the parameters of a model, by name or file; --hidden, --layers and --expected-time"
+        help="start from the parameters of a model, by name or file; --hidden, --layers, --features and --expected-time"
         " must be those of the model",
-    )
-    option(
-        "--seed",
-        metavar="S",
-        type=values.seed,
-        help="seed of the initial parameters and of the order of samples (default: 0)",
     )
 
 
@@ -126,18 +85,6 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _margin(text: str) -> tuple[str, float]:
-    """Read TERM=X."""
-    term, sign, factor = text.partition("=")
-    try:
-        found = float(factor)
-    except ValueError:
-        found = -1.0
-    if not sign or not term or not 0 < found <= 1:
-        raise argparse.ArgumentTypeError(f"expected TERM=X with X above 0 and at most 1, got {text!r}")
-    return term, found
-
-
 def _train(arguments: argparse.Namespace, watch: Watch) -> "Trained":
     from cnpgen.training.train import train_model
 
@@ -146,9 +93,7 @@ def _train(arguments: argparse.Namespace, watch: Watch) -> "Trained":
         arguments.out,
         settings=_settings(arguments),
         start_from=arguments.start_from,
-        steps=arguments.steps,
-        epochs=arguments.epochs,
-        cpu_seconds=arguments.cpu_seconds,
+        **_length(arguments),
         check_rows=arguments.check,
         command=_command(arguments),
         force=arguments.force,
@@ -159,32 +104,30 @@ def _train(arguments: argparse.Namespace, watch: Watch) -> "Trained":
 
 
 def _settings(arguments: argparse.Namespace) -> "TrainingSettings":
-    from cnpgen.errors import UsageError
-    from cnpgen.training.settings import METRICS, TrainingSettings
+    from cnpgen.training.presets import PRESETS
+    from cnpgen.training.settings import TrainingSettings
 
-    names = ("hidden", "layers", "batch_size", "learning_rate", "expected_time", "rate_bias", *_STEPS, *_FLAGS, "seed")
-    given = {name: getattr(arguments, name) for name in names if getattr(arguments, name) is not None}
-    metric = METRICS[arguments.metric or "ramped"]
-    if arguments.growth is not None and metric.kind == "fixed":
-        raise UsageError("--growth changes nothing with --metric fixed, whose weights do not grow")
-    given["metric"] = metric if arguments.growth is None else replace(metric, growth=arguments.growth)
-    if arguments.margin is not None:
-        given["margins"] = dict(arguments.margin)
-    if arguments.imitate is not None:
-        given["imitation"] = arguments.imitate
-    return TrainingSettings(**given)
+    settings = TrainingSettings() if arguments.preset is None else PRESETS[arguments.preset].settings
+    return changed_settings(settings, arguments)
+
+
+def _length(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return the length of the run, by name: as passed, else that of the preset."""
+    from cnpgen.training.presets import PRESETS
+
+    passed = {name: getattr(arguments, name) for name in _LENGTHS}
+    if arguments.preset is None or any(value is not None for value in passed.values()):
+        return passed
+    return vars(PRESETS[arguments.preset].length)
 
 
 def _command(arguments: argparse.Namespace) -> str:
     """Return the command that makes this model, without what changes nothing."""
-    lengths, network = ("cpu_seconds", "steps", "epochs"), ("hidden", "layers", "batch_size", "learning_rate")
-    how = ("metric", "growth", "expected_time", "rate_bias", *_STEPS, *_FLAGS, "imitate", "seed", "check")
-    names = (*lengths, *network, *how)
-    default = arguments.parser.get_default
-    said = [(name, getattr(arguments, name)) for name in names]
-    said[-2:-2] = [("margin", f"{term}={factor:g}") for term, factor in arguments.margin or ()]
+    said = [(name, getattr(arguments, name)) for name in ("preset", *_LENGTHS)]
+    said += [*passed_settings(arguments), ("check", arguments.check)]
     if arguments.start_from is not None:
         said.insert(0, ("from", shlex.quote(Path(arguments.start_from).name)))
+    default = arguments.parser.get_default
     options = [f"--{name.replace('_', '-')} {value!s}" for name, value in said if value not in {None, default(name)}]
     options = [option.removesuffix(" True") for option in options]
     places = [shlex.quote(path.resolve().name) for path in (arguments.folder, arguments.out)]

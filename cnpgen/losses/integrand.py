@@ -118,7 +118,7 @@ def _stage(robot: "Robot", problem: Problem, form: str) -> tuple[Inputs, FrozenS
     tightening = sym("tightening", 2 * m)
     inputs = Inputs(path, rate, obstacle_poses, relaxation, sym("node"), tightening, sym("weights", m))
     unused = iter(ca.vertsplit(relaxation))
-    terms = [task_term(state, problem.objective.centrifugal)]
+    terms = [task_term(state, problem.objective.terms)]
     for index, (_, conditions) in enumerate(pairs):
         values = [next(unused) if varying[index] else None for _ in range(sizes[index])]
         terms.append(constraint_term(conditions, tightening[index], tightening[m + index], values))

@@ -68,7 +68,7 @@ class Metric:
     """The weights of one training run.
 
     Args:
-        weights: First weights (e^alpha), shape (m,), positive.
+        weights: First weights (e^alpha), shape (m,); a term of weight 0 is omitted and keeps this weight.
         budgets: Acceptable value of every term (the paper's C-bar^2), shape (m,); 0 where there is none.
         settings: Settings of the metric.
 
@@ -84,16 +84,17 @@ class Metric:
                 f"weights and budgets must have one shape (m,), got {first.shape} and {self._budgets.shape}",
                 concerns="budgets",
             )
-        if not (np.isfinite(first).all() and (first > 0).all()):
+        if not (np.isfinite(first).all() and (first >= 0).all()):
             raise UsageError(
-                f"first weights must be positive and finite, got {first.tolist()!s:.200}", concerns="weights"
+                f"first weights must be finite and not negative, got {first.tolist()!s:.200}", concerns="weights"
             )
         if not (np.isfinite(self._budgets).all() and (self._budgets >= 0).all()):
             raise UsageError(
                 f"must be finite and not negative, got {self._budgets.tolist()!s:.200}", argument="budgets"
             )
         self.settings = settings or MetricSettings()
-        self.alpha: Array = np.log(first)
+        with np.errstate(divide="ignore"):
+            self.alpha: Array = np.log(first)
         self._sum, self._count = np.zeros(len(first)), 0
 
     @checked_arguments
@@ -134,17 +135,20 @@ class Metric:
     def _learn(self, progress: float) -> None:
         settings, count = self.settings, self._count
         if count and progress < settings.frozen:
-            budgets = self._budgets / settings.grown(progress)
+            budgets = np.where(np.isfinite(self.alpha), self._budgets, 0.0)  # an omitted term learns nothing
+            budgets = budgets * settings.budget_factor / settings.grown(progress)
             alpha = alpha_step(
                 self.alpha, self._sum / count, budgets, gamma=settings.gamma, largest_log=settings.largest_log
             )
             with np.errstate(divide="ignore"):
-                self.alpha = np.clip(alpha, np.log(settings.lowest), np.log(settings.highest))
+                bounded = np.clip(alpha, np.log(settings.lowest), np.log(settings.highest))
+            self.alpha = np.where(np.isfinite(self.alpha), bounded, self.alpha)
         self._sum, self._count = np.zeros(len(self.alpha)), 0
 
     def state(self) -> dict[str, Any]:
         """Return the learned state, JSON-able."""
-        return {"alpha": self.alpha.tolist(), "sum": self._sum.tolist(), "count": self._count}
+        alpha = [value if np.isfinite(value) else None for value in self.alpha.tolist()]  # None: an omitted term
+        return {"alpha": alpha, "sum": self._sum.tolist(), "count": self._count}
 
     @checked_arguments
     def load_state(self, state: Mapping[str, Any]) -> None:
@@ -154,7 +158,8 @@ class Metric:
             UsageError: It is the state of another metric.
         """
         try:
-            alpha, total, count = np.array(state["alpha"], float), np.array(state["sum"], float), int(state["count"])
+            values = [-np.inf if value is None else value for value in state["alpha"]]
+            alpha, total, count = np.array(values, float), np.array(state["sum"], float), int(state["count"])
         except (KeyError, TypeError, ValueError) as error:
             raise UsageError(f"not the state of a metric: {error}", concerns="state") from error
         if alpha.shape != self.alpha.shape or total.shape != self.alpha.shape:

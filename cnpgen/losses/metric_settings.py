@@ -35,6 +35,7 @@ class MetricSettings:
         largest_log: Bound on ``|log(mean L_i / C_i)|`` in a step, from the authors' implementation.
         lowest: Lower bound of a learned weight; without it the weight of a term without violations decreases forever.
         highest: Upper bound of a learned weight.
+        budget_factor: Factor of all budgets of the learned metric.
         average: Average over the plans of a batch: "mean" as published, "median" or "trimmed".
         frozen: Progress after which a learned metric is constant.
     """
@@ -47,12 +48,13 @@ class MetricSettings:
     largest_log: float = 10.0
     lowest: float = 0.0
     highest: float = math.inf
+    budget_factor: float = 1.0
     average: Average = "mean"
     frozen: float = math.inf
 
     def __post_init__(self) -> None:
         check_fields(self)
-        for name in ("growth", "gamma", "largest_log", "highest"):
+        for name in ("growth", "gamma", "largest_log", "highest", "budget_factor"):
             if not getattr(self, name) > 0:
                 raise UsageError(f"{name} of a metric must be above 0, got {getattr(self, name)}", concerns=name)
         if not self.lowest <= self.highest:

@@ -11,13 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.kernels.symbolic.dynamics import acceleration_at, body_motions
-from cnpgen.kernels.symbolic.linalg import cross, dot
+from cnpgen.kernels.symbolic.linalg import dot
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
 from cnpgen.problems.constraints.constraint import Condition
-
-CENTRIFUGAL_SMOOTHING_M_S2 = 0.05  # below, the centrifugal term is quadratic, so that its gradient is continuous
-MIN_SQUARED_SPEED_M2_S2 = 1e-4  # keeps the direction of a tip at rest defined
+from cnpgen.problems.objectives import ObjectiveTerm
 
 
 @dataclass(frozen=True)
@@ -33,31 +30,28 @@ class Term:
     parts: list[tuple[Any, Any]]
 
 
-def task_term(state: SymbolicState, eta: float) -> Term:
-    """Return ``1 + eta kappa v^2`` (paper, Appendix B, eta).
+def task_term(state: SymbolicState, objective: Sequence[ObjectiveTerm]) -> Term:
+    """Return the step loss of the objective: ``1 + sum of weight_i size_i``; ``1 + eta kappa v^2`` in the paper.
 
     Args:
         state: The state.
-        eta: Weight of the tip's centrifugal acceleration relative to the time [s^2/m].
+        objective: Terms in addition to the duration.
     """
     import casadi as ca
 
-    if eta == 0:
-        return Term(ca.SX(1), [])
-    v = state.tip_velocity
-    across = cross(v, _tip_acceleration(state))
-    square = dot(across, across) / (dot(v, v) + MIN_SQUARED_SPEED_M2_S2)
-    size = ca.sqrt(square + CENTRIFUGAL_SMOOTHING_M_S2**2) - CENTRIFUGAL_SMOOTHING_M_S2
-    return Term(1 + eta * size, [(size, eta)])
-
-
-def _tip_acceleration(state: SymbolicState) -> list[Any]:
-    """Return the acceleration of the tip [m/s^2] by the recursion of the inverse dynamics, for a third of the cost."""
-    chain = state.robot.chain
-    last = body_motions(chain, state.q, state.dq, state.ddq)[-1]
-    without_gravity = acceleration_at(last.acceleration, last.omega, last.alpha, chain.tip_translation.tolist())
-    rotation = [[dot(row, column) for column in chain.tip_rotation.tolist()] for row in state.kinematics.rotation]
-    return [dot(row, without_gravity) + g for row, g in zip(rotation, chain.gravity.tolist(), strict=True)]
+    value, parts = ca.SX(1), []
+    for term in objective:
+        residuals = term.training_residuals(state)
+        squares = dot(residuals, residuals)
+        smoothing = term.smoothing if term.training_smoothing is None else term.training_smoothing
+        if smoothing > 0:
+            size = ca.sqrt(squares + smoothing**2) - smoothing
+            parts.append((size, term.weight))
+        else:
+            size = squares
+            parts += [(e, 2 * term.weight * e) for e in residuals]
+        value += term.weight * size
+    return Term(value, parts)
 
 
 def constraint_term(conditions: Sequence[Condition], factor: Any, inset: Any, relaxation: Sequence[Any]) -> Term:

@@ -15,7 +15,7 @@ from cnpgen.pipelines.pipeline_file import read_pipeline
 from cnpgen.pipelines.stages.stage import Stage
 from cnpgen.problems.checks import tables
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.problem_file import missing_kinds, restoring_reader, without_defaults
+from cnpgen.problems.problem_file import missing_kinds, missing_kinds_of_problem, restoring_reader, without_defaults
 from cnpgen.schema import registry
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.catalogue import load_recipe, read_kind, reference
@@ -75,7 +75,7 @@ def restore_dataset_recipe(content: dict[str, Any], urdf: str, folder: Path) -> 
     """
     pipeline_table = content["pipeline"]
     missing = missing_kinds(registry.STAGES, tables(pipeline_table, "stage"))
-    missing += missing_kinds(registry.CONSTRAINTS, tables(pipeline_table["problem"], "constraint"))
+    missing += missing_kinds_of_problem(pipeline_table["problem"])
     if missing:
         raise PluginError(missing)
     path, mistakes = folder / "recipe.toml", list[str]()

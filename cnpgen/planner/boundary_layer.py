@@ -49,7 +49,7 @@ class BoundaryLayer:
         path_scale: Factor of phi [rad]; pi in the paper.
         line_projection_steps: Number of Gauss-Newton steps that project the line.
         projection_steps: Number of Gauss-Newton steps that project the path.
-        expected_time: Unit of durations: "distance" as in the paper, or "reach" (``ModelConfig``).
+        expected_time: Unit of durations: "distance", "reach" or "travel" (``ModelConfig``).
         goal_acceleration: "free", or "given" if boundary conditions include goal accelerations, as in panda-cup.
         backend: Backend of the kernels; by default the fastest available.
         cache_folder: Folder of compiled kernels; by default the shared cache.

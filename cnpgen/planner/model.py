@@ -28,8 +28,9 @@ class ModelConfig:
         path_scale: Factor of the configuration head's output [rad]; pi in the paper.
         line_projection_steps: Gauss-Newton steps that project the line onto the equalities; 0 in the paper.
         projection_steps: Gauss-Newton steps that project the path onto the equalities.
-        expected_time: Unit of durations: "distance", the time of the distance at the velocity limits, as in the paper,
-            or "reach", the minimum time in which every joint could reach its goal state.
+        expected_time: Unit of durations: "distance", the time of the distance at the velocity limits, at least 0.2 s;
+            "travel", the same without a lower bound, as in the authors' implementation; or "reach", the minimum time
+            in which every joint could reach its goal state.
         within_limits: Whether control points are clipped to the joint limits after each of these steps.
         time_parametrized: Whether rates are fitted to the limits after the network (``time_parametrization``).
         via_points: Via points of alternative lines for plans with violations [rad], n numbers each (``via_points``).

@@ -13,7 +13,7 @@ from cnpgen.kernels.library import KernelLibrary
 from cnpgen.planner.control_point_functions import line_change, tips_at_ends
 from cnpgen.planner.control_points import along_line
 from cnpgen.planner.expressions import effective_steps
-from cnpgen.planner.tasks import Tasks, expected_time, reaching_time
+from cnpgen.planner.tasks import MIN_EXPECTED_TIME_S, MIN_TRAVEL_TIME_S, Tasks, expected_time, reaching_time
 from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem import Problem
 from cnpgen.trajectory.boundary import Boundary
@@ -50,6 +50,7 @@ class TaskPreprocessor:
         line: Kernel of ``control_point_functions.line_change``; None if the line is not projected.
         reaching_time: Kernel of ``tasks.reaching_time``; None if the expected time is that of the distance.
         via_line: The same kernel with offsets; None if there are no via points, or no projection.
+        least_time: Lower bound of the expected time of the distance [s].
     """
 
     problem: Problem
@@ -58,6 +59,7 @@ class TaskPreprocessor:
     line: Kernel | None
     reaching_time: Kernel | None = None
     via_line: Kernel | None = None
+    least_time: float = MIN_EXPECTED_TIME_S
 
     def __call__(self, boundary: Boundary, via_point: Array | None = None, *, ends: Array | None = None) -> Tasks:
         """Prepare N tasks, in float64.
@@ -72,7 +74,10 @@ class TaskPreprocessor:
         start_xyz, goal_xyz, *velocity = (tip.T for tip in self.tips(ends))
         scene = scene_of(self.problem, start_xyz, goal_xyz, *velocity)
         reaching = self.reaching_time
-        time = expected_time(boundary, self.velocity_limit) if reaching is None else reaching(ends)[0][0]
+        if reaching is None:
+            time = expected_time(boundary, self.velocity_limit, least=self.least_time)
+        else:
+            time = reaching(ends)[0][0]
         correction = None if via_point is None else self._via_offsets(boundary, via_point)
         kernel, offsets = (self.line, []) if correction is None else (self.via_line, [lanes(correction)])
         if kernel is not None:
@@ -116,4 +121,5 @@ def make_task_preprocessor(
     tips = kernels.load(tips_at_ends, fixed_at_goal=fixed_at_goal)
     time = kernels.load(reaching_time, fixed_at_goal=fixed_at_goal) if expected_time == "reach" else None
     via_line = load(line_change, with_offsets=True) if steps and via_lines else None
-    return TaskPreprocessor(problem, robot.velocity_limit, tips, line, time, via_line)
+    least_time = MIN_TRAVEL_TIME_S if expected_time == "travel" else MIN_EXPECTED_TIME_S
+    return TaskPreprocessor(problem, robot.velocity_limit, tips, line, time, via_line, least_time)

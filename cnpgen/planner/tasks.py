@@ -19,7 +19,8 @@ Array = NDArray[Any]
 
 MIN_EXPECTED_TIME_S = 0.2  # lower bound of ``expected_time``
 MIN_REACH_TIME_S = 0.03  # lower bound of ``reaching_time``
-EXPECTED_TIMES = ("distance", "reach")  # by ``expected_time`` and ``reaching_time``
+MIN_TRAVEL_TIME_S = 1e-6  # lower bound without effect on moving joints: avoids a division by zero
+EXPECTED_TIMES = ("distance", "reach", "travel")  # ``expected_time``, ``reaching_time``, ``expected_time`` unbounded
 
 
 @dataclass(frozen=True)
@@ -72,18 +73,19 @@ class Tasks:
         )
 
 
-def expected_time(boundary: Boundary, velocity_limit: Array) -> Array:
-    """Return the largest time that a joint needs at its velocity limit (paper, expected time) [s].
+def expected_time(boundary: Boundary, velocity_limit: Array, *, least: float = MIN_EXPECTED_TIME_S) -> Array:
+    """Return the largest time that a joint needs at its velocity limit (authors' implementation, expected time) [s].
 
     Args:
         boundary: Boundary conditions.
         velocity_limit: Planning limits [rad/s], shape (n,).
+        least: Lower bound [s].
 
     Returns:
-        Shape (N,), at least ``MIN_EXPECTED_TIME_S``.
+        Shape (N,).
     """
     joint_times: Array = np.abs(boundary.goal_q - boundary.start_q) / velocity_limit
-    time: Array = joint_times.max(axis=1, initial=MIN_EXPECTED_TIME_S)
+    time: Array = joint_times.max(axis=1, initial=least)
     return time
 
 

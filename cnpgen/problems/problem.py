@@ -13,6 +13,7 @@ from cnpgen.errors import MachineError
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.constraints.object_clearance import ObjectClearance
+from cnpgen.problems.objectives import Centrifugal, ObjectiveTerm
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot_spec import HeldObject, LimitSpec, Payload, RobotSpec
 from cnpgen.robots.shape.inline import with_inline_meshes
@@ -33,7 +34,7 @@ MAX_TABLES = 100  # of obstacles or constraints
 
 @dataclass(frozen=True, kw_only=True)
 class Objective:
-    """Objective of a motion: the integral over time of ``1 + centrifugal |kappa| v^2`` (paper, Appendix B, eta)."""
+    """Objective of a motion: its duration plus weighted terms."""
 
     centrifugal: float = field(
         "weight of the centrifugal acceleration |kappa| v^2 of the tip relative to time",
@@ -41,6 +42,15 @@ class Objective:
         default=0.0,
         low=0.0,
     )
+    term: tuple[ObjectiveTerm, ...] = field(
+        "further terms", default=(), form="[[objective.term]] tables", since_version=2
+    )
+
+    @property
+    def terms(self) -> tuple[ObjectiveTerm, ...]:
+        """All terms in addition to the duration."""
+        own = (Centrifugal(weight=self.centrifugal),) if self.centrifugal > 0 else ()
+        return (*own, *self.term)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,8 +124,8 @@ class Problem:
 
     @property
     def uses_jerk(self) -> bool:
-        """Whether a constraint limits jerks."""
-        return any(constraint.uses_jerk for constraint in self.constraint)
+        """Whether a constraint or a term of the objective uses jerks."""
+        return any(item.uses_jerk for item in self.constraint) or any(term.uses_jerk for term in self.objective.term)
 
     @property
     def path_orders(self) -> int:

@@ -13,6 +13,7 @@ from cnpgen.errors import PluginError, RecipeError
 from cnpgen.problems.checks import problem_mistakes, tables
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.geometry import chosen_geometry, geometry_mistakes, with_object_clearance
+from cnpgen.problems.objectives import ObjectiveTerm
 from cnpgen.problems.problem import FILES, Problem
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.inline import inline_mesh, is_inline, mesh_files
@@ -38,6 +39,12 @@ def load_problem(name_or_path: str | Path, *, relative_to: Path | None = None) -
         RecipeError: The file has mistakes; the error lists all of them.
     """
     return load_recipe(("problem",), name_or_path, relative_to, read_problem)
+
+
+KIND_READERS: dict[type, Reader] = {
+    Constraint: partial(read_kind, registry.CONSTRAINTS),
+    ObjectiveTerm: partial(read_kind, registry.OBJECTIVES),
+}  # of the tables with a key ``use``
 
 
 def load_problem_behind(name_or_path: str | Path) -> Problem:
@@ -76,8 +83,7 @@ def read_problem(path: Path, mistakes: list[str]) -> Problem | None:
     if table is None:
         return None
     where = RecipeLocation(str(path))
-    readers: dict[type, Reader] = {Constraint: partial(read_kind, registry.CONSTRAINTS)}
-    problem = parse(Problem, table, where=where, mistakes=mistakes, readers=readers)
+    problem = parse(Problem, table, where=where, mistakes=mistakes, readers=KIND_READERS)
     before = len(mistakes)
     mistakes.extend(problem_mistakes(table, where, path.parent))
     mistakes.extend(geometry_mistakes(table, where, path.parent))
@@ -128,7 +134,7 @@ def restore_problem(content: dict[str, Any], urdf: str, folder: Path) -> Problem
         RecipeError: This version of cnpgen does not support the content.
         PluginError: A required package is not installed.
     """
-    if missing := missing_kinds(registry.CONSTRAINTS, tables(content, "constraint")):
+    if missing := missing_kinds_of_problem(content):
         raise PluginError(missing)
     path, mistakes = folder / "recipe.toml", list[str]()
     problem: Problem | None = restoring_reader(urdf, path)(
@@ -151,8 +157,7 @@ def restoring_reader(urdf: str, path: Path) -> Reader:
             raise ValueError("expected the table of a problem, with a robot")  # noqa: TRY004 - as of other mistakes
         robot = {key: entry for key, entry in value["robot"].items() if key not in FILES}
         value = {**value, "robot": robot | {"urdf": "robot.urdf"}}
-        readers: dict[type, Reader] = {Constraint: partial(read_kind, registry.CONSTRAINTS)}
-        made = parse(Problem, value, where=where, mistakes=mistakes, readers=readers)
+        made = parse(Problem, value, where=where, mistakes=mistakes, readers=KIND_READERS)
         if made is None or (named := list(_meshes_on_disk(made, urdf, where))):
             mistakes.extend(() if made is None else named)
             return None
@@ -170,6 +175,16 @@ def _meshes_on_disk(problem: Problem, urdf: str, where: RecipeLocation) -> Itera
     for index, each in enumerate(problem.obstacle):
         if each.mesh and not is_inline(each.mesh):
             yield (where / "obstacle" / index / "mesh").message(text.format(show(each.mesh)))
+
+
+def missing_kinds_of_problem(content: dict[str, Any]) -> list[str]:
+    """Return the missing packages of the constraints and objective terms of a resolved problem."""
+    objective = content.get("objective")
+    terms = tables(objective, "term") if isinstance(objective, dict) else []
+    return [
+        *missing_kinds(registry.CONSTRAINTS, tables(content, "constraint")),
+        *missing_kinds(registry.OBJECTIVES, terms),
+    ]
 
 
 def missing_kinds(group: str, entries: list[tuple[int, dict[str, Any]]]) -> list[str]:

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError, UsageError
-from cnpgen.problems.problem import FILES, Problem, resolved
+from cnpgen.problems.objectives import read_objective
+from cnpgen.problems.problem import FILES, Objective, Problem, resolved
 from cnpgen.problems.problem_file import load_problem_behind, restore_problem
 from cnpgen.robots.urdf import urdf_tree
 from cnpgen.schema.argument_types import checked_arguments
@@ -150,6 +151,47 @@ class ProblemRecord(StoredProblem):
             pin.forwardKinematics(model, data, configuration)
             found[row] = pin.updateFramePlacement(model, data, frame).translation
         return found
+
+
+def with_control_points(record: ProblemRecord, path: int | None, rate: int | None) -> ProblemRecord:
+    """Return the record of a problem with other numbers of control points.
+
+    Args:
+        record: The record.
+        path: Number of control points of p(s); None for that of the problem.
+        rate: Number of control points of r(s); None for that of the problem.
+
+    Raises:
+        UsageError: A number does not suit the degree.
+    """
+    counts = {"path_control_points": path, "rate_control_points": rate}
+    changed = {key: count for key, count in counts.items() if count not in {None, record.content["trajectory"][key]}}
+    if not changed:
+        return record
+    content = {**record.content, "trajectory": {**record.content["trajectory"], **changed}}
+    found = ProblemRecord(json.dumps(content, ensure_ascii=False, allow_nan=False), record.urdf)
+    try:
+        found.trajectory  # noqa: B018 - checks the numbers
+    except RecipeError as error:
+        raise UsageError(f"{', '.join(changed)}: {error}", concerns=next(iter(changed))) from error
+    return found
+
+
+def with_objective(record: ProblemRecord, objective: str) -> ProblemRecord:
+    """Return the record of a problem with another objective.
+
+    Args:
+        record: The record.
+        objective: See ``read_objective``; empty or "time" for the objective of the problem.
+
+    Raises:
+        UsageError: The objective is invalid.
+    """
+    terms = read_objective(objective)
+    if terms is None:
+        return record
+    content = {**record.content, "objective": resolved(Objective(term=terms))}
+    return ProblemRecord(json.dumps(plain(content), ensure_ascii=False, allow_nan=False), record.urdf)
 
 
 def record_problem(problem: Problem) -> ProblemRecord:

@@ -3,8 +3,8 @@
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from cnpgen.errors import UsageError, nearest
-from cnpgen.refine.solver.cost_term import OBJECTIVES
+from cnpgen.errors import UsageError
+from cnpgen.problems.objectives import read_objective
 from cnpgen.refine.solver.sqp import DEFAULT_SETTINGS
 from cnpgen.schema.argument_types import check_fields
 from cnpgen.schema.arguments import integer, number
@@ -15,9 +15,9 @@ class RefineOptions:
     """Options of ``refine_plans`` and ``solve_plans``.
 
     Attributes:
-        objective: "time": the problem's own objective, time and centrifugal acceleration; "effort" or "jerk": the time
-            with that cost term.
-        weight: Weight of the cost term; by default the problem's, or 1 for effort and jerk.
+        objective: "time": the problem's own objective; or the time with other terms, such as "effort",
+            "effort=0.5" or "effort=1, jerk=0.1" (``cnpgen.problems.objectives.read_objective``).
+        weight: Weight of these terms, or of the problem's centrifugal acceleration; by default as they are defined.
         max_iterations: Largest number of iterations on the coarse level; 0 only scales plans in time.
         tolerance: Relative change of the objective at which it has converged; further steps restore feasibility.
             Without an input plan a tenth of it applies, among obstacles a twentieth.
@@ -35,9 +35,7 @@ class RefineOptions:
 
     def __post_init__(self) -> None:
         check_fields(self)
-        if self.objective not in OBJECTIVES:
-            expected = f"expected one of {', '.join(OBJECTIVES)}{nearest(self.objective, OBJECTIVES)}"
-            raise UsageError(f"objective {self.objective!r} does not exist: {expected}", concerns="objective")
+        read_objective(self.objective)
         if self.weight is not None and number("weight", self.weight) < 0:
             raise UsageError(f"must not be negative, got {self.weight}", argument="weight")
         integer("max_iterations", self.max_iterations, least=0)

@@ -16,7 +16,7 @@ from cnpgen.refine.grid_levels import GridLevel, GridLevels, default_grid_levels
 from cnpgen.refine.rrt_connect import RestSpace
 from cnpgen.refine.solver.bounds import Bounds, BoundsTemplate
 from cnpgen.refine.solver.compiled_backend import load_step_library
-from cnpgen.refine.solver.cost_term import CostTerm, cost_term_residuals
+from cnpgen.refine.solver.cost_term import CostTerm, cost_term_residuals, residual_counts
 from cnpgen.refine.solver.grid import make_grid
 from cnpgen.refine.solver.hulls import Hulls, HullTranscription
 from cnpgen.refine.solver.residuals import stage_jacobian, stage_values
@@ -73,7 +73,8 @@ class Refiner:
             kernels.load(stage_values),
             kernels.load(stage_jacobian),
             cost_term,
-            None if cost_term is None else kernels.load(cost_term_residuals, kind=cost_term.kind),
+            None if cost_term is None else kernels.load(cost_term_residuals, terms=cost_term.tables),
+            () if cost_term is None else residual_counts(robot, cost_term),
             load_step_library(kernels),
         )
         self.levels = default_grid_levels(problem, settings) if levels is None else levels

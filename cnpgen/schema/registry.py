@@ -1,4 +1,4 @@
-"""Registry of stages, constraints, planners and exporters: built-in kinds, and kinds of installed packages."""
+"""Registry of stages, constraints, objectives, planners and exporters, built-in and of installed packages."""
 
 import contextlib
 import dataclasses
@@ -16,12 +16,14 @@ from cnpgen.errors import RecipeError, nearest
 
 STAGES = "cnpgen.stages"
 CONSTRAINTS = "cnpgen.constraints"
+OBJECTIVES = "cnpgen.objectives"
 PLANNERS = "cnpgen.planners"
 EXPORTERS = "cnpgen.exporters"
 
 CONTRACTS: dict[str, str] = {  # base class of the kinds of a group
     STAGES: "cnpgen.pipelines.stages.stage:Stage",
     CONSTRAINTS: "cnpgen.problems.constraints.constraint:Constraint",
+    OBJECTIVES: "cnpgen.problems.objectives:ObjectiveTerm",
     PLANNERS: "cnpgen.benchmark.benchmark_planner:BenchmarkPlanner",
     EXPORTERS: "cnpgen.plans.exporter:Exporter",
 }
@@ -69,9 +71,17 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "object-contact": "cnpgen.problems.constraints.clearance:ObjectContact",
         "puck-contact": "cnpgen.problems.constraints.puck_contact:PuckContact",
     },
+    OBJECTIVES: {
+        "centrifugal": "cnpgen.problems.objectives:Centrifugal",
+        "effort": "cnpgen.problems.objectives:Effort",
+        "jerk": "cnpgen.problems.objectives:Jerk",
+        "path-length": "cnpgen.problems.objectives:PathLength",
+        "tip-reference": "cnpgen.problems.objectives:TipReference",
+    },
     PLANNERS: {
-        "cnp-b": "cnpgen.benchmark.planners.learned:CNPB",
-        "cnp-b+refine": "cnpgen.benchmark.planners.learned:RefinedCNPB",
+        "cnpgen": "cnpgen.benchmark.planners.learned:ShippedNetwork",
+        "cnpgen+refine": "cnpgen.benchmark.planners.learned:RefinedNetwork",
+        "cnp-b-paper": "cnpgen.benchmark.planners.learned:PaperNetwork",
         "solve": "cnpgen.benchmark.planners.solve:Solve",
         "trajopt": "cnpgen.benchmark.planners.trajopt:TrajOpt",
         "aqp": "cnpgen.benchmark.planners.aqp:AQP",
@@ -88,12 +98,14 @@ BUILT_IN: dict[str, dict[str, str]] = {
     },
 }
 
+RENAMED: dict[str, dict[str, str]] = {PLANNERS: {"cnp-b": "cnpgen", "cnp-b+refine": "cnpgen+refine"}}  # old -> new
+
 
 def names(group: str) -> tuple[str, ...]:
     """List the kinds of a group: the built-in ones in their order, then those of installed packages by name.
 
     Args:
-        group: ``STAGES``, ``CONSTRAINTS``, ``PLANNERS`` or ``EXPORTERS``.
+        group: ``STAGES``, ``CONSTRAINTS``, ``OBJECTIVES``, ``PLANNERS`` or ``EXPORTERS``.
     """
     others = {entry.name for entry in installed(group)} - BUILT_IN[group].keys()
     return (*BUILT_IN[group], *sorted(others))
@@ -103,7 +115,7 @@ def load(group: str, name: str) -> type[Any]:
     """Import the class of a kind.
 
     Args:
-        group: ``STAGES``, ``CONSTRAINTS``, ``PLANNERS`` or ``EXPORTERS``.
+        group: ``STAGES``, ``CONSTRAINTS``, ``OBJECTIVES``, ``PLANNERS`` or ``EXPORTERS``.
         name: Name of the kind, as ``use`` has it in a recipe.
 
     Returns:
@@ -116,13 +128,19 @@ def load(group: str, name: str) -> type[Any]:
     noun = noun_of(group)
     if not sources:
         known = names(group)
-        hint = nearest(name, known)
+        hint = name_hint(group, name)
         known_names = f"known: {', '.join(known)}, and those of packages with the entry point group {group!r}"
         raise RecipeError([f"unknown {noun} {name!r}{hint}; {known_names}"])
     if len(sources) > 1:
         raise RecipeError([f"{noun} {name!r} is defined more than once: by {' and by '.join(sources)}"])
     source, importer = next(iter(sources.items()))
     return _imported(importer, f"{noun} {name!r} of {source}", base=contract(group))
+
+
+def name_hint(group: str, name: str) -> str:
+    """Return the new name of a renamed kind, or the most similar name, in parentheses; empty if there is none."""
+    renamed = RENAMED.get(group, {}).get(name)
+    return nearest(name, names(group)) if renamed is None else f" (its name is now {renamed!r})"
 
 
 def contract(group: str) -> type[Any]:
@@ -146,7 +164,7 @@ def name_of(group: str, kind: type) -> str:
     """Return the name under which a class is registered, or ``"module:Class"`` if it is not.
 
     Args:
-        group: ``STAGES``, ``CONSTRAINTS``, ``PLANNERS`` or ``EXPORTERS``.
+        group: ``STAGES``, ``CONSTRAINTS``, ``OBJECTIVES``, ``PLANNERS`` or ``EXPORTERS``.
         kind: The class.
     """
     spec = f"{kind.__module__}:{kind.__qualname__}"
@@ -193,7 +211,7 @@ def why_missing(group: str, use: str, package: str) -> str:
     """Return the missing package of a kind in a recipe; empty if the kind exists.
 
     Args:
-        group: ``STAGES``, ``CONSTRAINTS``, ``PLANNERS`` or ``EXPORTERS``.
+        group: ``STAGES``, ``CONSTRAINTS``, ``OBJECTIVES``, ``PLANNERS`` or ``EXPORTERS``.
         use: Name of the kind.
         package: The package that had it, empty if that is not known.
     """

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from cnpgen.errors import UsageError
-from cnpgen.losses.margins import suggested_margins
+from cnpgen.losses.margins import Margins, suggested_margins
 from cnpgen.losses.metric import Metric
 from cnpgen.losses.metric_settings import suggested_weights
 from cnpgen.losses.plan_loss import PlanLoss
@@ -16,7 +16,7 @@ from cnpgen.machine.versions import __version__
 from cnpgen.planner.inference_pipeline import InferencePipeline, LoadedProblem, make_inference_pipeline
 from cnpgen.planner.model import Model, ModelConfig, is_rest_to_rest
 from cnpgen.planner.network.architecture import Architecture, initial_parameters
-from cnpgen.planner.network.features import Features, count_features, usual_blocks
+from cnpgen.planner.network.features import Features, count_features, feature_blocks, published_features
 from cnpgen.planner.projection import make_projection
 from cnpgen.store.files.documents import plain
 from cnpgen.training.data import TrainingData
@@ -66,7 +66,7 @@ def prepare_run(
     architecture = _architecture(loaded, settings, boundary, initial_model)
     if initial_model is not None:
         _check_initial_model(initial_model, architecture, settings, loaded, zero)
-    rows, features = _rows(boundary, inference, initial_model)
+    rows, features = _rows(boundary, inference, loaded, settings, initial_model)
     if settings.imitation:
         rows = _with_demonstrations(rows, source, loaded)
     loss = _loss(loaded, settings)
@@ -95,10 +95,20 @@ def prepare_run(
     return run, inference
 
 
-def _rows(boundary: Boundary, inference: InferencePipeline, initial_model: Model | None) -> tuple[Rows, Features]:
+def _rows(
+    boundary: Boundary,
+    inference: InferencePipeline,
+    loaded: LoadedProblem,
+    settings: TrainingSettings,
+    initial_model: Model | None,
+) -> tuple[Rows, Features]:
     """Prepare the rows, with the lines of the initial model's plans."""
     if initial_model is None:
-        return prepare_rows(boundary, inference.prepare)
+        blocks, robot = feature_blocks(boundary, settings.features), loaded.robot
+        features = None
+        if settings.features == "paper":
+            features = published_features(blocks, robot.velocity_limit, robot.acceleration_limit)
+        return prepare_rows(boundary, inference.prepare, features=features, blocks=blocks)
     lines = None if inference.via_points is None else lambda some: inference.planned(initial_model, some)[0]
     return prepare_rows(boundary, inference.prepare, features=initial_model.features, lines=lines)
 
@@ -115,6 +125,10 @@ def _with_demonstrations(rows: Rows, source: TrainingData, loaded: LoadedProblem
             f"{source.dataset.folder} has no plans to imitate: make it with"
             " make_dataset(..., certify=True) or 'cnpgen make-dataset --certify', or train without imitation"
         )
+    spec = loaded.problem.trajectory
+    theirs, ours = (target.path.shape[1], target.rate.shape[1]), (spec.path_control_points, spec.rate_control_points)
+    if theirs != ours:
+        raise UsageError(f"the plans to imitate have {theirs} control points, these motions {ours}")
     return replace(rows, target=target)
 
 
@@ -146,7 +160,7 @@ def _architecture(
     check_memory("hidden", settings.hidden, settings.layers * settings.hidden**2)
     check_memory("batch_size", settings.batch_size, settings.batch_size * settings.nodes)
     spec = loaded.problem.trajectory
-    blocks = usual_blocks(boundary) if initial_model is None else initial_model.features.blocks
+    blocks = feature_blocks(boundary, settings.features) if initial_model is None else initial_model.features.blocks
     return Architecture(
         inputs=count_features(blocks, loaded.robot.n),
         hidden=settings.hidden,
@@ -158,9 +172,16 @@ def _architecture(
 
 def _loss(loaded: LoadedProblem, settings: TrainingSettings) -> PlanLoss:
     backend = loaded.kernels.backend
-    usual = suggested_margins(loaded.problem)
+    usual = suggested_margins(loaded.problem) if settings.usual_margins else Margins()
     margins = replace(usual, factors={**usual.factors, **settings.margins})
-    loss = PlanLoss(loaded.problem, nodes=settings.nodes, form=settings.form, backend=backend, margins=margins)
+    loss = PlanLoss(
+        loaded.problem,
+        nodes=settings.nodes,
+        form=settings.form,
+        backend=backend,
+        margins=margins,
+        dtype=settings.precision,
+    )
     loss.load_kernels()  # outside the timed steps
     return loss
 
@@ -168,6 +189,8 @@ def _loss(loaded: LoadedProblem, settings: TrainingSettings) -> PlanLoss:
 def _metric(loss: PlanLoss, settings: TrainingSettings) -> Metric:
     learned = settings.metric.kind == "learned"
     weights = loss.weights0 if learned else suggested_weights(loss.problem, loss.weights0)
+    if settings.constraint_terms == "budgeted":
+        weights = np.where(loss.budgets > 0, weights, 0.0)
     return Metric(weights, loss.budgets, settings.metric)
 
 

@@ -3,12 +3,15 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 from cnpgen.errors import UsageError
 from cnpgen.losses.metric_settings import BOUNDED, PUBLISHED, MetricSettings
+from cnpgen.losses.plan_loss import FORMS
 from cnpgen.planner.model import ModelConfig
+from cnpgen.planner.network.features import FEATURE_SETS
 from cnpgen.planner.tasks import EXPECTED_TIMES
+from cnpgen.problems.objectives import read_objective
 from cnpgen.schema.argument_types import check_fields
 from cnpgen.schema.arguments import integer, number
 
@@ -20,13 +23,23 @@ METRICS = {
 }
 MIN_INTEGERS = {
     "hidden": 1, "layers": 1, "batch_size": 1, "nodes": 1, "shifts": 1,
-    "warm_up": 0, "seed": 0, "line_projection_steps": 0, "projection_steps": 0,
+    "warm_up": 0, "seed": 0, "line_projection_steps": 0, "projection_steps": 0, "validations": 1,
 }  # fmt: skip
 VALID_INTERVALS = {
     "learning_rate": "(0, inf)", "final_rate": "[0, 1]", "path_scale": "(0, inf)", "head_scale": "[0, inf)",
     "rate_bias": "(-inf, inf)", "sample_clip": "(0, inf]", "batch_clip": "(0, inf]", "memory": "[0, 1)",
     "imitation": "[0, 1)",
 }  # fmt: skip
+
+
+CHOICES: dict[str, tuple[str, ...]] = {
+    "expected_time": EXPECTED_TIMES,
+    "features": FEATURE_SETS,
+    "loss_form": ("", *FORMS),
+    "constraint_terms": ("all", "budgeted"),
+    "keep": ("best", "last"),
+    "precision": ("float32", "float64"),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +70,20 @@ class TrainingSettings:
         metric: Schedule of the weights of the constraint terms.
         expected_time: Unit of durations; see ``ModelConfig``.
         margins: Constraint term -> factor of its limits, in (0, 1], that replaces the usual one.
+        usual_margins: Whether the other bounds are tightened as the constraint classes suggest.
         imitation: Fraction of the run, at its beginning, that imitates the plans of a certified dataset.
+        features: Inputs of the network: "full"; "states", the standardized boundary states; or "paper", the boundary
+            states divided by pi and by the limits.
+        loss_form: Form of the loss, "signed" or "paper" (``PlanLoss``); empty for the one that suits the metric.
+        constraint_terms: "all", or "budgeted": only those with a budget, which are those of the paper.
+        time_varying_bounds: Whether motions that start off the manifold have the time-varying bounds of the verdict.
+        path_control_points: Number of path control points; None for that of the problem.
+        rate_control_points: Number of rate control points; None for that of the problem.
+        keep: Model that is kept: the "best" of all validations, or the "last" one.
+        objective: Objective in place of that of the problem, such as "effort" or "effort=2, jerk=0.1"
+            (``cnpgen.problems.objectives.read_objective``); empty for that of the problem.
+        precision: Precision of the loss and its gradient; the network has float32.
+        validations: Number of validations, evenly distributed over the run.
     """
 
     hidden: int = 128
@@ -82,7 +108,18 @@ class TrainingSettings:
     metric: MetricSettings = field(default_factory=MetricSettings)
     expected_time: str = "distance"
     margins: Mapping[str, float] = field(default_factory=dict)
+    usual_margins: bool = True
     imitation: float = 0.0
+    features: str = "full"
+    loss_form: str = ""
+    constraint_terms: str = "all"
+    time_varying_bounds: bool = True
+    path_control_points: int | None = None
+    rate_control_points: int | None = None
+    keep: str = "best"
+    objective: str = ""
+    precision: Literal["float32", "float64"] = "float32"
+    validations: int = 10
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -93,14 +130,20 @@ class TrainingSettings:
         _within("growth", self.metric.growth, "(0, inf)")
         for term, factor in self.margins.items():
             _within("margins", factor, "(0, 1]", of=f" for {term!r}")
-        if self.expected_time not in EXPECTED_TIMES:
-            raise UsageError(
-                f"must be one of {', '.join(EXPECTED_TIMES)}, got {self.expected_time!r}", argument="expected_time"
-            )
+        read_objective(self.objective)
+        for name, choices in CHOICES.items():
+            if getattr(self, name) not in choices:
+                known = ", ".join(filter(None, choices))
+                raise UsageError(f"must be one of {known}, got {getattr(self, name)!r}", argument=name)
+        for name in ("path_control_points", "rate_control_points"):
+            if getattr(self, name) is not None:
+                integer(name, getattr(self, name), least=1)
 
     @property
     def form(self) -> str:
-        """Form of the loss: "paper" for the paper's metric, whose budgets are defined for it, else "signed"."""
+        """Form of the loss: as set, else "paper" for the paper's metric, whose budgets belong to it, or "signed"."""
+        if self.loss_form:
+            return self.loss_form
         return "paper" if self.metric.kind == "learned" and self.metric.every == "epoch" else "signed"
 
     @property

@@ -76,7 +76,7 @@ class Learner:
         """
 
         def cost(points: ControlPoints) -> LossValue:
-            start_tip = rows.tasks.start_xyz
+            start_tip = rows.tasks.start_xyz if self.settings.time_varying_bounds else None
             return self.loss(
                 points.path,
                 points.rate,

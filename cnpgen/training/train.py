@@ -13,7 +13,7 @@ from cnpgen.machine.times import NO_TIME, Stopwatch, Times
 from cnpgen.planner.inference_pipeline import InferencePipeline, loaded_problem
 from cnpgen.planner.model import Model
 from cnpgen.planner.model_file import find_model, load_model, save_model
-from cnpgen.problems.problem_record import as_record
+from cnpgen.problems.problem_record import as_record, with_control_points, with_objective
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import concerning, integer
 from cnpgen.store.files.atomic import file_sha256
@@ -108,7 +108,10 @@ def train_model(
             return _finished(job)
         check_beside(job.out)
     lock = output_lock(job.out, job.out.with_suffix(LOCK))
-    with lock, one_thread(), loaded_problem(as_record(job.source.dataset.problem)) as loaded:
+    record = with_control_points(
+        as_record(job.source.dataset.problem), settings.path_control_points, settings.rate_control_points
+    )
+    with lock, one_thread(), loaded_problem(with_objective(record, settings.objective)) as loaded:
         run, inference = prepare_run(
             job.source,
             loaded,

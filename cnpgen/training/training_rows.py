@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cnpgen.loader.order import Order
 from cnpgen.planner.control_points import ControlPoints
-from cnpgen.planner.network.features import Features, fit_features, usual_blocks
+from cnpgen.planner.network.features import Features, feature_blocks, fit_features
 from cnpgen.planner.task_preprocessor import TaskPreprocessor
 from cnpgen.planner.tasks import Tasks
 from cnpgen.plans.format import BOUNDARY, CONDITIONS
@@ -55,6 +55,7 @@ def prepare_rows(
     prepare: TaskPreprocessor,
     *,
     features: Features | None = None,
+    blocks: tuple[str, ...] | None = None,
     lines: Callable[[Boundary], Tasks] | None = None,
     dtype: str = "float32",
 ) -> tuple[Rows, Features]:
@@ -64,24 +65,27 @@ def prepare_rows(
         boundary: Boundary conditions of N rows.
         prepare: Preprocessor of the problem's tasks.
         features: Standardization of the features; by these rows if None.
+        blocks: Blocks of features to standardize by these rows; all if None.
         lines: Preprocessor of tasks along other lines; ``prepare`` if None.
         dtype: Float type of the rows.
 
     Returns:
         The rows, and the standardization of their features.
     """
-    blocks = [
+    parts = [
         slice(first, first + PREPARED_ROWS_PER_BLOCK)
         for first in range(0, max(len(boundary), 1), PREPARED_ROWS_PER_BLOCK)
     ]
     straight = replace(prepare, line=None)  # features do not depend on the projected line, which takes most of the time
-    definition = features or fit_features((straight(boundary[block]) for block in blocks), usual_blocks(boundary))
+    definition = features or fit_features(
+        (straight(boundary[part]) for part in parts), blocks or feature_blocks(boundary)
+    )
     arrays: dict[str, Array] = {}
-    for block in blocks:
-        for name, values in _arrays((lines or prepare)(boundary[block]), definition, dtype).items():
+    for part in parts:
+        for name, values in _arrays((lines or prepare)(boundary[part]), definition, dtype).items():
             if name not in arrays:
                 arrays[name] = np.empty((len(boundary), *values.shape[1:]), dtype)
-            arrays[name][block] = values
+            arrays[name][part] = values
     ends = Boundary(**{name: arrays.pop(name) for name in boundary.conditions()})
     row_features, scene = arrays.pop("features"), Scene(tuple(prepare.problem.obstacle), arrays.pop("poses"))
     return Rows(features=row_features, tasks=Tasks(ends, scene=scene, **arrays)), definition

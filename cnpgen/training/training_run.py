@@ -26,7 +26,7 @@ Array = NDArray[Any]
 Watcher = Callable[[Mapping[str, Any]], None]
 Validate = Callable[[Model], Mapping[str, Any]]
 
-LOG_LINES, VALIDATIONS = 100, 10  # per run
+LOG_LINES = 100  # per run
 SHIFT_STRIDE = 7  # between the shifts of successive steps; coprime to the number of shifts
 
 
@@ -151,7 +151,7 @@ class Run:
         step, records = state.adam.step, []
         if _is_due(step, state.steps, LOG_LINES):
             records.append(self._progress(state))
-        if _is_due(step, state.steps, VALIDATIONS):
+        if _is_due(step, state.steps, self.learner.settings.validations):
             records.append(self._check(state))
         return records
 
@@ -187,7 +187,7 @@ class Run:
         """Validate the averaged parameters; keep them if they are the best so far."""
         started, step = time.process_time(), state.adam.step
         record = self.validate(self.model(state.adam.average))
-        if record["score"] >= state.best.score:
+        if self.learner.settings.keep == "last" or record["score"] >= state.best.score:
             state.best = Best(record["score"], step, state.adam.average.copy())
         state.checking += time.process_time() - started
         return {"step": step, "seconds": round(state.seconds, 2), "validation": dict(record)}

@@ -27,7 +27,7 @@ def test_every_planner_has_a_row_in_one_table(suite: str, tmp_path: Path) -> Non
         assert row["ending"] in {"planned", "no plan", "out of time"}, (name, row["error"])
         assert summary[name]["ratios"]["valid"]["p"] <= 1
         assert row["answer"] is None or "failure" not in row["executed"]["nominal"]
-    assert {name for name in planners if summary[name]["ratios"]["success"]["count"]} >= {"cnp-b+refine", "solve"}
+    assert {name for name in planners if summary[name]["ratios"]["success"]["count"]} >= {"cnpgen+refine", "solve"}
 
 
 def executed_values(benchmark: Benchmark, planner: str, plant: str, key: str) -> np.ndarray:
@@ -36,15 +36,15 @@ def executed_values(benchmark: Benchmark, planner: str, plant: str, key: str) ->
 
 @pytest.mark.extended
 def test_hits_81(tmp_path: Path) -> None:
-    benchmark = run_benchmark("hits-81", tmp_path, planners=["cnp-b+refine", "aqp", "trajopt"], plants=PLANTS)
-    rows = benchmark.results["cnp-b+refine"]
+    benchmark = run_benchmark("hits-81", tmp_path, planners=["cnpgen+refine", "aqp", "trajopt"], plants=PLANTS)
+    rows = benchmark.results["cnpgen+refine"]
     assert sum(row["verdict"]["valid"] for row in rows) == 81
     for plant in PLANTS:
-        assert executed_values(benchmark, "cnp-b+refine", plant, "success").all()
-        assert executed_values(benchmark, "cnp-b+refine", plant, "z_error_mm_s").max() <= (
+        assert executed_values(benchmark, "cnpgen+refine", plant, "success").all()
+        assert executed_values(benchmark, "cnpgen+refine", plant, "z_error_mm_s").max() <= (
             0.1 if plant == "nominal" else 1.0
         )
-    assert np.median(executed_values(benchmark, "cnp-b+refine", "nominal", "hit_time_s")) <= 0.43
+    assert np.median(executed_values(benchmark, "cnpgen+refine", "nominal", "hit_time_s")) <= 0.43
     assert executed_values(benchmark, "aqp", "nominal", "scored").sum() >= 75
     assert 0.6 <= np.median(executed_values(benchmark, "aqp", "nominal", "hit_time_s")) <= 0.7
     assert executed_values(benchmark, "trajopt", "nominal", "scored").sum() >= 0.91 * 81
@@ -52,17 +52,17 @@ def test_hits_81(tmp_path: Path) -> None:
 
 @pytest.mark.extended
 def test_heavy_100(tmp_path: Path) -> None:
-    benchmark = run_benchmark("heavy-100", tmp_path, planners=["cnp-b+refine"], plants=["nominal", "heavier"])
-    assert sum(row["verdict"]["valid"] for row in benchmark.results["cnp-b+refine"]) == 100
+    benchmark = run_benchmark("heavy-100", tmp_path, planners=["cnpgen+refine"], plants=["nominal", "heavier"])
+    assert sum(row["verdict"]["valid"] for row in benchmark.results["cnpgen+refine"]) == 100
     for plant in ("nominal", "heavier"):
-        assert executed_values(benchmark, "cnp-b+refine", plant, "success").all()
+        assert executed_values(benchmark, "cnpgen+refine", plant, "success").all()
 
 
 @pytest.mark.extended
 @pytest.mark.parametrize("suite", ["replan", "online"])
 def test_replanning_scenarios(suite: str, tmp_path: Path) -> None:
-    benchmark = run_benchmark(suite, tmp_path, planners=["cnp-b+refine"], plants=["nominal"])
-    assert executed_values(benchmark, "cnp-b+refine", "nominal", "success").sum() >= 23
+    benchmark = run_benchmark(suite, tmp_path, planners=["cnpgen+refine"], plants=["nominal"])
+    assert executed_values(benchmark, "cnpgen+refine", "nominal", "success").sum() >= 23
 
 
 @pytest.mark.extended

@@ -29,7 +29,7 @@ from dataclasses import dataclass
 import numpy as np
 from cnpgen.benchmark import Trajectory
 from cnpgen.benchmark.benchmark_planner import BenchmarkPlanner
-from cnpgen.benchmark.planners.learned import CNPB
+from cnpgen.benchmark.planners.learned import ShippedNetwork
 from cnpgen.benchmark.suite import load_suite
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Unreliable(BenchmarkPlanner):
     "Fails differently on every problem."
 
     def prepare(self, setting):
-        good, others = CNPB().prepare(setting), load_suite("hits-81").problems()[0]
+        good, others = ShippedNetwork().prepare(setting), load_suite("hits-81").problems()[0]
         actions = {
             0: lambda problem: os._exit(1),
             1: good,
@@ -95,9 +95,9 @@ def test_a_planner_that_cannot_be_prepared_affects_only_its_own_rows(
     (tmp_path / "unreliable.py").write_text(
         text.replace("good, others =", f"{failure}\n        good, others ="), encoding="utf-8"
     )
-    benchmark = run_benchmark("hits-81", tmp_path / "results", planners=[unreliable, "cnp-b"], n=2)
+    benchmark = run_benchmark("hits-81", tmp_path / "results", planners=[unreliable, "cnpgen"], n=2)
     assert [row["ending"] for row in benchmark.results[unreliable]] == ["crashed"] * 2
-    assert [row["ending"] for row in benchmark.results["cnp-b"]] == ["planned"] * 2
+    assert [row["ending"] for row in benchmark.results["cnpgen"]] == ["planned"] * 2
     messages = {
         "1 / 0": "ZeroDivisionError: division by zero",
         "os._exit(1)": "its process ended or was not ready in time",
@@ -110,64 +110,65 @@ def test_a_planner_that_cannot_be_prepared_affects_only_its_own_rows(
 @pytest.mark.slow
 def test_a_report_omits_the_image_of_a_damaged_line(tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
-    run_benchmark("hits-81", tmp_path, planners=["cnp-b"], n=1, plants=["nominal"], workers=1)
-    file = tmp_path / "cnp-b.jsonl"
+    run_benchmark("hits-81", tmp_path, planners=["cnpgen"], n=1, plants=["nominal"], workers=1)
+    file = tmp_path / "cnpgen.jsonl"
     head, planned, *others = map(json.loads, file.read_text().splitlines())
     planned["answer"]["path_control_points"] = [row[:3] for row in planned["answer"]["path_control_points"]]
     file.write_text("".join(json.dumps(row) + "\n" for row in (head, planned, *others)))
-    benchmark = run_benchmark("hits-81", tmp_path, planners=["cnp-b"], n=1, plants=["nominal", "heavier"], workers=1)
-    failure = benchmark.results["cnp-b"][0]["executed"]["heavier"]["failure"]
+    benchmark = run_benchmark("hits-81", tmp_path, planners=["cnpgen"], n=1, plants=["nominal", "heavier"], workers=1)
+    failure = benchmark.results["cnpgen"][0]["executed"]["heavier"]["failure"]
     assert failure.startswith("path_control_points has 3 joints, but 'airhockey' plans 6")
     report = save_benchmark_report(benchmark, tmp_path / "report.html").read_text()
-    assert "cnp-b, problem 0: no image: path_control_points has 3 joints" in report
-    assert "1 of 1 (20.7 to 100 %) (paper: 100 %)" in report
+    assert "cnpgen, problem 0: no image: path_control_points has 3 joints" in report
+    assert "1 of 1 (20.7 to 100 %)" in report
+    assert "CNP-B, has in the paper: " in report
 
 
 @pytest.mark.slow
 def test_a_report_uses_the_next_answer_if_the_first_cannot_be_executed(tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
-    first = run_benchmark("hits-81", tmp_path, planners=["cnp-b"], n=2)
-    file = tmp_path / "cnp-b.jsonl"
+    first = run_benchmark("hits-81", tmp_path, planners=["cnpgen"], n=2)
+    file = tmp_path / "cnpgen.jsonl"
     lines = file.read_text().splitlines()
-    broken = first.results["cnp-b"][0]
+    broken = first.results["cnpgen"][0]
     broken["answer"]["rate_control_points"][0] = None
     file.write_text("\n".join([lines[0], json.dumps(broken), *lines[2:]]) + "\n")
-    benchmark = run_benchmark("hits-81", tmp_path, planners=["cnp-b"], n=2, plants=["nominal"], workers=1)
-    assert "cannot be executed" in benchmark.results["cnp-b"][0]["executed"]["nominal"]["failure"]
+    benchmark = run_benchmark("hits-81", tmp_path, planners=["cnpgen"], n=2, plants=["nominal"], workers=1)
+    assert "cannot be executed" in benchmark.results["cnpgen"][0]["executed"]["nominal"]["failure"]
     report = save_benchmark_report(benchmark, tmp_path / "report.html").read_text()
-    assert "cnp-b, problem 1" in report or "No images" in report
+    assert "cnpgen, problem 1" in report or "No images" in report
 
 
 @pytest.mark.slow
 def test_a_run_resumes_and_adds_executions_and_problems(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("mujoco")
-    first = run_benchmark("hits-81", tmp_path, planners=["cnp-b"], n=2)
-    file = tmp_path / "cnp-b.jsonl"
+    first = run_benchmark("hits-81", tmp_path, planners=["cnpgen"], n=2)
+    file = tmp_path / "cnpgen.jsonl"
     text = file.read_text()
     file.write_text(text + text.splitlines()[-1][:100])  # cut off by an interruption
     activities: list[str] = []
     second = run_benchmark(
         "hits-81",
         tmp_path,
-        planners=["cnp-b"],
+        planners=["cnpgen"],
         n=3,
         plants=["nominal"],
         workers=1,
         progress=lambda *a: activities.append(a[0]),
     )
-    assert activities == ["cnp-b plans", *["cnp-b, nominal plant"] * 3]
+    assert activities == ["cnpgen plans", *["cnpgen, nominal plant"] * 3]
     assert file.read_text().startswith(text)
-    assert second.results["cnp-b"][0]["planning_s"] == first.results["cnp-b"][0]["planning_s"]
-    assert all(row["executed"]["nominal"]["scored"] for row in second.results["cnp-b"])
-    third = run_benchmark("hits-81", tmp_path, planners=["cnp-b"], n=3, plants=["nominal"], workers=1)
+    assert second.results["cnpgen"][0]["planning_s"] == first.results["cnpgen"][0]["planning_s"]
+    assert all(row["executed"]["nominal"]["scored"] for row in second.results["cnpgen"])
+    third = run_benchmark("hits-81", tmp_path, planners=["cnpgen"], n=3, plants=["nominal"], workers=1)
     assert third.results == second.results
     monkeypatch.setattr("cnpgen.benchmark.html_report.MAX_FILM_FRAMES", 3)
     report = save_benchmark_report(third, tmp_path / "report.html", video=True).read_text()
-    assert "paper: 100 %" in report
+    assert ": 100 %, planning time" in report
     assert "<svg" in report
     assert "src='data:video/mp4;base64," in report or "No images: this machine cannot draw" in report
     assert not re.search("(src|href)=['\"](?!data:|#)", report)
-    assert [file.name for file in sorted(tmp_path.iterdir())] == ["cnp-b.jsonl", "report.html", "runs.json"]
+    assert [file.name for file in sorted(tmp_path.iterdir())] == ["cnpgen.jsonl", "report.html", "runs.json"]
 
 
 @pytest.mark.slow
@@ -177,9 +178,9 @@ def test_a_run_resumes_and_adds_executions_and_problems(tmp_path: Path, monkeypa
 @pytest.mark.filterwarnings("default")  # of dask and ray
 def test_parallel_planners_return_the_results_of_one(tmp_path: Path, engine: str) -> None:
     pytest.importorskip({"loky": "joblib", "dask": "distributed"}.get(engine, engine))
-    (serial,) = run_benchmark("hits-81", tmp_path / "serial", planners=["cnp-b"], n=3).results.values()
+    (serial,) = run_benchmark("hits-81", tmp_path / "serial", planners=["cnpgen"], n=3).results.values()
     (parallel,) = run_benchmark(
-        "hits-81", tmp_path / "parallel", planners=["cnp-b"], n=3, engine=engine, workers=2
+        "hits-81", tmp_path / "parallel", planners=["cnpgen"], n=3, engine=engine, workers=2
     ).results.values()
     assert [row["planners_at_once"] for row in parallel] == [2] * 3
     for key in ("problem", "answer", "verdict"):
@@ -188,11 +189,11 @@ def test_parallel_planners_return_the_results_of_one(tmp_path: Path, engine: str
 
 @pytest.mark.slow
 def test_results_of_another_run_are_refused(tmp_path: Path) -> None:
-    run_benchmark("hits-81", tmp_path, planners=["cnp-b"], n=1)
+    run_benchmark("hits-81", tmp_path, planners=["cnpgen"], n=1)
     with pytest.raises(UsageError, match="holds results of another run"):
-        run_benchmark("hits-110", tmp_path, planners=["cnp-b"], n=1)
-    run_benchmark("hits-110", tmp_path, planners=["cnp-b"], n=1, force=True)
-    assert json.loads((tmp_path / "cnp-b.jsonl").read_text().splitlines()[0])["suite"] == "hits-110"
+        run_benchmark("hits-110", tmp_path, planners=["cnpgen"], n=1)
+    run_benchmark("hits-110", tmp_path, planners=["cnpgen"], n=1, force=True)
+    assert json.loads((tmp_path / "cnpgen.jsonl").read_text().splitlines()[0])["suite"] == "hits-110"
 
 
 PLANNED = {"problem": 0, "ending": "planned", "planning_s": 1.0, "planning_cpu_s": 1.0, "error": "", "answer": None}
@@ -236,17 +237,22 @@ def test_deeply_nested_lines_are_ignored_and_a_pipe_is_refused(tmp_path: Path) -
 
 
 def test_mistakes_are_reported_before_any_work(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"unknown planner 'cnpb'.*did you mean 'cnp-b'"):
-        run_benchmark("hits-81", tmp_path, planners=["cnpb"])
+    with pytest.raises(UsageError, match=r"unknown planner 'cnpgn'.*did you mean 'cnpgen'"):
+        run_benchmark("hits-81", tmp_path, planners=["cnpgn"])
+    for old, new in {"cnp-b": "cnpgen", "cnp-b+refine": "cnpgen+refine"}.items():
+        with pytest.raises(
+            UsageError, match=rf"unknown planner '{re.escape(old)}' \(its name is now '{re.escape(new)}'\)"
+        ):
+            run_benchmark("hits-81", tmp_path, planners=[old])
     with pytest.raises(UsageError, match="unknown plant"):
-        run_benchmark("hits-81", tmp_path, planners=["cnp-b"], plants=["lighter"])
+        run_benchmark("hits-81", tmp_path, planners=["cnpgen"], plants=["lighter"])
     with pytest.raises(UsageError, match="time_limit must be above 0"):
-        run_benchmark("hits-81", tmp_path, planners=["cnp-b"], time_limit=0)
+        run_benchmark("hits-81", tmp_path, planners=["cnpgen"], time_limit=0)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_an_unsuitable_planner_is_reported_as_not_applicable(tmp_path: Path) -> None:
-    benchmark = run_benchmark("heavy-100", tmp_path, planners=["cnp-b", "aqp"], n=2)
+    benchmark = run_benchmark("heavy-100", tmp_path, planners=["cnpgen", "aqp"], n=2)
     assert [row["ending"] for row in benchmark.results["aqp"]] == ["not applicable"] * 2
     assert failure_summaries(benchmark) == [
         "aqp: 2 of 2 not applicable, problem 0: aqp plans hits on a table with up to 7 joints,"
@@ -363,7 +369,7 @@ def test_children_of_a_planner_end_with_its_time_limit(
 
 
 def test_an_answer_after_the_time_limit_does_not_count() -> None:
-    process = PlannerProcess("cnp-b", Setting(load_suite("hits-81").problems(1)[0].problem, time_limit=1.0))
+    process = PlannerProcess("cnpgen", Setting(load_suite("hits-81").problems(1)[0].problem, time_limit=1.0))
     late = PlanningOutcome(Ending.PLANNED, {"t": []}, seconds=1.001)
     assert process._in_time(late).ending == "out of time"
     assert process._in_time(late).answer is None
@@ -373,27 +379,27 @@ def test_an_answer_after_the_time_limit_does_not_count() -> None:
 
 def test_a_report_covers_the_folder_and_nothing_else(random: str, tmp_path: Path) -> None:
     folder = tmp_path / "results"
-    run_benchmark("hits-81", folder, planners=["cnp-b"], n=3)
-    benchmark = run_benchmark("hits-81", folder, planners=[random], n=2, reference="cnp-b")
-    assert {name: len(rows) for name, rows in benchmark.results.items()} == {random: 2, "cnp-b": 3}
+    run_benchmark("hits-81", folder, planners=["cnpgen"], n=3)
+    benchmark = run_benchmark("hits-81", folder, planners=[random], n=2, reference="cnpgen")
+    assert {name: len(rows) for name, rows in benchmark.results.items()} == {random: 2, "cnpgen": 3}
     assert len(benchmark.problems) == 3
-    assert [run.planners for run in benchmark.runs] == [("cnp-b",), (random,)]
+    assert [run.planners for run in benchmark.runs] == [("cnpgen",), (random,)]
     save_benchmark_tables(benchmark, folder)
     lines = (folder / "results.csv").read_text().splitlines()
     csv_rows = list(csv.DictReader(line for line in lines if not line.startswith("#")))
     assert [(row["planner"], row["problem"]) for row in csv_rows] == [
-        (random, "0"), (random, "1"), ("cnp-b", "0"), ("cnp-b", "1"), ("cnp-b", "2"),
+        (random, "0"), (random, "1"), ("cnpgen", "0"), ("cnpgen", "1"), ("cnpgen", "2"),
     ]  # fmt: skip
-    assert float(csv_rows[2]["planning_ms"]) == 1e3 * benchmark.results["cnp-b"][0]["planning_s"]
+    assert float(csv_rows[2]["planning_ms"]) == 1e3 * benchmark.results["cnpgen"][0]["planning_s"]
     for name in ("results.csv", "tables.md", "tables.tex"):
         text = (folder / name).read_text()
         for needed in (benchmark.runs[-1].date, benchmark.runs[-1].processor, "seed 0", "numpy"):
             assert needed in text, (name, needed)
-    assert "| planned | random | cnp-b |" in (folder / "tables.md").read_text()
+    assert "| planned | random | cnpgen |" in (folder / "tables.md").read_text()
     latex = (folder / "tables.tex").read_text()
-    assert r"planned & random & cnp-b \\" in latex
+    assert r"planned & random & cnpgen \\" in latex
     assert re.search(r"(?<!\\)%", re.sub(r"^%.*$", "", latex, flags=re.M)) is None
-    with pytest.raises(UsageError, match="reference must be one of cnp-b, random, got 'solve'"):
+    with pytest.raises(UsageError, match="reference must be one of cnpgen, random, got 'solve'"):
         run_benchmark("hits-81", folder, planners=[random], n=1, reference="solve")
     (folder / "other.jsonl").write_text('{"format": "cnpgen-benchmark", "suite": "heavy-100"}\n')
     with pytest.raises(UsageError, match=r"other.jsonl holds results of another run"):
@@ -408,4 +414,4 @@ def test_a_report_covers_the_folder_and_nothing_else(random: str, tmp_path: Path
 def test_a_damaged_record_of_runs_is_named(tmp_path: Path) -> None:
     (tmp_path / "runs.json").write_text('[{"date": 5}]')
     with pytest.raises(DatasetError, match=r"runs.json is damaged: .*; delete it"):
-        run_benchmark("hits-81", tmp_path, planners=["cnp-b"], n=1)
+        run_benchmark("hits-81", tmp_path, planners=["cnpgen"], n=1)

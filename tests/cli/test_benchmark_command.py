@@ -13,7 +13,7 @@ def test_the_list_names_suites_planners_and_plants(capsys: pytest.CaptureFixture
     assert main(["benchmark", "--list", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert {"hits-81", "hits-110", "heavy-100"} <= found["suites"].keys()
-    assert {"cnp-b", "cnp-b+refine", "solve", "trajopt", "aqp"} <= found["planners"].keys()
+    assert {"cnpgen", "cnpgen+refine", "solve", "trajopt", "aqp"} <= found["planners"].keys()
     assert list(found["plants"]) == ["nominal", "heavier", "delayed"]
 
 
@@ -24,13 +24,13 @@ def test_the_list_says_of_a_planner_that_cannot_be_imported_why(
         assert main(["benchmark", "--list", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert "No module named 'no_such_module'" in found["planners"]["mine"]
-    assert "cnp-b" in found["planners"]
+    assert "cnpgen" in found["planners"]
 
 
 @pytest.mark.slow
 def test_a_short_benchmark_of_all_planners(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("mujoco")
-    planners = ["cnp-b", "cnp-b+refine", "solve", "trajopt", "aqp"]
+    planners = ["cnpgen", "cnpgen+refine", "solve", "trajopt", "aqp"]
     options = ["-o", str(tmp_path / "results"), "--n", "1", "--simulate", "--workers", "1"]
     assert main(["benchmark", "hits-81", "--planners", *planners, *options, "--json"]) == 0
     found = json.loads(capsys.readouterr().out)

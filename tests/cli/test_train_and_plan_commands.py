@@ -150,10 +150,10 @@ def test_how_a_model_is_trained_is_said_by_options_and_kept_in_it(tiny, tmp_path
     config = load_model(path).config
     assert (config.expected_time, config.time_parametrized, config.within_limits) == ("reach", True, True)
     options = (
-        "--expected-time reach --rate-bias -0.1 --within-limits --time-parametrized"
-        " --margin joint-velocity=0.97 --margin table=1"
+        "--rate-bias -0.1 --expected-time reach --within-limits --time-parametrized --batch-size 32"
+        " --learning-rate 0.002 --seed 7 --metric bounded --growth 3.0 --margin joint-velocity=0.97 --margin table=1"
     )
-    assert f"{options} --seed 7 --check 2" in load_model(path).training["command"]
+    assert f"{options} --check 2" in load_model(path).training["command"]
 
 
 @pytest.mark.slow
@@ -205,6 +205,11 @@ def test_growth_that_changes_nothing_is_refused(tiny, tmp_path, capsys):
         ["--steps", "0"],
         ["--steps", "5", "--epochs", "2"],
         ["--learning-rate", "-1"],
+        ["--preset", "article"],
+        ["--gamma", "0.1"],
+        ["--metric", "fixed", "--budget-factor", "0.1"],
+        ["--features", "paper", "--keep", "first"],
+        ["--path-control-points", "5"],
     ],
 )
 def test_train_refuses_what_cannot_be_meant(tiny, tmp_path, capsys, words):

@@ -1,6 +1,8 @@
 """Refiners of the shipped problems, and of problems that differ from them only in their bounds."""
 
+from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,9 +10,13 @@ import pytest
 from cnpgen.judges.plans import Verdict, judge
 from cnpgen.kernels.compiler import find_compiler
 from cnpgen.kernels.library import KernelLibrary, default_cache_folder, problem_kernels
+from cnpgen.problems.objectives import ObjectiveTerm, read_objective
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.refiner import Refiner
-from cnpgen.refine.solver.cost_term import CostTerm
+from cnpgen.refine.solver.cost_term import CostTerm, cost_term_residuals, residual_counts
+from cnpgen.refine.solver.grid import make_grid
+from cnpgen.refine.solver.residuals import stage_jacobian, stage_values
+from cnpgen.refine.solver.transcription import ResidualKernels, Transcription
 from cnpgen.refine.strategy import PlanChecker, refine_task
 from cnpgen.refine.task import Attempt, RefinementTask
 from cnpgen.trajectory.boundary import Boundary
@@ -19,6 +25,28 @@ from cnpgen.world.world import World
 from tests.examples.plans import PROBLEMS, ROBOTS, Plan
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
+
+
+def cost_term_of(name: str, weight: float) -> CostTerm:
+    """Return a cost term of one registered kind."""
+    terms = read_objective(f"{name}={weight}")
+    assert terms is not None
+    return CostTerm(terms)
+
+
+def transcription_of(plan: Plan, points: int, terms: tuple[ObjectiveTerm, ...]) -> Transcription:
+    """Return the transcription of a plan's problem with an objective, interpreted: faster than compiling."""
+    kernels, spec = library(plan.problem.name), plan.problem.trajectory
+    stages = [kernels.load(builder) for builder in (stage_values, stage_jacobian)]
+    parts: tuple[Any, ...] = ()
+    if terms:
+        cost_term = CostTerm(terms)
+        residuals = replace(kernels, backend="numpy").load(cost_term_residuals, terms=cost_term.tables)
+        parts = cost_term, residuals, residual_counts(plan.robot, cost_term)
+    grid = make_grid(spec, points)
+    return Transcription(
+        ResidualKernels(spec, *stages, *parts), grid, boundary=plan.boundary, obstacle_poses=obstacle_poses(plan)
+    )
 
 
 @cache

@@ -291,7 +291,7 @@ def _of_losses(problem: Any, plans: Any) -> list[ValidCall]:
 
 def _of_benchmark(folder: Path, problem: Any, plans: Any) -> list[ValidCall]:
     suite = benchmark.load_suite("hits-81")
-    ran = benchmark.run_benchmark("hits-81", folder / "ran", planners=["cnp-b"], n=1)
+    ran = benchmark.run_benchmark("hits-81", folder / "ran", planners=["cnpgen"], n=1)
     at = np.linspace(0, 1, 50)
     path = benchmark.Trajectory(at, np.sin(at)[:, None] * np.ones(6))
     scenario = benchmark.load_suite("replan").replanning
@@ -313,7 +313,7 @@ def _of_benchmark(folder: Path, problem: Any, plans: Any) -> list[ValidCall]:
         ValidCall(
             "run_benchmark",
             benchmark.run_benchmark,
-            {"suite": "hits-81", "folder": folder / "ran", "planners": ["cnp-b"], "n": 1, "workers": 1},
+            {"suite": "hits-81", "folder": folder / "ran", "planners": ["cnpgen"], "n": 1, "workers": 1},
             frozenset({"n", "repeat"}),  # large ones are valid and run the whole suite
         ),
         ValidCall("Benchmark.summary", ran.summary),

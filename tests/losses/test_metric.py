@@ -75,6 +75,24 @@ def test_averages_of_ten_plans_with_one_outlier(average, expected):
     assert average_loss(np.concatenate([terms, [[np.nan, 1.0]], [[1.0, np.inf]]]), average).tolist() == expected
 
 
+@pytest.mark.parametrize("kind", ["fixed", "ramped", "learned"])
+def test_a_term_of_weight_zero_is_omitted_and_learns_nothing(kind):
+    settings = MetricSettings(kind=kind, every="batch", growth=2.0, lowest=1e-3, gamma=1.0)
+    metric = Metric([0.0, 1.0], [1.0, 1.0], settings)
+    metric.observe([[9.0, E, E]], 0.0)
+    assert metric.weights(0.0).tolist() == [0.0, pytest.approx(E if kind == "learned" else 1.0)]
+    again = Metric([0.0, 1.0], [1.0, 1.0], settings)
+    again.load_state(json.loads(json.dumps(metric.state(), allow_nan=False)))
+    assert again.weights(0.5).tolist() == metric.weights(0.5).tolist()
+
+
+def test_a_factor_of_budgets_is_that_of_every_budget():
+    settings = MetricSettings(kind="learned", every="batch", growth=1.0, gamma=1.0, budget_factor=0.1)
+    metric = Metric([1.0, 1.0], [1.0, 0.0], settings)
+    metric.observe([[9.0, 1.0, 7.0]], 0.0)
+    assert metric.weights(0.0) == pytest.approx([10.0, 1.0])
+
+
 def test_a_batch_without_valid_plans_changes_nothing():
     metric = Metric([2.0], [1.0], MetricSettings(kind="learned", every="batch"))
     before = metric.state()
@@ -168,7 +186,7 @@ def test_invalid_settings_are_refused(options, message):
     ("weights", "budgets", "message"),
     [
         ([1.0], [1.0, 2.0], r"one shape \(m,\), got \(1,\) and \(2,\)"),
-        ([0.0], [1.0], r"must be positive and finite, got \[0.0\]"),
+        ([-1.0], [1.0], r"must be finite and not negative, got \[-1.0\]"),
         ([1.0], [-1.0], r"must be finite and not negative, got \[-1.0\]"),
     ],
 )

@@ -45,7 +45,7 @@ def test_a_model_file_contains_the_expected_time_unless_it_is_the_default(model,
     save_model(tmp_path / "r.h5", reach)
     assert load_model(tmp_path / "r.h5").config == reach.config
     save_model(tmp_path / "w.h5", replace(model, config=replace(model.config, expected_time="soon")))
-    with pytest.raises(DatasetError, match="expected_time must be one of distance, reach, got 'soon'"):
+    with pytest.raises(DatasetError, match="expected_time must be one of distance, reach, travel, got 'soon'"):
         load_model(tmp_path / "w.h5")
 
 

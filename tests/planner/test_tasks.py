@@ -72,5 +72,5 @@ def test_the_boundary_layer_supports_both_expected_times() -> None:
     limits = robot.velocity_limit, robot.acceleration_limit
     expected = [reaching(ends, *limits) for ends in np.concatenate(list(boundary.conditions().values()), axis=1)]
     np.testing.assert_allclose(layer.tasks(boundary).expected_time, expected, rtol=1e-12)
-    with pytest.raises(UsageError, match="expected_time must be one of distance, reach, got 'soon'"):
+    with pytest.raises(UsageError, match="expected_time must be one of distance, reach, travel, got 'soon'"):
         BoundaryLayer("airhockey", expected_time="soon")

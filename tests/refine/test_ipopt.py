@@ -8,10 +8,9 @@ import pytest
 from benchmarks.ipopt import Program, lagrangian_hessian, minimize_with_ipopt, with_ipopt
 from cnpgen.refine import initial_guesses
 from cnpgen.refine.solver.bounds import Bounds
-from cnpgen.refine.solver.cost_term import CostTerm
 from cnpgen.refine.solver.sqp import Settings
 from tests.examples.plans import load
-from tests.examples.refiner import refiner, task
+from tests.examples.refiner import cost_term_of, refiner, task
 from tests.refine.test_solver import transcription
 
 more = pytest.mark.extended  # the same claim for another motion
@@ -63,7 +62,7 @@ def test_the_hessian_of_the_lagrangian_is_that_of_finite_differences(label: str,
 
 def test_without_multipliers_only_the_objective_is_curved() -> None:
     plan = load("hit")
-    motion = transcription(plan, 12, cost_term=CostTerm("centrifugal", 0.01))
+    motion = transcription(plan, 12, cost_term=cost_term_of("centrifugal", 0.01))
     at = motion.evaluate(motion.pack(plan.motion.path[0], plan.motion.rate[0]))
     np.testing.assert_array_equal(lagrangian_hessian(motion, at, np.zeros(at.g.shape), 3.0), 3.0 * at.curvature)
 

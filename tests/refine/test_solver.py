@@ -22,7 +22,7 @@ from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.solver import compiled_backend, qp_subproblem, sqp
 from cnpgen.refine.solver.bounds import INTERVAL_FRACTION, Bounds
 from cnpgen.refine.solver.compiled_backend import CompiledBackend
-from cnpgen.refine.solver.cost_term import CostTerm, choose_cost_term, cost_term_residuals
+from cnpgen.refine.solver.cost_term import CostTerm, choose_cost_term, cost_term_residuals, residual_counts
 from cnpgen.refine.solver.deadline import Deadline
 from cnpgen.refine.solver.grid import make_grid
 from cnpgen.refine.solver.qp_subproblem import Backend, NumpyBackend, ResidualSelection
@@ -39,7 +39,17 @@ from cnpgen.world.world import World
 from tests.conftest import some
 from tests.examples.constraints import TipSpeed
 from tests.examples.plans import PROBLEMS, Plan, load, raised
-from tests.examples.refiner import library, needs_compiler, obstacle_poses, refine, refiner, refiner_of, task, verdict
+from tests.examples.refiner import (
+    cost_term_of,
+    library,
+    needs_compiler,
+    obstacle_poses,
+    refine,
+    refiner,
+    refiner_of,
+    task,
+    verdict,
+)
 
 LABELS = ("hit", "replan", "transport")
 
@@ -49,8 +59,10 @@ def transcription(
 ) -> Transcription:
     kernels, spec = library(plan.problem.name), plan.problem.trajectory
     interpreted = replace(kernels, backend="numpy")  # faster than compiling for few points
-    residuals = None if cost_term is None else interpreted.load(cost_term_residuals, kind=cost_term.kind)
-    stage = ResidualKernels(spec, kernels.load(stage_values), kernels.load(stage_jacobian), cost_term, residuals)
+    residuals = None if cost_term is None else interpreted.load(cost_term_residuals, terms=cost_term.tables)
+    counts = () if cost_term is None else residual_counts(plan.robot, cost_term)
+    stages = (kernels.load(builder) for builder in (stage_values, stage_jacobian))
+    stage = ResidualKernels(spec, *stages, cost_term, residuals, counts)
     return Transcription(
         stage, make_grid(spec, points), boundary=boundary or plan.boundary, obstacle_poses=obstacle_poses(plan)
     )
@@ -75,7 +87,7 @@ def test_gradients_of_residuals_and_objective_are_those_of_finite_differences(
     plan = load(label)
     b = plan.boundary
     boundary = replace(b, goal_ddq=b.goal_dq * 0 + 0.3) if goal_acceleration else b
-    motion = transcription(plan, 24, boundary, CostTerm(kind, 0.3) if kind else None)
+    motion = transcription(plan, 24, boundary, cost_term_of(kind, 0.3) if kind else None)
     random = np.random.default_rng(0)
     x = motion.pack(plan.motion.path[0], plan.motion.rate[0]) + 0.02 * random.normal(size=motion.nx)
     at = motion.evaluate(x)
@@ -105,7 +117,7 @@ def test_residuals_are_the_scaled_constraints_of_the_problem() -> None:
 @pytest.mark.parametrize("kind", some(["effort", "jerk", "centrifugal"], 1, "slow"))
 def test_the_objective_is_an_integral_over_time_as_pinocchio_evaluates_it(kind: str) -> None:
     plan = load("hit")
-    with_term, without = (transcription(plan, 24, cost_term=term) for term in (CostTerm(kind, 1.0), None))
+    with_term, without = (transcription(plan, 24, cost_term=term) for term in (cost_term_of(kind, 1.0), None))
     x = without.pack(plan.motion.path[0], plan.motion.rate[0])
     added = with_term.value(x)[0] - without.value(x)[0]
     exact = Motion(without.unpack(x)[0][None], plan.motion.rate)  # with its boundary control points recomputed
@@ -127,10 +139,10 @@ def test_the_objective_is_an_integral_over_time_as_pinocchio_evaluates_it(kind: 
 
 def test_objectives_are_chosen_by_name_and_invalid_options_are_refused() -> None:
     problem = PROBLEMS["airhockey"]
-    assert choose_cost_term(problem) == CostTerm("centrifugal", 0.01)
+    assert choose_cost_term(problem) == cost_term_of("centrifugal", 0.01)
     assert choose_cost_term(problem, "time", 0.0) is None
     assert choose_cost_term(PROBLEMS["heavy-object"]) is None
-    assert choose_cost_term(problem, "jerk", 0.2) == CostTerm("jerk", 0.2)
+    assert choose_cost_term(problem, "jerk", 0.2) == cost_term_of("jerk", 0.2)
     with pytest.raises(UsageError, match=r"objective 'tiem' .*did you mean 'time'"):
         RefineOptions(objective="tiem")
     with pytest.raises(UsageError, match="weight must not be negative, got -1"):
@@ -356,7 +368,7 @@ def test_an_iterate_becomes_feasible_once_its_objective_has_converged(monkeypatc
 @pytest.mark.parametrize("label", LABELS)
 def test_a_rejected_step_is_never_tried_again_unchanged(label: str, monkeypatch: pytest.MonkeyPatch) -> None:
     plan = load(label)
-    problem, tool = task(plan), refiner(plan.problem.name, CostTerm("jerk", 1.0))
+    problem, tool = task(plan), refiner(plan.problem.name, cost_term_of("jerk", 1.0))
     reject, rejections = sqp._Iterate._reject, []
 
     def record(iterate: sqp._Iterate, violations: np.ndarray, selected: np.ndarray, size: float) -> None:
@@ -373,7 +385,7 @@ def test_a_rejected_step_is_never_tried_again_unchanged(label: str, monkeypatch:
 @pytest.mark.slow
 def test_cached_values_of_a_transcription_belong_to_its_variables() -> None:
     plan = load("hit")
-    cost_term = CostTerm("centrifugal", 0.01)
+    cost_term = cost_term_of("centrifugal", 0.01)
     motion = transcription(plan, 32, cost_term=cost_term)
     x = motion.pack(plan.motion.path[0], plan.motion.rate[0])
     for variables in (x, x + 0.01, x.copy(), x):

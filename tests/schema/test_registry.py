@@ -10,6 +10,7 @@ from cnpgen.errors import RecipeError
 from cnpgen.pipelines.stages.stage import Stage
 from cnpgen.plans.exporter import Exporter
 from cnpgen.problems.constraints.constraint import Constraint
+from cnpgen.problems.objectives import ObjectiveTerm
 from cnpgen.schema import registry
 from cnpgen.schema.keys import field
 from cnpgen.schema.registry import CONSTRAINTS, STAGES, load, name_of, names
@@ -153,6 +154,7 @@ def test_every_group_has_a_base():
     assert {group: registry.contract(group) for group in registry.BUILT_IN} == {
         STAGES: Stage,
         CONSTRAINTS: Constraint,
+        registry.OBJECTIVES: ObjectiveTerm,
         registry.PLANNERS: BenchmarkPlanner,
         registry.EXPORTERS: Exporter,
     }

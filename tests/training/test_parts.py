@@ -179,7 +179,7 @@ def test_margins_tighten_the_limits_that_they_name_and_no_others(monkeypatch: py
     ("changes", "message"),
     [
         ({"margins": {"joint-velocity": 1.5}}, r"margins must be in \(0, 1\] for 'joint-velocity', got 1.5"),
-        ({"expected_time": "soon"}, "expected_time must be one of distance, reach, got 'soon'"),
+        ({"expected_time": "soon"}, "expected_time must be one of distance, reach, travel, got 'soon'"),
     ],
 )
 def test_invalid_margins_and_expected_times_raise_errors(changes: dict[str, Any], message: str):

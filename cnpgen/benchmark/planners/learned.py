@@ -1,6 +1,8 @@
-"""Shipped models as planners: the plan of the network, and the refined plan."""
+"""Trained models as planners: the shipped model, its refined plan, and the paper's method from a model file."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 from cnpgen.benchmark.benchmark_planner import Answer, BenchmarkPlanner, Plan, Setting
 from cnpgen.benchmark.planners.solve import near_base
@@ -8,33 +10,27 @@ from cnpgen.errors import UsageError
 from cnpgen.planner.planner import Planner
 from cnpgen.plans.plans import Plans
 from cnpgen.refine.refine_plans import refine_plans
+from cnpgen.schema.keys import field
 
 
 @dataclass(frozen=True)
-class CNPB(BenchmarkPlanner):
+class ShippedNetwork(BenchmarkPlanner):
     """Plan of the shipped model without refining."""
 
     def prepare(self, setting: Setting) -> Plan:
         """Load the model."""
         if not setting.model:
             raise UsageError(f"cnpgen ships no model for these problems of {setting.problem.name!r}")
-        planner = Planner(setting.model)
-
-        def plan(problem: Plans) -> Plans:
-            return planner.plan_batch(problem.boundary, sample_id=problem.sample_id, columns=problem.columns)
-
-        base = planner.robot.base
-        planner.plan(base, base)  # load kernels before planning is timed
-        return plan
+        return _batch_of_one(Planner(setting.model))
 
 
 @dataclass(frozen=True)
-class RefinedCNPB(BenchmarkPlanner):
+class RefinedNetwork(BenchmarkPlanner):
     """Refined plan of the shipped model."""
 
     def prepare(self, setting: Setting) -> Plan:
         """Load the model and the refiner."""
-        network = CNPB().prepare(setting)
+        network = ShippedNetwork().prepare(setting)
         refine_plans(near_base(setting.problem), workers=1)
 
         def plan(problem: Plans) -> Answer:
@@ -43,3 +39,35 @@ class RefinedCNPB(BenchmarkPlanner):
             return refine_plans(drafts, workers=1).plans
 
         return plan
+
+
+@dataclass(frozen=True)
+class PaperNetwork(BenchmarkPlanner):
+    """Plan of a model trained as published (train --preset paper), from a model file."""
+
+    model: str = field("path of the model file, or name of a shipped model", default="")
+
+    def prepare(self, setting: Setting) -> Plan:
+        """Load the model, which must be for the problem of the suite."""
+        if not self.model:
+            raise UsageError(
+                "cnp-b-paper needs a model file: pass --set cnp-b-paper.model=FILE;"
+                " 'cnpgen train --preset paper' makes one"
+            )
+        planner = Planner(Path(self.model) if Path(self.model).suffix else self.model, scale_time=False)
+        theirs = planner.model.problem
+        if theirs.comparable_sha256 != setting.problem.comparable_sha256:
+            differs = ", ".join(setting.problem.differences(theirs)[:4])
+            raise UsageError(f"the model {self.model} is for another problem, they differ in {differs}")
+        return _batch_of_one(planner)
+
+
+def _batch_of_one(planner: Planner) -> Callable[[Plans], Plans]:
+    """Return the function that plans one boundary problem; load its kernels before planning is timed."""
+
+    def plan(problem: Plans) -> Plans:
+        return planner.plan_batch(problem.boundary, sample_id=problem.sample_id, columns=problem.columns)
+
+    base = planner.robot.base
+    planner.plan(base, base)
+    return plan

@@ -5,9 +5,9 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from cnpgen.kernels.symbolic.dynamics import inverse_dynamics
+from cnpgen.kernels.symbolic.dynamics import acceleration_at, body_motions, inverse_dynamics
 from cnpgen.kernels.symbolic.kinematics import Kinematics, bias_acceleration, forward_kinematics, tip_velocity
-from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, constants, cross, scale, times
+from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, constants, cross, dot, scale, times
 from cnpgen.robots.solid import pose_width
 
 if TYPE_CHECKING:
@@ -65,6 +65,15 @@ class SymbolicState:
     def tip_acceleration(self) -> Vec:
         """Linear acceleration of the tip [m/s^2]."""
         return add(tip_velocity(self.kinematics, self.ddq), bias_acceleration(self.kinematics, self.dq))
+
+    @cached_property
+    def recursive_tip_acceleration(self) -> Vec:
+        """Linear acceleration of the tip [m/s^2] by the recursion of the inverse dynamics, for a third of the cost."""
+        chain = self.robot.chain
+        last = body_motions(chain, self.q, self.dq, self.ddq)[-1]
+        without_gravity = acceleration_at(last.acceleration, last.omega, last.alpha, chain.tip_translation.tolist())
+        rotation = [[dot(row, column) for column in chain.tip_rotation.tolist()] for row in self.kinematics.rotation]
+        return [dot(row, without_gravity) + g for row, g in zip(rotation, chain.gravity.tolist(), strict=True)]
 
     @cached_property
     def tip_angular_velocity(self) -> Vec:

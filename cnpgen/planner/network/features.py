@@ -18,6 +18,7 @@ STATES = ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq")
 USUAL = (*STATES, "sin_cos", "tips", "expected_time")
 ARRIVAL = "goal_ddq"  # only if goal accelerations are given
 BLOCKS = (*USUAL, ARRIVAL)
+FEATURE_SETS = ("full", "states", "paper")
 MIN_DEVIATION = 1e-7  # SI units; features with a smaller standard deviation are constant
 
 
@@ -43,9 +44,30 @@ class Features:
         return raw.astype(dtype)
 
 
-def usual_blocks(boundary: Boundary) -> tuple[str, ...]:
-    """Return the feature blocks of tasks with such boundary conditions."""
-    return USUAL if boundary.goal_ddq is None else BLOCKS
+def feature_blocks(boundary: Boundary, features: str = "full") -> tuple[str, ...]:
+    """Return the feature blocks of tasks with such boundary conditions.
+
+    Args:
+        boundary: The boundary conditions.
+        features: One of ``FEATURE_SETS``: all blocks ("full"), or the boundary states ("states", "paper").
+    """
+    blocks = USUAL if features == "full" else STATES
+    return blocks if boundary.goal_ddq is None else (*blocks, ARRIVAL)
+
+
+def published_features(blocks: tuple[str, ...], velocity_limit: Array, acceleration_limit: Array) -> Features:
+    """Return states divided by pi and by the limits (paper, section on the neural network: normalized states).
+
+    The paper does not define the normalization; this one is that of the authors' implementation.
+
+    Args:
+        blocks: Blocks of boundary states.
+        velocity_limit: Planning limits [rad/s], shape (n,).
+        acceleration_limit: Planning limits [rad/s^2], shape (n,).
+    """
+    units = {"q": np.full_like(velocity_limit, np.pi), "dq": velocity_limit, "ddq": acceleration_limit}
+    scale = np.concatenate([1 / units[name.partition("_")[2]] for name in blocks])
+    return Features(blocks, np.zeros_like(scale), scale)
 
 
 def fit_features(parts: Iterable[Tasks], blocks: tuple[str, ...] = USUAL) -> Features:

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from cnpgen.kernels.compiled_kernel import CACHE_LINE_DOUBLES, address_of, aligned_array
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.refine.solver.bounds import Bounds
-from cnpgen.refine.solver.cost_term import ACCELERATION_SMOOTHING_M_S2
 from cnpgen.refine.solver.grid import Bases
 from cnpgen.refine.solver.qp_subproblem import (
     ELASTIC_CURVATURE_ROOT,
@@ -62,17 +61,18 @@ class _Motion(ctypes.Structure):
 
     _fields_ = (
         *((name, c_long) for name in ("n", "path", "rate", "support", "fixed", "nx", "stride", "m")),
-        *((name, c_long) for name in ("n_time_nodes", "n_cost_residuals", "thinning")),
+        *((name, c_long) for name in ("n_time_nodes", "n_cost_residuals", "n_cost_groups", "thinning")),
         *((name, _Bases) for name in ("grid", "cost_bases")),
         *((name, c_void_p) for name in ("values", "jacobian", "cost_residuals")),
         *((name, c_void_p) for name in ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq", "goal_ddq")),
-        *((name, c_void_p) for name in ("obstacle_poses", "time_basis", "time_weights", "cost_weights", "smoothing")),
+        *((name, c_void_p) for name in ("obstacle_poses", "time_basis", "time_weights", "cost_weights", "cost_groups")),
+        *((name, c_void_p) for name in ("smoothing",)),
         *((name, c_void_p) for name in ("lower", "upper", "nonsmooth", "accelerated")),
         *((name, c_void_p) for name in ("control", "rates", "derivative", "w")),
         *((name, c_void_p) for name in ("gradient", "hessian", "factor", "scratch")),
         *((name, c_void_p) for name in ("index", "initial")),
         ("program", _Polyhedron),
-        *((name, c_double) for name in ("eta", "beta", "rate_eta", "cost_smoothing")),
+        *((name, c_double) for name in ("eta", "beta", "rate_eta")),
         *((name, c_double) for name in ("violation", "gain", "remaining")),
         *((name, c_long * 6) for name in ("point", "variable")),
         *((name, c_long) for name in ("n_derivatives", "n_selected")),
@@ -176,13 +176,15 @@ class CompiledBackend:
 
     def _constants(self, motion: Transcription, bounds: Bounds) -> dict[str, Any]:
         """Return the arrays that no step changes."""
-        grid, weight = motion.grid, 0.0 if motion.kernels.cost_term is None else motion.kernels.cost_term.weight
+        grid, kernels = motion.grid, motion.kernels
+        groups = np.empty((0, 3)) if kernels.cost_term is None else kernels.cost_term.groups(kernels.cost_counts)
         arrays = {
             **vars(motion.boundary),
             "obstacle_poses": motion.poses_along,
             "time_basis": grid.time_basis,
             "time_weights": grid.time_weights,
-            "cost_weights": weight * grid.cost_weights,
+            "cost_weights": grid.cost_weights,
+            "cost_groups": groups,
             "smoothing": motion.smoothing,
             "lower": bounds.lower.T,
             "upper": bounds.upper.T,
@@ -191,7 +193,7 @@ class CompiledBackend:
         }
         fields: dict[str, Any] = {name: None if array is None else self._keep(array) for name, array in arrays.items()}
         fields |= {"grid": self._bases(grid.bases), "cost_bases": self._bases(grid.cost_bases)}
-        return {**fields, "n_time_nodes": len(grid.time_weights)}
+        return {**fields, "n_time_nodes": len(grid.time_weights), "n_cost_groups": len(groups)}
 
     def _kernel_addresses(self, motion: Transcription) -> dict[str, Any]:
         """Return the addresses of the compiled kernels and the constants of the cost term."""
@@ -199,9 +201,8 @@ class CompiledBackend:
         fields = {"values": kernels.values.address, "jacobian": kernels.jacobian.address}
         if kernels.cost_term is None or kernels.cost_residuals is None:
             return fields
-        smoothing = ACCELERATION_SMOOTHING_M_S2 if kernels.cost_term.kind == "centrifugal" else 0.0
         count, address = kernels.cost_residuals.tape.outputs[0], kernels.cost_residuals.address
-        return {**fields, "cost_residuals": address, "n_cost_residuals": count, "cost_smoothing": smoothing}
+        return {**fields, "cost_residuals": address, "n_cost_residuals": count}
 
     def _work_arrays(self, motion: Transcription, stride: int) -> dict[str, int]:
         """Allocate the work arrays with the sizes of step.c."""

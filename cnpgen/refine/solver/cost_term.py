@@ -1,55 +1,65 @@
-"""Cost terms in addition to the duration: centrifugal acceleration, effort or jerk, as residuals with derivatives."""
+"""Cost terms in addition to the duration: the terms of an objective, as residuals with derivatives."""
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.kernels.symbolic.linalg import symbols
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState, time_derivatives
-from cnpgen.problems.problem import Problem
+from cnpgen.problems.objectives import Centrifugal, ObjectiveTerm, read_objective
+from cnpgen.problems.problem import Problem, resolved
+from cnpgen.schema import registry
+from cnpgen.schema.catalogue import read_kind
+from cnpgen.schema.keys import RecipeLocation
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
-Kind = Literal["centrifugal", "effort", "jerk"]
-
-OBJECTIVES: dict[str, Kind] = {"time": "centrifugal", "effort": "effort", "jerk": "jerk"}
-ACCELERATION_SMOOTHING_M_S2 = 0.5  # the cost of smaller accelerations is quadratic: its gradient is continuous
-SPEED_SMOOTHING_M2_S2 = 1e-4  # defines the direction of a tip at rest
 
 
 @dataclass(frozen=True)
 class CostTerm:
-    """Term ``weight * integral of rho(e(q, dq, ddq, jerk)) over time`` of the objective.
+    """Sum of the terms of an objective in addition to the duration.
 
     Attributes:
-        kind: "centrifugal": e is the tip's acceleration across its velocity [m/s^2] and rho its norm (paper, Appendix
-            B); "effort": torques as fractions of their limits and "jerk": jerks as fractions of their limits, rho the
-            sum of squares.
-        weight: Weight relative to the time [s^2/m] or [1].
+        terms: The terms, of positive weight.
     """
 
-    kind: Kind
-    weight: float
+    terms: tuple[ObjectiveTerm, ...]
 
-    def rate(self, e: Array) -> tuple[Array, Array]:
-        """Evaluate rho and its curvature.
+    @property
+    def tables(self) -> list[dict[str, Any]]:
+        """The kinds of the terms with their keys except the weight, JSON-able."""
+        return [{key: value for key, value in resolved(term).items() if key != "weight"} for term in self.terms]
+
+    def groups(self, counts: Iterable[int]) -> Array:
+        """Return number of residuals, smoothing and weight of every term, shape (terms, 3)."""
+        rows = [(count, term.smoothing, term.weight) for count, term in zip(counts, self.terms, strict=True)]
+        return np.array(rows, float)
+
+    def rate(self, e: Array, counts: Iterable[int]) -> tuple[Array, Array]:
+        """Evaluate the weighted size of the residuals and its curvature.
 
         Args:
             e: Residuals, shape (m, K).
+            counts: Number of residuals of every term.
 
         Returns:
-            ``(rho, weight)``, shape (K,) each: ``weight * e`` is the gradient of rho in e, and ``weight`` times the
-            identity bounds its Hessian from above.
+            ``(rho, weight)``, shapes (K,) and (m, K): ``weight * e`` is the gradient of rho in e, and the diagonal
+            matrix of ``weight`` bounds its Hessian from above.
         """
-        squares = np.sum(e * e, axis=0)
-        if self.kind != "centrifugal":
-            return squares, np.full(squares.shape, 2.0)
-        size = np.sqrt(squares + ACCELERATION_SMOOTHING_M_S2**2)
-        return size - ACCELERATION_SMOOTHING_M_S2, 1.0 / size
+        rho, weights, first = np.zeros(e.shape[1]), np.empty(e.shape), 0
+        for count, smoothing, weight in self.groups(counts).tolist():
+            part = slice(first, first := first + int(count))
+            squares = np.sum(e[part] * e[part], axis=0)
+            size = np.sqrt(squares + smoothing**2)
+            rho += weight * (size - smoothing if smoothing > 0 else squares)
+            weights[part] = weight / size if smoothing > 0 else 2.0 * weight
+        return rho, weights
 
 
 def choose_cost_term(problem: Problem, objective: str = "time", weight: float | None = None) -> CostTerm | None:
@@ -57,39 +67,52 @@ def choose_cost_term(problem: Problem, objective: str = "time", weight: float | 
 
     Args:
         problem: The problem.
-        objective: One of ``OBJECTIVES``; "time" is the problem's own objective: time and centrifugal acceleration.
-        weight: Weight of the term; by default the problem's for the centrifugal acceleration and 1 for the others.
+        objective: See ``read_objective``; "time" is the problem's own objective.
+        weight: Weight of each term; by default that in ``objective`` or of the problem. Of the problem's own objective,
+            weight of the centrifugal acceleration.
     """
-    kind = OBJECTIVES[objective]
-    default = problem.objective.centrifugal if kind == "centrifugal" else 1.0
-    chosen = default if weight is None else weight
-    return CostTerm(kind, chosen) if chosen > 0 else None
+    terms = read_objective(objective)
+    if terms is None:
+        terms = problem.objective.terms
+        if weight is not None:
+            terms = (Centrifugal(weight=weight), *problem.objective.term)
+    elif weight is not None:
+        terms = tuple(replace(term, weight=weight) for term in terms)
+    terms = tuple(term for term in terms if term.weight > 0)
+    return CostTerm(terms) if terms else None
 
 
-def cost_term_residuals(robot: "Robot", kind: Kind) -> Any:
-    """Build ``w -> (e, de/dw)`` with ``w = (p, p', p'', p''', r, r', r'')``, the Jacobian column by column."""
+def cost_term_residuals(robot: "Robot", terms: list[dict[str, Any]]) -> Any:
+    """Build ``w -> (e, de/dw)`` with ``w = (p, p', p'', p''', r, r', r'')``, the Jacobian column by column.
+
+    Args:
+        robot: The robot.
+        terms: ``CostTerm.tables``.
+    """
     import casadi as ca
 
+    w_sx, state = _state(robot)
+    residuals = ca.vertcat(*(e for term in _restored(terms) for e in term.residuals(state)))
+    jacobian = ca.densify(ca.jacobian(residuals, w_sx))
+    return ca.Function("cost_term", [w_sx], ca.cse([residuals, ca.vec(jacobian)]))
+
+
+def residual_counts(robot: "Robot", cost_term: CostTerm) -> tuple[int, ...]:
+    """Return the number of residuals of every term."""
+    _, state = _state(robot)
+    return tuple(len(term.residuals(state)) for term in cost_term.terms)
+
+
+def _state(robot: "Robot") -> tuple[Any, SymbolicState]:
     n = robot.n
     w_sx, w = symbols("w", 4 * n + 3)
     p, *path = (w[order * n : (order + 1) * n] for order in range(4))
     dq, ddq, jerk = time_derivatives(path, w[4 * n :])
-    if kind == "jerk":
-        e = [x / float(limit) for x, limit in zip(jerk or (), robot.jerk_limit, strict=True)]
-    else:
-        state = SymbolicState(robot, p, dq, ddq, [], (), None)
-        e = _centrifugal_acceleration(state) if kind == "centrifugal" else _torque_fractions(state)
-    residuals = ca.vertcat(*e)
-    jacobian = ca.densify(ca.jacobian(residuals, w_sx))
-    return ca.Function(f"cost_term_{kind}", [w_sx], ca.cse([residuals, ca.vec(jacobian)]))
+    return w_sx, SymbolicState(robot, p, dq, ddq, [], (), None, jerk)
 
 
-def _centrifugal_acceleration(state: SymbolicState) -> list[Any]:
-    """Return the acceleration of the tip across its velocity, of norm kappa v^2."""
-    v, a = state.tip_velocity, state.tip_acceleration
-    along = sum(x * y for x, y in zip(v, a, strict=True)) / (sum(x * x for x in v) + SPEED_SMOOTHING_M2_S2)
-    return [y - along * x for x, y in zip(v, a, strict=True)]
-
-
-def _torque_fractions(state: SymbolicState) -> list[Any]:
-    return [tau / float(limit) for tau, limit in zip(state.torque, state.robot.torque_limit, strict=True)]
+def _restored(tables: list[dict[str, Any]]) -> list[ObjectiveTerm]:
+    """Return the terms of ``CostTerm.tables``, of weight 1."""
+    keys = [{key: value for key, value in table.items() if key not in {"source", "package"}} for table in tables]
+    mistakes: list[str] = []
+    return [read_kind(registry.OBJECTIVES, table, RecipeLocation(table["use"]), mistakes) for table in keys]

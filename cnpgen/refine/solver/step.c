@@ -15,13 +15,14 @@ typedef struct { /* a spline basis at some phases: three or four orders of the p
 
 typedef struct {
   long n, path, rate, support, fixed, nx, stride, m; /* stride: of rows of nx + 1 */
-  long n_time_nodes, n_cost_residuals, thinning;
+  long n_time_nodes, n_cost_residuals, n_cost_groups, thinning;
   bases grid, cost_bases;
   kernel *values, *jacobian, *cost_residuals;
   const double *start_q, *start_dq, *start_ddq, *goal_q, *goal_dq, *goal_ddq; /* (n,); goal_ddq may be NULL */
   const double *obstacle_poses;             /* (width, K) */
   const double *time_basis, *time_weights;  /* basis of r at the nodes of the time integral (nodes, R), their weights */
-  const double *cost_weights;               /* (cost_bases.points,), times the weight of the cost term */
+  const double *cost_weights;               /* (cost_bases.points,) */
+  const double *cost_groups;                /* (n_cost_groups, 3): number of residuals, smoothing and weight of a term */
   const double *smoothing;                  /* (R, R) */
   const double *lower, *upper;              /* (m, K) */
   const unsigned char *nonsmooth;           /* (m, K) */
@@ -31,7 +32,7 @@ typedef struct {
   double *scratch;
   int *index, *initial; /* row nx + 1 + j is of residual i at point k: index[j] = i K + k; memory for as many */
   polyhedron program;   /* of the box, (nx,), the elastic variable, and the selected residuals */
-  double eta, beta, rate_eta, cost_smoothing, violation, gain, remaining;
+  double eta, beta, rate_eta, violation, gain, remaining;
   long point[6], variable[6], n_derivatives, n_selected;
 } motion;
 
@@ -147,22 +148,28 @@ static double cost_term(motion *s, int derivatives) {
   states(s, b, w);
   s->cost_residuals(points, (const double *const[]){w}, &points, (double *const[]){e, jacobian});
   EACH(k, 0, points) {
-    double squares = 0, r = w[b->orders * n * points + k], weight = s->cost_weights[k] / r;
-    EACH(i, 0, count) squares += e[i * points + k] * e[i * points + k];
-    double size = sqrt(squares + s->cost_smoothing * s->cost_smoothing);
-    double rho = s->cost_smoothing > 0 ? size - s->cost_smoothing : squares;
-    double root = sqrt(weight * (s->cost_smoothing > 0 ? 1 / size : 2));
-    cost += weight * rho;
-    if (!derivatives) continue;
-    EACH(i, 0, s->rate)
-      s->gradient[nx - s->rate + i] -= weight * rho / r * rate_at(s, b, k, 0)[i] * s->rates[i];
-    EACH(i, 0, count) {
-      gather(s, b->orders, jacobian, count, i, points, k, J);
-      for (long j = 0; j < b->orders * padded(n) + b->orders - 1; j++) J[j] *= root;
-      chain(s, b, k, J, gradient);
-      weighted[k * count + i] = root * e[i * points + k];
-      gradient += stride;
+    double r = w[b->orders * n * points + k], total = 0;
+    long first = 0;
+    EACH(g, 0, s->n_cost_groups) {
+      const double *group = s->cost_groups + 3 * g;
+      long behind = first + (long)group[0];
+      double smoothing = group[1], weight = group[2] * s->cost_weights[k] / r, squares = 0;
+      EACH(i, first, behind) squares += e[i * points + k] * e[i * points + k];
+      double size = sqrt(squares + smoothing * smoothing);
+      double root = sqrt(weight * (smoothing > 0 ? 1 / size : 2));
+      total += weight * (smoothing > 0 ? size - smoothing : squares);
+      if (derivatives) EACH(i, first, behind) {
+        gather(s, b->orders, jacobian, count, i, points, k, J);
+        for (long j = 0; j < b->orders * padded(n) + b->orders - 1; j++) J[j] *= root;
+        chain(s, b, k, J, gradient);
+        weighted[k * count + i] = root * e[i * points + k];
+        gradient += stride;
+      }
+      first = behind;
     }
+    cost += total;
+    if (derivatives) EACH(i, 0, s->rate)
+      s->gradient[nx - s->rate + i] -= total / r * rate_at(s, b, k, 0)[i] * s->rates[i];
   }
   if (!derivatives) return cost;
   gram(rows, stride, count * points, nx, s->hessian, stride);

@@ -60,6 +60,7 @@ class ResidualKernels:
         jacobian: Kernel of ``cnpgen.refine.solver.residuals.stage_jacobian``.
         cost_term: Cost term in addition to the duration, or None.
         cost_residuals: Kernel of ``cnpgen.refine.solver.cost_term.cost_term_residuals``, or None.
+        cost_counts: Number of residuals of every term of the cost term.
         step_library: Library of ``cnpgen.refine.solver.compiled_backend``, or None for the NumPy backend.
     """
 
@@ -68,6 +69,7 @@ class ResidualKernels:
     jacobian: Kernel
     cost_term: CostTerm | None = None
     cost_residuals: Kernel | None = None
+    cost_counts: tuple[int, ...] = ()
     step_library: CDLL | None = None
 
 
@@ -196,25 +198,25 @@ class Transcription:
         assert self.kernels.cost_residuals is not None
         w = self.grid.cost_bases.states(path, rate)
         e, jacobian = self.kernels.cost_residuals(w)
-        weights = self.kernels.cost_term.weight * self.grid.cost_weights / w[4 * self.n]
+        weights = self.grid.cost_weights / w[4 * self.n]
         return e, jacobian.reshape(len(w), *e.shape), weights
 
     def _cost(self, path: Array, rate: Array) -> float:
         """Return the value of the cost term."""
         assert self.kernels.cost_term is not None
         e, _, weights = self._cost_residuals(path, rate)
-        return float(weights @ self.kernels.cost_term.rate(e)[0])
+        return float(weights @ self.kernels.cost_term.rate(e, self.kernels.cost_counts)[0])
 
     def _add_cost_term(self, path: Array, rate: Array, gradient: Array, curvature: Array) -> float:
         """Add the cost term's gradient and its Gauss-Newton Hessian; return its value."""
         assert self.kernels.cost_term is not None
         bases = self.grid.cost_bases
         e, jacobian, weights = self._cost_residuals(path, rate)
-        rho, rho_derivative = self.kernels.cost_term.rate(e)
+        rho, rho_derivative = self.kernels.cost_term.rate(e, self.kernels.cost_counts)
         m, points = e.shape
         k, residual = np.repeat(np.arange(points), m), np.tile(np.arange(m), points)
         rows = self._chain(jacobian[:, residual, k].T, k, rate, bases)
-        row_weights = (weights * rho_derivative)[k]
+        row_weights = (weights * rho_derivative)[residual, k]
         gradient += (row_weights * e[residual, k]) @ rows
         half = rows * np.sqrt(row_weights)[:, None]
         gradient[self.split :] -= (weights * rho / (bases.rate[0] @ rate)) @ bases.rate[0] * rate

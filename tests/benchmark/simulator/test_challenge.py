@@ -55,9 +55,9 @@ def test_records_are_in_the_robots_frame(plans: Plans) -> None:
 
 @pytest.mark.slow
 def test_a_benchmark_executes_in_the_challenge(tmp_path: Path) -> None:
-    benchmark = run_benchmark("hits-81", tmp_path, planners=["cnp-b"], n=1, environment=CLONE, workers=1)
+    benchmark = run_benchmark("hits-81", tmp_path, planners=["cnpgen"], n=1, environment=CLONE, workers=1)
     assert benchmark.executions == ("challenge",)
-    assert benchmark.results["cnp-b"][0]["executed"]["challenge"]["success"]
+    assert benchmark.results["cnpgen"][0]["executed"]["challenge"]["success"]
     assert "executed by the challenge plant" in save_benchmark_report(benchmark, tmp_path / "report.html").read_text()
 
 
@@ -129,7 +129,7 @@ def test_other_problems_than_hits_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"the Air Hockey Challenge has a table .* 'heavy-object' is another problem"):
         simulate_plans(draw_boundary_problems("heavy-object", 1, seed=0), environment=CLONE)
     with pytest.raises(UsageError, match="is another problem"):
-        run_benchmark("heavy-100", tmp_path, planners=["cnp-b"], n=1, environment=CLONE)
+        run_benchmark("heavy-100", tmp_path, planners=["cnpgen"], n=1, environment=CLONE)
 
 
 def test_items_of_one_number_are_assigned_as_numbers() -> None:
@@ -145,7 +145,7 @@ REAL_CLONE, ITS_PYTHON = (Path(os.environ.get(f"CNPGEN_CHALLENGE{name}", "")) fo
 REAL = """
 import json, sys
 from cnpgen.benchmark.run_suite import run_benchmark
-done = run_benchmark("hits-81", sys.argv[2], planners=["cnp-b", "aqp"], n=9, environment=sys.argv[1], workers=1)
+done = run_benchmark("hits-81", sys.argv[2], planners=["cnpgen", "aqp"], n=9, environment=sys.argv[1], workers=1)
 print(json.dumps({name: [row["executed"]["challenge"] for row in rows] for name, rows in done.results.items()}))
 """
 
@@ -161,9 +161,9 @@ def test_the_real_environment_separates_planners(tmp_path: Path) -> None:
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
     assert done.returncode == 0, done.stderr
     executed = json.loads(done.stdout)
-    assert sum(row["success"] for row in executed["cnp-b"]) == 9
+    assert sum(row["success"] for row in executed["cnpgen"]) == 9
     assert sum(row["scored"] for row in executed["aqp"]) < 9
-    for row in (*executed["cnp-b"], *executed["aqp"]):
+    for row in (*executed["cnpgen"], *executed["aqp"]):
         assert row["hit"]
         assert row["contact_distance_mm"] < 20
         assert 1 < row["plane_error_mm"] < 10  # the controller of the environment tracks loosely

@@ -1,0 +1,279 @@
+"""Ablations of the training: every variant changes one setting of the shipped planners, or of the paper's method.
+
+Each variant is trained with several seeds and judged on new problems. Finished results are in FOLDER/results.jsonl, so
+an interrupted run resumes with the same command; other variants and seeds extend it.
+
+    python benchmarks/ablations.py FOLDER --seconds 60 --seeds 1 2 3
+    python benchmarks/ablations.py FOLDER --only metric head --plot docs/images/ablations.svg
+"""
+
+import argparse
+import json
+import math
+import statistics
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from common import arguments, progress, report, table
+
+import cnpgen
+from cnpgen.benchmark.hypothesis_tests import wilson
+from cnpgen.make.make_dataset import make_dataset
+from cnpgen.make.recipe_file import load_dataset_recipe
+from cnpgen.plans.evaluate import evaluate_plans
+from cnpgen.plans.plans import Plans
+from cnpgen.refine.refine_plans import refine_plans
+from cnpgen.store.files.figure_file import new_figure, save_figure
+from cnpgen.training.presets import PAPER
+from cnpgen.training.settings import METRICS, TrainingSettings
+from cnpgen.training.train import train_model
+
+ROWS, VALIDATION_ROWS = 18_000, 200
+CHECK_ROWS, VALIDATIONS = 100, 5
+PROBLEM_SEED, DATA_SEED = 31_415, 27_182  # used nowhere else
+TIMED_PLANS = 200
+BASE = TrainingSettings(validations=VALIDATIONS)
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One variant.
+
+    Attributes:
+        group: Subject.
+        name: Name in the table.
+        settings: Training settings, except the seed.
+        rows: Number of training samples.
+        time_factor: Factor of the training time.
+    """
+
+    group: str
+    name: str
+    settings: TrainingSettings = BASE
+    rows: int = ROWS
+    time_factor: float = 1.0
+
+
+def variants() -> Iterator[Variant]:
+    """Yield all variants, the unchanged settings first."""
+    yield Variant("base", "shipped settings")
+    for name in ("fixed", "bounded", "learned"):
+        yield Variant("metric", name, replace(BASE, metric=METRICS[name]))
+    steps = {"no path": (1, 0), "no line": (0, 1), "neither": (0, 0)}
+    for name, (line, path) in steps.items():
+        yield Variant("projection", name, replace(BASE, line_projection_steps=line, projection_steps=path))
+    yield Variant("head", "pi, Glorot", replace(BASE, path_scale=math.pi, head_scale=1.0, rate_bias=0.0))
+    for name in ("states", "paper"):
+        yield Variant("features", name, replace(BASE, features=name))
+    yield Variant("margins", "none", replace(BASE, usual_margins=False))
+    yield Variant("clipping", "none", replace(BASE, sample_clip=math.inf, batch_clip=math.inf))
+    yield Variant("average", "none", replace(BASE, memory=0.0))
+    yield Variant("learning rate", "5e-5, constant", replace(BASE, learning_rate=5e-5, final_rate=1.0, warm_up=0))
+    for hidden in (64, 256):
+        yield Variant("width", str(hidden), replace(BASE, hidden=hidden))
+    for layers in (3, 8):
+        yield Variant("depth", str(layers), replace(BASE, layers=layers))
+    for count in (9, 10, 20):  # 8 do not suffice for boundary accelerations
+        yield Variant("control points of the path", str(count), replace(BASE, path_control_points=count))
+    for count in (8, 10, 15):
+        yield Variant("control points of the rate", str(count), replace(BASE, rate_control_points=count))
+    for rows in (1_000, 5_000, 120_000):
+        yield Variant("samples", f"{rows:,}", rows=rows)
+    yield Variant("precision of the loss", "float64", replace(BASE, precision="float64"))
+    for factor in (0.25, 4.0):
+        yield Variant("training time", f"x {factor:g}", time_factor=factor)
+    published = replace(PAPER.settings, hidden=128, validations=VALIDATIONS)
+    yield Variant("paper", "preset, 5 x 128", published)
+    yield Variant("paper", "preset, ramped metric", replace(published, metric=METRICS["ramped"], loss_form="signed"))
+
+
+@dataclass(frozen=True)
+class Test:
+    """New problems and the durations of their refined plans [s], shape (N,); nan where refining failed."""
+
+    problems: Plans
+    refined: np.ndarray
+
+
+def new_problems(dataset: str, n: int) -> Test:
+    """Draw problems that no training has seen; refine the shipped planner's plans for them."""
+    progress(f"refining {n:,} new problems")
+    problems = cnpgen.draw_boundary_problems(dataset, n, seed=PROBLEM_SEED)
+    drafts = cnpgen.Planner(dataset).plan_batch(problems.boundary, columns=problems.columns)
+    refinement = refine_plans(drafts, workers=1)
+    return Test(problems, np.where(refinement.valid, refinement.plans.duration, np.nan))
+
+
+def result_of(variant: Variant, seed: int, test: Test, options: argparse.Namespace) -> dict[str, Any]:
+    """Train one variant with one seed and judge it."""
+    folder: Path = options.folder
+    data = folder / f"{options.dataset}-{variant.rows}"
+    splits = {"train": variant.rows, "validation": VALIDATION_ROWS}
+    make_dataset(replace(load_dataset_recipe(options.dataset), splits=splits, seed=DATA_SEED), data, workers=1)
+    trained = train_model(
+        data,
+        folder / f"{key_of(variant, seed).replace(' ', '-').replace(',', '')}.h5",
+        settings=replace(variant.settings, seed=seed),
+        cpu_seconds=options.seconds * variant.time_factor,
+        check_rows=CHECK_ROWS,
+        workers=1,
+    )
+    planner = cnpgen.Planner(trained.path)
+    plans = planner.plan_batch(test.problems.boundary, columns=test.problems.columns)
+    evaluation = evaluate_plans(plans, workers=1)
+    worst = [max((m.severity for m in verdict.margins.values()), default=math.inf) for verdict in evaluation.verdicts]
+    summary = evaluation.summary()
+    return {
+        "variant": key_of(variant, seed),
+        "group": variant.group,
+        "name": variant.name,
+        "seed": seed,
+        "seconds": options.seconds * variant.time_factor,
+        "problems": len(plans),
+        "valid": int(evaluation.valid.sum()),
+        "paper_valid": round(summary["paper_valid_ratio"] * len(plans)),
+        "duration_ratio": float(np.nanmean(plans.duration) / np.nanmean(test.refined)),
+        "worst_median": float(np.median(worst)),
+        "worst_p95": float(np.quantile(worst, 0.95)),
+        "training_cpu_s": trained.model.training["cpu_seconds"],
+        "steps": trained.model.training["steps"],
+        "planning_cpu_ms": planning_time(planner, test),
+    }
+
+
+def planning_time(planner: cnpgen.Planner, test: Test) -> float:
+    """Measure the median CPU time of single plans [ms]."""
+    times = []
+    for index in range(min(TIMED_PLANS, len(test.refined))):
+        boundary = test.problems.boundary[index : index + 1]
+        started = time.process_time()
+        planner.plan_batch(boundary)
+        times.append(time.process_time() - started)
+    return 1e3 * statistics.median(times)
+
+
+def key_of(variant: Variant, seed: int) -> str:
+    """Return the identity of a result in the folder."""
+    return f"{variant.group} {variant.name} {seed}"
+
+
+def run(options: argparse.Namespace) -> list[dict[str, Any]]:
+    """Compute the missing results: all variants with the first seed, then with the next ones."""
+    options.folder.mkdir(parents=True, exist_ok=True)
+    file = options.folder / "results.jsonl"
+    chosen = [variant for variant in variants() if not options.only or variant.group in {"base", *options.only}]
+    done = read(file)
+    missing = [(variant, seed) for seed in options.seeds for variant in chosen if key_of(variant, seed) not in done]
+    test = new_problems(options.dataset, options.n) if missing and not options.tables else None
+    for variant, seed in missing if test is not None else ():
+        progress(key_of(variant, seed))
+        assert test is not None
+        record = result_of(variant, seed, test, options)
+        with file.open("a", encoding="utf-8") as lines:
+            lines.write(json.dumps(record) + "\n")
+    wanted = {key_of(variant, seed) for variant in chosen for seed in options.seeds}
+    return [record for key, record in read(file).items() if key in wanted]
+
+
+def read(file: Path) -> dict[str, dict[str, Any]]:
+    """Read the finished results by their key."""
+    lines = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
+    return {record["variant"]: record for record in map(json.loads, lines)}
+
+
+@dataclass(frozen=True)
+class Row:
+    """Results of one variant over its seeds."""
+
+    group: str
+    name: str
+    records: list[dict[str, Any]]
+
+    def ratio(self, key: str) -> tuple[float, float, float]:
+        """Return a pooled ratio and its 95 % interval by Wilson."""
+        count = sum(record[key] for record in self.records)
+        total = sum(record["problems"] for record in self.records)
+        return count / total, *wilson(count / total, total)
+
+    def spread(self, key: str) -> tuple[float, float, float]:
+        """Return the mean over seeds of a figure, its minimum and its maximum."""
+        values = [record[key] for record in self.records]
+        return statistics.mean(values), min(values), max(values)
+
+
+def rows_of(results: list[dict[str, Any]]) -> list[Row]:
+    """Group the results by variant, in the order of ``variants``."""
+    rows = []
+    for variant in variants():
+        records = [item for item in results if (item["group"], item["name"]) == (variant.group, variant.name)]
+        if records:
+            rows.append(Row(variant.group, variant.name, records))
+    return rows
+
+
+def cells(row: Row) -> tuple[str, ...]:
+    """Format a row of the table."""
+    valid, paper = row.ratio("valid"), row.ratio("paper_valid")
+    ratios = (f"{100 * value:.1f} ({100 * low:.1f} to {100 * high:.1f})" for value, low, high in (valid, paper))
+    per_seed = " ".join(f"{100 * record['valid'] / record['problems']:.1f}" for record in row.records)
+    duration, worst = row.spread("duration_ratio"), row.spread("worst_median")
+    tail, steps = row.spread("worst_p95"), row.spread("steps")
+    times = row.spread("training_cpu_s")[0], row.spread("planning_cpu_ms")[0]
+    figures = (f"{duration[0]:.3f}", f"{worst[0]:.2f}, {tail[0]:.2f}", f"{steps[0]:,.0f}", f"{times[0]:.0f}")
+    return (row.group, row.name, *ratios, per_seed, *figures, f"{times[1]:.2f}")
+
+
+def plot(rows: list[Row], path: str) -> None:
+    """Draw valid ratios and durations of all variants."""
+    figure = new_figure(9, 0.27 * len(rows) + 1, dpi=100)
+    left, right = figure.subplots(1, 2, sharey=True)
+    places = np.arange(len(rows))[::-1]
+    for key, color, label in (("valid", "C0", "strict"), ("paper_valid", "C1", "paper's rules")):
+        for place, row in zip(places, rows, strict=True):
+            value, low, high = row.ratio(key)
+            left.plot([100 * low, 100 * high], [place, place], color=color)
+            left.plot([100 * value], [place], "o", color=color, markersize=4, label=label if place == 0 else None)
+    for place, row in zip(places, rows, strict=True):
+        mean, low, high = row.spread("duration_ratio")
+        right.plot([low, high], [place, place], color="C2")
+        right.plot([mean], [place], "o", color="C2", markersize=4)
+    left.set_yticks(places, [f"{row.group}: {row.name}" for row in rows], fontsize=7)
+    left.set_xlabel("valid plans [%]")
+    left.legend(fontsize=7)
+    right.axvline(1.0, color="0.8")
+    right.set_xlabel("duration / refined duration")
+    save_figure(figure, Path(path))
+
+
+def main() -> None:
+    def add(parser: argparse.ArgumentParser) -> None:
+        parser.add_argument("folder", type=Path, help="folder of datasets, models and results")
+        parser.add_argument("--dataset", default="airhockey-hit", help="dataset and shipped model")
+        parser.add_argument("--seconds", type=float, default=60.0, help="CPU time of a training [s]")
+        parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
+        parser.add_argument("--n", type=int, default=1000, help="new problems")
+        parser.add_argument("--only", nargs="+", help="groups of variants")
+        parser.add_argument("--tables", action="store_true", help="print finished results only")
+        parser.add_argument("--plot", metavar="FILE", help="figure to write")
+
+    options = arguments(__doc__, add)
+    results = run(options)
+    rows = rows_of(results)
+    if options.plot:
+        plot(rows, options.plot)
+    head = ("subject", "variant", "valid %", "paper's rules %", "valid % by seed", "duration / refined")
+    figures = ("violation / tolerance: median, p95", "steps", "training s", "planning ms")
+    title = f"{options.dataset}: {options.seconds:g} CPU s, {options.n:,} new problems, 95 % intervals over seeds"
+    report(
+        {"results": results, "base": str(asdict(BASE))},
+        [table(title, (*head, *figures), map(cells, rows), left=2)],
+        as_json=options.json,
+    )
+
+
+if __name__ == "__main__":
+    main()
