@@ -136,7 +136,7 @@ class PlanRuntime:
 
         Args:
             plan: One plan or one sequence, from ``state_at(at)`` to rest; None is refused.
-            at: Switch time [s], after all times of ``set_point``.
+            at: Switch time [s], not before the last time of ``set_point``.
 
         Raises:
             UsageError: There are several plans, or they are of another robot.
@@ -145,13 +145,13 @@ class PlanRuntime:
         if plan is None:
             return Switch(SwitchOutcome.NO_PLAN, at)
         self._check_plan(plan)
-        if at <= self._now:
+        if at < self._now:
             return Switch(SwitchOutcome.LATE, at)
         if (outcome := self._find_reason(plan)) is not None:
             return Switch(outcome[0], at, outcome[1])
         motion = sample_motion(plan, at)
         with self._lock:
-            if at <= self._now:
+            if at < self._now:
                 return Switch(SwitchOutcome.LATE, at)
             if detail := self._jump(motion, at):
                 return Switch(SwitchOutcome.JUMP, at, detail)

@@ -105,7 +105,7 @@ def test_plans_that_must_not_be_executed_are_refused_and_the_motion_continues(pl
         SwitchOutcome.JUMP: executing.switch(sequence, 0.31),
         SwitchOutcome.INVALID: executing.switch(far, 0.3),
     }
-    executing.set_point(0.3)
+    executing.set_point(0.301)
     refusals[SwitchOutcome.LATE] = executing.switch(sequence, 0.3)
     for outcome, switch in refusals.items():
         assert switch.outcome is outcome
