@@ -21,7 +21,8 @@ from common import arguments, median, progress, report, table, verdict
 
 from cnpgen.machine.threads import one_thread
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
-from cnpgen.planner.plan_hits import CONTACT_DISTANCE_M, hit_tasks, load_completion, plan_hits
+from cnpgen.planner.hit_tasks import hit_tasks, load_completion
+from cnpgen.planner.plan_hits import CONTACT_DISTANCE_M, plan_hits
 from cnpgen.planner.planner import Planner
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.plans import Plans

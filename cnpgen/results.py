@@ -1,4 +1,4 @@
-"""Classes that public functions return, the parts of these classes, and the values of objectives."""
+"""Classes that public functions return, values of objectives, and the execution of plans (``PlanRuntime``)."""
 
 from cnpgen.judges.plans.verdict import Margin, Metrics, PaperRule, Reason, Verdict
 from cnpgen.judges.rows.row_report import Check, RowReport
@@ -15,6 +15,8 @@ from cnpgen.planner.model import ModelConfig, Outputs
 from cnpgen.planner.network.architecture import Architecture, Layer
 from cnpgen.planner.network.features import Features
 from cnpgen.planner.plan_hits import PlannedHits
+from cnpgen.planner.plan_runtime import PlanRuntime, Switch, SwitchOutcome
+from cnpgen.planner.set_points import SetPoint
 from cnpgen.planner.tasks import Tasks
 from cnpgen.plans.evaluate import Evaluation
 from cnpgen.plans.export import Exported
@@ -73,6 +75,7 @@ __all__ = [
     "Outputs",
     "PaperRule",
     "PlanIndexError",
+    "PlanRuntime",
     "PlanStatus",
     "PlannedHits",
     "Reason",
@@ -80,12 +83,15 @@ __all__ = [
     "RowError",
     "RowReport",
     "SamplingStatistics",
+    "SetPoint",
     "ShardRecord",
     "ShardTask",
     "Solid",
     "Split",
     "States",
     "StoredProblem",
+    "Switch",
+    "SwitchOutcome",
     "Tasks",
     "Times",
     "Trained",

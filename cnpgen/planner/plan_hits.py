@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -13,36 +11,21 @@ from numpy.typing import ArrayLike, NDArray
 from cnpgen.errors import UsageError, counted
 from cnpgen.machine.threads import one_thread
 from cnpgen.pipelines.completion import Completion
-from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.pipeline_file import restore_pipeline
-from cnpgen.pipelines.stages.behind_puck import behind
-from cnpgen.pipelines.stages.hitting_velocity import SPEED_SHARE_COLUMN
-from cnpgen.pipelines.stages.stage import TaskBatch
-from cnpgen.planner.inference_pipeline import loaded_problem
-from cnpgen.planner.model import Model
-from cnpgen.planner.plan_requests import drawing_stages
+from cnpgen.planner.hit_tasks import State, boundary_of_tasks, hit_tasks, load_completion
+from cnpgen.planner.moving_pucks import Meeting, plan_moving_hits
 from cnpgen.planner.planner import Planner
+from cnpgen.planner.puck_model import PuckModel
 from cnpgen.plans.boundary_file import CONTEXT
-from cnpgen.plans.format import BOUNDARY, CONDITIONS
+from cnpgen.plans.join import JoinedPlans, join_plans
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.constraints.puck_contact import PuckContact
-from cnpgen.problems.problem_record import ProblemRecord, as_problem
-from cnpgen.robots.plausible_values import check_plausible
+from cnpgen.problems.problem_record import as_problem
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import number, numbers
-from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]
 
 CONTACT_DISTANCE_M = 0.07  # from the centre of the paper's puck to that of its mallet at contact
-HIT_COLUMNS = ("start_q", "start_dq", "start_ddq", "goal_xyz", "hit_angle", SPEED_SHARE_COLUMN)
-
-_ARGUMENT_OF = {"goal_xyz": "puck", "hit_angle": "target", SPEED_SHARE_COLUMN: "speed_share"} | dict.fromkeys(
-    HIT_COLUMNS[:3], "state"
-)
-
-State = tuple[ArrayLike, ArrayLike, ArrayLike]
-"""Positions [rad], velocities [rad/s], accelerations [rad/s^2], shape (n,) or (N, n), as from ``Plans.states_at``."""
 
 _COMPLETIONS: WeakKeyDictionary[Planner, Completion] = WeakKeyDictionary()
 
@@ -54,10 +37,33 @@ class PlannedHits:
     Attributes:
         plans: Plans of the hits that have an answer, not checked yet; ``plans.sample_id`` is the index of each hit.
         reasons: Reason why a hit has no answer; empty if it has one. One entry per hit.
+        delay: Time to wait before each plan starts [s], shape (M,) for M plans; zero without a meeting time.
+        overlap: Path of the mallet from the contact to the goal [m].
+        return_plans: The ways back, M plans from the ends of the hits to the home configuration; None without one.
     """
 
     plans: Plans
     reasons: tuple[str, ...]
+    delay: Array
+    overlap: float
+    return_plans: Plans | None = None
+
+    @property
+    def contact_time(self) -> Array:
+        """Time from the start of each plan to the contact of mallet and puck [s], shape (M,)."""
+        time: Array = self.plans.duration - self.overlap / self.plans.columns["hit_speed"]
+        return time
+
+    @property
+    def sequences(self) -> JoinedPlans:
+        """Hits with their ways back.
+
+        Raises:
+            UsageError: The hits were planned without a home configuration.
+        """
+        if self.return_plans is None:
+            raise UsageError("the hits have no ways back: pass home= to plan_hits", concerns="home")
+        return join_plans(self.plans, self.return_plans)
 
     def __repr__(self) -> str:
         return f"<{len(self.plans):,} of {counted(len(self.reasons), 'hit')} of {self.plans.problem.name!r} planned>"
@@ -73,11 +79,18 @@ def plan_hits(
     *,
     contact_distance: float | None = None,
     speed_share: ArrayLike = 1.0,
+    puck_velocity: ArrayLike | None = None,
+    meeting_time: ArrayLike | None = None,
+    puck_model: PuckModel | None = None,
+    home: ArrayLike | None = None,
 ) -> PlannedHits:
     """Plan hits from a state of the arm that send a puck towards a target.
 
     The pipeline stages of the model's training rows compute the goal configuration and velocity (``cnpgen.complete``
     does the same for files). They are loaded at the first call for a planner.
+
+    For a moving puck, the planner solves for the time at which the mallet meets the puck, and the direction of the hit
+    accounts for the puck's velocity. With a meeting time, an arm at rest waits before the plan starts.
 
     Args:
         planner: A planner whose model was trained on hits.
@@ -88,110 +101,56 @@ def plan_hits(
         contact_distance: Distance from the puck's centre to the mallet's at the goal [m]; by default that of the
             problem's constraint ``puck-contact``, or 0.07 without one.
         speed_share: Speed of the hit as a fraction of the highest possible one, a number or shape (N,).
+        puck_velocity: Velocity of the puck in the state of the arm, x and y [m/s], shape (2,) or (N, 2).
+        meeting_time: Time from the state of the arm to the contact [s], a number or shape (N,); by default as soon as
+            possible. A hit that cannot be in time has a reason.
+        puck_model: Drag, restitution and friction of a moving puck; by default those of the simulator.
+        home: Joint positions at which the arm rests after the hit [rad], shape (n,) or (N, n).
 
     Returns:
         Plans of the hits that have an answer, not checked yet, and the reasons why the others have none.
 
     Raises:
-        UsageError: A shape is wrong, a value is not finite, the contact distance differs from that of the problem, or
-            the model was not trained on hits.
+        UsageError: A shape is wrong, a value is not finite, the contact distance differs from that of the problem, the
+            model was not trained on hits, or ``home`` is given for a model without moving starts.
     """
     completion = _COMPLETIONS.get(planner)
     if completion is None:
         completion = _COMPLETIONS[planner] = load_completion(planner.model, planner.backend)
-    distance = _contact_distance(planner.model.problem, contact_distance)
-    tasks = hit_tasks(completion, state, puck, target, contact_distance=distance, share=speed_share)
-    columns = {name: tasks[name][0] for name in CONTEXT}
-    boundary = boundary_of_tasks(tasks, planner.model.fixed_at_goal)
-    return PlannedHits(planner.plan_batch(boundary, sample_id=tasks.alive, columns=columns), tasks.why())
+    contact = as_problem(planner.model.problem).first(PuckContact)
+    distance, overlap = _contact_distance(contact, contact_distance), 0.0 if contact is None else contact.overlap
+    if puck_velocity is None and meeting_time is None:
+        tasks = hit_tasks(completion, state, puck, target, contact_distance=distance, share=speed_share)
+        columns = {name: tasks[name][0] for name in CONTEXT}
+        boundary = boundary_of_tasks(tasks, planner.model.fixed_at_goal)
+        plans = planner.plan_batch(boundary, sample_id=tasks.alive, columns=columns)
+        hits = PlannedHits(plans, tasks.why(), np.zeros(len(plans)), overlap)
+    else:
+        velocity = np.zeros(2) if puck_velocity is None else puck_velocity
+        meeting = Meeting(puck_model or PuckModel(), distance, overlap, meeting_time)
+        found = plan_moving_hits(planner, completion, meeting, state, puck, velocity, target, share=speed_share)
+        hits = PlannedHits(*found, overlap)
+    return hits if home is None else replace(hits, return_plans=_plan_returns(planner, hits, numbers("home", home)))
 
 
-def _contact_distance(problem: ProblemRecord, given: float | None) -> float:
-    """Return the contact distance of a problem [m]; it must equal the given one, if there is any."""
-    constraint = as_problem(problem).first(PuckContact)
+def _plan_returns(planner: Planner, hits: PlannedHits, home: Array) -> Plans:
+    """Plan the ways back, from the ends of hits to rest at home, shape (n,) or (N, n)."""
+    plans = hits.plans
+    if home.ndim == 2:
+        if len(home) != len(hits.reasons):
+            raise UsageError(f"has {len(home)} rows for {len(hits.reasons)} hits", argument="home")
+        home = home[plans.sample_id]
+    q, dq, ddq = plans.states_at(plans.duration)
+    goal = np.broadcast_to(home, q.shape) if len(q) else q
+    return replace(planner.plan(q, goal, start_dq=dq, start_ddq=ddq), sample_id=plans.sample_id)
+
+
+def _contact_distance(contact: PuckContact | None, given: float | None) -> float:
+    """Return the distance of the centres at the goal [m]; it must equal that of the constraint, if there is one."""
     if given is None:
-        return CONTACT_DISTANCE_M if constraint is None else constraint.contact_distance
+        return CONTACT_DISTANCE_M if contact is None else contact.contact_distance
     distance = number("contact_distance", given)
-    if constraint is not None and distance != constraint.contact_distance:
-        expected = f"{constraint.contact_distance:g} m, as in the problem's constraint puck-contact"
+    if contact is not None and distance != contact.contact_distance:
+        expected = f"{contact.contact_distance:g} m, as in the problem's constraint puck-contact"
         raise UsageError(f"must be {expected}, got {distance:g} m", argument="contact_distance")
     return distance
-
-
-def load_completion(model: Model, backend: str | None) -> Completion:
-    """Load the pipeline stages that completed the model's training rows, with the columns of hits as input.
-
-    Raises:
-        UsageError: The model does not record its stages, or they do not complete hits.
-        CnpgenError: The stages do not fit this version of cnpgen, or a backend is missing.
-    """
-    stages = model.training.get("stages")
-    if stages is None:
-        raise UsageError("the model does not record the pipeline stages of its training rows, so it cannot plan hits")
-    name = str(model.training.get("dataset", {}).get("name", model.problem.name))
-    with loaded_problem(model.problem, backend) as loaded:
-        context = Context(loaded.problem, loaded.robot, loaded.kernels)
-        return Completion(restore_pipeline(name, drawing_stages(stages), loaded.problem), context, HIT_COLUMNS)
-
-
-def hit_tasks(
-    completion: Completion,
-    state: State,
-    puck: ArrayLike,
-    target: ArrayLike,
-    *,
-    contact_distance: float,
-    share: ArrayLike,
-) -> TaskBatch:
-    """Complete the tasks of N hits; see ``plan_hits``."""
-    n = completion.context.robot.n
-    if len(state) != 3 or np.ndim(state[0]) == 0:
-        raise UsageError(
-            f"must be positions, velocities and accelerations, got {len(state)} values or arrays", argument="state"
-        )
-    parts = [_lanes("state", values, {n}) for values in state]
-    centre, goal = _lanes("puck", puck, {2, 3}), _lanes("target", target, {2})
-    direction = goal - centre[:2]
-    if not np.count_nonzero(direction, axis=0).all():
-        raise UsageError(f"must differ from the puck's position, got {goal.T.tolist()} for both", argument="target")
-    angle = np.arctan2(direction[1:], direction[:1])
-    shares = _lanes("speed_share", np.reshape(numbers("speed_share", share), (-1, 1)), {1})
-    _check_distance(completion, contact_distance, {"puck": centre, "target": goal})
-    columns = [*parts, behind(centre, angle, contact_distance), angle, shares]
-    counts = {name: values.shape[1] for name, values in zip(HIT_COLUMNS, columns, strict=True)}
-    largest = max(counts.values())
-    for column, count in counts.items():
-        name = _ARGUMENT_OF[column]
-        if count == 0:
-            raise UsageError("is empty, expected at least 1 hit", argument=name)
-        if count not in {1, largest}:
-            raise UsageError(f"has {count:,} hits, another argument has {largest:,}", argument=name)
-    return completion(dict(zip(HIT_COLUMNS, columns, strict=True)))
-
-
-def _check_distance(completion: Completion, contact_distance: float, positions: Mapping[str, Array]) -> None:
-    """Check that lengths are not in millimetres."""
-    lengths = {"contact_distance": np.array([[contact_distance]])}
-    lengths |= {name: values.T for name, values in positions.items()}
-    if max(np.abs(values).max(initial=0) for values in lengths.values()) < completion.context.robot.reach:
-        return  # the usual case: the check takes 50 microseconds
-    check_plausible(completion.context.robot, lengths, dict.fromkeys(lengths, "m"), noun="hit")
-
-
-def boundary_of_tasks(tasks: TaskBatch, fixed_at_goal: int) -> Boundary:
-    """Return the boundary conditions of the tasks that have an answer, with goal accelerations if they are fixed."""
-    names = BOUNDARY if fixed_at_goal == 2 else CONDITIONS
-    return Boundary(*(np.ascontiguousarray(tasks[name].T) for name in names))
-
-
-def _lanes(name: str, values: ArrayLike, widths: set[int]) -> Array:
-    """Return values of shape (w,) or (N, w) as (w, N)."""
-    array = numbers(name, values)
-    if array.ndim == 1:
-        array = array[None]
-    if array.ndim != 2 or array.shape[1] not in widths:
-        expected = " or ".join(f"({width},) or (N, {width})" for width in sorted(widths))
-        raise UsageError(f"must have shape {expected}, got {np.shape(values)}", argument=name)
-    if not math.isfinite(np.vdot(array, array)) and not np.isfinite(array).all():  # vdot takes a third of the time
-        raise UsageError(f"must be finite, got {array}", argument=name)
-    return array.T

@@ -1,0 +1,125 @@
+"""Tasks of hits: state of the arm, puck and target become the columns of a boundary problem."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cnpgen.errors import UsageError
+from cnpgen.pipelines.completion import Completion
+from cnpgen.pipelines.context import Context
+from cnpgen.pipelines.pipeline_file import restore_pipeline
+from cnpgen.pipelines.stages.behind_puck import behind
+from cnpgen.pipelines.stages.hitting_velocity import SPEED_SHARE_COLUMN
+from cnpgen.pipelines.stages.stage import TaskBatch
+from cnpgen.planner.inference_pipeline import loaded_problem
+from cnpgen.planner.model import Model
+from cnpgen.planner.plan_requests import drawing_stages
+from cnpgen.plans.format import BOUNDARY, CONDITIONS
+from cnpgen.robots.plausible_values import check_plausible
+from cnpgen.schema.arguments import numbers
+from cnpgen.trajectory.boundary import Boundary
+
+Array = NDArray[np.float64]
+
+HIT_COLUMNS = ("start_q", "start_dq", "start_ddq", "goal_xyz", "hit_angle", SPEED_SHARE_COLUMN)
+
+_ARGUMENT_OF = {"goal_xyz": "puck", "hit_angle": "target", SPEED_SHARE_COLUMN: "speed_share"} | dict.fromkeys(
+    HIT_COLUMNS[:3], "state"
+)
+
+State = tuple[ArrayLike, ArrayLike, ArrayLike]
+"""Positions [rad], velocities [rad/s], accelerations [rad/s^2], shape (n,) or (N, n), as from ``Plans.states_at``."""
+
+
+def load_completion(model: Model, backend: str | None) -> Completion:
+    """Load the pipeline stages that completed the model's training rows, with the columns of hits as input.
+
+    Raises:
+        UsageError: The model does not record its stages, or they do not complete hits.
+        CnpgenError: The stages do not fit this version of cnpgen, or a backend is missing.
+    """
+    stages = model.training.get("stages")
+    if stages is None:
+        raise UsageError("the model does not record the pipeline stages of its training rows, so it cannot plan hits")
+    name = str(model.training.get("dataset", {}).get("name", model.problem.name))
+    with loaded_problem(model.problem, backend) as loaded:
+        context = Context(loaded.problem, loaded.robot, loaded.kernels)
+        return Completion(restore_pipeline(name, drawing_stages(stages), loaded.problem), context, HIT_COLUMNS)
+
+
+def hit_tasks(
+    completion: Completion,
+    state: State,
+    puck: ArrayLike,
+    target: ArrayLike,
+    *,
+    contact_distance: float,
+    share: ArrayLike,
+    angle: Array | None = None,
+) -> TaskBatch:
+    """Complete the tasks of N hits; see ``plan_hits``.
+
+    Args:
+        completion: The stages.
+        state: State of the arm.
+        puck: Position of the puck at the contact.
+        target: Target of the puck.
+        contact_distance: Distance of the centres at the goal [m].
+        share: Speed as a fraction of the highest possible one.
+        angle: Direction of the hit, shape (N,) [rad]; by default towards the target.
+    """
+    n = completion.context.robot.n
+    if len(state) != 3 or np.ndim(state[0]) == 0:
+        raise UsageError(
+            f"must be positions, velocities and accelerations, got {len(state)} values or arrays", argument="state"
+        )
+    parts = [lanes("state", values, {n}) for values in state]
+    centre, goal = lanes("puck", puck, {2, 3}), lanes("target", target, {2})
+    direction = goal - centre[:2]
+    if not np.count_nonzero(direction, axis=0).all():
+        raise UsageError(f"must differ from the puck's position, got {goal.T.tolist()} for both", argument="target")
+    angles = np.arctan2(direction[1:], direction[:1]) if angle is None else angle[None]
+    shares = lanes("speed_share", np.reshape(numbers("speed_share", share), (-1, 1)), {1})
+    _check_distance(completion, contact_distance, {"puck": centre, "target": goal})
+    columns = [*parts, behind(centre, angles, contact_distance), angles, shares]
+    counts = {name: values.shape[1] for name, values in zip(HIT_COLUMNS, columns, strict=True)}
+    largest = max(counts.values())
+    for column, count in counts.items():
+        name = _ARGUMENT_OF[column]
+        if count == 0:
+            raise UsageError("is empty, expected at least 1 hit", argument=name)
+        if count not in {1, largest}:
+            raise UsageError(f"has {count:,} hits, another argument has {largest:,}", argument=name)
+    return completion(dict(zip(HIT_COLUMNS, columns, strict=True)))
+
+
+def _check_distance(completion: Completion, contact_distance: float, positions: Mapping[str, Array]) -> None:
+    """Check that lengths are not in millimetres."""
+    lengths = {"contact_distance": np.array([[contact_distance]])}
+    lengths |= {name: values.T for name, values in positions.items()}
+    if max(np.abs(values).max(initial=0) for values in lengths.values()) < completion.context.robot.reach:
+        return  # the usual case: the check takes 50 microseconds
+    check_plausible(completion.context.robot, lengths, dict.fromkeys(lengths, "m"), noun="hit")
+
+
+def boundary_of_tasks(tasks: TaskBatch, fixed_at_goal: int) -> Boundary:
+    """Return the boundary conditions of the tasks that have an answer, with goal accelerations if they are fixed."""
+    names = BOUNDARY if fixed_at_goal == 2 else CONDITIONS
+    return Boundary(*(np.ascontiguousarray(tasks[name].T) for name in names))
+
+
+def lanes(name: str, values: ArrayLike, widths: set[int]) -> Array:
+    """Return values of shape (w,) or (N, w) as (w, N)."""
+    array = numbers(name, values)
+    if array.ndim == 1:
+        array = array[None]
+    if array.ndim != 2 or array.shape[1] not in widths:
+        expected = " or ".join(f"({width},) or (N, {width})" for width in sorted(widths))
+        raise UsageError(f"must have shape {expected}, got {np.shape(values)}", argument=name)
+    if not math.isfinite(np.vdot(array, array)) and not np.isfinite(array).all():  # vdot takes a third of the time
+        raise UsageError(f"must be finite, got {array}", argument=name)
+    return array.T

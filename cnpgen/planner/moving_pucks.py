@@ -1,0 +1,146 @@
+"""Hits of moving pucks: the time at which the mallet meets the puck, and the direction of the hit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cnpgen.errors import UsageError
+from cnpgen.pipelines.completion import Completion
+from cnpgen.planner.hit_tasks import State, boundary_of_tasks, hit_tasks, lanes
+from cnpgen.planner.planner import Planner
+from cnpgen.planner.puck_model import PuckModel
+from cnpgen.plans.boundary_file import CONTEXT
+from cnpgen.plans.plans import Plans
+from cnpgen.schema.arguments import numbers
+
+Array = NDArray[np.float64]
+
+MAX_MEETING_ITERATIONS = 12
+MAX_MEETING_ERROR_S = 1e-4  # of the time at which mallet and puck meet
+EXPECTED_HIT_SPEED_M_S = 1.5  # of the first iteration
+TOO_LATE = "the mallet cannot meet the puck in time"
+NO_MEETING = "no meeting time: the iteration does not converge"
+
+
+@dataclass(frozen=True)
+class Meeting:
+    """Rules of the meeting of mallet and puck.
+
+    Attributes:
+        model: Motion and contact of the puck.
+        distance: Distance of the centres at the goal [m].
+        overlap: Path of the mallet from the contact to the goal [m].
+        time: Given times of the contact [s], or None for the earliest.
+    """
+
+    model: PuckModel
+    distance: float
+    overlap: float
+    time: ArrayLike | None
+
+
+def plan_moving_hits(  # noqa: PLR0917 - in the order of plan_hits
+    planner: Planner,
+    completion: Completion,
+    meeting: Meeting,
+    state: State,
+    puck: ArrayLike,
+    velocity: ArrayLike,
+    target: ArrayLike,
+    *,
+    share: ArrayLike,
+) -> tuple[Plans, tuple[str, ...], Array]:
+    """Plan hits of moving pucks; see ``plan_hits``.
+
+    The earliest meeting time is a fixed point: the time of the contact in the plan to the puck at this time. The
+    iteration converges if the puck is slower than the mallet.
+
+    Returns:
+        Plans, reasons of the others, and waiting times before the plans [s].
+
+    Raises:
+        UsageError: As ``plan_hits``.
+    """
+    hits = _Hits(completion.context.robot.n, state, puck, velocity, target, share, meeting.time)
+    time, speed = hits.meeting_time.copy(), np.full(len(hits), EXPECTED_HIT_SPEED_M_S)
+    reasons, active = [""] * len(hits), np.arange(len(hits))
+    for iteration in range(MAX_MEETING_ITERATIONS):
+        position, puck_velocity = meeting.model.predict(hits.puck[active], hits.velocity[active], time[active])
+        angle = meeting.model.hit_angle(puck_velocity, speed[active], hits.target[active] - position)
+        tasks = hit_tasks(
+            completion,
+            tuple(part[active] for part in hits.state),  # type: ignore[arg-type]
+            position,
+            hits.target[active],
+            contact_distance=meeting.distance,
+            share=hits.share[active],
+            angle=angle,
+        )
+        for row, reason in zip(active.tolist(), tasks.why(), strict=True):
+            reasons[row] = reason
+        active = active[tasks.alive]
+        speed[active] = tasks["hit_speed"][0]
+        if meeting.time is not None and iteration == 0 and len(active):
+            continue  # the direction depends on the speed
+        columns = {name: tasks[name][0] for name in CONTEXT}
+        plans = planner.plan_batch(
+            boundary_of_tasks(tasks, planner.model.fixed_at_goal), sample_id=active, columns=columns
+        )
+        contact = plans.duration - meeting.overlap / speed[active]
+        change, last = np.abs(contact - time[active]), time[active]
+        if meeting.time is not None or not len(active) or (change <= MAX_MEETING_ERROR_S).all():
+            break
+        time[active] = np.where(change <= MAX_MEETING_ERROR_S, last, contact)
+    if meeting.time is None:
+        delay, accepted, reason = np.zeros(len(active)), change <= MAX_MEETING_ERROR_S, NO_MEETING
+    else:
+        delay, reason = hits.meeting_time[active] - contact, TOO_LATE
+        accepted = delay >= 0
+    for row in active[~accepted].tolist():
+        reasons[row] = reason
+    return hits.with_pucks(plans[accepted], meeting.model, delay[accepted]), tuple(reasons), delay[accepted]
+
+
+class _Hits:
+    """Arguments of N hits, brought to one length."""
+
+    def __init__(  # noqa: PLR0917 - in the order of plan_hits
+        self,
+        n: int,
+        state: State,
+        puck: ArrayLike,
+        velocity: ArrayLike,
+        target: ArrayLike,
+        share: ArrayLike,
+        meeting_time: ArrayLike | None,
+    ) -> None:
+        given = {"puck": puck, "puck_velocity": velocity, "target": target}
+        parts = {name: lanes(name, values, {2}).T for name, values in given.items()}
+        scalars = {"speed_share": share, "meeting_time": 0.0 if meeting_time is None else meeting_time}
+        parts |= {
+            name: lanes(name, np.reshape(numbers(name, values), (-1, 1)), {1}).T for name, values in scalars.items()
+        }
+        parts |= {f"state {index}": lanes("state", values, {n}).T for index, values in enumerate(state)}
+        self._size = max(len(values) for values in parts.values())
+        for name, values in parts.items():
+            if len(values) not in {1, self._size}:
+                argument = name.partition(" ")[0]
+                raise UsageError(f"has {len(values)} hits, another argument has {self._size}", argument=argument)
+            parts[name] = np.repeat(values, self._size // len(values), axis=0)
+        self.puck, self.velocity, self.target = (parts[name] for name in given)
+        self.share, self.meeting_time = parts["speed_share"][:, 0], parts["meeting_time"][:, 0]
+        self.state = tuple(parts[f"state {index}"] for index in range(3))
+        if meeting_time is not None and (self.state[1].any() or self.state[2].any()):
+            raise UsageError("is not at rest: an arm that waits for the puck must be", argument="state")
+
+    def __len__(self) -> int:
+        return self._size
+
+    def with_pucks(self, plans: Plans, model: PuckModel, delay: Array) -> Plans:
+        """Add the pucks at the starts of the plans: columns ``puck_xy`` [m] and ``puck_velocity`` [m/s]."""
+        rows = plans.sample_id
+        position, velocity = model.predict(self.puck[rows], self.velocity[rows], delay)
+        return replace(plans, columns={**plans.columns, "puck_xy": position, "puck_velocity": velocity})
