@@ -1,5 +1,6 @@
 """Plots of one plan: joints relative to their limits over time, the tip over the table or among the obstacles."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -80,16 +81,25 @@ def plot_plan(
 
 
 def along(
-    problem: Problem, robot: Robot, motion: Motion, index: int, *, samples: int = PLOT_SAMPLES
+    problem: Problem,
+    robot: Robot,
+    motion: Motion,
+    index: int,
+    *,
+    samples: int = PLOT_SAMPLES,
+    extra_times: Sequence[float] = (),
+    scene: Scene | None = None,
 ) -> tuple[PathWorld, Array, Array]:
-    """Place the robot at K times of one motion, uniformly spaced.
+    """Place the robot at K times of one motion, uniformly spaced but for extra ones.
 
     Args:
         problem: The problem.
         robot: Its robot.
         motion: The motion.
         index: Index of the plan in error messages.
-        samples: Number of times K.
+        samples: Number of uniformly spaced times.
+        extra_times: Further times [s].
+        scene: Obstacles of the motion; by default those of the problem, which matter for distances only.
 
     Returns:
         The world, phases, and times [s], shape (K,) each.
@@ -99,7 +109,8 @@ def along(
     """
     if not motion.runs_forward()[0]:
         raise UsageError(f"plan {index} cannot be drawn: its rate ds/dt is not positive everywhere")
-    t = np.linspace(0, motion.duration()[0], samples)
+    duration = float(motion.duration()[0])
+    t = np.union1d(np.linspace(0, duration, samples), np.clip(np.array(extra_times, float), 0, duration))
     s = motion.phase_at(t[None])[0]
     states = motion.at(s)
     q, dq, ddq = (values[0].T for values in (states.q, states.dq, states.ddq))
@@ -107,7 +118,8 @@ def along(
         raise UsageError(f"plan {index} cannot be drawn: its values are not finite")
     world = PathWorld(robot, problem.obstacle, problem.object_size)
     jerk = states.jerk[0].T if problem.uses_jerk else None
-    world.set_path(q, dq, ddq, place_obstacles(problem.obstacle), jerk)
+    poses = place_obstacles(problem.obstacle) if scene is None else scene.poses[0]
+    world.set_path(q, dq, ddq, poses, jerk)
     return world, s, t
 
 
