@@ -140,7 +140,7 @@ SYNONYMS = {  # words of other projects -> the word of a name here
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Return ``" (did you mean 'x'?)"`` for the known name of the same meaning or spelling, or an empty string."""
+    """Return ``" (did you mean 'x'?)"`` for a synonym or the most similar known name, or an empty string."""
     names = list(known)
     meant = "-".join(SYNONYMS.get(word, word) for word in name.split("-"))
     if meant != name and meant in names:

@@ -411,6 +411,7 @@ def test_a_copied_recipe_is_planned_with_a_named_model(tmp_path, monkeypatch, ca
     assert failing(capsys, plan)[0] == 2
     assert main([*plan, "--model", "airhockey-hit", "--quiet"]) == 0
     assert len(load_plans(tmp_path / "dataset-plans.h5")) == 3
+    capsys.readouterr()
     text = (tmp_path / "mine" / "pipeline.toml").read_text()
     (tmp_path / "mine" / "pipeline.toml").write_text(text.replace("full_speed = 0.5", "full_speed = 0.7"))
     assert "drawn in another way" in failing(capsys, [*plan, "--model", "airhockey-hit", "-o", "b.h5"])[1]
