@@ -121,7 +121,7 @@ const measure = async (address, width) => {
   document.body.append(frame);
   await loaded;
   const root = frame.contentDocument.documentElement, article = frame.contentDocument.querySelector("article");
-  const found = {address, width, beyond: root.scrollWidth - root.clientWidth, text: article.innerText.length,
+  const found = {address, width, overflow: root.scrollWidth - root.clientWidth, text: article.innerText.length,
                  size: parseFloat(frame.contentWindow.getComputedStyle(article).fontSize),
                  pictures: [...root.querySelectorAll("article img")].filter((image) => !image.alt).length};
   frame.remove();
@@ -208,7 +208,7 @@ def test_pages_are_legible_at_1280_and_400_pixels(site: Path, address: str, tmp_
     text = chromium(tmp_path / "browser", f"{address}/measure.html", "--dump-dom", budget=400_000).stdout
     measured = json.loads(re.search(r'<pre id="found">(.*?)</pre>', text, re.S)[1].replace("&gt;", ">"))
     assert len(measured) == 2 * len(pages)
-    assert [found for found in measured if found["beyond"] > 0] == []  # no horizontal scrolling
+    assert [found for found in measured if found["overflow"] > 0] == []  # no horizontal scrolling
     assert min(found["size"] for found in measured) >= 14
     assert min(found["text"] for found in measured) > 100
     assert [found["address"] for found in measured if found["pictures"]] == []
