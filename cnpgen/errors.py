@@ -121,9 +121,30 @@ def requires_extra(extra: str, package: str) -> Iterator[None]:
         raise MissingExtraError(f"{package} cannot be imported ({error}): pip install 'cnpgen[{extra}]'") from error
 
 
+SYNONYMS = {  # words of other projects -> the word of a name here
+    "speed": "velocity",
+    "effort": "torque",
+    "load": "inspect",
+    "open": "inspect",
+    "info": "inspect",
+    "verify": "validate",
+    "generate": "make-dataset",
+    "new": "init",
+    "optimize": "refine",
+    "judge": "evaluate",
+    "check": "evaluate",
+    "visualize": "view",
+    "render": "view",
+    "help": "docs",
+}
+
+
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Return ``" (did you mean 'x'?)"`` for the known name most similar to ``name``, or an empty string."""
+    """Return ``" (did you mean 'x'?)"`` for a synonym or the most similar known name, or an empty string."""
     names = list(known)
+    meant = "-".join(SYNONYMS.get(word, word) for word in name.split("-"))
+    if meant != name and meant in names:
+        return f" (did you mean {meant!r}?)"
     completions = [candidate for candidate in names if len(name) > 2 and candidate.startswith(name)]
     close = difflib.get_close_matches(name, names, n=1, cutoff=0.5) or completions
     return f" (did you mean {close[0]!r}?)" if close else ""

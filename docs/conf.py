@@ -5,12 +5,14 @@
 
 The source folder is the repository: links to SECURITY.md or to data cards work on the site and in the repository.
 The navigation follows the order of the links in index.md. Pages of the API are written before the build to
-reference/api/, a folder that git ignores. Notebooks of the tutorials are written to the folder notebooks of the site.
+reference/api/, a folder that git ignores. Notebooks of the tutorials are written to the folder notebooks of the site,
+interactive pages to the folder gallery.
 """
 
 import inspect
 import re
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 from sphinx.application import Sphinx
@@ -18,6 +20,7 @@ from sphinx.application import Sphinx
 DOCS = Path(__file__).resolve().parent
 sys.path[:0] = [str(DOCS.parent), str(DOCS)]  # the package of this checkout; the scripts beside this file
 
+from gallery import CARDS, available, write_gallery  # noqa: E402
 from generate import public_objects  # noqa: E402
 from notebooks import write_notebooks  # noqa: E402
 
@@ -28,7 +31,7 @@ author = "The cnpgen developers"
 copyright = author  # noqa: A001 - Sphinx reads this name
 version = release = __version__
 root_doc = "docs/index"
-include_patterns = ["*.md", "docs/**", "datasets/**/*.md", "pipelines/*.md", "problems/*.md"]
+include_patterns = ["*.md", "docs/**", "datasets/*.md", "datasets/**/*.md", "pipelines/*.md", "problems/*.md"]
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
 myst_heading_anchors = 4  # the anchors of headings are GitHub's
@@ -43,6 +46,8 @@ html_title = f"cnpgen {__version__}"
 html_baseurl = DOCUMENTATION_URL
 html_extra_path = ["site"]  # index.html forwards to docs/index.html
 html_copy_source = False
+html_static_path = ["static"]
+html_css_files = ["site.css"]
 
 CAPTIONS = {
     "tutorials": "Tutorials",
@@ -71,8 +76,26 @@ def add_navigation(_: Sphinx, docname: str, source: list[str]) -> None:
     if docname.startswith("docs/tutorials/"):
         file = f"../../notebooks/{docname.rpartition('/')[2]}.ipynb"
         source[0] += f'\n<p><a href="{file}" download>This page as a notebook</a></p>\n'
+    if docname.startswith("datasets/") and not source[0].startswith("#"):
+        source[0] = f"# {docname.rpartition('/')[2]}\n\n{source[0]}"  # cards have no heading
+    if docname == "docs/how-to/gallery":
+        source[0] = with_pages(source[0])
     if docname == "docs/reference/api":
         source[0] += toctree(["api/*"], ":glob:")
+
+
+def with_pages(text: str) -> str:
+    """Replace the pictures of the gallery by interactive pages, and add those of dataset cards."""
+    for name in available():
+        frame = f'<iframe src="../../gallery/{name}.html" title="{name}" loading="lazy"></iframe>'
+        pattern = rf"<!-- gallery: {name} -->\n\n!\[[^\]]*\]\([^)]*\)"
+        link = f'<a href="../../gallery/{name}.html">Open this page alone</a>'
+        text = re.sub(pattern, f'<div class="gallery">\n{frame}\n</div>\n<p>{link}</p>', text)
+    for name in CARDS:
+        alt = f"Histograms, task space and acceptance of {name}"
+        picture = f'<p><img src="../../gallery/{name}.png" alt="{alt}"></p>'
+        text = text.replace(f"<!-- card: {name} -->", picture if find_spec("matplotlib") else "")
+    return text
 
 
 def write_api_pages(app: Sphinx) -> None:
@@ -100,6 +123,7 @@ def write_downloads(app: Sphinx, error: Exception | None) -> None:
     """Write the notebooks into a site that was built."""
     if error is None and app.builder.name == "html":
         write_notebooks(Path(app.outdir) / "notebooks")
+        write_gallery(Path(app.outdir) / "gallery")
 
 
 def setup(app: Sphinx) -> None:

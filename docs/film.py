@@ -1,11 +1,12 @@
 """Render the film of the README: python docs/film.py (extra `benchmark`).
 
-MuJoCo executes a hit and a transport; the film is four times slower than real time.
+MuJoCo executes a hit, a transport and a transport among obstacles; the film is four times slower than real time.
 """
 
 import tempfile
 from pathlib import Path
 
+import gallery
 import imageio.v3 as iio
 import numpy as np
 from PIL import Image
@@ -14,16 +15,23 @@ import cnpgen
 from cnpgen.cli.main import main as run
 
 FILM = Path(__file__).parent / "images" / "film.gif"
-CLIPS = {"airhockey-pucks": 36, "heavy-object": 0}  # recipe -> index of the problem that is filmed
+CLIPS = {"airhockey-pucks": 36, "heavy-object": 0, "clutter": 0}  # recipe or page of the gallery -> problem
 SIZE = (400, 300)  # [pixels]
 FRAMES_PER_S = 12.5  # every second frame of a film of `cnpgen simulate`
 COLORS = 64
 
 
+def solved_plan(clip: str, index: int) -> cnpgen.Plans:
+    """Return the plan of a clip."""
+    if clip == "clutter":
+        return gallery.clutter()[0][index : index + 1]
+    problems = cnpgen.draw_boundary_problems(clip, index + 1, seed=1)[index : index + 1]
+    return cnpgen.solve_plans(problems, workers=1).plans
+
+
 def frames(recipe: str, index: int) -> list[Image.Image]:
-    """Solve a problem of a recipe, execute its plan and return every second frame."""
-    problems = cnpgen.draw_boundary_problems(recipe, index + 1, seed=1)[index : index + 1]
-    plans = cnpgen.solve_plans(problems, workers=1).plans
+    """Solve a problem, execute its plan and return every second frame."""
+    plans = solved_plan(recipe, index)
     with tempfile.TemporaryDirectory() as folder:
         file, clip = f"{folder}/plan.h5", f"{folder}/clip.mp4"
         cnpgen.save_plans(file, plans)

@@ -260,3 +260,88 @@ def test_the_list_of_optional_packages_is_complete() -> None:
     required = {re.split(r"[^\w-]", requirement)[0] for requirement in SETTINGS["dependencies"]}
     required |= {"pinocchio", "cnpgen"}  # pinocchio is installed by `pin`
     assert imported - required - sys.stdlib_module_names == OPTIONAL.keys() - BY_NAME
+
+
+CITATION_KEYS = ("cff-version", "message", "title", "abstract", "type", "authors", "version", "license", "keywords")
+LEFT_TO_THE_PUBLISHER = ("date-released", "doi", "repository-code", "url")
+
+
+def test_the_citation_is_complete_but_for_marked_lines_of_the_publisher() -> None:
+    yaml = pytest.importorskip("yaml")
+    text = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    citation = yaml.safe_load(text)
+    assert [key for key in CITATION_KEYS if not citation.get(key)] == []
+    assert citation["references"][0]["authors"][0]["family-names"] == "Kicki"
+    _, _, marked = text.partition("# PUBLISHER: ")
+    for key in LEFT_TO_THE_PUBLISHER:
+        assert key in citation or re.search(rf"^# {key}: ", marked, re.M), key
+
+
+METADATA = ("Name", "Version", "Summary", "License-Expression", "Requires-Python", "Author", "Keywords", "Project-URL")
+
+
+def test_the_metadata_of_the_wheel_are_complete(wheel: zipfile.ZipFile) -> None:
+    (name,) = [name for name in wheel.namelist() if name.endswith(".dist-info/METADATA")]
+    metadata = Parser().parsestr(wheel.read(name).decode())
+    assert [key for key in METADATA if not metadata.get(key)] == []
+    assert metadata["Version"] == cnpgen.__version__
+    assert metadata["Description-Content-Type"] == "text/markdown"
+    assert metadata.get_payload().startswith("# cnpgen")
+    assert "License :: " not in str(metadata.get_all("Classifier"))  # replaced by the license expression
+
+
+def _install_command() -> str:
+    """Return the install command of the README."""
+    (block,) = re.findall(
+        r"<!-- install -->\n```bash\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.S
+    )
+    return str(block).strip()
+
+
+@pytest.mark.extended
+def test_the_release_is_built_and_the_install_command_of_the_readme_works_with_its_wheel(tmp_path: Path) -> None:
+    pytest.importorskip("build")
+    source, dist, home = tmp_path / "source", tmp_path / "dist", tmp_path / "home"
+    ignored = shutil.ignore_patterns("__pycache__", ".git", ".venv", ".*_cache", "build", "dist", "shared")
+    shutil.copytree(ROOT, source, ignore=ignored)
+    home.mkdir()
+    _checked([sys.executable, "-m", "build", "--no-isolation", "--outdir", str(dist), str(source)], home)
+    (built,), (archive,) = dist.glob("*.whl"), dist.glob("*.tar.gz")
+    assert built.name == f"cnpgen-{cnpgen.__version__}-py3-none-any.whl"
+    assert archive.name == f"cnpgen-{cnpgen.__version__}.tar.gz"
+    if importlib.util.find_spec("twine"):
+        _checked([sys.executable, "-m", "twine", "check", "--strict", str(built), str(archive)], home)
+    command = _install_command()
+    assert "'.[plot]'" in command
+    if not _has_index(home):
+        pytest.skip("no package index")
+    _checked(["bash", "-euo", "pipefail", "-c", command.replace("'.[plot]'", f"'{built}[plot]'")], home)
+    assert (home / "airhockey-replan-v1" / "manifest.json").is_file()
+    script = str(home / ".venv" / "bin" / "cnpgen")
+    assert "airhockey-hit" in _checked([script, "list"], home)
+    assert _checked([script, "docs", "releases"], home).startswith("# Releases")
+    _checked([script, "validate", "airhockey-replan-v1"], home)
+
+
+def _checked(command: list[str], folder: Path) -> str:
+    """Run a command without the repository on the path; return its output."""
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def _has_index(folder: Path) -> bool:
+    """Return whether pip reaches a package index."""
+    command = [
+        sys.executable,
+        "-m",
+        "pip",
+        "download",
+        "--quiet",
+        "--no-deps",
+        "--dest",
+        str(folder / "probe"),
+        "joblib",
+    ]
+    return subprocess.run(command, cwd=folder, capture_output=True, check=False).returncode == 0

@@ -191,8 +191,9 @@ def _draw(found: "Evaluation", picture: str, index: int | None) -> None:
 
     plans, chosen = found.plans, _chosen(found) if index is None else index
     problem, robot = open_problem(plans.problem)
-    note = f"sample {plans.sample_id[chosen]}: {found.verdicts[chosen]}"
-    plot_plan(problem, robot, plans.motion, chosen, picture, scene=plans.scene[chosen], note=note)
+    verdict = found.verdicts[chosen]
+    note = f"sample {plans.sample_id[chosen]}: {verdict}"
+    plot_plan(problem, robot, plans.motion, chosen, picture, scene=plans.scene[chosen], note=note, verdict=verdict)
     print(f"drawn: plan {chosen} in {picture}", file=sys.stderr)
 
 

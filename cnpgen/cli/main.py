@@ -14,6 +14,7 @@ from typing import Any, NoReturn
 from cnpgen.cli import (
     benchmark_command,
     complete_command,
+    copy_command,
     docs_command,
     doctor_command,
     evaluate_command,
@@ -46,6 +47,7 @@ _COMMANDS = (
     merge_command,
     extend_command,
     init_command,
+    copy_command,
     list_command,
     show_command,
     inspect_command,
@@ -71,6 +73,7 @@ _EPILOG = """\
 examples:
   cnpgen list                                        list recipes
   cnpgen init my-arm --urdf arm.urdf                 recipes for your own arm
+  cnpgen copy airhockey-hit my-hits                  copy a recipe for editing
   cnpgen make-dataset airhockey-hit --n 1000         make 1000 samples; the same command resumes
   cnpgen inspect airhockey-hit-v1 --plot hits.png    summarize them
   cnpgen validate airhockey-hit-v1 --deep            verify them

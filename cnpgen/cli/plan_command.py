@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from cnpgen.cli import values
 from cnpgen.cli.parser import Commands, Parser, add_command, add_engine, add_json
 from cnpgen.cli.plan_files import check_suffix
+from cnpgen.cli.recipe_names import is_recipe
 from cnpgen.cli.refine_options import LARGE_ANGLES, REFINING, WORKERS, add_refining, check_place, refine_and_save
 from cnpgen.errors import counted
 
@@ -17,12 +18,12 @@ if TYPE_CHECKING:
     from cnpgen.plans import Plans
 
 _TEXT = """\
-The problems are samples of a dataset, or boundary conditions in an HDF5 file (a shard, a plan file, or any other):
-start_q and goal_q of shape (N, joints), optionally start_dq, start_ddq and goal_dq, and goal_ddq for models that hold
-the goal's acceleration. Plans meet the boundary conditions to rounding; 'cnpgen evaluate' checks the constraints. With
---refine the plans are optimized as by 'cnpgen refine', and the exit code is 1 if a plan is invalid in the end. Finished
-plans are kept in PLANS.part, and the same command resumes. The plan file is printed on stdout; an existing one is
-replaced only with --force.
+The problems are samples of a dataset, fresh draws of a recipe as 'cnpgen solve' makes them, or boundary conditions in
+an HDF5 file (a shard, a plan file, or any other): start_q and goal_q of shape (N, joints), optionally start_dq,
+start_ddq and goal_dq, and goal_ddq for models that hold the goal's acceleration. Plans meet the boundary conditions to
+rounding; 'cnpgen evaluate' checks the constraints. With --refine the plans are optimized as by 'cnpgen refine', and the
+exit code is 1 if a plan is invalid in the end. Finished plans are kept in PLANS.part, and the same command resumes. The
+plan file is printed on stdout; an existing one is replaced only with --force.
 """
 
 
@@ -30,12 +31,17 @@ def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
     parser = add_command(commands, "plan", run, title="plan with a trained model", text=_TEXT)
     option = parser.add_argument
-    option("problems", metavar="DIR|FILE", type=Path, help="a dataset, or an HDF5 file of boundary conditions")
-    option("--model", metavar="NAME|FILE", required=True, help="a shipped model, or a model file")
-    option("-o", "--out", metavar="PLANS", type=Path, required=True, help="plan file to write, .h5")
+    text = "a dataset's folder; a dataset or pipeline by name, or a recipe file; or boundary conditions in HDF5"
+    option("problems", metavar="DIR|NAME|FILE", help=text)
+    text = "a shipped model, or a model file (default for a shipped dataset by name: the model of this name)"
+    option("--model", metavar="NAME|FILE", help=text)
+    option(
+        "-o", "--out", metavar="PLANS", type=Path, help="plan file to write, .h5 (default for a recipe: NAME-plans.h5)"
+    )
     option("--split", metavar="NAME", help="split of the dataset (default: validation)")
     option("--first", metavar="I", type=values.natural, help="first sample of the split (default: 0)")
-    option("--n", metavar="K", type=values.rows, help="number of samples; by default all that follow")
+    option("--n", metavar="K", type=values.rows, help="number of problems; for a folder by default all that follow")
+    option("--seed", metavar="S", type=values.seed, help="root seed of fresh problems; default the recipe's")
     option("--other-rows", action="store_true", help="accept samples of another pipeline than the training data")
     option("--allow-large-angles", action="store_true", help=LARGE_ANGLES)
     option("--no-time-scaling", action="store_true", help="keep the rates of the network")
@@ -56,6 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
     from cnpgen.planner.model_file import load_model
     from cnpgen.planner.planner import Planner
 
+    _complete(arguments)
     _check(arguments)
     model = load_model(arguments.model)
     requests = _requests(arguments, model)
@@ -71,6 +78,25 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.refine:
         return refine_and_save(arguments, plans, arguments.out, title=f"refining plans of {arguments.model}")
     return _save(arguments, plans, seconds)
+
+
+def _complete(arguments: argparse.Namespace) -> None:
+    """Set the model and the output of a recipe's fresh problems, if they are not given.
+
+    Raises:
+        UsageError: One of them is missing, and there is no default.
+    """
+    from cnpgen.errors import UsageError
+    from cnpgen.planner.model_file import shipped_models
+
+    name, recipe = arguments.problems, is_recipe(arguments.problems)
+    if recipe and arguments.model is None and name in shipped_models():
+        arguments.model = name
+    if recipe and arguments.out is None:
+        arguments.out = Path(f"{Path(name).stem}-plans.h5")
+    for option, value in (("--model", arguments.model), ("-o/--out", arguments.out)):
+        if value is None:
+            raise UsageError(f"the following arguments are required: {option}; see 'cnpgen plan --help'")
 
 
 def _check(arguments: argparse.Namespace) -> None:
@@ -105,9 +131,14 @@ def _requests(arguments: argparse.Namespace, model: "Model") -> "Requests":
     from cnpgen.errors import UsageError
     from cnpgen.planner.plan_requests import read_file, read_rows
 
-    if arguments.problems.is_dir():
+    if is_recipe(arguments.problems):
+        return _draws(arguments, model)
+    if arguments.seed is not None:
+        raise UsageError(f"--seed is for fresh draws of a recipe, got {arguments.problems}")
+    problems = Path(arguments.problems)
+    if problems.is_dir():
         return read_rows(
-            arguments.problems,
+            problems,
             model,
             split=arguments.split or "validation",
             first=arguments.first or 0,
@@ -116,6 +147,29 @@ def _requests(arguments: argparse.Namespace, model: "Model") -> "Requests":
         )
     if arguments.split is not None or arguments.first is not None or arguments.n is not None:
         raise UsageError("--split, --first and --n need the folder of a dataset, got a file")
-    return read_file(
-        arguments.problems, model, other=arguments.other_rows, allow_large_angles=arguments.allow_large_angles
-    )
+    return read_file(problems, model, other=arguments.other_rows, allow_large_angles=arguments.allow_large_angles)
+
+
+def _draws(arguments: argparse.Namespace, model: "Model") -> "Requests":
+    """Draw fresh problems of a recipe."""
+    from cnpgen.errors import UsageError
+    from cnpgen.make.draw_boundary_problems import draw_boundary_problems
+    from cnpgen.make.recipe_file import load_dataset_recipe
+    from cnpgen.planner.plan_requests import Requests, check_stages, checked_boundary
+    from cnpgen.plans.boundary_file import CONTEXT
+    from cnpgen.problems.problem import resolved
+    from cnpgen.problems.problem_record import record_problem
+    from cnpgen.store.files.documents import plain
+
+    name = arguments.problems
+    if arguments.split is not None or arguments.first is not None:
+        raise UsageError("--split and --first need the folder of a dataset; samples drawn from a recipe have --seed")
+    if arguments.n is None:
+        raise UsageError(f"--n is required: the number of fresh problems of the recipe {name}")
+    recipe = load_dataset_recipe(name)
+    stages = plain(resolved(recipe.pipeline))["stage"]
+    check_stages(name, record_problem(recipe.pipeline.problem), stages, model, other=arguments.other_rows)
+    problems = draw_boundary_problems(recipe, arguments.n, seed=arguments.seed)
+    conditions = {name: values for name, values in vars(problems.boundary).items() if values is not None}
+    columns = {name: problems.columns[name] for name in CONTEXT if name in problems.columns}
+    return Requests(checked_boundary(name, conditions, model), problems.sample_id, columns)

@@ -40,6 +40,14 @@ def check_recipe(recipe: str, *, of_dataset: str = DATASET) -> None:
         raise UsageError(f"{recipe} is {what}, expected a recipe: {hint}")
 
 
+def is_recipe(what: str) -> bool:
+    """Return whether an argument is a recipe file, or the name of a shipped dataset or pipeline and no path."""
+    path = Path(what)
+    return (
+        path.suffix == ".toml" if path.exists() else path.suffix == ".toml" or what in _shipped("dataset", "pipeline")
+    )
+
+
 def check_there(what: str) -> None:
     """Refuse an argument that is neither a path nor the name of a recipe.
 

@@ -66,7 +66,7 @@ def add_refining(parser: Options) -> None:
     option(
         "--deadline",
         metavar="S",
-        type=values.seconds,
+        type=values.seconds_with_unit,
         help="time per plan, such as 10ms: returns the best plan until then, never worse than the input",
     )
     option(

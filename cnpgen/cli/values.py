@@ -105,6 +105,16 @@ def seconds(text: str) -> float:
     return _quantity(text, "s", "a time above 0, such as 0.001 or 1ms")
 
 
+def seconds_with_unit(text: str) -> float:
+    """Read a time above 0 with its unit, where a number alone is probably meant in another one: ``10ms``."""
+    time = seconds(text)
+    if text.strip()[-1:].isdigit() or text.strip().endswith("."):
+        raise ArgumentTypeError(
+            f"expected a time with its unit, such as 10ms; got {text!r}, is it {text}ms or {text}s?"
+        )
+    return time
+
+
 def meters(text: str) -> float:
     """Read a length above 0: ``0.02`` or ``20mm``."""
     return _quantity(text, "m", "a length above 0, such as 0.02 or 20mm")

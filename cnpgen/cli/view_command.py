@@ -1,6 +1,8 @@
 """``cnpgen view``: show a robot, a plan or a sample in a browser."""
 
 import argparse
+import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,12 +11,17 @@ from cnpgen.cli.parser import Commands, Parser, add_command
 
 if TYPE_CHECKING:
     from cnpgen.cli.view.view_scene import ViewScene
+    from cnpgen.judges.plans import Verdict
     from cnpgen.plans import Plans
 
+MAX_ROWS_OF_PAGE = 50  # each adds about 0.3 MB
+
 _TEXT = """\
-The page is one file that needs no network: the arm with its meshes, its obstacles, the path of its tip, a time slider,
-and its joints relative to their limits. A plan moves; a sample without a plan is shown at its start and goal, a problem
-in its base configuration. Plans and datasets contain collision geometry only; --problem locates the visual meshes.
+The page is one file that needs no network: the arm, obstacles, puck, path and frame of the tip, a time slider and a
+slider for every joint. Curves show the joints relative to their limits and the other conditions with their bounds. The
+verdict lists the smallest margin of every condition; for a rejected plan, a click shows the place and time of a
+violation. A sample without a plan is shown at its start and goal, a problem in its base configuration. --rows puts
+several plans on one page. Plans and datasets contain collision geometry only; --problem locates the visual meshes.
 --serve serves the page locally until Ctrl-C and reloads it when a file changes; ?row=I shows another sample. Needs
 MeshCat's viewer: pip install 'cnpgen[view]'.
 """
@@ -27,7 +34,15 @@ def add(commands: "Commands[Parser]") -> None:
     option(
         "what", metavar="PROBLEM|DIR|FILE", help="a problem by name or file, the folder of a dataset, or a plan file"
     )
-    option("--row", metavar="I", type=values.natural, help="plan of the file, or sample of the split (default: 0)")
+    rows = parser.add_mutually_exclusive_group()
+    text = "plan of the file, or sample of the split (default: 0)"
+    rows.add_argument("--row", metavar="I", type=values.natural, help=text)
+    rows.add_argument(
+        "--rows",
+        metavar="I,...",
+        type=values.numbers,
+        help=f"several of them, such as 0,3,10-12; at most {MAX_ROWS_OF_PAGE}",
+    )
     option("--split", metavar="NAME", help="split of the folder (default: validation)")
     text = "the problem of plans or rows, whose URDF leads to its visual meshes"
     option("--problem", metavar="NAME|FILE", help=text)
@@ -62,71 +77,102 @@ def _serve(arguments: argparse.Namespace) -> int:
     from cnpgen.store.layout import SPECIFICATION
 
     def page(row: int | None, stamp: str) -> str:
-        shown = arguments if row is None else argparse.Namespace(**(vars(arguments) | {"row": row}))
-        return page_of(_scene(shown), stamp=stamp)
+        chosen = arguments if row is None else argparse.Namespace(**(vars(arguments) | {"row": row, "rows": None}))
+        return page_of(_scene(chosen), stamp=stamp)
 
     _scene(arguments)  # report errors before serving
-    files = [Path(given) for given in (arguments.what, arguments.problem) if given and Path(given).exists()]
+    files = [Path(file) for file in (arguments.what, arguments.problem) if file and Path(file).exists()]
     watched = [path / SPECIFICATION if path.is_dir() else path for path in files]
     serve(page, watched, port=arguments.serve, ready=lambda address: print(address, flush=True))
     return 0
 
 
 def _scene(arguments: argparse.Namespace) -> "ViewScene":
-    """Build the scene of a problem, a sample or a plan."""
-    from cnpgen.cli.view.view_scene import scene_of_plan, scene_of_problem
+    """Build the scene of a problem, of samples or of plans."""
+    from cnpgen.cli.view.view_scene import scene_of_plans, scene_of_problem
     from cnpgen.plans import open_problem
     from cnpgen.problems.load_robot import load_robot
     from cnpgen.problems.problem_file import load_problem_behind
     from cnpgen.store.paths import file_kind
 
-    what, row = Path(arguments.what), arguments.row or 0
+    what, rows = Path(arguments.what), arguments.rows or (arguments.row or 0,)
     if not what.is_dir() and not file_kind(what):
         _refuse_for_problem(arguments)
         problem = load_problem_behind(arguments.what)
         return scene_of_problem(problem, load_robot(problem))
-    plans, noun = (_row(arguments, row), "row") if what.is_dir() else (_plan(arguments, row), "plan")
+    _check_rows(rows)
+    plans, count = _samples(arguments, rows) if what.is_dir() else _plans(arguments, rows)
     if arguments.problem:
         problem = load_problem_behind(arguments.problem)
         robot = load_robot(problem)
     else:
         problem, robot = open_problem(plans.problem)
-    title = f"{problem.name}: {what.name}, {noun} {row}"
-    return scene_of_plan(problem, robot, plans, title, with_meshes=bool(arguments.problem))
+    noun = "row" if what.is_dir() else "plan"
+    return scene_of_plans(
+        problem,
+        robot,
+        plans,
+        [f"{problem.name}: {what.name}, {noun} {row}" for row in rows],
+        _verdicts(plans, of_samples=what.is_dir()),
+        with_meshes=bool(arguments.problem),
+        first_row=rows[0],
+        n_rows=count,
+    )
+
+
+def _check_rows(rows: Sequence[int]) -> None:
+    """Refuse more rows than a page may have."""
+    from cnpgen.errors import UsageError
+
+    if len(rows) > MAX_ROWS_OF_PAGE:
+        raise UsageError(f"--rows: expected at most {MAX_ROWS_OF_PAGE} rows on one page, got {len(rows)}")
+
+
+def _verdicts(plans: "Plans", *, of_samples: bool) -> "list[Verdict | None]":
+    """Judge plans; None for samples without a plan, whose durations are nan."""
+    from cnpgen.plans.evaluate import evaluate_plans
+
+    verdicts = evaluate_plans(plans, workers=1).verdicts
+    pairs = zip(plans.duration.tolist(), verdicts, strict=True)
+    return [None if of_samples and math.isnan(duration) else verdict for duration, verdict in pairs]
 
 
 def _refuse_for_problem(arguments: argparse.Namespace) -> None:
     """Refuse options that do not apply to a problem."""
     from cnpgen.errors import UsageError
 
-    given = [name for name in ("row", "split", "problem") if getattr(arguments, name) is not None]
-    if given:
-        raise UsageError(f"--{given[0]} needs plans or the folder of a dataset, got {arguments.what}")
+    extra = [name for name in ("row", "rows", "split", "problem") if getattr(arguments, name) is not None]
+    if extra:
+        raise UsageError(f"--{extra[0]} needs plans or the folder of a dataset, got {arguments.what}")
 
 
-def _row(arguments: argparse.Namespace, row: int) -> "Plans":
-    """Read a row of a dataset."""
+def _samples(arguments: argparse.Namespace, rows: Sequence[int]) -> "tuple[Plans, int]":
+    """Read rows of a dataset, and count those of the split."""
     from cnpgen.errors import DatasetError
     from cnpgen.plans.boundary_problems import load_boundary_problems
+    from cnpgen.plans.concatenate import concatenate
     from cnpgen.problems.problem_file import load_problem_behind
     from cnpgen.problems.problem_record import record_problem
+    from cnpgen.store.reader import open_dataset
 
-    plans = load_boundary_problems(arguments.what, split=arguments.split or "validation", start=row, n=1)
+    split = arguments.split or "validation"
+    samples = [load_boundary_problems(arguments.what, split=split, start=row, n=1) for row in rows]
+    plans = concatenate(samples)
     if arguments.problem:
         wanted = record_problem(load_problem_behind(arguments.problem))
         if where := plans.problem.differences(wanted):
             raise DatasetError(f"{arguments.what} is not of {wanted.name!r}: they differ in {', '.join(where)}")
-    return plans
+    return plans, open_dataset(arguments.what).spec.splits[split]
 
 
-def _plan(arguments: argparse.Namespace, row: int) -> "Plans":
-    """Read a plan."""
+def _plans(arguments: argparse.Namespace, rows: Sequence[int]) -> "tuple[Plans, int]":
+    """Read plans, and count those of the file."""
     from cnpgen.cli.plan_files import read_plans
     from cnpgen.errors import UsageError
 
     if arguments.split:
         raise UsageError(f"--split is for the folder of a dataset, got {arguments.what}")
-    plans = read_plans(Path(arguments.what), problem=arguments.problem)
-    if row >= len(plans):
-        raise UsageError(f"--row: {arguments.what} has no plan {row}: {len(plans)} plans are numbered from 0")
-    return plans[row : row + 1]
+    plans, option = read_plans(Path(arguments.what), problem=arguments.problem), "--rows" if arguments.rows else "--row"
+    if (row := max(rows)) >= len(plans):
+        raise UsageError(f"{option}: {arguments.what} has no plan {row}: {len(plans)} plans are numbered from 0")
+    return plans[list(rows)], len(plans)

@@ -148,9 +148,16 @@ def drawing_stages(stages: Iterable[Mapping[str, Any]]) -> list[Mapping[str, Any
 
 def check_drawing(where: str, spec: DatasetSpec, model: Model, *, other: bool) -> None:
     """Raise an error for rows of another problem, and unless ``other`` for rows drawn by another recipe."""
-    check_problem(where, as_record(spec.problem), model)
+    check_stages(where, as_record(spec.problem), spec.stages, model, other=other)
+
+
+def check_stages(
+    where: str, record: ProblemRecord, drawn_by: Iterable[Mapping[str, Any]], model: Model, *, other: bool
+) -> None:
+    """Raise an error for rows of another problem, and unless ``other`` for rows drawn by other resolved stages."""
+    check_problem(where, record, model)
     stages = model.training.get("stages")
-    if other or stages is None or _stages_sha256(stages) == _stages_sha256(spec.stages):
+    if other or stages is None or _stages_sha256(stages) == _stages_sha256(drawn_by):
         return
     name = model.training.get("dataset", {}).get("name", "another dataset")
     raise DatasetError(

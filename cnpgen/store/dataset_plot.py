@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import DatasetError
+from cnpgen.errors import DatasetError, counted
 from cnpgen.store.field import Field
 from cnpgen.store.files.figure_file import new_figure, save_figure
 from cnpgen.store.inspection import Inspection
@@ -43,7 +43,7 @@ def plot_dataset(inspection: Inspection, path: str | Path) -> None:
     heights = [1.3 * len(joints) + 0.3, 4.2]
     figure = new_figure(14, sum(heights) + 0.5)
     spec = inspection.spec
-    figure.suptitle(f"{spec.name} {spec.version}, {sum(inspection.rows.values()):,} rows ({inspection.state})")
+    figure.suptitle(f"{spec.name} {spec.version}, {counted(sum(inspection.rows.values()), 'row')} ({inspection.state})")
     parts = figure.subfigures(2, 1, height_ratios=heights, squeeze=False)
     _draw_histograms(parts[0, 0], joints, inspection.statistics)
     _draw_task_space(parts[1, 0], inspection)
@@ -51,11 +51,12 @@ def plot_dataset(inspection: Inspection, path: str | Path) -> None:
 
 
 def _joint_fields(inspection: Inspection) -> list[Field]:
-    """Return the fields with one column per joint and a histogram."""
+    """Return the fields with one column per joint and a histogram, without those that are constant."""
     joints = tuple(inspection.spec.robot.get("joint_names", ()))
     statistics = inspection.statistics
     fields = [field for field in inspection.spec.fields if field.names == joints]
-    return [field for field in fields if statistics[field.name].histogram is not None]
+    found = [(field, statistics[field.name]) for field in fields]
+    return [field for field, values in found if values.histogram is not None and not values.constant.all()]
 
 
 def _draw_histograms(figure: "SubFigure", fields: list[Field], statistics: Mapping[str, FieldStatistics]) -> None:
@@ -117,7 +118,7 @@ def _draw_motions(axis: "Axes", rows: dict[str, NDArray[Any]]) -> None:
         arrows: dict[str, Any] = {"angles": "xy", "scale_units": "xy", "scale": 1, "width": 0.003, "alpha": 0.6}
         axis.quiver(x, y, length * np.cos(angle), length * np.sin(angle), color=_COLORS["goal"], **arrows)
     legend = f", arrows: goal velocity x {1e3 * ARROW_DURATION_S:g} ms" if "hit_speed" in rows else ""
-    axis.set_title(f"{len(rows['goal_xyz'])} rows from above{legend}", fontsize=9)
+    axis.set_title(f"{counted(len(rows['goal_xyz']), 'row')} from above{legend}", fontsize=9)
 
 
 def _draw_acceptance(figure: "SubFigure", axis: "Axes", name: str, density: DensityMap) -> None:

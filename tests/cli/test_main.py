@@ -137,6 +137,18 @@ def test_a_wrong_value_is_one_line(run, option, value, tmp_path):
 def test_a_wrong_time_is_said_once(run, value):
     expected = f"--deadline: expected a time above 0, such as 0.001 or 1ms; got {value!r}; see"
     assert expected in one_line(run("refine", "x.h5", "--deadline", value)[2])
+
+
+@pytest.mark.parametrize("value", ["10", "0.01", "1e-2", "5."])
+def test_a_deadline_without_a_unit_is_refused(run, value):
+    expected = f"--deadline: expected a time with its unit, such as 10ms; got {value!r}, is it {value}ms or {value}s?"
+    for command in (("refine", "x.h5"), ("solve", "airhockey-hit"), ("plan", "airhockey-hit", "--refine")):
+        code, _, err = run(*command, "--deadline", value)
+        assert code == 2
+        assert expected in one_line(err)
+
+
+def test_a_wrong_unit_is_named(run):
     assert "unknown unit 'mz'" in one_line(run("refine", "x.h5", "--deadline", "5mz")[2])
 
 
@@ -151,6 +163,11 @@ def test_a_wrong_time_is_said_once(run, value):
         (("show", "airhockey-hot"), "'airhockey-hit'"),
         (("show", "--stage", "start-k"), "'start-ik'"),
         (("show", "--constraint", "tabel"), "'table'"),
+        (("show", "--constraint", "joint-speed"), "'joint-velocity'"),
+        (("show", "--constraint", "joint-effort"), "'joint-torque'"),
+        (("load", "x"), "'inspect'"),
+        (("verify", "x"), "'validate'"),
+        (("generate", "x"), "'make-dataset'"),
         (("list", "stage"), "'stages'"),
         (("--hepl",), "'--help'"),
         (("inspect", "x", "--jsn"), "'--json'"),

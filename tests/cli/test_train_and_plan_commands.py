@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from cnpgen.cli.main import main
+from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.planner.model_file import load_model
 from cnpgen.plans import load_plans
 from cnpgen.plans.status import PlanStatus
@@ -393,3 +394,47 @@ def test_a_file_without_goals_or_of_another_problem_is_an_error(trained, tmp_pat
         file["start_q"], file["goal_q"] = np.zeros((2, 6)), np.zeros((2, 6))
         file.attrs["problem_sha256"] = "0" * 64
     assert "another problem than the model" in failing(capsys, words)[1]
+
+
+def test_a_recipe_is_planned_with_the_model_of_its_name(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["plan", "airhockey-hit", "--n", "6", "--seed", "5"]) == 0
+    assert capsys.readouterr().out == "airhockey-hit-plans.h5\n"
+    plans, problems = (
+        load_plans(tmp_path / "airhockey-hit-plans.h5"),
+        draw_boundary_problems("airhockey-hit", 6, seed=5),
+    )
+    np.testing.assert_array_equal(plans.boundary.goal_dq, problems.boundary.goal_dq)
+    assert np.isfinite(plans.duration).all()
+
+
+def test_a_copied_recipe_is_planned_with_a_named_model(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["copy", "airhockey-hit", "mine"]) == 0
+    capsys.readouterr()
+    plan = ["plan", "mine/dataset.toml", "--n", "3"]
+    assert failing(capsys, plan)[0] == 2
+    assert main([*plan, "--model", "airhockey-hit", "--quiet"]) == 0
+    assert len(load_plans(tmp_path / "dataset-plans.h5")) == 3
+    capsys.readouterr()
+    text = (tmp_path / "mine" / "pipeline.toml").read_text()
+    (tmp_path / "mine" / "pipeline.toml").write_text(text.replace("full_speed = 0.5", "full_speed = 0.7"))
+    assert "drawn in another way" in failing(capsys, [*plan, "--model", "airhockey-hit", "-o", "b.h5"])[1]
+    assert main([*plan, "--model", "airhockey-hit", "-o", "b.h5", "--other-rows", "--quiet"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["airhockey-hit"], "--n is required: the number of fresh problems of the recipe airhockey-hit"),
+        (["airhockey-hit", "--n", "2", "--split", "train"], "--split and --first need the folder of a dataset"),
+        (["airhockey-pucks", "--n", "2"], "the following arguments are required: --model"),
+        (["heavy-object", "--n", "2", "--model", "airhockey-hit"], "the model plans for 'airhockey'"),
+        (["somewhere", "-o", "x.h5"], "the following arguments are required: --model"),
+    ],
+)
+def test_recipes_that_cannot_be_planned_are_refused(words, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    code, text = failing(capsys, ["plan", *words])
+    assert code in {1, 2}
+    assert message in text

@@ -28,7 +28,7 @@ from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
 from tests.conftest import HANGING, some
 from tests.examples.plan_files import plans_of
-from tests.examples.plans import load
+from tests.examples.plans import load, perturbed
 from tests.examples.shaped_robot import WEDGE, write_problem
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -54,9 +54,10 @@ def content(page: Path) -> dict[str, Any]:
     return in_page(page.read_text(encoding="utf-8"))
 
 
-def in_page(text: str) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads(re.search(r'type="application/json">(.*?)</script>', text, re.S)[1])
-    return found
+def in_page(text: str, view: int = 0) -> dict[str, Any]:
+    """Data of a page: those of the robot and of one view."""
+    data: dict[str, Any] = json.loads(re.search(r'type="application/json">(.*?)</script>', text, re.S)[1])
+    return data | data["views"][view]
 
 
 def array(text: str, dtype: str, *shape: int) -> np.ndarray:
@@ -117,7 +118,7 @@ def test_obstacles_the_object_and_the_path_are_shown(page):
 @needs_meshcat
 def test_a_page_asks_no_network(page):
     text = page.read_text(encoding="utf-8")
-    assert not re.search(r"<(script|link|img)[^>]*(src|href)=", text)
+    assert not re.search(r'<(script|link|img)[^>]*(src|href)="(?!data:)', text)
 
 
 @needs_meshcat
@@ -148,7 +149,7 @@ def test_a_problem_is_shown_in_its_base_configuration(tmp_path):
     shown = content(tmp_path / "arm.html")
     assert (shown["labels"], shown["note"]) == (
         ["base"],
-        "drawn as the line through its joints' origins that stands for it",
+        "drawn as the line through its joints' origins",
     )
     assert [body["name"] for body in shown["world"]] == ["table"]
     assert len(shown["robot"]) > 3
@@ -158,7 +159,7 @@ def test_a_problem_is_shown_in_its_base_configuration(tmp_path):
 def test_a_robot_with_a_shape_has_capsules(tmp_path):
     assert main(["view", str(write_problem(tmp_path)), "-o", str(tmp_path / "crane.html")]) == 0
     shown = content(tmp_path / "crane.html")
-    assert shown["note"].startswith("drawn as judges see it")
+    assert shown["note"].startswith("drawn with the convex parts")
     assert {body["name"] for body in shown["capsules"]} == {body["name"] for body in shown["robot"]}
     assert [body["name"] for body in shown["world"]] == ["wall", "roof"]
 
@@ -332,20 +333,21 @@ def test_a_port_that_is_taken_is_said(capsys):
     assert f"cannot listen on port {port}" in capsys.readouterr().err
 
 
-def chromium(page: Path, *options: str, address: str = "") -> str:
+def chromium(page: Path, *options: str, address: str = "", state: str = "time=120&ends", stream: str = "stdout") -> str:
     """Open a page from disk in a browser without a screen; return what it prints."""
     flags = ["--headless", "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
     flags += ["--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update"]
-    flags += ["--disable-sync", f"--user-data-dir={page.parent / 'browser'}", "--window-size=1200,700"]
+    flags += ["--disable-sync", f"--user-data-dir={page.parent / 'browser'}"]
+    flags += [] if any("--window-size" in option for option in options) else ["--window-size=1200,700"]
     command = [
         str(CHROMIUM),
         *flags,
         "--virtual-time-budget=8000",
         *options,
-        f"{address or page.as_uri()}#time=120&ends",
+        f"{address or page.as_uri()}#{state}",
     ]
     done = subprocess.run(command, capture_output=True, text=True, timeout=HANGING, check=True)
-    return done.stdout
+    return str(getattr(done, stream))
 
 
 @needs_meshcat
@@ -354,7 +356,7 @@ def test_a_browser_runs_the_page(page):
     found = chromium(page, "--dump-dom")
     assert 'data-ready="yes"' in found
     assert content(page)["labels"][120] in re.search(r'<output id="time">(.*?)</output>', found)[1]
-    assert found.count("<canvas") == 5  # the scene, and four curves
+    assert found.count("<canvas") == 8  # the scene, four curves of limits and three of conditions
 
 
 @needs_meshcat
@@ -368,3 +370,104 @@ def test_a_browser_draws_the_arm_its_start_and_its_goal(page):
     assert (blue > red + 0.15).mean() > 0.005  # the start
     assert (red > blue + 0.2).mean() > 0.01  # the goal and the object
     assert (np.ptp(scene, axis=2) < 0.03).mean() > 0.3  # the arm, and nothing
+
+
+@pytest.fixture(scope="module")
+def rejected(plans: Path) -> Path:
+    """A page of three plans: one valid, one that violates several conditions, one that cannot be evaluated."""
+    valid, broken = load("transport"), perturbed(load("transport"), 0.2)
+    backwards = valid.changed(rate=-valid.motion.rate)
+    file = plans.with_name("rejected.h5")
+    cnpgen.save_plans(file, plans_of(valid, broken, backwards))
+    assert main(["view", str(file), "--rows", "0-2", "-o", str(file.with_suffix(".html"))]) == 0
+    return file.with_suffix(".html")
+
+
+@needs_meshcat
+def test_a_rejected_plan_shows_the_time_and_the_place_of_its_violations(rejected):
+    text = rejected.read_text(encoding="utf-8")
+    verdict = cnpgen.evaluate_plans(cnpgen.load_plans(rejected.with_suffix(".h5"))).verdicts[1]
+    valid, broken = in_page(text, 0), in_page(text, 1)
+    assert (valid["verdict"]["valid"], valid["verdict"]["reason"]) == (True, "ok")
+    assert all(cause["ok"] for cause in valid["verdict"]["causes"])
+    causes = {cause["name"]: cause for cause in broken["verdict"]["causes"]}
+    assert (broken["verdict"]["valid"], broken["verdict"]["reason"]) == (False, verdict.reason)
+    violated = [margin for margin in verdict.margins.values() if not margin.ok]
+    assert len(violated) >= 3
+    for margin in violated:
+        cause = causes[f"{margin.name} {margin.part}".strip()]
+        assert not cause["ok"]
+        assert broken["times"][cause["frame"]] == pytest.approx(margin.time, abs=1e-9)
+    contact = next(margin for margin in violated if margin.name == "object contact")
+    cause = causes[f"{contact.name} {contact.part}"]
+    body = next(body for body in broken["world"] if body["name"] == contact.part)
+    corners = array(body["corners"], "<f4", -1, 3)
+    assert (corners.min(axis=0) - 0.03 < cause["point"]).all()
+    assert (cause["point"] < corners.max(axis=0) + 0.03).all()
+
+
+@needs_meshcat
+def test_a_plan_that_cannot_be_evaluated_is_shown_at_its_ends_with_the_reason(rejected):
+    shown = in_page(rejected.read_text(encoding="utf-8"), 2)
+    assert shown["labels"] == ["start", "goal"]
+    assert shown["verdict"] == {"valid": False, "reason": "rate not positive", "causes": []}
+
+
+@needs_meshcat
+def test_several_rows_of_a_dataset_are_on_one_page(plans, tmp_path):
+    folder, page = plans.with_name("rows"), tmp_path / "rows.html"
+    assert main(["view", str(folder), "--split", "train", "--rows", "0,2-3", "-o", str(page)]) == 0
+    data = content(page)
+    assert [view["title"].rpartition(" ")[2] for view in data["views"]] == ["0", "2", "3"]
+    assert data["n_rows"] == cnpgen.load_dataset(folder).splits["train"]
+    assert all(view["verdict"] is None for view in data["views"])
+
+
+@needs_meshcat
+def test_the_puck_is_ahead_of_the_goal_and_the_mallet_on_the_tip(tmp_path):
+    plan = load("hit")
+    cnpgen.save_plans(tmp_path / "hit.h5", plans_of(plan))
+    assert main(["view", str(tmp_path / "hit.h5"), "-o", str(tmp_path / "hit.html")]) == 0
+    shown = content(tmp_path / "hit.html")
+    (puck,) = (body for body in shown["world"] if body["name"] == "puck")
+    corners = array(puck["corners"], "<f4", -1, 3)
+    model, data, frame = plan.robot.model, plan.robot.model.createData(), plan.robot.tip_frame
+    jacobian = pin.computeFrameJacobian(model, data, plan.boundary.goal_q[0], frame, pin.LOCAL_WORLD_ALIGNED)
+    direction = (jacobian[:3] @ plan.boundary.goal_dq[0])[:2]
+    distance = (corners.min(axis=0) + corners.max(axis=0))[:2] / 2 - plan.goal_xyz[0, :2]
+    np.testing.assert_allclose(distance / np.linalg.norm(distance), direction / np.linalg.norm(direction), atol=1e-4)
+    assert [body["name"] for body in shown["mallet"]] == ["mallet"]
+    assert "puck distance" in [curve["name"] for curve in shown["conditions"]]
+
+
+@needs_meshcat
+@needs_chromium
+def test_joint_sliders_move_the_tip_as_pinocchio_computes_it(page):
+    q = [0.3, -0.4, 0.5, -1.2, 0.6, 0.7, -0.8]
+    found = chromium(page, "--dump-dom", state="q=" + ",".join(map(str, q)))
+    tip = np.array(re.search(r'data-tip="([^"]*)"', found)[1].split(), float)
+    robot = load_robot(load_problem("heavy-object"))
+    data = robot.model.createData()
+    pin.framesForwardKinematics(robot.model, data, np.array(q))
+    np.testing.assert_allclose(tip, data.oMf[robot.tip_frame].translation, atol=2e-6)
+    assert ">posed<" in found
+
+
+@needs_meshcat
+@needs_chromium
+@pytest.mark.parametrize("width", [1280, 500])
+def test_a_browser_shows_the_verdict_without_an_error(rejected, width):
+    picture = rejected.with_name(f"rejected-{width}.png")
+    flags = ["--enable-logging=stderr", "--v=0", f"--window-size={width},800"]
+    found = chromium(rejected, "--dump-dom", *flags, state="plan=1")
+    assert "rejected: " in re.search(r'<span id="badge"[^>]*>([^<]*)', found)[1]
+    assert found.count('class="violated"') >= 3
+    assert ">2 of 3<" in found
+    log = chromium(rejected, f"--screenshot={picture}", *flags, state="plan=1", stream="stderr")
+    messages = [line for line in log.splitlines() if "CONSOLE" in line and "GL Driver Message" not in line]
+    assert messages == []
+    image = pytest.importorskip("matplotlib.image").imread(picture)[..., :3]
+    scene = image[100:360, : width // 2]
+    assert np.ptp(scene, axis=(0, 1)).min() > 0.3  # the arm and its obstacles are drawn
+    reddish = (image[..., 0] > 0.6) & (image[..., 1] < 0.3) & (image[..., 2] < 0.3)
+    assert reddish.mean() > 0.003  # the badge and the violated conditions

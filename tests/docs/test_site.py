@@ -1,11 +1,17 @@
 """The site builds without a warning from the Markdown of the repository; in the extended run only."""
 
+import json
 import re
 import shutil
 import subprocess
 import sys
+import threading
+from collections.abc import Iterator
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from cnpgen.cli.docs_command import list_pages, page_url
@@ -103,3 +109,106 @@ def test_a_broken_link_fails_the_build(mistake: str, tmp_path: Path) -> None:
     done = build(source, tmp_path / "site", builder="dummy")  # resolves links and writes nothing
     assert done.returncode != 0
     assert "scenes.md" in done.stderr
+
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+MEASURE = """<!DOCTYPE html><title>measure</title><body><pre id="found"></pre><script>
+const measure = async (address, width) => {
+  const frame = document.createElement("iframe");
+  Object.assign(frame, {width, height: 900, src: address});
+  const loaded = new Promise((done) => { frame.onload = done; });
+  document.body.append(frame);
+  await loaded;
+  const root = frame.contentDocument.documentElement, article = frame.contentDocument.querySelector("article");
+  const found = {address, width, overflow: root.scrollWidth - root.clientWidth, text: article.innerText.length,
+                 size: parseFloat(frame.contentWindow.getComputedStyle(article).fontSize),
+                 pictures: [...root.querySelectorAll("article img")].filter((image) => !image.alt).length};
+  frame.remove();
+  return found;
+};
+(async () => {
+  const all = [];
+  for (const address of ADDRESSES) { for (const width of [1280, 400]) { all.push(await measure(address, width)); } }
+  document.getElementById("found").textContent = JSON.stringify(all);
+})();
+</script></body>"""
+
+
+class _Quiet(SimpleHTTPRequestHandler):
+    def log_message(self, *_: object) -> None:
+        """Do not log requests."""
+
+
+@pytest.fixture(scope="module")
+def address(site: Path) -> Iterator[str]:
+    """Address at which the site is served."""
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(_Quiet, directory=str(site))) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+
+
+def chromium(profile: Path, url: str, *options: str, budget: int = 8_000) -> subprocess.CompletedProcess[str]:
+    """Open a page in a browser without a screen."""
+    flags = ["--headless", "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+    flags += ["--no-first-run", "--disable-background-networking", "--disable-sync", f"--user-data-dir={profile}"]
+    flags += ["--enable-logging=stderr", "--v=0", f"--virtual-time-budget={budget}"]
+    command = [str(CHROMIUM), *flags, *options, url]
+    return subprocess.run(command, capture_output=True, text=True, timeout=HANGING, check=True)
+
+
+def errors(log: str) -> list[str]:
+    """Return the messages of a page's console, without the driver's remarks on speed."""
+    return [line for line in log.splitlines() if "CONSOLE" in line and "GL Driver Message" not in line]
+
+
+@pytest.mark.extended
+def test_the_gallery_is_part_of_the_site(site: Path) -> None:
+    pytest.importorskip("meshcat")
+    text = (site / "docs" / "how-to" / "gallery.html").read_text(encoding="utf-8")
+    frames = re.findall(r'<iframe src="../../gallery/(\w+).html"', text)
+    assert {"hit", "transport", "clutter", "comparison"} <= set(frames)
+    assert {path.stem for path in (site / "gallery").glob("*.html")} == set(frames)
+    for name in re.findall(r'<img src="../../gallery/([\w-]+).png"', text):
+        assert (site / "gallery" / f"{name}.png").stat().st_size > 10_000
+
+
+@pytest.mark.extended
+@needs_chromium
+def test_the_pages_of_the_gallery_run_without_an_error_and_draw_their_scene(
+    site: Path, address: str, tmp_path: Path
+) -> None:
+    image = pytest.importorskip("matplotlib.image")
+    pages = sorted((site / "gallery").glob("*.html"))
+    assert len(pages) >= 4
+    for page in pages:
+        picture, url = tmp_path / f"{page.stem}.png", f"{address}/gallery/{page.name}#time=100"
+        done = chromium(tmp_path / "browser", url, f"--screenshot={picture}", "--window-size=1200,700")
+        assert errors(done.stderr) == [], page.name
+        scene = image.imread(picture)[60:560, 20:760, :3]
+        assert (scene.max(axis=2) < 0.85).mean() > 0.03, page.name  # bodies in front of the bright background
+        assert np.ptp(scene, axis=2).max() > 0.2, page.name  # colored frames, objects or obstacles
+        text = chromium(tmp_path / "browser", url, "--dump-dom").stdout
+        assert 'data-ready="yes"' in text
+        if page.stem != "comparison":  # the plan of the network may be rejected
+            assert re.search(r'<span id="badge"[^>]*>valid<', text), page.name
+
+
+@pytest.mark.extended
+@needs_chromium
+def test_pages_are_legible_at_1280_and_400_pixels(site: Path, address: str, tmp_path: Path) -> None:
+    pages = sorted(
+        path.relative_to(site).as_posix() for path in (site / "docs").rglob("*.html") if "api/" not in str(path)
+    )
+    assert len(pages) > 35
+    (site / "measure.html").write_text(
+        MEASURE.replace("ADDRESSES", json.dumps([f"/{page}" for page in pages])), encoding="utf-8"
+    )
+    text = chromium(tmp_path / "browser", f"{address}/measure.html", "--dump-dom", budget=400_000).stdout
+    measured = json.loads(re.search(r'<pre id="found">(.*?)</pre>', text, re.S)[1].replace("&gt;", ">"))
+    assert len(measured) == 2 * len(pages)
+    assert [found for found in measured if found["overflow"] > 0] == []  # no horizontal scrolling
+    assert min(found["size"] for found in measured) >= 14
+    assert min(found["text"] for found in measured) > 100
+    assert [found["address"] for found in measured if found["pictures"]] == []

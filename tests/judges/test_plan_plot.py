@@ -247,3 +247,38 @@ def test_obstacles_of_every_kind_are_drawn_at_their_poses(drawn):
         boxes = [bounding_box(patch) for patch in axes[title].patches]
         for solid, found in zip(solids_of(obstacles, poses), boxes, strict=True):
             np.testing.assert_allclose([found.min, found.max], [solid.low[[1, up]], solid.high[[1, up]]], atol=2e-3)
+
+
+def marks(axis: Any) -> list[tuple[float, float]]:
+    """Return the marked violations of an axis."""
+    return [tuple(np.ravel(line.get_data())) for line in axis.get_lines() if line.get_label() == "violation"]
+
+
+def test_violations_of_joints_and_conditions_are_marked_at_their_times(drawn: "list[Figure]") -> None:
+    plan = perturbed(load("transport"), 0.2)
+    verdict = plan.judged()
+    plot_plan(plan.problem, plan.robot, plan.motion, 0, Path("plan.png"), scene=plan.scene, verdict=verdict)
+    axes = axes_of(drawn[0])
+    titles = {
+        "joint velocity": "velocity [% of limit]",
+        "tilt": "tilt\n[deg]",
+        "object contact": "object contact\n[mm]",
+        "robot clearance": "robot clearance\n[mm]",
+    }
+    violated = {name for name in titles if not verdict.margins[name].ok}
+    assert {"joint velocity", "tilt", "object contact"} <= violated
+    for name, title in titles.items():
+        margin, marked = verdict.margins[name], marks(axes[title])
+        assert [time for time, _ in marked] == ([pytest.approx(margin.time)] if name in violated else [])
+    (tilt,) = marks(axes["tilt\n[deg]"])
+    assert tilt[1] == pytest.approx(np.degrees(verdict.margins["tilt"].value), rel=1e-3)
+    (outside,) = (line for line in axes["tilt\n[deg]"].get_lines() if line.get_label() == "_violated")
+    assert np.nanmin(outside.get_ydata()) > 1.8
+
+
+def test_a_valid_plan_has_no_marks(drawn: "list[Figure]") -> None:
+    plan = load("hit")
+    plot_plan(plan.problem, plan.robot, plan.motion, 0, Path("plan.png"), scene=plan.scene, verdict=plan.judged())
+    axes = axes_of(drawn[0])
+    assert "puck distance\n[mm]" in axes
+    assert not any(marks(axis) for axis in axes.values())

@@ -146,6 +146,19 @@ def test_folders_without_a_dataset_are_refused(tmp_path):
         inspect_dataset(tmp_path / "file")
 
 
+def test_constant_fields_are_left_out_of_a_plot(hits, tmp_path, monkeypatch):
+    from matplotlib.figure import Figure
+
+    figures: list[Figure] = []
+    monkeypatch.setattr(Figure, "savefig", lambda self, path: figures.append(self))
+    found = inspect_dataset(hits)
+    assert found.statistics["start_dq"].constant.all()  # hits start at rest
+    plot_dataset(found, tmp_path / "hits.png")
+    labels = [axis.get_ylabel() for part in figures[0].subfigs for axis in part.axes]
+    drawn = {label.partition("\n")[0] for label in labels if "\n" in label}
+    assert drawn == {"start_q", "goal_q", "goal_dq"}
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("suffix", some(["png", "svg"]))
 def test_a_dataset_is_plotted(hits, tmp_path, suffix):

@@ -1,28 +1,65 @@
-"""The scene of a page: the robot at several times, its obstacles, and its joints relative to their limits."""
+"""The scene of a page: the robot, and one or more views of it with obstacles, curves and the verdict."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.cli.view.view_bodies import Body, capsule_bodies, robot_bodies, tube, wrapped
+from cnpgen.cli.view.view_verdict import ViewVerdict, view_verdict
+from cnpgen.judges.plans.condition_curves import ConditionCurve, condition_curves
 from cnpgen.judges.plans.plan_plot import along, shares_of_limits
+from cnpgen.judges.plans.verdict import Verdict
 from cnpgen.plans.plans import Plans
+from cnpgen.problems.constraints.puck_contact import PUCK_OUT_OF_REACH_M, PuckContact
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene import Scene
 from cnpgen.robots.shape.hull import CUBE
+from cnpgen.robots.solid import pose_width
 from cnpgen.world.forward_kinematics import ForwardKinematics
 
 Array = NDArray[np.float64]
 
 FRAMES_PER_MOTION = 240
-DRAWN_DEPTH_M = 1.0  # of obstacles without a lower end
-THIN = 5e-3  # m: what a table is drawn as thick as
-LINE = 4e-3  # m: radius of the line that the tip draws
+MIN_DRAWN_HEIGHT_M = 0.1  # of obstacles without a lower end, which are drawn down to the floor
+DRAWN_TABLE_M = 5e-3  # thickness of a drawn table
+TIP_PATH_RADIUS_M = 4e-3
+TRIAD_LENGTH_M, TRIAD_RADIUS_M = 0.12, 4e-3  # axes of a drawn frame
+PUCK_HEIGHT_M, MALLET_HEIGHT_M = 0.012, 0.05
+DISC_CORNERS = 48
+
+
+@dataclass(frozen=True)
+class View:
+    """A plan, a sample or a configuration of the robot.
+
+    Attributes:
+        title: Title.
+        labels: Label of each of the K frames: its time, "start" or "goal".
+        times: Times of the frames [s], shape (K,); 0, 1, ... without a motion.
+        q: Joint positions [rad], shape (n, K).
+        poses: Poses of the joints, the universe first and the tip last, shape (K, joints, 4, 4).
+        world: Obstacles, the table and the puck.
+        path: Path of the tip, of a motion.
+        shares: Quantity -> share of the limits, shape (n, K); empty without a motion.
+        conditions: Curves of the other conditions; empty without a motion.
+        verdict: The verdict; None without a motion.
+    """
+
+    title: str
+    labels: tuple[str, ...]
+    times: Array
+    q: Array
+    poses: Array
+    world: tuple[Body, ...]
+    path: tuple[Body, ...]
+    shares: dict[str, Array]
+    conditions: tuple[ConditionCurve, ...]
+    verdict: ViewVerdict | None
 
 
 @dataclass(frozen=True)
@@ -30,91 +67,135 @@ class ViewScene:
     """The content of a page.
 
     Attributes:
-        title: What it is of.
-        labels: Label of each of the K frames: its time, "start" or "goal".
-        times: Times of the frames [s], shape (K,); 0, 1, ... without a motion.
-        poses: Where the joints are, the universe first and the tip last, shape (K, joints, 4, 4).
-        robot: Bodies of the robot.
-        kind: What they are: "meshes", "pieces" or "line".
-        capsules: Capsules round its links.
-        world: Obstacles, and the table.
-        path: The path of the tip, of a motion.
+        robot: The robot.
+        bodies: Bodies of the robot.
+        kind: Their kind: "meshes", "pieces" or "line".
+        capsules: Capsules around its links.
         held: The held object, in the tip's frame.
-        joints: Names of the planned joints.
-        shares: Quantity -> share of the limits, shape (n, K); nothing where there is no motion.
+        mallet: The mallet, relative to the position of the tip.
+        triad: Axes of a frame, in the tip's frame.
+        views: The views, one or more.
+        first_row: Row of the first view.
+        n_rows: Number of rows that the source has.
     """
 
-    title: str
-    labels: tuple[str, ...]
-    times: Array
-    poses: Array
-    robot: tuple[Body, ...]
+    robot: Robot
+    bodies: tuple[Body, ...]
     kind: str
     capsules: tuple[Body, ...]
-    world: tuple[Body, ...]
-    path: tuple[Body, ...]
     held: tuple[Body, ...]
-    joints: tuple[str, ...]
-    shares: dict[str, Array]
+    mallet: tuple[Body, ...]
+    triad: tuple[Body, ...]
+    views: tuple[View, ...]
+    first_row: int = 0
+    n_rows: int = 1
 
 
 def scene_of_problem(problem: Problem, robot: Robot) -> ViewScene:
     """Show a robot in its base configuration."""
     q = robot.base[:, None]
-    title, bodies = f"{problem.name}: base configuration", robot_bodies(problem, robot)
-    return _scene(problem, robot, title, q, bodies, labels=("base",), times=np.zeros(1))
+    tip = _poses(robot, q)[:, -1, :3, 3]
+    scene = scene_of(problem, tip, tip, np.zeros((1, 3)))
+    view = _still(problem, robot, f"{problem.name}: base configuration", q, ("base",), scene)
+    return _scene(problem, robot, [view], with_meshes=True)
 
 
-def scene_of_plan(problem: Problem, robot: Robot, plans: Plans, title: str, *, with_meshes: bool) -> ViewScene:
-    """Show the motion of one plan or, of a row without a plan, its start and its goal.
+def scene_of_plans(
+    problem: Problem,
+    robot: Robot,
+    plans: Plans,
+    titles: Sequence[str],
+    verdicts: Sequence[Verdict | None],
+    *,
+    with_meshes: bool,
+    first_row: int = 0,
+    n_rows: int = 1,
+) -> ViewScene:
+    """Show motions or, of rows without a plan, their starts and goals.
 
     Args:
         problem: The problem.
         robot: Its robot.
-        plans: The plan.
-        title: What the page is called.
+        plans: The plans.
+        titles: Title of each plan.
+        verdicts: Verdict on each plan; None for rows without a plan.
         with_meshes: Whether the URDF's visual meshes are read.
-
-    Raises:
-        UsageError: The plan cannot be evaluated.
+        first_row: Row of the first plan in its source.
+        n_rows: Number of rows of the source.
     """
-    bodies = robot_bodies(problem, robot, with_meshes=with_meshes)
-    if not np.isfinite(plans.duration[0]):
-        boundary = plans.boundary
+    scene = plans.scene
+    views = [
+        _view(problem, robot, plans[i : i + 1], titles[i], verdicts[i], scene[i : i + 1]) for i in range(len(plans))
+    ]
+    return _scene(problem, robot, views, with_meshes=with_meshes, first_row=first_row, n_rows=n_rows)
+
+
+def _view(  # noqa: PLR0917 - all of them are shown
+    problem: Problem, robot: Robot, plan: Plans, title: str, verdict: Verdict | None, scene: Scene
+) -> View:
+    """Show one motion, or its start and goal if there is none or it cannot be evaluated."""
+    if verdict is None or not verdict.margins:
+        boundary = plan.boundary
         q = np.array([boundary.start_q[0], boundary.goal_q[0]]).T
-        return _scene(problem, robot, title, q, bodies, labels=("start", "goal"), times=np.arange(2.0))
-    world, _, times = along(problem, robot, plans.motion, 0, samples=FRAMES_PER_MOTION)
-    labels = tuple(f"{time:.3f} s" for time in times)
-    return _scene(problem, robot, title, world.q, bodies, labels=labels, times=times, shares=shares_of_limits(world))
+        rejected = None if verdict is None else ViewVerdict(valid=False, reason=str(verdict.reason), causes=())
+        return _still(problem, robot, title, q, ("start", "goal"), scene, rejected)
+    extra = [margin.time for margin in verdict.margins.values() if not margin.ok]
+    world, s, times = along(problem, robot, plan.motion, 0, samples=FRAMES_PER_MOTION, extra_times=extra, scene=scene)
+    curves = condition_curves(problem, world, s, scene.bodies())
+    poses = _poses(robot, world.q)
+    return View(
+        title=title,
+        labels=tuple(f"{time:.3f} s" for time in times),
+        times=times,
+        q=world.q,
+        poses=poses,
+        world=tuple(_world(problem, scene)),
+        path=(tube("path of the tip", poses[:, -1, :3, 3], TIP_PATH_RADIUS_M),),
+        shares=shares_of_limits(world),
+        conditions=tuple(curves),
+        verdict=view_verdict(verdict, curves, times, poses, robot.joint_names),
+    )
+
+
+def _still(  # noqa: PLR0917 - all of them are shown
+    problem: Problem,
+    robot: Robot,
+    title: str,
+    q: Array,
+    labels: tuple[str, ...],
+    scene: Scene,
+    verdict: ViewVerdict | None = None,
+) -> View:
+    """Show configurations without a motion."""
+    times, world = np.arange(float(len(labels))), tuple(_world(problem, scene))
+    return View(title, labels, times, q, _poses(robot, q), world, (), {}, (), verdict)
 
 
 def _scene(
     problem: Problem,
     robot: Robot,
-    title: str,
-    q: Array,
-    bodies: tuple[list[Body], str],
+    views: list[View],
     *,
-    labels: tuple[str, ...],
-    times: Array,
-    shares: dict[str, Array] | None = None,
+    with_meshes: bool,
+    first_row: int = 0,
+    n_rows: int = 1,
 ) -> ViewScene:
-    poses = _poses(robot, q)
-    tip = poses[:, -1, :3, 3]
-    size = problem.object_size
+    bodies, kind = robot_bodies(problem, robot, with_meshes=with_meshes)
+    size, contact, tip = problem.object_size, problem.first(PuckContact), robot.n + 1
     return ViewScene(
-        title=title,
-        labels=labels,
-        times=times,
-        poses=poses,
-        robot=tuple(bodies[0]),
-        kind=bodies[1],
+        robot=robot,
+        bodies=tuple(bodies),
+        kind=kind,
         capsules=tuple(capsule_bodies(robot)),
-        world=tuple(_world(problem, scene_of(problem, tip[:1], tip[-1:], np.zeros((1, 3))))),
-        path=(tube("path of the tip", tip, LINE),) if shares else (),
-        held=() if size is None else (wrapped("object", robot.n + 1, CUBE * np.array(size), 0.0),),
-        joints=robot.joint_names,
-        shares=shares or {},
+        held=() if size is None else (wrapped("object", tip, CUBE * np.array(size), 0.0),),
+        mallet=() if contact is None else (_disc("mallet", np.zeros(3), contact.mallet_radius, MALLET_HEIGHT_M, tip),),
+        triad=tuple(
+            wrapped(f"axis {name}", tip, np.array([np.zeros(3), TRIAD_LENGTH_M * axis]), TRIAD_RADIUS_M)
+            for name, axis in zip("xyz", np.eye(3), strict=True)
+        ),
+        views=tuple(views),
+        first_row=first_row,
+        n_rows=n_rows,
     )
 
 
@@ -131,16 +212,29 @@ def _poses(robot: Robot, q: Array) -> Array:
 
 
 def _world(problem: Problem, scene: Scene) -> Iterator[Body]:
-    """Draw obstacles, and a table."""
-    for obstacle, solid in zip(problem.obstacle, scene.bodies(), strict=True):
+    """Draw obstacles, a table and a puck."""
+    for obstacle, solid in zip(scene.obstacles, scene.bodies(), strict=True):
         if obstacle.upright and obstacle.height is None:
-            yield _box(obstacle.name, np.array([*solid.low[:2], solid.high[2] - DRAWN_DEPTH_M]), solid.high)
+            bottom = min(0.0, solid.high[2] - MIN_DRAWN_HEIGHT_M)
+            yield _box(obstacle.name, np.array([*solid.low[:2], bottom]), solid.high)
         else:
             yield wrapped(obstacle.name, 0, solid.position + solid.corners, solid.radius)
-    for each in problem.constraint:
-        if isinstance(each, Table):
-            low, high = (each.x.low, each.y.low, each.z - THIN), (each.x.high, each.y.high, each.z)
-            yield _box("table", np.array(low), np.array(high))
+    contact, table = problem.first(PuckContact), problem.first(Table)
+    if table is not None:
+        low, high = (table.x.low, table.y.low, table.z - DRAWN_TABLE_M), (table.x.high, table.y.high, table.z)
+        yield _box("table", np.array(low), np.array(high))
+    if contact is not None:
+        x, y = scene.poses[0, pose_width(scene.obstacles) :][2:4]
+        if x < PUCK_OUT_OF_REACH_M:
+            height = table.z if table else 0.0
+            yield _disc("puck", np.array([x, y, height]), contact.puck_radius, PUCK_HEIGHT_M, 0)
+
+
+def _disc(name: str, bottom: Array, radius: float, height: float, joint: int) -> Body:
+    """Return an upright disc on a point [m], shape (3,)."""
+    angles = np.arange(DISC_CORNERS) * 2 * np.pi / DISC_CORNERS
+    circle = np.column_stack([radius * np.cos(angles), radius * np.sin(angles), np.zeros(DISC_CORNERS)])
+    return wrapped(name, joint, bottom + np.concatenate([circle, circle + np.array([0, 0, height])]), 0.0)
 
 
 def _box(name: str, low: Array, high: Array) -> Body:

@@ -1,5 +1,6 @@
 """Plots of one plan: joints relative to their limits over time, the tip over the table or among the obstacles."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -7,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
+from cnpgen.judges.plans.condition_curves import ConditionCurve, condition_curves
+from cnpgen.judges.plans.verdict import Margin, Verdict
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem import Problem
@@ -26,6 +29,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+TABLE_HEIGHT = "table height"  # drawn with the tip
 PLOT_SAMPLES = 1000  # in time
 DRAWN_STATES = 7  # at which the arm and the object are drawn
 MAX_LEGEND_CHARACTERS = 115  # that fit above the curves
@@ -41,8 +45,11 @@ def plot_plan(
     *,
     scene: Scene | None = None,
     note: str = "",
+    verdict: Verdict | None = None,
 ) -> None:
-    """Draw one plan.
+    """Draw one plan: joints relative to their limits, other conditions with their bounds, and the tip.
+
+    States at which a condition is violated are marked, and so are the violations of the verdict.
 
     Args:
         problem: The problem.
@@ -52,6 +59,7 @@ def plot_plan(
         path: Image file, ``.png``, ``.pdf`` or ``.svg``; overwritten if it exists.
         scene: Obstacles of this motion; by default from its ends.
         note: Additional text of the title.
+        verdict: The verdict on this motion, whose violations are marked.
 
     Raises:
         UsageError: There is no such plan, or it cannot be evaluated.
@@ -60,15 +68,21 @@ def plot_plan(
     if not 0 <= index < len(motion):
         raise UsageError(f"there is no plan {index}, expected 0 to {len(motion) - 1}")
     one = Motion(motion.path[index : index + 1], motion.rate[index : index + 1], motion.degree)
+    margins = [] if verdict is None else [margin for margin in verdict.margins.values() if not margin.ok]
     with np.errstate(all="ignore"):
-        world, s, t = along(problem, robot, one, index)
-    if scene is None:
-        ends = world.tip_position[:, :1].T, world.tip_position[:, -1:].T
-        scene = scene_of(problem, *ends, world.tip_velocity[:, -1:].T)
-    figure = new_figure(15, 9)
+        world, s, t = along(problem, robot, one, index, extra_times=[margin.time for margin in margins])
+        if scene is None:
+            ends = world.tip_position[:, :1].T, world.tip_position[:, -1:].T
+            scene = scene_of(problem, *ends, world.tip_velocity[:, -1:].T)
+        world.set_path(world.q, world.dq, world.ddq, scene.poses[0], world.jerk)
+    curves = [curve for curve in condition_curves(problem, world, s, scene.bodies()) if curve.name != TABLE_HEIGHT]
+    columns = [1.15, 0.85, 1.0] if curves else [1.15, 1.0]
+    figure = new_figure(20 if curves else 15, 9)
     figure.suptitle(f"{problem.name}, plan {index}: {t[-1]:.3f} s" + (f"\n{note}" if note else ""))
-    joints, tip = figure.subfigures(1, 2, width_ratios=[1.15, 1.0], squeeze=False)[0]
-    _draw_joints(joints, world, t)
+    joints, *conditions, tip = figure.subfigures(1, len(columns), width_ratios=columns, squeeze=False)[0]
+    _draw_joints(joints, world, t, margins)
+    if curves:
+        _draw_conditions(conditions[0], curves, t, margins)
     table = problem.first(Table)
     if table is None:
         _draw_views(tip, problem, world, scene.bodies())
@@ -80,16 +94,25 @@ def plot_plan(
 
 
 def along(
-    problem: Problem, robot: Robot, motion: Motion, index: int, *, samples: int = PLOT_SAMPLES
+    problem: Problem,
+    robot: Robot,
+    motion: Motion,
+    index: int,
+    *,
+    samples: int = PLOT_SAMPLES,
+    extra_times: Sequence[float] = (),
+    scene: Scene | None = None,
 ) -> tuple[PathWorld, Array, Array]:
-    """Place the robot at K times of one motion, uniformly spaced.
+    """Place the robot at K times of one motion, uniformly spaced but for extra ones.
 
     Args:
         problem: The problem.
         robot: Its robot.
         motion: The motion.
         index: Index of the plan in error messages.
-        samples: Number of times K.
+        samples: Number of uniformly spaced times.
+        extra_times: Further times [s].
+        scene: Obstacles of the motion; by default those of the problem, which matter for distances only.
 
     Returns:
         The world, phases, and times [s], shape (K,) each.
@@ -99,7 +122,8 @@ def along(
     """
     if not motion.runs_forward()[0]:
         raise UsageError(f"plan {index} cannot be drawn: its rate ds/dt is not positive everywhere")
-    t = np.linspace(0, motion.duration()[0], samples)
+    duration = float(motion.duration()[0])
+    t = np.union1d(np.linspace(0, duration, samples), np.clip(np.array(extra_times, float), 0, duration))
     s = motion.phase_at(t[None])[0]
     states = motion.at(s)
     q, dq, ddq = (values[0].T for values in (states.q, states.dq, states.ddq))
@@ -107,7 +131,8 @@ def along(
         raise UsageError(f"plan {index} cannot be drawn: its values are not finite")
     world = PathWorld(robot, problem.obstacle, problem.object_size)
     jerk = states.jerk[0].T if problem.uses_jerk else None
-    world.set_path(q, dq, ddq, place_obstacles(problem.obstacle), jerk)
+    poses = place_obstacles(problem.obstacle) if scene is None else scene.poses[0]
+    world.set_path(q, dq, ddq, poses, jerk)
     return world, s, t
 
 
@@ -124,7 +149,7 @@ def shares_of_limits(world: PathWorld) -> dict[str, Array]:
     }
 
 
-def _draw_joints(figure: "SubFigure", world: PathWorld, t: Array) -> None:
+def _draw_joints(figure: "SubFigure", world: PathWorld, t: Array, margins: Sequence[Margin]) -> None:
     """Draw the quantities of ``shares_of_limits`` of every joint over time."""
     robot, shares = world.robot, shares_of_limits(world)
     axes = figure.subplots(len(shares), 1, sharex=True)
@@ -132,12 +157,49 @@ def _draw_joints(figure: "SubFigure", world: PathWorld, t: Array) -> None:
         for values, joint in zip(share, robot.joint_names, strict=True):
             axis.plot(t, 100 * values, linewidth=1.2, label=joint)
         _draw_limits(axis, float(np.nanmax(np.abs(share), initial=0.0)))
+        for margin in margins:
+            if margin.name == f"joint {name}":
+                k = int(np.abs(t - margin.time).argmin())
+                value = 100 * share[robot.joint_names.index(margin.part), k]
+                _mark(axis, margin.time, float(np.clip(value, *axis.get_ylim())))
         axis.set_ylabel(f"{name} [% of limit]", fontsize=9)
     axes[-1].set_xlabel("t [s]")
     axes[-1].set_xlim(t[0], t[-1])
     columns = max(1, MAX_LEGEND_CHARACTERS // (max(map(len, robot.joint_names)) + 8))  # with space between entries
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=min(robot.n, columns), fontsize=8)
+
+
+def _draw_conditions(figure: "SubFigure", curves: list[ConditionCurve], t: Array, margins: Sequence[Margin]) -> None:
+    """Draw the values of conditions over time, with their bounds and violations."""
+    for axis, curve in zip(figure.subplots(len(curves), 1, sharex=True, squeeze=False)[:, 0], curves, strict=True):
+        for values, part in zip(curve.values, curve.parts, strict=True):
+            axis.plot(t, values, linewidth=1.2, color=None if part else "black", label=part or None)
+            axis.annotate(part, (t[0], values[0]), (2, 3), textcoords="offset points", fontsize=8)
+        low, high = axis.get_ylim()
+        for bound, side in ((curve.lower, -1), (curve.upper, 1)):
+            if np.isfinite(bound).all():
+                axis.plot(t, bound, color=_LIMIT, linewidth=1, linestyle="--")
+                reach = bound + side * 1.5 * curve.tolerance
+                low, high = min(low, float(reach.min())), max(high, float(reach.max()))
+                axis.fill_between(t, bound, bound + side * 1e6, color="tab:red", alpha=0.08, linewidth=0)
+        axis.set_ylim(low, high)
+        outside = np.where(curve.violated, curve.values, np.nan)
+        axis.plot(t, outside.T, color=_GOAL, linewidth=2.5, label="_violated")
+        for margin in margins:
+            if margin.name == curve.name:
+                k = int(np.abs(t - margin.time).argmin())
+                violation = np.maximum(curve.lower[k] - curve.values[:, k], curve.values[:, k] - curve.upper[k])
+                _mark(axis, margin.time, float(curve.values[violation.argmax(), k]))
+        axis.set_ylabel(f"{curve.label}\n[{curve.unit}]", fontsize=9)
+        axis.grid(axis="x", color="0.9", linewidth=0.6)
+    axis.set_xlabel("t [s]")
+    axis.set_xlim(t[0], t[-1])
+
+
+def _mark(axis: "Axes", time: float, value: float) -> None:
+    """Mark a violation."""
+    axis.plot([time], [value], "x", color=_GOAL, markersize=9, markeredgewidth=2, label="violation")
 
 
 def _draw_limits(axis: "Axes", largest: float) -> None:

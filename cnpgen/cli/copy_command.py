@@ -1,0 +1,98 @@
+"""``cnpgen copy``: copy a shipped recipe with all files that it refers to, for editing."""
+
+import argparse
+import os
+import re
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cnpgen.cli.parser import Commands, Parser, add_command
+
+if TYPE_CHECKING:
+    from cnpgen.cli.describe import Recipe
+
+_TEXT = """\
+A dataset is copied as DIR/dataset.toml with its DIR/pipeline.toml and DIR/problem.toml, a pipeline with its problem.
+The copies have the name of the folder and refer to each other; the URDF is copied unless it belongs to a package. The
+path of the first file is printed on stdout. Existing files are replaced only with --force.
+"""
+_NEXT = {
+    "dataset": "cnpgen make-dataset {0}",
+    "pipeline": "cnpgen make-dataset {0} --n 1000",
+    "problem": "cnpgen show {0}",
+}
+
+
+def add(commands: "Commands[Parser]") -> None:
+    """Add the command."""
+    parser = add_command(commands, "copy", run, title="copy a recipe for editing", text=_TEXT)
+    parser.add_argument("recipe", metavar="NAME", help="a shipped dataset, pipeline or problem (see 'cnpgen list')")
+    parser.add_argument("folder", metavar="DIR", help="folder of the copies; its name becomes theirs")
+    parser.add_argument("--kind", choices=("dataset", "pipeline", "problem"), help="kind, if several have this name")
+    parser.add_argument("--force", action="store_true", help="replace existing files")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command."""
+    from cnpgen.cli.recipe_names import check_recipe
+    from cnpgen.cli.show_command import load_any
+    from cnpgen.errors import UsageError
+    from cnpgen.store.files.atomic import write_file
+
+    check_recipe(arguments.recipe)
+    if os.path.exists(arguments.recipe) or arguments.recipe.endswith(".toml"):  # noqa: PTH110 - names may be too long
+        raise UsageError(f"expected the name of a shipped recipe, got the path {arguments.recipe}: copy your own files")
+    folder = Path(arguments.folder)
+    texts = copied_texts(load_any(arguments.recipe, arguments.kind), _name(folder))
+    existing = [str(folder / name) for name in texts if (folder / name).exists()]
+    if existing and not arguments.force:
+        raise UsageError(f"{', '.join(existing)} exists already: --force writes over it")
+    for name, text in texts.items():
+        folder.mkdir(parents=True, exist_ok=True)
+        write_file(folder / name, text)
+    first = folder / next(iter(texts))
+    print(first)
+    print(f"next: edit the files in {folder}, then: {_NEXT[first.stem].format(first)}", file=sys.stderr)
+    return 0
+
+
+def _name(folder: Path) -> str:
+    """Return the name of recipes in a folder."""
+    from cnpgen.errors import UsageError
+    from cnpgen.schema.keys import NAME
+
+    name = folder.resolve().name
+    if not re.match(NAME, name):
+        raise UsageError(f"DIR must be lower-case letters, digits and hyphens, such as my-hits; got {name!r}")
+    return name
+
+
+def copied_texts(recipe: "Recipe", name: str) -> dict[str, str]:
+    """Return the files of a copy, that of the recipe itself first: name -> text.
+
+    Args:
+        recipe: A shipped dataset, pipeline or problem.
+        name: Name of the copies.
+    """
+    from cnpgen.make.recipe import DatasetRecipe
+    from cnpgen.pipelines.pipeline import Pipeline
+
+    if isinstance(recipe, DatasetRecipe):
+        text = _changed(recipe.path, name=name, pipeline="pipeline.toml")
+        return {"dataset.toml": text, **copied_texts(recipe.pipeline, name)}
+    if isinstance(recipe, Pipeline):
+        text = _changed(recipe.path, name=name, problem="problem.toml")
+        return {"pipeline.toml": text, **copied_texts(recipe.problem, name)}
+    files = {"problem.toml": _changed(recipe.path, name=name)}
+    if "://" not in recipe.robot.urdf:  # of a package
+        files[recipe.robot.urdf] = recipe.urdf_path.read_text(encoding="utf-8")
+    return files
+
+
+def _changed(file: Path, **keys: str) -> str:
+    """Return the text of a recipe file with other values of keys; comments stay."""
+    text = file.read_text(encoding="utf-8")
+    for key, value in keys.items():
+        text = re.sub(rf'^{key} *= *"[^"]*"', f'{key} = "{value}"', text, count=1, flags=re.MULTILINE)
+    return text

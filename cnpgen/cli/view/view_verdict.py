@@ -1,0 +1,85 @@
+"""The verdict of a page: reasons, and the time and place of every condition's smallest margin."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.judges.plans.condition_curves import ConditionCurve, plot_unit
+from cnpgen.judges.plans.verdict import Margin, Verdict
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Cause:
+    """The smallest margin of a condition, or its largest violation.
+
+    Attributes:
+        name: Name of the condition with the joint, axis or bodies.
+        text: Margin or violation, with unit and tolerance.
+        frame: Frame of the view at its time.
+        ok: Whether the condition is met.
+        point: Place in the world frame [m], shape (3,): between the closest points, at the joint, or at the tip.
+    """
+
+    name: str
+    text: str
+    frame: int
+    ok: bool
+    point: Array
+
+
+@dataclass(frozen=True)
+class ViewVerdict:
+    """The verdict on one plan.
+
+    Attributes:
+        valid: Whether the plan is valid.
+        reason: Reason, "ok" if it is valid.
+        causes: All conditions, the largest violation first.
+    """
+
+    valid: bool
+    reason: str
+    causes: tuple[Cause, ...]
+
+
+def view_verdict(
+    verdict: Verdict, curves: Sequence[ConditionCurve], times: Array, poses: Array, joints: Sequence[str]
+) -> ViewVerdict:
+    """Locate the margins of a verdict in time and space.
+
+    Args:
+        verdict: The verdict on a plan.
+        curves: Curves of its conditions.
+        times: Times of the K frames [s].
+        poses: Poses of the joints, the universe first and the tip last, shape (K, joints, 4, 4).
+        joints: Names of the planned joints.
+    """
+    by_name = {curve.name: curve for curve in curves}
+    margins = sorted(verdict.margins.values(), key=lambda margin: -margin.severity)
+    causes = []
+    for margin in margins:
+        frame = int(np.abs(times - margin.time).argmin())
+        point = _point(margin, by_name.get(margin.name), poses[frame], frame, joints)
+        causes.append(Cause(f"{margin.name} {margin.part}".strip(), margin_text(margin), frame, margin.ok, point))
+    return ViewVerdict(verdict.valid, str(verdict.reason), tuple(causes))
+
+
+def margin_text(margin: Margin) -> str:
+    """Return a margin as text in the units of plots."""
+    factor, unit = plot_unit(margin.unit)
+    side = "outside" if margin.violation > 0 else "inside"
+    amount, tolerance = factor * abs(margin.violation), factor * margin.tolerance
+    return f"{amount:.3g} {unit} {side}, tolerance {tolerance:.3g} {unit}"
+
+
+def _point(margin: Margin, curve: ConditionCurve | None, poses: Array, frame: int, joints: Sequence[str]) -> Array:
+    """Return the place of a margin [m], shape (3,)."""
+    if curve is not None and curve.points is not None:
+        return np.asarray(curve.points[frame].mean(axis=0))
+    if margin.part in joints:
+        return np.asarray(poses[1 + list(joints).index(margin.part), :3, 3])
+    return np.asarray(poses[-1, :3, 3])

@@ -1,0 +1,167 @@
+"""Values of a problem's conditions over time, for plots and pages: tilt, clearances, distances from the manifold."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.judges.plans.joint_limits import is_proven
+from cnpgen.judges.plans.measure import MeasuredCondition, measure, name_part
+from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
+from cnpgen.problems.constraints.constraint import Condition, Constraint
+from cnpgen.problems.constraints.joint import JointTorque
+from cnpgen.problems.constraints.self_clearance import SelfClearance
+from cnpgen.world.closest_points import ClosestPoints, Kind, closest_points
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from cnpgen.problems.problem import Problem
+    from cnpgen.robots.solid import Solid
+    from cnpgen.world.path import PathWorld
+    from cnpgen.world.world import World
+
+Array = NDArray[np.float64]
+
+_UPRIGHT = "upright"  # the angle of "tilt" includes this condition
+_COSINE = "tilt cosine"  # drawn as an angle
+_SCALES = {"m": (1e3, "mm"), "rad": (180 / np.pi, "deg")}  # SI unit -> factor and unit of plots
+
+
+@dataclass(frozen=True)
+class ConditionCurve:
+    """Values of one condition along a motion, with bounds.
+
+    Attributes:
+        name: Name of the condition, as in the verdict.
+        label: Name of the values: of an equality they are deviations, of several values distances from their bounds.
+        unit: Unit of values and bounds, "mm" and "deg" instead of "m" and "rad".
+        parts: Names of the m values; one empty name for a single value.
+        values: Values, shape (m, K).
+        lower: Lower bounds, shape (K,); -inf for none.
+        upper: Upper bounds, shape (K,); inf for none.
+        tolerance: Violation of a bound that is accepted.
+        points: Closest points of two bodies in the world frame [m], shape (K, 2, 3); None if it is no distance.
+        pairs: Names of the closest bodies at every state, empty if it is no distance.
+    """
+
+    name: str
+    label: str
+    unit: str
+    parts: tuple[str, ...]
+    values: Array
+    lower: Array
+    upper: Array
+    tolerance: float
+    points: Array | None = None
+    pairs: tuple[str, ...] = ()
+
+    @property
+    def violated(self) -> NDArray[np.bool_]:
+        """Mask of the states at which a value is outside its bounds by more than the tolerance, shape (K,)."""
+        outside = np.maximum(self.lower - self.values, self.values - self.upper)
+        return np.asarray(~(outside <= self.tolerance).all(axis=0))
+
+
+def plot_unit(unit: str) -> tuple[float, str]:
+    """Return the factor and the name of the unit in which plots show an SI unit."""
+    return _SCALES.get(unit, (1.0, unit))
+
+
+def condition_curves(
+    problem: "Problem", world: "PathWorld", s: Array, solids: "Sequence[Solid]"
+) -> list[ConditionCurve]:
+    """Measure all conditions that are no limits of joints, at every state.
+
+    Args:
+        problem: The problem.
+        world: The robot along a motion, among the obstacles of the motion.
+        s: Phases of the states, shape (K,).
+        solids: The obstacles of the motion.
+    """
+    start_tip = world.tip_position[:, 0].copy()
+    curves: list[ConditionCurve] = []
+    for constraint in problem.constraint:
+        if is_proven(constraint) or isinstance(constraint, JointTorque):
+            continue
+        if isinstance(constraint, RobotClearance | SelfClearance | ObjectContact):
+            curves += _distance_curves(problem, constraint, world, solids)
+        else:
+            curves += _value_curves(problem, measure(constraint, world, s, start_tip))
+    return curves
+
+
+def _value_curves(problem: "Problem", measured: list[MeasuredCondition]) -> Iterator[ConditionCurve]:
+    """Convert measured conditions: one value with its bounds, several values as distances from their bounds."""
+    for condition in measured:
+        stated = condition.condition
+        if stated.name == _UPRIGHT:
+            continue
+        if stated.name == _COSINE:
+            yield _tilt_curve(condition)
+            continue
+        unit = stated.unit if isinstance(stated.unit, str) else stated.unit[0]
+        factor, shown = plot_unit(unit)
+        tolerance = factor * float(condition.tolerance.min())
+        count = condition.g.shape[1]
+        if len(condition.g) == 1:
+            center = stated.lower[0] if stated.is_equality else 0.0
+            lower, upper = (
+                stated.lower[0] - center - condition.relaxation,
+                stated.upper[0] - center + condition.relaxation,
+            )
+            label = f"{stated.name}, deviation" if center else stated.name
+            values = factor * (condition.g - center)
+            yield ConditionCurve(stated.name, label, shown, ("",), values, factor * lower, factor * upper, tolerance)
+        else:
+            parts = tuple(name_part(problem, condition.constraint, stated, i) for i in range(len(condition.g)))
+            inside, unbounded = -factor * condition.violation, np.full(count, np.inf)
+            label = f"{stated.name}, distance inside"
+            yield ConditionCurve(stated.name, label, shown, parts, inside, np.zeros(count), unbounded, tolerance)
+
+
+def _tilt_curve(condition: MeasuredCondition) -> ConditionCurve:
+    """Convert the cosine of a tilt to an angle."""
+    least = float(condition.condition.lower[0])
+    limit, accepted = (float(np.degrees(np.arccos(cosine))) for cosine in (least, least - condition.tolerance[0]))
+    angle = np.degrees(np.arccos(np.clip(condition.g, -1.0, 1.0)))
+    count = angle.shape[1]
+    return ConditionCurve(
+        _COSINE, "tilt", "deg", ("",), angle, np.full(count, -np.inf), np.full(count, limit), accepted - limit
+    )
+
+
+def _distance_curves(
+    problem: "Problem", constraint: Constraint, world: "PathWorld", solids: "Sequence[Solid]"
+) -> Iterator[ConditionCurve]:
+    """Measure the smallest distance of a constraint on distances at every state, with the closest points."""
+    kind: Kind = "object" if isinstance(constraint, ObjectContact) else "robot"
+    kind = "self" if isinstance(constraint, SelfClearance) else kind
+    stated = _stated(constraint, world)
+    if not stated.g:
+        return
+    radius = (problem.arm_radius or 0.0) if kind == "robot" and world.robot.shape is None else 0.0
+    closest: ClosestPoints = closest_points(world, kind, solids, radius=radius)
+    count = len(closest.distance)
+    least = np.full(count, 1e3 * (float(stated.lower[0]) - radius))
+    names = [name_part(problem, constraint, stated, i) for i in range(len(stated.g))]
+    yield ConditionCurve(
+        stated.name,
+        stated.name,
+        "mm",
+        ("",),
+        1e3 * closest.distance[None],
+        least,
+        np.full(count, np.inf),
+        1e3 * float(constraint.allowed(stated)[0]),
+        closest.points,
+        tuple(names[pair] for pair in closest.pair),
+    )
+
+
+def _stated(constraint: Constraint, world: "PathWorld") -> Condition:
+    """Return the condition of a constraint on distances."""
+    (condition,) = constraint.judged(cast("World", world))
+    return condition
