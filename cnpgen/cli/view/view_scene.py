@@ -13,7 +13,7 @@ from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
-from cnpgen.robots.scene import Scene
+from cnpgen.robots.scene import PARKED_POSITION_M, Scene
 from cnpgen.robots.shape.hull import CUBE
 from cnpgen.world.forward_kinematics import ForwardKinematics
 
@@ -82,10 +82,13 @@ def scene_of_plan(problem: Problem, robot: Robot, plans: Plans, title: str, *, w
     if not np.isfinite(plans.duration[0]):
         boundary = plans.boundary
         q = np.array([boundary.start_q[0], boundary.goal_q[0]]).T
-        return _scene(problem, robot, title, q, bodies, labels=("start", "goal"), times=np.arange(2.0))
+        return _scene(
+            problem, robot, title, q, bodies, labels=("start", "goal"), times=np.arange(2.0), scene=plans.scene
+        )
     world, _, times = along(problem, robot, plans.motion, 0, samples=FRAMES_PER_MOTION)
     labels = tuple(f"{time:.3f} s" for time in times)
-    return _scene(problem, robot, title, world.q, bodies, labels=labels, times=times, shares=shares_of_limits(world))
+    shares = shares_of_limits(world)
+    return _scene(problem, robot, title, world.q, bodies, labels=labels, times=times, shares=shares, scene=plans.scene)
 
 
 def _scene(
@@ -98,9 +101,12 @@ def _scene(
     labels: tuple[str, ...],
     times: Array,
     shares: dict[str, Array] | None = None,
+    scene: Scene | None = None,
 ) -> ViewScene:
     poses = _poses(robot, q)
     tip = poses[:, -1, :3, 3]
+    if scene is None:
+        scene = scene_of(problem, tip[:1], tip[-1:], np.zeros((1, 3)))
     size = problem.object_size
     return ViewScene(
         title=title,
@@ -110,7 +116,7 @@ def _scene(
         robot=tuple(bodies[0]),
         kind=bodies[1],
         capsules=tuple(capsule_bodies(robot)),
-        world=tuple(_world(problem, scene_of(problem, tip[:1], tip[-1:], np.zeros((1, 3))))),
+        world=tuple(_world(problem, scene)),
         path=(tube("path of the tip", tip, LINE),) if shares else (),
         held=() if size is None else (wrapped("object", robot.n + 1, CUBE * np.array(size), 0.0),),
         joints=robot.joint_names,
@@ -133,6 +139,8 @@ def _poses(robot: Robot, q: Array) -> Array:
 def _world(problem: Problem, scene: Scene) -> Iterator[Body]:
     """Draw obstacles, and a table."""
     for obstacle, solid in zip(problem.obstacle, scene.bodies(), strict=True):
+        if solid.position[2] <= PARKED_POSITION_M[2]:  # the plan has fewer obstacles than the problem
+            continue
         if obstacle.upright and obstacle.height is None:
             yield _box(obstacle.name, np.array([*solid.low[:2], solid.high[2] - DRAWN_DEPTH_M]), solid.high)
         else:
