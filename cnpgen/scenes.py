@@ -1,5 +1,7 @@
 """Planning problems in scenes: files of other software, families, and plans ('cnpgen docs scene-files')."""
 
+from cnpgen.make.solve_scenes import SolvedScenes, solve_scenes
+from cnpgen.plans.scene_plans import scene_plans
 from cnpgen.problems.scenes.scene_files import load_scenes, save_scenes
 from cnpgen.problems.scenes.scene_problem import GoalPose, SceneError, SceneProblem
 
@@ -7,6 +9,9 @@ __all__ = [
     "GoalPose",
     "SceneError",
     "SceneProblem",
+    "SolvedScenes",
     "load_scenes",
     "save_scenes",
+    "scene_plans",
+    "solve_scenes",
 ]

@@ -67,7 +67,9 @@ def _problem(scene_path: Path, scene: Any, path: Path, request: Any) -> ScenePro
     place = f"{scene_path}: scene {name!r}"
     joints, start = _start(request, str(path))
     goals = part(request, "goal_constraints", list, str(path))
-    goal_q = [goal for goal in (_joint_goal(entry, joints, str(path)) for entry in goals) if goal is not None]
+    if not all(isinstance(entry, dict) for entry in goals):
+        raise SceneError(f"{path}: goal_constraints must be mappings")
+    goal_q = [_joint_goal(entry, joints, start, str(path)) for entry in goals if entry.get("joint_constraints")]
     pose = next(filter(None, (_pose_goal(entry, str(path)) for entry in goals)), None)
     if not goal_q and pose is None:
         raise SceneError(f"{path}: goal_constraints have neither joint_constraints nor position_constraints")
@@ -94,13 +96,10 @@ def _start(request: Any, where: str) -> tuple[tuple[str, ...], Array]:
     return tuple(map(str, names)), positions
 
 
-def _joint_goal(goal: Any, joints: tuple[str, ...], where: str) -> Array | None:
-    """Return the joint positions of a goal; joints without a constraint keep nan, which is checked later."""
-    constraints = part(goal, "joint_constraints", list, where)
-    if not constraints:
-        return None
-    positions = np.full(len(joints), np.nan)
-    for constraint in constraints:
+def _joint_goal(goal: Any, joints: tuple[str, ...], start: Array, where: str) -> Array:
+    """Return the joint positions of a goal; joints without a constraint keep their start position."""
+    positions = start.copy()
+    for constraint in part(goal, "joint_constraints", list, where):
         name = str(constraint.get("joint_name")) if isinstance(constraint, dict) else repr(constraint)
         if name not in joints:
             raise SceneError(f"{where}: the goal constrains the joint {name!r}, which start_state lacks")

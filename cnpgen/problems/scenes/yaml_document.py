@@ -95,8 +95,8 @@ def part(document: Any, key: str, kind: type, where: str) -> Any:
     if value is None:
         return kind()
     if not isinstance(value, kind):
-        names = {dict: "a mapping", list: "a list", str: "a text"}
-        raise SceneError(f"{where}: {key} must be {names[kind]}, got {value!r:.60}")
+        name = "a mapping" if kind is dict else "a list" if kind is list else "a text"
+        raise SceneError(f"{where}: {key} must be {name}, got {value!r:.60}")
     return value
 
 

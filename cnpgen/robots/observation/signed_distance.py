@@ -47,10 +47,10 @@ def _distance(kind: int, size: Array, local: Array) -> Array:
         radial = np.hypot(local[:, 0], local[:, 1]) - radius
         return _outside_or_inside(np.stack([radial, np.abs(local[:, 2]) - half], axis=1))
     along = np.clip(local[:, 2], -half, half)  # half is 0 for a sphere
-    return np.sqrt(local[:, 0] ** 2 + local[:, 1] ** 2 + (local[:, 2] - along) ** 2) - radius
+    return np.asarray(np.sqrt(local[:, 0] ** 2 + local[:, 1] ** 2 + (local[:, 2] - along) ** 2) - radius)
 
 
 def _outside_or_inside(gaps: Array) -> Array:
     """Return the distance from a product of intervals, or of a disc and an interval, from the gap along each."""
     outside = np.linalg.norm(np.maximum(gaps, 0), axis=1)
-    return np.where(outside > 0, outside, gaps.max(axis=1))
+    return np.asarray(np.where(outside > 0, outside, gaps.max(axis=1)))
