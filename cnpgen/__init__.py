@@ -32,6 +32,7 @@ public names are in these modules:
 * ``cnpgen.losses``: the loss of a plan, its metric and its margins.
 * ``cnpgen.results``: classes that functions return.
 * ``cnpgen.trajectories``: sampled trajectories of other planners: load, import, fit, and their verdicts.
+* ``cnpgen.scenes``: planning problems in scene files, families of scenes, and plans for them.
 * ``cnpgen.errors``: the exceptions.
 * ``cnpgen.plugins``: contracts of stages, constraints and exporters.
 * ``cnpgen.benchmark``: comparison of planners, and simulation of plans.
@@ -46,7 +47,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-_MODULES = ("benchmark", "errors", "losses", "plugins", "recipes", "results", "trajectories")
+_MODULES = ("benchmark", "errors", "losses", "plugins", "recipes", "results", "scenes", "trajectories")
 
 
 def _lazy_exports(package: str, file: str) -> tuple[list[str], Callable[[str], Any], Callable[[], list[str]]]:

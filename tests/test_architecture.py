@@ -26,10 +26,10 @@ LAYERS = (
     ("refine", "planner"),
     ("make", "training", "interop"),
     ("validate", "benchmark"),
-    ("cli", "plugins", "recipes", "results", "trajectories", "__init__"),
+    ("cli", "plugins", "recipes", "results", "scenes", "trajectories", "__init__"),
     ("__main__",),
 )
-MAX_PACKAGES = 26
+MAX_PACKAGES = 27
 # Packages of lower layers that must not be imported: the judge shares no code with the solvers that it checks.
 SOLVERS = ("kernels", "pipelines", "losses", "refine", "planner")
 INDEPENDENT = {"judges": SOLVERS, "world": SOLVERS, "benchmark.simulator": SOLVERS}
@@ -173,6 +173,7 @@ def test_every_module_is_imported_or_registered() -> None:
         "plugins",
         "recipes",
         "results",
+        "scenes",
         "trajectories",
         "training.select_via_points",
         *BRIDGES,

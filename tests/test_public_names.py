@@ -86,7 +86,7 @@ def annotated(public: Any) -> Iterator[tuple[str, Any]]:
                     yield f"{function.__name__}: {name}", hint
 
 
-MODULES = ("benchmark", "errors", "losses", "plugins", "recipes", "results", "trajectories")
+MODULES = ("benchmark", "errors", "losses", "plugins", "recipes", "results", "scenes", "trajectories")
 MAX_NAMES, MAX_HELP_LINES = 40, 400
 MAX_ANNOTATION_CHARACTERS = 80  # of one argument in a signature; NumPy's ArrayLike in full has 300
 

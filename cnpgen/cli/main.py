@@ -25,6 +25,7 @@ from cnpgen.cli import (
     inspect_command,
     list_command,
     make_command,
+    make_scenes_command,
     merge_command,
     plan_command,
     refine_command,
@@ -54,6 +55,7 @@ _COMMANDS = (
     validate_command,
     train_command,
     plan_command,
+    make_scenes_command,
     complete_command,
     solve_command,
     refine_command,
@@ -80,6 +82,8 @@ examples:
   cnpgen train airhockey-hit-v1 -o hits.h5           train a planner in two minutes
   cnpgen plan airhockey-hit-v1 --model hits.h5 -o plans.h5; a shipped one: --model airhockey-hit
   cnpgen solve airhockey-hit --n 100 -o plans.h5     plan 100 fresh problems
+  cnpgen make-scenes tabletop --robot panda --n 100 -o scenes.h5
+  cnpgen solve scenes.h5 --robot panda -o plans.h5   plan problems in scenes, also of MoveIt or MPiNets
   cnpgen complete airhockey-replan pucks.csv -o problems.h5
   cnpgen refine plans.h5 -o better.h5                optimize plans of any source
   cnpgen evaluate plans.h5 --plot plan.png           judge plans with Pinocchio and Coal

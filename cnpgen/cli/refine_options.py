@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from cnpgen.machine.times import Times
+    from cnpgen.make.solve_scenes import SolvedScenes
     from cnpgen.plans import Plans
     from cnpgen.refine.refine_plans import Refinement
 
@@ -76,20 +77,20 @@ def add_refining(parser: Options) -> None:
 
 def refine_and_save(
     arguments: argparse.Namespace,
-    plans: "Plans",
+    plans: "Plans | None",
     out: Path,
     *,
     title: str,
-    make: "Callable[..., Refinement] | None" = None,
+    make: "Callable[..., Refinement | SolvedScenes] | None" = None,
 ) -> int:
     """Refine plans, save them, print a summary; return the exit code.
 
     Args:
         arguments: What ``add_options`` added.
-        plans: The plans.
+        plans: The plans; None if ``make`` has them.
         out: Where they go.
         title: What is going on.
-        make: ``refine_plans`` by default, or ``solve_plans``.
+        make: ``refine_plans`` by default, ``solve_plans``, or a function that solves scenes.
     """
     from cnpgen.plans import save_plans
     from cnpgen.refine.options import RefineOptions
@@ -108,7 +109,8 @@ def refine_and_save(
         meter.note(f"{finished[1] / finished[0]:.1%} valid")
 
     try:
-        found = (make or refine_plans)(
+        run: Callable[..., Refinement | SolvedScenes] = make or refine_plans
+        found = run(
             plans,
             options=options,
             workers=arguments.workers,
@@ -120,7 +122,7 @@ def refine_and_save(
             progress=progress,
         )
         facts = found.summary()
-        if arguments.explain:
+        if arguments.explain and any("finding" not in failure for failure in facts["not_valid"]):
             _explain(facts, found, meter)
     except KeyboardInterrupt as interruption:
         kept = f"{journal} keeps all finished problems; run the same command again to resume"
@@ -152,7 +154,7 @@ def _tell(arguments: argparse.Namespace, facts: dict[str, Any], out: Path, times
     print(json.dumps({"file": str(out), **facts}, indent=2) if arguments.json else out)
 
 
-def _explain(facts: dict[str, Any], found: "Refinement", meter: Meter) -> None:
+def _explain(facts: dict[str, Any], found: "Refinement | SolvedScenes", meter: Meter) -> None:
     """Add proofs of infeasibility to the results of invalid plans."""
     from cnpgen.refine.proof.explain import explain_plans
 
@@ -186,4 +188,5 @@ def _summary(facts: dict[str, Any], times: "Times", *, listed: int) -> list[str]
 def _failure_text(failure: dict[str, Any]) -> str:
     """Describe why one plan is invalid, with the proof of its problem if requested."""
     why = f"{failure['finding']}: {failure['explanation']}" if "finding" in failure else failure["outcome"]
-    return f"plan {failure['plan']} (sample {failure['sample_id']}): {failure['reason']}; {why}"
+    name = f"scene {failure['scene']!r}" if "scene" in failure else f"sample {failure['sample_id']}"
+    return f"plan {failure['plan']} ({name}): {failure['reason']}; {why}"

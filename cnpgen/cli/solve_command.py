@@ -4,13 +4,14 @@ import argparse
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from cnpgen.cli import values
 from cnpgen.cli.parser import Commands, Parser, add_command
 from cnpgen.cli.refine_options import LARGE_ANGLES, TEXT, add_options, refine_and_save
 
 if TYPE_CHECKING:
+    from cnpgen.make.solve_scenes import SolvedScenes
     from cnpgen.plans import Plans
 
 _TEXT = (
@@ -19,6 +20,11 @@ A folder of a dataset gives its rows, a recipe gives fresh draws, which no split
 certified dataset have plans already: these are refined. An HDF5 file gives boundary conditions: a shard, a file of
 plans, whose plans are not looked at, or any other with start_q and goal_q of shape (N, joints), and start_dq,
 start_ddq and goal_dq where they are not zero. --problem names the problem if the file does not.
+
+With --robot, files of scenes are solved: planning scenes and requests of MoveIt or robometrics in YAML, MPiNets or
+Avoid Everything in HDF5, or a folder of them ('cnpgen docs scene-files'). All plans of one call are written to one
+file; the column obstacle_poses contains the obstacles of each. Unsolved scenes are listed with a reason.
+
 """
     + TEXT
 )
@@ -31,7 +37,8 @@ def add(commands: "Commands[Parser]") -> None:
     option(
         "what",
         metavar="DIR|NAME|FILE",
-        help="a dataset's folder; a dataset or pipeline by name, or a recipe file; or boundary conditions in HDF5",
+        help="a dataset's folder; a dataset or pipeline by name, or a recipe file; boundary conditions in HDF5;"
+        " or, with --robot, scenes",
     )
     option("--n", metavar="K", type=values.rows, help="number of problems; for a folder all of the split by default")
     option("--split", metavar="NAME", help="split of the folder (default: validation)")
@@ -42,6 +49,7 @@ def add(commands: "Commands[Parser]") -> None:
         metavar="NAME|FILE",
         help="the problem of boundary conditions in HDF5; its tolerances are used",
     )
+    option("--robot", metavar="NAME|FILE", help="solve scenes with this problem of a robot, such as panda")
     option("-o", "--out", metavar="OUT", type=Path, help="output file (default: DIR-plans.h5 or NAME-plans.h5)")
     option("--allow-large-angles", action="store_true", help=LARGE_ANGLES)
     add_options(parser)
@@ -51,10 +59,28 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     from cnpgen.refine.refine_plans import refine_plans, solve_plans
 
+    if arguments.robot is not None:
+        return _solve_scenes(arguments)
     problems = _problems(arguments)
     out = arguments.out or Path(f"{_name(Path(arguments.what))}-plans.h5")
     make = refine_plans if math.isfinite(problems.duration[0]) else solve_plans  # rows of certified datasets have plans
     return refine_and_save(arguments, problems, out, title=f"solving {arguments.what}", make=make)
+
+
+def _solve_scenes(arguments: argparse.Namespace) -> int:
+    from cnpgen.make.solve_scenes import solve_scenes
+    from cnpgen.problems.problem_record import as_problem
+    from cnpgen.problems.scenes.scene_files import load_scenes
+
+    _refuse(arguments, ["split", "seed", "problem"], "--robot is for scenes, which have --first and --n")
+    scenes = load_scenes(arguments.what, start=arguments.first or 0, n=arguments.n)
+    problem = as_problem(arguments.robot)
+    out = arguments.out or Path(f"{_name(Path(arguments.what))}-plans.h5")
+
+    def solve(_: "Plans", **options: Any) -> "SolvedScenes":
+        return solve_scenes(problem, scenes, **options)
+
+    return refine_and_save(arguments, None, out, title=f"solving {arguments.what}", make=solve)
 
 
 def _name(what: Path) -> str:
@@ -64,10 +90,14 @@ def _name(what: Path) -> str:
 
 def _problems(arguments: argparse.Namespace) -> "Plans":
     """Read or draw the boundary problems, by what it is that was given."""
+    from cnpgen.errors import UsageError
+    from cnpgen.problems.scenes.scene_files import holds_scenes
     from cnpgen.store.paths import file_kind
 
     what = Path(arguments.what)
     kind = file_kind(what)
+    if what.exists() and holds_scenes(what):
+        raise UsageError(f"{what} holds scenes: --robot panda solves them, or another problem of a robot")
     if what.is_dir():
         return _rows(arguments)
     if what.is_file() and (kind or what.suffix == ".h5") and not kind.endswith(" of cnpgen"):

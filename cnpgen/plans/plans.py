@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError, counted
-from cnpgen.plans.format import FLOATS, INTEGERS, NOTES
+from cnpgen.plans.format import FLOATS, INTEGERS, NOTES, OBSTACLE_POSES
 from cnpgen.plans.plausible import warn_of_far_joints
 from cnpgen.plans.status import PlanStatus
 from cnpgen.problems.obstacles import goal_velocities, scene_of
@@ -44,7 +44,8 @@ class Plans:
         degree: Degree of both splines.
         columns: Further columns of the tasks: name -> values in SI units, shape (N,) or (N, w). ``start_xyz`` and
             ``goal_xyz``, the tip's positions in the world frame [m], shape (N, 3), are always there after
-            ``make_plans`` and ``load_plans``.
+            ``make_plans`` and ``load_plans``. ``obstacle_poses``, shape (N, width), replaces the poses and sizes of the
+            problem's obstacles (``cnpgen.robots.solid``), so that every plan has its own scene.
         sample_id: Sample ID of every plan in a dataset, shape (N,).
         status: Status of every plan, values of ``PlanStatus``, shape (N,).
         source: Source of the plans, a line of text, or empty.
@@ -110,10 +111,12 @@ class Plans:
 
         Raises:
             RecipeError: The problem needs a plug-in that is not installed.
+            UsageError: The column ``obstacle_poses`` does not fit the problem.
         """
         problem, robot = open_problem(self.problem)
         velocity = goal_velocities(problem, robot, self.boundary.goal_q, self.boundary.goal_dq)
-        return scene_of(problem, self.columns["start_xyz"], self.columns["goal_xyz"], velocity)
+        scene = scene_of(problem, self.columns["start_xyz"], self.columns["goal_xyz"], velocity)
+        return scene.with_poses(self.columns[OBSTACLE_POSES]) if OBSTACLE_POSES in self.columns else scene
 
     @cached_property
     def duration(self) -> Array:

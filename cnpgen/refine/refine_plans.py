@@ -21,6 +21,7 @@ from cnpgen.machine.engine import Engine, assembled
 from cnpgen.machine.threads import one_thread
 from cnpgen.machine.times import NO_TIME, Stopwatch, Times
 from cnpgen.machine.versions import __version__
+from cnpgen.plans.format import OBSTACLE_POSES
 from cnpgen.plans.plans import Plans, screen
 from cnpgen.plans.status import PlanStatus
 from cnpgen.plans.tips import correct_tips
@@ -276,6 +277,7 @@ def _identity(plans: Plans, options: RefineOptions) -> str:
     digest = hashlib.sha256(plans.problem.recipe.encode() + plans.problem.urdf.encode())
     boundary = [values for values in vars(plans.boundary).values() if values is not None]
     ends = [plans.columns["start_xyz"], plans.columns["goal_xyz"]]
+    ends += [plans.columns[name] for name in (OBSTACLE_POSES,) if name in plans.columns]
     for values in (*boundary, *ends, plans.path_control_points, plans.rate_control_points):
         digest.update(str(values.shape).encode() + np.ascontiguousarray(values).tobytes())
     return json.dumps(

@@ -11,10 +11,13 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.robots.obstacle import Obstacle
-from cnpgen.robots.solid import Solid, solids_of
+from cnpgen.robots.shape.hull import MAX_COORDINATE_M
+from cnpgen.robots.solid import Solid, pose_width, solids_of
 from cnpgen.schema.arguments import integer
 
 Array = NDArray[np.float64]
+
+PARKED_POSITION_M = (0.0, 0.0, -100.0)  # of obstacles that a sample with fewer obstacles does not have
 
 
 class SampleIndexError(UsageError, IndexError):
@@ -49,6 +52,30 @@ class Scene:
             raise SampleIndexError(
                 f"samples are selected by numbers, a mask or a slice: {error}", concerns="index"
             ) from error
+
+    def with_poses(self, poses: Array) -> Scene:
+        """Return the scene with other poses and sizes of the obstacles; values for a constraint are kept.
+
+        Args:
+            poses: Poses and sizes of the obstacles of each sample, shape (N, ``pose_width(obstacles)``).
+
+        Raises:
+            UsageError: The shape is wrong, or a number is not finite or larger than ``MAX_COORDINATE_M``.
+        """
+        expected = len(self), pose_width(self.obstacles)
+        if poses.shape != expected:
+            raise UsageError(
+                f"must have shape {expected} for {len(self.obstacles)} obstacles, got {poses.shape}",
+                argument="obstacle_poses",
+            )
+        if not (np.abs(poses) <= MAX_COORDINATE_M).all():  # also false for nan
+            sample, entry = np.argwhere(~(np.abs(poses) <= MAX_COORDINATE_M))[0].tolist()
+            value = poses[sample, entry]
+            raise UsageError(
+                f"must be finite and at most {MAX_COORDINATE_M:g}, got {value:g} at sample {sample}",
+                argument="obstacle_poses",
+            )
+        return Scene(self.obstacles, np.concatenate([poses, self.poses[:, expected[1] :]], axis=1))
 
     def astype(self, dtype: str) -> Scene:
         """Return the scene in another float type."""

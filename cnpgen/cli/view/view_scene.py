@@ -17,7 +17,7 @@ from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
-from cnpgen.robots.scene import Scene
+from cnpgen.robots.scene import PARKED_POSITION_M, Scene
 from cnpgen.robots.shape.hull import CUBE
 from cnpgen.robots.solid import pose_width
 from cnpgen.world.forward_kinematics import ForwardKinematics
@@ -214,6 +214,8 @@ def _poses(robot: Robot, q: Array) -> Array:
 def _world(problem: Problem, scene: Scene) -> Iterator[Body]:
     """Draw obstacles, a table and a puck."""
     for obstacle, solid in zip(scene.obstacles, scene.bodies(), strict=True):
+        if solid.position[2] <= PARKED_POSITION_M[2]:  # the plan has fewer obstacles than the problem
+            continue
         if obstacle.upright and obstacle.height is None:
             bottom = min(0.0, solid.high[2] - MIN_DRAWN_HEIGHT_M)
             yield _box(obstacle.name, np.array([*solid.low[:2], bottom]), solid.high)

@@ -77,11 +77,11 @@ class Column:
         """Size of the numbers in memory [bytes]."""
         return math.prod(self.shape) * self.dtype.itemsize
 
-    def read(self) -> NDArray[Any]:
-        """Return the numbers."""
+    def read(self, rows: slice | None = None) -> NDArray[Any]:
+        """Return the numbers, by default of all rows."""
         from h5py import Dataset
 
-        return np.asarray(Dataset(self._dataset)[()])
+        return np.asarray(Dataset(self._dataset)[() if rows is None else rows])
 
 
 @dataclass(eq=False)

@@ -1,0 +1,134 @@
+"""``cnpgen make-scenes``: planning problems in scenes of a family, written as a scene file."""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from cnpgen.cli import values
+from cnpgen.cli.parser import Commands, Parser, add_command, add_json
+from cnpgen.cli.progress import Meter
+
+_TEXT = """\
+A family draws furniture and objects around the robot. Goals are grasp-like poses, for which inverse kinematics finds
+collision-free joint positions; starts are neutral, at other grasps or random. Nine of ten straight lines between them
+collide. 'cnpgen solve OUT --robot NAME' solves the problems. The format follows from OUT: HDF5 as of MPiNets (.h5,
+.hdf5), or a folder of planning scenes and requests of MoveIt in YAML. --list prints the families with their parameters.
+'cnpgen docs scenes' describes them. The same arguments give the same problems.
+"""
+
+
+def add(commands: "Commands[Parser]") -> None:
+    """Add the command."""
+    parser = add_command(commands, "make-scenes", run, title="make planning problems in random scenes", text=_TEXT)
+    option = parser.add_argument
+    option("family", metavar="FAMILY", nargs="?", help="family of scenes, such as tabletop (see --list)")
+    option("--list", action="store_true", help="list families and their parameters")
+    option("--robot", metavar="NAME|FILE", help="problem of a robot with link geometry, such as panda")
+    option("--n", metavar="K", type=values.rows, help="number of problems")
+    option("--seed", metavar="S", type=values.seed, default=0, help="seed (default: 0)")
+    option("--per-scene", metavar="K", type=values.positive, default=4, help="largest number in one scene (default: 4)")
+    text = "parameter of the family, such as tables=2 or 'height=[0, 30] cm'"
+    option("--set", metavar="KEY=VALUE", nargs="+", default=[], type=family_parameter, help=text)
+    option("-o", "--out", metavar="OUT", type=Path, help="file (.h5, .hdf5) or folder (default: FAMILY-scenes.h5)")
+    option("--force", action="store_true", help="replace OUT")
+    option("--quiet", action="store_true", help="no progress")
+    add_json(parser)
+
+
+def family_parameter(text: str) -> tuple[str, Any]:
+    """Read a parameter of a family: the key and the value, as in a recipe or as plain text."""
+    import tomllib
+
+    key, equals, value = text.partition("=")
+    if not (equals and key):
+        raise argparse.ArgumentTypeError(f"expected KEY=VALUE, such as tables=2, got {text!r}")
+    try:
+        return key, tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        return key, value
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command."""
+    from cnpgen.errors import UsageError
+    from cnpgen.pipelines.families.scene_generator import make_scenes
+    from cnpgen.problems.scenes.scene_files import save_scenes
+
+    if arguments.list:
+        print(_listing(as_json=arguments.json))
+        return 0
+    missing = [name for name, value in (("FAMILY", arguments.family), ("--robot", arguments.robot)) if value is None]
+    missing += ["--n"] if arguments.n is None else []
+    if missing:
+        raise UsageError(f"{' and '.join(missing)} must be given; 'cnpgen make-scenes --list' lists families")
+    out = arguments.out or Path(f"{arguments.family}-scenes.h5")
+    _check_place(out, force=arguments.force)
+    meter = Meter(quiet=arguments.quiet, noun="problem")
+    meter.begin(f"making {arguments.family}", arguments.n)
+    try:
+        scenes = make_scenes(
+            arguments.family,
+            arguments.robot,
+            arguments.n,
+            seed=arguments.seed,
+            per_scene=arguments.per_scene,
+            parameters=dict(arguments.set),
+            progress=meter,
+        )
+    finally:
+        meter.close()
+    save_scenes(out, scenes)
+    obstacles = [len(scene.obstacles) for scene in scenes]
+    facts = {"file": str(out), "problems": len(scenes), "scenes": len({id(scene.obstacles) for scene in scenes})}
+    if not arguments.quiet:
+        text = f"{len(scenes)} problems in {facts['scenes']} scenes with {min(obstacles)} to {max(obstacles)} obstacles"
+        print(text, file=sys.stderr)
+    print(json.dumps(facts, indent=2) if arguments.json else out)
+    return 0
+
+
+def _check_place(out: Path, *, force: bool) -> None:
+    from cnpgen.errors import UsageError
+
+    if out.suffix not in {"", ".h5", ".hdf5"}:
+        raise UsageError(f"{out} must end in .h5 or .hdf5, or be a folder for YAML files")
+    if not out.parent.is_dir():
+        raise UsageError(f"{out} must be in a folder that exists")
+    if out.exists() and (not force or out.is_dir()):
+        hint = "-o names another folder" if out.is_dir() else "--force replaces it, -o names another file"
+        raise UsageError(f"{out} exists: {hint}")
+
+
+def _listing(*, as_json: bool) -> str:
+    """Return the families with their parameters."""
+    from dataclasses import fields
+
+    from cnpgen.pipelines.families.catalog import FAMILIES
+
+    table: dict[str, Any] = {}
+    for name, family in FAMILIES.items():
+        parameters = {
+            item.name: {
+                "description": item.metadata["doc"],
+                "unit": item.metadata["unit"],
+                "default": _plain(item.default),
+            }
+            for item in fields(family)
+        }
+        table[name] = {"description": family.describe(), "parameters": parameters}
+    if as_json:
+        return json.dumps(table, indent=2)
+    lines = []
+    for name, entry in table.items():
+        lines.append(f"{name}: {entry['description']}")
+        for key, item in entry["parameters"].items():
+            unit = "" if item["unit"] == "1" else f" {item['unit']}"
+            lines.append(f"  {key:<14} {item['default']}{unit}: {item['description']}")
+    return "\n".join(lines)
+
+
+def _plain(value: Any) -> Any:
+    """Return a range as a list."""
+    return [value.low, value.high] if hasattr(value, "low") else value

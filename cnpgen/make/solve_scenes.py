@@ -1,0 +1,239 @@
+"""Plans for the problems of scene files: scenes of one structure share kernels, and all plans fit into one file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import UsageError
+from cnpgen.machine.times import NO_TIME, Times
+from cnpgen.pipelines.families.resting_states import RestingStates, pose_states, seeds_of
+from cnpgen.plans.concatenate import concatenate
+from cnpgen.plans.plans import Plans
+from cnpgen.plans.scene_plans import (
+    Capacity,
+    capacity_of,
+    goal_states,
+    joint_order,
+    scene_plans,
+    with_wider_capacity,
+)
+from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.problem import Problem
+from cnpgen.problems.problem_record import as_problem
+from cnpgen.problems.scenes.scene_problem import GoalPose, SceneError, SceneProblem, checked_scene
+from cnpgen.refine.options import DEFAULT_OPTIONS, RefineOptions
+from cnpgen.refine.proof.explain import explain_plans
+from cnpgen.refine.refine_plans import Progress, Refinement, solve_plans
+from cnpgen.refine.task import Attempt
+from cnpgen.robots.robot import Robot
+from cnpgen.schema.argument_types import checked_arguments
+from cnpgen.store.dataset_spec import StoredProblem
+from cnpgen.world.pose_ik import PoseKinematics, solve_pose_ik
+
+Array = NDArray[np.float64]
+
+MAX_GOAL_STATES = 5  # of one scene that are tried, the nearest first
+POSE_SEEDS = 128  # of the inverse kinematics of a goal pose
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedScenes:
+    """Plans for the problems of N scenes.
+
+    Attributes:
+        scenes: The scenes.
+        plans: The plans in the same order, all of one problem; ``obstacle_poses`` has the obstacles of each.
+        results: Best attempt at every plan with its verdict.
+        times: Times of the run.
+    """
+
+    scenes: tuple[SceneProblem, ...]
+    plans: Plans
+    results: tuple[Attempt, ...]
+    times: Times = NO_TIME
+
+    def __repr__(self) -> str:
+        return f"<{len(self.scenes)} scenes of {self.plans.problem.name!r}, {int(self.valid.sum())} solved>"
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """Mask of the scenes with a plan that the independent verdict accepts, shape (N,)."""
+        return np.array([result.valid for result in self.results], bool)
+
+    def summary(self) -> dict[str, Any]:
+        """Return a summary for JSON; unsolved scenes have a name, a reason and an explanation."""
+        facts = Refinement(self.plans, self.plans, self.results, self.times).summary()
+        explanations = explain_plans(self.plans, np.flatnonzero(~self.valid).tolist())
+        for failure in facts["not_valid"]:
+            scene, explanation = self.scenes[failure["plan"]], explanations[failure["plan"]]
+            failure |= {"scene": scene.name, "file": scene.source}
+            failure |= {"finding": str(explanation.kind), "explanation": explanation.text}
+        return facts
+
+
+@checked_arguments
+def solve_scenes(
+    problem: Problem | StoredProblem | str | Path,
+    scenes: Sequence[SceneProblem],
+    *,
+    options: RefineOptions = DEFAULT_OPTIONS,
+    workers: int | None = None,
+    engine: str | None = None,
+    address: str | None = None,
+    journal: str | Path | None = None,
+    discard: bool = False,
+    begin: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
+) -> SolvedScenes:
+    """Plan the problems of scenes, from rest to rest, with the limits and constraints of a robot's problem.
+
+    Scenes with equal numbers of obstacles of each kind, rounded up to multiples of four, share compiled kernels. Of
+    several goal states, the collision-free ones are tried in the order of the duration of the straight line at full
+    speed, at most ``MAX_GOAL_STATES``. A goal pose without goal states gets some by inverse kinematics.
+
+    Args:
+        problem: The robot's problem, such as "panda"; obstacles of the scenes are added to its own.
+        scenes: The scenes.
+        options: See ``refine_plans``.
+        workers: See ``refine_plans``.
+        engine: See ``refine_plans``.
+        address: See ``refine_plans``.
+        journal: File for finished plans; further files beside it have its name and a number.
+        discard: See ``refine_plans``.
+        begin: See ``refine_plans``.
+        progress: See ``refine_plans``.
+
+    Raises:
+        SceneError: A scene does not fit the robot.
+        UsageError: There are no scenes, or the problem has no constraint ``robot-clearance``.
+        MachineError: See ``refine_plans``.
+    """
+    if not scenes:
+        raise UsageError("there are no scenes", concerns="scenes")
+    loaded, scenes = as_problem(problem), [checked_scene(scene) for scene in scenes]
+    robot = load_robot(loaded)
+    goals = [_goals(loaded, robot, scene, index) for index, scene in enumerate(scenes)]
+    run = _SceneRun(loaded, scenes, options, (workers, engine, address), progress)
+    if begin is not None:
+        begin(len(scenes), 0)
+    journals = list[Path]()
+    for attempt in range(max(map(len, goals))):
+        for own, indices in _groups(scenes, [i for i, states in enumerate(goals) if len(states) > attempt]):
+            waiting = [index for index in indices if not run.is_solved(index)]
+            file = None if journal is None else Path(f"{journal}.{len(journals)}")
+            journals += [] if file is None else [file]
+            if waiting:
+                run.solve(waiting, [goals[index][attempt] for index in waiting], own, file, discard=discard)
+    solved = run.result()
+    for file in journals:
+        file.unlink(missing_ok=True)
+    return solved
+
+
+def _groups(scenes: Sequence[SceneProblem], indices: Sequence[int]) -> list[tuple[dict[str, int], list[int]]]:
+    """Return the capacities of some scenes with the scenes of each."""
+    groups: dict[tuple[tuple[str, int], ...], list[int]] = {}
+    for index in indices:
+        groups.setdefault(tuple(capacity_of([scenes[index]]).items()), []).append(index)
+    return [(dict(capacity), members) for capacity, members in groups.items()]
+
+
+@dataclass(eq=False)
+class _SceneRun:
+    """Plans and attempts of the scenes so far."""
+
+    problem: Problem
+    scenes: Sequence[SceneProblem]
+    options: RefineOptions
+    engine: tuple[int | None, str | None, str | None]
+    progress: Progress | None
+
+    def __post_init__(self) -> None:
+        self._found: dict[int, tuple[Plans, Attempt]] = {}
+        self._capacity = capacity_of(self.scenes)
+        self._times = NO_TIME
+
+    def is_solved(self, index: int) -> bool:
+        return index in self._found and self._found[index][1].valid
+
+    def solve(
+        self, indices: Sequence[int], goals: Sequence[Array], own: Capacity, journal: Path | None, *, discard: bool
+    ) -> None:
+        """Plan scenes of one capacity."""
+        chosen = [self.scenes[index] for index in indices]
+        plans = scene_plans(self.problem, chosen, goals=goals, capacity=own, sample_id=indices)
+        workers, engine, address = self.engine
+        refinement = solve_plans(
+            plans,
+            options=self.options,
+            workers=workers,
+            engine=engine,
+            address=address,
+            journal=journal,
+            discard=discard,
+            begin=lambda _, finished: self._report(finished, finished),
+            progress=self._report,
+        )
+        self._times = _sum(self._times, refinement.times)
+        wide = with_wider_capacity(refinement.plans, self.problem, own, self._capacity)
+        for row, (index, attempt) in enumerate(zip(indices, refinement.results, strict=True)):
+            if index not in self._found or attempt.valid:
+                self._found[index] = wide[row], attempt
+
+    def _report(self, finished: int, valid: int) -> None:
+        if self.progress is not None and finished:
+            self.progress(finished, valid)
+
+    def result(self) -> SolvedScenes:
+        """Return all plans, those of all capacities in one set."""
+        plans, results = zip(*(self._found[index] for index in range(len(self.scenes))), strict=True)
+        return SolvedScenes(tuple(self.scenes), concatenate(plans), results, self._times)
+
+
+def _sum(first: Times, second: Times) -> Times:
+    return Times(**{name: value + getattr(second, name) for name, value in vars(first).items()})
+
+
+def _goals(problem: Problem, robot: Robot, scene: SceneProblem, index: int) -> Array:
+    """Return the goal states of a scene that are tried, in this order, shape (G, n), G > 0."""
+    states = goal_states(scene, robot) if len(scene.goal_q) else _states_of_pose(problem, robot, scene, index)
+    if len(states) == 1 or robot.shape is None:
+        return states[:MAX_GOAL_STATES]
+    valid = states[RestingStates(problem, robot, scene.obstacles).are_ends(states.T.copy())]
+    states = valid if len(valid) else states[:1]
+    start = joint_order(scene, robot, scene.start_q[None], "start")[0]
+    duration = (np.abs(states - start) / robot.velocity_limit).max(axis=1)
+    return states[np.argsort(duration, kind="stable")[:MAX_GOAL_STATES]]
+
+
+def _states_of_pose(problem: Problem, robot: Robot, scene: SceneProblem, index: int) -> Array:
+    """Return collision-free joint positions with the goal pose of a scene, shape (G, n), G > 0."""
+    pose = scene.goal_pose
+    if pose is None:
+        raise SceneError(f"{scene.place} has neither goal states nor a goal pose")
+    kinematics = PoseKinematics(robot, _frame_of(robot, scene, pose))
+    states = RestingStates(problem, robot, scene.obstacles)
+    positions, rotations = np.tile(pose.position, (POSE_SEEDS, 1)), np.tile(pose.rotation, (POSE_SEEDS, 1, 1))
+    random = np.random.default_rng([index, POSE_SEEDS])
+    found = pose_states(states, kinematics, positions, rotations, random)
+    if len(found):
+        return found
+    q, met = solve_pose_ik(kinematics, positions, rotations, seeds_of(robot, POSE_SEEDS, random))
+    if not met.any():
+        raise SceneError(f"{scene.place}: no joint positions with its goal pose were found")
+    return q.T[met][:1]  # in collision: the explanation of the unsolved scene names it
+
+
+def _frame_of(robot: Robot, scene: SceneProblem, pose: GoalPose) -> int | None:
+    """Return the index of the frame of a goal pose; None for the tip."""
+    if not pose.frame:
+        return None
+    if not robot.model.existFrame(pose.frame):
+        raise SceneError(f"{scene.place}: the robot has no frame {pose.frame!r}, which its goal pose names")
+    return int(robot.model.getFrameId(pose.frame))

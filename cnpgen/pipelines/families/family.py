@@ -1,0 +1,74 @@
+"""Contract of families: draw the obstacles of one scene and the grasps in it."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.robots.obstacle import Obstacle
+from cnpgen.schema.keys import Range, field
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Grasp:
+    """A place of the tip at rest, such as a grasp of an object or a free place in a shelf.
+
+    Attributes:
+        position: Position of the tip in the frame of the robot's base [m], shape (3,).
+        approach: Unit vector along which the tip's z axis points, shape (3,).
+        tilt: Largest angle between the approach and the z axis of the tip [rad].
+    """
+
+    position: Array
+    approach: Array
+    tilt: float = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """Obstacles and grasps of one scene, in the frame of the robot's base."""
+
+    obstacles: tuple[Obstacle, ...]
+    grasps: tuple[Grasp, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneFamily(ABC):
+    """Family of scenes: a frozen dataclass whose fields are the ranges of its random numbers.
+
+    The furniture stands around the base of an arm with a reach of about 0.85 m, which is the origin of the world.
+    """
+
+    distance: Range = field(
+        "distance of the furniture's front from the base", unit="m", default=Range(0.42, 0.6), low=0.1
+    )
+    bearing: Range = field("direction of the furniture from the base", unit="rad", default=Range(-0.7, 0.7))
+    turn: Range = field("rotation of the furniture against its direction", unit="rad", default=Range(-0.3, 0.3))
+
+    @classmethod
+    def describe(cls) -> str:
+        """Return a description of one line."""
+        return (cls.__doc__ or "").strip().partition("\n")[0]
+
+    @abstractmethod
+    def draw(self, random: np.random.Generator) -> Layout:
+        """Draw the obstacles and the grasps of one scene.
+
+        Args:
+            random: Random numbers of the scene.
+        """
+
+
+def uniform(random: np.random.Generator, interval: Range) -> float:
+    """Draw a number from an interval."""
+    return float(random.uniform(interval.low, interval.high))
+
+
+def whole(random: np.random.Generator, interval: Range) -> int:
+    """Draw a whole number from an interval, both ends included."""
+    return int(random.integers(round(interval.low), round(interval.high) + 1))

@@ -1,0 +1,122 @@
+"""Checks of states of rest among obstacles: collisions of links, self-collisions and holding torques."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import UsageError
+from cnpgen.problems.constraints.clearance import RobotClearance
+from cnpgen.problems.constraints.self_clearance import SelfClearance
+from cnpgen.problems.problem import Problem
+from cnpgen.robots.obstacle import Obstacle
+from cnpgen.robots.robot import Robot
+from cnpgen.robots.solid import place_obstacles, solids_of
+from cnpgen.world.forward_kinematics import ForwardKinematics
+from cnpgen.world.pose_ik import PoseKinematics, solve_pose_ik
+from cnpgen.world.rigid_bodies import RigidBodies
+
+Array = NDArray[np.float64]
+
+LINE_SPACING_RAD = 0.02  # rad or m, between checked states of a line
+
+
+class RestingStates:
+    """States of rest of a robot in one scene. It reuses Coal's memory: use it in one thread only.
+
+    Args:
+        problem: The robot's problem; its own obstacles are part of the scene.
+        robot: The robot, with link geometry.
+        obstacles: Further obstacles.
+
+    Raises:
+        UsageError: The robot has no link geometry.
+    """
+
+    def __init__(self, problem: Problem, robot: Robot, obstacles: Sequence[Obstacle] = ()) -> None:
+        if robot.shape is None:
+            raise UsageError(
+                f'the problem {problem.name!r} needs geometry = "urdf" in [robot] for collision checks in scenes',
+                concerns="problem",
+            )
+        self._robot, self._data = robot, robot.model.createData()
+        self._kinematics = ForwardKinematics(robot.model)
+        self._bodies = RigidBodies(robot.shape, len(problem.obstacle) + len(obstacles), robot.n)
+        clearance, own = problem.first(RobotClearance), problem.first(SelfClearance)
+        self._clearance = 0.0 if clearance is None else clearance.distance
+        self._self_clearance = None if own is None else own.distance
+        self.move((*problem.obstacle, *obstacles))
+
+    def move(self, obstacles: Sequence[Obstacle]) -> None:
+        """Replace the obstacles by others of the same number."""
+        self._solids = solids_of(obstacles, place_obstacles(obstacles))
+
+    def are_clear(self, q: Array, *, margin: float = 0.0) -> NDArray[np.bool_]:
+        """Return whether nothing collides at each state, shape (K,).
+
+        Args:
+            q: Joint positions [rad], shape (n, K).
+            margin: Distance between links and obstacles in addition to the problem's clearance [m].
+        """
+        if not q.shape[1]:
+            return np.zeros(0, bool)
+        bodies = self._bodies
+        bodies.place(*self._kinematics.poses(q), self._solids)
+        clear = bodies.pair_distances(bodies.obstacle_pairs).clear_states(self._clearance + margin)
+        if self._self_clearance is not None:
+            clear &= bodies.pair_distances(bodies.link_pairs).clear_states(self._self_clearance)
+        return clear
+
+    def can_hold(self, q: Array) -> NDArray[np.bool_]:
+        """Return whether the holding torques are within their limits at each state, shape (K,)."""
+        import pinocchio as pin
+
+        torques = [pin.computeGeneralizedGravity(self._robot.model, self._data, state) for state in q.T]
+        return np.array([bool((np.abs(torque) <= self._robot.torque_limit).all()) for torque in torques], bool)
+
+    def are_ends(self, q: Array, *, margin: float = 0.0) -> NDArray[np.bool_]:
+        """Return which states can start or end a motion: within limits, clear, and with feasible torques."""
+        robot = self._robot
+        inside = (q >= robot.position_lower[:, None]) & (q <= robot.position_upper[:, None])
+        valid = np.array(np.logical_and.reduce(inside))
+        valid[valid] = self.can_hold(q[:, valid])
+        valid[valid] = self.are_clear(q[:, valid], margin=margin)
+        return valid
+
+    def is_line_clear(self, start: Array, goal: Array) -> bool:
+        """Return whether the straight line between two joint positions is clear."""
+        count = max(2, int(np.ceil(np.abs(goal - start).max() / LINE_SPACING_RAD)) + 1)
+        return bool(self.are_clear(np.linspace(start, goal, count).T.copy()).all())
+
+
+def pose_states(
+    states: RestingStates,
+    kinematics: PoseKinematics,
+    positions: Array,
+    rotations: Array,
+    random: np.random.Generator,
+    *,
+    margin: float = 0.0,
+) -> Array:
+    """Return collision-free joint positions with given poses [rad], shape (G, n); G may be 0.
+
+    Args:
+        states: The scene.
+        kinematics: Kinematics of the frame that has the pose.
+        positions: Positions of the frame [m], one for each seed of the iteration, shape (K, 3).
+        rotations: Rotation matrices of the frame, shape (K, 3, 3).
+        random: Random numbers for the seeds.
+        margin: See ``RestingStates.are_ends``.
+    """
+    seeds = seeds_of(kinematics.robot, len(positions), random)
+    q, met = solve_pose_ik(kinematics, positions, rotations, seeds)
+    found = q[:, met]
+    return found[:, states.are_ends(found, margin=margin)].T.copy()
+
+
+def seeds_of(robot: Robot, count: int, random: np.random.Generator) -> Array:
+    """Return random joint positions within the limits [rad], shape (n, count)."""
+    low, high = robot.position_lower[:, None], robot.position_upper[:, None]
+    return np.asarray(low + (high - low) * random.uniform(size=(robot.n, count)))

@@ -1,0 +1,186 @@
+"""Planning problems in scenes of a family: obstacles, collision-free starts and goals, and lines that collide."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import UsageError
+from cnpgen.pipelines.families.catalog import load_family
+from cnpgen.pipelines.families.family import Grasp, Layout, SceneFamily
+from cnpgen.pipelines.families.resting_states import RestingStates, pose_states, seeds_of
+from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.problem import Problem
+from cnpgen.problems.problem_record import as_problem
+from cnpgen.problems.scenes.scene_problem import MAX_SCENES, SceneError, SceneProblem, checked_scene
+from cnpgen.robots.robot import Robot
+from cnpgen.schema.argument_types import checked_arguments
+from cnpgen.schema.arguments import integer
+from cnpgen.store.dataset_spec import StoredProblem
+from cnpgen.world.pose_ik import PoseKinematics
+
+Array = NDArray[np.float64]
+
+POSES_PER_GRASP = 24  # random rotations about the approach
+MAX_GRASPS = 8  # of one scene that are tried
+MAX_PAIRS = 24  # of a start and a goal that are tried for one problem
+MAX_FAILED_SCENES = 20  # in a row, without any problem
+END_MARGIN_M = 0.005  # clearance of starts and goals
+STRAIGHT_SHARE = 0.1  # of the problems that may be solvable by a straight line
+NEUTRAL_SPREAD_RAD = 0.1  # standard deviation of neutral starts around the base configuration
+_STARTS = {"neutral": 0.4, "grasp": 0.4, "random": 0.2}  # kind of start -> probability
+
+
+@checked_arguments
+def make_scenes(
+    family: str | SceneFamily,
+    problem: Problem | StoredProblem | str | Path,
+    n: int,
+    *,
+    seed: int = 0,
+    per_scene: int = 4,
+    parameters: Mapping[str, Any] | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> list[SceneProblem]:
+    """Generate planning problems in scenes of a family.
+
+    Goals are grasp-like poses, for which inverse kinematics finds collision-free states with feasible holding torques.
+    Starts are neutral states around the base configuration, other grasps, or random states. At least nine of ten
+    straight lines between start and goal collide. The same arguments give the same problems.
+
+    Args:
+        family: Name of a family, or a family.
+        problem: The robot's problem, such as "panda"; its robot needs link geometry.
+        n: Number of problems.
+        seed: Seed.
+        per_scene: Largest number of problems in one scene.
+        parameters: Values of the fields of a named family.
+        progress: Called with the number of problems since the last call.
+
+    Raises:
+        UsageError: An argument is invalid, or no problems are found for this robot.
+    """
+    n, seed = integer("n", n, least=1, most=MAX_SCENES), integer("seed", seed, least=0)
+    per_scene = integer("per_scene", per_scene, least=1)
+    if isinstance(family, str):
+        name, family = family, load_family(family, parameters)
+    elif parameters:
+        raise UsageError("parameters are for families by name", concerns="parameters")
+    else:
+        name = type(family).__name__
+    loaded = as_problem(problem)
+    generator = _Generator(loaded, load_robot(loaded), family)
+    scenes, failed, index = list[SceneProblem](), 0, 0
+    while len(scenes) < n:
+        random = np.random.default_rng([seed, zlib.crc32(name.encode()), index])
+        found = list(generator.problems(random, f"{name} {index}", min(per_scene, n - len(scenes))))
+        scenes += found
+        index, failed = index + 1, 0 if found else failed + 1
+        if failed > MAX_FAILED_SCENES:
+            raise UsageError(
+                f"{failed} scenes of the family {name!r} in a row have no collision-free start and goal for"
+                f" {loaded.name!r}: are they within its reach?"
+            )
+        if progress is not None and found:
+            progress(len(found))
+    return scenes
+
+
+@dataclass(frozen=True, eq=False)
+class _Generator:
+    """Generator of problems for one robot."""
+
+    problem: Problem
+    robot: Robot
+    family: SceneFamily
+
+    def problems(self, random: np.random.Generator, name: str, count: int) -> Iterator[SceneProblem]:
+        """Yield up to ``count`` problems in one scene."""
+        layout = self.family.draw(random)
+        scene = SceneProblem(
+            name=name, obstacles=layout.obstacles, start_q=np.zeros(self.robot.n), goal_q=np.zeros((0, self.robot.n))
+        )
+        try:
+            scene = checked_scene(scene)
+        except SceneError:  # an obstacle contains the base
+            return
+        states = RestingStates(self.problem, self.robot, scene.obstacles)
+        grasps = self._grasp_states(states, layout, random)
+        if not grasps:
+            return
+        for number in range(count):
+            pair = self._pair(states, grasps, random)
+            if pair is not None:
+                start, goal = pair
+                yield SceneProblem(
+                    name=f"{name} {number}",
+                    obstacles=scene.obstacles,
+                    start_q=start,
+                    goal_q=goal[None],
+                    joint_names=self.robot.joint_names,
+                )
+
+    def _grasp_states(self, states: RestingStates, layout: Layout, random: np.random.Generator) -> list[Array]:
+        """Return collision-free states at grasps, a few for each grasp, shape (G, n) each."""
+        kinematics, found = PoseKinematics(self.robot), list[Array]()
+        for index in random.permutation(len(layout.grasps))[:MAX_GRASPS]:
+            grasp = layout.grasps[index]
+            rotations = grasp_rotations(grasp, POSES_PER_GRASP, random)
+            positions = np.tile(grasp.position, (POSES_PER_GRASP, 1))
+            valid = pose_states(states, kinematics, positions, rotations, random, margin=END_MARGIN_M)
+            if len(valid):
+                found.append(valid)
+        return found
+
+    def _pair(
+        self, states: RestingStates, grasps: list[Array], random: np.random.Generator
+    ) -> tuple[Array, Array] | None:
+        """Return a start and a goal, or None after ``MAX_PAIRS`` attempts."""
+        may_be_straight = bool(random.random() < STRAIGHT_SHARE)
+        for _ in range(MAX_PAIRS):
+            target = int(random.integers(len(grasps)))
+            goal = grasps[target][random.integers(len(grasps[target]))]
+            start = self._start(states, [grasps[i] for i in range(len(grasps)) if i != target], random)
+            if start is not None and (may_be_straight or not states.is_line_clear(start, goal)):
+                return start, goal
+        return None
+
+    def _start(self, states: RestingStates, grasps: list[Array], random: np.random.Generator) -> Array | None:
+        """Return a collision-free start of a random kind, or None."""
+        kind = str(random.choice(list(_STARTS), p=list(_STARTS.values())))
+        if kind == "grasp":
+            if not grasps:
+                return None
+            chosen = grasps[int(random.integers(len(grasps)))]
+            return np.asarray(chosen[random.integers(len(chosen))])
+        if kind == "neutral":
+            q = self.robot.base + NEUTRAL_SPREAD_RAD * random.standard_normal(self.robot.n)
+        else:
+            q = seeds_of(self.robot, 1, random)[:, 0]
+        return q if states.are_ends(q[:, None], margin=END_MARGIN_M)[0] else None
+
+
+def grasp_rotations(grasp: Grasp, count: int, random: np.random.Generator) -> Array:
+    """Draw rotations whose z axis is within the tilt of a grasp's approach, shape (count, 3, 3)."""
+    cosine = 1 - random.uniform(size=count) * (1 - np.cos(grasp.tilt))
+    angle, roll = random.uniform(-np.pi, np.pi, (2, count))
+    sine = np.sqrt(1 - cosine**2)
+    z = np.stack([sine * np.cos(angle), sine * np.sin(angle), cosine], axis=1)
+    z = z @ _frame(grasp.approach).T
+    x = np.stack([_frame(axis)[:, 0] for axis in z])
+    y = np.cross(z, x)
+    turned = np.cos(roll)[:, None] * x + np.sin(roll)[:, None] * y
+    return np.stack([turned, np.cross(z, turned), z], axis=2)
+
+
+def _frame(axis: Array) -> Array:
+    """Return a rotation matrix whose third column is a unit vector."""
+    from cnpgen.robots.shape.hull import frame_along
+
+    return frame_along(axis.tolist(), 1.0)

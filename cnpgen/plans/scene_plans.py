@@ -1,0 +1,184 @@
+"""Scene problems as boundary problems of one problem whose obstacles differ from plan to plan."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import UsageError
+from cnpgen.plans.format import OBSTACLE_POSES
+from cnpgen.plans.plans import Plans, make_plans
+from cnpgen.problems.constraints.clearance import RobotClearance
+from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.problem import Problem
+from cnpgen.problems.problem_record import record_problem
+from cnpgen.problems.scenes.scene_problem import SceneError, SceneProblem
+from cnpgen.robots.observation.primitives import KINDS, primitives_of
+from cnpgen.robots.obstacle import Obstacle
+from cnpgen.robots.robot import Robot
+from cnpgen.robots.scene import PARKED_POSITION_M
+from cnpgen.robots.solid import number_slices, place_obstacles, pose_width
+from cnpgen.trajectory.boundary import Boundary
+
+Array = NDArray[np.float64]
+Capacity = Mapping[str, int]  # kind -> number of obstacles
+
+OBSTACLES_PER_STEP = 4  # capacities are multiples of it, so that scenes share compiled kernels
+JOINT_TOLERANCE_RAD = 1e-3  # outside a limit, which rounding of files to float32 may cause
+_PARKED_ROTATION = (0.1, 0.1, 0.1)  # any rotation: boxes of scenes have rotation matrices
+
+
+def capacity_of(scenes: Sequence[SceneProblem]) -> dict[str, int]:
+    """Return the numbers of obstacles of each kind that hold every scene, rounded up to ``OBSTACLES_PER_STEP``."""
+    counts = [Counter(obstacle.kind for obstacle in scene.obstacles) for scene in scenes]
+    most = {kind: max((count[kind] for count in counts), default=0) for kind in KINDS}
+    return {kind: -(-count // OBSTACLES_PER_STEP) * OBSTACLES_PER_STEP for kind, count in most.items() if count}
+
+
+def with_capacity(problem: Problem, capacity: Capacity) -> Problem:
+    """Return a problem with further obstacles, which stand far below the robot until a plan places them.
+
+    Args:
+        problem: The problem; its own obstacles stay where they are.
+        capacity: Numbers of further obstacles.
+
+    Raises:
+        UsageError: No constraint keeps the robot away from obstacles.
+    """
+    if problem.first(RobotClearance) is None:
+        raise UsageError(
+            f"the problem {problem.name!r} has no constraint robot-clearance: obstacles would be ignored",
+            concerns="problem",
+        )
+    parked = [_parked(kind, index) for kind in KINDS for index in range(1, capacity.get(kind, 0) + 1)]
+    return replace(problem, obstacle=(*problem.obstacle, *parked))
+
+
+def _parked(kind: str, index: int) -> Obstacle:
+    name, small = f"{kind} {index}", 0.01
+    if kind == "box":
+        return Obstacle(name=name, kind=kind, position=PARKED_POSITION_M, size=(small,) * 3, rotation=_PARKED_ROTATION)
+    if kind == "sphere":
+        return Obstacle(name=name, kind=kind, position=PARKED_POSITION_M, radius=small)
+    return Obstacle(name=name, kind=kind, position=PARKED_POSITION_M, radius=small, length=small)
+
+
+def scene_plans(
+    problem: Problem,
+    scenes: Sequence[SceneProblem],
+    *,
+    goals: Sequence[Array] | None = None,
+    capacity: Capacity | None = None,
+    sample_id: Sequence[int] | None = None,
+) -> Plans:
+    """Return the boundary problems of scenes, from rest to rest, as plans without motions.
+
+    Args:
+        problem: The robot's problem. Obstacles of the scenes are added to its own.
+        scenes: The scenes.
+        goals: Joint positions at the goals in the order of the planned joints, shape (n,) each; by default the first
+            goal state of each scene.
+        capacity: Numbers of obstacles, see ``capacity_of``.
+        sample_id: Sample IDs; by default the indices of the scenes.
+
+    Raises:
+        SceneError: A scene lacks a planned joint or a goal state, or a position is outside its limits.
+    """
+    robot = load_robot(problem)
+    capacity = capacity_of(scenes) if capacity is None else capacity
+    full = with_capacity(problem, capacity)
+    start = np.array([joint_order(scene, robot, scene.start_q[None], "start")[0] for scene in scenes])
+    if goals is None:
+        goals = [goal_states(scene, robot)[0] for scene in scenes]
+    zero, spec, count = np.zeros_like(start), problem.trajectory, len(scenes)
+    poses = np.array([_obstacle_poses(full, len(problem.obstacle), scene) for scene in scenes])
+    return make_plans(
+        record_problem(full),
+        Boundary(start, zero, zero, np.array(goals), zero, None),
+        path_control_points=np.full((count, spec.path_control_points, robot.n), np.nan),
+        rate_control_points=np.full((count, spec.rate_control_points), np.nan),
+        columns={OBSTACLE_POSES: poses},
+        sample_id=np.arange(count) if sample_id is None else np.array(sample_id, np.int64),
+        source=_source(scenes),
+    )
+
+
+def _source(scenes: Sequence[SceneProblem]) -> str:
+    files = list(dict.fromkeys(scene.source for scene in scenes if scene.source))
+    return f"scenes of {files[0]}" + (f" and {len(files) - 1} other files" if len(files) > 1 else "") if files else ""
+
+
+def goal_states(scene: SceneProblem, robot: Robot) -> Array:
+    """Return the goal states of a scene in the order of the planned joints [rad], shape (G, n), G > 0.
+
+    Raises:
+        SceneError: The scene has none, lacks a planned joint, or a state is outside the limits.
+    """
+    if not len(scene.goal_q):
+        raise SceneError(f"{scene.place} has no goal state")
+    return joint_order(scene, robot, scene.goal_q, "goal")
+
+
+def joint_order(scene: SceneProblem, robot: Robot, states: Array, end: str) -> Array:
+    """Return states of a scene in the order of the planned joints [rad], shape (G, n).
+
+    Raises:
+        SceneError: The scene lacks a planned joint, or a position is outside its limits by more than 1e-3 rad.
+    """
+    if scene.joint_names:
+        missing = [name for name in robot.joint_names if name not in scene.joint_names]
+        if missing:
+            raise SceneError(f"{scene.place} has no joint {missing[0]!r}, only {', '.join(scene.joint_names)}")
+        states = states[:, [scene.joint_names.index(name) for name in robot.joint_names]]
+    if states.shape[1] != robot.n:
+        raise SceneError(f"{scene.place} has {states.shape[1]} joint positions at the {end}, the robot has {robot.n}")
+    violation = np.maximum(robot.position_lower - states, states - robot.position_upper)
+    if violation.size and violation.max() > JOINT_TOLERANCE_RAD:
+        goal, joint = np.unravel_index(violation.argmax(), violation.shape)
+        low, high = robot.position_lower[joint], robot.position_upper[joint]
+        raise SceneError(
+            f"{scene.place}: {robot.joint_names[joint]} is {states[goal, joint]:.4f} at the {end}, outside of its"
+            f" limits [{low:.4f}, {high:.4f}]"
+        )
+    return np.clip(states, robot.position_lower, robot.position_upper)
+
+
+def _obstacle_poses(problem: Problem, fixed: int, scene: SceneProblem) -> Array:
+    """Return the poses and sizes of the problem's own obstacles and those of a scene, shape (width,)."""
+    numbers, slices = place_obstacles(problem.obstacle), number_slices(problem.obstacle)
+    free = {kind: [i for i, item in enumerate(problem.obstacle) if i >= fixed and item.kind == kind] for kind in KINDS}
+    primitives = primitives_of(scene.obstacles, place_obstacles(scene.obstacles))
+    for index, obstacle in enumerate(scene.obstacles):
+        if not free[obstacle.kind]:
+            raise UsageError(f"{scene.place} has more obstacles of the kind {obstacle.kind} than the capacity")
+        part = slices[free[obstacle.kind].pop(0)]
+        if obstacle.kind == "box":
+            rotation = primitives.rotations[index].ravel()
+            numbers[part] = [*primitives.centers[index], *primitives.sizes[index], *rotation]
+        else:
+            numbers[part] = place_obstacles([obstacle])
+    return numbers
+
+
+def with_wider_capacity(plans: Plans, problem: Problem, own: Capacity, capacity: Capacity) -> Plans:
+    """Return plans with parked obstacles up to another capacity, so that plans of several capacities fit one file.
+
+    Args:
+        plans: Plans of ``with_capacity(problem, own)``.
+        problem: The robot's problem.
+        own: Capacity of the plans.
+        capacity: Capacity of the result, at least as large.
+    """
+    before, after = with_capacity(problem, own).obstacle, with_capacity(problem, capacity)
+    poses = np.tile(place_obstacles(after.obstacle), (len(plans), 1))
+    positions = {
+        obstacle.name: part for obstacle, part in zip(after.obstacle, number_slices(after.obstacle), strict=True)
+    }
+    for obstacle, part in zip(before, number_slices(before), strict=True):
+        poses[:, positions[obstacle.name]] = plans.columns[OBSTACLE_POSES][:, part]
+    assert poses.shape[1] == pose_width(after.obstacle)
+    return replace(plans, problem=record_problem(after), columns={**plans.columns, OBSTACLE_POSES: poses})

@@ -1,0 +1,1 @@
+"""Files of planning problems in scenes: MoveIt YAML, MPiNets HDF5 and robometrics YAML."""

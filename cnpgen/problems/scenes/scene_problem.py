@@ -1,0 +1,164 @@
+"""Scene problem: one planning problem of a scene file, and its validation."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import UsageError
+from cnpgen.problems.scenes.quaternions import quaternion_mistake, roll_pitch_yaw, rotation_matrix
+from cnpgen.robots.observation.primitives import KINDS, primitives_of
+from cnpgen.robots.observation.signed_distance import signed_distances
+from cnpgen.robots.obstacle import Obstacle
+from cnpgen.robots.shape.hull import MAX_COORDINATE_M
+from cnpgen.robots.solid import place_obstacles
+
+Array = NDArray[np.float64]
+
+MAX_SCENE_OBSTACLES = 100  # as many as a problem may have
+MAX_SCENES = 100_000  # of one call
+MAX_BASE_DEPTH_M = 0.01  # of the robot's base in an obstacle, such as the plate that it stands on
+MIN_OBSTACLE_SIZE_M = 1e-6
+_SIZES = {"box": 3, "sphere": 1, "cylinder": 2, "capsule": 2}  # edge lengths; radius; radius and length
+
+
+class SceneError(UsageError):
+    """A scene with invalid content; the message names file, scene and obstacle."""
+
+
+@dataclass(frozen=True, eq=False)
+class GoalPose:
+    """Goal pose of a frame of the robot, in the frame of the robot's base.
+
+    Attributes:
+        frame: Name of the link or frame; empty for the problem's tip.
+        position: Position [m], shape (3,).
+        rotation: Rotation matrix, shape (3, 3).
+        position_tolerance: Accepted distance from the position [m].
+        rotation_tolerance: Accepted angle from the rotation [rad].
+    """
+
+    frame: str
+    position: Array
+    rotation: Array
+    position_tolerance: float = 1e-3
+    rotation_tolerance: float = 1e-2
+
+
+@dataclass(frozen=True, eq=False)
+class SceneProblem:
+    """One planning problem in a scene: obstacles, a start at rest, and a goal at rest.
+
+    Attributes:
+        name: Name of the scene, unique in its file.
+        obstacles: Obstacles with poses in the frame of the robot's base, which is the world frame.
+        start_q: Joint positions at the start [rad], shape (n,); empty if the file has none.
+        goal_q: Goal states [rad], any of which is a goal, shape (G, n); G may be 0 with a goal pose.
+        goal_pose: Goal pose, or None.
+        joint_names: Names of the n joints; empty for the planned joints of the problem in their order.
+        source: File of the scene, for messages.
+    """
+
+    name: str
+    obstacles: tuple[Obstacle, ...]
+    start_q: Array
+    goal_q: Array
+    goal_pose: GoalPose | None = None
+    joint_names: tuple[str, ...] = ()
+    source: str = ""
+
+    def __repr__(self) -> str:
+        kinds = Counter(obstacle.kind for obstacle in self.obstacles)
+        counts = ", ".join(f"{count} x {kind}" for kind, count in sorted(kinds.items())) or "no obstacles"
+        return f"<scene {self.name!r}: {counts}>"
+
+    @property
+    def place(self) -> str:
+        """File and scene, for messages."""
+        return f"{self.source}: scene {self.name!r}" if self.source else f"scene {self.name!r}"
+
+
+def make_obstacle(
+    name: str, kind: str, sizes: Sequence[float] | Array, position: Array, wxyz: Array, *, place: str
+) -> Obstacle:
+    """Build an obstacle from the numbers of a file.
+
+    Args:
+        name: Name of the obstacle.
+        kind: "box", "sphere", "cylinder" or "capsule".
+        sizes: Edge lengths of a box [m]; radius; or radius and length along z (of a capsule without its round ends).
+        position: Center in the frame of the robot's base [m], shape (3,).
+        wxyz: Quaternion (w, x, y, z) of its axes, shape (4,).
+        place: File and scene, for messages.
+
+    Raises:
+        SceneError: A number is not finite, a size is not positive, or the quaternion is not of unit length.
+    """
+    where = f"{place}: obstacle {name!r}"
+    if kind not in _SIZES:
+        raise SceneError(f"{where} is a {kind}, expected one of {', '.join(KINDS)}")
+    sizes, position, wxyz = (np.asarray(values, float) for values in (sizes, position, wxyz))
+    for what, values, count in (("size", sizes, _SIZES[kind]), ("position", position, 3), ("quaternion", wxyz, 4)):
+        if values.shape != (count,):
+            raise SceneError(f"{where}: {what} must have {count} numbers, got {values.tolist()!r:.60}")
+        if not (np.abs(values) <= MAX_COORDINATE_M).all():  # also false for nan
+            raise SceneError(f"{where}: {what} must be finite and at most {MAX_COORDINATE_M:g}, got {values.tolist()}")
+    if (sizes < MIN_OBSTACLE_SIZE_M).any():
+        raise SceneError(f"{where}: sizes must be at least {MIN_OBSTACLE_SIZE_M:g} m, got {sizes.tolist()}")
+    if text := quaternion_mistake(wxyz):
+        raise SceneError(f"{where}: {text}")
+    x, y, z = position.tolist()
+    turn = roll_pitch_yaw(rotation_matrix(wxyz))
+    if kind == "box":
+        a, b, c = sizes.tolist()
+        return Obstacle(name=name, kind=kind, position=(x, y, z), rotation=turn, size=(a, b, c))
+    if kind == "sphere":
+        return Obstacle(name=name, kind=kind, position=(x, y, z), radius=float(sizes[0]))
+    radius, length = sizes.tolist()
+    return Obstacle(name=name, kind=kind, position=(x, y, z), rotation=turn, radius=radius, length=length)
+
+
+def check_count(count: int, place: str) -> None:
+    """Raise SceneError for more obstacles than a scene may have, before any is built."""
+    if count > MAX_SCENE_OBSTACLES:
+        raise SceneError(f"{place} has {count:,} obstacles, expected at most {MAX_SCENE_OBSTACLES}")
+
+
+def checked_scene(scene: SceneProblem) -> SceneProblem:
+    """Check a scene and return it with unique names of obstacles.
+
+    Raises:
+        SceneError: There are too many obstacles, one contains the robot's base, or joint positions are invalid.
+    """
+    check_count(len(scene.obstacles), scene.place)
+    pose = scene.goal_pose
+    if pose is not None and not (np.abs([*pose.position, pose.position_tolerance]) <= MAX_COORDINATE_M).all():
+        raise SceneError(f"{scene.place}: the goal pose has numbers that are not finite or too large")
+    for what, values in (("start", scene.start_q), ("goal", scene.goal_q)):
+        if not np.isfinite(values).all():
+            raise SceneError(f"{scene.place}: the {what} has joint positions that are not finite")
+    scene = replace(scene, obstacles=_uniquely_named(scene.obstacles))
+    primitives = primitives_of(scene.obstacles, place_obstacles(scene.obstacles))
+    depths = -signed_distances(primitives, np.zeros((1, 3)))[:, 0]
+    if len(depths) and depths.max() > MAX_BASE_DEPTH_M:
+        name, depth = scene.obstacles[int(depths.argmax())].name, float(depths.max())
+        raise SceneError(
+            f"{scene.place}: obstacle {name!r} contains the robot's base, the origin, at a depth of {depth:.3g} m,"
+            f" expected at most {MAX_BASE_DEPTH_M:g} m: poses are relative to the base"
+        )
+    return scene
+
+
+def _uniquely_named(obstacles: tuple[Obstacle, ...]) -> tuple[Obstacle, ...]:
+    """Append numbers to names that occur more than once."""
+    counts, seen = Counter(obstacle.name for obstacle in obstacles), Counter[str]()
+    renamed = []
+    for obstacle in obstacles:
+        seen[obstacle.name] += 1
+        suffix = f" {seen[obstacle.name]}" if counts[obstacle.name] > 1 else ""
+        renamed.append(replace(obstacle, name=obstacle.name + suffix) if suffix else obstacle)
+    return tuple(renamed)

@@ -1,0 +1,130 @@
+"""YAML files of scenes, read as plain mappings, lists and texts in bounded memory and depth."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import requires_extra
+from cnpgen.problems.scenes.scene_problem import SceneError
+from cnpgen.store.files.atomic import read_file
+
+Array = NDArray[np.float64]
+
+MAX_YAML_BYTES = 1 << 25
+MAX_YAML_DEPTH = 32  # nested mappings and lists
+
+
+def read_yaml(path: Path) -> list[Any]:
+    """Read the documents of a YAML file; scalars stay texts, and plain nulls become None.
+
+    Anchors and aliases are refused, so the memory is proportional to the size of the file.
+
+    Raises:
+        SceneError: The file is not YAML, has anchors, or is nested too deeply.
+        MissingExtraError: PyYAML is missing.
+    """
+    with requires_extra("ros", "PyYAML"):
+        import yaml
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    try:
+        return list(_documents(path, yaml, yaml.parse(read_file(path, max_bytes=MAX_YAML_BYTES), Loader=loader)))
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError) as error:
+        raise SceneError(f"{path} is not YAML: {' '.join(str(error).split()):.300}") from error
+
+
+def _documents(path: Path, yaml: Any, events: Any) -> Iterator[Any]:
+    """Build documents from the events of a parser, without recursion."""
+    stack: list[Any] = []  # open mappings and lists, and the keys that wait for their values
+    for event in events:
+        if getattr(event, "anchor", None) is not None:
+            raise SceneError(f"{path} has the anchor {event.anchor!r:.60}, expected a file without anchors")
+        if isinstance(event, yaml.MappingStartEvent | yaml.SequenceStartEvent):
+            stack.append({} if isinstance(event, yaml.MappingStartEvent) else [])
+            if len(stack) > 2 * MAX_YAML_DEPTH:
+                raise SceneError(f"{path} is nested too deeply, expected at most {MAX_YAML_DEPTH} levels")
+            continue
+        if isinstance(event, yaml.MappingEndEvent | yaml.SequenceEndEvent):
+            value = stack.pop()
+        elif isinstance(event, yaml.ScalarEvent):
+            value = None if event.implicit[0] and event.value in {"", "~", "null"} else event.value
+        else:
+            continue
+        yield from _put(stack, value)
+
+
+def _put(stack: list[Any], value: Any) -> Iterator[Any]:
+    """Put a value into the innermost open collection; yield it if there is none."""
+    if not stack:
+        yield value
+    elif isinstance(stack[-1], list):
+        stack[-1].append(value)
+    elif isinstance(stack[-1], dict):
+        stack.append(_Key(value))
+    else:
+        key = stack.pop().text
+        stack[-1][key] = value
+
+
+class _Key:
+    """Key of a mapping that waits for its value."""
+
+    def __init__(self, value: Any) -> None:
+        self.text = value if isinstance(value, str) else repr(value)
+
+
+def part(document: Any, key: str, kind: type, where: str) -> Any:
+    """Return an entry of a mapping, or an empty mapping, list or text if it is missing.
+
+    Args:
+        document: The mapping.
+        key: Key of the entry.
+        kind: Expected type: dict, list or str.
+        where: Place of the mapping, for messages.
+
+    Raises:
+        SceneError: The entry has another type, or the document is not a mapping.
+    """
+    if not isinstance(document, dict):
+        raise SceneError(f"{where} must be a mapping, got {document!r:.60}")
+    value = document.get(key)
+    if value is None:
+        return kind()
+    if not isinstance(value, kind):
+        name = "a mapping" if kind is dict else "a list" if kind is list else "a text"
+        raise SceneError(f"{where}: {key} must be {name}, got {value!r:.60}")
+    return value
+
+
+def vector(value: Any, keys: str, where: str) -> Array:
+    """Return numbers of a list, or of a mapping by its keys.
+
+    Args:
+        value: A list of numbers, or a mapping such as ``{x: 1, y: 2, z: 3}``.
+        keys: Keys of a mapping in order, such as "xyz"; empty for a list of any length.
+        where: Place of the value, for messages.
+
+    Raises:
+        SceneError: There is another number of entries, or an entry is not a number.
+    """
+    entries = [value.get(key) for key in keys] if isinstance(value, dict) and keys else value
+    if not isinstance(entries, list) or (keys and len(entries) != len(keys)):
+        expected = f"{len(keys)} numbers" if keys else "a list of numbers"
+        raise SceneError(f"{where} must be {expected}, got {value!r:.60}")
+    return np.array([scalar(entry, where) for entry in entries])
+
+
+def scalar(value: Any, where: str) -> float:
+    """Return a number.
+
+    Raises:
+        SceneError: The value is not a number.
+    """
+    try:
+        return float(value)
+    except (TypeError, ValueError) as error:
+        raise SceneError(f"{where} must be a number, got {value!r:.60}") from error

@@ -1,0 +1,1 @@
+"""Observations of scenes: signed distances, point clouds, camera views and object tokens, in NumPy."""

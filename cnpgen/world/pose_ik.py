@@ -1,0 +1,121 @@
+"""Inverse kinematics of tip poses for many seeds at once: damped Gauss-Newton steps within the joint limits.
+
+The damping follows the error (Levenberg-Marquardt; Sugihara 2011). The tip may be another frame that the same joint
+carries.
+"""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.world.forward_kinematics import ForwardKinematics
+
+if TYPE_CHECKING:
+    import pinocchio as pin
+
+    from cnpgen.robots.robot import Robot
+
+Array = NDArray[np.float64]
+
+MAX_POSE_STEPS = 60
+MAX_POSE_STEP_RAD = 0.4  # rad or m, of any joint
+METERS_PER_RADIAN = 0.3  # weight of an angle against a distance
+POSE_DAMPING = 1e-3  # relative to the squared error
+POSE_POSITION_TOLERANCE_M = 1e-6
+POSE_ROTATION_TOLERANCE_RAD = 1e-6
+
+
+class PoseKinematics:
+    """Poses and Jacobians of a frame of a robot at many states.
+
+    Args:
+        robot: The robot.
+        frame: Index of the frame in Pinocchio's model; the tip by default.
+    """
+
+    def __init__(self, robot: "Robot", frame: int | None = None) -> None:
+        model = robot.model
+        placed = model.frames[robot.tip_frame if frame is None else frame]
+        self.robot, self._carrier = robot, placed.parentJoint
+        self._turn, self._offset = np.array(placed.placement.rotation), np.array(placed.placement.translation)
+        self._kinematics, self._joints = ForwardKinematics(model), list(model.supports[self._carrier])[1:]
+        self._motions = [_motion(model, joint) for joint in range(1, model.njoints)]
+
+    def evaluate(self, q: Array) -> tuple[Array, Array, Array]:
+        """Compute poses and Jacobians.
+
+        Args:
+            q: Joint positions [rad], shape (n, K).
+
+        Returns:
+            Positions [m], shape (K, 3); rotation matrices, shape (K, 3, 3); and Jacobians of linear and angular
+            velocity in world axes, shape (K, 6, n).
+        """
+        rotations, origins = self._kinematics.poses(q)
+        turns = rotations.transpose(3, 0, 1, 2)  # (K, n + 1, 3, 3)
+        points = origins.transpose(2, 0, 1)
+        position = points[:, self._carrier] + turns[:, self._carrier] @ self._offset
+        J = np.zeros((q.shape[1], 6, len(q)))
+        for joint in self._joints:
+            linear, angular = (turns[:, joint] @ part for part in np.split(self._motions[joint - 1], 2))
+            J[:, :3, joint - 1] = linear + np.cross(angular, position - points[:, joint])
+            J[:, 3:, joint - 1] = angular
+        return position, turns[:, self._carrier] @ self._turn, J
+
+
+def _motion(model: "pin.Model", joint: int) -> Array:
+    """Return the linear and the angular velocity per unit velocity of a joint in its own frame, shape (6,)."""
+    data = model.joints[joint].createData()
+    model.joints[joint].calc(data, np.zeros(model.nq), np.zeros(model.nv))
+    return np.array(data.S).reshape(6)
+
+
+def solve_pose_ik(
+    kinematics: PoseKinematics, positions: Array, rotations: Array, seeds: Array
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Search joint positions with given poses, one for each seed.
+
+    Args:
+        kinematics: Kinematics of the frame.
+        positions: Wanted positions [m], shape (K, 3).
+        rotations: Wanted rotation matrices, shape (K, 3, 3).
+        seeds: Joint positions at which the iteration starts [rad], shape (n, K).
+
+    Returns:
+        Joint positions within their limits [rad], shape (n, K), and the mask of those that have their pose, shape (K,).
+    """
+    robot = kinematics.robot
+    low, high = robot.position_lower[:, None], robot.position_upper[:, None]
+    q = np.clip(seeds, low, high)
+    for step in range(MAX_POSE_STEPS + 1):
+        position, rotation, J = kinematics.evaluate(q)
+        shift, turn = positions - position, rotation_vectors(rotations @ rotation.swapaxes(1, 2))
+        met = np.linalg.norm(shift, axis=1) <= POSE_POSITION_TOLERANCE_M
+        met &= np.linalg.norm(turn, axis=1) <= POSE_ROTATION_TOLERANCE_RAD
+        if step == MAX_POSE_STEPS or met.all():
+            break
+        error = np.concatenate([shift, METERS_PER_RADIAN * turn], axis=1)
+        J = J * np.repeat([1.0, METERS_PER_RADIAN], 3)[:, None]
+        damping = POSE_DAMPING * np.square(error).sum(axis=1) + 1e-9
+        square = J @ J.swapaxes(1, 2) + damping[:, None, None] * np.eye(6)
+        move = (J.swapaxes(1, 2) @ np.linalg.solve(square, error[..., None]))[..., 0].T
+        move *= np.minimum(1.0, MAX_POSE_STEP_RAD / np.maximum(np.abs(move).max(axis=0), 1e-12))
+        q = np.where(met, q, np.clip(q + move, low, high))
+    return q, met
+
+
+def rotation_vectors(rotations: Array) -> Array:
+    """Return the rotation vectors of rotation matrices [rad], shape (K, 3)."""
+    skew = np.stack(
+        [
+            rotations[:, 2, 1] - rotations[:, 1, 2],
+            rotations[:, 0, 2] - rotations[:, 2, 0],
+            rotations[:, 1, 0] - rotations[:, 0, 1],
+        ],
+        axis=1,
+    )
+    sine = np.linalg.norm(skew, axis=1) / 2
+    angle = np.arctan2(sine, (np.trace(rotations, axis1=1, axis2=2) - 1) / 2)
+    factor = np.where(sine > 1e-9, angle / np.maximum(2 * sine, 1e-12), 0.5)
+    return skew * factor[:, None]
