@@ -3,11 +3,13 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
+from threading import get_ident
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.kernels.collision.collision_checker import load_collision_library
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.problems.problem import Problem
 from cnpgen.refine import initial_guesses
@@ -70,14 +72,15 @@ class Refiner:
         self.spec = problem.trajectory if spec is None else spec
         self.residual_kernels = ResidualKernels(
             self.spec,
-            kernels.load(stage_values),
-            kernels.load(stage_jacobian),
+            kernels.load_by_structure(stage_values),
+            kernels.load_by_structure(stage_jacobian),
             cost_term,
-            None if cost_term is None else kernels.load(cost_term_residuals, kind=cost_term.kind),
+            None if cost_term is None else kernels.load_by_structure(cost_term_residuals, kind=cost_term.kind),
             load_step_library(kernels),
         )
         self.levels = default_grid_levels(problem, settings) if levels is None else levels
         self._world = world
+        self._collision_library, self._hulls = load_collision_library(kernels), dict[int, Hulls]()
         self.check = FineCheck(problem, world, self.residual_kernels)
         every, orders = tuple(vars(self.levels).values()), problem.path_orders
         self._grids = {points: make_grid(self.spec, points, orders) for points in {level.points for level in every}}
@@ -210,6 +213,14 @@ class Refiner:
     def rest_space(self, task: RefinementTask, hulls: Hulls | None = None) -> RestSpace:
         """Return the valid states at rest, for the search of joint-space paths."""
         return RestSpace(self.residual_kernels, self.robot, self.check.rest_bounds(task), task.scene.poses[0], hulls)
+
+    @property
+    def hulls(self) -> Hulls:
+        """Clearances of the links' hulls, one object per thread; see ``has_clearance_constraints``."""
+        thread = get_ident()
+        if thread not in self._hulls:
+            self._hulls[thread] = Hulls(self.problem, self.robot, self._collision_library)
+        return self._hulls[thread]
 
     @cached_property
     def _range_center(self) -> Array:

@@ -1,8 +1,9 @@
 """Clearances of the links' convex hulls, which some grid levels use in place of capsules.
 
-A capsule is some centimetres larger than its link. For parts that are close to each other Coal returns the distance,
-the closest points and the direction between them. The derivative of the distance treats the closest points and the
-direction as constant (envelope theorem): it is the velocity of the points along the direction.
+A capsule is some centimetres larger than its link. For parts that are close to each other compiled code
+(``cnpgen.kernels.collision``), or Coal without a compiler, returns the distance, the closest points and the direction.
+The derivative of the distance treats the closest points and the direction as constant (envelope theorem): it is the
+velocity of the points along the direction.
 """
 
 from dataclasses import replace
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.kernels.collision.collision_checker import MAX_JOINTS, CollisionChecker
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.constraints.self_clearance import SelfClearance
 from cnpgen.refine.solver.grid import Grid
@@ -22,6 +24,8 @@ from cnpgen.world.forward_kinematics import ForwardKinematics
 from cnpgen.world.rigid_bodies import Contacts, RigidBodies
 
 if TYPE_CHECKING:
+    from ctypes import CDLL
+
     from cnpgen.problems.problem import Problem
     from cnpgen.robots.robot import Robot
 
@@ -36,21 +40,27 @@ def has_clearance_constraints(problem: "Problem", robot: "Robot") -> bool:
 
 
 class Hulls:
-    """Clearances of a robot's convex parts at many states. Not thread-safe: Coal's memory is reused.
+    """Clearances of a robot's convex parts at many states. Not thread-safe: memory is reused.
 
     Args:
         problem: The problem.
         robot: Its robot; ``has_clearance_constraints`` must hold.
+        library: Library of compiled collision checks, or None to measure with Coal.
 
     Attributes:
+        checker: Compiled collision checks, or None.
+        obstacle_distance: Required distance from obstacles [m], None without such a constraint.
+        self_distance: Required distance of links from each other [m], None without such a constraint.
         min_distances: Required distances [m], shape (m,), of pairs of links or of a link and an obstacle.
         tolerance: Accepted violation of them in a valid motion [m].
     """
 
-    def __init__(self, problem: "Problem", robot: "Robot") -> None:
+    def __init__(self, problem: "Problem", robot: "Robot", library: "CDLL | None" = None) -> None:
         assert robot.shape is not None
-        self._model, self._obstacles, self._n = robot.model, problem.obstacle, robot.n
-        self._data, self._kinematics = self._model.createData(), ForwardKinematics(self._model)
+        usable = library is not None and robot.n <= MAX_JOINTS
+        self.checker = CollisionChecker(library, robot) if library is not None and usable else None
+        self._poses_of_checker: Array | None = None
+        self._obstacles, self._n, self._kinematics = problem.obstacle, robot.n, ForwardKinematics(robot.model)
         self._bodies = RigidBodies(robot.shape, len(problem.obstacle), robot.n)
         constraints = [item for item in problem.constraint if isinstance(item, RobotClearance | SelfClearance)]
         links = [part.link for part in robot.shape.convex_parts]
@@ -69,7 +79,11 @@ class Hulls:
                 self._uncovered.append((pairs[np.array(uncovered, bool)], indices, constraint.distance))
         self.min_distances = np.array([min_distances[column] for column in range(len(columns))])
         self.tolerance = max(constraint.effective_tolerance for constraint in constraints)
-        supports = [list(joints) for joints in self._model.supports]
+        self.obstacle_distance = _largest_distance(constraints, RobotClearance)
+        self.self_distance = _largest_distance(constraints, SelfClearance)
+        self._axes = np.array([joint.axis for joint in robot.chain.joints])
+        self._sliding = np.array(robot.sliding)
+        supports = [list(joints) for joints in robot.model.supports]
         self._moves = np.array([[joint in above for joint in range(1, robot.n + 1)] for above in supports])
 
     def measure(self, q: Array, obstacle_poses: Array) -> tuple[Array, list[Contacts]]:
@@ -85,9 +99,8 @@ class Hulls:
         """
         if not np.isfinite(q).all():
             return np.full((q.shape[1], len(self.min_distances)), np.nan), []
-        self._place(q, obstacle_poses)
         distances = np.repeat((self.min_distances + MEASURED_RANGE_M)[None], q.shape[1], axis=0)
-        groups = [self._bodies.contacts(pairs, required + MEASURED_RANGE_M) for pairs, _, required in self._groups]
+        groups = self._contacts(q, obstacle_poses)
         for contacts, (_, columns, _) in zip(groups, self._groups, strict=True):
             np.minimum.at(distances, (contacts.k, columns[contacts.pair]), contacts.distance)
         return distances, groups
@@ -100,6 +113,10 @@ class Hulls:
             obstacle_poses: Poses and sizes of the obstacles, shape (width,).
             uncovered_only: Whether to check only pairs of links that the solver's capsules do not cover.
         """
+        if self.checker is not None:
+            limit = None if uncovered_only else self.obstacle_distance
+            checker = self.placed_checker(obstacle_poses)
+            return checker.clear_states(q, obstacle_distance=limit, self_distance=self.self_distance)
         self._place(q, obstacle_poses)
         clear = np.ones(q.shape[1], bool)
         for pairs, _, required in self._uncovered if uncovered_only else self._groups:
@@ -112,21 +129,52 @@ class Hulls:
 
     def gradients(self, q: Array, distances: Array, groups: list[Contacts]) -> Array:
         """Differentiate the result of ``measure`` in q: shape (n, m, K), 0 for parts out of range."""
-        import pinocchio as pin
-
-        gradients, model, data = np.zeros((q.shape[1], len(self.min_distances), self._n)), self._model, self._data
-        J = np.array([pin.computeJointJacobians(model, data, state).reshape(6, -1) for state in q.T.copy()])
+        gradients = np.zeros((q.shape[1], len(self.min_distances), self._n))
+        axes, origins = self._joint_axes(q)
         for contacts, (_, columns, _) in zip(groups, self._groups, strict=True):
             k, column = contacts.k, columns[contacts.pair]
             normals = np.repeat(contacts.normal[:, None], 2, axis=1)
-            wrenches = np.concatenate([normals, np.cross(contacts.points, normals)], axis=2)  # of a unit force
-            speeds = np.einsum("cbi,cij,cbj->cbj", wrenches, J[k], self._moves[contacts.joints], optimize=True)
+            levers = np.cross(contacts.points, normals)  # of a unit force at the points, about the world's origin
+            turning = np.einsum("cjx,cbx->cbj", axes[k], levers)
+            turning += np.einsum("cjx,cbx->cbj", np.cross(origins, axes)[k], normals)
+            speeds = np.where(self._sliding, np.einsum("cjx,cbx->cbj", axes[k], normals), turning)
+            speeds *= self._moves[contacts.joints]
             nearest = contacts.distance <= distances[k, column]
             gradients[k[nearest], column[nearest]] = (speeds[:, 1] - speeds[:, 0])[nearest]
         return gradients.transpose(2, 1, 0)
 
+    def placed_checker(self, obstacle_poses: Array) -> CollisionChecker:
+        """Return the compiled collision checks among obstacles with these poses and sizes, shape (width,)."""
+        assert self.checker is not None
+        if self._poses_of_checker is None or not np.array_equal(self._poses_of_checker, obstacle_poses):
+            self.checker.place(self._obstacles, obstacle_poses)
+            self._poses_of_checker = obstacle_poses.copy()
+        return self.checker
+
+    def _contacts(self, q: Array, obstacle_poses: Array) -> list[Contacts]:
+        """Measure the contacts of every constraint within range."""
+        if self.checker is None:
+            self._place(q, obstacle_poses)
+            return [self._bodies.contacts(pairs, required + MEASURED_RANGE_M) for pairs, _, required in self._groups]
+        checker, groups = self.placed_checker(obstacle_poses), []
+        for pairs, _, required in self._groups:
+            of_obstacles = pairs is self._bodies.obstacle_pairs
+            close = checker.close_bodies(q, required + MEASURED_RANGE_M, of_obstacles=of_obstacles)
+            groups.append(Contacts(*close, joints=self._bodies.joints_of(pairs[close.pair])))
+        return groups
+
+    def _joint_axes(self, q: Array) -> tuple[Array, Array]:
+        """Return axes and origins [m] of the joints in the world frame, shape (K, n, 3) each."""
+        rotations, positions = self._kinematics.poses(q)
+        axes = np.einsum("jxyk,jy->kjx", rotations[1:], self._axes)
+        return axes, positions[1:].transpose(2, 0, 1)
+
     def _place(self, q: Array, obstacle_poses: Array) -> None:
         self._bodies.place(*self._kinematics.poses(q), solids_of(self._obstacles, obstacle_poses))
+
+
+def _largest_distance(constraints: list[Any], kind: type) -> float | None:
+    return max((constraint.distance for constraint in constraints if isinstance(constraint, kind)), default=None)
 
 
 class HullTranscription(Transcription):
