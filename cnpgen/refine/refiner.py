@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.kernels.collision.collision_checker import load_collision_library
-from cnpgen.kernels.library import KernelLibrary
+from cnpgen.kernels.library import KernelLibrary, problem_kernels
 from cnpgen.problems.problem import Problem
 from cnpgen.refine import initial_guesses
 from cnpgen.refine.fine_check import FineCheck
@@ -20,7 +20,8 @@ from cnpgen.refine.solver.bounds import Bounds, BoundsTemplate
 from cnpgen.refine.solver.compiled_backend import load_step_library
 from cnpgen.refine.solver.cost_term import CostTerm, cost_term_residuals
 from cnpgen.refine.solver.grid import make_grid
-from cnpgen.refine.solver.hulls import Hulls, HullTranscription
+from cnpgen.refine.solver.hulls import CompiledHullTranscription, Hulls, HullTranscription
+from cnpgen.refine.solver.hull_problem import can_measure_hulls, without_distances
 from cnpgen.refine.solver.residuals import stage_jacobian, stage_values
 from cnpgen.refine.solver.sqp import DEFAULT_SETTINGS, Result, Settings, minimize
 from cnpgen.refine.solver.transcription import ResidualKernels, Transcription
@@ -42,6 +43,10 @@ SLOWNESS = 1.6  # times slower than the bounds of speeds require: the solver cha
 
 class Refiner:
     """Solver of one problem, and the checks and initial guesses for it.
+
+    Attributes:
+        measures_hulls: Whether distances of the links' hulls replace those of capsules in all levels, see
+            ``cnpgen.refine.solver.hull_problem``.
 
     Args:
         problem: The problem.
@@ -70,6 +75,13 @@ class Refiner:
     ) -> None:
         self.problem, self.robot, self.settings, self.coarser = problem, robot, settings, coarser
         self.spec = problem.trajectory if spec is None else spec
+        library = load_collision_library(kernels)
+        self.measures_hulls = library is not None and can_measure_hulls(problem, robot, world)
+        self._library, self._hulls, solved = library, dict[int, Hulls](), problem
+        if self.measures_hulls:
+            solved = without_distances(problem)
+            kernels = problem_kernels(solved, robot, kernels.backend, kernels.cache_folder)
+        self._kernel_poses = slice(pose_width(problem.obstacle) - pose_width(solved.obstacle), None)
         self.residual_kernels = ResidualKernels(
             self.spec,
             kernels.load_by_structure(stage_values),
@@ -80,12 +92,17 @@ class Refiner:
         )
         self.levels = default_grid_levels(problem, settings) if levels is None else levels
         self._world = world
-        self._collision_library, self._hulls = load_collision_library(kernels), dict[int, Hulls]()
-        self.check = FineCheck(problem, world, self.residual_kernels)
+        self.check = FineCheck(
+            solved,
+            world,
+            self.residual_kernels,
+            poses=self.kernel_poses,
+            penetration=self._penetration if self.measures_hulls else None,
+        )
         every, orders = tuple(vars(self.levels).values()), problem.path_orders
         self._grids = {points: make_grid(self.spec, points, orders) for points in {level.points for level in every}}
         self._bounds = {
-            level: BoundsTemplate(problem, world, self._grids[level.points].s, level.tightening) for level in every
+            level: BoundsTemplate(solved, world, self._grids[level.points].s, level.tightening) for level in every
         }
 
     def input_variables(self, task: RefinementTask) -> Array | None:
@@ -102,13 +119,26 @@ class Refiner:
         return motion.pack(task.path, rate) if motion.duration(rate) < MAX_INPUT_DURATION_S else None
 
     def run_level(self, task: RefinementTask, level: GridLevel, x: Array, hulls: Hulls | None = None) -> Result:
-        """Run the solver on one level from variables x, shape (nx,); ``hulls`` replace the capsules."""
+        """Run the solver on one level from variables x, shape (nx,); ``hulls`` replace the capsules.
+
+        A refiner that ``measures_hulls`` has no capsules: its hulls are rows of compiled code on all levels.
+        """
         settings, motion = level.settings, self.transcription(task, level)
         ends = motion.end_residuals()
         bounds = self.bounds(task, level, ends)
         if not np.nanmax(bounds.end_violations(ends)) < MAX_END_VIOLATION:
             settings = replace(settings, max_iterations=0)
-        if hulls is not None:
+        if self.measures_hulls:
+            motion = CompiledHullTranscription(
+                self.residual_kernels,
+                motion.grid,
+                self.hulls,
+                boundary=task.boundary,
+                kernel_poses=self.kernel_poses(task),
+                obstacle_poses=task.scene.poses[0],
+            )
+            bounds = self._bounds[level].with_hull_distances(bounds, self.hulls.min_distances)
+        elif hulls is not None:
             motion = HullTranscription(
                 self.residual_kernels,
                 motion.grid,
@@ -125,8 +155,16 @@ class Refiner:
             self.residual_kernels,
             self._grids[level.points],
             boundary=task.boundary,
-            obstacle_poses=task.scene.poses[0],
+            obstacle_poses=self.kernel_poses(task),
         )
+
+    def kernel_poses(self, task: RefinementTask) -> Array:
+        """Return the scene values that the residual kernels take, shape (width,)."""
+        return task.scene.poses[0, self._kernel_poses]
+
+    def _penetration(self, task: RefinementTask, q: Array) -> float:
+        """Return by how much the hulls at states q (n, K) violate their required distances beyond the tolerance [m]."""
+        return self.hulls.violation(q, task.scene.poses[0]) - self.hulls.tolerance
 
     def bounds(self, task: RefinementTask, level: GridLevel, ends: Array) -> Bounds:
         """Return the bounds of a level for a motion whose boundary states have residuals ``ends``, shape (2, m)."""
@@ -212,14 +250,14 @@ class Refiner:
 
     def rest_space(self, task: RefinementTask, hulls: Hulls | None = None) -> RestSpace:
         """Return the valid states at rest, for the search of joint-space paths."""
-        return RestSpace(self.residual_kernels, self.robot, self.check.rest_bounds(task), task.scene.poses[0], hulls)
+        return RestSpace(self.residual_kernels, self.robot, self.check.rest_bounds(task), self.kernel_poses(task), hulls)
 
     @property
     def hulls(self) -> Hulls:
         """Clearances of the links' hulls, one object per thread; see ``has_clearance_constraints``."""
         thread = get_ident()
         if thread not in self._hulls:
-            self._hulls[thread] = Hulls(self.problem, self.robot, self._collision_library)
+            self._hulls[thread] = Hulls(self.problem, self.robot, self._library)
         return self._hulls[thread]
 
     @cached_property

@@ -33,7 +33,7 @@ from cnpgen.refine.solver.deadline import Deadline
 from cnpgen.refine.solver.hulls import Hulls, has_clearance_constraints
 from cnpgen.refine.solver.sqp import Result
 from cnpgen.refine.task import Attempt, Outcome, RefinementTask
-from cnpgen.refine.tree_paths import find_obstacle_paths, uses_compiled_trees
+from cnpgen.refine.tree_paths import find_obstacle_paths
 from cnpgen.robots.scene import Scene
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.remaining_trajectory import with_fewer_knots, with_finer_knots
@@ -87,11 +87,11 @@ def make_attempts(refiner: Refiner, task: RefinementTask, x: Array | None) -> It
     if x is not None or not np.array_equal(even_line, refiner.line_guess(task)):
         best = yield from _restart(refiner, task, None, even_line, best)
     best = yield from _restart(refiner, task, best.variables, even_line, best)
-    if hulls is not None:
-        yield from _on_hulls(refiner, task, best, hulls)
-    elif task.deadline is None and has_clearance_constraints(refiner.problem, refiner.robot):
+    if hulls is not None or task.deadline is not None:
+        return
+    if has_clearance_constraints(refiner.problem, refiner.robot):
         yield from _around_obstacles(refiner, task, best, refiner.hulls)
-    elif task.deadline is None and task.at_rest:
+    elif task.at_rest:
         yield from (_along_path(refiner, task, guess) for guess in _path_guesses(refiner, task))
 
 
@@ -99,8 +99,7 @@ def _hulls_of_trees(refiner: Refiner, task: RefinementTask) -> Hulls | None:
     """Return the clearances of the hulls if compiled trees can search paths for a task."""
     if task.deadline is not None or not has_clearance_constraints(refiner.problem, refiner.robot):
         return None
-    hulls = refiner.hulls
-    return hulls if uses_compiled_trees(refiner.rest_space(task, hulls)) else None
+    return refiner.hulls if refiner.measures_hulls else None
 
 
 def _best_of(attempts: Iterator[Attempt], best: Attempt) -> Generator[Attempt, None, Attempt]:
@@ -239,6 +238,13 @@ def _around_obstacles(refiner: Refiner, task: RefinementTask, best: Attempt, hul
     """
     if _ends_penetrate(task, hulls):
         return
+    if refiner.measures_hulls:
+        for guess in _path_guesses(refiner, task, hulls):
+            attempt = _along_path(refiner, task, guess)
+            yield attempt
+            if attempt.violation <= MAX_JUDGED_VIOLATION:
+                yield refiner.solve(task, refiner.levels.strict, attempt.variables, Outcome.RESTARTED)
+        return
     positions = refiner.check.transcription(task).positions(best.variables)
     best_first = hulls.max_penetration(positions, task.scene.poses[0]) < MAX_PENETRATION_M
     if best_first:
@@ -263,9 +269,9 @@ def _path_guesses(refiner: Refiner, task: RefinementTask, hulls: Hulls | None = 
     """Yield motions along valid joint-space paths, scaled in time if they are from rest to rest."""
     boundary, space = task.boundary, refiner.rest_space(task, hulls)
     paths: Iterator[Array] | list[Array] = []
-    if hulls is not None and uses_compiled_trees(space):
+    if hulls is not None and refiner.measures_hulls:
         paths = find_obstacle_paths(task, space, hulls)
-    if not paths:
+    else:
         paths = find_paths(boundary.start_q[0], boundary.goal_q[0], refiner.robot, space.follow)
     for states in paths:
         guess = refiner.path_guess(task, states)

@@ -19,12 +19,6 @@ TREE_MARGINS_M = (6e-3, 3e-3, 1e-3, 0.0)  # of the trees in turn, added to the r
 MAX_TREES = 12
 
 
-def uses_compiled_trees(space: RestSpace) -> bool:
-    """Return whether compiled trees can search a space: compiled collision checks, and no equalities of positions."""
-    hulls = space.hulls
-    return hulls is not None and hulls.checker is not None and not bool(space.bounds.equal.any())
-
-
 def find_obstacle_paths(task: RefinementTask, space: RestSpace, hulls: Hulls) -> list[Array]:
     """Search for paths between the ends of a task.
 

@@ -15,7 +15,7 @@ typedef struct {
   const capsule *links;
   const long *first_part, *part_of_link; /* parts of a link: part_of_link[first_part[link]...] */
   const long *link_pairs, *first_pair, *pairs; /* two links; pairs of a link pair from first_pair on; two parts */
-  const long *moving; /* part -> index among the moving parts */
+  const long *moving, *moving_frames; /* part -> index among the moving parts; their frames */
   const body *obstacles;
   const double *boxes; /* center, half sizes, rotation by rows, radius of bounding boxes: 16 rows of lanes */
   const double *vertices;

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-SOURCES = [Path(__file__).with_name(name) for name in ("convex.c", "collision.c", "tree_search.c")]
+SOURCES = [Path(__file__).with_name(name) for name in ("convex.c", "collision.c", "tree_search.c", "hull_rows.c")]
 MAX_JOINTS = 56  # of the arrays in collision.c
 MIN_CONTACT_CAPACITY = 1024  # of the first call; a second one follows where it is too small
 CAPSULE = np.dtype([("frame", np.int64), ("first", np.float64, 3), ("second", np.float64, 3), ("radius", np.float64)])
@@ -38,7 +38,7 @@ class _RobotScene(ctypes.Structure):
         *((name, c_void_p) for name in ("place", "axis", "sliding", "parts", "links", "first_part", "part_of_link")),
         *(
             (name, c_void_p)
-            for name in ("link_pairs", "first_pair", "pairs", "moving", "obstacles", "boxes", "vertices")
+            for name in ("link_pairs", "first_pair", "pairs", "moving", "moving_frames", "obstacles", "boxes", "vertices")
         ),
     )
 
@@ -115,6 +115,7 @@ class CollisionChecker:
         self.link_pairs = np.array([both for each in pairs for both in each], np.int64).reshape(-1, 2)
         self._set("pairs", self.link_pairs)
         self._set("moving", np.cumsum(parts["frame"] > 0) - 1)
+        self._set("moving_frames", parts["frame"][parts["frame"] > 0])
         for name, count in (
             ("n", robot.n),
             ("n_parts", len(parts)),

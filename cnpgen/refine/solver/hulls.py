@@ -7,12 +7,15 @@ velocity of the points along the direction.
 """
 
 from dataclasses import replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.kernels.collision.collision_checker import MAX_JOINTS, CollisionChecker
+from cnpgen.kernels.collision.row_kernels import DistanceColumns, RowKernels
+from cnpgen.kernels.kernel import Kernel
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.constraints.self_clearance import SelfClearance
 from cnpgen.refine.solver.grid import Grid
@@ -60,6 +63,7 @@ class Hulls:
         usable = library is not None and robot.n <= MAX_JOINTS
         self.checker = CollisionChecker(library, robot) if library is not None and usable else None
         self._poses_of_checker: Array | None = None
+        self._row_kernels: tuple[Kernel, RowKernels] | None = None
         self._obstacles, self._n, self._kinematics = problem.obstacle, robot.n, ForwardKinematics(robot.model)
         self._bodies = RigidBodies(robot.shape, len(problem.obstacle), robot.n)
         constraints = [item for item in problem.constraint if isinstance(item, RobotClearance | SelfClearance)]
@@ -127,6 +131,17 @@ class Hulls:
         """Return the largest violation of the required distances at states q (n, K) [m]."""
         return float((self.min_distances - self.measure(q, obstacle_poses)[0]).max(initial=-MEASURED_RANGE_M))
 
+    def violation(self, q: Array, obstacle_poses: Array) -> float:
+        """Return the largest violation of the required distances at states q (n, K) [m], at least 0."""
+        if self.checker is None or not np.isfinite(q).all():
+            return max(self.max_penetration(q, obstacle_poses), 0.0) if np.isfinite(q).all() else np.inf
+        checker, violation = self.placed_checker(obstacle_poses), 0.0
+        for required, of_obstacles in ((self.obstacle_distance, True), (self.self_distance, False)):
+            if required is not None:
+                close = checker.close_bodies(q, required, of_obstacles=of_obstacles)
+                violation = max(violation, float((required - close.distance).max(initial=0.0)))
+        return violation
+
     def gradients(self, q: Array, distances: Array, groups: list[Contacts]) -> Array:
         """Differentiate the result of ``measure`` in q: shape (n, m, K), 0 for parts out of range."""
         gradients = np.zeros((q.shape[1], len(self.min_distances), self._n))
@@ -142,6 +157,23 @@ class Hulls:
             nearest = contacts.distance <= distances[k, column]
             gradients[k[nearest], column[nearest]] = (speeds[:, 1] - speeds[:, 0])[nearest]
         return gradients.transpose(2, 1, 0)
+
+    def row_kernels(self, kernels: ResidualKernels, obstacle_poses: Array) -> RowKernels:
+        """Return kernels whose rows end with the distances of ``measure``; compiled kernels and checks are required."""
+        checker, columns = self.placed_checker(obstacle_poses), self._columns
+        if self._row_kernels is None or self._row_kernels[0] is not kernels.values:
+            self._row_kernels = kernels.values, RowKernels(kernels.values, kernels.jacobian, checker, columns)
+        return self._row_kernels[1]
+
+    @cached_property
+    def _columns(self) -> DistanceColumns:
+        rows = {True: np.zeros(0, np.int64), False: np.zeros(0, np.int64)}
+        for pairs, indices, _ in self._groups:
+            rows[pairs is self._bodies.obstacle_pairs] = np.ascontiguousarray(indices, np.int64)
+        distances = self.obstacle_distance, self.self_distance
+        return DistanceColumns(
+            self.min_distances, rows[True], rows[False], *distances, MEASURED_RANGE_M, DISTANCE_SCALE_M
+        )
 
     def placed_checker(self, obstacle_poses: Array) -> CollisionChecker:
         """Return the compiled collision checks among obstacles with these poses and sizes, shape (width,)."""
@@ -175,6 +207,37 @@ class Hulls:
 
 def _largest_distance(constraints: list[Any], kind: type) -> float | None:
     return max((constraint.distance for constraint in constraints if isinstance(constraint, kind)), default=None)
+
+
+class CompiledHullTranscription(Transcription):
+    """One motion on one grid with the clearances of the links' hulls as further residuals, evaluated in compiled code.
+
+    Args:
+        kernels: Residual kernels with compiled code.
+        grid: The grid.
+        hulls: Clearances of the hulls with compiled checks.
+        boundary: Boundary conditions of one motion.
+        kernel_poses: Scene values that the residual kernels take, shape (width,).
+        obstacle_poses: Poses and sizes of the obstacles, shape (width,).
+    """
+
+    def __init__(
+        self,
+        kernels: ResidualKernels,
+        grid: Grid,
+        hulls: Hulls,
+        *,
+        boundary: Boundary,
+        kernel_poses: Array,
+        obstacle_poses: Array,
+    ) -> None:
+        self._rows = hulls.row_kernels(kernels, obstacle_poses)
+        with_rows = replace(kernels, values=self._rows.values, jacobian=self._rows.jacobian)
+        super().__init__(with_rows, grid, boundary=boundary, obstacle_poses=kernel_poses)
+
+    def activate(self) -> None:
+        """Make the kernels those of this thread, see ``RowKernels``."""
+        self._rows.activate()
 
 
 class HullTranscription(Transcription):
