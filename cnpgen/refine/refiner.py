@@ -20,8 +20,9 @@ from cnpgen.refine.solver.bounds import Bounds, BoundsTemplate
 from cnpgen.refine.solver.compiled_backend import load_step_library
 from cnpgen.refine.solver.cost_term import CostTerm, cost_term_residuals
 from cnpgen.refine.solver.grid import make_grid
-from cnpgen.refine.solver.hulls import CompiledHullTranscription, Hulls, HullTranscription
+from cnpgen.refine.solver.hull_feedback import HullFeedback
 from cnpgen.refine.solver.hull_problem import can_measure_hulls, without_distances
+from cnpgen.refine.solver.hulls import CompiledHullTranscription, Hulls, HullTranscription
 from cnpgen.refine.solver.residuals import stage_jacobian, stage_values
 from cnpgen.refine.solver.sqp import DEFAULT_SETTINGS, Result, Settings, minimize
 from cnpgen.refine.solver.transcription import ResidualKernels, Transcription
@@ -38,6 +39,7 @@ Array = NDArray[np.float64]
 MAX_INPUT_DURATION_S = 60.0  # of an input plan that is used as initial guess; slower ones hardly change in a step
 MIN_RATE_FRACTION = 1e-3  # of a plan's largest rate control point
 MAX_END_VIOLATION = 10.0  # of boundary states, in scaled units; DAQP may take hours for larger ones
+MAX_FEEDBACKS = 5  # of collisions between grid points to the solver
 SLOWNESS = 1.6  # times slower than the bounds of speeds require: the solver changes such guesses more easily
 
 
@@ -101,6 +103,7 @@ class Refiner:
         )
         every, orders = tuple(vars(self.levels).values()), problem.path_orders
         self._grids = {points: make_grid(self.spec, points, orders) for points in {level.points for level in every}}
+        self._feedbacks = dict[int, HullFeedback]()
         self._bounds = {
             level: BoundsTemplate(solved, world, self._grids[level.points].s, level.tightening) for level in every
         }
@@ -118,12 +121,22 @@ class Refiner:
         motion, rate = self.check.transcription(task), np.maximum(task.rate, MIN_RATE_FRACTION * task.rate.max())
         return motion.pack(task.path, rate) if motion.duration(rate) < MAX_INPUT_DURATION_S else None
 
-    def run_level(self, task: RefinementTask, level: GridLevel, x: Array, hulls: Hulls | None = None) -> Result:
+    def run_level(
+        self,
+        task: RefinementTask,
+        level: GridLevel,
+        x: Array,
+        hulls: Hulls | None = None,
+        extra: Array | None = None,
+    ) -> Result:
         """Run the solver on one level from variables x, shape (nx,); ``hulls`` replace the capsules.
 
-        A refiner that ``measures_hulls`` has no capsules: its hulls are rows of compiled code on all levels.
+        A refiner that ``measures_hulls`` has no capsules: its hulls are rows of compiled code on all levels. Their
+        required distances then grow by ``extra`` [m], shape (K, columns), for a
+        motion that is nearly valid.
         """
-        settings, motion = level.settings, self.transcription(task, level)
+        motion = self.transcription(task, level)
+        settings = level.settings if extra is None else self.levels.strict.settings
         ends = motion.end_residuals()
         bounds = self.bounds(task, level, ends)
         if not np.nanmax(bounds.end_violations(ends)) < MAX_END_VIOLATION:
@@ -137,7 +150,7 @@ class Refiner:
                 kernel_poses=self.kernel_poses(task),
                 obstacle_poses=task.scene.poses[0],
             )
-            bounds = self._bounds[level].with_hull_distances(bounds, self.hulls.min_distances)
+            bounds = self._bounds[level].with_hull_distances(bounds, self.hulls.min_distances, extra)
         elif hulls is not None:
             motion = HullTranscription(
                 self.residual_kernels,
@@ -175,7 +188,27 @@ class Refiner:
     ) -> Attempt:
         """Run one level from variables x; return the result with its violation, scaled in time where that helps."""
         result = self.run_level(task, level, x, hulls)
+        if self.measures_hulls:
+            result = self._separated(task, level, result)
         return self.measured(task, result.x, outcome, result.iterations)
+
+    def _separated(self, task: RefinementTask, level: GridLevel, result: Result) -> Result:
+        """Run a level again with larger required distances where hulls collide between its grid points."""
+        feedback, motion, extra = self._feedback(level), self.transcription(task, level), None
+        for _ in range(MAX_FEEDBACKS):
+            path, _ = motion.unpack(result.x)
+            missing = feedback.missing_clearance(path, self.hulls, task.scene.poses[0])
+            if missing is None:
+                break
+            extra = missing if extra is None else extra + missing
+            earlier, result = result.iterations, self.run_level(task, level, result.x, extra=extra)
+            result = replace(result, iterations=earlier + result.iterations)
+        return result
+
+    def _feedback(self, level: GridLevel) -> HullFeedback:
+        if level.points not in self._feedbacks:
+            self._feedbacks[level.points] = HullFeedback(self.spec, self._grids[level.points].s)
+        return self._feedbacks[level.points]
 
     def measured(
         self, task: RefinementTask, x: Array, outcome: Outcome, iterations: int = 0, *, unlimited: bool = False

@@ -142,6 +142,27 @@ class Hulls:
                 violation = max(violation, float((required - close.distance).max(initial=0.0)))
         return violation
 
+    def missing(self, q: Array, margins: Array, obstacle_poses: Array) -> Array:
+        """Return by how much the distances at states q (n, K) are below the required ones plus margins [m], at least 0.
+
+        Args:
+            q: Joint positions [rad], shape (n, K).
+            margins: Additional distance at every state [m], shape (K,).
+            obstacle_poses: Poses and sizes of the obstacles, shape (width,).
+
+        Returns:
+            Shape (K, m).
+        """
+        missing = np.zeros((q.shape[1], len(self.min_distances)))
+        if not np.isfinite(q).all():
+            return missing + np.inf
+        contacts_of = self._contacts(q, obstacle_poses, float(margins.max()))
+        for contacts, (_, columns, _) in zip(contacts_of, self._groups, strict=True):
+            column = columns[contacts.pair]
+            below = self.min_distances[column] + margins[contacts.k] - contacts.distance
+            np.maximum.at(missing, (contacts.k, column), below)
+        return missing
+
     def gradients(self, q: Array, distances: Array, groups: list[Contacts]) -> Array:
         """Differentiate the result of ``measure`` in q: shape (n, m, K), 0 for parts out of range."""
         gradients = np.zeros((q.shape[1], len(self.min_distances), self._n))
@@ -183,15 +204,15 @@ class Hulls:
             self._poses_of_checker = obstacle_poses.copy()
         return self.checker
 
-    def _contacts(self, q: Array, obstacle_poses: Array) -> list[Contacts]:
-        """Measure the contacts of every constraint within range."""
+    def _contacts(self, q: Array, obstacle_poses: Array, within: float = MEASURED_RANGE_M) -> list[Contacts]:
+        """Measure the contacts of every constraint closer than the required distance plus ``within`` [m]."""
         if self.checker is None:
             self._place(q, obstacle_poses)
-            return [self._bodies.contacts(pairs, required + MEASURED_RANGE_M) for pairs, _, required in self._groups]
+            return [self._bodies.contacts(pairs, required + within) for pairs, _, required in self._groups]
         checker, groups = self.placed_checker(obstacle_poses), []
         for pairs, _, required in self._groups:
             of_obstacles = pairs is self._bodies.obstacle_pairs
-            close = checker.close_bodies(q, required + MEASURED_RANGE_M, of_obstacles=of_obstacles)
+            close = checker.close_bodies(q, required + within, of_obstacles=of_obstacles)
             groups.append(Contacts(*close, joints=self._bodies.joints_of(pairs[close.pair])))
         return groups
 
