@@ -280,7 +280,7 @@ def generate(
         ends = sampler.ends(scene, random, line_may_be_free=made % 5 == 4)
         if ends is not None:
             made += 1
-            yield replace(base, obstacle=scene.obstacles), *ends
+            yield base.with_obstacles(scene.obstacles), *ends
 
 
 def boundary_columns(start: Array, goal: Array) -> dict[str, Array]:

@@ -3,7 +3,7 @@
 import dataclasses
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -67,6 +67,13 @@ class Problem:
     def first(self, kind: type[Kind]) -> Kind | None:
         """Return the first constraint of a kind; None if there is none."""
         return next((each for each in self.constraint if isinstance(each, kind)), None)
+
+    @checked_arguments
+    def with_obstacles(self, obstacles: Sequence[Obstacle]) -> "Problem":
+        """Return the problem among other obstacles; robot, limits and constraints stay the same."""
+        other = dataclasses.replace(self, obstacle=tuple(obstacles))
+        vars(other)["urdf_text"] = self.urdf_text  # a cached property, expensive to read again
+        return other
 
     @property
     def arm_radius(self) -> float | None:
@@ -159,7 +166,7 @@ class Problem:
 
     @cached_property
     def structure(self) -> str | None:
-        """Hash (sha256) as ``identity``, without the names, poses and sizes of obstacles; None with plug-in constraints.
+        """Hash (sha256) as ``identity``, without names, poses and sizes of obstacles; None with plug-in constraints.
 
         Kernels that read these numbers from their arguments are equal for all problems of one structure.
         """

@@ -67,7 +67,7 @@ class FineCheck:
         kernels: Residual kernels.
         poses: Function that returns the scene values of a task that the kernels take.
         penetration: Function of a task and states (n, K) that returns by how much distances that the kernels do not
-            compute are violated beyond their tolerance [m]; None if there are none.
+            compute are violated above their tolerance [m]; None if there are none.
 
     Attributes:
         equalities: Names of the equality conditions.

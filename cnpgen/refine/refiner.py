@@ -93,6 +93,8 @@ class Refiner:
             load_step_library(kernels),
         )
         self.levels = default_grid_levels(problem, settings) if levels is None else levels
+        if self.measures_hulls and levels is None:  # trees avoid the hulls, so that their paths are nearly valid
+            self.levels = replace(self.levels, path=self.levels.warm)
         self._world = world
         self.check = FineCheck(
             solved,
@@ -176,7 +178,7 @@ class Refiner:
         return task.scene.poses[0, self._kernel_poses]
 
     def _penetration(self, task: RefinementTask, q: Array) -> float:
-        """Return by how much the hulls at states q (n, K) violate their required distances beyond the tolerance [m]."""
+        """Return by how much the hulls at states q (n, K) violate their required distances above the tolerance [m]."""
         return self.hulls.violation(q, task.scene.poses[0]) - self.hulls.tolerance
 
     def bounds(self, task: RefinementTask, level: GridLevel, ends: Array) -> Bounds:
@@ -283,7 +285,8 @@ class Refiner:
 
     def rest_space(self, task: RefinementTask, hulls: Hulls | None = None) -> RestSpace:
         """Return the valid states at rest, for the search of joint-space paths."""
-        return RestSpace(self.residual_kernels, self.robot, self.check.rest_bounds(task), self.kernel_poses(task), hulls)
+        bounds, poses = self.check.rest_bounds(task), self.kernel_poses(task)
+        return RestSpace(self.residual_kernels, self.robot, bounds, poses, hulls, task.scene.poses[0])
 
     @property
     def hulls(self) -> Hulls:

@@ -47,6 +47,7 @@ Array = NDArray[np.float64]
 MAX_CONTINUATIONS = 4  # of a motion that was scaled in time; most need one
 MAX_PENETRATION_M = 0.02  # of links in a plan that hull levels continue from
 MIN_END_PENETRATION_M = 1e-5  # of an end: smaller ones may be rounding errors
+MAX_LINE_PENETRATION_M = 0.05  # of the initial line, above which joint-space paths come first
 NEARLY_VALID = 30.0  # tolerances; attempts with larger violations are left for joint-space paths
 MAX_JUDGED_VIOLATION = 3.0  # tolerances on the fine grid; attempts with larger ones are judged only without better ones
 MAX_ROUNDING_ERROR = 1e-12  # rad and 1/s: smaller differences are rounding errors
@@ -72,7 +73,12 @@ def make_attempts(refiner: Refiner, task: RefinementTask, x: Array | None) -> It
         yield from _with_fewer_control_points(refiner, refiner.coarser, task, x)
     adjusted = refiner.measured(task, x, Outcome.ADJUSTED) if x is not None and task.at_rest else None
     hulls = _hulls_of_trees(refiner, task)
-    best = yield from run_levels(refiner, task, x, adjusted, max_violation=np.inf if hulls is None else NEARLY_VALID)
+    if hulls is not None and x is None and _is_deep(refiner, task, hulls):
+        best = refiner.measured(task, refiner.line_guess(task), Outcome.NOT_CONVERGED)
+        yield best
+    else:
+        max_violation = np.inf if hulls is None else NEARLY_VALID
+        best = yield from run_levels(refiner, task, x, adjusted, max_violation=max_violation)
     if refiner.check.ends_are_invalid(task):
         return
     if hulls is not None:
@@ -100,6 +106,13 @@ def _hulls_of_trees(refiner: Refiner, task: RefinementTask) -> Hulls | None:
     if task.deadline is not None or not has_clearance_constraints(refiner.problem, refiner.robot):
         return None
     return refiner.hulls if refiner.measures_hulls else None
+
+
+def _is_deep(refiner: Refiner, task: RefinementTask, hulls: Hulls) -> bool:
+    """Return whether the initial line is so deep in an obstacle that paths around it are tried first."""
+    motion = refiner.transcription(task, refiner.levels.coarse)
+    positions = motion.positions(refiner.line_guess(task))
+    return hulls.violation(positions, task.scene.poses[0]) > MAX_LINE_PENETRATION_M
 
 
 def _best_of(attempts: Iterator[Attempt], best: Attempt) -> Generator[Attempt, None, Attempt]:

@@ -36,10 +36,8 @@ class _RobotScene(ctypes.Structure):
     _fields_ = (
         *((name, c_long) for name in ("n", "n_parts", "n_links", "n_link_pairs", "n_obstacles", "lanes")),
         *((name, c_void_p) for name in ("place", "axis", "sliding", "parts", "links", "first_part", "part_of_link")),
-        *(
-            (name, c_void_p)
-            for name in ("link_pairs", "first_pair", "pairs", "moving", "moving_frames", "obstacles", "boxes", "vertices")
-        ),
+        *((name, c_void_p) for name in ("link_pairs", "first_pair", "pairs", "moving", "moving_frames")),
+        *((name, c_void_p) for name in ("obstacles", "boxes", "vertices")),
     )
 
 
