@@ -7,7 +7,7 @@ import json
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal, Protocol
@@ -53,6 +53,7 @@ class KernelLibrary:
     """Loader of kernels for one robot and problem, which builds those that are not cached.
 
     Attributes:
+        structure: Digest of the arguments without the poses and sizes of obstacles, or None; see ``load_by_structure``.
         backend: "compiled", "numpy" (interpreted tape) or "casadi" (CasADi's map; slow, for reference).
         cache_folder: Folder of cached tapes and libraries.
         identity: Digest of all ``arguments``.
@@ -63,7 +64,19 @@ class KernelLibrary:
     cache_folder: Path
     identity: str
     arguments: Mapping[str, Any] = field(default_factory=dict)
+    structure: str | None = None
     _compiler_pool: CompilerPool | None = field(default=None, init=False, repr=False)
+
+    def load_by_structure(self, builder: Callable[..., Any], **parameters: Any) -> Kernel:
+        """Return the kernel of an SX function that reads poses and sizes of obstacles from its arguments only.
+
+        Problems that differ only in these numbers share its tape; see ``load``.
+        """
+        if self.structure is None:
+            return self.load(builder, **parameters)
+        shared = replace(self, identity=self.structure)
+        shared._compiler_pool = self._compiler_pool
+        return shared.load(builder, **parameters)
 
     def load(self, builder: Callable[..., Any], loop: Loop | None = None, **parameters: Any) -> Kernel:
         """Return the kernel of an SX function.
@@ -221,10 +234,15 @@ class Identified(Protocol):
     def identity(self) -> str:
         """SHA-256 digest of everything that its kernels depend on."""
 
+    @property
+    def structure(self) -> str | None:
+        """Digest of the same without poses and sizes of obstacles, or None if kernels may depend on those."""
+
 
 def problem_kernels(problem: Identified, robot: object, backend: Backend, cache_folder: Path) -> KernelLibrary:
     """Return the kernel library of a problem and its robot, cached under the problem's identity."""
-    return KernelLibrary(backend, cache_folder, problem.identity, {"robot": robot, "problem": problem})
+    arguments = {"robot": robot, "problem": problem}
+    return KernelLibrary(backend, cache_folder, problem.identity, arguments, problem.structure)
 
 
 def choose_backend(requested: str | None = None) -> tuple[Backend, Path]:

@@ -3,7 +3,7 @@
 import dataclasses
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -79,6 +79,13 @@ class Problem:
     def first(self, kind: type[Kind]) -> Kind | None:
         """Return the first constraint of a kind; None if there is none."""
         return next((each for each in self.constraint if isinstance(each, kind)), None)
+
+    @checked_arguments
+    def with_obstacles(self, obstacles: Sequence[Obstacle]) -> "Problem":
+        """Return the problem among other obstacles; robot, limits and constraints stay the same."""
+        other = dataclasses.replace(self, obstacle=tuple(obstacles))
+        vars(other)["urdf_text"] = self.urdf_text  # a cached property, expensive to read again
+        return other
 
     @property
     def arm_radius(self) -> float | None:
@@ -173,6 +180,28 @@ class Problem:
         """
         content = json.dumps(without_labels(to_dict(self, label=_all_of)), sort_keys=True)
         return hashlib.sha256(content.encode() + self.urdf_text.encode()).hexdigest()
+
+    @cached_property
+    def structure(self) -> str | None:
+        """Hash (sha256) as ``identity``, without names, poses and sizes of obstacles; None with plug-in constraints.
+
+        Kernels that read these numbers from their arguments are equal for all problems of one structure.
+        """
+        if not all(type(constraint).__module__.startswith("cnpgen.") for constraint in self.constraint):
+            return None
+        content = without_labels(to_dict(self, label=_all_of))
+        content = {key: value for key, value in content.items() if key != "name"}
+        content["obstacle"] = [_structure_of(obstacle) for obstacle in content["obstacle"]]
+        text = json.dumps(content, sort_keys=True)
+        return hashlib.sha256(b"structure" + text.encode() + self.urdf_text.encode()).hexdigest()
+
+
+def _structure_of(obstacle: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the keys of a resolved obstacle that kernels contain as constants: all but name, pose and sizes."""
+    if obstacle.get("x") is not None or obstacle.get("y") is not None:
+        return {key: value for key, value in obstacle.items() if key not in {"name", "top", "below"}}
+    turned = any(obstacle.get("rotation") or ())
+    return {key: obstacle.get(key) for key in ("kind", "mesh", "scale")} | {"turned": turned}
 
 
 # Keys of [robot] that only locate, read or describe files; their results are in the text of the URDF.

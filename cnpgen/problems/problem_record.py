@@ -127,7 +127,9 @@ class ProblemRecord(StoredProblem):
             RecipeError: The problem needs another version of cnpgen, or a plug-in that is not installed.
         """
         with tempfile.TemporaryDirectory(prefix="cnpgen-") as folder:
-            yield restore_problem(self.content, self.urdf, Path(folder))
+            problem = restore_problem(self.content, self.urdf, Path(folder))
+            vars(problem)["urdf_text"] = self.urdf  # a cached property: the text contains meshes and pairs already
+            yield problem
 
     @checked_arguments
     def tip_positions(self, q: Array) -> Array:

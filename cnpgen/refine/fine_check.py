@@ -1,5 +1,6 @@
 """Residuals on a grid finer than the solver's, and uniform time scaling of motions that violate their limits."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 FINE_POINTS = 600
+PENETRATION_SCALE_M = 1e-4  # of violated distances without a tolerance of their own
 MAX_SCALINGS = 6  # of one motion, each by the factor that its largest violation requires
 MIN_RESIDUAL_TOLERANCE = 1e-12  # of scaled residuals: below rounding errors
 MIN_END_VIOLATION = 1.5  # tolerances: the bounds near an end differ slightly from those at it
@@ -63,15 +65,27 @@ class FineCheck:
         problem: The problem.
         world: World of the problem.
         kernels: Residual kernels.
+        poses: Function that returns the scene values of a task that the kernels take.
+        penetration: Function of a task and states (n, K) that returns by how much distances that the kernels do not
+            compute are violated above their tolerance [m]; None if there are none.
 
     Attributes:
         equalities: Names of the equality conditions.
     """
 
-    def __init__(self, problem: Problem, world: "World", kernels: ResidualKernels) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        world: "World",
+        kernels: ResidualKernels,
+        *,
+        poses: Callable[[RefinementTask], Array],
+        penetration: Callable[[RefinementTask, Array], float] | None = None,
+    ) -> None:
+        self._penetration = penetration
         self._grid = make_grid(kernels.spec, FINE_POINTS, problem.path_orders)
         self._last = cache_last(
-            lambda task: Transcription(kernels, self._grid, boundary=task.boundary, obstacle_poses=task.scene.poses[0])
+            lambda task: Transcription(kernels, self._grid, boundary=task.boundary, obstacle_poses=poses(task))
         )
         self._bounds = BoundsTemplate(problem, world, self._grid.s, NO_TIGHTENING)
         conditions = self._bounds.conditions
@@ -97,7 +111,9 @@ class FineCheck:
         worst = float(ratio.max())
         if not np.isfinite(worst):
             return cost, GridViolation(np.inf, True, np.inf)
-        if worst <= 1:
+        excess = -1.0 if self._penetration is None else self._penetration(task, motion.positions(x))
+        collision = 1.0 + excess / PENETRATION_SCALE_M if excess > 0 else 0.0
+        if max(worst, collision) <= 1:
             return cost, GridViolation(worst, False, 1.0)
         violated = ratio > 1
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -105,7 +121,8 @@ class FineCheck:
             size[self._speeds] **= 1 / self._powers
         speed, strength, jerk = (size[self._bounds.orders == order].max(initial=1.0) for order in (1, 2, 3))
         time_scale = max(speed, float(np.sqrt(strength)), float(np.cbrt(jerk)))
-        return cost, GridViolation(worst, bool(violated[:, self._bounds.orders == 0].any()), time_scale)
+        position = collision > 1 or bool(violated[:, self._bounds.orders == 0].any())
+        return cost, GridViolation(max(worst, collision), position, time_scale)
 
     def rest_bounds(self, task: RefinementTask) -> RestBounds:
         """Return the bounds halfway along the motion, relaxed by their tolerances except for clearances."""

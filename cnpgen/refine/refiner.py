@@ -3,12 +3,14 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
+from threading import get_ident
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.kernels.library import KernelLibrary
+from cnpgen.kernels.collision.collision_checker import load_collision_library
+from cnpgen.kernels.library import KernelLibrary, problem_kernels
 from cnpgen.problems.problem import Problem
 from cnpgen.refine import initial_guesses
 from cnpgen.refine.fine_check import FineCheck
@@ -18,7 +20,9 @@ from cnpgen.refine.solver.bounds import Bounds, BoundsTemplate
 from cnpgen.refine.solver.compiled_backend import load_step_library
 from cnpgen.refine.solver.cost_term import CostTerm, cost_term_residuals, residual_counts
 from cnpgen.refine.solver.grid import make_grid
-from cnpgen.refine.solver.hulls import Hulls, HullTranscription
+from cnpgen.refine.solver.hull_feedback import HullFeedback
+from cnpgen.refine.solver.hull_problem import can_measure_hulls, without_distances
+from cnpgen.refine.solver.hulls import CompiledHullTranscription, Hulls, HullTranscription
 from cnpgen.refine.solver.residuals import stage_jacobian, stage_values
 from cnpgen.refine.solver.sqp import DEFAULT_SETTINGS, Result, Settings, minimize
 from cnpgen.refine.solver.transcription import ResidualKernels, Transcription
@@ -35,11 +39,16 @@ Array = NDArray[np.float64]
 MAX_INPUT_DURATION_S = 60.0  # of an input plan that is used as initial guess; slower ones hardly change in a step
 MIN_RATE_FRACTION = 1e-3  # of a plan's largest rate control point
 MAX_END_VIOLATION = 10.0  # of boundary states, in scaled units; DAQP may take hours for larger ones
+MAX_FEEDBACKS = 5  # of collisions between grid points to the solver
 SLOWNESS = 1.6  # times slower than the bounds of speeds require: the solver changes such guesses more easily
 
 
 class Refiner:
     """Solver of one problem, and the checks and initial guesses for it.
+
+    Attributes:
+        measures_hulls: Whether distances of the links' hulls replace those of capsules in all levels, see
+            ``cnpgen.refine.solver.hull_problem``.
 
     Args:
         problem: The problem.
@@ -68,22 +77,38 @@ class Refiner:
     ) -> None:
         self.problem, self.robot, self.settings, self.coarser = problem, robot, settings, coarser
         self.spec = problem.trajectory if spec is None else spec
+        library = load_collision_library(kernels)
+        self.measures_hulls = library is not None and can_measure_hulls(problem, robot, world)
+        self._library, self._hulls, solved = library, dict[int, Hulls](), problem
+        if self.measures_hulls:
+            solved = without_distances(problem)
+            kernels = problem_kernels(solved, robot, kernels.backend, kernels.cache_folder)
+        self._kernel_poses = slice(pose_width(problem.obstacle) - pose_width(solved.obstacle), None)
         self.residual_kernels = ResidualKernels(
             self.spec,
-            kernels.load(stage_values),
-            kernels.load(stage_jacobian),
+            kernels.load_by_structure(stage_values),
+            kernels.load_by_structure(stage_jacobian),
             cost_term,
-            None if cost_term is None else kernels.load(cost_term_residuals, terms=cost_term.tables),
+            None if cost_term is None else kernels.load_by_structure(cost_term_residuals, terms=cost_term.tables),
             () if cost_term is None else residual_counts(robot, cost_term),
             load_step_library(kernels),
         )
         self.levels = default_grid_levels(problem, settings) if levels is None else levels
+        if self.measures_hulls and levels is None:  # trees avoid the hulls, so that their paths are nearly valid
+            self.levels = replace(self.levels, path=self.levels.warm)
         self._world = world
-        self.check = FineCheck(problem, world, self.residual_kernels)
+        self.check = FineCheck(
+            solved,
+            world,
+            self.residual_kernels,
+            poses=self.kernel_poses,
+            penetration=self._penetration if self.measures_hulls else None,
+        )
         every, orders = tuple(vars(self.levels).values()), problem.path_orders
         self._grids = {points: make_grid(self.spec, points, orders) for points in {level.points for level in every}}
+        self._feedbacks = dict[int, HullFeedback]()
         self._bounds = {
-            level: BoundsTemplate(problem, world, self._grids[level.points].s, level.tightening) for level in every
+            level: BoundsTemplate(solved, world, self._grids[level.points].s, level.tightening) for level in every
         }
 
     def input_variables(self, task: RefinementTask) -> Array | None:
@@ -99,14 +124,37 @@ class Refiner:
         motion, rate = self.check.transcription(task), np.maximum(task.rate, MIN_RATE_FRACTION * task.rate.max())
         return motion.pack(task.path, rate) if motion.duration(rate) < MAX_INPUT_DURATION_S else None
 
-    def run_level(self, task: RefinementTask, level: GridLevel, x: Array, hulls: Hulls | None = None) -> Result:
-        """Run the solver on one level from variables x, shape (nx,); ``hulls`` replace the capsules."""
-        settings, motion = level.settings, self.transcription(task, level)
+    def run_level(
+        self,
+        task: RefinementTask,
+        level: GridLevel,
+        x: Array,
+        hulls: Hulls | None = None,
+        extra: Array | None = None,
+    ) -> Result:
+        """Run the solver on one level from variables x, shape (nx,); ``hulls`` replace the capsules.
+
+        A refiner that ``measures_hulls`` has no capsules: its hulls are rows of compiled code on all levels. Their
+        required distances then grow by ``extra`` [m], shape (K, columns), for a
+        motion that is nearly valid.
+        """
+        motion = self.transcription(task, level)
+        settings = level.settings if extra is None else self.levels.strict.settings
         ends = motion.end_residuals()
         bounds = self.bounds(task, level, ends)
         if not np.nanmax(bounds.end_violations(ends)) < MAX_END_VIOLATION:
             settings = replace(settings, max_iterations=0)
-        if hulls is not None:
+        if self.measures_hulls:
+            motion = CompiledHullTranscription(
+                self.residual_kernels,
+                motion.grid,
+                self.hulls,
+                boundary=task.boundary,
+                kernel_poses=self.kernel_poses(task),
+                obstacle_poses=task.scene.poses[0],
+            )
+            bounds = self._bounds[level].with_hull_distances(bounds, self.hulls.min_distances, extra)
+        elif hulls is not None:
             motion = HullTranscription(
                 self.residual_kernels,
                 motion.grid,
@@ -123,8 +171,16 @@ class Refiner:
             self.residual_kernels,
             self._grids[level.points],
             boundary=task.boundary,
-            obstacle_poses=task.scene.poses[0],
+            obstacle_poses=self.kernel_poses(task),
         )
+
+    def kernel_poses(self, task: RefinementTask) -> Array:
+        """Return the scene values that the residual kernels take, shape (width,)."""
+        return task.scene.poses[0, self._kernel_poses]
+
+    def _penetration(self, task: RefinementTask, q: Array) -> float:
+        """Return by how much the hulls at states q (n, K) violate their required distances above the tolerance [m]."""
+        return self.hulls.violation(q, task.scene.poses[0]) - self.hulls.tolerance
 
     def bounds(self, task: RefinementTask, level: GridLevel, ends: Array) -> Bounds:
         """Return the bounds of a level for a motion whose boundary states have residuals ``ends``, shape (2, m)."""
@@ -135,7 +191,27 @@ class Refiner:
     ) -> Attempt:
         """Run one level from variables x; return the result with its violation, scaled in time where that helps."""
         result = self.run_level(task, level, x, hulls)
+        if self.measures_hulls:
+            result = self._separated(task, level, result)
         return self.measured(task, result.x, outcome, result.iterations)
+
+    def _separated(self, task: RefinementTask, level: GridLevel, result: Result) -> Result:
+        """Run a level again with larger required distances where hulls collide between its grid points."""
+        feedback, motion, extra = self._feedback(level), self.transcription(task, level), None
+        for _ in range(MAX_FEEDBACKS):
+            path, _ = motion.unpack(result.x)
+            missing = feedback.missing_clearance(path, self.hulls, task.scene.poses[0])
+            if missing is None:
+                break
+            extra = missing if extra is None else extra + missing
+            earlier, result = result.iterations, self.run_level(task, level, result.x, extra=extra)
+            result = replace(result, iterations=earlier + result.iterations)
+        return result
+
+    def _feedback(self, level: GridLevel) -> HullFeedback:
+        if level.points not in self._feedbacks:
+            self._feedbacks[level.points] = HullFeedback(self.spec, self._grids[level.points].s)
+        return self._feedbacks[level.points]
 
     def measured(
         self, task: RefinementTask, x: Array, outcome: Outcome, iterations: int = 0, *, unlimited: bool = False
@@ -210,7 +286,16 @@ class Refiner:
 
     def rest_space(self, task: RefinementTask, hulls: Hulls | None = None) -> RestSpace:
         """Return the valid states at rest, for the search of joint-space paths."""
-        return RestSpace(self.residual_kernels, self.robot, self.check.rest_bounds(task), task.scene.poses[0], hulls)
+        bounds, poses = self.check.rest_bounds(task), self.kernel_poses(task)
+        return RestSpace(self.residual_kernels, self.robot, bounds, poses, hulls, task.scene.poses[0])
+
+    @property
+    def hulls(self) -> Hulls:
+        """Clearances of the links' hulls, one object per thread; see ``has_clearance_constraints``."""
+        thread = get_ident()
+        if thread not in self._hulls:
+            self._hulls[thread] = Hulls(self.problem, self.robot, self._library)
+        return self._hulls[thread]
 
     @cached_property
     def _range_center(self) -> Array:

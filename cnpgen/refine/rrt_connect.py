@@ -2,13 +2,15 @@
 
 Kernels check many states of an edge at once against capsules; Coal's hulls decide where only a capsule collides. Where
 there are equalities, the states of an edge are first projected onto the manifold by Gauss-Newton steps within the joint
-limits (CBiRRT, Berenson et al. 2009). Random numbers are the same for every task. The refiner adds velocities and
-accelerations. The tree of ``benchmark/planners/tree.py`` has states, costs and pruning (SST) and is separate.
+limits (CBiRRT, Berenson et al. 2009). Without equalities, compiled trees search instead (``tree_paths``). Random
+numbers are the same for every task. The refiner adds velocities and accelerations. The tree of
+``benchmark/planners/tree.py`` has states, costs and pruning (SST) and is separate.
 """
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -47,7 +49,8 @@ class RestSpace:
         robot: The robot.
         bounds: Bounds of the residuals of a state.
         obstacle_poses: Poses and sizes of the obstacles, shape (width,).
-        hulls: Hulls that decide where capsules collide; None where the links are capsules.
+        hulls: Hulls that decide where capsules collide, or without capsules everywhere; None where links are capsules.
+        scene_poses: Poses and sizes of the obstacles of the hulls, by default ``obstacle_poses``.
     """
 
     kernels: ResidualKernels
@@ -55,11 +58,21 @@ class RestSpace:
     bounds: RestBounds
     obstacle_poses: Array
     hulls: Hulls | None = None
+    scene_poses: Array | None = None
 
     def follow(self, q: Array) -> Array:
         """Project K states, shape (n, K), onto the equalities; return the leading valid ones."""
         q = self.projected(q) if self.bounds.equal.any() else q
         return q[:, : self._count_valid(q)]
+
+    def meets_other_conditions(self, path: Array) -> bool:
+        """Return whether the states of a polyline, corners of shape (K, n), meet all conditions except distances."""
+        counts = [max(int(np.ceil(np.abs(b - a).max() / STATE_SPACING)), 1) for a, b in pairwise(path)]
+        where = np.concatenate([k + np.arange(count) / count for k, count in enumerate(counts)])
+        q = np.stack([np.interp(where, np.arange(len(path)), joint) for joint in path.T])
+        (g,) = self.kernels.values(*self._arguments(q))
+        met = (g >= self.bounds.lower[:, None]) & (g <= self.bounds.upper[:, None])
+        return bool(met[~self.bounds.capsules].all())
 
     def _count_valid(self, q: Array) -> int:
         """Return the number of leading valid states."""
@@ -67,13 +80,15 @@ class RestSpace:
         met = (g >= self.bounds.lower[:, None]) & (g <= self.bounds.upper[:, None])
         if self.hulls is None:
             return _first(~np.logical_and.reduce(met))
+        poses = self.obstacle_poses if self.scene_poses is None else self.scene_poses
         first = _first(~np.logical_and.reduce(met[~self.bounds.capsules]))
         if first:
-            first = _first(~self.hulls.clear_states(q[:, :first], self.obstacle_poses, uncovered_only=True))
-        unresolved = np.flatnonzero(~np.logical_and.reduce(met[self.bounds.capsules])[:first])
+            first = _first(~self.hulls.clear_states(q[:, :first], poses, uncovered_only=True))
+        resolved = np.logical_and.reduce(met[self.bounds.capsules]) & self.bounds.capsules.any()
+        unresolved = np.flatnonzero(~resolved[:first])
         if not len(unresolved):
             return first
-        collision = _first(~self.hulls.clear_states(q[:, unresolved], self.obstacle_poses))
+        collision = _first(~self.hulls.clear_states(q[:, unresolved], poses))
         return first if collision == len(unresolved) else int(unresolved[collision])
 
     def projected(self, q: Array) -> Array:

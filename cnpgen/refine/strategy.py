@@ -6,7 +6,8 @@ The next attempt is made only if no earlier one was accepted. Attempts in their 
 2. Coarse level from the input plan or a straight line, uniform time scaling, fine level, strict level.
 3. Other initial guesses, and the best attempt so far after uniform time scaling.
 4. Step 2 again, from a straight line at constant rate, then from the best attempt so far.
-5. Without a deadline: levels on hulls in place of capsules, and joint-space paths of RRT-Connect.
+5. Without a deadline: levels on hulls in place of capsules, and joint-space paths of RRT-Connect. If compiled trees can
+   search these paths, they come right after step 2, whose finer levels run only for nearly valid attempts.
 
 Acceptance (``RefinementSearch``): the independent verdict decides, never the solver's own residuals. The first valid
 plan is returned if it is precise; otherwise one more attempt is judged. The result is never worse than the input plan:
@@ -32,6 +33,7 @@ from cnpgen.refine.solver.deadline import Deadline
 from cnpgen.refine.solver.hulls import Hulls, has_clearance_constraints
 from cnpgen.refine.solver.sqp import Result
 from cnpgen.refine.task import Attempt, Outcome, RefinementTask
+from cnpgen.refine.tree_paths import find_obstacle_paths
 from cnpgen.robots.scene import Scene
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.remaining_trajectory import with_fewer_knots, with_finer_knots
@@ -45,6 +47,8 @@ Array = NDArray[np.float64]
 MAX_CONTINUATIONS = 4  # of a motion that was scaled in time; most need one
 MAX_PENETRATION_M = 0.02  # of links in a plan that hull levels continue from
 MIN_END_PENETRATION_M = 1e-5  # of an end: smaller ones may be rounding errors
+MAX_LINE_PENETRATION_M = 0.05  # of the initial line, above which joint-space paths come first
+NEARLY_VALID = 30.0  # tolerances; attempts with larger violations are left for joint-space paths
 MAX_JUDGED_VIOLATION = 3.0  # tolerances on the fine grid; attempts with larger ones are judged only without better ones
 MAX_ROUNDING_ERROR = 1e-12  # rad and 1/s: smaller differences are rounding errors
 INPUT_OUTCOMES = {Outcome.UNCHANGED, Outcome.ADJUSTED}
@@ -68,9 +72,19 @@ def make_attempts(refiner: Refiner, task: RefinementTask, x: Array | None) -> It
     if x is not None and refiner.coarser is not None:
         yield from _with_fewer_control_points(refiner, refiner.coarser, task, x)
     adjusted = refiner.measured(task, x, Outcome.ADJUSTED) if x is not None and task.at_rest else None
-    best = yield from run_levels(refiner, task, x, adjusted)
+    hulls = _hulls_of_trees(refiner, task)
+    if hulls is not None and x is None and _is_deep(refiner, task, hulls):
+        best = refiner.measured(task, refiner.line_guess(task), Outcome.NOT_CONVERGED)
+        yield best
+    else:
+        max_violation = np.inf if hulls is None else NEARLY_VALID
+        best = yield from run_levels(refiner, task, x, adjusted, max_violation=max_violation)
     if refiner.check.ends_are_invalid(task):
         return
+    if hulls is not None:
+        best = yield from _best_of(_around_obstacles(refiner, task, best, hulls), best)
+        if _ends_penetrate(task, hulls):
+            return
     for other in _from_other_guesses(refiner, task, x if adjusted is None else adjusted.variables, best):
         yield other
         best = other if other.is_better(best) else best
@@ -79,10 +93,40 @@ def make_attempts(refiner: Refiner, task: RefinementTask, x: Array | None) -> It
     if x is not None or not np.array_equal(even_line, refiner.line_guess(task)):
         best = yield from _restart(refiner, task, None, even_line, best)
     best = yield from _restart(refiner, task, best.variables, even_line, best)
-    if task.deadline is None and has_clearance_constraints(refiner.problem, refiner.robot):
-        yield from _around_obstacles(refiner, task, best)
-    elif task.deadline is None and task.at_rest:
+    if hulls is not None or task.deadline is not None:
+        return
+    if has_clearance_constraints(refiner.problem, refiner.robot):
+        yield from _around_obstacles(refiner, task, best, refiner.hulls)
+    elif task.at_rest:
         yield from (_along_path(refiner, task, guess) for guess in _path_guesses(refiner, task))
+
+
+def _hulls_of_trees(refiner: Refiner, task: RefinementTask) -> Hulls | None:
+    """Return the clearances of the hulls if compiled trees can search paths for a task."""
+    if task.deadline is not None or not has_clearance_constraints(refiner.problem, refiner.robot):
+        return None
+    return refiner.hulls if refiner.measures_hulls else None
+
+
+def _is_deep(refiner: Refiner, task: RefinementTask, hulls: Hulls) -> bool:
+    """Return whether the initial line is so deep in an obstacle that paths around it are tried first."""
+    motion = refiner.transcription(task, refiner.levels.coarse)
+    positions = motion.positions(refiner.line_guess(task))
+    return hulls.violation(positions, task.scene.poses[0]) > MAX_LINE_PENETRATION_M
+
+
+def _best_of(attempts: Iterator[Attempt], best: Attempt) -> Generator[Attempt, None, Attempt]:
+    """Yield attempts; return the best of them and ``best``."""
+    for attempt in attempts:
+        yield attempt
+        best = attempt if attempt.is_better(best) else best
+    return best
+
+
+def _ends_penetrate(task: RefinementTask, hulls: Hulls) -> bool:
+    """Return whether an end is inside an obstacle or another link, so that no motion is valid."""
+    ends = np.stack([task.boundary.start_q[0], task.boundary.goal_q[0]], axis=1)
+    return hulls.max_penetration(ends, task.scene.poses[0]) > hulls.tolerance + MIN_END_PENETRATION_M
 
 
 def _repair_only(refiner: Refiner, task: RefinementTask, x: Array | None) -> Attempt:
@@ -113,7 +157,13 @@ def _with_fewer_control_points(refiner: Refiner, coarser: Refiner, task: Refinem
 
 
 def run_levels(
-    refiner: Refiner, task: RefinementTask, x: Array | None, adjusted: Attempt | None, line: Array | None = None
+    refiner: Refiner,
+    task: RefinementTask,
+    x: Array | None,
+    adjusted: Attempt | None,
+    line: Array | None = None,
+    *,
+    max_violation: float = np.inf,
 ) -> Generator[Attempt, None, Attempt]:
     """Yield the attempts of the coarse, fine and strict levels; return the best one.
 
@@ -123,6 +173,7 @@ def run_levels(
         x: Variables of the initial guess, or None.
         adjusted: Input plan with exact ends, scaled in time, for motions from rest to rest; replaces ``x``.
         line: Initial guess without a plan, or with a plan of large violation; the straight line by default.
+        max_violation: Violation of the coarse level, in tolerances, above which the finer levels are left out.
     """
     coarse = run_coarse_level(refiner, task, x if adjusted is None else adjusted.variables, line)
     outcome = Outcome.SOLVED if coarse.converged else Outcome.NOT_CONVERGED
@@ -135,6 +186,8 @@ def run_levels(
     best = _continue_scaled(refiner, task, best)
     if not feasible or best.x is not coarse.x:
         yield best
+    if best.violation > max_violation:
+        return best
     fine = refiner.solve(task, refiner.levels.fine, best.variables, Outcome.SOLVED_FINE)
     yield fine
     if adjusted is not None and adjusted.outcome is Outcome.TIME_SCALED and adjusted.violation <= 1:
@@ -191,15 +244,20 @@ def _restart(
     return best
 
 
-def _around_obstacles(refiner: Refiner, task: RefinementTask, best: Attempt) -> Iterator[Attempt]:
+def _around_obstacles(refiner: Refiner, task: RefinementTask, best: Attempt, hulls: Hulls) -> Iterator[Attempt]:
     """Yield attempts on hulls in place of capsules, and along joint-space paths around the obstacles.
 
     The best attempt so far is continued first if its links hardly penetrate anything.
     """
-    hulls = Hulls(refiner.problem, refiner.robot)
-    ends = np.stack([task.boundary.start_q[0], task.boundary.goal_q[0]], axis=1)
-    if hulls.max_penetration(ends, task.scene.poses[0]) > hulls.tolerance + MIN_END_PENETRATION_M:
-        return  # no motion is valid
+    if _ends_penetrate(task, hulls):
+        return
+    if refiner.measures_hulls:
+        for guess in _path_guesses(refiner, task, hulls):
+            attempt = _along_path(refiner, task, guess)
+            yield attempt
+            if attempt.violation <= MAX_JUDGED_VIOLATION:
+                yield refiner.solve(task, refiner.levels.strict, attempt.variables, Outcome.RESTARTED)
+        return
     positions = refiner.check.transcription(task).positions(best.variables)
     best_first = hulls.max_penetration(positions, task.scene.poses[0]) < MAX_PENETRATION_M
     if best_first:
@@ -223,7 +281,12 @@ def _on_hulls(refiner: Refiner, task: RefinementTask, guess: Attempt, hulls: Hul
 def _path_guesses(refiner: Refiner, task: RefinementTask, hulls: Hulls | None = None) -> Iterator[Attempt]:
     """Yield motions along valid joint-space paths, scaled in time if they are from rest to rest."""
     boundary, space = task.boundary, refiner.rest_space(task, hulls)
-    for states in find_paths(boundary.start_q[0], boundary.goal_q[0], refiner.robot, space.follow):
+    paths: Iterator[Array] | list[Array] = []
+    if hulls is not None and refiner.measures_hulls:
+        paths = find_obstacle_paths(task, space, hulls)
+    else:
+        paths = find_paths(boundary.start_q[0], boundary.goal_q[0], refiner.robot, space.follow)
+    for states in paths:
         guess = refiner.path_guess(task, states)
         yield refiner.measured(task, guess, Outcome.RESTARTED, unlimited=True)
 

@@ -5,6 +5,7 @@ import json
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, dataclass
+from functools import cache
 from types import UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
@@ -105,6 +106,7 @@ class Key:
         return self.form or _expected(self.hint, self.unit)
 
 
+@cache
 def keys(cls: type) -> tuple[Key, ...]:
     """List the keys of a dataclass, in order.
 

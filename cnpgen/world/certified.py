@@ -5,6 +5,7 @@ signed distance. No failure of Coal can therefore overestimate a distance.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -42,8 +43,14 @@ class ConvexBody:
 
 
 def convex_body(corners: Array, radius: float = 0.0) -> ConvexBody:
-    """Return the body of all points within ``radius`` of the hull of ``corners``."""
-    return ConvexBody(corners, radius, coal_hull(corners))
+    """Return the body of all points within ``radius`` of the hull of ``corners``; bodies of links are cached."""
+    return _cached_body(corners.tobytes(), radius)
+
+
+@lru_cache(maxsize=512)
+def _cached_body(corners: bytes, radius: float) -> ConvexBody:
+    points = np.frombuffer(corners).reshape(-1, 3)
+    return ConvexBody(points, radius, coal_hull(points))
 
 
 class CertifiedDistance:

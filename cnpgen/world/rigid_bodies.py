@@ -140,9 +140,14 @@ class RigidBodies:
         pair, k, distance, direction, points = (np.array(column) for column in columns)
         pair, k = pair.astype(np.intp), k.astype(np.intp)
         frames = np.array(self._frames, np.intp)[pairs[pair]]
+        joints = self.joints_of(pairs[pair])
         normal = np.einsum("cij,cj->ci", self._rotations[frames[:, 0], ..., k], direction.reshape(-1, 3))
-        joints = np.where(frames < len(self._rotations) - len(self._solids), frames, 0)
         return Contacts(pair, k, distance, normal, points.reshape(-1, 2, 3), joints)
+
+    def joints_of(self, bodies: Pairs) -> NDArray[np.intp]:
+        """Return the indices of the joints that move bodies; 0 for fixed bodies."""
+        moved = np.where(np.arange(len(self._frames)) < len(self._balls), self._frames, 0)
+        return np.asarray(moved[bodies], np.intp)
 
     def extent(self, joint: int) -> float:
         """Return the largest distance of a point that is fixed to a joint's frame from its origin [m]."""

@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from cnpgen.kernels.collision.collision_checker import load_collision_library
+from cnpgen.kernels.library import KernelLibrary, choose_backend
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.refine import strategy
@@ -20,11 +22,18 @@ from tests.examples.shaped_robot import KINDS, OBSTACLES, write_problem
 STEP = 1e-6  # rad, of finite differences
 
 
+@pytest.fixture(params=["coal", pytest.param("compiled", marks=needs_compiler)])
+def library(request):
+    if request.param == "coal":
+        return None
+    return load_collision_library(KernelLibrary(*choose_backend("compiled"), "", {}))
+
+
 @pytest.mark.parametrize("obstacles", [KINDS, OBSTACLES], ids=["kinds", "boxes"])
-def test_gradients_are_those_of_finite_differences(tmp_path, obstacles):
+def test_gradients_are_those_of_finite_differences(tmp_path, obstacles, library):
     problem = load_problem(write_problem(tmp_path, obstacles=obstacles))
     robot = load_robot(problem)
-    hulls, obstacle_poses = Hulls(problem, robot), place_obstacles(problem.obstacle)
+    hulls, obstacle_poses = Hulls(problem, robot, library), place_obstacles(problem.obstacle)
     q = np.random.default_rng(0).uniform(robot.position_lower, robot.position_upper, (40, robot.n)).T.copy()
     distances, contacts = hulls.measure(q, obstacle_poses)
     gradients = hulls.gradients(q, distances, contacts)
@@ -38,10 +47,10 @@ def test_gradients_are_those_of_finite_differences(tmp_path, obstacles):
     assert compared > 150
 
 
-def test_distances_agree_with_meshes(tmp_path):
+def test_distances_agree_with_meshes(tmp_path, library):
     problem = load_problem(write_problem(tmp_path))
     robot = load_robot(problem)
-    hulls, meshes = Hulls(problem, robot), Meshes(problem, robot, tmp_path)
+    hulls, meshes = Hulls(problem, robot, library), Meshes(problem, robot, tmp_path)
     q = np.random.default_rng(1).uniform(robot.position_lower, robot.position_upper, (400, robot.n))
     obstacle_poses = place_obstacles(problem.obstacle)
     expected = np.array([min(meshes.distances(state)) for state in q])
@@ -54,11 +63,11 @@ def test_distances_agree_with_meshes(tmp_path):
     assert hulls.max_penetration(q.T.copy(), obstacle_poses) == -found.min()
 
 
-def test_distances_of_positions_that_are_not_finite_are_nan(tmp_path):
+def test_distances_of_positions_that_are_not_finite_are_nan(tmp_path, library):
     problem = load_problem(write_problem(tmp_path))
     robot = load_robot(problem)
     q = np.where(np.arange(3) == 1, np.nan, 0.0) + np.zeros((robot.n, 1))
-    assert np.isnan(Hulls(problem, robot).measure(q, place_obstacles(problem.obstacle))[0]).all()
+    assert np.isnan(Hulls(problem, robot, library).measure(q, place_obstacles(problem.obstacle))[0]).all()
 
 
 @pytest.mark.slow

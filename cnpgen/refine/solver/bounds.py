@@ -14,6 +14,7 @@ from cnpgen.problems.constraints.object_clearance import ObjectClearance
 from cnpgen.problems.constraints.self_clearance import SelfClearance
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.solver.residuals import DISTANCE_SCALE_M, residual_scale
+from cnpgen.robots.solid import place_obstacles
 
 if TYPE_CHECKING:
     from cnpgen.world.world import World
@@ -26,6 +27,9 @@ UNKNOWN_TOLERANCE = 1e9  # in scaled units, of conditions that only the verdict 
 PHASE_FACTOR = 1.03  # time-varying bounds close earlier by this factor: motions overshoot where they level out
 PRECISE_FRACTION = 0.1  # of the tolerance of an equality: the largest error of a precise plan
 INTERVAL_FRACTION = 0.9  # of the tolerance between grid points: the interpolation has an error
+
+
+_ORDERS: dict[str, list[int]] = {}  # structure of a problem -> result of ``condition_orders``
 
 
 @dataclass(frozen=True)
@@ -109,6 +113,22 @@ class Bounds:
         return Bounds(lower, upper, self.nonsmooth, self.interval_tolerance)
 
 
+def condition_orders(problem: Problem, world: "World") -> list[int]:
+    """Return the highest derivative of q on which each condition depends; the world is left at rest.
+
+    Problems that differ only in poses and sizes of obstacles share the result.
+    """
+    forms, structure = [constraint.solved for constraint in problem.constraint], problem.structure
+    rest = [np.zeros(world.robot.n)] * (3 if problem.uses_jerk else 2)
+    if structure is not None and structure in _ORDERS:
+        world.set_state(world.robot.base, rest[0], rest[1], place_obstacles(world.obstacles), *rest[2:])
+        return _ORDERS[structure]
+    orders = measured_needs(forms, world, jerk=problem.uses_jerk)
+    if structure is not None:
+        _ORDERS[structure] = orders
+    return orders
+
+
 class BoundsTemplate:
     """Bounds of the motions of a problem on one grid.
 
@@ -129,8 +149,7 @@ class BoundsTemplate:
     """
 
     def __init__(self, problem: Problem, world: "World", s: Array, tightening: Tightening) -> None:
-        solved_forms = [constraint.solved for constraint in problem.constraint]
-        orders = measured_needs(solved_forms, world, jerk=problem.uses_jerk)  # leaves the world at rest
+        orders = condition_orders(problem, world)
         pairs = [(constraint, condition) for constraint in problem.constraint for condition in constraint.solved(world)]
         tables, untightened = (
             [_bounds(*pair, s, amount, order) for pair, order in zip(pairs, orders, strict=True)]
@@ -170,14 +189,16 @@ class BoundsTemplate:
         bounds = self._without_ends(start_tip)
         return bounds if ends is None else self._relaxed_at_ends(bounds, ends)
 
-    def with_hull_distances(self, bounds: Bounds, min_distances: Array) -> Bounds:
+    def with_hull_distances(self, bounds: Bounds, min_distances: Array, extra: Array | None = None) -> Bounds:
         """Return bounds without those of capsules and with further columns for the distances of hulls.
 
         Args:
             bounds: Bounds of one motion.
             min_distances: Required distances [m], shape (columns,).
+            extra: Additional distances [m], shape (K, columns), or None.
         """
-        lower = (min_distances + _added_clearance(self._s, self._tightening)[:, None]) / DISTANCE_SCALE_M
+        added = _added_clearance(self._s, self._tightening)[:, None]
+        lower = (min_distances + (added if extra is None else added + extra)) / DISTANCE_SCALE_M
         lower[self._s == 1] = -np.inf
         free = np.where(self.capsules, np.inf, 0.0)
         return Bounds(

@@ -108,11 +108,12 @@ class CompiledBackend:
         self._points, self._m, self._nx = len(motion.grid.s), motion.kernels.values.tape.outputs[0], motion.nx
         self._motion = self._describe(motion, bounds, thinning)
         self._address = ctypes.addressof(self._motion)
-        self._fallback = NumpyBackend(motion, bounds, thinning)
+        self._fallback, self._activate = NumpyBackend(motion, bounds, thinning), motion.activate
 
     def value(self, x: Array) -> tuple[float, Array, float]:
         """Evaluate a motion; see ``Backend``."""
         g = np.empty((self._m, self._points))
+        self._activate()
         cost = self._evaluate(self._address, address_of(x), address_of(g))
         return cost, g.T, self._motion.violation
 
@@ -125,6 +126,7 @@ class CompiledBackend:
         before = None if selection.multipliers is None else np.ascontiguousarray(selection.multipliers.T)
         addresses = address_of(missed), None if before is None else address_of(before), address_of(selected)
         self._motion.violation = selection.violation
+        self._activate()
         self._build(
             self._address,
             address_of(x),

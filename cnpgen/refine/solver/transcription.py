@@ -98,6 +98,9 @@ class Transcription:
         self._cost_residuals = cache_last(self._evaluate_cost_residuals)
         self._boundary_derivatives = cache_last(lambda rate: boundary_derivatives(boundary, rate[None], spec))
 
+    def activate(self) -> None:
+        """Prepare kernels whose machine code has a context; the step library calls them afterwards."""
+
     def unpack(self, x: Array) -> tuple[Array, Array]:
         """Return path control points (C, n) and rate control points (R,) of the variables."""
         rate = np.exp(x[self.split :])

@@ -1,0 +1,340 @@
+"""Collision checks and plans among obstacles: states/s against Coal, and the CPU time of solving new scenes.
+
+The scenes are generated: tables, shelves, cages, boxes and desks with a Panda (3 kg at the hand) or a UR5. Every scene
+is solved once, in one process and thread, from a new problem: the set-up of the scene is part of its time. Kernels of
+every family are compiled before, since they depend on the kinds and the number of obstacles only.
+"""
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.kernels.collision.collision_checker import CollisionChecker, load_collision_library
+from cnpgen.kernels.library import KernelLibrary, choose_backend
+from cnpgen.plans.boundary_problems import plans_of_rows
+from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.problem import Problem
+from cnpgen.problems.problem_file import load_problem
+from cnpgen.problems.problem_record import record_problem
+from cnpgen.refine.options import DEFAULT_OPTIONS
+from cnpgen.refine.refine_engine import refine_serially
+from cnpgen.robots.obstacle import Obstacle
+from cnpgen.robots.robot import Robot
+from cnpgen.robots.solid import place_obstacles
+
+Array = NDArray[np.float64]
+Random = np.random.Generator
+Box = tuple[tuple[float, float, float], tuple[float, float, float]]  # lowest and highest corner [m]
+
+SAMPLES, MAX_BATCHES = 20_000, 40  # random states per batch of the search of ends
+MIN_END_CLEARANCE_M = 1e-3
+TORQUE_FRACTION = 0.95  # of the limits, at rest at both ends
+PROBLEM = """
+name = "scenes"
+[robot]
+{robot}
+geometry = "urdf"
+[limits]
+{limits}
+{payload}
+[trajectory]
+degree = 7
+path_control_points = 15
+rate_control_points = 20
+[[constraint]]
+use = "joint-position"
+tolerance = "1e-3 rad"
+[[constraint]]
+use = "joint-velocity"
+tolerance = "0.2 %"
+[[constraint]]
+use = "joint-acceleration"
+tolerance = "0.5 %"
+[[constraint]]
+use = "joint-torque"
+tolerance = "0.5 %"
+[[constraint]]
+use = "robot-clearance"
+tolerance = "0 mm"
+[[constraint]]
+use = "self-clearance"
+tolerance = "0 mm"
+"""
+ROBOTS = {
+    "panda": PROBLEM.format(
+        robot="""urdf = "package://example-robot-data/robots/panda_description/urdf/panda.urdf"
+joints = [
+  "panda_joint1", "panda_joint2", "panda_joint3", "panda_joint4", "panda_joint5", "panda_joint6", "panda_joint7",
+]
+tip = "panda_hand_tcp"
+base = "[0, -45, 0, -135, 0, 90, 45] deg"
+""",
+        limits="""velocity = [2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61]
+acceleration = [15, 7.5, 10, 12.5, 15, 20, 20]
+torque = [87, 87, 87, 87, 12, 12, 12]
+""",
+        payload='[payload]\nmass = "3 kg"\nsize = "[8, 8, 8] cm"',
+    ),
+    "ur5": PROBLEM.format(
+        robot="""urdf = "package://example-robot-data/robots/ur_description/urdf/ur5_joint_limited_robot.urdf"
+joints = ["shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint", "wrist_1_joint", "wrist_2_joint", "wrist_3_joint"]
+tip = "tool0"
+base = "[0, -90, 90, -90, -90, 0] deg"
+""",
+        limits='acceleration_rate = "10 1/s"\nacceleration_cap = "20 rad/s^2"',
+        payload='[payload]\nmass = "3 kg"\nsize = "[8, 8, 8] cm"',
+    ),
+}
+
+
+@dataclass(frozen=True)
+class GeneratedScene:
+    """Obstacles, and the boxes in which the tip starts and ends [m]."""
+
+    obstacles: tuple[Obstacle, ...]
+    regions: tuple[Box, ...]
+
+
+def box(name: str, position: Any, size: Any, yaw: float = 0.0) -> Obstacle:
+    """Return a box with a pose."""
+    return Obstacle(name=name, position=tuple(map(float, position)), size=tuple(size), rotation=(0.0, 0.0, yaw))
+
+
+def cylinder(name: str, position: Any, radius: float, length: float, roll: float = 0.0) -> Obstacle:
+    """Return a cylinder that is upright or turned about x."""
+    return Obstacle(
+        name=name,
+        kind="cylinder",
+        position=tuple(map(float, position)),
+        radius=radius,
+        length=length,
+        rotation=(roll, 0.0, 0.0),
+    )
+
+
+def table_scene(random: Random) -> GeneratedScene:
+    """Return a table with five boxes and four cylinders."""
+    top, obstacles = random.uniform(-0.05, 0.2), list[Obstacle]()
+    obstacles.append(box("table", (0.6, 0.0, top - 0.02), (0.7, 1.4, 0.04)))
+    for index in range(9):
+        x, y, height = random.uniform(0.4, 0.8), random.uniform(-0.55, 0.55), random.uniform(0.1, 0.4)
+        if index < 5:
+            size = (random.uniform(0.04, 0.15), random.uniform(0.04, 0.15), height)
+            obstacles.append(box(f"box {index}", (x, y, top + height / 2), size, random.uniform(-3.1, 3.1)))
+        else:
+            radius = random.uniform(0.03, 0.07)
+            obstacles.append(cylinder(f"can {index}", (x, y, top + height / 2), radius, height))
+    region = ((0.35, -0.55, top + 0.05), (0.75, 0.55, top + 0.3))
+    return GeneratedScene(tuple(obstacles), (region,))
+
+
+def shelf_scene(random: Random) -> GeneratedScene:
+    """Return a shelf of four boards with six cylinders on them."""
+    x, width, depth = random.uniform(0.6, 0.75), random.uniform(0.7, 1.0), random.uniform(0.25, 0.4)
+    bottom, gap = random.uniform(0.0, 0.15), random.uniform(0.28, 0.4)
+    midpoint = bottom + 1.5 * gap
+    obstacles = [box(f"board {i}", (x, 0.0, bottom + i * gap), (depth, width, 0.02), 1e-9) for i in range(4)]
+    for side in (-1, 0, 1):
+        obstacles.append(box(f"side {side}", (x, side * width / 2, midpoint), (depth, 0.02, 3 * gap + 0.02), 1e-9))
+    obstacles.append(box("back", (x + depth / 2, 0.0, midpoint), (0.02, width, 3 * gap), 1e-9))
+    for index in range(6):
+        y, height = random.uniform(-0.45, 0.45) * width, random.uniform(0.08, 0.15)
+        z = bottom + 0.015 + height / 2 + random.integers(3) * gap
+        obstacles.append(cylinder(f"can {index}", (x + random.uniform(-0.3, 0.3) * depth, y, z), 0.03, height))
+    regions = tuple(
+        ((x - depth / 2, sign * 0.25 * width - 0.2 * width, bottom + i * gap + 0.05),
+         (x, sign * 0.25 * width + 0.2 * width, bottom + (i + 1) * gap - 0.05))
+        for i in range(3)
+        for sign in (-1, 1)
+    )  # fmt: skip
+    return GeneratedScene(tuple(obstacles), regions)
+
+
+def cage_scene(random: Random) -> GeneratedScene:
+    """Return a cage of ten bars around the arm, two bars above it, and a table."""
+    radius, obstacles = random.uniform(0.45, 0.6), [box("table", (0.0, 0.0, -0.15), (1.8, 1.8, 0.1), 1e-9)]
+    angles = np.linspace(-2.2, 2.2, 10) + random.uniform(-0.08, 0.08, 10)
+    for index, angle in enumerate(angles):
+        place = (radius * np.cos(angle), radius * np.sin(angle), 0.5)
+        obstacles.append(cylinder(f"bar {index}", place, random.uniform(0.012, 0.02), 1.2))
+    for index, x in enumerate((0.25, 0.5)):
+        obstacles.append(cylinder(f"top {index}", (x, 0.0, random.uniform(0.8, 1.0)), 0.02, 1.4, np.pi / 2))
+    regions = tuple(
+        ((c * 0.65 - 0.12, s * 0.65 - 0.12, 0.15), (c * 0.65 + 0.12, s * 0.65 + 0.12, 0.6))
+        for c, s in zip(np.cos(angles[2:8]), np.sin(angles[2:8]), strict=True)
+    )
+    return GeneratedScene(tuple(obstacles), regions)
+
+
+def boxes_scene(random: Random) -> GeneratedScene:
+    """Return two open boxes beside each other, with a post between them."""
+    obstacles, regions = list[Obstacle](), list[Box]()
+    for index, side in enumerate((-1, 1)):
+        x, y, z = random.uniform(0.45, 0.6), side * random.uniform(0.27, 0.4), random.uniform(0.0, 0.2)
+        size, height = random.uniform(0.3, 0.42), random.uniform(0.15, 0.3)
+        yaw = random.uniform(-0.4, 0.4)
+        turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+        obstacles.append(box(f"floor {index}", (x, y, z), (size, size, 0.02), yaw))
+        for wall, (dx, dy) in enumerate([(1, 0), (-1, 0), (0, 1), (0, -1)]):
+            place = np.array([x, y]) + turn @ np.array([dx, dy]) * size / 2
+            sides = (0.02, size, height) if dx else (size, 0.02, height)
+            obstacles.append(box(f"wall {index} {wall}", (*place, z + height / 2), sides, yaw))
+        regions.append(((x - 0.12, y - 0.12, z + 0.04), (x + 0.12, y + 0.12, z + 0.6 * height)))
+    height = random.uniform(0.5, 0.9)
+    obstacles.append(cylinder("post", (random.uniform(0.4, 0.6), 0.0, height / 2), 0.04, height))
+    return GeneratedScene(tuple(obstacles), tuple(regions))
+
+
+def desk_scene(random: Random) -> GeneratedScene:
+    """Return a desk with four legs and a lower board; the arm moves between its top and below."""
+    top, x = random.uniform(0.35, 0.5), random.uniform(0.6, 0.7)
+    obstacles = [
+        box("top", (x, 0.0, top), (0.5, 1.0, 0.03), 1e-9),
+        box("board", (x, 0.0, top - random.uniform(0.42, 0.5)), (0.5, 1.0, 0.03), 1e-9),
+        box("monitor", (x + 0.1, random.uniform(-0.3, 0.3), top + 0.2), (0.05, 0.4, 0.35), random.uniform(-0.5, 0.5)),
+    ]
+    for index, (dx, dy) in enumerate([(0.22, 0.47), (0.22, -0.47), (-0.22, 0.47), (-0.22, -0.47)]):
+        obstacles.append(cylinder(f"leg {index}", (x + dx, dy, top / 2), 0.025, top))
+    above = ((x - 0.2, -0.4, top + 0.05), (x + 0.1, 0.4, top + 0.3))
+    below = ((x - 0.2, -0.35, top - 0.3), (x + 0.05, 0.35, top - 0.05))
+    return GeneratedScene(tuple(obstacles), (above, below))
+
+
+FAMILIES: dict[str, Callable[[Random], GeneratedScene]] = {
+    "table": table_scene,
+    "shelf": shelf_scene,
+    "cage": cage_scene,
+    "boxes": boxes_scene,
+    "desk": desk_scene,
+}
+
+
+class EndSampler:
+    """Random ends of motions: free of collisions, with feasible torques at rest, and the tip in a region."""
+
+    def __init__(self, robot: Robot, checker: CollisionChecker) -> None:
+        self.robot, self.checker = robot, checker
+
+    def ends(self, scene: GeneratedScene, random: Random, *, line_may_be_free: bool) -> tuple[Array, Array] | None:
+        """Return start and goal in different regions, or None if there are none in ``MAX_BATCHES`` batches."""
+        self.checker.place(scene.obstacles, place_obstacles(scene.obstacles))
+        found: list[list[Array]] = [[] for _ in scene.regions]
+        robot = self.robot
+        for _ in range(MAX_BATCHES):
+            q = random.uniform(robot.position_lower, robot.position_upper, (SAMPLES, robot.n))
+            poses = self.checker.joint_poses(q.T)[:, -1]
+            tip = poses[:, :9].reshape(-1, 3, 3) @ robot.chain.tip_translation + poses[:, 9:]
+            for region, states in zip(scene.regions, found, strict=True):
+                inside = q[((tip > region[0]) & (tip < region[1])).all(axis=1)]
+                if len(inside):
+                    clear = self.checker.clear_states(
+                        inside.T, obstacle_distance=MIN_END_CLEARANCE_M, self_distance=MIN_END_CLEARANCE_M
+                    )
+                    states.extend(state for state in inside[clear] if self.holds(state))
+            usable = [states for states in found if len(states) >= (3 if len(found) > 1 else 6)]
+            if len(usable) >= min(2, len(found)):
+                for _ in range(20):
+                    a, b = random.choice(len(usable), 2, replace=False) if len(usable) > 1 else (0, 0)
+                    start, goal = (usable[i][random.integers(len(usable[i]))] for i in (a, b))
+                    if np.abs(start - goal).max() < 0.2:
+                        continue
+                    if line_may_be_free or not self.line_is_free(start, goal):
+                        return start, goal
+        return None
+
+    def holds(self, q: Array) -> bool:
+        """Return whether the torques at rest are within a fraction of the limits."""
+        import pinocchio as pin
+
+        tau = pin.computeGeneralizedGravity(self.robot.model, self.robot.model.createData(), q)
+        return bool((np.abs(tau) <= TORQUE_FRACTION * self.robot.torque_limit).all())
+
+    def line_is_free(self, start: Array, goal: Array) -> bool:
+        """Return whether the straight line between two configurations is free of collisions."""
+        count = int(np.ceil(np.abs(goal - start).max() / 0.02)) + 1
+        return bool(
+            self.checker.clear_states(start[:, None] + (goal - start)[:, None] * np.linspace(0, 1, count)).all()
+        )
+
+
+def generate(
+    base: Problem, sampler: EndSampler, family: str, count: int, seed: int
+) -> Iterator[tuple[Problem, Array, Array]]:
+    """Yield problems of a family with start and goal; every fifth may have a free straight line."""
+    made, number = 0, 0
+    while made < count:
+        random = np.random.default_rng([seed, list(FAMILIES).index(family), number])
+        number += 1
+        scene = FAMILIES[family](random)
+        ends = sampler.ends(scene, random, line_may_be_free=made % 5 == 4)
+        if ends is not None:
+            made += 1
+            yield base.with_obstacles(scene.obstacles), *ends
+
+
+def boundary_columns(start: Array, goal: Array) -> dict[str, Array]:
+    """Return the columns of a motion from rest to rest."""
+    rest = np.zeros((1, len(start)))
+    columns = {"start_q": start[None], "start_dq": rest, "start_ddq": rest, "goal_q": goal[None], "goal_dq": rest}
+    return columns | {"start_xyz": np.zeros((1, 3)), "goal_xyz": np.zeros((1, 3))}
+
+
+def solve_scene(problem: Problem, start: Array, goal: Array) -> dict[str, Any]:
+    """Solve a new scene; return CPU time [s], validity, motion time [s] and the outcome."""
+    begun = time.process_time()
+    plans = plans_of_rows(record_problem(problem), boundary_columns(start, goal))
+    (attempt,) = refine_serially(plans, DEFAULT_OPTIONS)
+    cpu = time.process_time() - begun
+    return {
+        "cpu": cpu,
+        "valid": attempt.valid,
+        "duration": attempt.cost,
+        "outcome": attempt.outcome.name,
+        "reason": str(attempt.reason),
+        "iterations": attempt.iterations,
+    }
+
+
+if __name__ == "__main__":
+    import sys
+
+    np.seterr(all="ignore")
+    folder = Path(__import__("tempfile").mkdtemp())
+    name, fams, count, seed = sys.argv[1], sys.argv[2].split(","), int(sys.argv[3]), int(sys.argv[4])
+    (folder / "problem.toml").write_text(ROBOTS[name])
+    base = load_problem(folder / "problem.toml")
+    robot = load_robot(base)
+    b, f = choose_backend(None)
+    lib = load_collision_library(KernelLibrary(b, f, "", {}))
+    sampler = EndSampler(robot, CollisionChecker(lib, robot))
+    for fam in fams:
+        R = []
+        for problem, s, g in generate(base, sampler, fam, count, seed):
+            t0 = time.time()
+            r = solve_scene(problem, s, g)
+            R.append(r)
+            if not r["valid"] or r["cpu"] > 0.5:
+                print(fam, len(R) - 1, r, f"{time.time() - t0:.2f}", flush=True)
+        cpu = np.array([r["cpu"] for r in R])
+        from collections import Counter
+
+        print(
+            fam,
+            len(problem.obstacle),
+            "valid",
+            sum(r["valid"] for r in R),
+            len(R),
+            "cpu med/p95/max",
+            np.median(cpu),
+            np.percentile(cpu, 95),
+            cpu.max(),
+            "dur",
+            np.nanmean([r["duration"] for r in R]),
+            Counter(r["outcome"] for r in R),
+            flush=True,
+        )

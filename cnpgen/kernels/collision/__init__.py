@@ -1,0 +1,1 @@
+"""Compiled collision checks of robots among obstacles; both are arrays, so one library serves all of them."""

@@ -1,0 +1,201 @@
+"""Collision checks and distances of a robot among obstacles in compiled code, over batches of states.
+
+Judges do not use it: verdicts measure with Coal.
+"""
+
+import ctypes
+from collections.abc import Sequence
+from ctypes import c_double, c_int, c_long, c_void_p
+from itertools import product
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.kernels.collision.body_arrays import BODY, hull_vertices, obstacle_bodies
+from cnpgen.kernels.compiled_kernel import address_of
+from cnpgen.kernels.library import KernelLibrary
+from cnpgen.robots.obstacle import Obstacle
+
+if TYPE_CHECKING:
+    from cnpgen.robots.robot import Robot
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+SOURCES = [Path(__file__).with_name(name) for name in ("convex.c", "collision.c", "tree_search.c", "hull_rows.c")]
+MAX_JOINTS = 56  # of the arrays in collision.c
+MIN_CONTACT_CAPACITY = 1024  # of the first call; a second one follows where it is too small
+CAPSULE = np.dtype([("frame", np.int64), ("first", np.float64, 3), ("second", np.float64, 3), ("radius", np.float64)])
+
+
+class _RobotScene(ctypes.Structure):
+    """``robot_scene`` of collision.c."""
+
+    _fields_ = (
+        *((name, c_long) for name in ("n", "n_parts", "n_links", "n_link_pairs", "n_obstacles", "lanes")),
+        *((name, c_void_p) for name in ("place", "axis", "sliding", "parts", "links", "first_part", "part_of_link")),
+        *((name, c_void_p) for name in ("link_pairs", "first_pair", "pairs", "moving", "moving_frames")),
+        *((name, c_void_p) for name in ("obstacles", "boxes", "vertices")),
+    )
+
+
+class CloseBodies(NamedTuple):
+    """C pairs of bodies that are close to each other at a state.
+
+    Attributes:
+        pair: Indices of the pairs, shape (C,).
+        k: Indices of the states, shape (C,).
+        distance: Signed distances [m], shape (C,).
+        normal: Unit vectors from the first body to the second in the world frame, shape (C, 3).
+        points: Closest points of both bodies without their radii, in the world frame [m], shape (C, 2, 3).
+    """
+
+    pair: Indices
+    k: Indices
+    distance: Array
+    normal: Array
+    points: Array
+
+
+def load_collision_library(kernels: KernelLibrary) -> ctypes.CDLL | None:
+    """Return the library of collision checks, the same for all robots; None where kernels are not compiled."""
+    library = kernels.load_source(*SOURCES)
+    if library is not None:
+        library.clear_states.restype = library.joint_poses.restype = None
+        library.clear_states.argtypes = (c_void_p, c_void_p, c_long, c_double, c_double, c_void_p)
+        library.find_contacts.restype = c_long
+        library.find_contacts.argtypes = (c_void_p, c_void_p, c_long, c_double, c_int, c_long, *(c_void_p,) * 5)
+        library.joint_poses.argtypes = (c_void_p, c_void_p, c_long, c_void_p)
+    return library
+
+
+class CollisionChecker:
+    """A robot with link geometry among obstacles, in compiled code.
+
+    Args:
+        library: Library of ``load_collision_library``.
+        robot: The robot, with link geometry and at most ``MAX_JOINTS`` planned joints.
+
+    Attributes:
+        link_pairs: Pairs of convex parts of links that must not touch, the one nearer to the base first, shape (M, 2).
+    """
+
+    def __init__(self, library: ctypes.CDLL, robot: "Robot") -> None:
+        assert robot.shape is not None
+        self.library, self._n, self._arrays = library, robot.n, dict[str, Any]()
+        self._scene = _RobotScene()
+        shape, links = robot.shape, {capsule.link: i for i, capsule in enumerate(robot.shape.capsules)}
+        chain = [np.append(joint.rotation.ravel(), joint.translation) for joint in robot.chain.joints]
+        self._set("place", np.array(chain, np.float64))
+        self._set("axis", np.array([joint.axis for joint in robot.chain.joints], np.float64))
+        self._set("sliding", np.array(robot.sliding, np.int64))
+        parts, blocks, first = np.zeros(len(shape.convex_parts), BODY), list[Array](), 0
+        for body, part in zip(parts, shape.convex_parts, strict=True):
+            blocks.append(hull_vertices(part.vertices))
+            body["count"], body["first"], body["radius"] = len(blocks[-1]) // 3, first, part.radius
+            body["frame"], body["link"] = shape.joints[part.link], links[part.link]
+            first += len(blocks[-1])
+        self._vertices = np.concatenate(blocks)
+        self._set("parts", parts)
+        capsules = np.array([(shape.joints[c.link], c.first, c.second, c.radius) for c in shape.capsules], CAPSULE)
+        self._set("links", capsules)
+        of_link = [np.flatnonzero(parts["link"] == link) for link in range(len(capsules))]
+        self._set("first_part", np.append(0, np.cumsum([len(each) for each in of_link])))
+        self._set("part_of_link", np.concatenate(of_link))
+        kept = [(links[pair.first], links[pair.second]) for pair in shape.pairs if not pair.left_out]
+        pairs = [
+            [sorted(both, key=parts["frame"].__getitem__) for both in product(of_link[a], of_link[b])] for a, b in kept
+        ]
+        self._set("link_pairs", np.array(kept, np.int64).reshape(-1, 2))
+        self._set("first_pair", np.append(0, np.cumsum([len(each) for each in pairs])))
+        self.link_pairs = np.array([both for each in pairs for both in each], np.int64).reshape(-1, 2)
+        self._set("pairs", self.link_pairs)
+        self._set("moving", np.cumsum(parts["frame"] > 0) - 1)
+        self._set("moving_frames", parts["frame"][parts["frame"] > 0])
+        for name, count in (
+            ("n", robot.n),
+            ("n_parts", len(parts)),
+            ("n_links", len(capsules)),
+            ("n_link_pairs", len(kept)),
+        ):
+            setattr(self._scene, name, count)
+        self.place([], np.empty(0))
+
+    def place(self, obstacles: Sequence[Obstacle], numbers: Array) -> None:
+        """Set the obstacles.
+
+        Args:
+            obstacles: The obstacles.
+            numbers: Their poses and sizes, shape (width,), see ``cnpgen.robots.solid``.
+        """
+        bodies, vertices, boxes = obstacle_bodies(obstacles, numbers, len(self._vertices))
+        self._set("obstacles", bodies)
+        self._set("boxes", boxes)
+        self._set("vertices", np.concatenate([self._vertices, vertices]))
+        self._scene.n_obstacles, self._scene.lanes = len(bodies), boxes.shape[1]
+
+    @property
+    def address(self) -> int:
+        """Address of the scene for functions in C; valid until the obstacles change."""
+        return ctypes.addressof(self._scene)
+
+    def clear_states(
+        self, q: Array, *, obstacle_distance: float | None = 0.0, self_distance: float | None = 0.0
+    ) -> NDArray[np.bool_]:
+        """Return a mask of the states with sufficient distances, shape (K,).
+
+        Args:
+            q: Joint positions [rad], shape (n, K).
+            obstacle_distance: Required distance of moving links from obstacles [m]; None for no check.
+            self_distance: Required distance of links from each other [m]; None for no check.
+        """
+        states = np.ascontiguousarray(q.T)
+        clear = np.empty(len(states), np.uint8)
+        limits = [-np.inf if limit is None else limit for limit in (obstacle_distance, self_distance)]
+        self.library.clear_states(self.address, address_of(states), len(states), *limits, address_of(clear))
+        return clear.astype(bool)
+
+    def close_bodies(self, q: Array, within: float, *, of_obstacles: bool) -> CloseBodies:
+        """Measure all pairs of bodies at states where their signed distance is below ``within``.
+
+        Args:
+            q: Joint positions [rad], shape (n, K).
+            within: Distance below which a pair is returned [m].
+            of_obstacles: Whether to measure pairs (obstacle, moving part), numbered part by part; else ``link_pairs``.
+        """
+        states, capacity = np.ascontiguousarray(q.T), MIN_CONTACT_CAPACITY
+        while True:
+            close = CloseBodies(
+                np.empty(capacity, np.int64),
+                np.empty(capacity, np.int64),
+                np.empty(capacity),
+                np.empty((capacity, 3)),
+                np.empty((capacity, 2, 3)),
+            )
+            count = self.library.find_contacts(
+                self.address, address_of(states), len(states), within, of_obstacles, capacity, *map(address_of, close)
+            )
+            if count <= capacity:
+                return CloseBodies(*(values[:count] for values in close))
+            capacity = count
+
+    def joint_poses(self, q: Array) -> Array:
+        """Compute the poses of the joints' frames, that of the base first: rotation by rows and position.
+
+        Args:
+            q: Joint positions [rad], shape (n, K).
+
+        Returns:
+            Shape (K, n + 1, 12).
+        """
+        states = np.ascontiguousarray(q.T)
+        poses = np.empty((len(states), self._n + 1, 12))
+        self.library.joint_poses(self.address, address_of(states), len(states), address_of(poses))
+        return poses
+
+    def _set(self, name: str, array: Any) -> None:
+        """Keep an array and store its address in the scene."""
+        self._arrays[name] = np.ascontiguousarray(array)
+        setattr(self._scene, name, address_of(self._arrays[name]) if self._arrays[name].size else None)

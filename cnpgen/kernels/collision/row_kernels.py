@@ -1,0 +1,129 @@
+"""Kernels that append distances of a robot's convex parts to the rows of another kernel, for ``hull_rows.c``."""
+
+import ctypes
+from ctypes import c_double, c_long, c_void_p
+from dataclasses import dataclass, replace
+from itertools import count
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.kernels.collision.collision_checker import CollisionChecker
+from cnpgen.kernels.compiled_kernel import address_of
+from cnpgen.kernels.kernel import Kernel
+
+Array = NDArray[np.float64]
+
+MAX_CONTACTS_PER_STATE = 4096
+NUMBERS_PER_CONTACT = 12  # in hull_rows.c
+_GENERATIONS = count(1)
+
+
+class _RowContext(ctypes.Structure):
+    """``row_context`` of hull_rows.c."""
+
+    _fields_ = (
+        *((name, c_void_p) for name in ("values", "jacobian", "scene", "required", "obstacle_column", "pair_column")),
+        *((name, c_long) for name in ("rows", "columns", "width")),
+        *((name, c_double) for name in ("range", "scale", "obstacle_distance", "self_distance")),
+        *((name, c_long) for name in ("capacity", "generation")),
+        ("scratch", c_void_p),
+    )
+
+
+@dataclass(frozen=True)
+class DistanceColumns:
+    """Rows of distances.
+
+    Attributes:
+        required: Required distance of every row [m], shape (m,).
+        of_obstacles: Row of every pair (obstacle, moving part), part by part.
+        of_links: Row of every pair of ``CollisionChecker.link_pairs``.
+        obstacle_distance: Largest required distance from obstacles [m], None without such rows.
+        self_distance: Largest required distance of links from each other [m], None without such rows.
+        range: Distance above the required one at which measured values end [m].
+        scale: Distance of a residual of 1 [m].
+    """
+
+    required: Array
+    of_obstacles: NDArray[np.int64]
+    of_links: NDArray[np.int64]
+    obstacle_distance: float | None
+    self_distance: float | None
+    range: float
+    scale: float
+
+
+class RowKernels:
+    """The kernels ``(w, poses) -> g`` and ``-> (g, dg/dw)`` of a problem, with rows of distances.
+
+    Args:
+        values: Compiled kernel of the other rows; w begins with the joint positions.
+        jacobian: Compiled kernel of the other rows and their derivatives, column by column.
+        checker: Collision checks with the obstacles in place.
+        columns: The rows of distances.
+
+    Attributes:
+        values: Kernel of all rows.
+        jacobian: Kernel of all rows and their derivatives.
+    """
+
+    def __init__(self, values: Kernel, jacobian: Kernel, checker: CollisionChecker, columns: DistanceColumns) -> None:
+        rows, m = values.tape.outputs[0], len(columns.required)
+        width = values.tape.inputs[0]
+        limits = [-np.inf if x is None else x for x in (columns.obstacle_distance, columns.self_distance)]
+        numbers = NUMBERS_PER_CONTACT * MAX_CONTACTS_PER_STATE + m * (1 + width)
+        arrays = (columns.required, columns.of_obstacles, columns.of_links, np.empty(numbers))
+        self._keep: tuple[Any, ...] = (values, jacobian, checker, *arrays)
+        required, of_obstacles, of_links, scratch = map(address_of, arrays)
+        self._context = _RowContext(
+            values.address,
+            jacobian.address,
+            checker.address,
+            required,
+            of_obstacles,
+            of_links,
+            rows,
+            m,
+            width,
+            columns.range,
+            columns.scale,
+            *limits,
+            MAX_CONTACTS_PER_STATE,
+            next(_GENERATIONS),
+            scratch,
+        )
+        self._library = checker.library
+        self._library.set_row_context.argtypes, self._library.set_row_context.restype = (c_void_p,), None
+        self.values = _RowKernel(self, values, "row_values", (rows + m,))
+        self.jacobian = _RowKernel(self, jacobian, "row_jacobian", (rows + m, (rows + m) * width))
+
+    def activate(self) -> None:
+        """Make these kernels those of the thread: their machine code has one context per thread."""
+        self._library.set_row_context(ctypes.addressof(self._context))
+
+
+class _RowKernel(Kernel):
+    """Kernel of hull_rows.c; see ``Kernel``."""
+
+    def __init__(self, kernels: RowKernels, inner: Kernel, name: str, outputs: tuple[int, ...]) -> None:
+        super().__init__(replace(inner.tape, outputs=outputs))
+        self._kernels, self._function = kernels, getattr(kernels._library, name)
+        self._function.restype = None
+
+    @property
+    def address(self) -> int | None:
+        """Address of the machine code; see ``Kernel``."""
+        return ctypes.cast(self._function, c_void_p).value
+
+    def __call__(self, *arguments: Array) -> list[Array]:
+        """Evaluate the batch; see ``Kernel``."""
+        self._kernels.activate()
+        n = arguments[0].shape[-1]
+        arguments = tuple(np.ascontiguousarray(argument) for argument in arguments)
+        results = [np.empty((width, n)) for width in self.tape.outputs]
+        strides = (c_long * len(arguments))(*([n] * len(arguments)))
+        pointers = [(c_void_p * len(arrays))(*map(address_of, arrays)) for arrays in (arguments, results)]
+        self._function(c_long(n), pointers[0], strides, pointers[1])
+        return results

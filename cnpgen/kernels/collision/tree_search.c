@@ -1,0 +1,195 @@
+/* Joint-space paths among obstacles by RRT-Connect (Kuffner and LaValle 2000); collision.c precedes this file.
+
+Edges are checked as a whole, in bisection order, so that collisions show early. The required distances grow by a margin away
+from both ends, where the clearance may be smaller. Paths are shortened by straight lines between random points if that reduces
+their estimated duration. */
+
+typedef struct {
+  const robot_scene *scene;
+  const double *start, *goal, *lower, *upper, *velocity; /* ends, ranges of random configurations, velocity limits */
+  double obstacle_distance, self_distance, margin, ramp; /* the margin is complete at a distance `ramp` from the ends */
+  double spacing, extension, corner_time;                /* of states; largest of a tree; time that a corner costs [s] */
+  long max_extensions, shortcuts;
+  unsigned long long seed;
+} tree_settings;
+
+typedef struct {
+  long count, capacity, n;
+  double *q;
+  long *parent;
+} tree;
+
+typedef struct {
+  const tree_settings *s;
+  memory *m;
+  unsigned long long random;
+  double *q;
+} search;
+
+static double uniform(search *h) {
+  h->random ^= h->random << 13, h->random ^= h->random >> 7, h->random ^= h->random << 17;
+  return (h->random >> 11) * (1.0 / 9007199254740992.0);
+}
+
+static double largest_difference(const double *a, const double *b, long n) {
+  double largest = 0.0;
+  for (long j = 0; j < n; j++) largest = fmax(largest, fabs(a[j] - b[j]));
+  return largest;
+}
+
+static double squared_difference(const double *a, const double *b, long n) {
+  double sum = 0.0;
+  for (long j = 0; j < n; j++) sum += (a[j] - b[j]) * (a[j] - b[j]);
+  return sum;
+}
+
+static int state_is_clear(search *h, const double *q) {
+  const tree_settings *s = h->s;
+  long n = s->scene->n;
+  double away = fmin(largest_difference(q, s->start, n), largest_difference(q, s->goal, n));
+  double margin = s->ramp > 0 ? s->margin * fmin(1.0, away / s->ramp) : s->margin;
+  return is_clear(s->scene, h->m, q, s->obstacle_distance + margin, s->self_distance + margin);
+}
+
+/* Whether a straight line is clear, except for its first state and, if it is an end of the path, its last one. */
+static int line_is_clear(search *h, const double *a, const double *b, int check_last) {
+  long n = h->s->scene->n, count = (long)ceil(largest_difference(a, b, n) / h->s->spacing), step = 1;
+  if (check_last && !state_is_clear(h, b)) return 0;
+  while (2 * step < count) step *= 2;
+  for (long stride = step; stride >= 1; stride /= 2)
+    for (long k = stride; k < count; k += 2 * stride) {
+      for (long j = 0; j < n; j++) h->q[j] = a[j] + (b[j] - a[j]) * k / count;
+      if (!state_is_clear(h, h->q)) return 0;
+    }
+  return 1;
+}
+
+static long add_node(tree *t, const double *q, long parent) {
+  if (t->count == t->capacity) {
+    t->capacity *= 2;
+    t->q = realloc(t->q, t->capacity * t->n * sizeof(double));
+    t->parent = realloc(t->parent, t->capacity * sizeof(long));
+  }
+  memcpy(t->q + t->n * t->count, q, t->n * sizeof(double));
+  t->parent[t->count] = parent;
+  return t->count++;
+}
+
+static long nearest_node(const tree *t, const double *q) {
+  long nearest = 0;
+  double least = INFINITY;
+  for (long i = 0; i < t->count; i++) {
+    double distance = squared_difference(t->q + t->n * i, q, t->n);
+    if (distance < least) least = distance, nearest = i;
+  }
+  return nearest;
+}
+
+/* Extend a node towards a configuration; return the new node or -1. `reached`: whether it is the configuration. */
+static long extend(search *h, tree *t, long node, const double *target, double *fresh, int *reached) {
+  const double *from = t->q + t->n * node;
+  double distance = sqrt(squared_difference(from, target, t->n));
+  *reached = distance <= h->s->extension;
+  for (long j = 0; j < t->n; j++)
+    fresh[j] = *reached ? target[j] : from[j] + (target[j] - from[j]) * (h->s->extension / distance);
+  return line_is_clear(h, from, fresh, 1) ? add_node(t, fresh, node) : -1;
+}
+
+/* Write the path from the root of tree 0 over its node a and node b of tree 1 to its root; return its length. */
+static long join(const tree *trees, long a, long b, double *path, long max_points) {
+  long n = trees->n, count = 0, points = 0;
+  for (long i = a; i >= 0; i = trees[0].parent[i]) count++;
+  for (long i = b; i >= 0; i = trees[1].parent[i]) points++;
+  if (count + points > max_points) return 0;
+  long at_index = count;
+  for (long i = a; i >= 0; i = trees[0].parent[i]) memcpy(path + n * --at_index, trees[0].q + n * i, n * sizeof(double));
+  for (long i = trees[1].parent[b]; i >= 0; i = trees[1].parent[i]) memcpy(path + n * count++, trees[1].q + n * i, n * sizeof(double));
+  return count;
+}
+
+static double line_time(const tree_settings *s, const double *a, const double *b) {
+  double most = 0.0;
+  for (long j = 0; j < s->scene->n; j++) most = fmax(most, fabs(a[j] - b[j]) / s->velocity[j]);
+  return most;
+}
+
+/* Replace sections of a path by straight lines between random points on it; return its number of points. */
+static long shorten(search *h, double *path, long count, double *copy, long max_points) {
+  const tree_settings *s = h->s;
+  long n = s->scene->n;
+  double *ends = malloc(2 * n * sizeof(double));
+  for (long trial = 0; trial < s->shortcuts && count > 2 && count + 2 <= max_points; trial++) {
+    double whole = 0.0, along[2], section;
+    for (long i = 0; i + 1 < count; i++) whole += line_time(s, path + n * i, path + n * (i + 1));
+    along[0] = whole * uniform(h), along[1] = whole * uniform(h);
+    if (along[0] > along[1]) { double x = along[0]; along[0] = along[1], along[1] = x; }
+    long index[2];
+    for (int e = 0; e < 2; e++) {
+      long i = 0;
+      double passed = 0.0, length;
+      while ((length = line_time(s, path + n * i, path + n * (i + 1))), passed + length < along[e] && i + 2 < count) passed += length, i++;
+      double f = length > 0 ? fmin(1.0, (along[e] - passed) / length) : 0.0;
+      for (long j = 0; j < n; j++) ends[e * n + j] = path[n * i + j] + f * (path[n * (i + 1) + j] - path[n * i + j]);
+      index[e] = i;
+    }
+    if (index[0] == index[1]) continue;
+    section = along[1] - along[0] + (index[1] - index[0]) * s->corner_time;
+    double straight = line_time(s, ends, ends + n) + 2 * s->corner_time;
+    if (straight >= section || !line_is_clear(h, ends, ends + n, 1)) continue;
+    if (!state_is_clear(h, ends)) continue;
+    long kept = 0;
+    memcpy(copy, path, (index[0] + 1) * n * sizeof(double)), kept = index[0] + 1;
+    memcpy(copy + n * kept, ends, 2 * n * sizeof(double)), kept += 2;
+    memcpy(copy + n * kept, path + n * (index[1] + 1), (count - index[1] - 1) * n * sizeof(double));
+    count = kept + count - index[1] - 1;
+    memcpy(path, copy, count * n * sizeof(double));
+  }
+  for (long i = 1; i + 1 < count;) { /* remove points that are not needed */
+    double around = line_time(s, path + n * (i - 1), path + n * i) + line_time(s, path + n * i, path + n * (i + 1));
+    double straight = line_time(s, path + n * (i - 1), path + n * (i + 1));
+    if (straight < around + s->corner_time && line_is_clear(h, path + n * (i - 1), path + n * (i + 1), 0)) {
+      memmove(path + n * i, path + n * (i + 1), (count - i - 1) * n * sizeof(double));
+      count--;
+      i = i > 1 ? i - 1 : 1;
+    } else i++;
+  }
+  free(ends);
+  return count;
+}
+
+/* Search for a path from start to goal; return its number of points, at most max_points, or 0 if there is none. */
+long find_path(const tree_settings *s, double *path, long max_points) {
+  long n = s->scene->n, count = 0;
+  search h = {s, make_memory(s->scene), s->seed * 0x9E3779B97F4A7C15ull + 88172645463325252ull, malloc(n * sizeof(double))};
+  double *target = malloc(n * sizeof(double)), *fresh = malloc(n * sizeof(double));
+  tree trees[2];
+  for (int i = 0; i < 10; i++) uniform(&h);
+  for (int i = 0; i < 2; i++) {
+    trees[i] = (tree){0, 256, n, malloc(256 * n * sizeof(double)), malloc(256 * sizeof(long))};
+    add_node(trees + i, i ? s->goal : s->start, -1);
+  }
+  if (line_is_clear(&h, s->start, s->goal, 0)) {
+    memcpy(path, s->start, n * sizeof(double)), memcpy(path + n, s->goal, n * sizeof(double));
+    count = 2;
+  }
+  for (long trial = 0; trial < s->max_extensions && !count; trial++) {
+    int own = trees[0].count > trees[1].count, reached;
+    for (long j = 0; j < n; j++) target[j] = s->lower[j] + uniform(&h) * (s->upper[j] - s->lower[j]);
+    tree *near = trees + own, *other = trees + !own;
+    long node = extend(&h, near, nearest_node(near, target), target, fresh, &reached);
+    if (node < 0) continue;
+    memcpy(target, fresh, n * sizeof(double));
+    long far = nearest_node(other, target);
+    do far = extend(&h, other, far, target, fresh, &reached);
+    while (far >= 0 && !reached);
+    if (far >= 0) count = own ? join(trees, far, node, path, max_points) : join(trees, node, far, path, max_points);
+  }
+  if (count > 2) {
+    double *copy = malloc(max_points * n * sizeof(double));
+    count = shorten(&h, path, count, copy, max_points);
+    free(copy);
+  }
+  for (int i = 0; i < 2; i++) free(trees[i].q), free(trees[i].parent);
+  free(target), free(fresh), free(h.q), free_memory(h.m);
+  return count;
+}

@@ -1,0 +1,108 @@
+"""Joint-space paths among obstacles by RRT-Connect in compiled code (Kuffner and LaValle 2000)."""
+
+import ctypes
+from ctypes import c_double, c_long, c_ulonglong, c_void_p
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.kernels.collision.collision_checker import CollisionChecker
+from cnpgen.kernels.compiled_kernel import address_of
+
+Array = NDArray[np.float64]
+
+MAX_PATH_POINTS = 2000
+CORNER_TIME_S = 0.12  # of a corner of a path, added to the time at the velocity limits
+
+
+class _TreeSettings(ctypes.Structure):
+    """``tree_settings`` of tree_search.c."""
+
+    _fields_ = (
+        *((name, c_void_p) for name in ("scene", "start", "goal", "lower", "upper", "velocity")),
+        *((name, c_double) for name in ("obstacle_distance", "self_distance", "margin", "ramp")),
+        *((name, c_double) for name in ("spacing", "extension", "corner_time")),
+        *((name, c_long) for name in ("max_extensions", "shortcuts")),
+        ("seed", c_ulonglong),
+    )
+
+
+@dataclass(frozen=True)
+class TreeSettings:
+    """Settings of a search.
+
+    Attributes:
+        obstacle_distance: Required distance from obstacles [m]; None for no check.
+        self_distance: Required distance of links from each other [m]; None for no check.
+        margin: Additional distance away from both ends [m].
+        margin_ramp: Largest joint difference from an end below which the margin is smaller [rad or m].
+        spacing: Largest joint difference of neighboring checked states [rad or m].
+        extension: Largest length of an edge [rad or m].
+        max_extensions: Largest number of extensions of the trees.
+        shortcuts: Attempts to shorten a path.
+    """
+
+    obstacle_distance: float | None
+    self_distance: float | None
+    margin: float = 0.0
+    margin_ramp: float = 0.3
+    spacing: float = 0.03
+    extension: float = 1.0
+    max_extensions: int = 4000
+    shortcuts: int = 100
+
+
+def find_tree_path(
+    checker: CollisionChecker,
+    ends: tuple[Array, Array],
+    box: tuple[Array, Array],
+    velocity_limit: Array,
+    settings: TreeSettings,
+    *,
+    seed: int,
+) -> Array | None:
+    """Search for a path whose straight lines are clear; it is shortened by its estimated duration.
+
+    Args:
+        checker: The robot among its obstacles.
+        ends: First and last configuration [rad], shape (n,) each; they are not checked themselves.
+        box: Lowest and highest random configurations [rad], shape (n,) each.
+        velocity_limit: Velocity limits of the joints [rad/s], shape (n,).
+        settings: Settings of the search.
+        seed: Seed of the random numbers.
+
+    Returns:
+        Corners of the path [rad], shape (K, n), or None if the trees do not connect.
+    """
+    arrays = [np.ascontiguousarray(array, np.float64) for array in (*ends, *box, velocity_limit)]
+    limits = [-np.inf if x is None else x for x in (settings.obstacle_distance, settings.self_distance)]
+    native = _TreeSettings(
+        checker.address,
+        *map(address_of, arrays),
+        *limits,
+        settings.margin,
+        settings.margin_ramp,
+        settings.spacing,
+        settings.extension,
+        CORNER_TIME_S,
+        settings.max_extensions,
+        settings.shortcuts,
+        seed + 1,
+    )
+    path = np.empty((MAX_PATH_POINTS, len(arrays[0])))
+    search = checker.library.find_path
+    search.restype, search.argtypes = c_long, (c_void_p, c_void_p, c_long)
+    count = search(ctypes.addressof(native), address_of(path), len(path))
+    return path[:count].copy() if count else None
+
+
+def estimated_duration(path: Array, velocity_limit: Array) -> float:
+    """Estimate the duration of a motion along a path: velocity limits along its lines, and a time for every corner.
+
+    Args:
+        path: Corners [rad], shape (K, n).
+        velocity_limit: Velocity limits of the joints [rad/s], shape (n,).
+    """
+    lines = (np.abs(np.diff(path, axis=0)) / velocity_limit).max(axis=1)
+    return float(lines.sum() + CORNER_TIME_S * max(len(path) - 2, 0))

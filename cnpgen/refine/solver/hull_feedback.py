@@ -1,0 +1,53 @@
+"""Collisions between grid points, fed back to the solver as larger required distances at the neighboring points.
+
+A corner that passes a thin edge may collide between two grid points without a violation at either of them.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.refine.solver.hulls import Hulls
+from cnpgen.trajectory.spline import basis
+from cnpgen.trajectory.trajectory_spec import TrajectorySpec
+
+Array = NDArray[np.float64]
+
+STATES_PER_INTERVAL = 10
+FEEDBACK_MARGIN_M = 2e-4  # added to the required distances between grid points
+MARGIN_EDGE = 0.05  # phase over which the margin fades in from either end, where the clearance may be smaller
+MAX_FED_BACK_M = 0.02  # larger collisions are not between grid points
+
+
+class HullFeedback:
+    """Check of a motion's hulls between the points of a grid.
+
+    Args:
+        spec: Degree and numbers of control points.
+        s: Phases of the grid, shape (K,).
+    """
+
+    def __init__(self, spec: TrajectorySpec, s: Array) -> None:
+        fractions = np.arange(STATES_PER_INTERVAL) / STATES_PER_INTERVAL
+        phases = (s[:-1, None] + np.diff(s)[:, None] * fractions).ravel()
+        self._basis = basis(phases, spec.path_control_points, spec.degree)
+        self._margins = FEEDBACK_MARGIN_M * np.clip(np.minimum(phases, 1 - phases) / MARGIN_EDGE, 0, 1)
+        self._intervals = len(s) - 1
+
+    def missing_clearance(self, path: Array, hulls: Hulls, obstacle_poses: Array) -> Array | None:
+        """Return by how much the required distances must grow at the grid points [m].
+
+        Args:
+            path: Path control points, shape (C, n).
+            hulls: Clearances of the hulls.
+            obstacle_poses: Poses and sizes of the obstacles, shape (width,).
+
+        Returns:
+            Shape (K, columns), or None if no motion between grid points collides, or more than ``MAX_FED_BACK_M``.
+        """
+        missing = hulls.missing((self._basis @ path).T, self._margins, obstacle_poses)
+        worst = float((missing.max(axis=1) - self._margins).max())
+        if not 0 < worst < MAX_FED_BACK_M:
+            return None
+        between = missing.reshape(self._intervals, STATES_PER_INTERVAL, -1).max(axis=1)
+        edge = np.zeros((1, between.shape[1]))
+        return np.maximum(np.concatenate([between, edge]), np.concatenate([edge, between]))
