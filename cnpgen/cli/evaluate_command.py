@@ -61,7 +61,7 @@ def add(commands: "Commands[Parser]") -> None:
     sampled.add_argument(
         "--interpolation",
         choices=("hold", "linear", "cubic", "quintic"),
-        help="the controller's curve; default: linear for positions, cubic with velocities, quintic with accelerations",
+        help="judge a controller's curve; default: the motion that the samples resolve ('cnpgen docs trajectories')",
     )
     sampled.add_argument(
         "--max-jerk",

@@ -17,6 +17,7 @@ from cnpgen.errors import UsageError, counted
 from cnpgen.judges.plans.judge import check_step
 from cnpgen.judges.trajectories.interpolate import bounded_jerk, interpolated
 from cnpgen.judges.trajectories.judge_family import FamilyJudge
+from cnpgen.judges.trajectories.judge_samples import judge_samples
 from cnpgen.judges.trajectories.trajectory_verdict import Decision, TrajectoryVerdict
 from cnpgen.machine.workers import distribute, worker_count
 from cnpgen.plans.evaluate import MAX_VERDICT_STEP_S
@@ -100,10 +101,11 @@ def evaluate_trajectories(
 ) -> TrajectoryEvaluation:
     """Judge sampled trajectories: valid, invalid or undecided.
 
-    By default the controller's curve is judged: the interpolation that the given derivatives determine, which is linear
-    for positions alone, cubic with velocities and quintic with accelerations. With ``max_jerk``, all curves through the
-    samples whose jerks are within this bound are judged. With noise, so are all curves of samples within the noise. A
-    trajectory is valid if every curve is valid, invalid if every curve violates a condition, and otherwise undecided.
+    By default, the motion that the samples resolve is judged. It is valid if the smooth curve through exact samples
+    with velocities is valid; otherwise all curves within the errors of the resolution decide. With ``interpolation``, the
+    curve of a controller is judged. With ``max_jerk``, all curves through the samples whose jerks are within this bound
+    are judged. With noise, so are all curves of samples within the noise. A trajectory is valid if every curve is
+    valid, invalid if every curve violates a condition, and otherwise undecided.
     Obstacles that depend on the ends of a motion are placed at its first and last sample.
 
     Args:
@@ -177,6 +179,9 @@ def _judge(  # noqa: PLR0917 - the arguments of evaluate_trajectories
     judge = FamilyJudge(problem, robot, step=step)
     verdicts = []
     for trajectory in trajectories:
+        if max_jerk is None and interpolation is None:
+            verdicts.append(judge_samples(judge, trajectory, noise))
+            continue
         if max_jerk is None:
             family = interpolated(trajectory, interpolation, noise)
         else:

@@ -40,15 +40,15 @@ def interpolated(trajectory: Trajectory, interpolation: Interpolation | None, no
     Raises:
         UsageError: The samples lack the derivatives of the interpolation.
     """
-    data = _data(trajectory)
+    data = data_of(trajectory)
     kind = interpolation or INTERPOLATIONS[len(data)]
     if _DERIVATIVES[kind] >= len(data):
         missing = "velocities" if len(data) == 1 else "accelerations"
         raise UsageError(f"{kind} interpolation needs samples with {missing}", concerns="interpolation")
     data = data[: _DERIVATIVES[kind] + 1]
     h = np.diff(trajectory.t)
-    weights = _hermite_weights(len(data))
-    coefficients = np.einsum("cw,swn->csn", weights, _span_data(data, h))
+    weights = hermite_weights(len(data))
+    coefficients = np.einsum("cw,swn->csn", weights, span_data(data, h))
     errors = [_noise_errors(weights, order, h, noise, len(data)) for order in range(4)]
     bounds = [np.repeat(error[:, None], trajectory.q.shape[1], axis=1) for error in errors]
     for order in range(len(data) + 1, 4):  # derivatives that jump at the knots
@@ -57,6 +57,19 @@ def interpolated(trajectory: Trajectory, interpolation: Interpolation | None, no
         bounds[0] = bounds[0] + np.abs(np.diff(trajectory.q, axis=0))
         bounds[1] = bounds[2] = bounds[3] = np.full_like(bounds[0], UNDEFINED)
     return CurveFamily(trajectory.t, coefficients, (bounds[0], bounds[1], bounds[2], bounds[3]))
+
+
+def family_of_data(t: Array, data: list[Array]) -> CurveFamily:
+    """Return the known curve through positions and derivatives at knots.
+
+    Args:
+        t: Times of the knots [s], from 0, shape (S + 1,).
+        data: Positions, then their derivatives in SI units, shape (S + 1, n) each.
+    """
+    h = np.diff(t)
+    coefficients = np.einsum("cw,swn->csn", hermite_weights(len(data)), span_data(data, h))
+    exact = np.zeros((len(h), data[0].shape[1]))
+    return CurveFamily(t, coefficients, (exact, exact, exact, exact))
 
 
 def bounded_jerk(trajectory: Trajectory, max_jerk: Array, noise: Array) -> CurveFamily | None:
@@ -70,31 +83,28 @@ def bounded_jerk(trajectory: Trajectory, max_jerk: Array, noise: Array) -> Curve
     Raises:
         UsageError: There are fewer than three samples with positions alone.
     """
-    data = _data(trajectory)
+    data = data_of(trajectory)
     if len(data) == 1:
         if len(trajectory.t) < STENCIL - 1:
             raise UsageError("a bound of the jerk needs at least 3 samples of positions", concerns="max_jerk")
         chosen = _thinned(trajectory.t, float(max_jerk.min()), float(noise[0]))
         t, data = trajectory.t[chosen], [trajectory.q[chosen]]
         h = np.diff(t)
-        size = min(STENCIL, len(t))
-        first = np.clip(np.arange(len(h)) - 1, 0, len(t) - size)
-        window = first[:, None] + np.arange(size)
-        nodes, orders = (t[window] - t[:-1, None]) / h[:, None], np.zeros(size, np.intp)
-        weights, of_data = _lagrange_weights(nodes), data[0][window]
+        nodes, weights, of_data = polynomials_of_positions(t, data[0], STENCIL)
+        orders = np.zeros(nodes.shape[1], np.intp)
     else:
         t = trajectory.t
         h = np.diff(t)
         orders = np.tile(np.arange(len(data)), 2)
         nodes = np.broadcast_to(np.repeat([0.0, 1.0], len(data)), (len(h), 2 * len(data)))
-        weights = np.broadcast_to(_hermite_weights(len(data)), (len(h), 2 * len(data), 2 * len(data)))
-        of_data = _span_data(data, h)
+        weights = np.broadcast_to(hermite_weights(len(data)), (len(h), 2 * len(data), 2 * len(data)))
+        of_data = span_data(data, h)
     coefficients = np.einsum("scw,swn->csn", weights, of_data)
     scaled_noise = np.asarray(noise)[orders] * h[:, None] ** orders
     bounds = []
     for order in range(3):
         kernel = _kernel_norms(nodes, orders, weights, order)
-        from_noise = np.abs(_differentiated(weights, order) * scaled_noise[:, None]).sum(axis=2).max(axis=1)
+        from_noise = np.abs(differentiated(weights, order) * scaled_noise[:, None]).sum(axis=2).max(axis=1)
         error = (kernel * h**3)[:, None] * max_jerk + from_noise[:, None]
         bounds.append(error / h[:, None] ** order)
     family = CurveFamily(t, coefficients, (bounds[0], bounds[1], bounds[2], np.zeros_like(bounds[0])))
@@ -104,7 +114,7 @@ def bounded_jerk(trajectory: Trajectory, max_jerk: Array, noise: Array) -> Curve
     return replace(family, bounds=(*family.bounds[:3], wide), has_jerk=False)
 
 
-def _data(trajectory: Trajectory) -> list[Array]:
+def data_of(trajectory: Trajectory) -> list[Array]:
     """Return the positions and the derivatives that there are, shape (K, n) each."""
     return [values for values in (trajectory.q, trajectory.dq, trajectory.ddq) if values is not None]
 
@@ -116,13 +126,32 @@ def _thinned(t: Array, max_jerk: float, noise: float) -> NDArray[np.intp]:
     return np.unique(np.linspace(0, len(t) - 1, steps + 1).round().astype(np.intp))
 
 
-def _span_data(data: list[Array], h: Array) -> Array:
+def span_data(data: list[Array], h: Array) -> Array:
     """Return the scaled data of both ends of every span, shape (S, 2 m, n)."""
     scaled = [[values[end:][: len(h)] * h[:, None] ** order for order, values in enumerate(data)] for end in (0, 1)]
     return np.stack([*scaled[0], *scaled[1]], axis=1)
 
 
-def _hermite_weights(m: int) -> Array:
+def polynomials_of_positions(t: Array, q: Array, neighbors: int) -> tuple[Array, Array, Array]:
+    """Return polynomials through positions around every span.
+
+    Args:
+        t: Times of the samples [s], shape (K,).
+        q: Positions [rad], shape (K, n).
+        neighbors: Number W of samples that determine a polynomial; at most K are used.
+
+    Returns:
+        Nodes, where the span is [0, 1], shape (S, W), weights of the positions for the Bernstein coefficients, shape
+        (S, W, W), and the positions, shape (S, W, n).
+    """
+    size, count = min(neighbors, len(t)), len(t) - 1
+    first = np.clip(np.arange(count) - (size // 2 - 1), 0, len(t) - size)
+    window = first[:, None] + np.arange(size)
+    nodes = (t[window] - t[:-1, None]) / np.diff(t)[:, None]
+    return nodes, _lagrange_weights(nodes), q[window]
+
+
+def hermite_weights(m: int) -> Array:
     """Return weights from m derivatives at both ends to Bernstein coefficients on [0, 1], shape (2 m, 2 m)."""
     degree = 2 * m - 1
     weights = np.zeros((2 * m, 2 * m))
@@ -151,7 +180,7 @@ def _lagrange_weights(nodes: Array) -> Array:
     return np.asarray(to_bernstein @ powers)
 
 
-def _differentiated(weights: Array, order: int) -> Array:
+def differentiated(weights: Array, order: int) -> Array:
     """Differentiate Bernstein coefficients (..., d + 1, W) by the phase of the span."""
     for _ in range(order):
         degree = weights.shape[-2] - 1
@@ -163,7 +192,7 @@ def _noise_errors(weights: Array, order: int, h: Array, noise: Array, m: int) ->
     """Bound the effect of noise on a derivative in every span, shape (S,)."""
     orders = np.tile(np.arange(m), 2)
     scaled = noise[orders] * h[:, None] ** orders
-    return np.asarray((scaled @ np.abs(_differentiated(weights, order)).T).max(axis=1) / h**order)
+    return np.asarray((scaled @ np.abs(differentiated(weights, order)).T).max(axis=1) / h**order)
 
 
 def _kernel_norms(nodes: Array, orders: NDArray[np.intp], weights: Array, order: int) -> Array:
@@ -187,7 +216,7 @@ def _kernel_norm(nodes: Array, orders: NDArray[np.intp], weights: Array, order: 
     low, high = min(nodes.min(), 0.0), max(nodes.max(), 1.0)
     tau = low + (high - low) * (np.arange(KERNEL_NODES) + 0.5) / KERNEL_NODES
     u = np.linspace(0, 1, KERNEL_PHASES)
-    coefficients = _differentiated(weights, order)
+    coefficients = differentiated(weights, order)
     degree = len(coefficients) - 1
     basis = np.stack([comb(degree, k) * u**k * (1 - u) ** (degree - k) for k in range(degree + 1)])
     from_data = np.stack([_truncated(node - tau, 2 - k) for node, k in zip(nodes, orders, strict=True)])
@@ -219,5 +248,5 @@ def _is_consistent(  # noqa: PLR0917 - the family with everything that it was ma
     third = family.polynomials.jerk
     assert third is not None
     jerk = np.abs(third[0])
-    from_noise = (np.abs(_differentiated(weights, 3)) * scaled_noise[:, None]).sum(axis=2).max(axis=1)
+    from_noise = (np.abs(differentiated(weights, 3)) * scaled_noise[:, None]).sum(axis=2).max(axis=1)
     return bool((jerk <= limit + (from_noise[:, None] + 8 * rounding) / h**3).all())

@@ -7,20 +7,21 @@ sampled trajectory has no phase of its own: the phase is the share of its durati
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
+from itertools import chain, product
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.judges.plans.bernstein import find_maximum
 from cnpgen.judges.plans.continuous_collision import check_continuous_collision, is_contact, pairs_of
+from cnpgen.judges.plans.evaluated_trajectory import EvaluatedTrajectory
 from cnpgen.judges.plans.joint_limits import ProvenJointLimits, joint_limits, quantity_of
 from cnpgen.judges.plans.judge import check_step
 from cnpgen.judges.plans.local_maxima import check_local_maxima
 from cnpgen.judges.plans.measure import EvaluationContext, MeasuredCondition, by_name, evaluation_context
 from cnpgen.judges.plans.sampling import MAX_DURATION_S, MAX_TIME_SAMPLES, Samples, times
 from cnpgen.judges.plans.verdict import ZERO_TOLERANCE, Margin, Reason
-from cnpgen.judges.trajectories.curve_family import ORDERS, CurveFamily
+from cnpgen.judges.trajectories.curve_family import ORDERS, UNDEFINED, CurveFamily
 from cnpgen.judges.trajectories.trajectory_verdict import ConditionDecision, Decision, TrajectoryVerdict
 from cnpgen.judges.trajectories.uncertainty import uncertainty_of
 from cnpgen.problems.obstacles import scene_of
@@ -52,6 +53,11 @@ class FamilyJudge:
         self._world, self._moved = (PathWorld(robot, problem.obstacle, problem.object_size) for _ in range(2))
         self._limits = joint_limits(problem, self._world)
 
+    @property
+    def limits(self) -> ProvenJointLimits:
+        """Joint limits of the problem."""
+        return self._limits
+
     def __call__(self, family: CurveFamily) -> TrajectoryVerdict:
         """Judge one family; values that cannot be evaluated give an undecided verdict."""
         if not family.duration < MAX_DURATION_S or len(family.t) > MAX_TIME_SAMPLES:
@@ -68,9 +74,10 @@ class FamilyJudge:
         if not states.is_finite():
             return TrajectoryVerdict(Decision.UNDECIDED, Reason.NOT_FINITE, duration=family.duration, samples=len(s))
         poses = self._obstacle_poses(states.q, states.dq)
+        scenes = self._possible_scenes(family, states, poses)
         self._world.set_path(states.q, states.dq, states.ddq, poses, states.jerk)
         context = evaluation_context(self._problem, family, poses, self._world, samples, table)
-        errors = uncertainty_of(self._problem, family, self._moved, poses, context.measured, s)
+        errors = uncertainty_of(self._problem, family, self._moved, [poses, *scenes], context.measured, s)
         measured = [errors.add(condition, s) for condition in context.measured]
         context = replace(context, measured=measured, with_uncertainty=errors.add)
         entries = [*_limit_entries(self._limits, family, samples), *_measured_entries(context)]
@@ -85,6 +92,25 @@ class FamilyJudge:
         self._world.set_path(ends, speeds, still, poses, still)
         start, goal = self._world.tip_position.T[:, None].copy()
         return np.asarray(scene_of(self._problem, start, goal, self._world.tip_velocity[:, 1:].T).poses[0])
+
+    def _possible_scenes(self, family: CurveFamily, states: EvaluatedTrajectory, poses: Array) -> list[Array]:
+        """Return scenes whose values of the motion, such as a puck, are those of other curves of the family."""
+        if self._problem.scene_constraint is None:
+            return []
+        position, velocity, acceleration = (bound[-1] for bound in family.bounds[:3])
+        if (acceleration >= UNDEFINED).all():  # velocities jump between spans
+            velocity = velocity + np.abs(states.dq[:, -1] - family.polynomials.dq[-1, max(len(family.t) - 3, 0)])
+        scenes, known = [], self._problem.scene_width - self._problem.scene_constraint.scene_width
+        for (order, bound), sign in product({"q": position, "dq": velocity}.items(), (-1.0, 1.0)):
+            if not bound.any():
+                continue
+            for joint in (None, *np.flatnonzero(bound).tolist()):
+                ends = {name: getattr(states, name)[:, [0, -1]].copy() for name in ("q", "dq")}
+                moved = slice(None) if joint is None else joint
+                ends[order][moved, -1] += sign * bound[moved]
+                scene = self._obstacle_poses(ends["q"], ends["dq"])
+                scenes.append(np.concatenate([poses[:known], scene[known:]]))
+        return scenes
 
 
 def checked_phases(family: CurveFamily, step: float) -> Array:

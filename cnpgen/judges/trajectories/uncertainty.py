@@ -23,6 +23,7 @@ Array = NDArray[np.float64]
 MAX_BLOCKS = 400  # of samples that share one error
 CURVATURE_FACTOR = 1.5  # on the sum of changes
 COMBINATIONS = 8  # random ones of all changes
+SCENE_FACTOR = 2.0  # on the largest change by one of the possible scenes
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ def uncertainty_of(  # noqa: PLR0917 - the family, and everything that measures 
     problem: Problem,
     family: CurveFamily,
     world: PathWorld,
-    obstacle_poses: Array,
+    scenes: Sequence[Array],
     measured: Sequence[MeasuredCondition],
     s: Array,
 ) -> Uncertainty:
@@ -66,7 +67,7 @@ def uncertainty_of(  # noqa: PLR0917 - the family, and everything that measures 
         problem: The problem.
         family: The curves.
         world: A robot that is moved, other than the one at the samples.
-        obstacle_poses: Poses and sizes of the obstacles, shape (width,).
+        scenes: Poses and sizes of the obstacles, shape (width,); first those of the nominal curve, then possible ones.
         measured: Conditions at the samples, with the values of the nominal curve.
         s: Phases of the samples, shape (K,).
     """
@@ -82,8 +83,8 @@ def uncertainty_of(  # noqa: PLR0917 - the family, and everything that measures 
         else:
             smooth.append(condition)
     starts = np.unique(np.linspace(0, len(s), min(MAX_BLOCKS, len(s)) + 1).astype(np.intp))[:-1]
-    if smooth and not family.is_known:
-        found = _changes(problem, family, world, obstacle_poses, smooth, s, starts)
+    if smooth and (len(scenes) > 1 or not family.is_known):
+        found = _changes(problem, family, world, scenes, smooth, s, starts)
         for condition, change in zip(smooth, found, strict=True):
             relaxed = float(ends[0]) if condition.relaxation.any() else 0.0
             errors[_key(condition)] = change + relaxed
@@ -96,7 +97,7 @@ def _changes(  # noqa: PLR0917 - as of uncertainty_of
     problem: Problem,
     family: CurveFamily,
     world: PathWorld,
-    obstacle_poses: Array,
+    scenes: Sequence[Array],
     smooth: Sequence[MeasuredCondition],
     s: Array,
     starts: NDArray[np.intp],
@@ -108,7 +109,7 @@ def _changes(  # noqa: PLR0917 - as of uncertainty_of
     bounds = [np.maximum.reduceat(values, starts, axis=1) for values in family.bounds_at(s)[: len(states)]]
     start_tip = np.zeros(3)  # used by the relaxation only
 
-    def values(offsets: Sequence[Array]) -> list[Array]:
+    def values(offsets: Sequence[Array], obstacle_poses: Array = scenes[0]) -> list[Array]:
         moved = EvaluatedTrajectory(*(state + offset for state, offset in zip(states, offsets, strict=True)))
         world.set_path(moved.q, moved.dq, moved.ddq, obstacle_poses, moved.jerk)
         every = {
@@ -129,6 +130,11 @@ def _changes(  # noqa: PLR0917 - as of uncertainty_of
                 offsets[order][joint] = sign * bound[joint]
                 changes.append([np.abs(g - g0) for g, g0 in zip(values(offsets), nominal, strict=True)])
             total = [row + np.maximum(low, high) for row, low, high in zip(total, *changes, strict=True)]
+    of_scenes = [np.zeros_like(g) for g in nominal]
+    for scene in scenes[1:]:
+        differences = [np.abs(g - g0) for g, g0 in zip(values(still, scene), nominal, strict=True)]
+        of_scenes = [np.maximum(row, change) for row, change in zip(of_scenes, differences, strict=True)]
+    total = [row + SCENE_FACTOR * change for row, change in zip(total, of_scenes, strict=True)]
     random = np.random.default_rng(0)
     for _ in range(COMBINATIONS):
         offsets = [bound * random.choice([-1.0, 1.0], bound.shape) for bound in bounds]

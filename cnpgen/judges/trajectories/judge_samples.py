@@ -1,0 +1,57 @@
+"""Verdict on samples without a stated interpolation: what they resolve decides, and a valid curve through them proves.
+
+A trajectory is valid if its samples resolve the motion and the smooth curve through them is valid. At both ends this
+curve has the smallest changes of acceleration within the limits, which samples of faster changes allow. Otherwise every
+condition is decided for all curves within the errors of the samples' resolution. Exact positions without derivatives at
+100 Hz or more are connected by lines.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.judges.plans.joint_limits import ProvenJointLimits, quantity_of
+from cnpgen.judges.trajectories.interpolate import data_of, family_of_data, interpolated
+from cnpgen.judges.trajectories.judge_family import FamilyJudge
+from cnpgen.judges.trajectories.resolved_curves import is_resolved, resolved_curves
+from cnpgen.judges.trajectories.smooth_curve import AccelerationLimits, smooth_curve
+from cnpgen.judges.trajectories.trajectory_verdict import TrajectoryVerdict
+from cnpgen.trajectory.sampled_trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+MAX_LINEAR_SPAN_S = 0.0101  # between exact positions that a controller connects by lines
+TOLERANCE_SHARE = 0.9  # of the tolerance of accelerations and jerks that the smooth curve uses
+
+
+def judge_samples(judge: FamilyJudge, trajectory: Trajectory, noise: Array) -> TrajectoryVerdict:
+    """Judge the motion that samples resolve.
+
+    Args:
+        judge: The judge of the problem.
+        trajectory: The samples.
+        noise: Largest errors of positions, velocities and accelerations [rad, rad/s, rad/s^2], shape (3,).
+    """
+    limits = acceleration_limits(judge.limits)
+    if trajectory.dq is None and not noise.any() and np.diff(trajectory.t).max() <= MAX_LINEAR_SPAN_S:
+        return judge(interpolated(trajectory, "linear", noise))
+    if not noise.any() and is_resolved(trajectory, limits.acceleration):
+        curves = [smooth_curve(trajectory, limits)]
+        if trajectory.ddq is not None:
+            curves.insert(0, family_of_data(trajectory.t, data_of(trajectory)))
+        for curve in curves:
+            verdict = None if curve is None else judge(curve)
+            if verdict is not None and verdict.valid:
+                return verdict
+    return judge(resolved_curves(trajectory, noise, limits.acceleration))
+
+
+def acceleration_limits(limits: ProvenJointLimits) -> AccelerationLimits:
+    """Return the smallest acceleration and jerk limits of a problem with most of their tolerances."""
+    n = len(limits.joints)
+    smallest = {"ddq": np.full(n, np.inf), "jerk": np.full(n, np.inf)}
+    for constraint, bounds, tolerance in zip(limits.constraints, limits.bounds, limits.tolerance, strict=True):
+        quantity = quantity_of(constraint)
+        if quantity in smallest:
+            allowed = np.minimum(-bounds[:n], bounds[n:]) + TOLERANCE_SHARE * tolerance
+            smallest[quantity] = np.minimum(smallest[quantity], np.maximum(allowed, 0.0))
+    return AccelerationLimits(smallest["ddq"], smallest["jerk"])
