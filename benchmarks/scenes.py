@@ -139,8 +139,8 @@ def shelf_scene(random: Random) -> GeneratedScene:
     bottom, gap = random.uniform(0.0, 0.15), random.uniform(0.28, 0.4)
     midpoint = bottom + 1.5 * gap
     obstacles = [box(f"board {i}", (x, 0.0, bottom + i * gap), (depth, width, 0.02), 1e-9) for i in range(4)]
-    for side in (-1, 0, 1):
-        obstacles.append(box(f"side {side}", (x, side * width / 2, midpoint), (depth, 0.02, 3 * gap + 0.02), 1e-9))
+    sides = ((f"side {side}", side * width / 2) for side in (-1, 0, 1))
+    obstacles += [box(name, (x, y, midpoint), (depth, 0.02, 3 * gap + 0.02), 1e-9) for name, y in sides]
     obstacles.append(box("back", (x + depth / 2, 0.0, midpoint), (0.02, width, 3 * gap), 1e-9))
     for index in range(6):
         y, height = random.uniform(-0.45, 0.45) * width, random.uniform(0.08, 0.15)
