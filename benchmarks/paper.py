@@ -71,7 +71,7 @@ def epoch_of_met_budgets(curve: Curve, tolerance: float = 0.05) -> str:
 
 def rows(curves: list[Curve]) -> list[tuple[str, ...]]:
     """Format a row per training."""
-    cells = []
+    cells: list[tuple[str, ...]] = []
     for curve in curves:
         last, training = curve.steps[-1], curve.model.training
         ratios = [last["terms"][name] / last["budgets"][name] / factor(curve) for name in learned_terms(curve)]
@@ -161,9 +161,9 @@ def main() -> None:
         "budget factor",
         f"violation / budget: {names}",
     )
-    head = (*head, "weights", "valid", "paper's rules", "duration s")
+    outcome = ("weights", "valid", "paper's rules", "duration s")
     results = {"trainings": [dict(curve.model.training) for curve in curves]}
-    report(results, [table("The paper's preset", head, rows(curves))], as_json=options.json)
+    report(results, [table("The paper's preset", (*head, *outcome), rows(curves))], as_json=options.json)
 
 
 if __name__ == "__main__":
