@@ -13,6 +13,7 @@ from cnpgen.benchmark.simulator.plant import Plant as Plant
 from cnpgen.benchmark.simulator.simulate import Simulation as Simulation
 from cnpgen.benchmark.simulator.simulate import simulate_plans as simulate_plans
 from cnpgen.benchmark.suite import SampledProblems as SampledProblems
+from cnpgen.benchmark.suite import SceneFileProblems as SceneFileProblems
 from cnpgen.benchmark.suite import Suite as Suite
 from cnpgen.benchmark.suite import load_suite as load_suite
 from cnpgen.trajectory.sampled_trajectory import Trajectory as Trajectory

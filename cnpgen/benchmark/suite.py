@@ -12,8 +12,10 @@ from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.make.recipe_file import load_dataset_recipe
 from cnpgen.pipelines.stages.given_positions import MAX_TASKS
 from cnpgen.plans.plans import Plans
+from cnpgen.plans.scene_plans import scene_plans
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.problem_file import read_problem
+from cnpgen.problems.problem_file import load_problem, read_problem
+from cnpgen.problems.scenes.scene_files import load_scenes
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
 from cnpgen.schema.catalogue import list_recipes, load_recipe, reference
@@ -34,6 +36,14 @@ class SampledProblems:
 
 
 @dataclass(frozen=True, kw_only=True)
+class SceneFileProblems:
+    """Planning problems of a scene file, from rest to rest."""
+
+    file: str = field("scene file, relative to the suite")
+    robot: str = field("name or path of the robot's problem")
+
+
+@dataclass(frozen=True, kw_only=True)
 class Suite:
     """Boundary problems for the comparison of planners: pucks on a grid, or samples of a dataset."""
 
@@ -44,11 +54,12 @@ class Suite:
     pucks: Pucks | None = field("grid of pucks to hit from rest", default=None)
     replanning: ReplanningScenario | None = field("replanning scenarios: pucks to hit from moving states", default=None)
     samples: SampledProblems | None = field("random problems of a dataset", default=None)
+    scenes: SceneFileProblems | None = field("problems of a scene file", default=None, since_version=2)
 
     def find_mistakes(self) -> Iterator[tuple[str, str]]:
         """Yield (key, mistake) pairs."""
-        if sum(part is not None for part in (self.pucks, self.replanning, self.samples)) != 1:
-            yield "pucks", "expected exactly one of [pucks], [replanning] and [samples]"
+        if sum(part is not None for part in (self.pucks, self.replanning, self.samples, self.scenes)) != 1:
+            yield "pucks", "expected exactly one of [pucks], [replanning], [samples] and [scenes]"
 
     @checked_arguments
     def problems(self, n: int | None = None) -> tuple[Plans, ExecutedPrefix | None]:
@@ -67,6 +78,8 @@ class Suite:
         n = None if n is None else integer("n", n, least=1)
         if self.samples is not None:
             return draw_boundary_problems(self.samples.recipe, n or self.samples.n, seed=self.samples.seed), None
+        if self.scenes is not None:
+            return scene_plans(load_problem(self.scenes.robot), load_scenes(self.scenes.file))[:n], None
         if self.replanning is not None:
             problems, prefix = scenario_problems(self.replanning)
             return problems[:n], prefix
@@ -92,6 +105,12 @@ def list_suites() -> dict[str, Path]:
     return list_recipes("suite")
 
 
+def _located(scenes: SceneFileProblems, folder: Path) -> SceneFileProblems:
+    """Return the problems of a scene file with paths that do not depend on the working directory."""
+    robot = folder / scenes.robot
+    return replace(scenes, file=str(folder / scenes.file), robot=str(robot) if robot.is_file() else scenes.robot)
+
+
 def _read(path: Path, mistakes: list[str]) -> Suite | None:
     table = read_table(path, ("suite", "dataset", "pipeline"), mistakes)
     if table is None:
@@ -107,6 +126,8 @@ def _read(path: Path, mistakes: list[str]) -> Suite | None:
         )
     readers: dict[type, Reader] = {Problem: reference("problem", read_problem, path.parent)}
     suite = parse(Suite, table, where=RecipeLocation(str(path)), mistakes=mistakes, readers=readers)
+    if suite is not None and suite.scenes is not None:
+        return replace(suite, scenes=_located(suite.scenes, path.parent))
     if suite is None or suite.samples is None:
         return suite
     beside = path.parent / suite.samples.recipe

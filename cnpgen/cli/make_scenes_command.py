@@ -15,7 +15,7 @@ A family draws furniture and objects around the robot. Goals are grasp-like pose
 collision-free joint positions; starts are neutral, at other grasps or random. Nine of ten straight lines between them
 collide. 'cnpgen solve OUT --robot NAME' solves the problems. The format follows from OUT: HDF5 as of MPiNets (.h5,
 .hdf5), or a folder of planning scenes and requests of MoveIt in YAML. --list prints the families with their parameters.
-'cnpgen docs scenes' describes them. The same arguments give the same problems.
+'cnpgen docs scene-files' describes the formats. The same arguments give the same problems.
 """
 
 

@@ -1,7 +1,9 @@
 """RRT-Connect with path simplification (OMPL), timed by TOPP-RA (Pham and Pham, 2018).
 
-The search is that of CBiRRT. The simplified path becomes a cubic spline, which TOPP-RA times within the limits of
-velocity and acceleration. A goal in motion is met in speed along the path only, as far as this is feasible.
+The search is that of CBiRRT on a constraint manifold, and plain RRT-Connect with Coal's collision checks without one.
+The simplified path becomes a cubic spline, which TOPP-RA times within the limits of velocity and acceleration, and of
+torque if the problem limits it and there is no manifold. A goal in motion is met in speed along the path only, as far
+as this is feasible.
 """
 
 from dataclasses import dataclass
@@ -12,8 +14,11 @@ from numpy.typing import NDArray
 
 from cnpgen.benchmark.benchmark_planner import Answer, BenchmarkPlanner, Plan, Setting
 from cnpgen.benchmark.planners.cbirrt import Search, load_ompl, seed_ompl
+from cnpgen.benchmark.planners.free_search import FreeSearch, has_manifold
 from cnpgen.errors import requires_extra
 from cnpgen.plans.plans import Plans
+from cnpgen.problems.constraints.joint import JointTorque
+from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import field
@@ -37,6 +42,8 @@ class RRTConnect(BenchmarkPlanner):
         ompl = load_ompl()
         load_toppra()
         problem, robot = open_problem(setting.problem)
+        if not has_manifold(problem, robot):
+            return self._plan_freely(ompl, setting, problem, robot)
 
         def plan(task: Plans) -> Answer:
             seed_ompl(ompl, setting, task)
@@ -44,6 +51,18 @@ class RRTConnect(BenchmarkPlanner):
             search_time = setting.time_limit - simplify_time
             path = Search(problem, robot, task).solve(ompl, search_time, simplify_time=simplify_time)
             return None if path is None else timed_by_toppra(path, robot, task.boundary.goal_dq[0])
+
+        return plan
+
+    def _plan_freely(self, ompl: Any, setting: Setting, problem: Problem, robot: Robot) -> Plan:
+        """Return a function that plans among obstacles, without equality constraints."""
+        search, torque_limited = FreeSearch(problem, robot), problem.first(JointTorque) is not None
+
+        def plan(task: Plans) -> Answer:
+            seed_ompl(ompl, setting, task)
+            simplify_time = min(self.simplify_time, setting.time_limit / 2)
+            path = search.solve(ompl, task, setting.time_limit - simplify_time, simplify_time)
+            return None if path is None else timed_by_toppra(path, robot, np.zeros(robot.n), torque=torque_limited)
 
         return plan
 
@@ -62,13 +81,14 @@ def load_toppra() -> Any:
     return toppra
 
 
-def timed_by_toppra(path: Array, robot: Robot, goal_dq: Array) -> Trajectory | None:
+def timed_by_toppra(path: Array, robot: Robot, goal_dq: Array, *, torque: bool = False) -> Trajectory | None:
     """Time a path as fast as possible within the limits of velocity and acceleration.
 
     Args:
         path: Joint positions [rad], shape (K, n).
         robot: The robot with its limits.
         goal_dq: Joint velocities at the goal [rad/s], shape (n,).
+        torque: Whether torques are limited, too.
 
     Returns:
         The trajectory from rest, or None if TOPP-RA finds no timing.
@@ -89,6 +109,8 @@ def timed_by_toppra(path: Array, robot: Robot, goal_dq: Array) -> Trajectory | N
             (toppra.constraint.JointAccelerationConstraint, robot.acceleration_limit),
         )
     ]
+    if torque:
+        limits.append(_torque_constraint(toppra, robot))
     timing = toppra.algorithm.TOPPRA(limits, spline, parametrizer="ParametrizeConstAccel")
     tangent = spline(1.0, 1)
     end_rate = max(float(tangent @ goal_dq / (tangent @ tangent)), 0.0)
@@ -97,6 +119,19 @@ def timed_by_toppra(path: Array, robot: Robot, goal_dq: Array) -> Trajectory | N
         if timed is not None:
             return _sampled(timed)
     return None
+
+
+def _torque_constraint(toppra: Any, robot: Robot) -> Any:
+    """Return TOPP-RA's constraint of joint torques by inverse dynamics, without friction."""
+    import pinocchio as pin
+
+    data = robot.model.createData()
+
+    def inverse_dynamics(q: Array, dq: Array, ddq: Array) -> Array:
+        return np.array(pin.rnea(robot.model, data, q, dq, ddq))
+
+    limits = np.stack([-robot.torque_limit, robot.torque_limit], axis=1)
+    return toppra.constraint.JointTorqueConstraint(inverse_dynamics, limits, np.zeros(robot.n))
 
 
 def _sampled(timed: Any) -> Trajectory:

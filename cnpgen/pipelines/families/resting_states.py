@@ -13,7 +13,7 @@ from cnpgen.problems.constraints.self_clearance import SelfClearance
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot import Robot
-from cnpgen.robots.solid import place_obstacles, solids_of
+from cnpgen.robots.solid import Solid, place_obstacles, solids_of
 from cnpgen.world.forward_kinematics import ForwardKinematics
 from cnpgen.world.pose_ik import PoseKinematics, solve_pose_ik
 from cnpgen.world.rigid_bodies import RigidBodies
@@ -47,11 +47,12 @@ class RestingStates:
         clearance, own = problem.first(RobotClearance), problem.first(SelfClearance)
         self._clearance = 0.0 if clearance is None else clearance.distance
         self._self_clearance = None if own is None else own.distance
-        self.move((*problem.obstacle, *obstacles))
+        placed = (*problem.obstacle, *obstacles)
+        self._solids = solids_of(placed, place_obstacles(placed))
 
-    def move(self, obstacles: Sequence[Obstacle]) -> None:
-        """Replace the obstacles by others of the same number."""
-        self._solids = solids_of(obstacles, place_obstacles(obstacles))
+    def place_solids(self, solids: Sequence[Solid]) -> None:
+        """Replace the obstacles by as many others, see ``Scene.bodies``."""
+        self._solids = list(solids)
 
     def are_clear(self, q: Array, *, margin: float = 0.0) -> NDArray[np.bool_]:
         """Return whether nothing collides at each state, shape (K,).

@@ -99,6 +99,6 @@ class TableUnderPick(SceneFamily):
         place_objects(random, table, (0.15, 0.4, -0.3, 0.3), floor, objects, from_above=False)
         center_z = (floor + top) / 2
         for _ in range(3):
-            x, y, z = random.uniform(0.1, 0.3), random.uniform(-0.3, 0.3), random.uniform(-0.08, 0.08)
-            table.grasp((float(x), float(y), float(center_z + z)), (1, 0, 0), tilt=0.5)
+            place = random.uniform([0.1, -0.3, -0.08], [0.3, 0.3, 0.08]).tolist()
+            table.grasp((place[0], place[1], center_z + place[2]), (1, 0, 0), tilt=0.5)
         return table.layout()
