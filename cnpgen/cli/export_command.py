@@ -18,7 +18,9 @@ if TYPE_CHECKING:
 MAX_LISTED_PLANS = 10  # invalid plans that are listed by number
 
 _TEXT = """\
-npz is one NumPy archive; csv and joint-trajectory (a message of ROS 2, as JSON) are a folder with one file per plan.
+npz, parquet and mpd (B-splines of the paths) are one file. csv, joint-trajectory (a message of ROS 2, as JSON) and
+ros2-control (the goal of a trajectory controller, as YAML) are a folder with one file per plan. lerobot is a
+dataset in a folder (LeRobotDataset v3), with --rate frames per second.
 'cnpgen list exporters' shows all formats, including those of installed packages. 'cnpgen docs plan-format' shows how to
 read them. The path of the output is printed on stdout. Plans that cannot be sampled are left out and listed on
 stderr; the exit code is then 1. With --join, positions, velocities and accelerations must be
@@ -31,7 +33,12 @@ def add(commands: "Commands[Parser]") -> None:
     parser = add_command(commands, "export", run, title="write plans as sampled trajectories", text=_TEXT)
     option = parser.add_argument
     option("file", metavar="FILE", type=Path, help="plan file, .h5")
-    option("--to", metavar="FORMAT", required=True, help="format: npz, csv, joint-trajectory, or one of a package")
+    option(
+        "--to",
+        metavar="FORMAT",
+        required=True,
+        help="format: npz, csv, parquet, lerobot, mpd, ... ('cnpgen list exporters')",
+    )
     option("--rate", metavar="HZ", type=values.hertz, default=1000.0, help="samples per second (default: 1000)")
     option(
         "-o",
@@ -114,7 +121,8 @@ def _place(arguments: argparse.Namespace, exporter: "Exporter") -> Path:
     out: Path = arguments.out or Path(name)
     if not out.parent.is_dir():
         raise UsageError(f"{out} must be in a folder that exists")
-    target = out / f"plans{exporter.suffix}" if exporter.single_file and out.is_dir() else out
+    inside = exporter.single_file and out.is_dir() and not exporter.is_folder
+    target = out / f"plans{exporter.suffix}" if inside else out
     if target.exists() and not arguments.force and not (target.is_dir() and not any(target.iterdir())):
         raise UsageError(f"{target} exists; --force replaces files of the same name")
     return out

@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, RecipeError, UsageError
 from cnpgen.plans.exporter import ExportedSet, Exporter, SampledPlan, sample_plan
@@ -64,8 +65,9 @@ def export_plans(
 ) -> Exported:
     """Sample plans in time and write them; existing files are replaced.
 
-    Formats are "npz" (one file), "csv" and "joint-trajectory" (a folder with one file per plan, ``plan_00000.csv``),
-    and those of installed packages; 'cnpgen docs plan-format' has their content. Folders do not contain unplanned
+    Formats are "npz", "parquet" and "mpd" (one file), "csv", "joint-trajectory" and "ros2-control" (a folder with one
+    file per plan, ``plan_00000.csv``), "lerobot" (a dataset in a folder), and those of installed packages; 'cnpgen docs
+    plan-format' has their content. Folders do not contain unplanned
     joints. If the robot has movable ones, ``held_joints.yaml`` contains their positions. Plans that cannot be sampled
     are omitted and reported.
 
@@ -95,11 +97,19 @@ def export_plans(
         raise UsageError(f"{out} is a file, but {to!r} makes one file per plan: give a folder", concerns="out")
     problem, sampled = plans.problem, _sampled(plans, rate, kept)
     exported = ExportedSet(
-        np.array(kept), plans.sample_id[kept], problem.joint_names, problem.sliding_joints, problem.held_joints
+        np.array(kept),
+        plans.sample_id[kept],
+        problem.joint_names,
+        problem.sliding_joints,
+        problem.held_joints,
+        rate=rate,
+        problem=problem.name,
+        environment=_environment(plans, kept) if exporter.uses_environment else {},
+        motion=plans.motion[kept] if isinstance(plans, Plans) else None,
     )
     held = None
     if exporter.single_file:
-        files = [out / f"plans{exporter.suffix}" if out.is_dir() else out]
+        files = [out / f"plans{exporter.suffix}" if out.is_dir() and not exporter.is_folder else out]
         exporter.write(files[0], sampled, exported)
     else:
         files = [out / f"plan_{index:05d}{exporter.suffix}" for index in kept]
@@ -108,6 +118,17 @@ def export_plans(
         held = _write_held_joints(out, problem.held_joints)
     invalid = tuple(index for index in kept if plans.status[index] == PlanStatus.INVALID)
     return Exported(tuple(files), len(kept), refused, invalid, held)
+
+
+def _environment(plans: Plans | JoinedPlans, kept: list[int]) -> dict[str, NDArray[np.float64]]:
+    """Return goals, columns of the tasks and scenes of chosen plans, shape (N, w) each; of the last if joined."""
+    last = plans if isinstance(plans, Plans) else plans.parts[-1]
+    columns = {"goal_q": last.boundary.goal_q, "goal_dq": last.boundary.goal_dq, **last.columns}
+    scene = last.scene.poses
+    if scene.shape[1]:
+        columns["scene"] = scene
+    numbers = {name: np.asarray(values, np.float64) for name, values in columns.items() if values.dtype.kind in "fiu"}
+    return {name: values[kept].reshape(len(kept), -1) for name, values in numbers.items()}
 
 
 def _chosen(plans: Plans | JoinedPlans, only: Sequence[int] | None) -> list[int]:

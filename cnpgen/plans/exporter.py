@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar
 
@@ -51,6 +51,11 @@ class ExportedSet:
         joint_names: Names of the n planned joints.
         prismatic: Whether each planned joint is prismatic; its values are in m instead of rad.
         held_joints: Positions of the movable joints that are not planned: name -> rad or m.
+        rate: Samples per second [Hz].
+        problem: Name of the problem.
+        environment: Goals, columns of the tasks and scenes: name -> values in SI units, shape (N, w); empty for
+            formats that do not use them.
+        motion: The N motions as splines; None for joined plans.
     """
 
     index: NDArray[np.int64]
@@ -58,6 +63,10 @@ class ExportedSet:
     joint_names: tuple[str, ...]
     prismatic: tuple[bool, ...]
     held_joints: dict[str, float]
+    rate: float = 0.0
+    problem: str = ""
+    environment: Mapping[str, Array] = field(default_factory=dict)
+    motion: Motion | None = None
 
 
 @dataclass(frozen=True)
@@ -70,10 +79,14 @@ class Exporter(ABC):
         suffix: Suffix of the files, with the dot.
         single_file: Whether one file has all plans; otherwise each plan has its own file, and ``held_joints.yaml``
             beside the files has the positions of the joints that are not planned.
+        is_folder: Whether the output with all plans is a folder.
+        uses_environment: Whether the format has goals, columns of the tasks and scenes.
     """
 
     suffix: ClassVar[str]
     single_file: ClassVar[bool] = False
+    is_folder: ClassVar[bool] = False
+    uses_environment: ClassVar[bool] = False
 
     @abstractmethod
     def write(self, path: Path, plans: Iterable[SampledPlan], exported: ExportedSet) -> None:

@@ -84,19 +84,22 @@ class JointTrajectory(Exporter):
     def write(self, path: Path, plans: Iterable[SampledPlan], exported: ExportedSet) -> None:
         """Write a message; see ``Exporter.write``."""
         (plan,) = plans
-        rows = zip(plan.t, plan.q.tolist(), plan.dq.tolist(), plan.ddq.tolist(), strict=True)
-        points = ",\n    ".join(json.dumps(_point(*row)) for row in rows)
+        points = ",\n    ".join(point_text(plan, k) for k in range(len(plan.t)))
         header = json.dumps({"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""})
         names = json.dumps(exported.joint_names)
-        points = _WITHOUT_POINT.sub(r"\1.0", points)
         text = f'{{\n  "header": {header},\n  "joint_names": {names},\n  "points": [\n    {points}\n  ]\n}}\n'
         write_file(path, text)
 
 
-def _point(t: float, q: list[float], dq: list[float], ddq: list[float]) -> dict[str, Any]:
-    sec, nanosec = divmod(round(t * 1e9), 10**9)
-    stamp = {"sec": sec, "nanosec": nanosec}
-    return {"positions": q, "velocities": dq, "accelerations": ddq, "effort": [], "time_from_start": stamp}
+def point_text(plan: SampledPlan, k: int, *, effort: bool = True) -> str:
+    """Return sample k of a plan as a ``trajectory_msgs/JointTrajectoryPoint`` in one line of JSON that is also YAML."""
+    sec, nanosec = divmod(round(plan.t[k] * 1e9), 10**9)
+    values = {"positions": plan.q, "velocities": plan.dq, "accelerations": plan.ddq}
+    point: dict[str, Any] = {name: rows[k].tolist() for name, rows in values.items()}
+    if effort:
+        point["effort"] = []
+    text = json.dumps({**point, "time_from_start": {"sec": sec, "nanosec": nanosec}})
+    return _WITHOUT_POINT.sub(r"\1.0", text)
 
 
 def _add(archive: zipfile.ZipFile, name: str, values: NDArray[Any]) -> None:

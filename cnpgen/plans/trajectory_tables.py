@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -24,6 +25,9 @@ Values = NDArray[Any]
 
 MAX_ARCHIVE_BYTES = 1 << 32  # of the arrays of an archive
 HELD_JOINTS_FILE = "held_joints.yaml"  # beside exported plans; it holds no trajectory
+LEROBOT_INFO = "meta/info.json"  # in a folder of LeRobot
+JOINT_NAMES_KEY = b"cnpgen_joint_names"  # of the metadata of Parquet tables, as JSON
+PLAN_COLUMN = "plan"
 _PART_OF_ARCHIVE = re.compile(r"(.+)_(t|q|dq|ddq|jerk)")  # one array of a plan in an archive of cnpgen
 _POINT_FIELDS = {"positions": "q", "velocities": "dq", "accelerations": "ddq"}
 _NESTING = ("joint_trajectory", "trajectory", "trajectories", "solution")  # keys of messages that hold messages
@@ -54,6 +58,8 @@ def read_trajectory_tables(path: Path) -> list[TrajectoryTable]:
         MissingExtraError: The format needs a package that is not installed.
         MachineError: The file cannot be read.
     """
+    if (path / LEROBOT_INFO).is_file():
+        return list(_read_lerobot(path))
     if path.is_dir():
         files = [file for file in sorted(path.iterdir()) if is_trajectory_file(file)]
         if not files:
@@ -79,6 +85,8 @@ def is_trajectory_file(path: Path) -> bool:
 
 def holds_trajectories(path: Path) -> bool:
     """Return whether a path holds sampled trajectories, not plans: by its suffix, HDF5 files by their content."""
+    if (path / LEROBOT_INFO).is_file():
+        return True
     if path.is_dir():
         return not (path / SPECIFICATION).exists() and any(is_trajectory_file(file) for file in path.iterdir())
     if not path.is_file() or path.suffix.lower() not in _READERS:
@@ -137,23 +145,79 @@ def _split(path: Path, arrays: dict[str, Values], names: tuple[str, ...]) -> Ite
 
 
 def _read_parquet(path: Path) -> Iterator[TrajectoryTable]:
+    table = read_parquet(path)
+    names = tuple(json.loads((table.schema.metadata or {}).get(JOINT_NAMES_KEY, b"[]")))
+    columns = {name: _parquet_column(table, name, path) for name in table.column_names}
+    if names and PLAN_COLUMN in columns:  # a table of cnpgen
+        index = columns.pop(PLAN_COLUMN)
+        columns.pop("sample_id", None)
+        for plan in dict.fromkeys(index.tolist()):
+            rows = {name: values[index == plan] for name, values in columns.items()}
+            yield TrajectoryTable(f"{path}: plan {plan}", rows, names)
+        return
+    yield TrajectoryTable(str(path), columns)
+
+
+def read_parquet(path: Path) -> Any:
+    """Read a Parquet file as a table of pyarrow.
+
+    Raises:
+        UsageError: The file is damaged or too large.
+        MissingExtraError: pyarrow is not installed.
+    """
     with requires_extra("parquet", "pyarrow"):
         import pyarrow
         import pyarrow.parquet
     try:
-        table = pyarrow.parquet.read_table(path)
+        table = pyarrow.parquet.ParquetFile(path).read()
     except pyarrow.ArrowException as error:
         raise UsageError(f"{path} is not a Parquet file, or is damaged: {error}") from error
     if table.nbytes > MAX_ARCHIVE_BYTES:
         raise UsageError(f"{path} holds {table.nbytes:,} bytes, expected at most {MAX_ARCHIVE_BYTES:,}")
-    columns = {}
-    for name in table.column_names:
-        values = table.column(name).to_pylist()
-        try:
-            columns[name] = np.array(values)
-        except ValueError as error:
-            raise UsageError(f"{path}: column {name!r}: its rows have different lengths") from error
-    yield TrajectoryTable(str(path), columns)
+    return table
+
+
+def _parquet_column(table: Any, name: str, path: Path) -> Values:
+    """Return a column of numbers, lists of equal lengths, or texts as an array."""
+    try:
+        return np.array(table.column(name).to_pylist())
+    except ValueError as error:
+        raise UsageError(f"{path}: column {name!r}: its rows have different lengths") from error
+
+
+def _read_lerobot(folder: Path) -> Iterator[TrajectoryTable]:
+    """Yield the episodes of a LeRobotDataset v3: states, or actions without them, with their names."""
+    try:
+        info = parse_json(read_file(folder / LEROBOT_INFO, max_bytes=MAX_TABLE_BYTES).decode())
+        features, version = info["features"], str(info["codebase_version"])
+        key = next(key for key in ("observation.state", "action") if key in features)
+        width = int(features[key]["shape"][0])
+    except (ValueError, KeyError, TypeError, IndexError, StopIteration) as error:
+        raise UsageError(f"{folder / LEROBOT_INFO} does not describe a dataset of LeRobot: {error!r:.200}") from error
+    if not version.startswith("v3"):
+        raise UsageError(f"{folder} has LeRobot's format {version}, expected v3.0: convert it with LeRobot")
+    names = _feature_names(features[key].get("names"), width)
+    for path in sorted(folder.glob("data/*/*.parquet")):
+        table = read_parquet(path)
+        missing = [name for name in ("timestamp", "episode_index", key) if name not in table.column_names]
+        if missing:
+            raise UsageError(f"{path}: there is no column {missing[0]!r}, only {', '.join(table.column_names)}")
+        times, episodes, values = (_parquet_column(table, name, path) for name in ("timestamp", "episode_index", key))
+        values = values.reshape(len(times), -1)
+        for episode in dict.fromkeys(episodes.tolist()):
+            rows = episodes == episode
+            columns: dict[str, Values] = {"t": times[rows].astype(float)}
+            columns |= {name: values[rows, k].astype(float) for k, name in enumerate(names)}
+            yield TrajectoryTable(f"{folder}: episode {episode}", columns)
+
+
+def _feature_names(names: Any, width: int) -> list[str]:
+    """Return the names of a feature's values: a list, a list in an object, or indices."""
+    if isinstance(names, dict):
+        names = next((entry for entry in names.values() if isinstance(entry, list)), None)
+    if isinstance(names, list) and len(names) == width:
+        return [str(name) for name in names]
+    return [f"q{k}" for k in range(width)]
 
 
 def _read_json(path: Path) -> Iterator[TrajectoryTable]:

@@ -95,6 +95,10 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "npz": "cnpgen.plans.formats:NumpyArchive",
         "csv": "cnpgen.plans.formats:CsvTables",
         "joint-trajectory": "cnpgen.plans.formats:JointTrajectory",
+        "ros2-control": "cnpgen.plans.ros2_control:TrajectoryControllerGoal",
+        "parquet": "cnpgen.plans.parquet_table:ParquetTable",
+        "lerobot": "cnpgen.plans.lerobot_dataset:LeRobotDataset",
+        "mpd": "cnpgen.plans.spline_table:PathSplines",
     },
 }
 

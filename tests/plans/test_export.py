@@ -22,7 +22,7 @@ from cnpgen.trajectory.spline_motion import Motion
 from tests.examples.installed import installed_kind
 from tests.plans.test_plans import AIRHOCKEY, draw_plans, garbage
 
-FORMATS = registry.names(registry.EXPORTERS)
+FORMATS = ("npz", "csv", "joint-trajectory")
 FIELDS = ("q", "dq", "ddq", "jerk")
 JOINTS = list(AIRHOCKEY.robot.joints)
 

@@ -1,0 +1,219 @@
+"""Export format of LeRobot: plans as episodes of a LeRobotDataset v3.0, for imitation learning.
+
+A frame has the positions and velocities as ``observation.state``, goal, task columns and scene as
+``observation.environment_state``, and the positions at the next frame as ``action``.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import UsageError, requires_extra
+from cnpgen.plans.exporter import ExportedSet, Exporter, SampledPlan
+from cnpgen.plans.parquet_table import fixed_lists, write_parquet
+from cnpgen.plans.trajectory_tables import LEROBOT_INFO
+from cnpgen.store.files.atomic import write_file
+
+Values = NDArray[Any]
+
+LEROBOT_VERSION = "v3.0"
+MAX_CHUNK_FILES = 1000  # in a folder
+MAX_DATA_FILE_MB = 100
+MAX_VIDEO_FILE_MB = 200  # there are none, but readers expect the number
+DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+EPISODES_PATH = "meta/episodes/chunk-000/file-000.parquet"
+STATE, ENVIRONMENT, ACTION = "observation.state", "observation.environment_state", "action"
+QUANTILES = (0.01, 0.1, 0.5, 0.9, 0.99)
+_INDICES = {"timestamp": "float32", "frame_index": "int64", "episode_index": "int64", "index": "int64"}
+
+
+@dataclass(frozen=True)
+class LeRobotDataset(Exporter):
+    """A folder with a LeRobotDataset v3.0: one episode per plan, frames at the rate of the export.
+
+    Plans that last less than one frame have one. ``observation.environment_state`` is absent if there are no values.
+    """
+
+    suffix = "-lerobot"
+    single_file = True
+    is_folder = True
+    uses_environment = True
+
+    def write(self, path: Path, plans: Iterable[SampledPlan], exported: ExportedSet) -> None:
+        """Write the dataset, its description last; see ``Exporter.write``."""
+        with requires_extra("parquet", "pyarrow"):
+            import pyarrow  # noqa: F401
+        if exported.rate != round(exported.rate):
+            raise UsageError(
+                f"LeRobot needs a whole number of frames per second, got {exported.rate:g}", concerns="rate"
+            )
+        if (path / LEROBOT_INFO).exists():
+            (path / LEROBOT_INFO).unlink()  # an incomplete dataset has none
+        names = _names(exported)
+        episodes = _write_frames(path, plans, exported, names)
+        task = f"{exported.problem}: move to the goal"
+        _write_episodes(path, episodes, task)
+        _write_tasks(path, task)
+        totals = _statistics({key: np.concatenate([e.columns[key] for e in episodes]) for key in episodes[0].columns})
+        write_file(path / "meta" / "stats.json", json.dumps(totals, indent=2))
+        info = _info(exported, names, [len(episode.columns["index"]) for episode in episodes])
+        write_file(path / LEROBOT_INFO, json.dumps(info, indent=2))
+
+
+@dataclass(frozen=True, eq=False)
+class _Episode:
+    """One plan.
+
+    Attributes:
+        columns: Values of the frames, shape (K,) or (K, w).
+        file: Index of the data file.
+    """
+
+    columns: Mapping[str, Values]
+    file: int
+
+
+def _names(exported: ExportedSet) -> dict[str, list[str]]:
+    """Return the names of the values of every feature."""
+    joints = exported.joint_names
+    environment = [
+        name if values.shape[1] == 1 else f"{name}_{k}"
+        for name, values in exported.environment.items()
+        for k in range(values.shape[1])
+    ]
+    names = {STATE: [*joints, *(f"{joint}_velocity" for joint in joints)], ACTION: list(joints)}
+    return {STATE: names[STATE], **({ENVIRONMENT: environment} if environment else {}), ACTION: names[ACTION]}
+
+
+def _write_frames(
+    path: Path, plans: Iterable[SampledPlan], exported: ExportedSet, names: Mapping[str, list[str]]
+) -> list[_Episode]:
+    """Write the files of frames; return the episodes."""
+    environment = np.concatenate([np.empty((len(exported.index), 0)), *exported.environment.values()], axis=1)
+    episodes: list[_Episode] = []
+    pending: list[_Episode] = []
+    file = size = first = 0
+    for number, plan in enumerate(plans):
+        columns = _frames(plan, exported.rate, environment[number], number, first)
+        columns = {name: columns[name] for name in (*names, *_INDICES, "task_index")}
+        added = sum(values.nbytes for values in columns.values())
+        if pending and size + added > MAX_DATA_FILE_MB * 2**20:
+            _write_file(path, pending, file)
+            pending, file, size = [], file + 1, 0
+        episode = _Episode(columns, file)
+        pending.append(episode)
+        episodes.append(episode)
+        size, first = size + added, first + len(columns["index"])
+    _write_file(path, pending, file)
+    return episodes
+
+
+def _frames(plan: SampledPlan, rate: float, environment: Values, number: int, first: int) -> dict[str, Values]:
+    """Return the columns of one episode; the last sample of the plan is the last action."""
+    count = len(plan.t) - 1
+    frame = np.arange(count)
+    return {
+        STATE: np.concatenate([plan.q[:-1], plan.dq[:-1]], axis=1).astype(np.float32),
+        ENVIRONMENT: np.tile(environment.astype(np.float32), (count, 1)),
+        ACTION: plan.q[1:].astype(np.float32),
+        "timestamp": (frame / rate).astype(np.float32),
+        "frame_index": frame,
+        "episode_index": np.full(count, number),
+        "index": first + frame,
+        "task_index": np.zeros(count, np.int64),
+    }
+
+
+def _write_file(path: Path, episodes: list[_Episode], file: int) -> None:
+    """Write the frames of some episodes."""
+    import pyarrow
+
+    joined = {name: np.concatenate([e.columns[name] for e in episodes]) for name in episodes[0].columns}
+    columns = {name: fixed_lists(values) if values.ndim == 2 else values for name, values in joined.items()}
+    write_parquet(path / _data_path(file), pyarrow.table(columns))
+
+
+def _data_path(file: int) -> str:
+    chunk, index = divmod(file, MAX_CHUNK_FILES)
+    return DATA_PATH.format(chunk_index=chunk, file_index=index)
+
+
+def _write_episodes(path: Path, episodes: list[_Episode], task: str) -> None:
+    """Write the table of episodes with their statistics."""
+    import pyarrow
+
+    lengths = np.array([len(episode.columns["index"]) for episode in episodes])
+    ends, files = np.cumsum(lengths), np.array([episode.file for episode in episodes])
+    table: dict[str, Any] = {
+        "episode_index": np.arange(len(episodes)),
+        "tasks": [[task]] * len(episodes),
+        "length": lengths,
+        "data/chunk_index": files // MAX_CHUNK_FILES,
+        "data/file_index": files % MAX_CHUNK_FILES,
+        "dataset_from_index": ends - lengths,
+        "dataset_to_index": ends,
+        "meta/episodes/chunk_index": np.zeros(len(episodes), np.int64),
+        "meta/episodes/file_index": np.zeros(len(episodes), np.int64),
+    }
+    statistics = [_statistics(episode.columns) for episode in episodes]
+    for name, entry in statistics[0].items():
+        for key in entry:
+            table[f"stats/{name}/{key}"] = [row[name][key] for row in statistics]
+    write_parquet(path / EPISODES_PATH, pyarrow.table(table))
+
+
+def _write_tasks(path: Path, task: str) -> None:
+    """Write the table of tasks, whose index in pandas is the task's text."""
+    import pyarrow
+
+    index = "__index_level_0__"
+    columns: list[dict[str, Any]] = [
+        {"name": "task_index", "field_name": "task_index", "pandas_type": "int64", "numpy_type": "int64"},
+        {"name": None, "field_name": index, "pandas_type": "unicode", "numpy_type": "object"},
+    ]
+    described = [{**column, "metadata": None} for column in columns]
+    metadata = {"index_columns": [index], "column_indexes": [], "columns": described, "pandas_version": "2.0.0"}
+    table = pyarrow.table({"task_index": np.zeros(1, np.int64), index: [task]})
+    write_parquet(path / "meta" / "tasks.parquet", table.replace_schema_metadata({"pandas": json.dumps(metadata)}))
+
+
+def _statistics(columns: Mapping[str, Values]) -> dict[str, dict[str, list[float]]]:
+    """Return the statistics of every feature, each as a list of its values."""
+    statistics = {}
+    for name, values in columns.items():
+        rows = values.reshape(len(values), -1).astype(float)
+        entry = {"min": rows.min(axis=0), "max": rows.max(axis=0), "mean": rows.mean(axis=0), "std": rows.std(axis=0)}
+        entry |= {f"q{round(100 * q):02d}": np.quantile(rows, q, axis=0) for q in QUANTILES}
+        statistics[name] = {key: found.tolist() for key, found in entry.items()} | {"count": [len(rows)]}
+    return statistics
+
+
+def _info(exported: ExportedSet, names: Mapping[str, list[str]], lengths: list[int]) -> dict[str, Any]:
+    """Return the description of the dataset."""
+    features: dict[str, Any] = {
+        key: {"dtype": "float32", "shape": [len(values)], "names": values} for key, values in names.items()
+    }
+    indices = {**_INDICES, "task_index": "int64"}
+    features |= {name: {"dtype": dtype, "shape": [1], "names": None} for name, dtype in indices.items()}
+    return {
+        "codebase_version": LEROBOT_VERSION,
+        "robot_type": exported.problem,
+        "total_episodes": len(lengths),
+        "total_frames": sum(lengths),
+        "total_tasks": 1,
+        "chunks_size": MAX_CHUNK_FILES,
+        "data_files_size_in_mb": MAX_DATA_FILE_MB,
+        "video_files_size_in_mb": MAX_VIDEO_FILE_MB,
+        "fps": round(exported.rate),
+        "splits": {"train": f"0:{len(lengths)}"},
+        "data_path": DATA_PATH,
+        "video_path": None,
+        "features": features,
+    }
