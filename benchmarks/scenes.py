@@ -2,18 +2,26 @@
 
 The scenes are generated: tables, shelves, cages, boxes and desks with a Panda (3 kg at the hand) or a UR5. Every scene
 is solved once, in one process and thread, from a new problem: the set-up of the scene is part of its time. Kernels of
-every family are compiled before, since they depend on the kinds and the number of obstacles only.
+a robot are compiled before, since they do not depend on its obstacles.
 """
 
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+<<<<<<< HEAD
+=======
+from itertools import pairwise
+>>>>>>> scenes-kernel
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+<<<<<<< HEAD
+=======
+from benchmarks.common import arguments, median, progress, report, table
+>>>>>>> scenes-kernel
 from cnpgen.kernels.collision.collision_checker import CollisionChecker, load_collision_library
 from cnpgen.kernels.library import KernelLibrary, choose_backend
 from cnpgen.plans.boundary_problems import plans_of_rows
@@ -139,8 +147,13 @@ def shelf_scene(random: Random) -> GeneratedScene:
     bottom, gap = random.uniform(0.0, 0.15), random.uniform(0.28, 0.4)
     midpoint = bottom + 1.5 * gap
     obstacles = [box(f"board {i}", (x, 0.0, bottom + i * gap), (depth, width, 0.02), 1e-9) for i in range(4)]
+<<<<<<< HEAD
     sides = ((f"side {side}", side * width / 2) for side in (-1, 0, 1))
     obstacles += [box(name, (x, y, midpoint), (depth, 0.02, 3 * gap + 0.02), 1e-9) for name, y in sides]
+=======
+    sides = (depth, 0.02, 3 * gap + 0.02)
+    obstacles += [box(f"side {side}", (x, side * width / 2, midpoint), sides, 1e-9) for side in (-1, 0, 1)]
+>>>>>>> scenes-kernel
     obstacles.append(box("back", (x + depth / 2, 0.0, midpoint), (0.02, width, 3 * gap), 1e-9))
     for index in range(6):
         y, height = random.uniform(-0.45, 0.45) * width, random.uniform(0.08, 0.15)
@@ -300,7 +313,109 @@ def solve_scene(problem: Problem, start: Array, goal: Array) -> dict[str, Any]:
     }
 
 
+def checks(states: int) -> dict[str, float]:
+    """Return states/s of compiled checks and of Coal on recorded tree edges: a Panda among 20 obstacles."""
+    base, robot, checker = loaded("panda")
+    random, scene = np.random.default_rng(20), table_scene(np.random.default_rng(20))
+    more = cage_scene(random).obstacles[:11]
+    obstacles = (*scene.obstacles[:9], *more)
+    checker.place(obstacles, place_obstacles(obstacles))
+    q = random.uniform(robot.position_lower, robot.position_upper, (SAMPLES, robot.n))
+    free, edges, settings = q[checker.clear_states(q.T)], list[Array](), TreeSettings(0.0, 0.0, shortcuts=0)
+    box_of_joints, total = (robot.position_lower, robot.position_upper), 0
+    for start, goal in zip(free[::2], free[1::2], strict=False):
+        path = find_tree_path(checker, (start, goal), box_of_joints, robot.velocity_limit, settings, seed=0)
+        for a, b in pairwise(() if path is None else path):
+            count = int(np.ceil(np.abs(b - a).max() / settings.spacing)) + 1
+            edges.append(a[:, None] + (b - a)[:, None] * np.linspace(0, 1, count))
+            total += count
+        if total > states:
+            break
+    recorded = np.concatenate(edges, axis=1)
+    hulls, poses = Hulls(base.with_obstacles(obstacles), robot), place_obstacles(obstacles)
+    part = recorded[:, : states // 50]
+    times = [median(cpu_of(lambda: checker.clear_states(recorded)) for _ in range(5))]
+    times.append(cpu_of(lambda: hulls.clear_states(part, poses)))
+    equal = bool(np.array_equal(checker.clear_states(part), hulls.clear_states(part, poses)))
+    close = cpu_of(lambda: [checker.close_bodies(recorded[:, :100], 0.04, of_obstacles=kind) for kind in (True, False)])
+    return {
+        "states": recorded.shape[1],
+        "compiled states/s": recorded.shape[1] / times[0],
+        "coal states/s": part.shape[1] / times[1],
+        "equal results": float(equal),
+        "close bodies of 100 states [ms]": 1e3 * close,
+    }
+
+
+def cpu_of(function: Callable[[], Any]) -> float:
+    """Return the CPU time of a call [s]."""
+    begun = time.process_time()
+    function()
+    return time.process_time() - begun
+
+
+def loaded(name: str) -> tuple[Problem, Robot, CollisionChecker]:
+    """Return the problem of a robot without obstacles, the robot, and its collision checks."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "problem.toml"
+        path.write_text(ROBOTS[name], encoding="utf-8")
+        problem = load_problem(path)
+        robot = load_robot(problem)
+        problem = problem.with_obstacles(())  # with the text of the URDF
+    library = load_collision_library(KernelLibrary(*choose_backend("compiled"), "", {}))
+    assert library is not None
+    return problem, robot, CollisionChecker(library, robot)
+
+
+def solve_family(name: str, family: str, count: int, seed: int) -> dict[str, Any]:
+    """Solve problems of a family, each from a new scene; the first one, which may compile kernels, is solved twice."""
+    base, robot, checker = loaded(name)
+    problems = list(generate(base, EndSampler(robot, checker), family, count, seed))
+    solve_scene(*problems[0])
+    solved = [solve_scene(*problem) for problem in problems[1:]]
+    cpu, valid = np.array([each["cpu"] for each in solved]), [each["valid"] for each in solved]
+    return {
+        "problems": len(solved),
+        "valid": sum(valid),
+        "median cpu [s]": float(np.median(cpu)),
+        "p95 cpu [s]": float(np.percentile(cpu, 95)),
+        "p99 cpu [s]": float(np.percentile(cpu, 99)),
+        "cpu above 1 s": int((cpu > 1).sum()),
+        "mean motion time [s]": float(np.mean([each["duration"] for each in solved if each["valid"]])),
+        "reasons": sorted({each["reason"] for each in solved if not each["valid"]}),
+    }
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of this benchmark."""
+    parser.add_argument("--robots", nargs="*", default=["panda"], choices=list(ROBOTS), help="robots")
+    parser.add_argument("--families", nargs="*", default=list(FAMILIES), choices=list(FAMILIES), help="families")
+    parser.add_argument("--count", type=int, default=21, help="problems of every family; the first is not counted")
+    parser.add_argument("--seed", type=int, default=29_110_301, help="seed of the scenes")
+    parser.add_argument("--states", type=int, default=100_000, help="states of the collision checks")
+
+
+def main() -> None:
+    """Run the benchmark."""
+    chosen = arguments(__doc__, options)
+    with np.errstate(all="ignore"):
+        checked, rows, results = checks(chosen.states), list[tuple[str, ...]](), dict[str, Any]()
+        for name in chosen.robots:
+            for family in chosen.families:
+                progress(f"{name}: {family}")
+                figures = solve_family(name, family, chosen.count, chosen.seed)
+                results[f"{name} {family}"] = figures
+                rows.append((name, family, *(f"{value:.4g}" for key, value in figures.items() if key != "reasons")))
+    head = ("robot", "family", "problems", "valid", "median", "p95", "p99", "> 1 s", "motion time")
+    tables = [
+        table("collision checks", ("figure", "value"), [(key, f"{value:,.4g}") for key, value in checked.items()])
+    ]
+    tables.append(table("new scenes, CPU time in s with set-up", head, rows, left=2))
+    report({"checks": checked, "scenes": results}, tables, as_json=chosen.json)
+
+
 if __name__ == "__main__":
+<<<<<<< HEAD
     import sys
 
     np.seterr(all="ignore")
@@ -338,3 +453,6 @@ if __name__ == "__main__":
             Counter(r["outcome"] for r in R),
             flush=True,
         )
+=======
+    main()
+>>>>>>> scenes-kernel

@@ -102,11 +102,11 @@ def evaluate_trajectories(
     """Judge sampled trajectories: valid, invalid or undecided.
 
     By default, the motion that the samples resolve is judged. It is valid if the smooth curve through exact samples
-    with velocities is valid; otherwise all curves within the errors of the resolution decide. With ``interpolation``,
-    the curve of a controller is judged. With ``max_jerk``, all curves through the samples whose jerks are within it
-    are judged. With noise, so are all curves of samples within the noise. A trajectory is valid if every curve is
-    valid, invalid if every curve violates a condition, and otherwise undecided.
-    Obstacles that depend on the ends of a motion are placed at its first and last sample.
+    with velocities is valid; otherwise all curves within the errors of the resolution decide. With
+    ``interpolation``, the curve of a controller is judged. With ``max_jerk``, all curves through the samples whose
+    jerks are within it are judged. With noise, so are all curves of samples within the noise. A trajectory is valid
+    if every curve is valid, invalid if every curve violates a condition, and otherwise undecided. Obstacles that
+    depend on the ends of a motion are placed at its first and last sample.
 
     Args:
         problem: Problem, record, or name or path of a problem, pipeline or dataset.

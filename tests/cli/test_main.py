@@ -439,7 +439,7 @@ def test_list_shows_everything_that_there_is(run):
     code, out, err = run("list")
     assert (code, err) == (0, "")
     models = "planner trained on airhockey-hit"
-    for text in ("airhockey-replan", "120,000 rows", models, "7 joints, 7 constraints", "goal-ik", "robot-clearance"):
+    for text in ("airhockey-replan", "120,000 rows", models, "7 joints, 8 constraints", "goal-ik", "robot-clearance"):
         assert text in out
     assert max(len(line) for line in out.splitlines()) <= 100
 
@@ -447,7 +447,16 @@ def test_list_shows_everything_that_there_is(run):
 def test_list_can_be_narrowed_and_read_by_programs(run):
     assert "start-ik" not in run("list", "datasets")[1]
     found = json.loads(run("list", "--json")[1])
-    assert list(found) == ["datasets", "models", "pipelines", "problems", "stages", "constraints", "exporters"]
+    assert list(found) == [
+        "datasets",
+        "models",
+        "pipelines",
+        "problems",
+        "stages",
+        "constraints",
+        "objectives",
+        "exporters",
+    ]
     assert found["datasets"][0]["rows"] == 19_800
     assert Path(found["problems"][0]["file"]).is_file()
 

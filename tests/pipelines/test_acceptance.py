@@ -11,6 +11,8 @@ from cnpgen.pipelines.prepared import PreparedPipeline, random_generator
 from cnpgen.pipelines.stages.narrow_phase import unmet
 from cnpgen.pipelines.stages.stage import CandidateBatch
 from cnpgen.problems.constraints.constraint import Condition
+from cnpgen.robots.solid import place_obstacles
+from cnpgen.world.path import PathWorld
 from tests.conftest import SHIPPED, Prepare, needs_compiler, run_stages, some
 
 BACKENDS = [pytest.param("compiled", marks=needs_compiler), "numpy", "casadi"]
@@ -36,6 +38,14 @@ def sampling(candidates: CandidateBatch) -> set[str]:
     return {candidates.reasons[k - 1] for k in set(candidates.outcome.tolist()) if k}
 
 
+def clear_of_object(prepared: PreparedPipeline, q: np.ndarray) -> np.ndarray:
+    """Return whether the held object keeps 1 mm from the links, which only the acceptance checks."""
+    problem = prepared.context.problem
+    world = PathWorld(prepared.context.robot, problem.obstacle, problem.object_size)
+    world.set_path(q.copy(), 0 * q, 0 * q, place_obstacles(problem.obstacle))
+    return world.clear_of_held_object(1e-3)
+
+
 def with_margins(prepared: PreparedPipeline, candidates: CandidateBatch) -> CandidateBatch:
     """Keep candidates with a margin to every limit, so that one small change violates one constraint."""
     robot = prepared.context.robot
@@ -46,6 +56,8 @@ def with_margins(prepared: PreparedPipeline, candidates: CandidateBatch) -> Cand
         candidates.reject(margin.min(1) > 1e-3, "on a joint limit")
         if f"{end}_clearance" in candidates.columns:
             candidates.reject(candidates[f"{end}_clearance"][0] > 7e-3, "close to a pedestal")
+        if prepared.context.problem.object is not None:
+            candidates.reject(clear_of_object(prepared, candidates[f"{end}_q"]), "object in collision with the robot")
     return candidates
 
 

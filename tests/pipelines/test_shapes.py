@@ -97,7 +97,7 @@ def test_states_outside_the_mask_are_not_checked(context, drawn):
 
 
 def test_a_robot_without_a_shape_needs_no_narrow_phase(prepare: Prepare):
-    assert narrow_phase_of(prepare("heavy-object").context, "start") is None
+    assert narrow_phase_of(prepare("airhockey-replan").context, "start") is None
 
 
 @pytest.mark.parametrize("judge", ["segments", "coal"])  # the arm holds nothing

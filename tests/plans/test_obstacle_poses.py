@@ -10,6 +10,7 @@ import cnpgen
 from cnpgen.errors import UsageError
 from cnpgen.plans.plans import make_plans
 from cnpgen.problems.constraints.clearance import ObjectContact
+from cnpgen.problems.constraints.object_clearance import ObjectClearance
 from cnpgen.problems.constraints.vertical import Vertical
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.scene import PARKED_POSITION_M
@@ -22,7 +23,9 @@ def plans_with(poses: np.ndarray) -> cnpgen.Plans:
     """Return slow motions of joint 1 between two ends, one for each row of poses."""
     problem = cnpgen.load_problem("heavy-object")
     box = Obstacle(name="box", kind="box", position=PARKED_POSITION_M, size=(0.2, 0.2, 0.2))
-    constraints = tuple(item for item in problem.constraint if not isinstance(item, Vertical | ObjectContact))
+    constraints = tuple(
+        item for item in problem.constraint if not isinstance(item, Vertical | ObjectContact | ObjectClearance)
+    )
     problem = replace(problem, obstacle=(box,), object=None, payload=None, constraint=constraints)
     count, spec = len(poses), TrajectorySpec(degree=7, path_control_points=15, rate_control_points=20)
     start = np.tile([-0.5, 1.0, 0, -1.0, 0, 0.5, 0], (count, 1))

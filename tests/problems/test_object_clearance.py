@@ -44,7 +44,7 @@ def distance_of_coal(q: np.ndarray) -> float:
             request, result = coal.DistanceRequest(), coal.DistanceResult()
             transforms = [coal.Transform3s(each.rotation, each.translation) for each in (pose, tip)]
             coal.distance(coal_hull(part.vertices), transforms[0], box, transforms[1], request, result)
-            distances.append(result.min_distance)
+            distances.append(result.min_distance - part.radius)
     return min(distances)
 
 

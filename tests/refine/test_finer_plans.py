@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -62,8 +63,8 @@ def test_if_that_gives_no_valid_plan_all_control_points_are_used(monkeypatch: py
     spec = finer(plan.problem.trajectory, 2)
     tool, problem, run_levels = tool_of(plan, spec), slower_task(plan, spec), strategy.run_levels
 
-    def violating(refiner: Refiner, *arguments: object) -> Iterator[Attempt]:
-        for attempt in run_levels(refiner, *arguments):  # type: ignore[arg-type]
+    def violating(refiner: Refiner, *arguments: Any, **options: Any) -> Iterator[Attempt]:
+        for attempt in run_levels(refiner, *arguments, **options):
             factor = np.ones_like(attempt.rate)
             factor[3:-3] = np.exp(0.3) if refiner is tool.coarser else 1.0
             yield replace(attempt, rate=attempt.rate * factor)
@@ -107,6 +108,6 @@ def test_before_a_deadline_steps_with_all_control_points_are_expected_to_take_lo
     attempts = strategy.make_attempts(tool, problem, x)
     coarse = [next(attempts) for _ in range(3)]
     before = deadline.max_duration
-    monkeypatch.setattr(strategy, "run_levels", lambda *_: iter([coarse[-1]]))
+    monkeypatch.setattr(strategy, "run_levels", lambda *_, **__: iter([coarse[-1]]))
     next(attempts)
     assert deadline.max_duration > 5 * before > 0

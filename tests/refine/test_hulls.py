@@ -7,7 +7,10 @@ from cnpgen.kernels.collision.collision_checker import load_collision_library
 from cnpgen.kernels.library import KernelLibrary, choose_backend
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
+from cnpgen.refine import refiner as refiner_module
 from cnpgen.refine import strategy
+from cnpgen.refine.refine_engine import load_refiner
+from cnpgen.refine.solver.hull_feedback import HullFeedback
 from cnpgen.refine.solver.hulls import MEASURED_RANGE_M, Hulls, has_clearance_constraints
 from cnpgen.refine.solver.sqp import DEFAULT_SETTINGS
 from cnpgen.refine.strategy import PlanChecker
@@ -16,7 +19,7 @@ from cnpgen.robots.solid import place_obstacles
 from cnpgen.trajectory.spline_motion import Motion
 from tests.conftest import needs_compiler
 from tests.examples.meshes import Meshes
-from tests.examples.narrow import IN_SLOT, SLOT, between, narrow, refiner
+from tests.examples.narrow import BESIDE_WALL, IN_SLOT, SLOT, WALL, between, narrow, refiner
 from tests.examples.shaped_robot import KINDS, OBSTACLES, write_problem
 
 STEP = 1e-6  # rad, of finite differences
@@ -70,13 +73,62 @@ def test_distances_of_positions_that_are_not_finite_are_nan(tmp_path, library):
     assert np.isnan(Hulls(problem, robot, library).measure(q, place_obstacles(problem.obstacle))[0]).all()
 
 
+@needs_compiler
+def test_compiled_rows_are_the_distances_of_hulls_and_their_gradients(tmp_path):
+    problem = load_problem(write_problem(tmp_path, obstacles=KINDS))
+    robot, tool = load_robot(problem), load_refiner(problem, load_robot(problem))
+    kernels, poses = tool.residual_kernels, place_obstacles(problem.obstacle)
+    hulls, width, rows = tool.hulls, kernels.values.tape.inputs[0], kernels.values.tape.outputs[0]
+    w = np.random.default_rng(0).uniform(0.1, 1.0, (width, 40))
+    q = np.random.default_rng(1).uniform(robot.position_lower, robot.position_upper, (40, robot.n)).T.copy()
+    w[: robot.n] = q
+    with_rows, scene = hulls.row_kernels(kernels, poses), np.zeros((0, 40))
+    (values,) = with_rows.values(w, scene)
+    again, jacobian = with_rows.jacobian(w, scene)
+    own, own_jacobian = kernels.jacobian(w, scene)
+    distances, contacts = Hulls(problem, robot).measure(q, poses)  # by Coal
+    np.testing.assert_allclose(values[:rows], own, rtol=1e-12)
+    np.testing.assert_allclose(values, again, atol=1e-9)  # initial guesses of GJK differ
+    np.testing.assert_allclose(0.1 * values[rows:].T, distances, atol=1e-4)  # cylinders are prisms for Coal
+    jacobian = jacobian.reshape(width, -1, 40)
+    np.testing.assert_allclose(jacobian[:, :rows], own_jacobian.reshape(width, rows, 40), rtol=1e-12)
+    measured, contacts = hulls.measure(q, poses)
+    gradients = hulls.gradients(q, measured, contacts)
+    np.testing.assert_allclose(0.1 * jacobian[: robot.n, rows:], gradients, atol=1e-4)  # of curved bodies
+    assert not jacobian[robot.n :, rows:].any()
+    assert np.abs(gradients).max() > 0.1
+
+
+@needs_compiler
+def test_scenes_of_a_robot_share_kernels(tmp_path):
+    problem = load_problem(write_problem(tmp_path, obstacles=KINDS))
+    other = problem.with_obstacles(problem.obstacle[:2])
+    tapes = [load_refiner(item, load_robot(item)).residual_kernels.values.tape for item in (problem, other)]
+    assert tapes[0].inputs == tapes[1].inputs
+    assert tapes[0].to_bytes() == tapes[1].to_bytes()
+
+
+@needs_compiler
+def test_collisions_between_grid_points_require_more_clearance(tmp_path):
+    problem = narrow(tmp_path, WALL)
+    tool, task = load_refiner(problem, load_robot(problem)), between(problem, BESIDE_WALL)
+    path, _ = tool.check.transcription(task).unpack(tool.line_guess(task))
+    poses, s = task.scene.poses[0], np.linspace(0, 1, 9)
+    assert HullFeedback(tool.spec, s).missing_clearance(path, tool.hulls, poses) is None  # deeper than fed back
+    q = np.linspace(*BESIDE_WALL, 400).T.copy()
+    missing = tool.hulls.missing(q, np.zeros(400), poses)
+    distances = tool.hulls.measure(q, poses)[0]
+    np.testing.assert_allclose(missing, np.maximum(tool.hulls.min_distances - distances, 0), atol=1e-12)
+    assert missing.max() > 0.02
+
+
 @pytest.mark.slow
 @needs_compiler
 def test_no_attempt_is_made_if_an_end_is_inside_an_obstacle(tmp_path):
     problem = narrow(tmp_path, SLOT)
     tool, inside = refiner(problem), between(problem, np.add(IN_SLOT, [0.0, 0.0, 0.1, 0.0]))
     best = tool.attempt(inside, tool.line_guess(inside), 1.0, Outcome.SOLVED, iterations=0, violation=0.0)
-    assert list(strategy._around_obstacles(tool, inside, best)) == []
+    assert list(strategy._around_obstacles(tool, inside, best, tool.hulls)) == []
 
 
 def test_robots_without_a_shape_have_no_hulls(tmp_path):
@@ -89,16 +141,22 @@ def test_robots_without_a_shape_have_no_hulls(tmp_path):
 
 @pytest.mark.slow
 @needs_compiler
-def test_a_slot_that_is_too_narrow_for_capsules_is_wide_enough_for_hulls(tmp_path):
+@pytest.mark.parametrize("compiled", [True, False])
+def test_a_slot_that_is_too_narrow_for_capsules_is_wide_enough_for_hulls(tmp_path, compiled, monkeypatch):
     problem = narrow(tmp_path, SLOT)
-    robot, tool, task = load_robot(problem), refiner(problem), between(problem, IN_SLOT)
+    if not compiled:
+        monkeypatch.setattr(refiner_module, "can_measure_hulls", lambda *_: False)
+    robot, task = load_robot(problem), between(problem, IN_SLOT)
+    tool = load_refiner(problem, robot)
+    assert tool.measures_hulls == compiled
     hulls, checker, start = (
         Hulls(problem, robot),
         PlanChecker(problem, robot, degree=tool.spec.degree),
         tool.line_guess(task),
     )
-    capsules = tool.run_level(task, tool.levels.warm, start)
-    assert capsules.violation > 0.01  # 1 mm
+    if not compiled:
+        capsules = tool.run_level(task, tool.levels.warm, start)
+        assert capsules.violation > 0.01  # 1 mm
     found = tool.run_level(task, tool.levels.warm, start, hulls)
     assert found.violation < DEFAULT_SETTINGS.violation_tolerance
     path, rate = tool.check.transcription(task).unpack(found.x)

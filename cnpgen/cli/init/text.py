@@ -52,9 +52,10 @@ class _Writer:
         """Write one of several tables of the same name; without one, how it would be written."""
         kind = cls if item is None else type(item)
         yield from _comment(kind_summary(kind))
-        yield _unless(item, f"[[{path.split('.')[-2]}]]")
+        yield _unless(item, f"[[{path.rpartition('.')[0]}]]")
         if cls in GROUPS:
-            yield f'use = "{registry.name_of(GROUPS[cls], kind)}"'
+            names = registry.names(GROUPS[cls])
+            yield f'# use = "{names[0]}"' if item is None else f'use = "{registry.name_of(GROUPS[cls], kind)}"'
         yield from self.table(kind, item, path)
 
     def key(self, key: Key, table: Any, name: str) -> Iterator[str]:
