@@ -5,24 +5,21 @@ is solved once, in one process and thread, from a new problem: the set-up of the
 a robot are compiled before, since they do not depend on its obstacles.
 """
 
+import argparse
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-<<<<<<< HEAD
-=======
 from itertools import pairwise
->>>>>>> scenes-kernel
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from common import arguments, median, progress, report, table
 from numpy.typing import NDArray
 
-<<<<<<< HEAD
-=======
-from benchmarks.common import arguments, median, progress, report, table
->>>>>>> scenes-kernel
 from cnpgen.kernels.collision.collision_checker import CollisionChecker, load_collision_library
+from cnpgen.kernels.collision.tree_search import TreeSettings, find_tree_path
 from cnpgen.kernels.library import KernelLibrary, choose_backend
 from cnpgen.plans.boundary_problems import plans_of_rows
 from cnpgen.problems.load_robot import load_robot
@@ -31,6 +28,7 @@ from cnpgen.problems.problem_file import load_problem
 from cnpgen.problems.problem_record import record_problem
 from cnpgen.refine.options import DEFAULT_OPTIONS
 from cnpgen.refine.refine_engine import refine_serially
+from cnpgen.refine.solver.hulls import Hulls
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.solid import place_obstacles
@@ -147,13 +145,8 @@ def shelf_scene(random: Random) -> GeneratedScene:
     bottom, gap = random.uniform(0.0, 0.15), random.uniform(0.28, 0.4)
     midpoint = bottom + 1.5 * gap
     obstacles = [box(f"board {i}", (x, 0.0, bottom + i * gap), (depth, width, 0.02), 1e-9) for i in range(4)]
-<<<<<<< HEAD
-    sides = ((f"side {side}", side * width / 2) for side in (-1, 0, 1))
-    obstacles += [box(name, (x, y, midpoint), (depth, 0.02, 3 * gap + 0.02), 1e-9) for name, y in sides]
-=======
     sides = (depth, 0.02, 3 * gap + 0.02)
     obstacles += [box(f"side {side}", (x, side * width / 2, midpoint), sides, 1e-9) for side in (-1, 0, 1)]
->>>>>>> scenes-kernel
     obstacles.append(box("back", (x + depth / 2, 0.0, midpoint), (0.02, width, 3 * gap), 1e-9))
     for index in range(6):
         y, height = random.uniform(-0.45, 0.45) * width, random.uniform(0.08, 0.15)
@@ -415,44 +408,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-<<<<<<< HEAD
-    import sys
-
-    np.seterr(all="ignore")
-    folder = Path(__import__("tempfile").mkdtemp())
-    name, fams, count, seed = sys.argv[1], sys.argv[2].split(","), int(sys.argv[3]), int(sys.argv[4])
-    (folder / "problem.toml").write_text(ROBOTS[name])
-    base = load_problem(folder / "problem.toml")
-    robot = load_robot(base)
-    b, f = choose_backend(None)
-    lib = load_collision_library(KernelLibrary(b, f, "", {}))
-    sampler = EndSampler(robot, CollisionChecker(lib, robot))
-    for fam in fams:
-        R = []
-        for problem, s, g in generate(base, sampler, fam, count, seed):
-            t0 = time.time()
-            r = solve_scene(problem, s, g)
-            R.append(r)
-            if not r["valid"] or r["cpu"] > 0.5:
-                print(fam, len(R) - 1, r, f"{time.time() - t0:.2f}", flush=True)
-        cpu = np.array([r["cpu"] for r in R])
-        from collections import Counter
-
-        print(
-            fam,
-            len(problem.obstacle),
-            "valid",
-            sum(r["valid"] for r in R),
-            len(R),
-            "cpu med/p95/max",
-            np.median(cpu),
-            np.percentile(cpu, 95),
-            cpu.max(),
-            "dur",
-            np.nanmean([r["duration"] for r in R]),
-            Counter(r["outcome"] for r in R),
-            flush=True,
-        )
-=======
     main()
->>>>>>> scenes-kernel

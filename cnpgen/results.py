@@ -16,6 +16,7 @@ from cnpgen.planner.network.architecture import Architecture, Layer
 from cnpgen.planner.network.features import Features
 from cnpgen.planner.plan_hits import PlannedHits
 from cnpgen.planner.plan_runtime import PlanRuntime, Switch, SwitchOutcome
+from cnpgen.planner.puck_model import PuckModel
 from cnpgen.planner.set_points import SetPoint
 from cnpgen.planner.tasks import Tasks
 from cnpgen.plans.evaluate import Evaluation
@@ -78,6 +79,7 @@ __all__ = [
     "PlanRuntime",
     "PlanStatus",
     "PlannedHits",
+    "PuckModel",
     "Reason",
     "Refinement",
     "RowError",

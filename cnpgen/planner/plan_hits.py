@@ -21,7 +21,7 @@ from cnpgen.plans.plans import Plans
 from cnpgen.problems.constraints.puck_contact import PuckContact
 from cnpgen.problems.problem_record import as_problem
 from cnpgen.schema.argument_types import checked_arguments
-from cnpgen.schema.arguments import number, numbers
+from cnpgen.schema.arguments import concerning, number, numbers
 
 Array = NDArray[np.float64]
 
@@ -142,7 +142,8 @@ def _plan_returns(planner: Planner, hits: PlannedHits, home: Array) -> Plans:
         home = home[plans.sample_id]
     q, dq, ddq = plans.states_at(plans.duration)
     goal = np.broadcast_to(home, q.shape) if len(q) else q
-    return replace(planner.plan(q, goal, start_dq=dq, start_ddq=ddq), sample_id=plans.sample_id)
+    with concerning("home"):
+        return replace(planner.plan(q, goal, start_dq=dq, start_ddq=ddq), sample_id=plans.sample_id)
 
 
 def _contact_distance(contact: PuckContact | None, given: float | None) -> float:

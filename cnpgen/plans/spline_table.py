@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from cnpgen.errors import UsageError
 from cnpgen.plans.exporter import ExportedSet, Exporter, SampledPlan
 from cnpgen.store.files.atomic import write_file
+from cnpgen.store.files.hdf5 import create_hdf5
 from cnpgen.trajectory.spline_motion import Motion
 
 WAYPOINTS = 128  # of a path, equidistant in phase
@@ -37,7 +38,7 @@ class PathSplines(Exporter):
         import h5py
 
         buffer = io.BytesIO()
-        with h5py.File(buffer, "w") as file:
+        with h5py.File(create_hdf5(buffer)) as file:
             for name, values in _columns(motion, exported).items():
                 file.create_dataset(name, data=values, track_times=False)
             file.attrs["joint_names"] = list(exported.joint_names)
