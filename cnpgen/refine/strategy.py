@@ -76,9 +76,10 @@ def make_attempts(refiner: Refiner, task: RefinementTask, x: Array | None) -> It
     if hulls is not None and x is None and _is_deep(refiner, task, hulls):
         best = refiner.measured(task, refiner.line_guess(task), Outcome.NOT_CONVERGED)
         yield best
+    elif hulls is not None:
+        best = yield from run_levels(refiner, task, x, adjusted, max_violation=NEARLY_VALID)
     else:
-        max_violation = np.inf if hulls is None else NEARLY_VALID
-        best = yield from run_levels(refiner, task, x, adjusted, max_violation=max_violation)
+        best = yield from run_levels(refiner, task, x, adjusted)
     if refiner.check.ends_are_invalid(task):
         return
     if hulls is not None:
