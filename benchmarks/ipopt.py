@@ -55,7 +55,7 @@ def with_ipopt(refiner: Refiner) -> Refiner:
         return minimize_with_ipopt(motion, bounds, x, level.settings)
 
     other = copy.copy(refiner)
-    other.run_level = run_level  # type: ignore[method-assign]
+    other.run_level = run_level  # type: ignore[method-assign, assignment]
     return other
 
 

@@ -108,7 +108,12 @@ class GeneratedScene:
 
 def box(name: str, position: Any, size: Any, yaw: float = 0.0) -> Obstacle:
     """Return a box with a pose."""
-    return Obstacle(name=name, position=tuple(map(float, position)), size=tuple(size), rotation=(0.0, 0.0, yaw))
+    return Obstacle(
+        name=name,
+        position=(float(position[0]), float(position[1]), float(position[2])),
+        size=tuple(size),
+        rotation=(0.0, 0.0, yaw),
+    )
 
 
 def cylinder(name: str, position: Any, radius: float, length: float, roll: float = 0.0) -> Obstacle:
@@ -116,7 +121,7 @@ def cylinder(name: str, position: Any, radius: float, length: float, roll: float
     return Obstacle(
         name=name,
         kind="cylinder",
-        position=tuple(map(float, position)),
+        position=(float(position[0]), float(position[1]), float(position[2])),
         radius=radius,
         length=length,
         rotation=(roll, 0.0, 0.0),

@@ -73,12 +73,10 @@ def make_attempts(refiner: Refiner, task: RefinementTask, x: Array | None) -> It
         yield from _with_fewer_control_points(refiner, refiner.coarser, task, x)
     adjusted = refiner.measured(task, x, Outcome.ADJUSTED) if x is not None and task.at_rest else None
     hulls = _hulls_of_trees(refiner, task)
-    if hulls is not None and x is None and _is_deep(refiner, task, hulls):
-        best = refiner.measured(task, refiner.line_guess(task), Outcome.NOT_CONVERGED)
-        yield best
+    if hulls is None:
+        best = yield from run_levels(refiner, task, x, adjusted)
     else:
-        max_violation = np.inf if hulls is None else NEARLY_VALID
-        best = yield from run_levels(refiner, task, x, adjusted, max_violation=max_violation)
+        best = yield from _before_paths(refiner, task, x, adjusted, hulls)
     if refiner.check.ends_are_invalid(task):
         return
     if hulls is not None:
@@ -106,6 +104,17 @@ def _hulls_of_trees(refiner: Refiner, task: RefinementTask) -> Hulls | None:
     if task.deadline is not None or not has_clearance_constraints(refiner.problem, refiner.robot):
         return None
     return refiner.hulls if refiner.measures_hulls else None
+
+
+def _before_paths(
+    refiner: Refiner, task: RefinementTask, x: Array | None, adjusted: Attempt | None, hulls: Hulls
+) -> Generator[Attempt, None, Attempt]:
+    """Yield the attempts before joint-space paths; return the best one."""
+    if x is None and _is_deep(refiner, task, hulls):
+        line = refiner.measured(task, refiner.line_guess(task), Outcome.NOT_CONVERGED)
+        yield line
+        return line
+    return (yield from run_levels(refiner, task, x, adjusted, max_violation=NEARLY_VALID))
 
 
 def _is_deep(refiner: Refiner, task: RefinementTask, hulls: Hulls) -> bool:

@@ -3,7 +3,7 @@
 import dataclasses
 import json
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import MISSING, dataclass
 from functools import cache
 from types import UnionType
@@ -106,13 +106,18 @@ class Key:
         return self.form or _expected(self.hint, self.unit)
 
 
-@cache
 def keys(cls: type) -> tuple[Key, ...]:
     """List the keys of a dataclass, in order.
 
     Args:
         cls: Dataclass; fields that are not declared with ``field`` are not keys.
     """
+    return _keys_of(cls)
+
+
+@cache
+def _keys_of(cls: Hashable) -> tuple[Key, ...]:
+    assert isinstance(cls, type)
     hints = get_type_hints(cls)
     return tuple(
         Key(name=spec.name, hint=_present(hints[spec.name]), default=spec.default, **spec.metadata)

@@ -178,7 +178,8 @@ class CollisionChecker:
                 self.address, address_of(states), len(states), within, of_obstacles, capacity, *map(address_of, close)
             )
             if count <= capacity:
-                return CloseBodies(*(values[:count] for values in close))
+                pair, k, distance, normal, points = close
+                return CloseBodies(pair[:count], k[:count], distance[:count], normal[:count], points[:count])
             capacity = count
 
     def joint_poses(self, q: Array) -> Array:

@@ -50,4 +50,4 @@ class HullFeedback:
             return None
         between = missing.reshape(self._intervals, STATES_PER_INTERVAL, -1).max(axis=1)
         edge = np.zeros((1, between.shape[1]))
-        return np.maximum(np.concatenate([between, edge]), np.concatenate([edge, between]))
+        return np.asarray(np.maximum(np.concatenate([between, edge]), np.concatenate([edge, between])))

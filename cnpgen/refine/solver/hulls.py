@@ -227,7 +227,8 @@ class Hulls:
 
 
 def _largest_distance(constraints: list[Any], kind: type) -> float | None:
-    return max((constraint.distance for constraint in constraints if isinstance(constraint, kind)), default=None)
+    chosen: list[Any] = [constraint for constraint in constraints if isinstance(constraint, kind)]
+    return max((float(constraint.distance) for constraint in chosen), default=None)
 
 
 class CompiledHullTranscription(Transcription):
