@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 from math import ceil
 from typing import NamedTuple
 
@@ -84,26 +83,21 @@ def sample_motion(plan: Plans | JoinedPlans, start: float) -> SampledMotion:
         plan: The plan.
         start: Time at which it starts [s].
     """
-    begins = plan.begins[:, 0] if isinstance(plan, JoinedPlans) else np.zeros(1)
-    edges = _edges(np.append(begins, plan.duration[0]))
-    states = plan.motion.at_times(edges[None])
-    width = np.diff(edges)[:, None]
-    left, right = (
-        np.stack([states.q[0, ends], states.dq[0, ends] * width, states.ddq[0, ends] * width**2], axis=1)
-        for ends in (slice(None, -1), slice(1, None))
-    )
-    coefficients = np.einsum("ij,cjn->cin", _QUINTIC, np.concatenate([left, right], axis=1))
-    return SampledMotion(start + edges, coefficients, states.q[0, -1].copy())
-
-
-def _edges(times: Array) -> Array:
-    """Divide the intervals between ascending times evenly; the jerk is continuous within them."""
-    parts = [
-        np.linspace(low, high, max(ceil((high - low) / MAX_GRID_STEP_S), 1), endpoint=False)
-        for low, high in pairwise(times.tolist())
-        if high > low
-    ]
-    return np.append(np.concatenate(parts), times[-1])
+    parts = plan.parts if isinstance(plan, JoinedPlans) else (plan,)
+    begins = plan.begins[:, 0].tolist() if isinstance(plan, JoinedPlans) else [0.0]
+    ends = [*begins[1:], float(plan.duration[0])]
+    edges, coefficients, last = [], [], np.zeros(0)
+    for part, begin, end in zip(parts, begins, ends, strict=True):
+        if end <= begin:
+            continue  # the next part replaces it at once
+        cells = ceil((end - begin) / MAX_GRID_STEP_S)
+        times, width = np.linspace(0.0, end - begin, cells + 1), (end - begin) / cells
+        states = part.motion.at_times(times[None])
+        nodes = np.stack([states.q[0], states.dq[0] * width, states.ddq[0] * width**2], axis=1)
+        coefficients.append(np.einsum("ij,cjn->cin", _QUINTIC, np.concatenate([nodes[:-1], nodes[1:]], axis=1)))
+        edges.append(start + begin + times[:-1])
+        last = states.q[0, -1]
+    return SampledMotion(np.append(np.concatenate(edges), start + ends[-1]), np.concatenate(coefficients), last)
 
 
 def at_rest(q: ArrayLike, start: float) -> SampledMotion:

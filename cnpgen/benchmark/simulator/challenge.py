@@ -82,7 +82,8 @@ def execute_in_challenge(scene: SimulatorScene, reference: Reference, start_dq: 
     """
     environment = _environment(scene.plant.environment)
     try:
-        environment.begin(_all_joints(scene, reference.q[:1])[0], _all_joints(scene, start_dq[None])[0], scene.puck)
+        start_q, start_speed = _all_joints(scene, reference.q[:1])[0], _all_joints(scene, start_dq[None])[0]
+        environment.begin(start_q, start_speed, scene.puck, scene.puck_velocity)
         tick, done = 0, False
         while not done:
             done = environment.advance(_action(scene, reference, tick))
@@ -187,19 +188,22 @@ class _Recorder:
 
     recorded: list[tuple[Array, ...]]
     _start: Array
+    _puck_velocity: Array
 
-    def begin(self: Any, q: Array, dq: Array, puck: Array) -> None:
-        """Reset to positions and velocities of the arm, shape (7,), and a resting puck [m], shape (2,)."""
+    def begin(self: Any, q: Array, dq: Array, puck: Array, velocity: tuple[float, float] = (0.0, 0.0)) -> None:
+        """Reset to positions and velocities of the arm, shape (7,), and of the puck [m] and [m/s], shape (2,)."""
         self.recorded, self._start = [], dq
         self._frame = np.array(self.env_info["robot"]["base_frame"][0])
         self._puck = (self._frame @ [*puck, 0.0, 1.0])[:2]
+        self._puck_velocity = (self._frame[:3, :3] @ [*velocity, 0.0])[:2]
         self.init_state = q
         self.reset()
 
     def setup(self: Any, obs: Any) -> None:
         """Set puck and velocities; called by the environment in ``reset``."""
-        for axis, value in zip("xy", self._puck.tolist(), strict=True):
+        for axis, value, speed in zip("xy", self._puck.tolist(), self._puck_velocity.tolist(), strict=True):
             self._write_data(f"puck_{axis}_pos", value)
+            self._write_data(f"puck_{axis}_vel", speed)
         for name, speed in zip(JOINTS, self._start.tolist(), strict=True):
             self._data.joint(f"iiwa_1/{name}").qvel = speed
         if hasattr(self, "q_vel_prev"):

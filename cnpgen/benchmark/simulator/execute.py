@@ -111,7 +111,7 @@ class _Run:
         data, n = self._data, self._n
         data.qpos[:n], data.qvel[:n] = self._reference.q[0], start_dq
         if self._scene.puck is not None:
-            data.qpos[n:] = self._scene.puck
+            data.qpos[n:], data.qvel[n:] = self._scene.puck, self._scene.puck_velocity
         self._mujoco.mj_forward(self._model, data)
         tick = 0
         while not self._is_over(tick):

@@ -168,6 +168,8 @@ def execute_states(
 def simulator_scene(problem: Plans, plant: Plant) -> SimulatorScene:
     """Build the simulated world of one boundary problem: obstacles, and the puck if the goal is a hit.
 
+    The columns ``puck_xy`` [m] and ``puck_velocity`` [m/s] of hits of moving pucks define the puck at the start.
+
     Args:
         problem: One boundary problem, or a plan for it.
         plant: The robot.
@@ -176,6 +178,9 @@ def simulator_scene(problem: Plans, plant: Plant) -> SimulatorScene:
     goal_xyz, scene = problem.columns["goal_xyz"][0], SimulatorScene(loaded, robot, plant, problem.scene.poses[0])
     if scene.height is None:
         return scene
+    if "puck_xy" in problem.columns:
+        puck, (vx, vy) = problem.columns["puck_xy"][0], problem.columns["puck_velocity"][0].tolist()
+        return replace(scene, puck=puck, puck_velocity=(vx, vy))
     velocity = _tip_velocity(robot, problem.boundary.goal_q[0], problem.boundary.goal_dq[0])
     return replace(scene, puck=puck_of(goal_xyz, velocity))
 

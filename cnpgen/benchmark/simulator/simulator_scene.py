@@ -69,6 +69,7 @@ class SimulatorScene:
         plant: Deviations from the nominal model.
         obstacle_poses: Poses and sizes of the obstacles, shape (width,).
         puck: Position of the puck [m], shape (2,), or None.
+        puck_velocity: Velocity of the puck at the start [m/s].
     """
 
     problem: Problem
@@ -76,6 +77,7 @@ class SimulatorScene:
     plant: Plant
     obstacle_poses: Array
     puck: Array | None = None
+    puck_velocity: tuple[float, float] = (0.0, 0.0)
 
     @property
     def height(self) -> float | None:

@@ -1,0 +1,44 @@
+"""The example agent in the evaluator of the Air Hockey Challenge, in a Python environment of its own.
+
+``CNPGEN_CHALLENGE`` is a clone of the Challenge, ``CNPGEN_CHALLENGE_PYTHON`` the interpreter with its libraries.
+"""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+RUN = ROOT / "docs" / "examples" / "challenge_run.py"
+CONSTRAINTS = {"joint_pos_constr", "joint_vel_constr", "ee_constr", "link_constr"}
+
+
+def run(python: str, *options: str) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [python, str(RUN), *options]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=600, check=False)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(
+    not {"CNPGEN_CHALLENGE", "CNPGEN_CHALLENGE_PYTHON"} <= os.environ.keys(),
+    reason="CNPGEN_CHALLENGE and CNPGEN_CHALLENGE_PYTHON are not set",
+)
+def test_the_agent_scores_without_violating_a_constraint():
+    python, clone = os.environ["CNPGEN_CHALLENGE_PYTHON"], os.environ["CNPGEN_CHALLENGE"]
+    done = run(python, "--environment", clone, "--episodes", "4", "--chunk", "4", "--seed", "31")
+    assert done.returncode == 0, done.stderr
+    result = json.loads(done.stdout.splitlines()[-1])
+    assert result["episodes"] == 4
+    assert result["successes"] >= 3
+    assert not CONSTRAINTS & result["violations"].keys()
+
+
+def test_a_folder_without_the_environment_gives_a_message(tmp_path):
+    done = run(sys.executable, "--environment", str(tmp_path))
+    assert done.returncode == 3
+    assert done.stderr.startswith("the environment cannot be imported: ")
+    assert "Traceback" not in done.stderr
