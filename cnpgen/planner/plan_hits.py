@@ -135,11 +135,11 @@ def plan_hits(
 
 def _plan_returns(planner: Planner, hits: PlannedHits, home: Array) -> Plans:
     """Plan the ways back, from the ends of hits to rest at home, shape (n,) or (N, n)."""
-    plans = hits.plans
-    if home.ndim == 2:
-        if len(home) != len(hits.reasons):
-            raise UsageError(f"has {len(home)} rows for {len(hits.reasons)} hits", argument="home")
-        home = home[plans.sample_id]
+    plans, n = hits.plans, planner.robot.n
+    if home.shape not in ((n,), (len(hits.reasons), n)):
+        expected = f"({n},) or ({len(hits.reasons)}, {n})"
+        raise UsageError(f"must have shape {expected}, got {home.shape}", argument="home")
+    home = home[plans.sample_id] if home.ndim == 2 else home
     q, dq, ddq = plans.states_at(plans.duration)
     goal = np.broadcast_to(home, q.shape) if len(q) else q
     with concerning("home"):

@@ -167,8 +167,10 @@ class RobotModel:
         """
         from cnpgen.problems.obstacles import scene_of
 
-        vectors = {"start_xyz": start_xyz, "goal_xyz": goal_xyz, "goal_velocity": goal_velocity}
-        given = {name: np.atleast_2d(numbers(name, xyz)) for name, xyz in vectors.items() if xyz is not None}
+        vectors: dict[str, ArrayLike] = {"start_xyz": start_xyz, "goal_xyz": goal_xyz}
+        if goal_velocity is not None:
+            vectors["goal_velocity"] = goal_velocity
+        given = {name: np.atleast_2d(numbers(name, xyz)) for name, xyz in vectors.items()}
         start, goal = given["start_xyz"], given["goal_xyz"]
         for name, xyz in given.items():
             if xyz.shape != (len(start), 3):

@@ -29,7 +29,7 @@ KEEPER_RATE_RAD_S = 3.0  # of the opponent's motion
 KEEPER_X_M = np.linspace(2.28, 2.48, 6)
 KEEPER_RADIUS_M = 0.08
 MIN_MARGIN_M = 0.03  # of the puck to keeper and posts, to hit at once
-SAFE_X_M = 0.78  # a puck that stays beyond it can wait until the arm is at home
+SAFE_X_M = 0.78  # a puck that stays outside it can wait until the arm is at home
 FIRST_MOTION_S = 2.2
 PUSH_ANGLES_RAD = np.radians(np.arange(-180.0, 180.0, 15.0))  # of pucks that the arm cannot hit forwards
 PUSH_SHARES = np.array([0.2, 0.35, 0.5])
@@ -257,7 +257,7 @@ class HitAgent(AgentBase):
         }
 
     def find_push(self, now, rest, puck, velocity):
-        """Return a slow hit that moves a puck at the arm's own band, where it cannot be hit forwards, to the middle."""
+        """Return a slow hit that moves a puck at the arm's own band, where it cannot be hit forwards, to the midpoint."""
         still, time = np.zeros(6), np.array([PUSH_MEETING_S])
         (position,), (puck_velocity,) = PUCK.predict(puck[None], velocity[None], time)
         angles, shares = (part.ravel() for part in np.meshgrid(PUSH_ANGLES_RAD, PUSH_SHARES))

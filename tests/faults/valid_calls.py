@@ -304,6 +304,7 @@ def _of_benchmark(folder: Path, problem: Any, plans: Any) -> list[ValidCall]:
         ValidCall("Suite.find_mistakes", suite.find_mistakes),
         ValidCall("Suite.problems", suite.problems, {"n": 1}),
         ValidCall("SampledProblems", benchmark.SampledProblems, {"recipe": "airhockey-hit"}),
+        ValidCall("SceneFileProblems", benchmark.SceneFileProblems, {"file": "scenes.h5", "robot": "panda"}),
         ValidCall("Pucks", benchmark.Pucks, _fields(suite.pucks)),
         ValidCall("Pucks.find_mistakes", suite.pucks.find_mistakes),
         ValidCall("Pucks.positions", suite.pucks.positions),

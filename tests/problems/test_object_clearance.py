@@ -81,7 +81,9 @@ def test_capsules_of_solvers_are_conservative_and_close() -> None:
     bound = np.array([float(ca.mmin(margins(each))) for each in states])
     exact = np.array([distance_of_coal(each) for each in states]) - CLEARANCE.distance
     assert np.all(bound[exact < 0] < 0)
-    assert np.mean(bound[exact > 0.05] > 0) > 0.97  # close: most free states are free for solvers, too
+    free = exact > 0.01
+    assert free.sum() > 100
+    assert np.mean(bound[free] > 0) > 0.97  # close: most free states are free for solvers, too
 
 
 def test_gradients_of_capsules_agree_with_differences() -> None:
