@@ -179,7 +179,7 @@ def test_invalid_arguments_raise_errors(planner, still):
         plan_hits(planner, moving, [1.0, 0.1], TARGET, meeting_time=0.6)
     with pytest.raises(UsageError, match="pass home="):
         _ = plan_hits(planner, still, [1.0, 0.1], TARGET).sequences
-    with pytest.raises(UsageError, match="home home must have shape"):
+    with pytest.raises(UsageError, match="home must have shape"):
         plan_hits(planner, still, [1.0, 0.1], TARGET, home=np.zeros((2, 6)))
     with pytest.raises(UsageError, match="restitution must be finite and not negative, got -1"):
         PuckModel(restitution=-1.0)
