@@ -24,12 +24,13 @@ MIN_ACCEPTED_M = -0.005  # smallest margin of a hit
 PUCK = PuckModel(restitution=0.46, friction=1.0, band_restitution=0.7, band_loss=1 / 3, home_edge=0.5677)
 REACH_X_M, REACH_Y_M = (0.72, 1.32), 0.43  # of pucks that are hit
 MEETING_TIMES_S = np.arange(0.34, 2.6, 0.06)
+MIN_CONTACT_TIME_S = 0.05  # of a hit that is executed
 MIN_DELAY_S, MAX_DELAY_S = 0.08, 0.16  # before the start of a hit, for planning in several steps
 KEEPER_RATE_RAD_S = 3.0  # of the opponent's motion
 KEEPER_X_M = np.linspace(2.28, 2.48, 6)
 KEEPER_RADIUS_M = 0.08
 MIN_MARGIN_M = 0.03  # of the puck to keeper and posts, to hit at once
-SAFE_X_M = 0.78  # a puck that stays outside it can wait until the arm is at home
+SAFE_X_M = 0.78  # a puck that stays farther away can wait until the arm is at home
 FIRST_MOTION_S = 2.2
 PUSH_ANGLES_RAD = np.radians(np.arange(-180.0, 180.0, 15.0))  # of pucks that the arm cannot hit forwards
 PUSH_SHARES = np.array([0.2, 0.35, 0.5])
@@ -183,7 +184,7 @@ class HitAgent(AgentBase):
             self.aim(self.shot, now, rest, puck, velocity)
         else:
             shot, self.shot = self.shot, None
-            if shot["hits"].reasons[0] == "":
+            if shot["planned"]:
                 start = shot["time"] - float(shot["hits"].contact_time[0])
                 if start >= now:
                     shot["switch"] = self.runtime.switch(shot["hits"].sequences, start)
@@ -257,7 +258,7 @@ class HitAgent(AgentBase):
         }
 
     def find_push(self, now, rest, puck, velocity):
-        """Return a slow hit that moves a puck at the arm's own band, where it cannot be hit forwards, to the midpoint."""
+        """Return a slow hit that moves a puck at the arm's own band, where it cannot be hit forwards, to the centre."""
         still, time = np.zeros(6), np.array([PUSH_MEETING_S])
         (position,), (puck_velocity,) = PUCK.predict(puck[None], velocity[None], time)
         angles, shares = (part.ravel() for part in np.meshgrid(PUSH_ANGLES_RAD, PUSH_SHARES))
@@ -310,11 +311,12 @@ class HitAgent(AgentBase):
         )
         shot["plans"] += 1
         shot["hits"], shot["normal"], shot["position"], shot["velocity"] = hits, normal, position[0], puck_velocity[0]
-        if hits.reasons[0]:
+        contact = 0.0 if hits.reasons[0] else float(hits.contact_time[0])
+        shot["planned"] = contact >= MIN_CONTACT_TIME_S  # not for a mallet that is at the puck already
+        if not shot["planned"]:
             shot["plans"] = 3
             return
         plan = hits.plans
-        contact = float(hits.contact_time[0])
         states = plan.motion.at_times(np.arange(0, contact + 1e-9, contact / np.ceil(contact / 3e-3))[None])
         q, dq = (np.pad(values[0], ((0, 0), (0, 1))) for values in (states.q, states.dq))
         shot["u"], shot["du"] = self.mallet.offset(q, dq, contact / np.ceil(contact / 3e-3))

@@ -66,4 +66,8 @@ class AirHockeySingle:
         return any({contact.geom1, contact.geom2} == pair for contact in self._data.contact)
 
     def _write_data(self, name: str, value: float) -> None:
-        self._data.joint(name.rpartition("_")[0]).qpos = value - BASE["xy".index(name[5])]
+        joint = self._data.joint(name.rpartition("_")[0])
+        if name.endswith("vel"):
+            joint.qvel = value
+        else:
+            joint.qpos = value - BASE["xy".index(name[5])]
