@@ -25,7 +25,6 @@ ANGLE_ITERATIONS = 8
 class PuckModel:
     """Motion and contacts of a puck; the defaults are those of the simulator's plants.
 
-    ``benchmarks/puck_model.py`` identifies the parameters of a plant.
 
     Attributes:
         drag: Deceleration over velocity on the table [1/s].
