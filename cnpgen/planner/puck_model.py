@@ -25,7 +25,6 @@ ANGLE_ITERATIONS = 8
 class PuckModel:
     """Motion and contacts of a puck; the defaults are those of the simulator's plants.
 
-
     Attributes:
         drag: Deceleration over velocity on the table [1/s].
         restitution: Speed of separation over speed of approach, for mallet and puck.
