@@ -14,7 +14,7 @@ import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import BrokenExecutor
 from contextlib import closing, contextmanager, suppress
-from functools import partial
+from functools import partial, wraps
 from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
@@ -118,6 +118,7 @@ def _on_processes(function: Callable[[T], R], tasks: Iterable[T], workers: int, 
     therefore written to a file, and only the file name goes through the pipe.
     """
     _start_helpers()
+    _tolerate_aborts()
     ours: dict[str, Any] = {"initializer": _end_with, "initargs": (os.getpid(),)}
     with _shared_folder() as folder:
         pack = partial(_packed, function, folder)
@@ -207,6 +208,26 @@ def _start_helpers() -> None:
             resource_tracker.ensure_running()
     finally:
         sys.warnoptions.remove(_IGNORED_WARNING)
+
+
+def _tolerate_aborts() -> None:
+    """Let loky's manager thread survive an abort that removes a task between its submission and its dispatch.
+
+    The thread of joblib 1.6 looks up such a task and ends with a KeyError. This process would then hang at its exit.
+    """
+    from joblib.externals.loky import process_executor
+
+    manager = getattr(process_executor, "_ExecutorManagerThread", None)
+    dispatch = getattr(manager, "add_call_item_to_queue", None)
+    if manager is None or dispatch is None or hasattr(dispatch, "__wrapped__"):
+        return
+
+    @wraps(dispatch)
+    def dispatch_remaining(thread: Any) -> None:
+        with suppress(KeyError):
+            dispatch(thread)
+
+    manager.add_call_item_to_queue = dispatch_remaining
 
 
 def _end_with(parent: int) -> None:

@@ -128,6 +128,27 @@ def test_results_of_any_length_come_back_and_leave_no_file_behind(monkeypatch, t
     assert not list(tmp_path.iterdir())
 
 
+ABORTED_TASK = """
+from joblib.externals.loky import process_executor
+from cnpgen.machine.workers import distribute
+from tests.machine.test_workers import long_or_short
+
+manager = process_executor._ExecutorManagerThread
+flag = manager.flag_executor_shutting_down
+manager.flag_executor_shutting_down = lambda thread: (thread.work_ids_queue.put(123456), flag(thread))
+list(distribute(long_or_short, [5, -10, 7], 2))
+"""  # an abort removes the task 123456 before its dispatch
+
+
+@pytest.mark.slow
+def test_an_abort_between_submission_and_dispatch_ends_with_the_error_of_the_task():
+    command = [sys.executable, "-c", ABORTED_TASK]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=HANGING)
+    assert done.returncode == 1
+    assert "DatasetError: xxxxxxxxxx" in done.stderr
+    assert "KeyError" not in done.stderr
+
+
 @pytest.mark.slow
 @linux
 def test_what_a_killed_process_leaves_is_tidied_up_without_a_word(tmp_path):

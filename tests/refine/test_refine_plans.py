@@ -131,11 +131,12 @@ def test_boundary_conditions_that_violate_a_limit_get_the_least_violation_but_no
     assert (
         max(result.iterations for result in found.results) <= 2 * RefineOptions().max_iterations
     )  # of the coarse, fine and strict levels
-    margins = [each.margins["joint velocity"] for each in evaluate_plans(found.plans).verdicts]
-    assert [each.phase for each in margins] == [1.0, 1.0]
-    for each in margins:
-        assert each.value / each.bound == pytest.approx(1.02)
-    assert {result.reason for result in found.results} == {"joint velocity limit"}
+    for verdict in evaluate_plans(found.plans).verdicts:
+        velocity = verdict.margins["joint velocity"]
+        unavoidable = 0.02 * abs(velocity.bound) / velocity.tolerance  # at the goal, in tolerances
+        worst = max(margin.violation / margin.tolerance for margin in verdict.margins.values())
+        assert unavoidable * (1 - 1e-6) <= velocity.violation / velocity.tolerance <= worst <= 1.2 * unavoidable
+    assert {result.reason for result in found.results} <= {"joint velocity limit", "joint acceleration limit"}
 
 
 def test_two_threads_give_the_same_plans_as_one() -> None:
