@@ -479,7 +479,7 @@ def test_a_broken_plug_in_does_not_hide_the_others(run, monkeypatch):
 
 
 def test_show_prefers_the_dataset_and_can_be_told_otherwise(run):
-    assert run("show", "heavy-object")[1].startswith("dataset heavy-object 1.0.0")
+    assert run("show", "heavy-object")[1].startswith("dataset heavy-object 1.1.0")
     assert run("show", "heavy-object", "--kind", "pipeline")[1].startswith("pipeline heavy-object")
     assert run("show", "heavy-object", "--kind", "problem")[1].startswith("problem heavy-object")
     assert run("show", "airhockey")[1].startswith("problem airhockey")

@@ -355,8 +355,10 @@ def chromium(page: Path, *options: str, address: str = "", state: str = "time=12
 def test_a_browser_runs_the_page(page):
     found = chromium(page, "--dump-dom")
     assert 'data-ready="yes"' in found
-    assert content(page)["labels"][120] in re.search(r'<output id="time">(.*?)</output>', found)[1]
-    assert found.count("<canvas") == 8  # the scene, four curves of limits and three of conditions
+    shown = content(page)
+    assert shown["labels"][120] in re.search(r'<output id="time">(.*?)</output>', found)[1]
+    assert (len(shown["curves"]), len(shown["conditions"])) == (4, 4)
+    assert found.count("<canvas") == 1 + 4 + 4  # the scene, the limits and the conditions
 
 
 @needs_meshcat

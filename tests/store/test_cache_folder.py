@@ -284,15 +284,15 @@ def test_a_file_that_disappears_while_the_cache_is_checked_causes_no_error(tmp_p
 READ_ONLY = """
 import logging, os, sys, warnings
 from pathlib import Path
-from cnpgen.kernels import cache
+from cnpgen.store.files import cache_folder
 from cnpgen.kernels.library import KernelLibrary
-from tests.kernels.test_cache import BUILT, doubling, tripling
+from tests.store.test_cache_folder import BUILT, doubling, tripling
 warnings.simplefilter("error")
 logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
 def refuse(**_):
     raise PermissionError(13, "Permission denied")
-cache.tempfile.TemporaryFile = refuse  # root can write everywhere
-folder = cache.usable_cache_folder(Path(sys.argv[1]))
+cache_folder.tempfile.TemporaryFile = refuse  # root can write everywhere
+folder = cache_folder.usable_cache_folder(Path(sys.argv[1]))
 assert folder != Path(sys.argv[1])
 KernelLibrary("compiled", folder, "test").load(doubling)
 assert not BUILT

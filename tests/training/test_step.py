@@ -68,7 +68,7 @@ def test_a_plan_with_a_loss_of_nan_does_not_affect_the_gradient_of_others(tiny):
     learner, rows, parameters = prepared(tiny, "heavy-object")
     poses = np.where(np.arange(6)[:, None] == 2, np.nan, rows.tasks.scene.poses)
     broken = replace(rows, tasks=replace(rows.tasks, scene=replace(rows.tasks.scene, poses=poses)))
-    weights, gradient = np.ones(7), np.empty_like(parameters)
+    weights, gradient = np.ones(len(learner.loss.terms) - 1), np.empty_like(parameters)
     terms = learner.gradient(parameters, broken, weights, shift=0.3, clipping=Clipping(), out=gradient)
     assert np.isnan(terms[2]).all()
     expected = np.empty_like(parameters)
@@ -81,7 +81,7 @@ def test_a_plan_with_a_loss_of_nan_does_not_affect_the_gradient_of_others(tiny):
 def test_the_gradient_of_a_sample_is_clipped_to_the_limit(tiny):
     learner, rows, parameters = prepared(tiny, "heavy-object")
     clipped = replace(learner, settings=replace(UNCLIPPED, sample_clip=1.0))
-    alone, weights = [], np.full(7, 1e3)
+    alone, weights = [], np.full(len(learner.loss.terms) - 1, 1e3)
     for i in range(len(rows)):
         gradient = np.empty_like(parameters)
         learner.gradient(parameters, rows.take(np.array([i])), weights, shift=0.3, clipping=Clipping(), out=gradient)
