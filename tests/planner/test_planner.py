@@ -260,7 +260,7 @@ def test_values_in_degrees_are_refused(planner, rows):
     with pytest.raises(UnitError, match=message) as caught:
         planner.plan(start, rows.goal_q[0])
     assert caught.value.argument == "start_q"
-    with pytest.raises(UnitError, match="goal_dq must be from .* rad/s, got 60 rad/s in plan 0 of joint_1"):
+    with pytest.raises(UnitError, match=r"goal_dq must be from .* rad/s, got 60 rad/s in plan 0 of joint_1"):
         planner.plan(rows.start_q[0], rows.goal_q[0], goal_dq=np.array([60.0, 0, 0, 0, 0, 0]))
     with pytest.raises(UnitError, match=message):
         planner.plan_batch(replace(rows[:1], start_q=start[None]))
