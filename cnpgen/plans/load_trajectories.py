@@ -100,11 +100,15 @@ def load_trajectories(
     if rate is not None and not number("rate", rate) > 0:
         raise UsageError(f"must be above 0, got {rate}", argument="rate")
     options = _Options(record, names, unit == "deg", rate, separate_by, unwrap)
-    found = [
-        (part.place, *_trajectory(part, options))
-        for table in read_trajectory_tables(Path(path))
-        for part in _separated(table, separate_by)
-    ]
+    try:
+        found = [
+            (part.place, *_trajectory(part, options))
+            for table in read_trajectory_tables(Path(path))
+            for part in _separated(table, separate_by)
+        ]
+    except UsageError as error:
+        error.argument = error.argument or "path"
+        raise
     if unit == "rad":
         _check_unit(path, open_problem(record)[1], [trajectory.q for _, trajectory, _ in found])
     ignored = dict.fromkeys(name for *_, unused in found for name in unused)
@@ -252,7 +256,7 @@ def _numbers(table: TrajectoryTable, name: str, *, ndim: int) -> Array:
     if values.ndim != ndim or values.dtype.kind not in "biuf":
         if values.ndim != 1 or ndim != 1:
             raise UsageError(f"{table.place}: {name} must have {ndim} dimensions of numbers, got shape {values.shape}")
-        row = next(k for k, value in enumerate(values.tolist()) if not _is_number(value))
+        row = next((k for k, value in enumerate(values.tolist()) if not _is_number(value)), 0)  # or numbers as texts
         place = f"line {table.lines[row]}" if table.lines else f"row {row}"
         raise UsageError(f"{table.place}: {place}: {name} must be a number, got {values[row].item()!r:.60}")
     return values.astype(float)

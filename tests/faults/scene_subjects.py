@@ -3,6 +3,7 @@
 import json
 import shutil
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from random import Random
@@ -115,15 +116,16 @@ def change_text_file(path: Path, draw: Random) -> None:
 
 
 def read_scene(folder: Path, draw: Random) -> None:
-    """Read scenes, make plans of them, and write them again."""
+    """Read scenes; make plans of them and write them again, which is refused if they are of another robot."""
     (path,) = folder.iterdir()
-    scenes = load_scenes(path, n=draw.choice((None, 1)))
+    scenes = load_scenes(path, n=draw.choice((None, 1)))[:3]
     problem = load_problem(SCENE_PROBLEM)
-    read_all(
-        lambda: scene_plans(problem, scenes[:3]),
-        lambda: save_scenes(folder / "again.h5", scenes[:3]),
-        lambda: save_scenes(folder / "again", scenes[:3], joints=load_robot(problem).joint_names),
-    )
+    with suppress(CnpgenError):
+        read_all(
+            lambda: scene_plans(problem, scenes),
+            lambda: save_scenes(folder / "again.h5", scenes),
+            lambda: save_scenes(folder / "again", scenes, joints=load_robot(problem).joint_names),
+        )
 
 
 def read_trajectory(folder: Path, draw: Random) -> None:
