@@ -237,6 +237,7 @@ def answer_from_dict(problem: Plans, content: dict[str, Any]) -> Plans | Traject
         degree=content["degree"],
         columns=problem.columns,
         sample_id=problem.sample_id,
+        allow_large_angles=True,  # as in the problem
     )
 
 

@@ -68,7 +68,12 @@ def run(arguments: argparse.Namespace) -> int:
     requests = _requests(arguments, model)
     planner = Planner(model, scale_time=not arguments.no_time_scaling)
     begun = time.perf_counter()
-    plans = planner.plan_batch(requests.boundary, sample_id=requests.sample_id, columns=requests.columns)
+    plans = planner.plan_batch(
+        requests.boundary,
+        sample_id=requests.sample_id,
+        columns=requests.columns,
+        allow_large_angles=arguments.allow_large_angles,
+    )
     seconds = time.perf_counter() - begun
     if not arguments.quiet:
         text = f"{counted(len(plans), 'plan')} in {1e3 * seconds:.1f} ms"

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import UsageError
 from cnpgen.machine.times import NO_TIME, Times
 from cnpgen.pipelines.families.resting_states import RestingStates, pose_states, seeds_of
 from cnpgen.plans.concatenate import concatenate
@@ -26,7 +25,7 @@ from cnpgen.plans.scene_plans import (
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import as_problem
-from cnpgen.problems.scenes.scene_problem import GoalPose, SceneError, SceneProblem, checked_scene
+from cnpgen.problems.scenes.scene_problem import GoalPose, SceneError, SceneProblem, check_scenes, checked_scene
 from cnpgen.refine.options import DEFAULT_OPTIONS, RefineOptions
 from cnpgen.refine.proof.explain import explain_plans
 from cnpgen.refine.refine_plans import Progress, Refinement, solve_plans
@@ -114,8 +113,7 @@ def solve_scenes(
         UsageError: There are no scenes, or the problem has no constraint ``robot-clearance``.
         MachineError: See ``refine_plans``.
     """
-    if not scenes:
-        raise UsageError("there are no scenes", concerns="scenes")
+    check_scenes(scenes)
     loaded, scenes = as_problem(problem), [checked_scene(scene) for scene in scenes]
     robot = load_robot(loaded)
     goals = [_goals(loaded, robot, scene, index) for index, scene in enumerate(scenes)]

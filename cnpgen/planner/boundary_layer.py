@@ -22,7 +22,7 @@ from cnpgen.planner.projection import Projection, make_projection
 from cnpgen.planner.task_preprocessor import TaskPreprocessor, make_task_preprocessor
 from cnpgen.planner.tasks import EXPECTED_TIMES, Tasks
 from cnpgen.plans.plans import Plans, make_plans
-from cnpgen.plans.plausible import warn_of_far_joints
+from cnpgen.plans.plausible import check_boundary_units
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import as_problem
@@ -120,15 +120,17 @@ class BoundaryLayer:
 
     @checked_arguments
     @one_thread()
-    def tasks(self, boundary: Boundary) -> Tasks:
+    def tasks(self, boundary: Boundary, *, allow_large_angles: bool = False) -> Tasks:
         """Prepare N tasks: compute everything that the network needs from boundary conditions.
 
         Args:
             boundary: Boundary conditions, shape (N, n) each: arrays, or tensors on the CPU.
+            allow_large_angles: Whether to accept values that are probably in degrees or millimetres, with a warning.
 
         Raises:
             UsageError: A shape is wrong, a value is no real number, or the presence of goal accelerations does not
                 match ``goal_acceleration``.
+            UnitError: A value is probably in degrees or millimetres.
         """
         if boundary.fixed_at_goal > self._fixed_at_goal:
             raise UsageError(
@@ -143,7 +145,8 @@ class BoundaryLayer:
             if array.shape != shape:
                 raise UsageError(f"must have shape (N, {shape[1]}), N = {shape[0]}, got {array.shape}", argument=name)
         checked = Boundary(**arrays)
-        warn_of_far_joints(self._kernels.arguments["robot"], checked)
+        robot = self._kernels.arguments["robot"]
+        check_boundary_units(robot, checked, argument="boundary", allow_large_angles=allow_large_angles)
         return self._preprocessor_and_projection[0](checked)
 
     @checked_arguments
@@ -220,6 +223,7 @@ class BoundaryLayer:
             rate_control_points=points.rate,
             columns={"start_xyz": tasks.start_xyz, "goal_xyz": tasks.goal_xyz},
             sample_id=sample_id,
+            allow_large_angles=True,  # checked with the tasks
         )
 
     @checked_arguments

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,8 +19,10 @@ from cnpgen.planner.inference_pipeline import loaded_problem
 from cnpgen.planner.model import Model
 from cnpgen.planner.plan_requests import drawing_stages
 from cnpgen.plans.format import BOUNDARY, CONDITIONS
+from cnpgen.plans.plausible import UNITS, is_usual
 from cnpgen.robots.plausible_values import check_plausible
-from cnpgen.schema.arguments import numbers
+from cnpgen.robots.robot import Robot
+from cnpgen.schema.arguments import concerning, numbers
 from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]
@@ -78,6 +80,7 @@ def hit_tasks(
             f"must be positions, velocities and accelerations, got {len(state)} values or arrays", argument="state"
         )
     parts = [lanes("state", values, {n}) for values in state]
+    _check_state(completion.context.robot, parts)
     centre, goal = lanes("puck", puck, {2, 3}), lanes("target", target, {2})
     direction = goal - centre[:2]
     if not np.count_nonzero(direction, axis=0).all():
@@ -95,6 +98,17 @@ def hit_tasks(
         if count not in {1, largest}:
             raise UsageError(f"has {count:,} hits, another argument has {largest:,}", argument=name)
     return completion(dict(zip(HIT_COLUMNS, columns, strict=True)))
+
+
+def _check_state(robot: Robot, parts: Sequence[Array]) -> None:
+    """Check that positions, velocities and accelerations of the arm, shape (n, N) each, are not in degrees."""
+    columns = {name: values.T for name, values in zip(HIT_COLUMNS[:3], parts, strict=True)}
+    if all(is_usual(robot, name, values) for name, values in columns.items()):
+        return
+    with concerning("state"):
+        check_plausible(
+            robot, columns, {name: robot.units(UNITS[name.rpartition("_")[2]]) for name in columns}, noun="hit"
+        )
 
 
 def _check_distance(completion: Completion, contact_distance: float, positions: Mapping[str, Array]) -> None:

@@ -18,7 +18,7 @@ from cnpgen.planner.task_preprocessor import TaskPreprocessor, ends_of, lanes, m
 from cnpgen.planner.tasks import Tasks
 from cnpgen.planner.time_parametrization import TimeParametrization, make_time_parametrization
 from cnpgen.planner.time_scaling import TimeScaling, make_time_scaling
-from cnpgen.planner.via_points import ViaPoints, make_via_points
+from cnpgen.planner.via_points import MAX_LINES, ViaPoints, make_via_points
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
@@ -150,19 +150,20 @@ class InferencePipeline:
         path, rate, before = motion.path.copy(), motion.rate.copy(), via_points.violation(motion, tasks.scene.poses)
         correction = np.zeros_like(path[:, 3 : path.shape[1] - tasks.boundary.fixed_at_goal])
         correction += 0.0 if tasks.correction is None else tasks.correction
-        violating, count = np.flatnonzero(before > 1), len(via_points.via_points)
+        violating, count = np.flatnonzero(before > 1), min(MAX_LINES, len(via_points.via_points))
         for some in (violating[block] for block in blocks_of_motions(len(violating))):
-            repeated = np.repeat(some, count)
-            alternatives = self.prepare(tasks.boundary[repeated], np.tile(via_points.via_points, (len(some), 1)))
+            repeated = np.repeat(some, len(via_points.via_points))
+            lines = self.prepare(tasks.boundary[repeated], np.tile(via_points.via_points, (len(some), 1)))
+            alternatives = lines.take(via_points.best_lines(lines, count))
             assert alternatives.correction is not None
             motions = self._projected(model, alternatives, ends_of(alternatives.boundary))
             poses = alternatives.scene.poses
-            after = via_points.violation(motions, poses)
-            candidates = via_points.candidates(after)
-            fitted, time = self._fitted(motions[candidates], poses[candidates]), np.full(len(repeated), np.inf)
+            after = via_points.lower_bound(motions, poses)
+            candidates = via_points.candidates(after, count)
+            fitted, time = self._fitted(motions[candidates], poses[candidates]), np.full(len(motions), np.inf)
             time[candidates] = fitted.duration()
             fastest = time.reshape(len(some), -1).argmin(axis=1) + count * np.arange(len(some))
-            better = after[fastest] < before[some]
+            better = via_points.violation(motions[fastest], poses[fastest]) < before[some]
             replaced, sources = some[better], np.searchsorted(candidates, fastest[better])
             path[replaced], rate[replaced] = fitted.path[sources], fitted.rate[sources]
             correction[replaced] = alternatives.correction[fastest[better]]

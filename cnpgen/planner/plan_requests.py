@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.planner.model import Model
-from cnpgen.plans.boundary_file import ASKED, CONTEXT, BoundaryFile, boundary_in, check_units, read_boundary_file
+from cnpgen.plans.boundary_file import ASKED, CONTEXT, BoundaryFile, boundary_in, read_boundary_file
 from cnpgen.plans.boundary_problems import chosen_rows
+from cnpgen.plans.plausible import check_boundary_units
 from cnpgen.problems.problem_record import ProblemRecord, as_record, open_problem
 from cnpgen.store.dataset_spec import DatasetSpec
 from cnpgen.store.files.documents import canonical_sha256
@@ -93,7 +94,7 @@ def read_file(path: Path, model: Model, *, other: bool = False, allow_large_angl
         _check_recorded_problem(file, model)
     boundary = checked_boundary(str(path), file.columns, model)
     if not allow_large_angles:
-        check_units(str(path), open_problem(model.problem)[1], boundary)
+        check_boundary_units(open_problem(model.problem)[1], boundary, where=str(path))
     columns = {name: np.asarray(file.columns[name], np.float64) for name in CONTEXT if name in file.columns}
     return Requests(boundary, file.sample_id(len(boundary)), columns)
 

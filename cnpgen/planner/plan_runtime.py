@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -119,7 +120,7 @@ class PlanRuntime:
         Returns:
             State of shape (n,), or (K, n).
         """
-        times = numbers("time", time)
+        times = _checked_times(time)
         with self._lock:
             self._now = max(self._now, float(np.max(times)))
             timeline = self._timeline
@@ -128,7 +129,7 @@ class PlanRuntime:
     @checked_arguments
     def state_at(self, time: ArrayLike) -> SetPoint:
         """Return the state at a future time, from which a new plan may start; see ``set_point``."""
-        return _evaluate(self._timeline, numbers("time", time))
+        return _evaluate(self._timeline, _checked_times(time))
 
     @checked_arguments
     def switch(self, plan: Plans | JoinedPlans | None, at: float) -> Switch:
@@ -241,6 +242,16 @@ class PlanRuntime:
 def _part_at(timeline: tuple[SampledMotion, ...], time: float) -> SampledMotion:
     """Return the motion in execution at a time."""
     return next((part for part in reversed(timeline) if part.start <= time), timeline[0])
+
+
+def _checked_times(time: ArrayLike) -> Array:
+    """Return finite times of shape () or (K,), K > 0."""
+    times = numbers("time", time)
+    if times.ndim > 1 or not times.size:
+        raise UsageError(f"must be a number or ascending times of shape (K,), got shape {times.shape}", argument="time")
+    if not (math.isfinite(times) if times.ndim == 0 else np.isfinite(times).all()):
+        raise UsageError(f"must be finite, got {time!r:.100}", argument="time")
+    return times
 
 
 def _evaluate(timeline: tuple[SampledMotion, ...], times: Array) -> SetPoint:

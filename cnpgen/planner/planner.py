@@ -18,7 +18,7 @@ from cnpgen.planner.model import Model
 from cnpgen.planner.model_file import load_model, model_for
 from cnpgen.planner.plan_reuse import reuse_previous_plan
 from cnpgen.plans.plans import Plans
-from cnpgen.plans.plausible import warn_of_far_joints
+from cnpgen.plans.plausible import check_boundary_units
 from cnpgen.problems.problem import Problem
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import concerning, numbers
@@ -86,6 +86,7 @@ class Planner:
         return partial(type(self), scale_time=self._scale_time, backend=self.backend), (self.model,)
 
     @checked_arguments
+    @one_thread()
     def plan(
         self,
         start_q: ArrayLike,
@@ -95,12 +96,12 @@ class Planner:
         start_ddq: ArrayLike | None = None,
         goal_dq: ArrayLike | None = None,
         goal_ddq: ArrayLike | None = None,
+        allow_large_angles: bool = False,
     ) -> Plans:
         """Plan motions; boundary conditions hold to rounding for any network output.
 
         Boundary conditions are not checked against the limits. A plan from or to an invalid state is returned, and
-        ``evaluate_plans`` reports that it is not valid. A warning is issued if a joint position is so far outside its
-        limits that it is probably in degrees or normalized.
+        ``evaluate_plans`` reports that it is not valid.
 
         Args:
             start_q: Start positions [rad], shape (n,) for one motion or (N, n).
@@ -110,6 +111,7 @@ class Planner:
             goal_dq: Goal velocities [rad/s], shape (n,) or (N, n); zero by default.
             goal_ddq: Goal accelerations [rad/s^2], shape (n,) or (N, n), for models trained on rows with goal
                 accelerations; zero by default. Other models leave them free.
+            allow_large_angles: Whether to accept values that are probably in degrees or millimetres, with a warning.
 
         Returns:
             One plan or N, not checked yet (status UNKNOWN).
@@ -117,8 +119,11 @@ class Planner:
         Raises:
             UsageError: A shape is wrong, a value is not finite, a condition is not zero that was zero in all training
                 rows, or goal accelerations are given that the model leaves free.
+            UnitError: A condition is probably in degrees or millimetres.
         """
-        return self.plan_batch(boundary_of(self.robot.n, start_q, start_dq, start_ddq, goal_q, goal_dq, goal_ddq))
+        boundary = boundary_of(self.robot.n, start_q, start_dq, start_ddq, goal_q, goal_dq, goal_ddq)
+        check_boundary_units(self.robot, boundary, allow_large_angles=allow_large_angles)
+        return self._inference.plan(self.model, self._checked(boundary))
 
     @checked_arguments
     @one_thread()
@@ -128,6 +133,7 @@ class Planner:
         *,
         sample_id: NDArray[np.int64] | None = None,
         columns: Mapping[str, Array] | None = None,
+        allow_large_angles: bool = False,
     ) -> Plans:
         """Plan N motions.
 
@@ -135,11 +141,12 @@ class Planner:
             boundary: Boundary conditions, shape (N, n) each, float64 and finite.
             sample_id: Dataset samples of the tasks, shape (N,); 0, 1, ... by default.
             columns: Further columns of the tasks, as ``Plans.columns``.
+            allow_large_angles: See ``plan``.
 
         Raises:
             UsageError: See ``plan``.
         """
-        warn_of_far_joints(self.robot, boundary)
+        check_boundary_units(self.robot, boundary, argument="boundary", allow_large_angles=allow_large_angles)
         return self._inference.plan(self.model, self._checked(boundary), sample_id=sample_id, columns=columns)
 
     @checked_arguments

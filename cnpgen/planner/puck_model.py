@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
+from cnpgen.schema.argument_types import check_fields
 
 Array = NDArray[np.float64]
 
@@ -47,6 +48,7 @@ class PuckModel:
     home_edge: float = 0.56165
 
     def __post_init__(self) -> None:
+        check_fields(self)
         for name, value in vars(self).items():
             if not (np.isfinite(value) and value >= 0):
                 raise UsageError(f"must be finite and not negative, got {value:g}", argument=name)

@@ -7,8 +7,10 @@ from numpy.typing import NDArray
 
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
+from cnpgen.planner.control_points import along_line
 from cnpgen.planner.expressions import static_violation
 from cnpgen.planner.phase_grid import blocks_of_motions
+from cnpgen.planner.tasks import Tasks
 from cnpgen.problems.problem import Problem
 from cnpgen.trajectory.spline import basis, chebyshev
 from cnpgen.trajectory.spline_motion import Motion
@@ -16,6 +18,8 @@ from cnpgen.trajectory.spline_motion import Motion
 Array = NDArray[np.float64]
 
 STATIC_INTERVALS = 64  # between phases
+COARSE_PHASES = slice(4, None, 8)  # that most violating motions fail at
+MAX_LINES = 8  # that motions are planned along
 
 
 @dataclass(frozen=True)
@@ -42,25 +46,59 @@ class ViaPoints:
         Returns:
             Shape (N,); at most 1 if all conditions hold at the phases, inf if a position is not finite.
         """
-        violation, phases = np.empty(len(motion)), len(self.path)
-        for block in blocks_of_motions(len(motion)):
-            q = (self.path @ motion.path[block]).reshape(-1, motion.path.shape[2])
+        return self._violation_at(self.path, motion.path, obstacle_poses)
+
+    def lower_bound(self, motion: Motion, obstacle_poses: Array) -> Array:
+        """Return lower bounds of ``violation`` that are above 1 for the same motions, in a fraction of the time.
+
+        Motions with a violation at one of a few phases are not checked at the others.
+        """
+        bound = self._violation_at(self.path[COARSE_PHASES], motion.path, obstacle_poses)
+        unclear = np.flatnonzero(bound <= 1)
+        bound[unclear] = self.violation(motion[unclear], obstacle_poses[unclear])
+        return bound
+
+    def _violation_at(self, basis_of_p: Array, path: Array, obstacle_poses: Array) -> Array:
+        violation, phases = np.empty(len(path)), len(basis_of_p)
+        for block in blocks_of_motions(len(path)):
+            q = (basis_of_p @ path[block]).reshape(-1, path.shape[2])
             (worst,) = self.static_violation(
                 np.ascontiguousarray(q.T), np.repeat(obstacle_poses[block].T, phases, axis=1)
             )
             violation[block] = worst.reshape(-1, phases).max(axis=1)
         return np.nan_to_num(violation, nan=np.inf, posinf=np.inf)
 
-    def candidates(self, violation: Array) -> NDArray[np.intp]:
-        """Return the motions to choose from, given motions along all M lines of the first task, then of the next one.
+    def best_lines(self, lines: Tasks, count: int) -> NDArray[np.intp]:
+        """Return the lines with the smallest violations at a few phases, in their order.
 
         Args:
-            violation: Largest violations, shape (N M,).
+            lines: All M lines of the first task, then of the next one.
+            count: Number of lines per task, at most M.
+
+        Returns:
+            Rows of lines, shape (N count,).
+        """
+        assert lines.correction is not None
+        start, goal = lines.boundary.start_q[:, None], lines.boundary.goal_q[:, None]
+        interior = start + (goal - start) * along_line(lines.correction.shape[1]) + lines.correction
+        fixed = self.path.shape[1] - interior.shape[1] - 3
+        path = np.concatenate([np.repeat(start, 3, axis=1), interior, np.repeat(goal, fixed, axis=1)], axis=1)
+        violation = self._violation_at(self.path[COARSE_PHASES], path, lines.scene.poses)
+        order = violation.reshape(-1, len(self.via_points)).argsort(axis=1, kind="stable")[:, :count]
+        return np.asarray((order + len(self.via_points) * np.arange(len(order))[:, None]).ravel())
+
+    @staticmethod
+    def candidates(violation: Array, count: int) -> NDArray[np.intp]:
+        """Return the motions to choose from, given motions along all lines of the first task, then of the next one.
+
+        Args:
+            violation: Largest violations, shape (N count,).
+            count: Number of lines per task.
 
         Returns:
             Rows of motions: for every task those without violation, or else the one with the smallest.
         """
-        of_task = violation.reshape(-1, len(self.via_points))
+        of_task = violation.reshape(-1, count)
         least = of_task.min(axis=1, keepdims=True)
         return np.flatnonzero(of_task <= np.maximum(least, 1))
 

@@ -13,8 +13,8 @@ from cnpgen.plans.format import ATTRIBUTES, CONDITIONS, OBSTACLE_POSES, refuse_m
 from cnpgen.plans.format import FORMAT as PLANS
 from cnpgen.plans.format import PLAN_FILE_VERSION as PLANS_VERSION
 from cnpgen.plans.plan_file import stored_problem
+from cnpgen.plans.plausible import check_boundary_units
 from cnpgen.problems.problem_record import ProblemRecord, as_record
-from cnpgen.robots.plausible_values import UnitError, check_plausible
 from cnpgen.robots.robot import Robot
 from cnpgen.store.checked_shard import read_rows, recorded_shard
 from cnpgen.store.dataset_spec import DatasetSpec, load_dataset_spec, shards
@@ -28,7 +28,6 @@ from cnpgen.trajectory.boundary_arguments import boundary_of
 CONTEXT = ("hit_angle", "hit_speed")  # dataset columns that plans keep
 ASKED = (*CONDITIONS, "sample_id", OBSTACLE_POSES, *CONTEXT)
 _OF_SHARDS = ("specification_fingerprint", "recipe_sha256", "first_sample_id", "rows")
-UNIT_SUFFIXES = {"q": "", "dq": "/s", "ddq": "/s^2"}
 SAID = (*ATTRIBUTES, *_OF_SHARDS)  # attributes
 
 
@@ -108,7 +107,7 @@ class BoundaryFile:
         """
         boundary = boundary_in(str(self.path), self.columns, robot.n)
         if not allow_large_angles:
-            check_units(str(self.path), robot, boundary)
+            check_boundary_units(robot, boundary, where=str(self.path))
         return boundary
 
     def sample_id(self, rows: int) -> NDArray[np.int64]:
@@ -162,26 +161,6 @@ def read_boundary_file(path: Path) -> BoundaryFile:
         hint = "; of tasks in the workspace 'cnpgen complete' makes them" if tasks else ""
         raise DatasetError(f"{path} lacks {' and '.join(missing)}: boundary conditions are needed to plan{hint}")
     return found
-
-
-def check_units(where: str, robot: Robot, boundary: Boundary) -> None:
-    """Check that boundary conditions are not in degrees or millimetres.
-
-    Args:
-        where: Source of the boundary conditions, for messages.
-        robot: Robot of the problem.
-        boundary: The boundary conditions.
-
-    Raises:
-        UnitError: A value is so far outside of its range that it is probably in another unit.
-    """
-    columns = boundary.conditions()
-    units = {name: robot.units(f"rad{UNIT_SUFFIXES[name.rpartition('_')[2]]}") for name in columns}
-    try:
-        check_plausible(robot, columns, units, noun="plan")
-    except UnitError as error:
-        text = f"{where}: {error} {{allow_large_angles}} accepts such values."
-        raise UnitError(text, remedies={"allow_large_angles": True}) from error
 
 
 def boundary_in(where: str, columns: Mapping[str, NDArray[Any]], n: int) -> Boundary:

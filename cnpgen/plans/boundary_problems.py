@@ -148,4 +148,5 @@ def plans_of_rows(problem: ProblemRecord, columns: Mapping[str, NDArray[Any]], *
         columns={name: columns[name] for name in kept if name in columns},
         sample_id=columns.get("sample_id"),
         source=source,
+        allow_large_angles=True,  # checked with the file or the tasks
     )

@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 from cnpgen.errors import UsageError
 from cnpgen.plans.trajectory_tables import TrajectoryTable, read_trajectory_tables
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.problem_record import ProblemRecord, as_record
+from cnpgen.problems.problem_record import ProblemRecord, as_record, open_problem
+from cnpgen.robots.plausible_values import UnitError, find_implausible_value
+from cnpgen.robots.robot import Robot
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import number
 from cnpgen.schema.units import UNITS as KNOWN_UNITS
@@ -87,6 +89,7 @@ def load_trajectories(
 
     Raises:
         UsageError: A column is missing, a value is not finite, times do not increase, or the file is damaged.
+        UnitError: Positions without a unit are probably in degrees or millimetres.
         MissingExtraError: The format needs a package that is not installed.
     """
     record = as_record(problem)
@@ -97,15 +100,31 @@ def load_trajectories(
     if rate is not None and not number("rate", rate) > 0:
         raise UsageError(f"must be above 0, got {rate}", argument="rate")
     options = _Options(record, names, unit == "deg", rate, separate_by, unwrap)
-    found = [
-        (part.place, *_trajectory(part, options))
-        for table in read_trajectory_tables(Path(path))
-        for part in _separated(table, separate_by)
-    ]
+    try:
+        found = [
+            (part.place, *_trajectory(part, options))
+            for table in read_trajectory_tables(Path(path))
+            for part in _separated(table, separate_by)
+        ]
+    except UsageError as error:
+        error.argument = error.argument or "path"
+        raise
+    if unit == "rad":
+        _check_unit(path, open_problem(record)[1], [trajectory.q for _, trajectory, _ in found])
     ignored = dict.fromkeys(name for *_, unused in found for name in unused)
     return LoadedTrajectories(
         tuple(trajectory for _, trajectory, _ in found), tuple(place for place, *_ in found), tuple(ignored)
     )
+
+
+def _check_unit(path: str | Path, robot: Robot, positions: Sequence[Array]) -> None:
+    """Check that positions are in rad or m, by their medians: single trajectories may be far outside of the limits."""
+    median = np.median(np.concatenate(positions), axis=0)[None]
+    wrong = find_implausible_value(robot, "q", median, robot.units("rad"))
+    if wrong is not None:
+        hint = " {unit} reads degrees." if wrong.unit == "rad" else ""
+        text = f"{path}: the median position of {robot.joint_names[wrong.column]} {wrong}{hint}"
+        raise UnitError(text, concerns="path", remedies={"unit": "deg"} if hint else {})
 
 
 def _separated(table: TrajectoryTable, separate_by: str | None) -> Iterator[TrajectoryTable]:
@@ -237,7 +256,7 @@ def _numbers(table: TrajectoryTable, name: str, *, ndim: int) -> Array:
     if values.ndim != ndim or values.dtype.kind not in "biuf":
         if values.ndim != 1 or ndim != 1:
             raise UsageError(f"{table.place}: {name} must have {ndim} dimensions of numbers, got shape {values.shape}")
-        row = next(k for k, value in enumerate(values.tolist()) if not _is_number(value))
+        row = next((k for k, value in enumerate(values.tolist()) if not _is_number(value)), 0)  # or numbers as texts
         place = f"line {table.lines[row]}" if table.lines else f"row {row}"
         raise UsageError(f"{table.place}: {place}: {name} must be a number, got {values[row].item()!r:.60}")
     return values.astype(float)

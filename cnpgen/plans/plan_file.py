@@ -237,6 +237,7 @@ def _assembled(
         sample_id=columns.pop("sample_id", None),
         status=columns.pop("status", None),
         columns=columns,
+        allow_large_angles=True,  # the verdict reports them
     )
     if duration is not None and duration.shape != (len(plans),):
         raise UsageError(f"must have shape {(len(plans),)}, got {duration.shape}", argument="duration")

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError, counted
 from cnpgen.plans.format import FLOATS, INTEGERS, NOTES, OBSTACLE_POSES
-from cnpgen.plans.plausible import warn_of_far_joints
+from cnpgen.plans.plausible import check_boundary_units
 from cnpgen.plans.status import PlanStatus
 from cnpgen.problems.obstacles import goal_velocities, scene_of
 from cnpgen.problems.problem import Problem
@@ -191,6 +191,7 @@ def make_plans(
     sample_id: ArrayLike | None = None,
     status: ArrayLike | None = None,
     source: str = "",
+    allow_large_angles: bool = False,
 ) -> Plans:
     """Build plans; missing data is computed.
 
@@ -207,12 +208,12 @@ def make_plans(
         sample_id: Sample IDs, shape (N,); 0, 1, ... by default.
         status: Values of ``PlanStatus``, shape (N,); unknown by default.
         source: Source of the plans, a line of text.
-
-    Warns:
-        UserWarning: A joint position is so far outside its limits that it is probably in degrees or normalized.
+        allow_large_angles: Whether to accept boundary conditions that are probably in degrees or millimetres, with a
+            warning.
 
     Raises:
         UsageError: An array has the wrong shape.
+        UnitError: Boundary conditions are probably in degrees or millimetres.
     """
     record = as_record(problem)
     path = numbers("path_control_points", path_control_points)
@@ -229,7 +230,8 @@ def make_plans(
         status=np.zeros(rows, np.uint8) if status is None else _integers("status", status, np.uint8),
         source=source,
     )
-    warn_of_far_joints(open_problem(record)[1], plans.boundary)
+    robot = open_problem(record)[1]
+    check_boundary_units(robot, plans.boundary, argument="boundary", allow_large_angles=allow_large_angles)
     ends = {"start_xyz": plans.boundary.start_q, "goal_xyz": plans.boundary.goal_q}
     missing = {name: record.tip_positions(q) for name, q in ends.items() if name not in plans.columns}
     return replace(plans, columns={**plans.columns, **missing})

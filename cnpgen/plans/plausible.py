@@ -1,42 +1,62 @@
-"""Detection of implausible joint positions, in degrees or normalized."""
+"""Detection of boundary conditions in a wrong unit: degrees, millimetres, or normalized values."""
 
 import inspect
 import warnings
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from cnpgen.robots.plausible_values import find_implausible_value
+from cnpgen.robots.plausible_values import UnitError, check_plausible
 from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.boundary import Boundary
 
+UNITS = {"q": "rad", "dq": "rad/s", "ddq": "rad/s^2"}
 
-def warn_of_far_joints(robot: Robot, boundary: Boundary) -> None:
-    """Warn about a start or goal so far outside the joint limits that its unit is probably wrong.
 
-    It is not an error: boundary conditions are not judged on input, and the verdict reports violations of a plan.
-    Values that are not finite are ignored.
+def check_boundary_units(
+    robot: Robot, boundary: Boundary, *, where: str = "", argument: str | None = None, allow_large_angles: bool = False
+) -> None:
+    """Raise an error for boundary conditions so far outside of their limits that their unit is probably wrong.
+
+    Other violations of limits are no errors: the verdict reports them. Values that are not finite are ignored.
 
     Args:
         robot: Robot of the problem.
         boundary: Boundary conditions, shape (N, n) each.
+        where: Source of the boundary conditions, for messages.
+        argument: Name of the caller's argument that holds them; by default the name of the condition.
+        allow_large_angles: Whether to issue a warning instead.
+
+    Raises:
+        UnitError: A value is probably in another unit.
     """
-    low, high = robot.position_lower, robot.position_upper
-    for name in ("start_q", "goal_q"):
-        q = np.asarray(getattr(boundary, name))
-        if np.count_nonzero((low <= q) & (q <= high)) == q.size:
-            continue
-        wrong = find_implausible_value(robot, name, q, robot.units("rad"))
-        if wrong is not None:
-            joint, unit = wrong.column, wrong.unit
-            other = "millimetres" if unit == "m" else "degrees"
-            value, limits = f"{wrong.value:.6g} {unit}", f"[{low[joint]:.3g}, {high[joint]:.3g}]"
-            label = robot.joint_names[joint]
-            warnings.warn(
-                f"{name} of plan {wrong.row}: {label} = {value} is far outside of its limits, {limits}:"
-                f" joint positions must be in {unit}, are these {other}, or normalised?",
-                UserWarning,
-                stacklevel=_users_level(),
-            )
+    conditions = {name: np.asarray(values) for name, values in boundary.conditions().items()}
+    columns = {name: values for name, values in conditions.items() if not is_usual(robot, name, values)}
+    units = {name: robot.units(UNITS[name.rpartition("_")[2]]) for name in columns}
+    try:
+        check_plausible(robot, columns, units, noun="plan")
+    except UnitError as error:
+        text = f"{where}: {error}" if where else str(error)
+        if allow_large_angles:
+            warnings.warn(text, UserWarning, stacklevel=_users_level())
+            return
+        raise UnitError(
+            f"{text} {{allow_large_angles}} accepts such values.",
+            concerns=argument or error.argument,
+            remedies={"allow_large_angles": True},
+        ) from error
+
+
+def is_usual(robot: Robot, name: str, values: NDArray[Any]) -> bool:
+    """Return whether positions are within the limits, and derivatives within the smallest one: a fast check."""
+    if not name.endswith("_q"):
+        if not np.count_nonzero(values):
+            return True
+        limit = robot.velocity_limit if name.endswith("_dq") else robot.acceleration_limit
+        return bool(np.abs(values).max() <= limit.min())
+    within = (robot.position_lower <= values) & (values <= robot.position_upper)
+    return np.count_nonzero(within) == values.size
 
 
 def _users_level() -> int:

@@ -16,12 +16,14 @@ from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import record_problem
-from cnpgen.problems.scenes.scene_problem import SceneError, SceneProblem
+from cnpgen.problems.scenes.scene_problem import SceneError, SceneProblem, check_scenes
 from cnpgen.robots.observation.primitives import KINDS, primitives_of
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene import PARKED_POSITION_M
 from cnpgen.robots.solid import number_slices, place_obstacles, pose_width
+from cnpgen.schema.argument_types import checked_arguments
+from cnpgen.schema.arguments import numbers
 from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]
@@ -67,6 +69,7 @@ def _parked(kind: str, index: int) -> Obstacle:
     return Obstacle(name=name, kind=kind, position=PARKED_POSITION_M, radius=small, length=small)
 
 
+@checked_arguments
 def scene_plans(
     problem: Problem,
     scenes: Sequence[SceneProblem],
@@ -88,17 +91,21 @@ def scene_plans(
     Raises:
         SceneError: A scene lacks a planned joint or a goal state, or a position is outside its limits.
     """
+    check_scenes(scenes)
     robot = load_robot(problem)
     capacity = capacity_of(scenes) if capacity is None else capacity
     full = with_capacity(problem, capacity)
     start = np.array([joint_order(scene, robot, scene.start_q[None], "start")[0] for scene in scenes])
     if goals is None:
         goals = [goal_states(scene, robot)[0] for scene in scenes]
+    goal_q = numbers("goals", goals)
+    if goal_q.shape != start.shape:
+        raise UsageError(f"must have shape {start.shape}, got {goal_q.shape}", argument="goals")
     zero, spec, count = np.zeros_like(start), problem.trajectory, len(scenes)
     poses = np.array([_obstacle_poses(full, len(problem.obstacle), scene) for scene in scenes])
     return make_plans(
         record_problem(full),
-        Boundary(start, zero, zero, np.array(goals), zero, None),
+        Boundary(start, zero, zero, goal_q, zero, None),
         path_control_points=np.full((count, spec.path_control_points, robot.n), np.nan),
         rate_control_points=np.full((count, spec.rate_control_points), np.nan),
         columns={OBSTACLE_POSES: poses},
@@ -154,7 +161,8 @@ def _obstacle_poses(problem: Problem, fixed: int, scene: SceneProblem) -> Array:
     primitives = primitives_of(scene.obstacles, place_obstacles(scene.obstacles))
     for index, obstacle in enumerate(scene.obstacles):
         if not free[obstacle.kind]:
-            raise UsageError(f"{scene.place} has more obstacles of the kind {obstacle.kind} than the capacity")
+            text = f"{scene.place} has more obstacles of the kind {obstacle.kind} than the capacity"
+            raise UsageError(text, concerns="capacity")
         part = slices[free[obstacle.kind].pop(0)]
         if obstacle.kind == "box":
             rotation = primitives.rotations[index].ravel()

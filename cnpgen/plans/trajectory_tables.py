@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import CnpgenError, DatasetError, UsageError, either, requires_extra
+from cnpgen.problems.scenes.yaml_document import read_yaml
 from cnpgen.store.files.atomic import machine_error, read_file
 from cnpgen.store.files.csv_table import read_csv_table
 from cnpgen.store.files.documents import parse_json
@@ -168,13 +169,15 @@ def read_parquet(path: Path) -> Any:
     with requires_extra("parquet", "pyarrow"):
         import pyarrow
         import pyarrow.parquet
+    content = read_file(path, max_bytes=MAX_TABLE_BYTES)
     try:
-        table = pyarrow.parquet.ParquetFile(path).read()
-    except pyarrow.ArrowException as error:
+        file = pyarrow.parquet.ParquetFile(pyarrow.BufferReader(content))
+        size = sum(file.metadata.row_group(index).total_byte_size for index in range(file.num_row_groups))
+        if size <= MAX_ARCHIVE_BYTES:
+            return file.read()
+    except (pyarrow.ArrowException, OSError) as error:  # OSError: damaged headers
         raise UsageError(f"{path} is not a Parquet file, or is damaged: {error}") from error
-    if table.nbytes > MAX_ARCHIVE_BYTES:
-        raise UsageError(f"{path} holds {table.nbytes:,} bytes, expected at most {MAX_ARCHIVE_BYTES:,}")
-    return table
+    raise UsageError(f"{path} holds {size:,} bytes, expected at most {MAX_ARCHIVE_BYTES:,}")
 
 
 def _parquet_column(table: Any, name: str, path: Path) -> Values:
@@ -229,13 +232,7 @@ def _read_json(path: Path) -> Iterator[TrajectoryTable]:
 
 
 def _read_yaml(path: Path) -> Iterator[TrajectoryTable]:
-    with requires_extra("ros", "PyYAML"):
-        import yaml
-    try:
-        documents = list(yaml.safe_load_all(read_file(path, max_bytes=MAX_TABLE_BYTES).decode()))
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError) as error:
-        text = " ".join(str(error).split())
-        raise UsageError(f"{path} is not YAML: {text:.300}") from error
+    documents = read_yaml(path, numbers=True)
     for index, document in enumerate(documents):
         if document is not None:  # topics echoed by ROS end with an empty document
             yield from _from_document(document, f"{path}: document {index}" if len(documents) > 2 else str(path))

@@ -98,16 +98,16 @@ def check_plausible(robot: Robot, columns: Mapping[str, NDArray[Any]], units: Ma
 
 def _plausible_range(robot: Robot, name: str, unit: str) -> tuple[Any, Any]:
     """Return the ends of the plausible range of a quantity, scalars or one per joint."""
-    if name.endswith("_q"):
+    quantity = name.rpartition("_")[2]
+    if quantity == "q":
         low, high = robot.position_lower, robot.position_upper
         with np.errstate(invalid="ignore"):
             center, half = (low + high) / 2, MAX_RANGE_RATIO * (high - low) / 2
         bounded = np.isfinite(half)
         return np.where(bounded, center - half, -np.inf), np.where(bounded, center + half, np.inf)
-    limits = {"_dq": robot.velocity_limit, "_ddq": robot.acceleration_limit}
-    for suffix, limit in limits.items():
-        if name.endswith(suffix):
-            return -MAX_LIMIT_RATIO * limit, MAX_LIMIT_RATIO * limit
+    limits = {"dq": robot.velocity_limit, "ddq": robot.acceleration_limit}
+    if quantity in limits:
+        return -MAX_LIMIT_RATIO * limits[quantity], MAX_LIMIT_RATIO * limits[quantity]
     speed = float(np.linalg.norm(robot.velocity_limit)) if unit == "m/s" else 1.0
     lengths = MAX_LIMIT_RATIO * robot.reach * speed
     bound = {"rad": MAX_ANGLE_RAD, "m": lengths, "m/s": lengths}.get(unit, np.inf)

@@ -67,6 +67,7 @@ def fit_motion(
     return Motion(fit.path(rate).control[None], rate, spec.degree)
 
 
+@checked_arguments
 def largest_error(motion: Motion, t: ArrayLike, q: ArrayLike) -> float:
     """Compute the maximum distance of one motion from samples over all joints and samples [rad].
 

@@ -178,7 +178,7 @@ def _place(error: BaseException) -> str:
 
 def _limited_call(wrong: WrongCall) -> None:
     faulthandler.dump_traceback_later(MAX_HANG_S, exit=True)
-    signal.alarm(MAX_READ_TIME_S)
+    signal.setitimer(signal.ITIMER_PROF, MAX_READ_TIME_S)
     before = Path.cwd()
     try:
         with redirect_stdout(StringIO()):
@@ -188,7 +188,7 @@ def _limited_call(wrong: WrongCall) -> None:
                     pass
         del result
     finally:
-        signal.alarm(0)
+        signal.setitimer(signal.ITIMER_PROF, 0)
         faulthandler.cancel_dump_traceback_later()
         os.chdir(before)
 

@@ -57,6 +57,14 @@ from tests.examples.plans import load as stored_plan
 from tests.examples.urdf_reading import bodies_in, differences
 from tests.faults.good_files import IDENTITY
 from tests.faults.mutations import change_bytes, change_json, change_text, change_urdf, changed_number
+from tests.faults.scene_subjects import (
+    change_scene,
+    change_trajectory,
+    read_all,
+    read_scene,
+    read_scene_plans,
+    read_trajectory,
+)
 
 MAX_FUZZED_PUCKS = 100
 _PROBLEM = plans_of(stored_plan("hit"))
@@ -173,14 +181,7 @@ def _read_set(folder: Path, draw: Random) -> None:
         lambda: inspection_text(inspect_dataset(path)),
         lambda: validate_dataset(path, deep=draw.random() < 0.1, workers=1).summary(),
     ]
-    failures = []
-    for read in readers:
-        try:
-            read()
-        except CnpgenError as error:
-            failures.append(error)
-    if failures:
-        raise failures[0]
+    read_all(*readers)
 
 
 def _change_shard(good: Path, folder: Path, draw: Random) -> None:
@@ -214,7 +215,15 @@ def _read_shard(folder: Path, draw: Random) -> None:
 
 
 def _change_plans(good: Path, folder: Path, draw: Random) -> None:
-    content = (good / "without_checksum.h5").read_bytes()
+    _change_plan_file(good / "without_checksum.h5", folder, draw)
+
+
+def _change_scene_plans(good: Path, folder: Path, draw: Random) -> None:
+    _change_plan_file(good / "scene_plans.h5", folder, draw)
+
+
+def _change_plan_file(good: Path, folder: Path, draw: Random) -> None:
+    content = good.read_bytes()
     path = folder / "plans.h5"
     if draw.random() < 0.3:
         path.write_bytes(content)
@@ -358,18 +367,11 @@ def _change_boundary(good: Path, folder: Path, draw: Random) -> None:
 
 def _read_boundary(folder: Path, draw: Random) -> None:
     path = folder / "boundary.h5"
-    failures = []
-    for read in (
+    read_all(
         lambda: load_boundary_problems(path),
         lambda: load_boundary_problems(path, problem="airhockey"),
         lambda: read_file(path, load_model(folder / "model.h5")),
-    ):
-        try:
-            read()
-        except CnpgenError as error:
-            failures.append(error)
-    if failures:
-        raise failures[0]
+    )
 
 
 def _change_tasks(good: Path, folder: Path, draw: Random) -> None:
@@ -467,6 +469,9 @@ SUBJECTS: dict[str, Subject] = {
     "boundary": Subject(_change_boundary, _read_boundary),
     "tasks": Subject(_change_tasks, _read_tasks),
     "results": Subject(_change_results, _read_results),
+    "scenes": Subject(change_scene, read_scene),
+    "trajectory": Subject(change_trajectory, read_trajectory),
+    "scene-plans": Subject(_change_scene_plans, read_scene_plans),
 }
 
 

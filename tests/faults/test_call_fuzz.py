@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import cnpgen
-from cnpgen import benchmark, losses, recipes
+from cnpgen import benchmark, losses, recipes, scenes, trajectories
 from cnpgen.errors import MachineError, UsageError
 from cnpgen.machine import memory
 from cnpgen.schema.argument_types import checked_arguments
@@ -17,6 +17,7 @@ from tests.faults.call_fuzz import CallOutcome, fuzz_calls
 from tests.faults.valid_calls import EXCLUDED, ValidCall, valid_calls
 
 CALLS = 2500  # some seconds
+PUBLIC_MODULES = (cnpgen, losses, benchmark, recipes, scenes, trajectories)
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +40,7 @@ def test_every_valid_call_succeeds(valid: list[ValidCall]) -> None:
 
 def test_every_public_callable_has_a_valid_call(valid: list[ValidCall]) -> None:
     names = {call.name for call in valid}
-    public = {name: getattr(module, name) for module in (cnpgen, losses, benchmark, recipes) for name in module.__all__}
+    public = {name: getattr(module, name) for module in PUBLIC_MODULES for name in module.__all__}
     missing = [
         name
         for name, value in public.items()

@@ -1,5 +1,6 @@
 """Minimal inputs that formerly caused neither a result nor a CnpgenError."""
 
+import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -7,18 +8,22 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cnpgen.errors import DatasetError
+from cnpgen.errors import DatasetError, UsageError
+from cnpgen.planner.puck_model import PuckModel
 from cnpgen.plans import PlanStatus, load_plans, save_plans
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.plans import screen
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
+from cnpgen.scenes import Grasp, SceneProblem, load_family, load_scenes, save_scenes
 from cnpgen.store.dataset_spec import load_dataset_spec, shards
 from cnpgen.store.inspection import inspect_dataset
 from cnpgen.store.shard_record import load_record
+from cnpgen.trajectories import largest_error, load_trajectories
 from tests.examples.documents import rewritten
 from tests.examples.plan_files import plans_of
 from tests.examples.plans import load as stored_plan
+from tests.examples.scene_files import ROBOMETRICS
 from tests.examples.store import dataset  # noqa: F401 - a fixture
 
 
@@ -58,3 +63,38 @@ def test_a_rate_whose_differences_are_infinite(tmp_path: Path) -> None:
     assert screen(found).tolist() == [PlanStatus.UNKNOWN, PlanStatus.NOT_FORWARD]
     assert evaluate_plans(found, workers=1).valid.tolist() == [True, False]
     assert np.isfinite(found.duration[0])
+
+
+@pytest.mark.parametrize(
+    ("call", "argument"),
+    [
+        (lambda: load_family("tabletop", "a b"), "parameters"),
+        (lambda: load_family({}), "name"),
+        (lambda: PuckModel(friction="x"), "friction"),
+        (lambda: PuckModel(drag=np.zeros(2)), "drag"),
+        (lambda: save_scenes("scenes.h5", [None]), "scenes"),
+        (lambda: largest_error({"x": 1}, [0.0, 1.0], [[0.0], [1.0]]), "motion"),
+        (lambda: load_trajectories("missing.csv", "airhockey"), "path"),
+        (lambda: SceneProblem(name="a", obstacles=(), start_q=None, goal_q=np.zeros((1, 7))), "start_q"),
+        (lambda: Grasp(None, np.ones(3)), "position"),
+    ],
+)
+def test_wrong_arguments_of_scenes_and_trajectories_are_named(call: Any, argument: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        call()
+    assert caught.value.argument == argument
+
+
+def test_empty_states_in_a_scene_of_robometrics(tmp_path: Path) -> None:
+    pytest.importorskip("yaml")
+    lines = [line for line in ROBOMETRICS.splitlines() if "start:" not in line and not line.startswith("  - [")]
+    (tmp_path / "scene.yaml").write_text("\n".join(lines))
+    (scene,) = load_scenes(tmp_path / "scene.yaml")
+    assert scene.goal_q.shape == (0, 0)
+
+
+def test_numbers_written_as_texts_in_a_trajectory(tmp_path: Path) -> None:
+    rows = [{"t": str(k), "q": [0.1 * k] * 6} for k in range(3)]
+    (tmp_path / "rows.json").write_text(json.dumps(rows))
+    with pytest.raises(UsageError, match="row 0: t must be a number, got '0'"):
+        load_trajectories(tmp_path / "rows.json", "airhockey")

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 import cnpgen
-from cnpgen import benchmark, losses, recipes
+from cnpgen import benchmark, losses, recipes, results, scenes, trajectories
 from cnpgen.problems.problem_record import record_problem
 from tests.examples.models import boundary_of_columns, untrained_model
 from tests.examples.plans import load as stored_plan
@@ -26,6 +26,16 @@ EXCLUDED = {  # public callables without a valid call, and the reason
     "RunRecord": "made by run_benchmark",
     "Model": "made by load_model and train_model",
     "Dataset": "made by load_dataset",
+    "SceneError": "exceptions are raised, not called",
+    "SceneFamily": "abstract contract of families",
+    "SolvedScenes": "made by solve_scenes",
+    "solve_scenes": "compiles kernels for minutes; its arguments are those of scene_plans and solve_plans",
+    "ConditionDecision": "made by evaluate_trajectories",
+    "Decision": "an enum",
+    "TrajectoryEvaluation": "made by evaluate_trajectories",
+    "TrajectoryVerdict": "made by evaluate_trajectories",
+    "ImportedTrajectories": "made by import_trajectories",
+    "LoadedTrajectories": "made by load_trajectories",
 }
 
 
@@ -87,6 +97,9 @@ def valid_calls(folder: Path) -> list[ValidCall]:
         _of_losses(problem, plans),
         _of_benchmark(folder, problem, plans),
         _of_recipes(problem),
+        _of_scenes(folder),
+        _of_sampled(folder, problem, plans),
+        _of_runtime(),
     )
     return [call for group in groups for call in group]
 
@@ -204,7 +217,7 @@ def _of_plans(folder: Path, plans: Any) -> list[ValidCall]:
 
 def _of_planners(folder: Path, model: Any, dataset: Any, plans: Any) -> list[ValidCall]:
     planner = cnpgen.Planner(model, backend="numpy")
-    hits = cnpgen.Planner("airhockey-hit")
+    hits, moving = cnpgen.Planner("airhockey-hit"), cnpgen.Planner("airhockey-replan")
     layer = cnpgen.BoundaryLayer("airhockey")
     tasks = layer.tasks(plans.boundary)
     outputs = {
@@ -234,6 +247,18 @@ def _of_planners(folder: Path, model: Any, dataset: Any, plans: Any) -> list[Val
             cnpgen.plan_hits,
             {"planner": hits, "state": state, "puck": [1.0, 0.1], "target": [2.4, 0.0], "speed_share": 0.5},
         ),
+        ValidCall(
+            "plan_hits",
+            cnpgen.plan_hits,
+            {"planner": moving, "state": state, "puck": np.array([1.0, 0.1]), "target": np.array([2.4, 0.0])}
+            | {
+                "puck_velocity": np.array([-0.3, 0.1]),
+                "meeting_time": 0.9,
+                "puck_model": results.PuckModel(),
+                "home": base,
+            },
+        ),
+        ValidCall("PuckModel", results.PuckModel),
         ValidCall("BoundaryLayer", cnpgen.BoundaryLayer, {"problem": "airhockey"}),
         ValidCall("BoundaryLayer.__call__", layer.__call__, outputs),
         ValidCall(
@@ -350,4 +375,60 @@ def _of_recipes(problem: Any) -> list[ValidCall]:
         ValidCall("ProblemRecord.differences", stored.differences, {"other": stored}),
         ValidCall("ProblemRecord.restored", stored.restored),
         ValidCall("ProblemRecord.tip_positions", stored.tip_positions, {"q": np.zeros((2, 6))}),
+    ]
+
+
+def _of_scenes(folder: Path) -> list[ValidCall]:
+    problem = cnpgen.load_problem("heavy-object")
+    start = np.array([-0.6, 0.0, 0.0, -1.5, 0.0, 1.2, 0.8])
+    goal = start + np.array([0.4, *np.zeros(6)])
+    post = recipes.Obstacle(name="post", kind="cylinder", position=(0.0, 0.9, 0.3), radius=0.05, length=0.6)
+    scene = scenes.SceneProblem(name="post", obstacles=(post,), start_q=start, goal_q=goal[None])
+    scenes.save_scenes(folder / "scenes.h5", [scene])
+    grasp = scenes.Grasp(np.array([0.5, 0.2, 0.3]), np.array([0.0, 0.0, -1.0]))
+    family = scenes.load_family("tabletop")
+    return [
+        ValidCall("load_scenes", scenes.load_scenes, {"path": folder / "scenes.h5"}),
+        ValidCall("save_scenes", scenes.save_scenes, {"path": folder / "saved_scenes.h5", "scenes": [scene]}),
+        ValidCall("scene_plans", scenes.scene_plans, {"problem": problem, "scenes": [scene]}),
+        ValidCall("load_family", scenes.load_family, {"name": "tabletop"}),
+        ValidCall("make_scenes", scenes.make_scenes, {"family": family, "problem": problem, "n": 0}, frozenset({"n"})),
+        ValidCall("GoalPose", scenes.GoalPose, {"frame": "", "position": start[:3], "rotation": np.eye(3)}),
+        ValidCall("Grasp", scenes.Grasp, _fields(grasp)),
+        ValidCall("Layout", scenes.Layout, {"obstacles": (post,), "grasps": (grasp,)}),
+        ValidCall("SceneProblem", scenes.SceneProblem, _fields(scene)),
+    ]
+
+
+def _of_sampled(folder: Path, problem: Any, plans: Any) -> list[ValidCall]:
+    cnpgen.export_plans(plans[:1], folder / "exported", to="csv", rate=100)
+    loaded = trajectories.load_trajectories(folder / "exported", problem)
+    sampled = loaded.trajectories[0]
+    fitted = plans.motion[[0]]
+    return [
+        ValidCall(
+            "load_trajectories", trajectories.load_trajectories, {"path": folder / "exported", "problem": problem}
+        ),
+        ValidCall(
+            "import_trajectories",
+            trajectories.import_trajectories,
+            {"problem": problem, "trajectories": [sampled]},
+        ),
+        ValidCall("largest_error", trajectories.largest_error, {"motion": fitted, "t": sampled.t, "q": sampled.q}),
+    ]
+
+
+def _of_runtime() -> list[ValidCall]:
+    planner = cnpgen.Planner("airhockey-replan")
+    base = planner.robot.base
+    runtime = results.PlanRuntime(planner, base)
+    plan = planner.plan(base, base)
+    return [
+        ValidCall("PlanRuntime", results.PlanRuntime, {"planner": planner, "q": base}),
+        ValidCall("PlanRuntime.state_at", runtime.state_at, {"time": 0.0}),
+        ValidCall("PlanRuntime.set_point", results.PlanRuntime(planner, base).set_point, {"time": 0.0}),
+        ValidCall("PlanRuntime.switch", runtime.switch, {"plan": plan, "at": 0.0}),
+        ValidCall("PlanRuntime.stop", runtime.stop, {"at": 0.0}),
+        ValidCall("PlanRuntime.replan", runtime.replan, {"make_plan": lambda *_: plan, "at": 0.0}),
+        ValidCall("PlanRuntime.close", runtime.close),
     ]

@@ -12,6 +12,7 @@ import cnpgen
 from cnpgen.errors import UsageError
 from cnpgen.planner.boundary_layer import BoundaryLayer
 from cnpgen.plans.format import BOUNDARY
+from cnpgen.robots.plausible_values import UnitError
 from cnpgen.trajectory.boundary import Boundary
 from tests.conftest import needs_compiler, some
 from tests.examples.plans_of_networks import at_ends, boundary, boundary_for_layer, outputs
@@ -197,7 +198,10 @@ def test_boundary_conditions_are_read_from_rows_in_their_units(tiny: Any) -> Non
         Boundary.from_batch({name: rows[name] for name in ("start_q", "start_dq", "goal_q")}, None)
 
 
-def test_joint_positions_in_degrees_cause_a_warning(layers: Any) -> None:
+def test_joint_positions_in_degrees_are_refused(layers: Any) -> None:
     given = boundary("airhockey", 4)
-    with pytest.warns(UserWarning, match="goal_q of plan 0: joint_. = .* rad is far outside of its limits"):
-        layers["airhockey"].tasks(replace(given, goal_q=np.degrees(given.goal_q)))
+    degrees = replace(given, goal_q=np.degrees(given.goal_q))
+    with pytest.raises(UnitError, match=r"goal_q must be from .* rad, got .* in plan 0 of joint_.*did you mean"):
+        layers["airhockey"].tasks(degrees)
+    with pytest.warns(UserWarning, match="goal_q must be from"):
+        layers["airhockey"].tasks(degrees, allow_large_angles=True)

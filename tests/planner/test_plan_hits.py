@@ -89,6 +89,7 @@ def test_a_planner_can_be_pickled_after_planning_hits(planner, state):
         (((np.zeros(5),) * 3, [1.0, 0.0], TARGET), r"state must have shape \(6,\) or \(N, 6\), got \(5,\)"),
         (((np.zeros(6),) * 3, [1.0], TARGET), r"puck must have shape \(2,\) or \(N, 2\) or \(3,\) or \(N, 3\), got"),
         (((np.zeros(6),) * 3, [1.0, np.nan], TARGET), "puck must be finite"),
+        (((np.full(6, 40.0), *(np.zeros(6),) * 2), [1.0, 0.0], TARGET), "start_q must be .* 40 deg = 0.698 rad"),
         (((np.zeros((2, 6)),) * 3, np.ones((3, 2)), TARGET), "state has 2 hits, another argument has 3"),
         (((np.zeros((0, 6)),) * 3, np.ones((0, 2)), TARGET), "state is empty, expected at least 1 hit"),
     ],

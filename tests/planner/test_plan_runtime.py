@@ -194,3 +194,12 @@ def test_a_hit_that_is_replanned_in_flight_scores_in_the_simulator_at_1_khz(plan
     resting = execution.tip[min(2400, len(execution.tip) - 1)]
     assert np.linalg.norm(resting - base) < 5e-3
     assert evaluate_plans(hit).valid.all()
+
+
+@pytest.mark.parametrize("time", [np.nan, np.inf, [0.0, np.nan], [], [[0.0]]])
+def test_set_points_at_impossible_times_are_refused_and_change_nothing(planner, time):
+    runtime = PlanRuntime(planner, planner.robot.base)
+    for evaluate in (runtime.set_point, runtime.state_at):
+        with pytest.raises(UsageError, match=r"^time must be"):
+            evaluate(time)
+    assert runtime.switch(planner.plan(planner.robot.base, planner.robot.base), 0.0).outcome != SwitchOutcome.LATE

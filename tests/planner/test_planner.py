@@ -14,6 +14,7 @@ from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.join import join_plans
 from cnpgen.plans.status import PlanStatus
 from cnpgen.refine.refine_plans import refine_plans
+from cnpgen.robots.plausible_values import UnitError
 from cnpgen.trajectory.boundary import Boundary
 from tests.conftest import columns_of, some
 from tests.examples.models import boundary_of_columns, untrained_model
@@ -253,9 +254,16 @@ def test_plans_are_the_same_on_every_backend(planner, rows, backend):
     )
 
 
-def test_joint_positions_in_degrees_cause_a_warning(planner, rows):
-    with pytest.warns(
-        UserWarning, match="start_q of plan 0: joint_2 = 40 rad is far outside of its limits, .* degrees"
-    ) as warnings:
-        planner.plan(np.array([0, 40.0, 0, -30, 0, 110]), rows.goal_q[0])
+def test_values_in_degrees_are_refused(planner, rows):
+    start = np.array([0, 40.0, 0, -30, 0, 110])
+    message = "start_q must be from .* rad, got 40 rad in plan 0 of joint_2; .* 40 deg = 0.698 rad"
+    with pytest.raises(UnitError, match=message) as caught:
+        planner.plan(start, rows.goal_q[0])
+    assert caught.value.argument == "start_q"
+    with pytest.raises(UnitError, match=r"goal_dq must be from .* rad/s, got 60 rad/s in plan 0 of joint_1"):
+        planner.plan(rows.start_q[0], rows.goal_q[0], goal_dq=np.array([60.0, 0, 0, 0, 0, 0]))
+    with pytest.raises(UnitError, match=message):
+        planner.plan_batch(replace(rows[:1], start_q=start[None]))
+    with pytest.warns(UserWarning, match=message) as warnings:
+        planner.plan(start, rows.goal_q[0], allow_large_angles=True)
     assert {Path(each.filename).name for each in warnings} == {"test_planner.py"}  # the caller's line

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
+from cnpgen.planner.boundary_layer import BoundaryLayer
 from cnpgen.planner.inference_pipeline import loaded_problem
 from cnpgen.planner.model import Model
 from cnpgen.planner.model_file import load_model
@@ -13,6 +14,7 @@ from cnpgen.planner.planner import Planner
 from cnpgen.planner.via_points import ViaPoints, make_via_points
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.trajectory.boundary import Boundary
+from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.world.world import World
 from tests.conftest import needs_compiler
 from tests.examples.models import quickest
@@ -55,9 +57,43 @@ def test_static_violations_agree_with_pinocchio_and_coal() -> None:
 
 
 def test_candidates_are_lines_without_violation_or_else_the_one_with_the_smallest() -> None:
-    via_points = ViaPoints(np.zeros((3, 7)), None, None)  # type: ignore[arg-type]
     violation = np.array([0.5, 2.0, 0.9, 7.0, 3.0, 5.0, np.inf, np.inf, 4.0])
-    np.testing.assert_array_equal(via_points.candidates(violation), [0, 2, 4, 8])
+    np.testing.assert_array_equal(ViaPoints.candidates(violation, 3), [0, 2, 4, 8])
+
+
+@pytest.fixture(scope="module")
+def checks() -> ViaPoints:
+    """Three via points, with the check of heavy-object."""
+    middle = np.array(RETRACTED)
+    return make_via_points(
+        PROBLEMS["heavy-object"],
+        quickest("heavy-object").kernels,
+        np.stack([middle + step for step in (0.8, 0.0, 0.3)]),
+    )
+
+
+def test_the_lower_bound_decides_like_the_violation(checks: ViaPoints) -> None:
+    plan, random = load("transport"), np.random.default_rng(2)
+    count = 40
+    path = np.repeat(plan.motion.path, count, axis=0)
+    path[:, 4:-3] += random.uniform(0, 0.05, (count, 1, 1)) * random.normal(size=path[:, 4:-3].shape)
+    motion = Motion(path, np.repeat(plan.motion.rate, count, axis=0), plan.motion.degree)
+    poses = np.repeat(plan.scene.poses, count, axis=0)
+    violation, bound = checks.violation(motion, poses), checks.lower_bound(motion, poses)
+    assert 0 < (violation > 1).sum() < count
+    np.testing.assert_array_equal(bound > 1, violation > 1)
+    assert (bound <= violation + 1e-12).all()
+
+
+def test_the_best_lines_have_the_smallest_violations(checks: ViaPoints) -> None:
+    plan = load("transport")
+    tasks = BoundaryLayer("heavy-object").tasks(plan.boundary)
+    assert tasks.correction is not None
+    lines = tasks.take(np.zeros(6, int))
+    assert lines.correction is not None
+    offsets = np.array([0.6, 0.0, 0.1, 0.0, 0.9, 0.3])  # rad; from the projected line, of two tasks
+    lines = replace(lines, correction=lines.correction + offsets[:, None, None])
+    np.testing.assert_array_equal(checks.best_lines(lines, 2), [1, 2, 3, 5])
 
 
 @pytest.mark.slow  # it compiles for a minute

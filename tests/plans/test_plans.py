@@ -38,6 +38,7 @@ from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import resolved
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.refine.refine_plans import refine_plans
+from cnpgen.robots.plausible_values import UnitError
 from cnpgen.store.files.checksum_file import with_checksum
 from cnpgen.trajectory.boundary import Boundary, anchor_line, assemble
 from tests.examples.plan_files import remove_checksum
@@ -781,17 +782,20 @@ def test_plans_are_made_of_arrays_of_jax_and_tensors_of_torch() -> None:
 
 
 @pytest.mark.parametrize("end", ["start_q", "goal_q"])
-def test_joint_positions_in_degrees_are_said_to_be_suspicious_where_they_come_in(tmp_path: Path, end: str) -> None:
+def test_joint_positions_in_degrees_are_refused_where_they_come_in(tmp_path: Path, end: str) -> None:
     plans = draw_plans()
     degrees = getattr(plans.boundary, end).copy()
     degrees[2, 3] = 40.0
     boundary = replace(plans.boundary, **{end: degrees})
     points = {name: getattr(plans, name) for name in ("path_control_points", "rate_control_points")}
-    said = rf"^{end} of plan 2: joint_4 = 40 rad is far outside of its limits, \[-2\.09, 2\.09\]: .* degrees"
-    with pytest.warns(UserWarning, match=said):
-        made = make_plans(AIRHOCKEY, boundary, **points)
+    message = rf"^{end} must be from -4.19 to 4.19 rad, got 40 rad in plan 2 of joint_4; .* 40 deg = 0.698 rad"
+    with pytest.raises(UnitError, match=message + r"\? allow_large_angles=True accepts such values") as caught:
+        make_plans(AIRHOCKEY, boundary, **points)
+    assert caught.value.argument == "boundary"
+    with pytest.warns(UserWarning, match=message):
+        made = make_plans(AIRHOCKEY, boundary, **points, allow_large_angles=True)
     save_plans(tmp_path / "degrees.h5", made)
-    with pytest.warns(UserWarning, match=said):
+    with pytest.warns(UserWarning, match=message):  # the verdict reports it
         load_plans(tmp_path / "degrees.h5")
 
 

@@ -274,3 +274,42 @@ def test_the_command_judges_exported_plans(plans: Plans, tmp_path: Path, capsys:
     assert "undecided: joint acceleration: the curve lacks a derivative" in capsys.readouterr().out
     assert main(["evaluate", str(tmp_path / "out")]) == 2
     assert "--problem" in capsys.readouterr().err
+
+
+def test_positions_in_degrees_are_refused_with_a_suggestion(tmp_path: Path) -> None:
+    path = tmp_path / "degrees.csv"
+    rows = "".join(f"{t},1,40,0,-30,0,{110 + t}\n" for t in range(4))
+    path.write_text(f"t,q1,q2,q3,q4,q5,q6\n{rows}")
+    message = r"median position of joint_2 must be from .* 40 deg = 0\.698 rad\? unit='deg' reads degrees"
+    with pytest.raises(UsageError, match=message):
+        load_trajectories(path, "airhockey")
+    (trajectory,) = load_trajectories(path, "airhockey", unit="deg").trajectories
+    assert trajectory.q[0, 1] == pytest.approx(np.deg2rad(40))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "a: &a [1, 1]\nb: &b [*a, *a]\nt: [0, 1]\nq: *b\n",  # grows exponentially with more levels
+        "joint_trajectory: &x {trajectory: *x}\n",  # contains itself
+    ],
+)
+def test_yaml_with_anchors_is_refused(tmp_path: Path, text: str) -> None:
+    pytest.importorskip("yaml")
+    (tmp_path / "anchors.yaml").write_text(text)
+    with pytest.raises(UsageError, match="expected a file without anchors"):
+        load_trajectories(tmp_path / "anchors.yaml", "airhockey")
+
+
+def test_a_damaged_header_of_a_parquet_file_in_a_dataset_of_lerobot_is_an_error(tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    plans = plans_of(load("hit"))
+    export_plans(plans, tmp_path / "set", to="lerobot", rate=100)
+    (path,) = (tmp_path / "set").glob("data/*/*.parquet")
+    content = bytearray(path.read_bytes())
+    length = int.from_bytes(content[-8:-4], "little")
+    for place in range(len(content) - 8 - length, len(content) - 8, 3):
+        content[place] ^= 0xFF
+    path.write_bytes(content)
+    with pytest.raises(UsageError, match="is not a Parquet file, or is damaged"):
+        load_trajectories(tmp_path / "set", plans.problem)

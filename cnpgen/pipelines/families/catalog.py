@@ -11,6 +11,7 @@ from cnpgen.pipelines.families.family import SceneFamily
 from cnpgen.pipelines.families.free_mix import FreeMix
 from cnpgen.pipelines.families.shelves import BookshelfSmall, BookshelfTall, BookshelfThin, Cubby, MergedCubby
 from cnpgen.pipelines.families.tables import TablePick, Tabletop, TableUnderPick
+from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.keys import RecipeLocation
 from cnpgen.schema.parsing import parse
 
@@ -30,6 +31,7 @@ FAMILIES: dict[str, type[SceneFamily]] = {
 }
 
 
+@checked_arguments
 def load_family(name: str, parameters: Mapping[str, Any] | None = None) -> SceneFamily:
     """Return a family by its name.
 
@@ -41,7 +43,8 @@ def load_family(name: str, parameters: Mapping[str, Any] | None = None) -> Scene
         UsageError: The family or a parameter is unknown, or a value is invalid.
     """
     if name not in FAMILIES:
-        raise UsageError(f"unknown family {name!r}{nearest(name, FAMILIES)}, expected one of {', '.join(FAMILIES)}")
+        text = f"unknown family {name!r}{nearest(name, FAMILIES)}, expected one of {', '.join(FAMILIES)}"
+        raise UsageError(text, concerns="name")
     mistakes: list[str] = []
     family = parse(FAMILIES[name], dict(parameters or {}), where=RecipeLocation(name), mistakes=mistakes)
     if family is None or mistakes:

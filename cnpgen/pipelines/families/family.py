@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.robots.obstacle import Obstacle
+from cnpgen.schema.argument_types import check_fields
 from cnpgen.schema.keys import Range, field
 
 Array = NDArray[np.float64]
@@ -28,6 +29,9 @@ class Grasp:
     approach: Array
     tilt: float = 0.3
 
+    def __post_init__(self) -> None:
+        check_fields(self)
+
 
 @dataclass(frozen=True, eq=False)
 class Layout:
@@ -35,6 +39,9 @@ class Layout:
 
     obstacles: tuple[Obstacle, ...]
     grasps: tuple[Grasp, ...]
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
 
 @dataclass(frozen=True, kw_only=True)

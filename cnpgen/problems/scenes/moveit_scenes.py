@@ -77,7 +77,7 @@ def _problem(scene_path: Path, scene: Any, path: Path, request: Any) -> ScenePro
         name=name,
         obstacles=tuple(_obstacles(scene, place)),
         start_q=start,
-        goal_q=np.array(goal_q).reshape(-1, len(joints)),
+        goal_q=np.array(goal_q).reshape(len(goal_q), len(joints)),
         goal_pose=pose,
         joint_names=joints,
         source=str(scene_path),

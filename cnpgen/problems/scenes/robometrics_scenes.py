@@ -53,7 +53,7 @@ def _problem(path: Path, name: str, entry: Any, place: str) -> SceneProblem:
         name=name,
         obstacles=tuple(_obstacles(part(entry, "obstacles", dict, place), place)),
         start_q=start,
-        goal_q=np.array(goals).reshape(-1, len(start)),
+        goal_q=np.array(goals).reshape(len(goals), len(start)),
         goal_pose=pose,
         source=str(path),
     )

@@ -11,7 +11,7 @@ from cnpgen.errors import UsageError
 from cnpgen.problems.scenes.moveit_scenes import is_moveit, moveit_texts, read_moveit
 from cnpgen.problems.scenes.mpinets_scenes import is_mpinets, mpinets_bytes, read_mpinets
 from cnpgen.problems.scenes.robometrics_scenes import is_robometrics, read_robometrics
-from cnpgen.problems.scenes.scene_problem import MAX_SCENES, SceneError, SceneProblem, checked_scene
+from cnpgen.problems.scenes.scene_problem import MAX_SCENES, SceneError, SceneProblem, check_scenes, checked_scene
 from cnpgen.problems.scenes.yaml_document import read_yaml
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
@@ -130,8 +130,7 @@ def save_scenes(path: str | Path, scenes: Sequence[SceneProblem], *, joints: Seq
         MachineError: A file cannot be written.
     """
     path = Path(path)
-    if not scenes:
-        raise UsageError("there are no scenes to write", concerns="scenes")
+    check_scenes(scenes)
     if _is_hdf5(path):
         write_file(path, mpinets_bytes(scenes))
         return

@@ -16,6 +16,7 @@ from cnpgen.robots.observation.signed_distance import signed_distances
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.hull import MAX_COORDINATE_M
 from cnpgen.robots.solid import place_obstacles
+from cnpgen.schema.argument_types import check_fields
 
 Array = NDArray[np.float64]
 
@@ -48,6 +49,9 @@ class GoalPose:
     position_tolerance: float = 1e-3
     rotation_tolerance: float = 1e-2
 
+    def __post_init__(self) -> None:
+        check_fields(self)
+
 
 @dataclass(frozen=True, eq=False)
 class SceneProblem:
@@ -70,6 +74,9 @@ class SceneProblem:
     goal_pose: GoalPose | None = None
     joint_names: tuple[str, ...] = ()
     source: str = ""
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
     def __repr__(self) -> str:
         kinds = Counter(obstacle.kind for obstacle in self.obstacles)
@@ -126,6 +133,19 @@ def check_count(count: int, place: str) -> None:
     """Raise SceneError for more obstacles than a scene may have, before any is built."""
     if count > MAX_SCENE_OBSTACLES:
         raise SceneError(f"{place} has {count:,} obstacles, expected at most {MAX_SCENE_OBSTACLES}")
+
+
+def check_scenes(scenes: Sequence[SceneProblem]) -> None:
+    """Check the type of every scene, and that there is one.
+
+    Raises:
+        UsageError: There are no scenes, or one is no ``SceneProblem``.
+    """
+    if not scenes:
+        raise UsageError("there are no scenes", concerns="scenes")
+    for index, scene in enumerate(scenes):
+        if not isinstance(scene, SceneProblem):
+            raise UsageError(f"must be SceneProblems, got {scene!r:.100} at {index}", argument="scenes")
 
 
 def checked_scene(scene: SceneProblem) -> SceneProblem:

@@ -1,8 +1,9 @@
-"""YAML files of scenes, read as plain mappings, lists and texts in bounded memory and depth."""
+"""YAML files of scenes and trajectories, read as plain mappings, lists and texts in bounded memory and depth."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +20,14 @@ MAX_YAML_BYTES = 1 << 25
 MAX_YAML_DEPTH = 32  # nested mappings and lists
 
 
-def read_yaml(path: Path) -> list[Any]:
+def read_yaml(path: Path, *, numbers: bool = False) -> list[Any]:
     """Read the documents of a YAML file; scalars stay texts, and plain nulls become None.
 
     Anchors and aliases are refused, so the memory is proportional to the size of the file.
+
+    Args:
+        path: The file.
+        numbers: Whether plain scalars that are numbers become float; keys stay texts.
 
     Raises:
         SceneError: The file is not YAML, has anchors, or is nested too deeply.
@@ -32,12 +37,13 @@ def read_yaml(path: Path) -> list[Any]:
         import yaml
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     try:
-        return list(_documents(path, yaml, yaml.parse(read_file(path, max_bytes=MAX_YAML_BYTES), Loader=loader)))
+        events = yaml.parse(read_file(path, max_bytes=MAX_YAML_BYTES), Loader=loader)
+        return list(_documents(path, yaml, events, numbers))
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError) as error:
         raise SceneError(f"{path} is not YAML: {' '.join(str(error).split()):.300}") from error
 
 
-def _documents(path: Path, yaml: Any, events: Any) -> Iterator[Any]:
+def _documents(path: Path, yaml: Any, events: Any, numbers: bool) -> Iterator[Any]:
     """Build documents from the events of a parser, without recursion."""
     stack: list[Any] = []  # open mappings and lists, and the keys that wait for their values
     for event in events:
@@ -51,10 +57,23 @@ def _documents(path: Path, yaml: Any, events: Any) -> Iterator[Any]:
         if isinstance(event, yaml.MappingEndEvent | yaml.SequenceEndEvent):
             value = stack.pop()
         elif isinstance(event, yaml.ScalarEvent):
-            value = None if event.implicit[0] and event.value in {"", "~", "null"} else event.value
+            is_key = bool(stack) and isinstance(stack[-1], dict)
+            value = _scalar(event, numbers and not is_key)
         else:
             continue
         yield from _put(stack, value)
+
+
+def _scalar(event: Any, numbers: bool) -> str | float | None:
+    """Return the value of a scalar; quoted ones are texts."""
+    text: str = event.value
+    if event.implicit[0]:
+        if text in {"", "~", "null"}:
+            return None
+        if numbers:
+            with suppress(ValueError):
+                return float(text)
+    return text
 
 
 def _put(stack: list[Any], value: Any) -> Iterator[Any]:
