@@ -32,7 +32,7 @@ from cnpgen.store.dataset_spec import StoredProblem
 
 Array = NDArray[Any]
 FORMS = ("signed", "paper")
-MAX_THREADS = 1024
+MAX_LOSS_THREADS = 1024
 _BUILT = {"_gradient", "_values", "_time_varying_bound"}
 
 
@@ -99,7 +99,7 @@ class PlanLoss:
         cache_folder: str | Path | None = None,
         threads: int = 1,
     ) -> None:
-        self._threads = integer("threads", threads, least=1, most=MAX_THREADS)
+        self._threads = integer("threads", threads, least=1, most=MAX_LOSS_THREADS)
         _check_choice("dtype", dtype, DTYPES)
         _check_choice("form", form, FORMS)
         check_quadrature(rule, nodes)

@@ -14,7 +14,9 @@ from cnpgen.kernels.tape import NAMES, OPERATIONS, Tape
 
 Value = Any  # a tensor, or a constant as a Python number
 MAX_GUARD = 1e-12  # a denominator ``fmax(x, guard)`` with a smaller constant is that of a closest point
-MIN_DENOMINATOR = 1e-6  # m^2; below, segment and face or segment are parallel, and their closest points are arbitrary
+MIN_REGULAR_DENOMINATOR_M2 = (
+    1e-6  # below, segment and face or segment are parallel, and their closest points are arbitrary
+)
 
 
 def _maximum(a: Value, b: Value) -> torch.Tensor:
@@ -46,7 +48,7 @@ def _if_else_zero(condition: Value, value: Value) -> torch.Tensor:
 
 def _guarded_quotient(a: Value, b: Value) -> torch.Tensor:
     """Return a / b, constant for differentiation where b is small, so that second derivatives stay finite."""
-    regular = b.detach() > MIN_DENOMINATOR
+    regular = b.detach() > MIN_REGULAR_DENOMINATOR_M2
     quotient = a.detach() / b.detach() if isinstance(a, torch.Tensor) else a / b.detach()
     return torch.where(regular, a / torch.where(regular, b, 1.0), quotient)
 
