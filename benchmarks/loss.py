@@ -4,6 +4,7 @@ The clock is the process's CPU time. Every repetition measures all cases in turn
 repetitions, ratios are medians of the ratios within one repetition.
 
     python benchmarks/loss.py
+    python benchmarks/loss.py --torch
     python benchmarks/loss.py --batch 64 --nodes 32 --repeat 50
 """
 
@@ -47,7 +48,7 @@ def draw_plans(name: str, count: int) -> Plans:
     path = ends[0] * (1 - along) + ends[1] * along
     path += MAX_NOISE_RAD * random.uniform(-1, 1, path.shape)
     rate = random.uniform(0.8, 1.4, (count, spec.rate_control_points))
-    return Plans(path, rate, random.uniform(0.1, 0.4, (count, len(problem.obstacle))))
+    return Plans(path, rate, random.uniform(0.1, 0.4, (count, problem.scene_width)))
 
 
 @dataclass
@@ -130,6 +131,34 @@ def speed_table(cases: list[Case], points: int) -> str:
     return table(title, (*head, ""), rows, left=3)
 
 
+def torch_row(case: Case, repeat: int) -> tuple[str, ...]:
+    import torch
+
+    from cnpgen.interop.torch import TensorLoss
+
+    torch.set_num_threads(1)
+    path, rate = (torch.tensor(x, requires_grad=True) for x in (case.plans.path, case.plans.rate))
+    loss, weights = TensorLoss(case.loss), np.ones(len(case.loss.terms) - 1)
+
+    def gradient() -> Any:
+        total, _ = loss(path, rate, weights=weights, obstacle_poses=case.plans.obstacle_poses)
+        return torch.autograd.grad(total.sum(), [path])[0].numpy()
+
+    times = [(seconds(gradient), seconds(case.call)) for _ in range(repeat)]
+    poses = case.plans.obstacle_poses
+    expected = case.loss(case.plans.path, case.plans.rate, weights=weights, obstacle_poses=poses).path_gradient
+    error = np.abs(gradient() - expected).max() / np.abs(expected).max()
+    slower = median(a / b for a, b in times)
+    return case.problem, f"{1e3 * median(a for a, _ in times):.1f}", f"{slower:.1f}", f"{error:.1e}"
+
+
+def torch_table(cases: list[Case], repeat: int) -> str:
+    """Compare the loss in torch operations with the compiled one, in float64 on one thread."""
+    rows = [torch_row(case, repeat) for case in cases]
+    head = ("problem", "ms/batch", "times slower", "relative difference of the gradient")
+    return table("TensorLoss with its gradient on the CPU, against the compiled loss in float64", head, rows)
+
+
 @dataclass(frozen=True)
 class RuleError:
     """Error of a rule: means over plans, relative to ``REFERENCE_NODES`` nodes."""
@@ -198,12 +227,17 @@ def results(cases: list[Case], points: int, errors: list[list[RuleError]]) -> di
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--batch", type=int, default=128, help="plans per batch")
     parser.add_argument("--nodes", type=int, default=64, help="quadrature nodes")
+    parser.add_argument("--torch", action="store_true", help="compare with the loss in torch operations, and stop")
     parser.add_argument("--repeat", type=int, default=15, help="repetitions")
 
 
 def main() -> None:
     options = arguments(__doc__, add_options)
     points = options.batch * options.nodes
+    if options.torch:
+        cases = [prepare(problem, "compiled", "float64", options) for problem in PROBLEMS]
+        report({}, [torch_table(cases, options.repeat)], as_json=options.json)
+        return
     cases = [prepare(problem, *variant, options) for problem in PROBLEMS for variant in VARIANTS]
     for number in range(options.repeat):
         progress(f"repetition {number + 1} of {options.repeat}")

@@ -26,6 +26,7 @@ from cnpgen.errors import MissingExtraError
 from cnpgen.loader.frame import make_frame
 from cnpgen.machine.clusters import joined
 from cnpgen.machine.versions import DOCUMENTATION_URL
+from cnpgen.make.publish import upload_folder
 from cnpgen.plans.trajectory_tables import read_trajectory_tables
 from cnpgen.store.files.figure_file import new_figure
 
@@ -137,7 +138,8 @@ def test_every_library_that_is_imported_is_a_declared_dependency(wheel: zipfile.
     declared = Parser().parsestr(wheel.read(metadata).decode()).get_all("Requires-Dist") or []
     libraries = {re.split(r"[^A-Za-z0-9_.-]", text)[0] for text in declared}
     others = imported - set(sys.stdlib_module_names) - {"cnpgen"}
-    assert {{"pinocchio": "pin", "yaml": "pyyaml"}.get(name, name) for name in others} <= libraries
+    projects = {"pinocchio": "pin", "yaml": "pyyaml", "huggingface_hub": "huggingface-hub"}
+    assert {projects.get(name, name) for name in others} <= libraries
 
 
 def test_what_the_default_run_of_the_tests_leaves_out_is_run_before_a_change_lands() -> None:
@@ -221,6 +223,7 @@ OPTIONAL = {  # package that cnpgen imports -> extra that installs it, function 
     "pandas": ("pandas", lambda: frame("pandas")),
     "pyarrow": ("parquet", lambda: trajectories(".parquet")),
     "yaml": ("ros", lambda: trajectories(".yaml")),
+    "huggingface_hub": ("hub", lambda: upload_folder(Path(), "user/name", private=False)),
 }
 NAMES_IN_THE_INDEX = {"yaml": "pyyaml"}
 BY_NAME = {"meshcat", "polars", "pandas"}  # loaded by name, without an import statement

@@ -52,7 +52,7 @@ def describe_dataset(recipe: DatasetRecipe) -> str:
     facts = [
         ("rows", f"{sum(recipe.splits.values()):,}: {splits}"),
         ("seed", str(recipe.seed)),
-        ("licence", recipe.license),
+        ("licence", recipe.license or "none stated"),
         ("recipe", f"sha256 {recipe_digest(recipe)}"),
         ("file", recipe.path),
     ]

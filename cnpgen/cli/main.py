@@ -28,6 +28,7 @@ from cnpgen.cli import (
     make_scenes_command,
     merge_command,
     plan_command,
+    publish_command,
     refine_command,
     show_command,
     simulate_command,
@@ -65,6 +66,7 @@ _COMMANDS = (
     simulate_command,
     benchmark_command,
     export_command,
+    publish_command,
     doctor_command,
     docs_command,
 )

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,7 +18,7 @@ from cnpgen.kernels.library import Backend, choose_backend, problem_kernels
 from cnpgen.kernels.tape import DTYPES, Dtype
 from cnpgen.losses.integrand import grid_specs, loss_gradient, loss_values, relaxation_argument
 from cnpgen.losses.margins import Margins, constraint_terms
-from cnpgen.losses.plan_batch import PLANS_PER_BLOCK, PlanBatch, check_batch, check_shapes
+from cnpgen.losses.plan_batch import MAX_VECTOR_LANES, PLANS_PER_BLOCK, PlanBatch, check_batch, check_shapes
 from cnpgen.losses.quadrature import BasisTable, basis_table, check_quadrature
 from cnpgen.losses.time_varying_bound import TimeVaryingBound, make_time_varying_bound
 from cnpgen.machine.memory import check_memory
@@ -26,11 +27,12 @@ from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import as_problem
 from cnpgen.schema.argument_types import checked_arguments
-from cnpgen.schema.arguments import flag, number, numbers
+from cnpgen.schema.arguments import flag, integer, number, numbers
 from cnpgen.store.dataset_spec import StoredProblem
 
 Array = NDArray[Any]
 FORMS = ("signed", "paper")
+MAX_LOSS_THREADS = 1024
 _BUILT = {"_gradient", "_values", "_time_varying_bound"}
 
 
@@ -70,11 +72,13 @@ class PlanLoss:
         margins: Tightening of the bounds.
         backend: Backend of the kernels; by default the fastest that works on this machine.
         cache_folder: Cache of kernels; by default that of the user.
+        threads: Number of threads that share the plans of a call.
 
     Attributes:
         terms: Names of the columns of ``LossValue.terms``: "time", then the kinds of the constraints.
         budgets: Acceptable violations from the problem file (the paper's C-bar^2), shape (m,); 0 for none.
         weights0: First weights from the problem file (the paper's e^alpha), shape (m,).
+        tightening: Factors of the limits of all terms, then insets of their other bounds (``Margins``), shape (2 m,).
 
     Raises:
         UsageError: An argument has an unsupported value.
@@ -93,7 +97,9 @@ class PlanLoss:
         margins: Margins | None = None,
         backend: Backend | None = None,
         cache_folder: str | Path | None = None,
+        threads: int = 1,
     ) -> None:
+        self._threads = integer("threads", threads, least=1, most=MAX_LOSS_THREADS)
         _check_choice("dtype", dtype, DTYPES)
         _check_choice("form", form, FORMS)
         check_quadrature(rule, nodes)
@@ -102,7 +108,7 @@ class PlanLoss:
         self.terms = ("time", *constraint_terms(self.problem))
         self.budgets = np.array([constraint.budget for constraint in self.problem.constraint])
         self.weights0 = np.array([constraint.weight for constraint in self.problem.constraint])
-        self._tightening = _checked_margins(margins).tightening(self.terms[1:]).astype(dtype)
+        self.tightening = _checked_margins(margins).tightening(self.terms[1:]).astype(dtype)
         self._robot = load_robot(self.problem)
         chosen, folder = choose_backend(backend)
         folder = folder if cache_folder is None else Path(cache_folder)
@@ -150,13 +156,32 @@ class PlanLoss:
         n, selected = len(batch), slice(None) if gradient else slice(0)
         terms = np.empty((n, len(self.terms)), self.dtype)
         path_gradient, rate_gradient = np.empty_like(batch.path[selected]), np.empty_like(batch.rate[selected])
-        with np.errstate(all="ignore"):  # an overflow affects its own plan only
-            for rows in (slice(first, first + PLANS_PER_BLOCK) for first in range(0, n, PLANS_PER_BLOCK)):
-                part = batch[rows]
+
+        def evaluate_block(rows: slice) -> None:
+            part = batch[rows]
+            with one_thread(), np.errstate(all="ignore"):  # an overflow affects its own plan only
                 results = self._integrate(part, checked, table, gradient=gradient)
                 terms[rows], path_gradient[rows], rate_gradient[rows] = (part.samples(values) for values in results)
+
+        kernel = self._gradient if gradient else self._values  # loaded before threads start, as is the bound
+        if kernel.tape.inputs[relaxation_argument(self.problem)] and batch.start_tip is not None:
+            self._time_varying_bound  # noqa: B018 - a cached property
+        self._run(evaluate_block, n)
+        with np.errstate(all="ignore"):
             total = terms[:, 0] + terms[:, 1:] @ checked
         return LossValue(total, terms, path_gradient, rate_gradient)
+
+    def _run(self, evaluate_block: Callable[[slice], None], n: int) -> None:
+        """Evaluate blocks of plans; compiled kernels release Python's lock, so that threads run in parallel."""
+        share = -(-n // (self._threads * MAX_VECTOR_LANES)) * MAX_VECTOR_LANES  # whole vectors
+        size = PLANS_PER_BLOCK if self._threads == 1 else max(min(share, PLANS_PER_BLOCK), MAX_VECTOR_LANES)
+        blocks = [slice(first, first + size) for first in range(0, n, size)]
+        if self._threads == 1 or len(blocks) < 2:
+            for block in blocks:
+                evaluate_block(block)
+            return
+        with ThreadPoolExecutor(self._threads) as pool:
+            list(pool.map(evaluate_block, blocks))
 
     def load_kernels(self) -> None:
         """Load the kernel of gradients, compiling it if it is not cached; otherwise the first call does."""
@@ -174,7 +199,7 @@ class PlanLoss:
         terms = np.zeros((len(self.terms), lanes), self.dtype)
         arguments = (
             *path.swapaxes(1, 2), rate, batch.lanes(batch.obstacle_poses),
-            self._relaxation(batch, table, lanes, gradient=gradient), table.weights, self._tightening, weights,
+            self._relaxation(batch, table, lanes, gradient=gradient), table.weights, self.tightening, weights,
         )  # fmt: skip
         if not gradient:
             self._values(*arguments, out=[terms])

@@ -34,7 +34,11 @@ class DatasetRecipe:
     )
     seed: int = field("root seed", default=0, low=0, high=MAX_SEED)
     splits: dict[str, int] = field("samples per split", low=1, pattern=SPLIT_NAME)
-    license: str = field("license of the samples", default="CC-BY-4.0")
+    license: str = field(
+        "license of the samples, an SPDX identifier such as CC-BY-4.0; publishing needs one", default=""
+    )
+    creator: str = field("authors of the dataset, for its card", default="")
+    citation: str = field("how to cite the dataset, such as BibTeX, for its card", default="")
     path: Path = Path()
 
 

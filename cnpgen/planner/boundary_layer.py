@@ -57,6 +57,8 @@ class BoundaryLayer:
     Attributes:
         problem: The problem.
         goal_acceleration: "free" or "given".
+        path_scale: Factor of phi [rad].
+        projection_steps: Number of Gauss-Newton steps that project the path.
         path_outputs: Width of phi: interior control points times joints.
         rate_outputs: Width of log_rate: control points of the rate.
 
@@ -78,9 +80,9 @@ class BoundaryLayer:
         backend: Backend | None = None,
         cache_folder: str | Path | None = None,
     ) -> None:
-        self.problem, self._path_scale = as_problem(problem), number("path_scale", path_scale)
+        self.problem, self.path_scale = as_problem(problem), number("path_scale", path_scale)
         self._line_projection_steps = integer("line_projection_steps", line_projection_steps, least=0)
-        self._projection_steps = integer("projection_steps", projection_steps, least=0)
+        self.projection_steps = integer("projection_steps", projection_steps, least=0)
         if expected_time not in EXPECTED_TIMES:
             raise UsageError(
                 f"must be one of {', '.join(EXPECTED_TIMES)}, got {expected_time!r}", argument="expected_time"
@@ -115,7 +117,7 @@ class BoundaryLayer:
                 fixed_at_goal=self._fixed_at_goal,
             )
             return prepare, make_projection(
-                problem, kernels, steps=self._projection_steps, fixed_at_goal=self._fixed_at_goal
+                problem, kernels, steps=self.projection_steps, fixed_at_goal=self._fixed_at_goal
             )
 
     @checked_arguments
@@ -194,7 +196,7 @@ class BoundaryLayer:
             by_path = projection.vjp(points.path, tasks.scene.poses, path_gradient) if projection else path_gradient
             spec = self.problem.trajectory
             gradients = control_points.vjp(
-                tasks, points, path_gradient=by_path, rate_gradient=rate_gradient, scale=self._path_scale, spec=spec
+                tasks, points, path_gradient=by_path, rate_gradient=rate_gradient, scale=self.path_scale, spec=spec
             )
         overflowed = _finite(path_gradient, rate_gradient) & ~_finite(*gradients)
         for gradient in gradients:
@@ -243,7 +245,7 @@ class BoundaryLayer:
         self.check_shapes(tasks, phi.shape, log_rate.shape)
         with np.errstate(all="ignore"):
             return control_points.control_points(
-                tasks, phi, log_rate, scale=self._path_scale, spec=self.problem.trajectory
+                tasks, phi, log_rate, scale=self.path_scale, spec=self.problem.trajectory
             )
 
 

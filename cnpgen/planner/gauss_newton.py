@@ -47,7 +47,7 @@ def projection_change(
         within_limits: Whether interior control points are clipped to the joint limits after every step.
     """
     control, interior = list(control), slice(3, len(control) - fixed_at_goal)
-    table, response = _collocation(problem.trajectory.degree, len(control), interior)
+    table, response = collocation(problem.trajectory.degree, len(control), interior)
     equality, total = equality_residuals(robot, problem), [[0.0] * robot.n for _ in response]
     for _ in range(steps):
         q = [_combined(row, control) for row in table]
@@ -106,7 +106,7 @@ def _combined(factors: Array, points: list[Vec]) -> Vec:
     return [sum(factor * point[joint] for factor, point in used) for joint in range(len(points[0]))]
 
 
-def _collocation(degree: int, points: int, interior: slice) -> tuple[Array, Array]:
+def collocation(degree: int, points: int, interior: slice) -> tuple[Array, Array]:
     """Return the basis at K phases, and the response of the interior control points to a force there.
 
     Returns:

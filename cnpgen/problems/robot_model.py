@@ -45,6 +45,8 @@ class ConstraintValues:
         jacobian_q: Derivatives with respect to joint positions, shape (N, m, n).
         jacobian_dq: Derivatives with respect to joint velocities, shape (N, m, n).
         jacobian_ddq: Derivatives with respect to joint accelerations, shape (N, m, n).
+        drift: ``(dJ_q / dt) dq``, shape (N, m), 0 for conditions that depend on dq or ddq. The second time derivative
+            of a condition of positions is ``jacobian_q @ ddq + drift``, as controllers on the manifold use it.
     """
 
     names: tuple[str, ...]
@@ -55,6 +57,7 @@ class ConstraintValues:
     jacobian_q: Array
     jacobian_dq: Array
     jacobian_ddq: Array
+    drift: Array
 
     @property
     def violation(self) -> Array:
@@ -196,17 +199,11 @@ class RobotModel:
         """
         states = self._motion(q, dq, ddq)
         lanes = self._lanes(scene, states[0].shape[1])
-        g, *jacobians = self._run("constraint_values_of", *states, lanes)
+        g, *jacobians, drift = self._run("constraint_values_of", *states, lanes)
         names, lower, upper, tolerance = self._conditions()
         shape = (len(self.joint_names), len(names))
-        return ConstraintValues(
-            names,
-            g.T.copy(),
-            lower,
-            upper,
-            tolerance,
-            *(part.T.reshape(-1, *shape).swapaxes(1, 2) for part in jacobians),
-        )
+        by_q, by_dq, by_ddq = (part.T.reshape(-1, *shape).swapaxes(1, 2) for part in jacobians)
+        return ConstraintValues(names, g.T.copy(), lower, upper, tolerance, by_q, by_dq, by_ddq, drift.T.copy())
 
     @checked_arguments
     def min_distance(self, q: ArrayLike, *, scene: Scene | None = None) -> Array:
@@ -327,14 +324,19 @@ def inverse_dynamics_of(robot: Robot) -> Any:
 
 
 def constraint_values_of(robot: Robot, problem: Problem) -> Any:
-    """Build ``(q, dq, ddq, obstacle poses) -> (g, dg/dq, dg/d(dq), dg/d(ddq))``, Jacobians column by column."""
+    """Build ``(q, dq, ddq, obstacle poses) -> (g, dg/dq, dg/d(dq), dg/d(ddq), drift)``, Jacobians column by column."""
     import casadi as ca
+
+    from cnpgen.problems.constraints.needs import symbolic_needs
 
     state, pairs = _symbolic_conditions(robot, problem)
     inputs = [ca.vertcat(*values) for values in (state.q, state.dq, state.ddq, state.obstacle_poses)]
     g = ca.vertcat(*(value for _, condition in pairs for value in condition.g))
     jacobians = [ca.vec(ca.densify(ca.jacobian(g, x))) for x in inputs[:3]]
-    outputs = ca.cse(state.unfrozen([ca.densify(g), *jacobians]))
+    still = [symbolic_needs(condition, *inputs[1:3]) == 0 for _, condition in pairs for _ in condition.g]
+    positions = g * ca.DM([float(flag) for flag in still])
+    drift = ca.densify(ca.jtimes(ca.jtimes(positions, inputs[0], inputs[1]), inputs[0], inputs[1]))
+    outputs = ca.cse(state.unfrozen([ca.densify(g), *jacobians, drift]))
     return ca.Function("constraint_values_of", inputs, outputs)
 
 

@@ -1,7 +1,8 @@
 """The card of a dataset: the README.md for users and the Hugging Face hub."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +19,8 @@ _SIZES = (
     (10**8, "10M<n<100M"),
     (10**9, "100M<n<1B"),
 )
+
+PARQUET = "parquet"  # folder of the Parquet view in a repository
 
 _LOAD = """\
 Each `.h5` file holds one dataset per field, of shape `(rows, width)` or `(rows,)`, raw and in SI units. With h5py
@@ -61,26 +64,31 @@ independently of the code that made the dataset.
 """
 
 
-def card_text(summary: DatasetSummary, *, folder: str, notes: str = "") -> str:
+def card_text(summary: DatasetSummary, *, folder: str, notes: str = "", shards: str = "") -> str:
     """Return the card of a finished dataset; it depends on its rows and specification only, not on time or place.
 
     Args:
         summary: The finished shards.
-        folder: Name of the folder of the dataset.
+        folder: Name of the folder of the dataset, or of its repository on the Hugging Face Hub.
         notes: Text about the dataset to include, in Markdown.
+        shards: Folder of the shards with a slash at its end, of a repository with a Parquet view in ``PARQUET``; empty
+            for the card of the dataset itself.
     """
     spec = summary.spec
+    source = f'"{folder}"' if shards else f'"./{folder}"'
+    load = _LOAD.replace('"./FOLDER"', source).replace('f"{split}/', f'f"{shards}{{split}}/')
     split = next(iter(summary.statistics))
     sections = [
-        _front_matter(summary),
+        _front_matter(summary, f"{PARQUET}/{{}}/*.parquet" if shards else "{}/*.h5"),
         f"# {spec.name} {spec.version}\n\n{spec.title or spec.name}\n\n{_contents(summary)}",
         notes.strip(),
         f"{_AFTER_NOTES}\n\n{_making(summary)}",
-        f"## How to load it\n\n{_LOAD.replace('SPLIT', split).replace('FOLDER', folder)}",
+        f"## How to load it\n\n{load.replace('SPLIT', split)}",
         f"## Fields\n\n{_field_table(spec.fields)}",
         f"## Yield\n\n{_yield_table(summary)}",
         f"## Ranges ({split})\n\n{_range_table(spec.fields, summary.statistics[split])}",
-        f"## How to verify it\n\n{_VERIFY}",
+        f"## How to verify it\n\n{_VERIFY.replace('validate .', f'validate {shards}') if shards else _VERIFY}",
+        _origin(spec.recipe),
     ]
     return "\n\n".join(section.strip() for section in sections if section) + "\n"
 
@@ -93,8 +101,21 @@ def card_notes(card: str) -> str:
     return notes.strip()
 
 
-def _front_matter(summary: DatasetSummary) -> str:
-    """Return the YAML header that makes the folder a Hugging Face dataset; JSON strings are valid YAML."""
+def _origin(recipe: Mapping[str, Any]) -> str:
+    """Return the authors and the citation of a recipe."""
+    creator, citation = (str(recipe.get(key, "")).strip() for key in ("creator", "citation"))
+    authors = f"Made by {creator}." if creator else ""
+    quote = f"```text\n{citation}\n```" if citation else ""
+    return "\n\n".join(part for part in ("## Citation", authors, quote) if part) if authors or quote else ""
+
+
+def _front_matter(summary: DatasetSummary, files: str) -> str:
+    """Return the YAML header that makes the folder a Hugging Face dataset; JSON strings are valid YAML.
+
+    Args:
+        summary: The finished shards.
+        files: Pattern of the files of a split.
+    """
     spec = summary.spec
     rows = sum(spec.splits.values())
     size = next((name for limit, name in _SIZES if rows < limit), "n>1B")
@@ -104,7 +125,7 @@ def _front_matter(summary: DatasetSummary) -> str:
     lines += ["- cnpgen", "size_categories:", f'- "{size}"', "configs:", "- config_name: default", "  data_files:"]
     for split, count in spec.splits.items():
         if count:
-            lines += [f"  - split: {split}", f'    path: "{split}/*.h5"']
+            lines += [f"  - split: {split}", f'    path: "{files.format(split)}"']
     return "\n".join(["---", *lines, "---"])
 
 

@@ -402,3 +402,12 @@ def test_weights_may_be_given_by_name_with_the_problem_s_weights_for_others():
 def test_invalid_weights_by_name_are_refused(weights, message):
     with pytest.raises(CnpgenError, match=message):
         loss("airhockey").checked_weights(weights)
+
+
+def test_threads_change_no_result():
+    given, arguments = batch("hit", 70), {"nodes": 8, "dtype": "float64"}
+    one, two = (given.evaluated(PlanLoss("airhockey", threads=threads, **arguments)) for threads in (1, 2))
+    for name, values in vars(one).items():
+        assert np.array_equal(values, getattr(two, name))
+    with pytest.raises(CnpgenError, match="threads"):
+        PlanLoss("airhockey", threads=0)

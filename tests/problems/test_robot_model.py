@@ -90,6 +90,21 @@ def test_derivatives_of_constraint_values_are_those_of_finite_differences(model:
             )
 
 
+def test_the_drift_is_the_second_derivative_of_positions_at_constant_velocity(model: RobotModel) -> None:
+    q, dq, ddq = random_states(model, 4)
+    scene, h = scene_between(model, 4), 1e-4
+    values = model.constraint_values(q, dq, ddq, scene=scene)
+    still = [
+        index for index, name in enumerate(values.names) if name.startswith(("joint pos", "table", "tilt", "upright"))
+    ]
+    before, now, after = (model.constraint_values(q + step * dq, dq, ddq, scene=scene).g for step in (-h, 0, h))
+    numeric = (before - 2 * now + after) / h**2
+    assert np.abs(values.drift[:, still]).max() > 0.1
+    np.testing.assert_allclose(values.drift[:, still], numeric[:, still], rtol=1e-4, atol=1e-4)
+    fast = [index for index, name in enumerate(values.names) if name == "joint velocity"]
+    assert not values.drift[:, fast].any()
+
+
 def test_the_base_configuration_is_free_and_limits_decide_validity(model: RobotModel) -> None:
     base = model.base[None]
     scene = model.scene(*(model.forward_kinematics(base)[0],) * 2)

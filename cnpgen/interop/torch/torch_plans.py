@@ -38,7 +38,7 @@ def control_points(
     Raises:
         UsageError: A shape is wrong.
     """
-    outputs = (_tensor("phi", phi), _tensor("log_rate", log_rate))
+    outputs = (real_tensor("phi", phi), real_tensor("log_rate", log_rate))
     layer.check_shapes(tasks, *(tuple(output.shape) for output in outputs))
 
     def function(phi: Array, log_rate: Array) -> tuple[Array, Array]:
@@ -84,8 +84,8 @@ def plan_loss(
     Raises:
         UsageError: A shape is wrong, or a weight is negative or not finite.
     """
-    path = _tensor("path", path)
-    inputs = (path, _tensor("rate", rate), _tensor("weights", loss.ordered_weights(weights)))
+    path = real_tensor("path", path)
+    inputs = (path, real_tensor("rate", rate), real_tensor("weights", loss.ordered_weights(weights)))
     host = tuple(tensor.to("cpu", getattr(torch, loss.dtype)) for tensor in inputs)
     gradient = torch.is_grad_enabled() and (host[0].requires_grad or host[1].requires_grad)
     options = {
@@ -161,7 +161,7 @@ class _HostFunction(torch.autograd.Function):  # type: ignore[misc]
         return None, None, *_HostFunction.apply(ctx.vjp_on_host, None, *ctx.saved_tensors, *by_results)
 
 
-def _tensor(name: str, values: Any) -> torch.Tensor:
+def real_tensor(name: str, values: Any) -> torch.Tensor:
     """Return values as a tensor of real numbers.
 
     Raises:

@@ -1,0 +1,38 @@
+"""``cnpgen publish``: a dataset as a repository of the Hugging Face Hub."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from cnpgen.cli.parser import Commands, Parser, add_command
+
+_TEXT = """\
+The repository has a card, a Parquet view and the dataset itself in hdf5/. License, creator and citation are those of
+the recipe's keys; a dataset without a license is refused. The same command continues an interrupted upload. 'hf auth
+login' stores the token of the upload. The path of the folder, or the address of the repository, is printed on stdout.
+"""
+
+
+def add(commands: "Commands[Parser]") -> None:
+    """Add the command."""
+    title = "publish a dataset on the Hugging Face Hub (extra: hub)"
+    parser = add_command(commands, "publish", run, title=title, text=_TEXT)
+    option = parser.add_argument
+    option("folder", metavar="DIR", type=Path, help="folder of a finished dataset")
+    option("--to", metavar="USER/NAME", required=True, help="repository of the Hub; it is created if it does not exist")
+    option("-o", "--out", metavar="FOLDER", type=Path, help="folder of the repository here (default: DIR-hub)")
+    option("--private", action="store_true", help="a new repository is private")
+    option("--dry-run", action="store_true", help="write the folder, but upload nothing")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command."""
+    from cnpgen.make.publish import publish_dataset
+
+    folder = arguments.folder
+    out = arguments.out or folder.with_name(f"{folder.resolve().name}-hub")
+    published = publish_dataset(folder, arguments.to, out=out, private=arguments.private, dry_run=arguments.dry_run)
+    if published.url:
+        print(f"cnpgen: uploaded {published.folder}", file=sys.stderr)
+    print(published.url or published.folder)
+    return 0
