@@ -76,6 +76,7 @@ def parameter(text: str) -> tuple[str, str, Any]:
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     from cnpgen.benchmark.html_report import save_benchmark_report
+    from cnpgen.benchmark.paper_figures import save_benchmark_figures
     from cnpgen.benchmark.result_tables import save_benchmark_tables
     from cnpgen.errors import UsageError
 
@@ -92,6 +93,7 @@ def run(arguments: argparse.Namespace) -> int:
     folder = arguments.out or Path(f"{Path(arguments.suite).stem}-results")
     found = _run(arguments, folder)
     save_benchmark_tables(found, folder)
+    save_benchmark_figures(found, folder)
     report = save_benchmark_report(found, folder / "report.html", video=arguments.video)
     print(json.dumps(_facts(found, folder), indent=2) if arguments.json else _text(found))
     print(f"report: {report}", file=sys.stderr)
