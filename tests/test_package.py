@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 
 import cnpgen
-from cnpgen.benchmark.planners import cbirrt, rrtconnect, ruckig
+from cnpgen.benchmark.planners import cbirrt, crocoddyl_costs, drake_arm, rrtconnect, ruckig, sscbirrt
 from cnpgen.benchmark.simulator import rendering
 from cnpgen.benchmark.simulator.execute import load_mujoco
 from cnpgen.cli.view import page
@@ -138,8 +138,7 @@ def test_every_library_that_is_imported_is_a_declared_dependency(wheel: zipfile.
     declared = Parser().parsestr(wheel.read(metadata).decode()).get_all("Requires-Dist") or []
     libraries = {re.split(r"[^A-Za-z0-9_.-]", text)[0] for text in declared}
     others = imported - set(sys.stdlib_module_names) - {"cnpgen"}
-    projects = {"pinocchio": "pin", "yaml": "pyyaml", "huggingface_hub": "huggingface-hub"}
-    assert {projects.get(name, name) for name in others} <= libraries
+    assert {{"pinocchio": "pin", **NAMES_IN_THE_INDEX}.get(name, name) for name in others} <= libraries
 
 
 def test_what_the_default_run_of_the_tests_leaves_out_is_run_before_a_change_lands() -> None:
@@ -216,6 +215,9 @@ OPTIONAL = {  # package that cnpgen imports -> extra that installs it, function 
     "ompl": ("benchmark", cbirrt.load_ompl),
     "toppra": ("benchmark", rrtconnect.load_toppra),
     "ruckig": ("benchmark", ruckig.load_ruckig),
+    "sscbirrt": ("planners", sscbirrt.load_sscbirrt),
+    "pydrake": ("planners", drake_arm.load_drake),
+    "crocoddyl": ("crocoddyl", crocoddyl_costs.load_crocoddyl),
     "meshcat": ("view", page._viewer),
     "distributed": ("dask", lambda: cluster("dask")),
     "ray": ("ray", lambda: cluster("ray")),
@@ -225,7 +227,7 @@ OPTIONAL = {  # package that cnpgen imports -> extra that installs it, function 
     "yaml": ("ros", lambda: trajectories(".yaml")),
     "huggingface_hub": ("hub", lambda: upload_folder(Path(), "user/name", private=False)),
 }
-NAMES_IN_THE_INDEX = {"yaml": "pyyaml"}
+NAMES_IN_THE_INDEX = {"yaml": "pyyaml", "pydrake": "drake", "huggingface_hub": "huggingface-hub"}
 BY_NAME = {"meshcat", "polars", "pandas"}  # loaded by name, without an import statement
 SETTINGS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 

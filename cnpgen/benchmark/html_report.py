@@ -1,14 +1,14 @@
-"""Report of a benchmark as one HTML file: tables beside the paper's figures, box plots, images or films."""
+"""Report of a benchmark as one HTML file: tables beside the paper's figures, drawings, images or films."""
 
 import base64
 import io
 import tempfile
 from html import escape
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from cnpgen.benchmark.execution import Task, execution_of
-from cnpgen.benchmark.hypothesis_tests import FIGURES, values_of
+from cnpgen.benchmark.paper_figures import benchmark_values, distribution_figure, success_figure
 from cnpgen.benchmark.result_tables import failure_summaries, notes, table_rows
 from cnpgen.benchmark.run_suite import Benchmark
 from cnpgen.benchmark.simulator.plant import Plant
@@ -16,7 +16,9 @@ from cnpgen.benchmark.simulator.rendering import save_film, save_picture
 from cnpgen.errors import CnpgenError, MachineError
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.store.files.atomic import write_file
-from cnpgen.store.files.figure_file import new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 MAX_FILM_FRAMES = 300  # less than 1 MB
 _STYLE = "body{font-family:sans-serif;max-width:75em;margin:2em auto}td,th{padding:.2em .8em;text-align:right}"
@@ -43,7 +45,7 @@ def save_benchmark_report(benchmark: Benchmark, path: str | Path, *, video: bool
     parts += [f"<p>{escape(text)}</p>" for text in [*failure_summaries(benchmark), *notes(benchmark)]]
     for plant in benchmark.executions:
         title = f"executed by the {plant} plant" if plant else "planned"
-        parts.append(f"<h2>{title}</h2>{_table(benchmark, plant)}{_boxes(benchmark, plant)}")
+        parts.append(f"<h2>{title}</h2>{_table(benchmark, plant)}{_drawings(benchmark, plant)}")
     parts += _motions(benchmark, video=video)
     head = f"<!doctype html><meta charset='utf-8'><title>{escape(suite.name)}</title><style>{_STYLE}</style>"
     write_file(place, "\n".join([head, *parts]))
@@ -58,32 +60,25 @@ def _table(benchmark: Benchmark, plant: str) -> str:
     return "\n".join([*lines, "</table>"])
 
 
-def _boxes(benchmark: Benchmark, plant: str) -> str:
-    """Draw box plots of all figures."""
-    values = {
-        name: [values_of(row, plant, benchmark.plane_tolerance) for row in rows]
-        for name, rows in benchmark.results.items()
-    }
-    keys = [key for key in FIGURES if any(key in row for rows in values.values() for row in rows)]
-    figure = new_figure(4 * min(len(keys), 4), 3 * -(-len(keys) // 4), dpi=100)
-    for place, key in enumerate(keys, start=1):
-        axes = figure.add_subplot(-(-len(keys) // 4), min(len(keys), 4), place)
-        axes.boxplot([[row[key] for row in rows if key in row] for rows in values.values()])
-        axes.set_xticks(range(1, len(values) + 1), list(values), rotation=30, fontsize=7)
-        axes.set_title(FIGURES[key], fontsize=9)
-        if key.startswith("planning"):
-            axes.set_yscale("log")
+def _drawings(benchmark: Benchmark, plant: str) -> str:
+    """Draw success over planning time and box plots of all figures."""
+    values = benchmark_values(benchmark, plant)
+    return "".join(map(_as_svg, (success_figure(values, plant), distribution_figure(values))))
+
+
+def _as_svg(figure: "Figure") -> str:
     picture = io.StringIO()
     figure.savefig(picture, format="svg", metadata={"Date": None})
     return picture.getvalue().partition("?>\n")[2]
 
 
 def _motions(benchmark: Benchmark, *, video: bool) -> list[str]:
-    """Render the first executable plan of each planner, if this machine can render."""
-    parts = []
+    """Render one executable plan of each planner, if this machine can render: of the same problem if all have one."""
+    parts, common = [], _common_problem(benchmark)
     for name, rows in benchmark.results.items() if benchmark.plants else ():
         plant = benchmark.plants[0]
-        row = next((row for row in rows if _was_executed(row, plant.name)), None)
+        executed = [row for row in rows if _was_executed(row, plant.name)]
+        row = next((row for row in executed if row["problem"] == common), executed[0] if executed else None)
         if row is None:
             continue
         index = row["problem"]
@@ -98,6 +93,14 @@ def _motions(benchmark: Benchmark, *, video: bool) -> list[str]:
             continue
         parts.append(f"<figure>{element}<figcaption>{label}, {caption}</figcaption></figure>")
     return parts
+
+
+def _common_problem(benchmark: Benchmark) -> int | None:
+    """Return the first problem whose plans of all planners with any execution were executed, or None."""
+    name = benchmark.plants[0].name if benchmark.plants else ""
+    executed = [{row["problem"] for row in rows if _was_executed(row, name)} for rows in benchmark.results.values()]
+    known = [problems for problems in executed if problems]
+    return min(set.intersection(*known), default=None) if known else None
 
 
 def _was_executed(row: dict[str, Any], plant: str) -> bool:

@@ -25,6 +25,7 @@ FLAGS = {  # of a row; those from "at the goal, executed" on need an execution
     "scored": "scored",
     "touched_early": "touched the puck early",
     "collided": "collided",
+    "violated": "violated a constraint of the environment",
     "success": "success",
 }
 FIGURES = {
@@ -45,6 +46,7 @@ FIGURES = {
     "tracking_error_rad_s": "tracking error [rad s]",
     "acceleration_use": "maximum acceleration / limit",
     "torque_use": "maximum torque / rated, executed",
+    "penalty_points": "penalty points of the environment",
 }
 TAILS = {"p99": 0.99, "p999": 0.999, "max": 1.0}
 REFERENCE_PLANNER = "cnpgen+refine"  # default reference of the comparison, if present
@@ -72,6 +74,8 @@ def values_of(row: Mapping[str, Any], plant: str = "", plane_tolerance: float = 
     if plant:
         executed = executed or {}
         values |= {name: value for name, value in executed.items() if name in FLAGS or name in FIGURES}
+        if "penalty_points" in executed:
+            values["violated"] = executed["penalty_points"] > 0
         values["success"] = bool(executed) and succeeded(executed, plane_tolerance)
     verdict = row.get("verdict")
     if verdict is None:

@@ -53,6 +53,9 @@ def add(commands: "Commands[Parser]") -> None:
     option("--reference", metavar="NAME", help="planner that p-values compare with (default: cnpgen+refine)")
     text = "field of a planner, such as trajopt.iterations=50 or rrtconnect.simplify_time=0.5s"
     option("--set", metavar="NAME.KEY=VALUE", nargs="+", default=[], type=parameter, help=text)
+    text = "instead, try random values of fields of one planner, such as drake.control_points=8..25; ranks them"
+    option("--search", metavar="NAME.KEY=LOW..HIGH", nargs="+", default=[], type=parameter_range, help=text)
+    option("--trials", metavar="K", type=values.positive, default=20, help="random trials of --search (default: 20)")
     option("--replan", action="store_true", help="discard earlier answers of these planners in DIR")
     text = "delete results of another suite, version, time limit, seed or planner parameters in DIR"
     option("--force", action="store_true", help=text)
@@ -73,9 +76,25 @@ def parameter(text: str) -> tuple[str, str, Any]:
         return name, key, value
 
 
+def parameter_range(text: str) -> tuple[str, str, tuple[float, float]]:
+    """Read the range of a field: the name of the planner, the key, and both ends in SI units."""
+    left, _, right = text.partition("=")
+    name, _, key = left.rpartition(".")
+    ends = right.split("..")
+    try:
+        low, high = (int(end) if end.lstrip("-").isdigit() else float(end) for end in ends)
+    except ValueError:
+        name = ""
+    if not (name and key):
+        text = f"expected NAME.KEY=LOW..HIGH in SI units, such as drake.control_points=8..25, got {text!r}"
+        raise argparse.ArgumentTypeError(text)
+    return name, key, (low, high)
+
+
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     from cnpgen.benchmark.html_report import save_benchmark_report
+    from cnpgen.benchmark.paper_figures import save_benchmark_figures
     from cnpgen.benchmark.result_tables import save_benchmark_tables
     from cnpgen.errors import UsageError
 
@@ -89,12 +108,51 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError(f"{option} needs --simulate")
     if arguments.video and not arguments.simulate:
         raise UsageError("--video needs --simulate")
+    if arguments.search:
+        return _search(arguments)
     folder = arguments.out or Path(f"{Path(arguments.suite).stem}-results")
     found = _run(arguments, folder)
     save_benchmark_tables(found, folder)
+    save_benchmark_figures(found, folder)
     report = save_benchmark_report(found, folder / "report.html", video=arguments.video)
     print(json.dumps(_facts(found, folder), indent=2) if arguments.json else _text(found))
     print(f"report: {report}", file=sys.stderr)
+    return 0
+
+
+def _search(arguments: argparse.Namespace) -> int:
+    """Search for parameters of one planner and print the trials, the best one first."""
+    from cnpgen.benchmark.parameter_search import SEARCH_FILE, csv_of, search_parameters
+    from cnpgen.errors import UsageError
+
+    (planner, *others), ranges = {name for name, _, _ in arguments.search}, {k: ends for _, k, ends in arguments.search}
+    if others or arguments.planners not in (None, [planner]) or arguments.set or arguments.repeat != 1:
+        raise UsageError("--search has fields of one planner, without --planners, --set and --repeat")
+    folder = arguments.out or Path(f"{Path(arguments.suite).stem}-search")
+    try:
+        trials = search_parameters(
+            arguments.suite,
+            folder,
+            planner,
+            ranges,
+            trials=arguments.trials,
+            seed=arguments.seed,
+            n=arguments.n,
+            plants=(arguments.plant or ("nominal",)) if arguments.simulate else (),
+            environment=arguments.environment,
+            time_limit=arguments.time_limit,
+            plane_tolerance=arguments.plane_tolerance,
+            workers=arguments.workers,
+            engine=arguments.engine,
+            address=arguments.address,
+            replan=arguments.replan,
+            force=arguments.force,
+        )
+    except KeyboardInterrupt as interruption:
+        kept = f"{folder} keeps all finished problems; run the same command again to resume"
+        raise type(interruption)(kept) from interruption
+    print(json.dumps([asdict(trial) for trial in trials], indent=2) if arguments.json else csv_of(trials, list(ranges)))
+    print(f"trials: {folder / SEARCH_FILE}", file=sys.stderr)
     return 0
 
 

@@ -1,4 +1,4 @@
-"""``cnpgen init``: write a problem, a pipeline and a dataset for an arm, from its URDF."""
+"""``cnpgen init``: write a problem, a pipeline and a dataset for an arm, or a package with a planner."""
 
 import argparse
 import sys
@@ -13,16 +13,19 @@ The command writes NAME/problem.toml, NAME/pipeline.toml and NAME/dataset.toml: 
 boxes of positions in front of the robot, within its limits and without self-collision. Comments explain every key. The
 head of problem.toml lists findings about the robot: joints, masses, frames, link pairs, the free space that convex
 parts of links reject, and placeholders for limits that the URDF lacks. Links whose convex hulls reject much free space
-are decomposed. 'cnpgen docs your-arm' continues from there.
+are decomposed. 'cnpgen docs your-arm' continues from there. With --planner the command writes NAME/pyproject.toml and a
+module with a planner for 'cnpgen benchmark', which uses limits, kinematics and the table through the public interface.
 """
 
 
 def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
-    parser = add_command(commands, "init", run, title="write recipes for your own arm", text=_TEXT)
+    parser = add_command(commands, "init", run, title="write recipes for your own arm, or a planner", text=_TEXT)
     option = parser.add_argument
     option("name", metavar="NAME", help="name of the recipes and of their folder")
-    option("--urdf", metavar="FILE", type=Path, required=True, help="URDF file; the recipes refer to its path")
+    kind = parser.add_mutually_exclusive_group(required=True)
+    kind.add_argument("--urdf", metavar="FILE", type=Path, help="URDF file; the recipes refer to its path")
+    kind.add_argument("--planner", action="store_true", help="write a package with a planner for 'cnpgen benchmark'")
     option("--tip", metavar="FRAME", help="tip frame, a link or joint; default the only link without a child")
     text = "a folder that is searched for package:// of the URDF; may be repeated. By default those of"
     text += (
@@ -42,6 +45,8 @@ def run(arguments: argparse.Namespace) -> int:
     from cnpgen.robots.shape.mesh_files import packages_of_environment
 
     folder = _folder(arguments.name)
+    if arguments.planner:
+        return _write_planner(folder, force=arguments.force)
     there = [str(folder / name) for name in FILES if (folder / name).exists()]
     _refuse(there if not arguments.force else [])
     arm = read_arm(arguments.urdf, arguments.tip)
@@ -54,6 +59,17 @@ def run(arguments: argparse.Namespace) -> int:
         recipe, share = dataset_of(initial, folder)
     _write(folder, sampling_texts(recipe, share))
     _say_next(folder)
+    return 0
+
+
+def _write_planner(folder: Path, *, force: bool) -> int:
+    from cnpgen.cli.init.planner_package import planner_texts
+
+    texts = planner_texts(folder.name)
+    _refuse([] if force else [str(folder / name) for name in texts if (folder / name).exists()])
+    _write(folder, texts)
+    next_ = [f"pip install -e {folder}", f"cnpgen benchmark hits-81 --planners {folder.name} cnpgen --n 2"]
+    print("next:", *next_, "cnpgen docs benchmark", sep="\n  ", file=sys.stderr)
     return 0
 
 

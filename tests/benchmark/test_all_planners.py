@@ -12,6 +12,7 @@ from tests.conftest import some
 
 pytest.importorskip("mujoco")
 MODULES = {"cbirrt": ("ompl",), "rrtconnect": ("ompl", "toppra"), "ruckig": ("ruckig",)}
+MODULES |= {"sscbirrt": ("sscbirrt",), "drake": ("pydrake",), "crocoddyl": ("crocoddyl",)}
 ALL = tuple(name for name in registry.BUILT_IN[registry.PLANNERS] if all(map(find_spec, MODULES.get(name, ()))))
 NEED_A_MODEL_FILE = ("cnp-b-paper",)  # tests/benchmark/test_learned_planners.py has it
 PLANTS = ("nominal", "heavier", "delayed")

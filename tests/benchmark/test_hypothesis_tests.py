@@ -42,6 +42,15 @@ def test_planned_and_executed_errors_are_distinguished() -> None:
     assert "z_error_mm_s" not in values_of(row())
 
 
+def test_penalty_points_count_as_violated_constraints() -> None:
+    rows = [row(), row()]
+    for known, points in zip(rows, (0.0, 3.0), strict=True):
+        known["executed"]["challenge"] = {**known["executed"]["nominal"], "penalty_points": points}
+    assert [values_of(known, "challenge")["violated"] for known in rows] == [False, True]
+    assert "violated" not in values_of(rows[0], "nominal")
+    assert summarize_results({"a": rows}, "challenge")["a"]["ratios"]["violated"]["count"] == 1
+
+
 def test_a_summary_has_counts_and_quartiles() -> None:
     rows = [row(seconds=seconds, scored=seconds < 0.4) for seconds in (0.1, 0.2, 0.3, 0.4, 0.5)]
     summary = summarize_results({"a": rows, "b": [row(planned=False)] * 5}, "nominal")

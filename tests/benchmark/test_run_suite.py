@@ -13,6 +13,13 @@ import pytest
 
 from cnpgen.benchmark.benchmark_planner import Setting
 from cnpgen.benchmark.html_report import save_benchmark_report
+from cnpgen.benchmark.paper_figures import (
+    benchmark_values,
+    distribution_figure,
+    save_benchmark_figures,
+    success_figure,
+    success_over_time,
+)
 from cnpgen.benchmark.process import Ending, PlannerProcess, PlanningOutcome
 from cnpgen.benchmark.result_tables import failure_summaries, save_benchmark_tables, table_rows
 from cnpgen.benchmark.results_file import answer_from_dict, answer_to_dict, open_results
@@ -409,6 +416,26 @@ def test_a_report_covers_the_folder_and_nothing_else(random: str, tmp_path: Path
     (folder / "notes.jsonl").write_text('{"mine": 1}\n')  # not results of a benchmark
     run_benchmark("hits-81", folder, planners=[random], n=1, force=True)
     assert (folder / "notes.jsonl").read_text() == '{"mine": 1}\n'
+
+
+def test_figures_have_success_over_planning_time_and_suitable_axes(random: str, tmp_path: Path) -> None:
+    benchmark = run_benchmark("hits-81", tmp_path, planners=["cnpgen", random], n=3)
+    for row, seconds in zip(benchmark.results["cnpgen"], (0.3, 0.1, 0.2), strict=True):
+        row["planning_cpu_s"] = seconds
+    benchmark.results["cnpgen"][2]["verdict"]["valid"] = False
+    values = benchmark_values(benchmark, "")
+    times, ratios = success_over_time(values["cnpgen"], "valid")
+    np.testing.assert_allclose(times, [100.0, 300.0])
+    np.testing.assert_allclose(ratios, [1 / 3, 2 / 3])
+    axes = success_figure(values, "").axes[0]
+    assert axes.get_xscale() == "log"
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["cnpgen (67 %)", "random (0 %)"]
+    scales = {axes.get_title(): axes.get_yscale() for axes in distribution_figure(values).axes}
+    assert scales["planning time, CPU [ms]"] == "log"
+    assert scales["motion time [s]"] == "linear"
+    paths = save_benchmark_figures(benchmark, tmp_path)
+    assert [path.name for path in paths] == ["success-planned.pdf", "distributions-planned.pdf"]
+    assert all(path.read_bytes().startswith(b"%PDF") for path in paths)
 
 
 def test_a_damaged_record_of_runs_is_named(tmp_path: Path) -> None:

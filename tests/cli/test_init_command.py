@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import cnpgen
+from cnpgen.benchmark.run_suite import run_benchmark
 from cnpgen.cli.describe_keys import part_of
 from cnpgen.cli.init import link_overlaps
 from cnpgen.cli.init.arm import read_arm
@@ -24,6 +25,7 @@ from cnpgen.schema.keys import PerJoint, Range, keys
 from cnpgen.world.world import World
 from tests.examples.example_robots import folder as robots
 from tests.examples.example_robots import needs_robots
+from tests.examples.installed import installed_kind
 from tests.examples.meshes import Meshes
 from tests.examples.shaped_robot import LINKS, arm_of_channels, write_crane
 
@@ -493,3 +495,33 @@ def test_a_value_is_written_as_toml_reads_it(value, text):
     assert toml(value) == text
     if text:
         tomllib.loads(f"key = {text}")
+
+
+def test_the_template_of_a_planner_runs_in_the_benchmark(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["init", "my-line", "--planner"]) == 0
+    assert capsys.readouterr().out.split() == ["my-line/pyproject.toml", "my-line/my_line.py"]
+    settings = tomllib.loads(Path("my-line/pyproject.toml").read_text())["project"]
+    entry_points = settings["entry-points"]["cnpgen.planners"]
+    assert entry_points == {"my-line": "my_line:MyLine"}
+    with installed_kind(tmp_path / "my-line", "my-line", entry_points["my-line"], monkeypatch):
+        for suite in ("hits-81", "heavy-100"):
+            benchmark = run_benchmark(suite, tmp_path / suite, planners=["my-line"], n=1)
+            (row,) = benchmark.results["my-line"]
+            assert row["ending"] == "planned", row["error"]
+            verdict = row["verdict"]
+            assert verdict["severity"]["joint velocity"] <= 1
+            assert verdict["severity"]["joint torque"] <= 1
+            assert suite != "hits-81" or verdict["severity"]["table height"] <= 1
+    assert main(["init", "my-line", "--planner"]) == 2
+    assert "exists already" in capsys.readouterr().err
+    assert main(["init", "my-line", "--planner", "--force"]) == 0
+
+
+def test_an_arm_and_a_planner_exclude_each_other(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["init", "mine", "--planner", "--urdf", str(IIWA)]) == 2
+    assert "not allowed with" in capsys.readouterr().err
+    assert main(["init", "mine"]) == 2
+    assert "--urdf" in capsys.readouterr().err

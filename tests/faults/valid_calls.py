@@ -352,6 +352,9 @@ def _of_benchmark(folder: Path, problem: Any, plans: Any) -> list[ValidCall]:
         ValidCall(
             "save_benchmark_tables", benchmark.save_benchmark_tables, {"benchmark": ran, "folder": folder / "ran"}
         ),
+        ValidCall(
+            "save_benchmark_figures", benchmark.save_benchmark_figures, {"benchmark": ran, "folder": folder / "ran"}
+        ),
         ValidCall("simulate_plans", benchmark.simulate_plans, {"plans": plans[:0], "workers": 1}),
         ValidCall("Trajectory", benchmark.Trajectory, {"t": path.t, "q": path.q}),
         ValidCall("Trajectory.states", path.states, {"t": np.array([0.1, 0.5])}),

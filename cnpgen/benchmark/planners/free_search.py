@@ -39,6 +39,14 @@ class FreeSearch:
     def __init__(self, problem: Problem, robot: Robot) -> None:
         self._robot, self._states = robot, RestingStates(problem, robot)
 
+    def place_obstacles(self, task: Plans) -> None:
+        """Place the obstacles of a boundary problem."""
+        self._states.place_solids(task.scene.bodies(0))
+
+    def is_valid(self, q: Array) -> bool:
+        """Return whether the robot can hold joint positions q [rad], shape (n,), without collision."""
+        return bool(self._states.can_hold(q[:, None])[0] and self._states.are_clear(q[:, None])[0])
+
     def solve(self, ompl: Any, task: Plans, time_limit: float, simplify_time: float) -> Array | None:
         """Search for a path and simplify it.
 
@@ -52,7 +60,7 @@ class FreeSearch:
             Joint positions [rad], shape (K, n), or None.
         """
         base, n = ompl.base, self._robot.n
-        self._states.place_solids(task.scene.bodies(0))
+        self.place_obstacles(task)
         space = base.RealVectorStateSpace(n)
         bounds = base.RealVectorBounds(n)
         for index, (low, high) in enumerate(zip(self._robot.position_lower, self._robot.position_upper, strict=True)):
@@ -62,7 +70,7 @@ class FreeSearch:
         information = base.SpaceInformation(space)
         information.setStateValidityCheckingResolution(STATE_DISTANCE_RAD / space.getMaximumExtent())
         setup = ompl.geometric.SimpleSetup(information)
-        setup.setStateValidityChecker(self._is_valid)
+        setup.setStateValidityChecker(lambda state: self.is_valid(np.array([state[index] for index in range(n)])))
         ends = [space.allocState() for _ in range(2)]
         for state, q in zip(ends, (task.boundary.start_q[0], task.boundary.goal_q[0]), strict=True):
             for index in range(n):
@@ -78,7 +86,3 @@ class FreeSearch:
         path = setup.getSolutionPath()
         path.interpolate()
         return np.array([[state[index] for index in range(n)] for state in path.getStates()])
-
-    def _is_valid(self, state: Any) -> bool:
-        q = np.array([state[index] for index in range(self._robot.n)])[:, None]
-        return bool(self._states.can_hold(q)[0] and self._states.are_clear(q)[0])

@@ -29,6 +29,10 @@ Array = NDArray[np.float64]
 MODULE = "air_hockey_challenge.environments.position_control_wrapper"
 JOINTS = tuple(f"joint_{number}" for number in range(1, 8))
 TICKS_PER_STEP = 20  # of the controller in one step of the environment
+CONSTRAINTS = ("JointPositionConstraint", "JointVelocityConstraint", "EndEffectorConstraint", "LinkConstraint")
+PENALTY_POINTS = {"joint_pos_constr": 2.0, "joint_vel_constr": 1.0, "ee_constr": 3.0, "link_constr": 3.0}
+"""Points of an episode that violates a constraint in any step, as in the Challenge's evaluator."""
+
 LIBRARIES = ("numpy", "mujoco", "mushroom-rl")
 UNSUPPORTED = (AssertionError, AttributeError, KeyError, IndexError, TypeError, ValueError)
 """Errors of the environment's code with other versions of itself or of its libraries."""
@@ -88,6 +92,8 @@ def execute_in_challenge(scene: SimulatorScene, reference: Reference, start_dq: 
         while not done:
             done = environment.advance(_action(scene, reference, tick))
             tick += TICKS_PER_STEP
+            if tick < reference.ticks + TICKS_PER_STEP:
+                environment.count_violations()
             done = tick >= reference.ticks and (done or puck_is_done(reference, tick, *environment.puck_state()))
         environment.record(np.zeros(len(JOINTS)))
     except RuntimeError as error:  # the environment turns warnings of MuJoCo into errors
@@ -131,7 +137,11 @@ def _tick_record(scene: SimulatorScene, reference: Reference, environment: Any) 
     torque_use = torque[:, planned] / rated_torque(scene.problem, robot)
     tip, rotation = np.array([tip.translation for tip in tips]), np.array([tip.rotation for tip in tips])
     unknown_force = np.full((len(q), 2), np.nan)
-    return TickRecord(q, tip, rotation, desired, torque_use, puck, velocity, touched, unknown_force)
+    steps = dict(environment.violated_steps)
+    penalty = sum(PENALTY_POINTS.get(name, 0.0) for name, count in steps.items() if count)
+    return TickRecord(
+        q, tip, rotation, desired, torque_use, puck, velocity, touched, unknown_force, 0.0, steps, penalty
+    )
 
 
 def _unsupported(folder: str, error: Exception) -> MachineError:
@@ -158,6 +168,7 @@ def _environment(folder: str) -> Any:
     try:
         control = importlib.import_module(MODULE)
         iiwas = importlib.import_module("air_hockey_challenge.environments.iiwas")
+        constraints = importlib.import_module("air_hockey_challenge.constraints")
     except (ImportError, OSError, SyntaxError) as error:
         raise MachineError(f"{folder} cannot be imported ({error}): install the requirements in its README") from error
     if not Path(str(control.__file__)).resolve().is_relative_to(folder):
@@ -165,9 +176,11 @@ def _environment(folder: str) -> Any:
     try:
         kind = type("Recorded", (_Recorder, control.PositionControlIIWA, iiwas.AirHockeySingle), {})
         environment = kind(interpolation_order=None)
+        environment.constraints = [getattr(constraints, name)(environment.env_info) for name in CONSTRAINTS]
         still = np.zeros(len(JOINTS))
         environment.begin(still, still, np.array([1.0, 0.0]))
         environment.advance(np.zeros((TICKS_PER_STEP, 3, len(JOINTS))))
+        environment.count_violations()
     except UNSUPPORTED as error:
         raise _unsupported(folder, error) from error
     return environment
@@ -187,12 +200,16 @@ class _Recorder:
     """Mix-in for the environment's classes: sets the start and records every tick."""
 
     recorded: list[tuple[Array, ...]]
+    constraints: list[Any]
+    violated_steps: dict[str, int]
     _start: Array
+    _observed: Array
     _puck_velocity: Array
 
     def begin(self: Any, q: Array, dq: Array, puck: Array, velocity: tuple[float, float] = (0.0, 0.0)) -> None:
         """Reset to positions and velocities of the arm, shape (7,), and of the puck [m] and [m/s], shape (2,)."""
         self.recorded, self._start = [], dq
+        self.violated_steps = {constraint.name: 0 for constraint in self.constraints}
         self._frame = np.array(self.env_info["robot"]["base_frame"][0])
         self._puck = (self._frame @ [*puck, 0.0, 1.0])[:2]
         self._puck_velocity = (self._frame[:3, :3] @ [*velocity, 0.0])[:2]
@@ -212,8 +229,14 @@ class _Recorder:
 
     def advance(self: Any, action: Array) -> bool:
         """Take one step; return whether the episode is over."""
-        _, _, over, _ = self.step(action)
+        self._observed, _, over, _ = self.step(action)
         return bool(over)
+
+    def count_violations(self: Any) -> None:
+        """Count the constraints that the observed positions and velocities after a step violate."""
+        q, dq = (self._observed[self.env_info[f"joint_{name}_ids"]] for name in ("pos", "vel"))
+        for constraint in self.constraints:
+            self.violated_steps[constraint.name] += int(np.any(constraint.fun(q, dq) > 0))
 
     def reward(self, *_: Any) -> float:
         """Return 0; rewards are unused."""

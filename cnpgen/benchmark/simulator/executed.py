@@ -31,6 +31,8 @@ class Executed:
         table_force: Maximum normal force between mallet and table until the puck's result is final [N].
         table_friction: Maximum friction force between them [N].
         table_contact_time: Time for which they touched [s].
+        violated_steps: Constraint of the environment -> number of its steps that violate it; None without such.
+        penalty: Penalty points of the environment's rules, without those of computation times.
         failure: Reason why nothing was executed, or empty.
     """
 
@@ -52,6 +54,8 @@ class Executed:
     table_force: float = math.nan
     table_friction: float = math.nan
     table_contact_time: float = math.nan
+    violated_steps: Mapping[str, int] | None = None
+    penalty: float = math.nan
     failure: str = ""
 
     @property
@@ -79,6 +83,8 @@ class Executed:
             "table_force_n": self.table_force,
             "table_friction_n": self.table_friction,
             "table_contact_s": self.table_contact_time,
+            **{f"{name}_steps": count for name, count in (self.violated_steps or {}).items()},
+            "penalty_points": self.penalty,
             "failure": self.failure or None,
         }
         return {name: value for name, value in values.items() if value is not None and not _is_nan(value)}

@@ -1,5 +1,6 @@
 """Result of an execution, computed from the record of every tick."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,6 +35,8 @@ class TickRecord:
         puck_velocity: Its velocities [m/s], shape (K, 2); nan without one.
         puck_contact: Whether mallet and puck touch, shape (K,).
         table_force: Normal and friction force between mallet and table [N], shape (K, 2); nan if not simulated.
+        violated_steps: See ``Executed``.
+        penalty: See ``Executed``.
         max_penetration: Maximum penetration of an obstacle [m].
     """
 
@@ -47,6 +50,8 @@ class TickRecord:
     puck_contact: NDArray[np.bool_]
     table_force: Array
     max_penetration: float = 0.0
+    violated_steps: Mapping[str, int] | None = None
+    penalty: float = np.nan
 
 
 def puck_is_done(reference: Reference, tick: int, x: float, speed: float) -> bool:
@@ -84,6 +89,8 @@ def outcome_of(scene: SimulatorScene, reference: Reference, goal_xyz: Array, rec
         else TICK_S * float(tilt(record.rotation[during].transpose(1, 2, 0)).sum()),
         tracking_error=TICK_S * float(np.abs(record.q[during] - record.reference[during]).sum()),
         torque_use=float(np.abs(record.torque_use).max()),
+        violated_steps=record.violated_steps,
+        penalty=record.penalty,
     )
     planned_tip = _tip_positions(scene, reference.q[: reference.ticks])
     if height is not None:

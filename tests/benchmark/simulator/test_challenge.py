@@ -53,6 +53,16 @@ def test_records_are_in_the_robots_frame(plans: Plans) -> None:
     assert np.linalg.norm(at_the_hit - plans.columns["goal_xyz"][0]) < 0.002
 
 
+def test_violated_constraints_and_penalties_are_counted(plans: Plans) -> None:
+    (executed,) = simulate_plans(plans[:1], environment=CLONE, workers=1).executed
+    row = executed.to_dict()
+    assert 3 < row["joint_vel_constr_steps"] <= np.ceil(plans.duration[0] / 0.02)  # steps of 20 ms, of the plan only
+    assert [row[f"{name}_constr_steps"] for name in ("joint_pos", "ee", "link")] == [0, 0, 0]
+    assert row["penalty_points"] == 1.0
+    (elsewhere,) = simulate_plans(plans[:1], workers=1).executed
+    assert not {"joint_vel_constr_steps", "penalty_points"} & elsewhere.to_dict().keys()
+
+
 @pytest.mark.slow
 def test_a_benchmark_executes_in_the_challenge(tmp_path: Path) -> None:
     benchmark = run_benchmark("hits-81", tmp_path, planners=["cnpgen"], n=1, environment=CLONE, workers=1)
@@ -150,6 +160,7 @@ print(json.dumps({name: [row["executed"]["challenge"] for row in rows] for name,
 """
 
 
+@pytest.mark.extended
 @pytest.mark.skipif(
     not (REAL_CLONE / "air_hockey_challenge").is_dir() or not ITS_PYTHON.is_file(),
     reason="CNPGEN_CHALLENGE or CNPGEN_CHALLENGE_PYTHON is not set",
@@ -168,4 +179,6 @@ def test_the_real_environment_separates_planners(tmp_path: Path) -> None:
         assert row["contact_distance_mm"] < 20
         assert 1 < row["plane_error_mm"] < 10  # the controller of the environment tracks loosely
         assert row["hit_time_s"] > 0.1
+        assert {row[f"{name}_constr_steps"] for name in ("joint_pos", "ee", "link")} == {0}
+        assert row["penalty_points"] == (1.0 if row["joint_vel_constr_steps"] else 0.0)
         assert "table_force_n" not in row  # the environment simulates no contact of mallet and table

@@ -27,7 +27,7 @@ def model() -> mujoco.MjModel:
 
 
 class AirHockeySingle:
-    """Steps of 20 ms, unused observations, data by name."""
+    """Steps of 20 ms, data by name."""
 
     def __init__(self) -> None:
         self._model = model()
@@ -35,6 +35,7 @@ class AirHockeySingle:
         frame = np.eye(4)
         frame[:3, 3] = BASE
         self.env_info = {"robot": {"base_frame": [frame]}}
+        self.env_info |= {"joint_pos_ids": np.arange(7), "joint_vel_ids": np.arange(7, 14)}
         self.init_state = np.zeros(7)
 
     def reset(self, obs: object = None) -> np.ndarray:
@@ -54,7 +55,11 @@ class AirHockeySingle:
             self._data.qfrc_applied[:6] = self._compute_action(None, action)[:6]
             mujoco.mj_step(self._model, self._data, STEPS)
         away = abs(self._read_data("puck_x_pos")[0]) > 0.974
-        return np.zeros(0), self.reward(), bool(away), {}
+        return self._observation(), self.reward(), bool(away), {}
+
+    def _observation(self) -> np.ndarray:
+        joints = [self._data.joint(f"iiwa_1/joint_{number}") for number in range(1, 8)]
+        return np.concatenate([*(joint.qpos for joint in joints), *(joint.qvel for joint in joints)])
 
     def _read_data(self, name: str) -> np.ndarray:
         joint = self._data.joint(name.rpartition("_")[0])

@@ -1,0 +1,144 @@
+"""Random search over the parameters of a planner, as the paper tuned its baselines."""
+
+import csv
+import io
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cnpgen.benchmark.run_suite import Benchmark, run_benchmark
+from cnpgen.errors import UsageError
+from cnpgen.schema.arguments import integer
+from cnpgen.store.files.atomic import write_file
+
+SEARCH_FILE = "search.csv"
+MAX_TRIALS = 10_000
+MIN_LOGARITHMIC_RANGE = 10.0  # ratio of both ends, from which values are log-uniform
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Result of one set of parameters.
+
+    Attributes:
+        number: Its number; 0 has the default parameters.
+        parameters: Values of the fields of the planner.
+        solved: Ratio of successful executions, or of valid plans without a plant.
+        planning_cpu_ms: Median planning time [ms], nan if the planner does not apply.
+        duration_s: Median motion time [s], nan without a plan.
+    """
+
+    number: int
+    parameters: Mapping[str, Any]
+    solved: float
+    planning_cpu_ms: float
+    duration_s: float
+
+
+def search_parameters(
+    suite: str | Path,
+    folder: str | Path,
+    planner: str,
+    ranges: Mapping[str, Sequence[float]],
+    *,
+    trials: int = 20,
+    seed: int = 0,
+    **options: Any,
+) -> list[Trial]:
+    """Try random parameters of a planner on a suite; an interrupted search resumes.
+
+    Values are uniform in their range, or log-uniform if both ends are positive and differ by a factor of 10 or more.
+    Ranges of two whole numbers give whole numbers. Tune on other problems than those of the comparison: the name of a
+    dataset gives fresh ones.
+
+    Args:
+        suite: A suite, or the name or file of a suite or dataset.
+        folder: Folder for results: one folder per trial, and ``search.csv``.
+        planner: Name of the planner.
+        ranges: Field of the planner -> (low, high), in SI units.
+        trials: Number of random sets of parameters, beside the default ones.
+        seed: Seed of the parameters, and of random planners.
+        options: Further arguments of ``run_benchmark``, for example ``n``, ``plants`` and ``time_limit``.
+
+    Returns:
+        The trials, the best one first: by solved problems, then by motion time, then by planning time.
+
+    Raises:
+        UsageError: A range or a field is invalid.
+        RecipeError, MachineError: As ``run_benchmark``.
+    """
+    trials, seed = integer("trials", trials, least=1, most=MAX_TRIALS), integer("seed", seed, least=0)
+    sets: list[dict[str, Any]] = [{}, *(random_parameters(ranges, [seed, number]) for number in range(trials))]
+    done = []
+    for number, parameters in enumerate(sets):
+        benchmark = run_benchmark(
+            suite,
+            Path(folder) / f"trial-{number}",
+            planners=[planner],
+            seed=seed,
+            parameters={planner: parameters} if parameters else None,
+            **options,
+        )
+        done.append(_trial(number, parameters, benchmark, planner))
+    ranked = sorted(done, key=_rank)
+    write_file(Path(folder) / SEARCH_FILE, csv_of(ranked, list(ranges)))
+    return ranked
+
+
+def random_parameters(ranges: Mapping[str, Sequence[float]], seed: Sequence[int]) -> dict[str, Any]:
+    """Draw a value for each field.
+
+    Args:
+        ranges: See ``search_parameters``.
+        seed: Seed of the generator.
+
+    Raises:
+        UsageError: There is no range, or one is not two increasing, finite numbers.
+    """
+    if not ranges:
+        raise UsageError("must have a range for one field at least", argument="ranges")
+    random, values = np.random.default_rng(list(seed)), {}
+    for key, ends in ranges.items():
+        if len(ends) != 2 or not all(map(math.isfinite, ends)) or not ends[0] < ends[1]:
+            raise UsageError(f"must have two increasing numbers for {key!r}, got {ends!r:.100}", argument="ranges")
+        low, high = ends
+        is_whole = all(isinstance(end, int) for end in ends)
+        if low > 0 and high / low >= MIN_LOGARITHMIC_RANGE:
+            value = float(np.exp(random.uniform(math.log(low), math.log(high))))
+        else:
+            value = float(random.uniform(low, high))
+        values[key] = int(np.clip(round(value), low, high)) if is_whole else value
+    return values
+
+
+def csv_of(trials: Sequence[Trial], keys: Sequence[str]) -> str:
+    """Write trials as CSV, a row each; fields of the default parameters are empty.
+
+    Args:
+        trials: The trials.
+        keys: Names of the fields.
+    """
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["trial", "solved", "planning_cpu_ms", "duration_s", *keys])
+    for trial in trials:
+        values = [trial.parameters.get(key, "") for key in keys]
+        writer.writerow([trial.number, trial.solved, trial.planning_cpu_ms, trial.duration_s, *values])
+    return text.getvalue()
+
+
+def _trial(number: int, parameters: Mapping[str, Any], benchmark: Benchmark, planner: str) -> Trial:
+    plant = benchmark.executions[0]
+    summary = benchmark.summary(plant)[planner]
+    ratio = summary["ratios"].get("success" if plant else "valid", {"share": 0.0})
+    medians = [summary["figures"].get(key, {}).get("median", math.nan) for key in ("planning_cpu_ms", "duration_s")]
+    return Trial(number, parameters, ratio["share"], *medians)
+
+
+def _rank(trial: Trial) -> tuple[float, float, float, int]:
+    times = [math.inf if math.isnan(time) else time for time in (trial.duration_s, trial.planning_cpu_ms)]
+    return -trial.solved, times[0], times[1], trial.number

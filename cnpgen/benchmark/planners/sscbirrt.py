@@ -1,0 +1,150 @@
+"""CBiRRT of the package ``sscbirrt`` (Berenson et al., 2011), with its own shortcuts and timing.
+
+Its Python search is used, because the validity checks are those of the other samplers. The path is shortened and timed
+within the limits of velocity and acceleration by Hauser and Ng-Thow-Hing (2010). It ignores the velocities of both
+ends, which are at rest.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.benchmark.benchmark_planner import Answer, BenchmarkPlanner, Plan, Setting
+from cnpgen.benchmark.planners.cbirrt import MANIFOLD_TOLERANCE, MAX_PROJECTIONS, SEEDS, Search
+from cnpgen.benchmark.planners.free_search import FreeSearch, has_manifold
+from cnpgen.errors import requires_extra
+from cnpgen.plans.plans import Plans
+from cnpgen.problems.problem_record import open_problem
+from cnpgen.robots.robot import Robot
+from cnpgen.schema.keys import field
+from cnpgen.trajectory.sampled_trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+PROJECTION_TOLERANCE = 1e-3  # default of the package; states of the path may be ten times further away
+MIN_BREAK_DISTANCE_S = 1e-9  # closer breaks of the acceleration are joined
+
+
+@dataclass(frozen=True)
+class SSCBiRRT(BenchmarkPlanner):
+    """CBiRRT with shortcuts in time and timing (package sscbirrt), from rest to rest."""
+
+    step_size: float = field("largest step of the trees", unit="rad", default=0.1, low=1e-3)
+
+    def prepare(self, setting: Setting) -> Plan:
+        """Import the package."""
+        load_sscbirrt()
+        problem, robot = open_problem(setting.problem)
+        free = None if has_manifold(problem, robot) else FreeSearch(problem, robot)
+
+        def plan(task: Plans) -> Answer:
+            if free is not None:
+                free.place_obstacles(task)
+                return self._plan(setting, robot, task, is_valid=free.is_valid, manifold=None)
+            search = Search(problem, robot, task)
+            return self._plan(setting, robot, task, is_valid=search.is_valid, manifold=ManifoldSet(search))
+
+        return plan
+
+    def _plan(
+        self,
+        setting: Setting,
+        robot: Robot,
+        task: Plans,
+        *,
+        is_valid: Callable[[Array], bool],
+        manifold: "ManifoldSet | None",
+    ) -> Trajectory | None:
+        """Search for a path and time it; return None without a path in time."""
+        package = load_sscbirrt()
+        validity = _Validity(is_valid)
+        config = package.CBiRRTConfig(timeout=setting.time_limit, step_size=self.step_size)
+        planner = package.CBiRRT(_Joints(robot), collision_checker=validity, config=config)
+        start, goal = (
+            package.FiniteSet([q[0]], metric=planner.space.distance)
+            for q in (task.boundary.start_q, task.boundary.goal_q)
+        )
+        question = package.PlanningProblem(planner.space, start, goal, validity, path_constraint=manifold)
+        limits = package.TrajectoryOptions(robot.velocity_limit, robot.acceleration_limit)
+        seed = int(setting.random(task).integers(SEEDS))
+        try:
+            result = planner.solve(question, seed=seed, trajectory=limits)
+        except package.PlanningError:  # an end is invalid
+            return None
+        return sampled(result.trajectory) if result.success else None
+
+
+class ManifoldSet:
+    """Set of joint positions near a manifold, in the interface of the package.
+
+    Args:
+        search: Search whose residual is to be small.
+    """
+
+    def __init__(self, search: Search) -> None:
+        self._search = search
+
+    def contains(self, q: Array) -> bool:
+        """Return whether the residual at q is within the tolerance."""
+        return abs(self._search.residual(q)[0]) <= MANIFOLD_TOLERANCE
+
+    def project(self, _previous: Array, proposed: Array) -> Array | None:
+        """Project a configuration by Newton's method; return None if it does not converge."""
+        q = np.array(proposed, float)
+        for _ in range(MAX_PROJECTIONS):
+            residual, gradient = self._search.residual(q)
+            if abs(residual) <= PROJECTION_TOLERANCE:
+                return q
+            q -= residual * gradient / max(float(gradient @ gradient), np.finfo(float).tiny)
+        return None
+
+
+def load_sscbirrt() -> Any:
+    """Import the package.
+
+    Raises:
+        MissingExtraError: The package is missing.
+    """
+    with requires_extra("planners", "sscbirrt"):
+        import sscbirrt
+    return sscbirrt
+
+
+def sampled(motion: Any) -> Trajectory | None:
+    """Return a timed path of the package at the breaks of its accelerations, between which cubics are exact.
+
+    Args:
+        motion: A ``sscbirrt.Trajectory``.
+    """
+    times = [np.zeros(1)]
+    for piece, start in zip(motion.pieces, motion.breaks, strict=False):
+        for ramp in piece.ramps:
+            ends = np.cumsum([span for span, _ in ramp.pieces])
+            times.append(start + ends)
+    t = np.unique(np.append(np.concatenate(times), motion.duration))
+    t = np.append(t[:-1][np.diff(t) > MIN_BREAK_DISTANCE_S], t[-1])
+    if len(t) < 2:
+        return None
+    q, dq, _ = motion.evaluate(t)
+    return Trajectory(t, q, dq)
+
+
+class _Joints:
+    """Joint limits in the interface of the package, which needs no kinematics here."""
+
+    def __init__(self, robot: Robot) -> None:
+        self.dof = robot.n
+        self.joint_limits = robot.position_lower, robot.position_upper
+
+    def forward_kinematics(self, q: Array) -> Array:
+        raise NotImplementedError
+
+
+class _Validity:
+    """Validity of states in the interface of the package."""
+
+    def __init__(self, is_valid: Callable[[Array], bool]) -> None:
+        self.is_valid = is_valid
