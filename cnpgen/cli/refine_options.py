@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from cnpgen.machine.times import Times
     from cnpgen.make.solve_scenes import SolvedScenes
     from cnpgen.plans import Plans
-    from cnpgen.refine.refine_plans import Refinement
+    from cnpgen.refine.refinement import Refinement
 
 REFINING = ("objective", "weight", "max_iterations", "tolerance", "deadline")  # what add_refining adds
 LARGE_ANGLES = "accept boundary conditions in a file that are probably in degrees or millimetres"

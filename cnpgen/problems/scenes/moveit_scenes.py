@@ -124,12 +124,13 @@ def _pose_goal(goal: Any, where: str) -> GoalPose | None:
     dimensions = vector(part(primitives[0], "dimensions", list, where), "", f"{where}: dimensions of the goal region")
     is_sphere = _kind(primitives[0]) == "sphere"
     angles = [orientations[0].get(f"absolute_{axis}_axis_tolerance", 0.01) for axis in "xyz"]
+    radius = float(dimensions[0] if is_sphere else dimensions.min() / 2)
     return GoalPose(
         frame=frame,
         position=_pose(poses[0], where)[0],
         rotation=_rotation(orientations[0].get("orientation"), where),
-        position_tolerance=float(dimensions[0] if is_sphere else dimensions.min() / 2),
-        rotation_tolerance=min(scalar(angle, f"{where}: orientation tolerance") for angle in angles),
+        position_tolerance=radius / np.sqrt(3),  # a cube in the region, for any orientation
+        rotation_tolerance=np.array([scalar(angle, f"{where}: orientation tolerance") for angle in angles]),
     )
 
 

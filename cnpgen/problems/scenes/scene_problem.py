@@ -38,15 +38,22 @@ class GoalPose:
         frame: Name of the link or frame; empty for the problem's tip.
         position: Position [m], shape (3,).
         rotation: Rotation matrix, shape (3, 3).
-        position_tolerance: Accepted distance from the position [m].
-        rotation_tolerance: Accepted angle from the rotation [rad].
+        position_tolerance: Accepted displacements along the axes of the pose [m], a number or shape (3,).
+        rotation_tolerance: Accepted components of the rotation vector in these axes [rad], a number or shape (3,).
+            About an axis with pi or more, any rotation is accepted.
     """
 
     frame: str
     position: Array
     rotation: Array
-    position_tolerance: float = 1e-3
-    rotation_tolerance: float = 1e-2
+    position_tolerance: float | Array = 0.0
+    rotation_tolerance: float | Array = 0.0
+
+    @property
+    def tolerances(self) -> tuple[Array, Array]:
+        """Tolerances of position [m] and rotation [rad], shape (3,) each."""
+        position, rotation = (np.asarray(each, float) for each in (self.position_tolerance, self.rotation_tolerance))
+        return np.broadcast_to(position, 3), np.broadcast_to(rotation, 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,8 +143,11 @@ def checked_scene(scene: SceneProblem) -> SceneProblem:
     """
     check_count(len(scene.obstacles), scene.place)
     pose = scene.goal_pose
-    if pose is not None and not (np.abs([*pose.position, pose.position_tolerance]) <= MAX_COORDINATE_M).all():
-        raise SceneError(f"{scene.place}: the goal pose has numbers that are not finite or too large")
+    if pose is not None:
+        if not (np.abs([*pose.position, *pose.rotation.ravel()]) <= MAX_COORDINATE_M).all():
+            raise SceneError(f"{scene.place}: the goal pose has numbers that are not finite or too large")
+        if not all((each >= 0).all() for each in pose.tolerances):
+            raise SceneError(f"{scene.place}: tolerances of the goal pose must not be negative, got {pose.tolerances}")
     for what, values in (("start", scene.start_q), ("goal", scene.goal_q)):
         if not np.isfinite(values).all():
             raise SceneError(f"{scene.place}: the {what} has joint positions that are not finite")

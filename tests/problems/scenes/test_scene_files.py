@@ -144,7 +144,7 @@ def test_moveit_scenes_and_requests_are_read_with_composed_poses(tmp_path: Path)
     assert scene.goal_pose.frame == "panda_hand"
     assert scene.goal_pose.position == pytest.approx([0.4, 0.1, 0.6])
     assert scene.goal_pose.rotation == pytest.approx(np.diag([1.0, -1.0, -1.0]))
-    assert (scene.goal_pose.position_tolerance, scene.goal_pose.rotation_tolerance) == (0.002, 0.01)
+    assert np.array(scene.goal_pose.tolerances) == pytest.approx(np.array([[0.002 / 3**0.5] * 3, [0.01] * 3]))
 
 
 def test_one_file_of_a_pair_reads_the_other_one_too(tmp_path: Path) -> None:
