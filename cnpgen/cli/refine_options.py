@@ -188,5 +188,7 @@ def _summary(facts: dict[str, Any], times: "Times", *, listed: int) -> list[str]
 def _failure_text(failure: dict[str, Any]) -> str:
     """Describe why one plan is invalid, with the proof of its problem if requested."""
     why = f"{failure['finding']}: {failure['explanation']}" if "finding" in failure else failure["outcome"]
+    if failure.get("finding") == "gave up":
+        why = f"{why}; {failure['outcome']}"
     name = f"scene {failure['scene']!r}" if "scene" in failure else f"sample {failure['sample_id']}"
     return f"plan {failure['plan']} ({name}): {failure['reason']}; {why}"

@@ -11,8 +11,8 @@ The next attempt is made only if no earlier one was accepted. Attempts in their 
 
 Acceptance (``RefinementSearch``): the independent verdict decides, never the solver's own residuals. The first valid
 plan is returned if it is precise; otherwise one more attempt is judged. If the verdict rejects an attempt for a shallow
-collision of hulls, the solver continues it with a constraint at the phase that the verdict names. The result is never worse than the input plan:
-it replaces the input only if the verdict finds a smaller violation, or none and a lower cost.
+collision of hulls, the solver continues it with a constraint at the phase that the verdict names. The result is never
+worse than the input plan: it replaces it only if the verdict finds a smaller violation, or none and a lower cost.
 """
 
 import time
@@ -268,11 +268,14 @@ def _around_obstacles(refiner: Refiner, task: RefinementTask, best: Attempt, hul
     if _ends_penetrate(task, hulls):
         return
     if refiner.measures_hulls:
+        found_path = False
         for guess in _path_guesses(refiner, task, hulls):
-            attempt = _along_path(refiner, task, guess)
+            found_path, attempt = True, _along_path(refiner, task, guess)
             yield attempt
             if attempt.violation <= MAX_JUDGED_VIOLATION:
                 yield refiner.solve(task, refiner.levels.strict, attempt.variables, Outcome.RESTARTED)
+        if not found_path:
+            yield replace(best, outcome=Outcome.NO_PATH, iterations=0)
         return
     positions = refiner.check.transcription(task).positions(best.variables)
     best_first = hulls.max_penetration(positions, task.scene.poses[0]) < MAX_PENETRATION_M
@@ -356,6 +359,7 @@ class RefinementSearch:
         judged: Judged attempts.
         skipped: Attempts with violations above ``MAX_JUDGED_VIOLATION``.
         verdict: Last verdict.
+        found_no_path: Whether trees searched paths among the obstacles in vain.
     """
 
     refiner: Refiner
@@ -365,10 +369,12 @@ class RefinementSearch:
     judged: list[Attempt] = field(default_factory=list)
     skipped: list[Attempt] = field(default_factory=list)
     verdict: Verdict | None = None
+    found_no_path: bool = False
 
     def add(self, attempt: Attempt) -> bool:
         """Judge an attempt; return whether the search ends: it is valid and precise, or an earlier one is valid."""
         self.iterations += attempt.iterations
+        self.found_no_path |= attempt.outcome is Outcome.NO_PATH
         found_valid = any(earlier.valid for earlier in self.judged)
         if attempt.violation > MAX_JUDGED_VIOLATION:
             self.skipped.append(attempt)
@@ -468,7 +474,8 @@ def refine_task(refiner: Refiner, checker: PlanChecker, task: RefinementTask) ->
             best = min(best, judged, key=lambda attempt: attempt.rank)
             if judged.valid:
                 break
-    return best.result(search.iterations)
+    no_path = search.found_no_path and best.outcome is Outcome.UNSOLVED
+    return best.result(search.iterations, Outcome.NO_PATH if no_path else None)
 
 
 @np.errstate(all="ignore")  # see ``refine_task``

@@ -15,7 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.problems.scenes.quaternions import quaternion_mistake, quaternion_of, rotation_matrix
-from cnpgen.problems.scenes.scene_problem import GoalPose, SceneError, SceneProblem, check_count, make_mesh, make_obstacle
+from cnpgen.problems.scenes.scene_problem import (
+    GoalPose,
+    SceneError,
+    SceneProblem,
+    check_count,
+    make_mesh,
+    make_obstacle,
+)
 from cnpgen.problems.scenes.yaml_document import part, scalar, vector
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.convex_part import turned

@@ -183,7 +183,9 @@ def checked_scene(scene: SceneProblem) -> SceneProblem:
             raise SceneError(f"{scene.place}: the {what} has joint positions that are not finite")
     for obstacle in scene.obstacles:
         if obstacle.kind == "mesh" and not is_inline(obstacle.mesh):
-            raise SceneError(f"{scene.place}: obstacle {obstacle.name!r} is a mesh file, expected corners: see make_mesh")
+            raise SceneError(
+                f"{scene.place}: obstacle {obstacle.name!r} is a mesh file, expected corners: see make_mesh"
+            )
     scene = replace(scene, obstacles=_uniquely_named(scene.obstacles))
     depths = np.array([_depth_of_base(obstacle) for obstacle in scene.obstacles])
     if len(depths) and depths.max() > MAX_BASE_DEPTH_M:

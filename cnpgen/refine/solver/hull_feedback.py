@@ -1,7 +1,7 @@
 """Collisions between grid points, fed back to the solver as larger required distances at the neighboring points.
 
-A corner that passes a thin edge may collide between two grid points without a violation at either of them. Some collisions
-are found by the verdict only, which names their phase.
+A corner that passes a thin edge may collide between two grid points without a violation at either of them. Some
+collisions are found by the verdict only, which names their phase.
 """
 
 import numpy as np

@@ -301,7 +301,7 @@ def test_meshes_of_moveit_are_hulls_with_composed_poses(tmp_path: Path) -> None:
     mesh = scene.obstacles[-1]
     assert (mesh.kind, mesh.name) == ("mesh", "wedge")
     (solid,) = solids_of([mesh], place_obstacles([mesh]))
-    placed = np.array([1.0, 0, 0]) + (corners + [0.5, 0, 0.1]) * [-1, -1, 1]
+    placed = np.array([1.0, 0, 0]) + (corners + np.array([0.5, 0, 0.1])) * [-1, -1, 1]
     assert solid.low == pytest.approx(placed.min(axis=0))
     assert solid.high == pytest.approx(placed.max(axis=0))
 
