@@ -35,7 +35,8 @@ from cnpgen.pipelines.stages.ik import GoalIK, StartIK
 from cnpgen.pipelines.stages.stage import Stage
 from cnpgen.planner.planner import Planner
 from cnpgen.problems.load_robot import load_robot
-from cnpgen.refine.refine_plans import Refinement, refine_plans, solve_plans
+from cnpgen.refine.refine_plans import refine_plans, solve_plans
+from cnpgen.refine.refinement import Refinement
 from cnpgen.trajectory.boundary import Boundary
 
 NEAR_GOALS, ALL_GOALS = "heavy-object", "heavy-object-anywhere"

@@ -27,7 +27,7 @@ from cnpgen.plans.status import PlanStatus
 from cnpgen.problems.robot_model import ConstraintValues
 from cnpgen.refine.objective_values import objective_values
 from cnpgen.refine.proof.explain import Explanation, Feasibility
-from cnpgen.refine.refine_plans import Refinement
+from cnpgen.refine.refinement import Refinement
 from cnpgen.refine.task import Attempt, Outcome
 from cnpgen.robots.solid import Solid
 from cnpgen.store.check import Finding

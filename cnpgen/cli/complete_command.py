@@ -20,6 +20,8 @@ The stages of the pipeline compute everything that the tasks do not give: 'goal_
 to hit a puck. Columns have the names of dataset fields, with components after a dot, in SI units. The start is given by
 joints (start_q.*, start_dq.*, start_ddq.*) or by position (start_xyz.*); the default is the problem's base at rest. The
 speed of a hit is the maximum unless hit_speed [m/s] or hit_speed_share is given. 'cnpgen docs tasks' has examples.
+Tasks of a robot's problem, such as panda, are goal poses: goal_xyz.*, goal_wxyz.*, with goal_xyz_tolerance.* and
+goal_rotation_tolerance.* along and about the axes of the pose. 'cnpgen solve' plans the best motion to any goal state.
 The boundary problems are written to OUT, which is printed on stdout; 'cnpgen solve', 'refine' and 'plan' read it. Its
 sample_id is the index of the task. Tasks without an answer are left out, with the reason on stderr. The exit code is 1
 if no task has an answer.
@@ -32,7 +34,7 @@ def add(commands: "Commands[Parser]") -> None:
         commands, "complete", run, title="compute boundary problems for tasks in the workspace", text=_TEXT
     )
     option = parser.add_argument
-    option("pipeline", metavar="NAME|FILE", help="a pipeline or dataset by name, or a recipe file")
+    option("pipeline", metavar="NAME|FILE", help="a pipeline, dataset or problem by name, or a recipe file")
     option("tasks", metavar="TASKS", type=Path, help="a table of tasks: CSV, or HDF5")
     option("-o", "--out", metavar="OUT", type=Path, required=True, help="file of boundary problems to write, .h5")
     option("--force", action="store_true", help="replace OUT")
@@ -47,7 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
     from cnpgen.make.complete import complete
     from cnpgen.plans import save_plans
 
-    check_there(arguments.pipeline)
+    check_there(arguments.pipeline, "dataset", "pipeline", "problem")
     check_recipe(arguments.pipeline)
     check_suffix(arguments.out)
     check_place(arguments.out, force=arguments.force)
@@ -66,14 +68,14 @@ def run(arguments: argparse.Namespace) -> int:
 def _facts(found: "Completed", out: Path) -> dict[str, object]:
     rejected = [{"task": task, "reason": reason} for task, reason in enumerate(found.reasons) if reason]
     written = str(out) if len(found.plans) else None
-    return {"file": written, "tasks": len(found.reasons), "completed": len(found.plans), "without_answer": rejected}
+    return {"file": written, "tasks": len(found.reasons), "completed": len(found), "without_answer": rejected}
 
 
 def _summary(found: "Completed") -> list[str]:
     """Summarize how many tasks have an answer, and the reasons of the others."""
     from cnpgen.errors import counted
 
-    lines = [f"{len(found.plans):,} of {counted(len(found.reasons), 'task')} completed"]
+    lines = [f"{len(found):,} of {counted(len(found.reasons), 'task')} completed"]
     for reason, count in found.rejections.items():
         indices = [task for task, why in enumerate(found.reasons) if why == reason][:MAX_LISTED_TASKS]
         more = f" and {count - MAX_LISTED_TASKS:,} more" if count > MAX_LISTED_TASKS else ""

@@ -48,25 +48,27 @@ def is_recipe(what: str) -> bool:
     )
 
 
-def check_there(what: str) -> None:
+def check_there(what: str, *kinds: str) -> None:
     """Refuse an argument that is neither a path nor the name of a recipe.
 
     Args:
         what: Name or path of a recipe, or the folder of a dataset.
+        *kinds: Kinds of recipes, datasets and pipelines by default.
 
     Raises:
         UsageError: There is nothing of the kind.
     """
-    from cnpgen.errors import UsageError, nearest
+    from cnpgen.errors import UsageError, either, nearest
 
-    names = _shipped("dataset", "pipeline")
+    kinds = kinds or ("dataset", "pipeline")
+    names = _shipped(*kinds)
     if Path(what).exists() or what in names:
         return
     hint = nearest(what, [*names, *_neighbours(Path(what))])
     if what.endswith(".toml"):
         raise UsageError(f"no such file: {what}{hint}")
     raise UsageError(
-        f"{what} is neither a folder nor a file, dataset or pipeline{hint}: 'cnpgen list' names those that ship"
+        f"{what} is neither a folder nor a file, {either(kinds)}{hint}: 'cnpgen list' names those that ship"
     )
 
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from cnpgen.machine.times import Times
     from cnpgen.make.solve_scenes import SolvedScenes
     from cnpgen.plans import Plans
-    from cnpgen.refine.refine_plans import Refinement
+    from cnpgen.refine.refinement import Refinement
 
 REFINING = ("objective", "weight", "max_iterations", "tolerance", "deadline")  # what add_refining adds
 LARGE_ANGLES = "accept boundary conditions in a file that are probably in degrees or millimetres"
@@ -188,5 +188,7 @@ def _summary(facts: dict[str, Any], times: "Times", *, listed: int) -> list[str]
 def _failure_text(failure: dict[str, Any]) -> str:
     """Describe why one plan is invalid, with the proof of its problem if requested."""
     why = f"{failure['finding']}: {failure['explanation']}" if "finding" in failure else failure["outcome"]
+    if failure.get("finding") == "gave up":
+        why = f"{why}; {failure['outcome']}"
     name = f"scene {failure['scene']!r}" if "scene" in failure else f"sample {failure['sample_id']}"
     return f"plan {failure['plan']} ({name}): {failure['reason']}; {why}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import DatasetError, UsageError, counted
 from cnpgen.kernels.library import choose_backend
+from cnpgen.make.complete_poses import PoseTasks, problem_of_poses
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.make.recipe_file import as_dataset_recipe
 from cnpgen.make.task_table import read_tasks
@@ -21,8 +23,10 @@ from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.steps import steps_of
 from cnpgen.plans.boundary_problems import plans_of_rows
 from cnpgen.plans.plans import Plans
+from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import record_problem
 from cnpgen.robots.plausible_values import UnitError, check_plausible
+from cnpgen.robots.robot import Robot
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import numbers
 from cnpgen.store.field import Field
@@ -37,6 +41,7 @@ class Completed:
     Attributes:
         plans: Boundary problems of the solved tasks, as plans without motions; ``plans.sample_id`` is the index of the
             task. ``solve_plans`` and ``refine_plans`` compute the motions; a planner plans for ``plans.boundary``.
+            A task with a goal pose has one row for each of its goal states, with the column ``goal_option``.
         reasons: Rejection reason of each task; empty for solved tasks.
     """
 
@@ -44,7 +49,10 @@ class Completed:
     reasons: tuple[str, ...]
 
     def __repr__(self) -> str:
-        return f"<{len(self.plans):,} of {counted(len(self.reasons), 'task')} of {self.plans.problem.name!r} completed>"
+        return f"<{len(self):,} of {counted(len(self.reasons), 'task')} of {self.plans.problem.name!r} completed>"
+
+    def __len__(self) -> int:
+        return self.reasons.count("")
 
     @property
     def rejections(self) -> dict[str, int]:
@@ -54,7 +62,7 @@ class Completed:
 
 @checked_arguments
 def complete(
-    recipe: str | Path | Pipeline | DatasetRecipe, table: str | Path | None = None, /, **columns: ArrayLike
+    recipe: str | Path | Pipeline | DatasetRecipe | Problem, table: str | Path | None = None, /, **columns: ArrayLike
 ) -> Completed:
     """Complete tasks: compute their missing columns with the stages of a pipeline, without random sampling.
 
@@ -65,8 +73,13 @@ def complete(
     target or along the line from start to goal. Restrictions of sampling only, such as the minimum distance of start
     and goal, do not apply to tasks. Tasks are completed independently of each other.
 
+    Tasks of a robot's problem, such as "panda", have goal poses of the tip: ``goal_xyz`` with the quaternion
+    ``goal_wxyz``, or any orientation, ``goal_xyz_tolerance`` [m] and ``goal_rotation_tolerance`` [rad] along and about
+    the axes of the pose; pi frees an axis. Each task then has several rows, one for each goal state, and
+    ``solve_plans`` returns the best valid motion to any of them.
+
     Args:
-        recipe: Name of a shipped pipeline or dataset, path of a recipe file, or a loaded recipe.
+        recipe: Name of a shipped pipeline, dataset or problem, path of a recipe file, or a loaded recipe.
         table: Path of a table of tasks, CSV or HDF5, in place of the columns; see 'cnpgen docs tasks'.
         columns: Name of a dataset column -> values in SI units, shape (w,) for one task or (N, w); scalars have shape
             () or (N,). The value of one task applies to all.
@@ -79,16 +92,22 @@ def complete(
         RecipeError: The recipe has mistakes.
         MachineError: No backend works, or the table cannot be read.
     """
-    pipeline = recipe if isinstance(recipe, Pipeline) else as_dataset_recipe(recipe).pipeline
-    context = load_context(pipeline.problem, *choose_backend(None))
+    problem = problem_of_poses(recipe)
+    if problem is not None:
+        poses = PoseTasks(problem)
+        fields, flat, run = poses.fields, False, partial(_completed_poses, poses)
+    else:
+        pipeline = recipe if isinstance(recipe, Pipeline) else as_dataset_recipe(recipe).pipeline
+        context = load_context(pipeline.problem, *choose_backend(None))
+        fields, flat = given_fields(steps_of(pipeline), context), table_height(context) is not None
+        run = partial(_completed, pipeline, context)
     if table is None:
-        return _completed(pipeline, context, columns)
+        return run(columns)
     if columns:
         raise UsageError(f"give a table or columns, got the table {table} and {', '.join(columns)}", argument="table")
-    fields, flat = given_fields(steps_of(pipeline), context), table_height(context) is not None
     tasks = read_tasks(Path(table), fields, flat=flat)
     try:
-        return _completed(pipeline, context, tasks)
+        return run(tasks)
     except UnitError as error:
         raise UnitError(f"{table}: {error}", concerns="table") from error
     except UsageError as error:
@@ -97,21 +116,31 @@ def complete(
 
 def _completed(pipeline: Pipeline, context: Context, columns: Mapping[str, ArrayLike]) -> Completed:
     completion = Completion(pipeline, context, columns)
-    flat = completion.height is not None
-    given = {name: _rows(completion.given[name], values, flat=flat) for name, values in columns.items()}
+    given = _given(completion.given, columns, completion.context.robot, flat=completion.height is not None)
+    tasks = completion({name: rows.T for name, rows in given.items()})
+    rows = {**completion.rows(tasks), "sample_id": tasks.alive.astype(np.int64)}
+    problem, source = record_problem(pipeline.problem), f"tasks completed by {pipeline.name}"
+    return Completed(plans_of_rows(problem, rows, source=source), tasks.why())
+
+
+def _completed_poses(poses: PoseTasks, columns: Mapping[str, ArrayLike]) -> Completed:
+    poses.check(columns)
+    return Completed(*poses.complete(_given(poses.fields, columns, poses.robot, flat=False)))
+
+
+def _given(
+    fields: Mapping[str, Field], columns: Mapping[str, ArrayLike], robot: Robot, *, flat: bool
+) -> dict[str, Array]:
+    """Return the columns of tasks as rows of equal number, or one row for all."""
+    given = {name: _rows(fields[name], values, flat=flat) for name, values in columns.items()}
     count = max(map(len, given.values()))
     for name, values in given.items():
         if len(values) not in {1, count}:
             raise UsageError(
                 f"is given for {counted(len(values), 'task')}, another column for {count:,}", argument=name
             )
-    check_plausible(
-        completion.context.robot, given, {name: field.unit for name, field in completion.given.items()}, noun="task"
-    )
-    tasks = completion({name: rows.T for name, rows in given.items()})
-    rows = {**completion.rows(tasks), "sample_id": tasks.alive.astype(np.int64)}
-    problem, source = record_problem(pipeline.problem), f"tasks completed by {pipeline.name}"
-    return Completed(plans_of_rows(problem, rows, source=source), tasks.why())
+    check_plausible(robot, given, {name: field.unit for name, field in fields.items()}, noun="task")
+    return given
 
 
 def _rows(field: Field, values: ArrayLike, *, flat: bool) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.machine.times import NO_TIME, Times
-from cnpgen.pipelines.families.resting_states import RestingStates, pose_states, seeds_of
+from cnpgen.make.goal_poses import MAX_GOAL_STATES, MIN_DIFFERENCE_RAD, POSE_SEEDS, nearest_states, states_of_pose
+from cnpgen.pipelines.families.resting_states import RestingStates
 from cnpgen.plans.concatenate import concatenate
+from cnpgen.plans.format import GOAL_OPTION
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.scene_plans import (
     Capacity,
@@ -28,17 +30,15 @@ from cnpgen.problems.problem_record import as_problem
 from cnpgen.problems.scenes.scene_problem import GoalPose, SceneError, SceneProblem, check_scenes, checked_scene
 from cnpgen.refine.options import DEFAULT_OPTIONS, RefineOptions
 from cnpgen.refine.proof.explain import explain_plans
-from cnpgen.refine.refine_plans import Progress, Refinement, solve_plans
+from cnpgen.refine.refine_plans import Progress, solve_plans
+from cnpgen.refine.refinement import Refinement
 from cnpgen.refine.task import Attempt
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.store.dataset_spec import StoredProblem
-from cnpgen.world.pose_ik import PoseKinematics, solve_pose_ik
+from cnpgen.world.pose_ik import PoseKinematics
 
 Array = NDArray[np.float64]
-
-MAX_GOAL_STATES = 5  # of one scene that are tried, the nearest first
-POSE_SEEDS = 128  # of the inverse kinematics of a goal pose
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,8 +93,8 @@ def solve_scenes(
     """Plan the problems of scenes, from rest to rest, with the limits and constraints of a robot's problem.
 
     Scenes with equal numbers of obstacles of each kind, rounded up to multiples of four, share compiled kernels. Of
-    several goal states, the collision-free ones are tried in the order of the duration of the straight line at full
-    speed, at most ``MAX_GOAL_STATES``. A goal pose without goal states gets some by inverse kinematics.
+    several goal states, the ``MAX_GOAL_STATES`` collision-free ones with the fastest straight lines are tried, and the
+    result is the best valid motion to any of them. A goal pose without goal states gets some by inverse kinematics.
 
     Args:
         problem: The robot's problem, such as "panda"; obstacles of the scenes are added to its own.
@@ -121,24 +121,21 @@ def solve_scenes(
     if begin is not None:
         begin(len(scenes), 0)
     journals = list[Path]()
-    for attempt in range(max(map(len, goals))):
-        for own, indices in _groups(scenes, [i for i, states in enumerate(goals) if len(states) > attempt]):
-            waiting = [index for index in indices if not run.is_solved(index)]
-            file = None if journal is None else Path(f"{journal}.{len(journals)}")
-            journals += [] if file is None else [file]
-            if waiting:
-                run.solve(waiting, [goals[index][attempt] for index in waiting], own, file, discard=discard)
+    for own, indices in _groups(scenes):
+        file = None if journal is None else Path(f"{journal}.{len(journals)}")
+        journals += [] if file is None else [file]
+        run.solve(indices, [goals[index] for index in indices], own, file, discard=discard)
     solved = run.result()
     for file in journals:
         file.unlink(missing_ok=True)
     return solved
 
 
-def _groups(scenes: Sequence[SceneProblem], indices: Sequence[int]) -> list[tuple[dict[str, int], list[int]]]:
-    """Return the capacities of some scenes with the scenes of each."""
+def _groups(scenes: Sequence[SceneProblem]) -> list[tuple[dict[str, int], list[int]]]:
+    """Return the capacities of the scenes with the indices of the scenes of each."""
     groups: dict[tuple[tuple[str, int], ...], list[int]] = {}
-    for index in indices:
-        groups.setdefault(tuple(capacity_of([scenes[index]]).items()), []).append(index)
+    for index, scene in enumerate(scenes):
+        groups.setdefault(tuple(capacity_of([scene]).items()), []).append(index)
     return [(dict(capacity), members) for capacity, members in groups.items()]
 
 
@@ -157,15 +154,16 @@ class _SceneRun:
         self._capacity = capacity_of(self.scenes)
         self._times = NO_TIME
 
-    def is_solved(self, index: int) -> bool:
-        return index in self._found and self._found[index][1].valid
-
     def solve(
         self, indices: Sequence[int], goals: Sequence[Array], own: Capacity, journal: Path | None, *, discard: bool
     ) -> None:
-        """Plan scenes of one capacity."""
-        chosen = [self.scenes[index] for index in indices]
-        plans = scene_plans(self.problem, chosen, goals=goals, capacity=own, sample_id=indices)
+        """Plan scenes of one capacity, each to any of its goal states, shape (G, n) each."""
+        options = [(index, option, goal) for index, states in zip(indices, goals, strict=True)
+                   for option, goal in enumerate(states)]  # fmt: skip
+        rows, numbers, states = zip(*options, strict=True)
+        plans = scene_plans(self.problem, [self.scenes[i] for i in rows], goals=states, capacity=own, sample_id=rows)
+        if any(numbers):
+            plans = replace(plans, columns={**plans.columns, GOAL_OPTION: np.array(numbers, float)})
         workers, engine, address = self.engine
         refinement = solve_plans(
             plans,
@@ -179,10 +177,11 @@ class _SceneRun:
             progress=self._report,
         )
         self._times = _sum(self._times, refinement.times)
-        wide = with_wider_capacity(refinement.plans, self.problem, own, self._capacity)
+        columns = {name: values for name, values in refinement.plans.columns.items() if name != GOAL_OPTION}
+        chosen = replace(refinement.plans, columns=columns)
+        wide = with_wider_capacity(chosen, self.problem, own, self._capacity)
         for row, (index, attempt) in enumerate(zip(indices, refinement.results, strict=True)):
-            if index not in self._found or attempt.valid:
-                self._found[index] = wide[row], attempt
+            self._found[index] = wide[row], attempt
 
     def _report(self, finished: int, valid: int) -> None:
         if self.progress is not None and finished:
@@ -200,14 +199,17 @@ def _sum(first: Times, second: Times) -> Times:
 
 def _goals(problem: Problem, robot: Robot, scene: SceneProblem, index: int) -> Array:
     """Return the goal states of a scene that are tried, in this order, shape (G, n), G > 0."""
-    states = goal_states(scene, robot) if len(scene.goal_q) else _states_of_pose(problem, robot, scene, index)
+    if not len(scene.goal_q):
+        return _states_of_pose(problem, robot, scene, index)
+    states = goal_states(scene, robot)
     if len(states) == 1 or robot.shape is None:
         return states[:MAX_GOAL_STATES]
     valid = states[RestingStates(problem, robot, scene.obstacles).are_ends(states.T.copy())]
-    states = valid if len(valid) else states[:1]
-    start = joint_order(scene, robot, scene.start_q[None], "start")[0]
-    duration = (np.abs(states - start) / robot.velocity_limit).max(axis=1)
-    return states[np.argsort(duration, kind="stable")[:MAX_GOAL_STATES]]
+    return nearest_states(valid, _start(scene, robot), robot) if len(valid) else states[:1]
+
+
+def _start(scene: SceneProblem, robot: Robot) -> Array:
+    return np.asarray(joint_order(scene, robot, scene.start_q[None], "start")[0])
 
 
 def _states_of_pose(problem: Problem, robot: Robot, scene: SceneProblem, index: int) -> Array:
@@ -217,15 +219,12 @@ def _states_of_pose(problem: Problem, robot: Robot, scene: SceneProblem, index: 
         raise SceneError(f"{scene.place} has neither goal states nor a goal pose")
     kinematics = PoseKinematics(robot, _frame_of(robot, scene, pose))
     states = RestingStates(problem, robot, scene.obstacles)
-    positions, rotations = np.tile(pose.position, (POSE_SEEDS, 1)), np.tile(pose.rotation, (POSE_SEEDS, 1, 1))
-    random = np.random.default_rng([index, POSE_SEEDS])
-    found = pose_states(states, kinematics, positions, rotations, random)
-    if len(found):
-        return found
-    q, met = solve_pose_ik(kinematics, positions, rotations, seeds_of(robot, POSE_SEEDS, random))
-    if not met.any():
+    valid, found = states_of_pose(kinematics, states, pose, np.random.default_rng([index, POSE_SEEDS]))
+    if not len(found):
         raise SceneError(f"{scene.place}: no joint positions with its goal pose were found")
-    return q.T[met][:1]  # in collision: the explanation of the unsolved scene names it
+    if not len(valid):
+        return found[:1]  # in collision: the explanation of the unsolved scene names it
+    return nearest_states(valid, _start(scene, robot), robot, min_difference=MIN_DIFFERENCE_RAD)
 
 
 def _frame_of(robot: Robot, scene: SceneProblem, pose: GoalPose) -> int | None:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.plans.format import ATTRIBUTES, CONDITIONS, OBSTACLE_POSES, refuse_misspelt
+from cnpgen.plans.format import ATTRIBUTES, CONDITIONS, GOAL_OPTION, OBSTACLE_POSES, refuse_misspelt
 from cnpgen.plans.format import FORMAT as PLANS
 from cnpgen.plans.format import PLAN_FILE_VERSION as PLANS_VERSION
 from cnpgen.plans.plan_file import stored_problem
@@ -26,7 +26,7 @@ from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.boundary_arguments import boundary_of
 
 CONTEXT = ("hit_angle", "hit_speed")  # dataset columns that plans keep
-ASKED = (*CONDITIONS, "sample_id", OBSTACLE_POSES, *CONTEXT)
+ASKED = (*CONDITIONS, "sample_id", OBSTACLE_POSES, GOAL_OPTION, *CONTEXT)
 _OF_SHARDS = ("specification_fingerprint", "recipe_sha256", "first_sample_id", "rows")
 SAID = (*ATTRIBUTES, *_OF_SHARDS)  # attributes
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, UsageError, lacks
 from cnpgen.plans.boundary_file import CONTEXT, read_boundary_file
-from cnpgen.plans.format import OBSTACLE_POSES
+from cnpgen.plans.format import GOAL_OPTION, OBSTACLE_POSES
 from cnpgen.plans.plan_file import agreed_problem
 from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.problems.problem import Problem
@@ -137,7 +137,7 @@ def plans_of_rows(problem: ProblemRecord, columns: Mapping[str, NDArray[Any]], *
     """
     spec = problem.trajectory
     rows, n = columns["start_q"].shape
-    kept = ("start_xyz", "goal_xyz", OBSTACLE_POSES, *CONTEXT)
+    kept = ("start_xyz", "goal_xyz", OBSTACLE_POSES, GOAL_OPTION, *CONTEXT)
     points, rates = spec.path_control_points, spec.rate_control_points
     path, rate = (columns.get(f"{part}_control_points", np.array(np.nan)) for part in ("path", "rate"))
     return make_plans(

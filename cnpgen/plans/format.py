@@ -21,6 +21,7 @@ NOTES = ("source", "refined_with")
 ATTRIBUTES = ("format", "format_version", "degree", "problem", "problem_recipe", "problem_urdf", "problem_sha256")
 
 OBSTACLE_POSES = "obstacle_poses"  # column with the obstacles of every plan, instead of the problem's
+GOAL_OPTION = "goal_option"  # column with the number of a goal state among those of one sample_id, the nearest first
 
 UNITS = {"q": "rad", "dq": "rad/s", "ddq": "rad/s^2", "jerk": "rad/s^3"}  # for revolute joints
 MIN_SIMILARITY = 0.8  # similarity ratio of names from which one is treated as a misspelling of the other
@@ -35,6 +36,7 @@ _OTHERS = (
     Field("refine_objective", "s", "what was minimised: time and what is added to it", role="diagnostic"),
     Field("hit_angle", "rad", "direction of the hit about world z, from world x", role="context", frame="world"),
     Field(OBSTACLE_POSES, "m", "poses and sizes of the obstacles", role="context", frame="world"),
+    Field(GOAL_OPTION, "1", "number of the goal state among those of its task", role="context"),
     Field("hit_speed", "m/s", "speed of the tip along the hit at the goal", role="context", frame="world"),
 )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -27,7 +28,7 @@ from cnpgen.schema.arguments import numbers
 from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]
-Capacity = Mapping[str, int]  # kind -> number of obstacles
+Capacity = Mapping[str, int]  # kind, or corners of a mesh -> number of obstacles
 
 OBSTACLES_PER_STEP = 4  # capacities are multiples of it, so that scenes share compiled kernels
 JOINT_TOLERANCE_RAD = 1e-3  # outside a limit, which rounding of files to float32 may cause
@@ -35,10 +36,19 @@ _PARKED_ROTATION = (0.1, 0.1, 0.1)  # any rotation: boxes of scenes have rotatio
 
 
 def capacity_of(scenes: Sequence[SceneProblem]) -> dict[str, int]:
-    """Return the numbers of obstacles of each kind that hold every scene, rounded up to ``OBSTACLES_PER_STEP``."""
-    counts = [Counter(obstacle.kind for obstacle in scene.obstacles) for scene in scenes]
-    most = {kind: max((count[kind] for count in counts), default=0) for kind in KINDS}
-    return {kind: -(-count // OBSTACLES_PER_STEP) * OBSTACLES_PER_STEP for kind, count in most.items() if count}
+    """Return the numbers of obstacles of each shape that hold every scene.
+
+    The shape is a kind, or the corners of a mesh. Numbers of kinds are rounded up to ``OBSTACLES_PER_STEP``.
+    """
+    counts = [Counter(map(_shape, scene.obstacles)) for scene in scenes]
+    meshes = sorted({shape for count in counts for shape in count} - set(KINDS))
+    most = {shape: max((count[shape] for count in counts), default=0) for shape in (*KINDS, *meshes)}
+    steps = {shape: OBSTACLES_PER_STEP if shape in KINDS else 1 for shape in most}
+    return {shape: -(-count // steps[shape]) * steps[shape] for shape, count in most.items() if count}
+
+
+def _shape(obstacle: Obstacle) -> str:
+    return obstacle.mesh or obstacle.kind
 
 
 def with_capacity(problem: Problem, capacity: Capacity) -> Problem:
@@ -56,11 +66,15 @@ def with_capacity(problem: Problem, capacity: Capacity) -> Problem:
             f"the problem {problem.name!r} has no constraint robot-clearance: obstacles would be ignored",
             concerns="problem",
         )
-    parked = [_parked(kind, index) for kind in KINDS for index in range(1, capacity.get(kind, 0) + 1)]
-    return replace(problem, obstacle=(*problem.obstacle, *parked))
+    shapes = [*KINDS, *sorted(capacity.keys() - set(KINDS))]
+    parked = [_parked(shape, index) for shape in shapes for index in range(1, capacity.get(shape, 0) + 1)]
+    return problem.with_obstacles((*problem.obstacle, *parked))
 
 
 def _parked(kind: str, index: int) -> Obstacle:
+    if kind not in KINDS:
+        name = f"mesh {hashlib.sha256(kind.encode()).hexdigest()[:8]} {index}"
+        return Obstacle(name=name, kind="mesh", mesh=kind, position=PARKED_POSITION_M, rotation=_PARKED_ROTATION)
     name, small = f"{kind} {index}", 0.01
     if kind == "box":
         return Obstacle(name=name, kind=kind, position=PARKED_POSITION_M, size=(small,) * 3, rotation=_PARKED_ROTATION)
@@ -157,18 +171,18 @@ def joint_order(scene: SceneProblem, robot: Robot, states: Array, end: str) -> A
 def _obstacle_poses(problem: Problem, fixed: int, scene: SceneProblem) -> Array:
     """Return the poses and sizes of the problem's own obstacles and those of a scene, shape (width,)."""
     numbers, slices = place_obstacles(problem.obstacle), number_slices(problem.obstacle)
-    free = {kind: [i for i, item in enumerate(problem.obstacle) if i >= fixed and item.kind == kind] for kind in KINDS}
-    primitives = primitives_of(scene.obstacles, place_obstacles(scene.obstacles))
-    for index, obstacle in enumerate(scene.obstacles):
-        if not free[obstacle.kind]:
+    free: dict[str, list[int]] = {}
+    for index, obstacle in enumerate(problem.obstacle[fixed:], fixed):
+        free.setdefault(_shape(obstacle), []).append(index)
+    for obstacle in scene.obstacles:
+        if not free.get(_shape(obstacle)):
             text = f"{scene.place} has more obstacles of the kind {obstacle.kind} than the capacity"
             raise UsageError(text, concerns="capacity")
-        part = slices[free[obstacle.kind].pop(0)]
+        own, part = place_obstacles([obstacle]), slices[free[_shape(obstacle)].pop(0)]
         if obstacle.kind == "box":
-            rotation = primitives.rotations[index].ravel()
-            numbers[part] = [*primitives.centers[index], *primitives.sizes[index], *rotation]
-        else:
-            numbers[part] = place_obstacles([obstacle])
+            box = primitives_of([obstacle], own)
+            own = np.concatenate([box.centers[0], box.sizes[0], box.rotations[0].ravel()])
+        numbers[part] = own
     return numbers
 
 

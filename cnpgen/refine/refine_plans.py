@@ -5,94 +5,36 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import counted
 from cnpgen.machine.engine import Engine, assembled
 from cnpgen.machine.threads import one_thread
-from cnpgen.machine.times import NO_TIME, Stopwatch, Times
+from cnpgen.machine.times import Stopwatch
 from cnpgen.machine.versions import __version__
-from cnpgen.plans.format import OBSTACLE_POSES
+from cnpgen.plans.format import GOAL_OPTION, OBSTACLE_POSES
 from cnpgen.plans.plans import Plans, screen
 from cnpgen.plans.status import PlanStatus
 from cnpgen.plans.tips import correct_tips
+from cnpgen.refine.goal_options import refine_goal_options
 from cnpgen.refine.options import DEFAULT_OPTIONS, RefineOptions
 from cnpgen.refine.refine_engine import prepare, refine_serially
+from cnpgen.refine.refinement import Refinement
 from cnpgen.refine.refinement_journal import Journal, open_journal
 from cnpgen.refine.task import Attempt, Outcome
 from cnpgen.schema.argument_types import checked_arguments
 
-REFINEMENT_FORMAT = "cnpgen-refinement"
-REFINEMENT_VERSION = 1
 MAX_SERIAL_PLANS = 60  # up to which the start of a second process takes longer than the plans
 PLANS_PER_TASK = 4  # of one of several processes: the transfer of a task takes a twentieth of a plan's time
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]  # called with plans finished and valid since the last call
-
-
-@dataclass(frozen=True, eq=False)
-class Refinement:
-    """Result of refining N plans.
-
-    Attributes:
-        input_plans: Input plans, with the tip positions of their boundary conditions.
-        plans: Refined plans, in the same order.
-        results: Best attempt at every plan with its verdict, outcome, iterations and cost.
-        times: Times of the run; plans from a journal took none.
-    """
-
-    input_plans: Plans
-    plans: Plans
-    results: tuple[Attempt, ...]
-    times: Times = NO_TIME
-
-    def __repr__(self) -> str:
-        outcomes = _counted(result.outcome.name.lower() for result in self.results)
-        counts = ", ".join(f"{count:,} {name}" for name, count in outcomes.items())
-        plans = f"{counted(len(self.results), 'plan')} of {self.plans.problem.name!r}"
-        return f"<{plans} refined, {int(self.valid.sum()):,} valid{counts and ': '}{counts}>"
-
-    @property
-    def valid(self) -> NDArray[np.bool_]:
-        """Mask of the plans that the independent verdict accepts, shape (N,)."""
-        return np.array([result.valid for result in self.results], bool)
-
-    def summary(self) -> dict[str, Any]:
-        """Return a summary of all plans for JSON."""
-        durations = self.plans.duration[self.valid]
-        iterations = [result.iterations for result in self.results]
-        return {
-            "format": REFINEMENT_FORMAT,
-            "format_version": REFINEMENT_VERSION,
-            "checksum": self.input_plans.checksum,
-            "plans": len(self.results),
-            "valid": int(self.valid.sum()),
-            "outcomes": _counted(result.outcome.name.lower() for result in self.results),
-            "reasons": _counted(str(result.reason) for result in self.results if not result.valid),
-            "mean_duration_s": float(durations.mean()) if len(durations) else None,
-            "median_iterations": float(np.median(iterations)) if iterations else None,
-            "seconds": self.times.rounded(),
-            "not_valid": [
-                {
-                    "plan": index,
-                    "sample_id": int(sample),
-                    "reason": str(result.reason),
-                    "outcome": result.outcome.text,
-                }
-                for index, (sample, result) in enumerate(zip(self.plans.sample_id, self.results, strict=True))
-                if not result.valid
-            ],
-        }
 
 
 @checked_arguments
@@ -109,6 +51,9 @@ def solve_plans(
     progress: Progress | None = None,
 ) -> Refinement:
     """Plan boundary problems without initial guesses; existing plans are ignored.
+
+    Problems with the column ``goal_option`` are goal states of tasks: rows with the same ``sample_id`` belong to one
+    task, and the result has the best valid motion to any of its goal states, one row for each task.
 
     Args:
         problems: Boundary problems of ``draw_boundary_problems`` or ``load_boundary_problems``.
@@ -131,17 +76,10 @@ def solve_plans(
         path_control_points=np.full_like(problems.path_control_points, np.nan),
         rate_control_points=np.full_like(problems.rate_control_points, np.nan),
     )
-    return refine_plans(
-        without_plans,
-        options=options,
-        workers=workers,
-        engine=engine,
-        address=address,
-        journal=journal,
-        discard=discard,
-        begin=begin,
-        progress=progress,
-    )
+    run = partial(refine_plans, options=options, workers=workers, engine=engine, address=address, discard=discard)
+    if GOAL_OPTION in problems.columns and len(problems):
+        return refine_goal_options(without_plans, run, journal=journal, begin=begin, progress=progress)
+    return run(without_plans, journal=journal, begin=begin, progress=progress)
 
 
 @checked_arguments
@@ -266,10 +204,6 @@ def _columns(results: list[Attempt]) -> Mapping[str, Array]:
         "refine_iterations": np.array([result.iterations for result in results], float),
         "refine_objective": np.array([result.cost for result in results], float),
     }
-
-
-def _counted(words: Iterator[str]) -> dict[str, int]:
-    return {str(word): count for word, count in Counter(words).most_common()}
 
 
 def _identity(plans: Plans, options: RefineOptions) -> str:

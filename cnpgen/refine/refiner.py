@@ -195,9 +195,33 @@ class Refiner:
             result = self._separated(task, level, result)
         return self.measured(task, result.x, outcome, result.iterations)
 
-    def _separated(self, task: RefinementTask, level: GridLevel, result: Result) -> Result:
+    def fed_back(
+        self, task: RefinementTask, attempt: Attempt, phase: float, depth: float, extra: Array | None
+    ) -> tuple[Attempt, Array] | None:
+        """Continue an attempt that the verdict rejected for a collision at a phase with a depth [m].
+
+        Args:
+            task: The task.
+            attempt: The attempt.
+            phase: Phase of the collision.
+            depth: Its depth [m].
+            extra: Additional distances of earlier collisions [m], shape (K, columns), or None.
+
+        Returns:
+            The result with larger required distances there, and all additional distances; None without compiled hulls.
+        """
+        if not self.measures_hulls:
+            return None
+        level, path = self.levels.warm, attempt.path
+        more = self._feedback(level).clearance_at(path, self.hulls, task.scene.poses[0], phase=phase, depth=depth)
+        extra = more if extra is None else extra + more
+        result = self.run_level(task, level, attempt.variables, extra=extra)
+        result = self._separated(task, level, result, extra)
+        return self.measured(task, result.x, Outcome.SOLVED_FINE, result.iterations), extra
+
+    def _separated(self, task: RefinementTask, level: GridLevel, result: Result, extra: Array | None = None) -> Result:
         """Run a level again with larger required distances where hulls collide between its grid points."""
-        feedback, motion, extra = self._feedback(level), self.transcription(task, level), None
+        feedback, motion = self._feedback(level), self.transcription(task, level)
         for _ in range(MAX_FEEDBACKS):
             path, _ = motion.unpack(result.x)
             missing = feedback.missing_clearance(path, self.hulls, task.scene.poses[0])

@@ -10,8 +10,9 @@ The next attempt is made only if no earlier one was accepted. Attempts in their 
    search these paths, they come right after step 2, whose finer levels run only for nearly valid attempts.
 
 Acceptance (``RefinementSearch``): the independent verdict decides, never the solver's own residuals. The first valid
-plan is returned if it is precise; otherwise one more attempt is judged. The result is never worse than the input plan:
-it replaces the input only if the verdict finds a smaller violation, or none and a lower cost.
+plan is returned if it is precise; otherwise one more attempt is judged. If the verdict rejects an attempt for a shallow
+collision of hulls, the solver continues it with a constraint at the phase that the verdict names. The result is never
+worse than the input plan: it replaces it only if the verdict finds a smaller violation, or none and a lower cost.
 """
 
 import time
@@ -24,12 +25,15 @@ from numpy.typing import NDArray
 
 from cnpgen.judges.plans.judge import Judge
 from cnpgen.judges.plans.verdict import Reason, Verdict
+from cnpgen.problems.constraints.clearance import RobotClearance
+from cnpgen.problems.constraints.self_clearance import SelfClearance
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.grid_levels import MAX_INITIAL_VIOLATION
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.rrt_connect import find_paths
 from cnpgen.refine.solver.bounds import PRECISE_FRACTION
 from cnpgen.refine.solver.deadline import Deadline
+from cnpgen.refine.solver.hull_feedback import MAX_FED_BACK_M
 from cnpgen.refine.solver.hulls import Hulls, has_clearance_constraints
 from cnpgen.refine.solver.sqp import Result
 from cnpgen.refine.task import Attempt, Outcome, RefinementTask
@@ -50,7 +54,10 @@ MIN_END_PENETRATION_M = 1e-5  # of an end: smaller ones may be rounding errors
 MAX_LINE_PENETRATION_M = 0.05  # of the initial line, above which joint-space paths come first
 NEARLY_VALID = 30.0  # tolerances; attempts with larger violations are left for joint-space paths
 MAX_JUDGED_VIOLATION = 3.0  # tolerances on the fine grid; attempts with larger ones are judged only without better ones
+MAX_FEEDBACKS = 3  # of collisions of one attempt from the verdict to the solver
+FEEDBACK_GROWTH = 3.0  # of the added distance, from one of them to the next: an edge may pass between grid points
 MAX_ROUNDING_ERROR = 1e-12  # rad and 1/s: smaller differences are rounding errors
+COLLISION_REASONS = {RobotClearance.reason, SelfClearance.reason}
 INPUT_OUTCOMES = {Outcome.UNCHANGED, Outcome.ADJUSTED}
 VERDICT_TIME_S = 5e-3  # of a verdict, before one was timed
 
@@ -261,11 +268,14 @@ def _around_obstacles(refiner: Refiner, task: RefinementTask, best: Attempt, hul
     if _ends_penetrate(task, hulls):
         return
     if refiner.measures_hulls:
+        found_path = False
         for guess in _path_guesses(refiner, task, hulls):
-            attempt = _along_path(refiner, task, guess)
+            found_path, attempt = True, _along_path(refiner, task, guess)
             yield attempt
             if attempt.violation <= MAX_JUDGED_VIOLATION:
                 yield refiner.solve(task, refiner.levels.strict, attempt.variables, Outcome.RESTARTED)
+        if not found_path:
+            yield replace(best, outcome=Outcome.NO_PATH, iterations=0)
         return
     positions = refiner.check.transcription(task).positions(best.variables)
     best_first = hulls.max_penetration(positions, task.scene.poses[0]) < MAX_PENETRATION_M
@@ -303,7 +313,8 @@ def _path_guesses(refiner: Refiner, task: RefinementTask, hulls: Hulls | None = 
 def _along_path(refiner: Refiner, task: RefinementTask, guess: Attempt) -> Attempt:
     """Optimize a motion along a joint-space path: with a high penalty of violations first, then as usual."""
     best = refiner.solve(task, refiner.levels.path, guess.variables, Outcome.RESTARTED)
-    if best.violation <= 1:
+    same_level = refiner.levels.path is refiner.levels.warm and best.outcome is not Outcome.TIME_SCALED
+    if best.violation <= 1 and not same_level:
         again = refiner.solve(task, refiner.levels.warm, best.variables, Outcome.RESTARTED)
         best = _continue_scaled(refiner, task, again if again.is_better(best) else best)
     return replace(best, outcome=Outcome.RESTARTED)
@@ -347,6 +358,8 @@ class RefinementSearch:
         iterations: Iterations of all attempts so far.
         judged: Judged attempts.
         skipped: Attempts with violations above ``MAX_JUDGED_VIOLATION``.
+        verdict: Last verdict.
+        found_no_path: Whether trees searched paths among the obstacles in vain.
     """
 
     refiner: Refiner
@@ -355,16 +368,40 @@ class RefinementSearch:
     iterations: int = 0
     judged: list[Attempt] = field(default_factory=list)
     skipped: list[Attempt] = field(default_factory=list)
+    verdict: Verdict | None = None
+    found_no_path: bool = False
 
     def add(self, attempt: Attempt) -> bool:
         """Judge an attempt; return whether the search ends: it is valid and precise, or an earlier one is valid."""
         self.iterations += attempt.iterations
+        self.found_no_path |= attempt.outcome is Outcome.NO_PATH
         found_valid = any(earlier.valid for earlier in self.judged)
         if attempt.violation > MAX_JUDGED_VIOLATION:
             self.skipped.append(attempt)
             return found_valid
         self.judged.append(self._judge_attempt(attempt))
         return found_valid or (self.judged[-1].valid and self.judged[-1].is_precise)
+
+    def continue_rejected(self, attempt: Attempt) -> bool:
+        """Continue an attempt whose verdict names a shallow collision; return whether the search ends.
+
+        The collision becomes a constraint at its phase.
+        """
+        extra: Array | None = None
+        for earlier in range(MAX_FEEDBACKS):
+            margin = None if self.verdict is None else self.verdict.worst
+            if margin is None or margin.reason not in COLLISION_REASONS or attempt.violation > MAX_JUDGED_VIOLATION:
+                break
+            if not 0 < margin.violation < MAX_FED_BACK_M:
+                break
+            depth = margin.violation * FEEDBACK_GROWTH**earlier
+            following = self.refiner.fed_back(self.task, attempt, margin.phase, depth, extra)
+            if following is None or following[0].violation > MAX_JUDGED_VIOLATION:
+                break
+            attempt, extra = following
+            if self.add(attempt):
+                return True
+        return False
 
     def best(self) -> Attempt:
         """Return the best attempt."""
@@ -391,7 +428,7 @@ class RefinementSearch:
 
     def judge(self, plan: Attempt) -> Attempt:
         """Return a plan with its verdict."""
-        verdict = self.checker.verdict(self.task, plan.path, plan.rate)
+        verdict = self.verdict = self.checker.verdict(self.task, plan.path, plan.rate)
         keeps_outcome = verdict.valid or plan.outcome in INPUT_OUTCOMES
         return replace(
             plan,
@@ -427,7 +464,7 @@ def refine_task(refiner: Refiner, checker: PlanChecker, task: RefinementTask) ->
         return _invalid_input(refiner, task)
     search, x = RefinementSearch(refiner, checker, task), refiner.input_variables(task)
     for attempt in make_attempts(refiner, task, x):
-        if search.add(attempt):
+        if search.add(attempt) or search.continue_rejected(attempt):
             break
     best = search.best()
     for path, rate, outcome in () if search.costs_less_than_input(best, x) else _input_plans(refiner, task, x):
@@ -437,7 +474,8 @@ def refine_task(refiner: Refiner, checker: PlanChecker, task: RefinementTask) ->
             best = min(best, judged, key=lambda attempt: attempt.rank)
             if judged.valid:
                 break
-    return best.result(search.iterations)
+    no_path = search.found_no_path and best.outcome is Outcome.UNSOLVED
+    return best.result(search.iterations, Outcome.NO_PATH if no_path else None)
 
 
 @np.errstate(all="ignore")  # see ``refine_task``

@@ -29,6 +29,7 @@ class Outcome(IntEnum):
     ADJUSTED = 7
     NOT_CONVERGED = 8
     OUT_OF_TIME = 9
+    NO_PATH = 10
 
     @property
     def text(self) -> str:
@@ -43,6 +44,7 @@ class Outcome(IntEnum):
             Outcome.ADJUSTED: "input plan returned with exact boundary conditions and positive rates",
             Outcome.NOT_CONVERGED: "valid, but the objective still decreased at the iteration limit",
             Outcome.OUT_OF_TIME: "the best plan until the deadline; more time may give a better one",
+            Outcome.NO_PATH: "no path among the obstacles was found by the trees; this is the best attempt",
             Outcome.INVALID_INPUT: "the boundary conditions are not finite",
         }[self]
 

@@ -1,9 +1,10 @@
 """Inverse kinematics of tip poses for many seeds at once: damped Gauss-Newton steps within the joint limits.
 
 The damping follows the error (Levenberg-Marquardt; Sugihara 2011). The tip may be another frame that the same joint
-carries.
+carries. With tolerances, every step aims for the nearest pose within them, and directions without an error are free.
 """
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,6 +25,45 @@ METERS_PER_RADIAN = 0.3  # weight of an angle against a distance
 POSE_DAMPING = 1e-3  # relative to the squared error
 POSE_POSITION_TOLERANCE_M = 1e-6
 POSE_ROTATION_TOLERANCE_RAD = 1e-6
+TOLERANCE_INSET = 1e-5  # m and rad, from the end of a tolerance, so that solutions are within it
+
+
+@dataclass(frozen=True, eq=False)
+class PoseTolerance:
+    """Tolerances of K poses along and about the axes of the wanted poses.
+
+    Attributes:
+        position: Accepted displacements along the axes [m], shape (K, 3).
+        rotation: Accepted components of the rotation vector [rad], shape (K, 3); about an axis with pi or more any
+            rotation is accepted.
+    """
+
+    position: Array
+    rotation: Array
+
+    def nearest(
+        self, positions: Array, rotations: Array, at: tuple[Array, Array]
+    ) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """Return the nearest poses within the tolerances.
+
+        Args:
+            positions: Wanted positions [m], shape (K, 3).
+            rotations: Wanted rotation matrices, shape (K, 3, 3).
+            at: Present positions and rotation matrices.
+
+        Returns:
+            Positions; rotation matrices; and the mask of the three displacements and three rotations that are within
+            their tolerances, shape (K, 6).
+        """
+        back = rotations.swapaxes(1, 2)
+        shift = (back @ (at[0] - positions)[..., None])[..., 0]
+        turn = rotation_vectors(back @ at[1])
+        error = np.concatenate([shift, turn], axis=1)
+        limit = np.concatenate([self.position, np.where(self.rotation >= np.pi, np.inf, self.rotation)], axis=1)
+        inner = np.maximum(limit - TOLERANCE_INSET, 0.0)
+        nearest = np.clip(error, -inner, inner)
+        place = positions + (rotations @ nearest[:, :3, None])[..., 0]
+        return place, rotations @ rotation_matrices(nearest[:, 3:]), (error == nearest) & (limit > 0)
 
 
 class PoseKinematics:
@@ -72,7 +112,12 @@ def _motion(model: "pin.Model", joint: int) -> Array:
 
 
 def solve_pose_ik(
-    kinematics: PoseKinematics, positions: Array, rotations: Array, seeds: Array
+    kinematics: PoseKinematics,
+    positions: Array,
+    rotations: Array,
+    seeds: Array,
+    *,
+    tolerance: PoseTolerance | None = None,
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Search joint positions with given poses, one for each seed.
 
@@ -81,6 +126,7 @@ def solve_pose_ik(
         positions: Wanted positions [m], shape (K, 3).
         rotations: Wanted rotation matrices, shape (K, 3, 3).
         seeds: Joint positions at which the iteration starts [rad], shape (n, K).
+        tolerance: Accepted differences from the poses; by default none.
 
     Returns:
         Joint positions within their limits [rad], shape (n, K), and the mask of those that have their pose, shape (K,).
@@ -90,19 +136,42 @@ def solve_pose_ik(
     q = np.clip(seeds, low, high)
     for step in range(MAX_POSE_STEPS + 1):
         position, rotation, J = kinematics.evaluate(q)
-        shift, turn = positions - position, rotation_vectors(rotations @ rotation.swapaxes(1, 2))
+        place, facing, free = positions, rotations, None
+        if tolerance is not None:
+            place, facing, free = tolerance.nearest(positions, rotations, (position, rotation))
+        shift, turn = place - position, rotation_vectors(facing @ rotation.swapaxes(1, 2))
         met = np.linalg.norm(shift, axis=1) <= POSE_POSITION_TOLERANCE_M
         met &= np.linalg.norm(turn, axis=1) <= POSE_ROTATION_TOLERANCE_RAD
         if step == MAX_POSE_STEPS or met.all():
             break
         error = np.concatenate([shift, METERS_PER_RADIAN * turn], axis=1)
         J = J * np.repeat([1.0, METERS_PER_RADIAN], 3)[:, None]
+        if free is not None:
+            error, J = _without_free(error, J, rotations, free)
         damping = POSE_DAMPING * np.square(error).sum(axis=1) + 1e-9
         square = J @ J.swapaxes(1, 2) + damping[:, None, None] * np.eye(6)
         move = (J.swapaxes(1, 2) @ np.linalg.solve(square, error[..., None]))[..., 0].T
         move *= np.minimum(1.0, MAX_POSE_STEP_RAD / np.maximum(np.abs(move).max(axis=0), 1e-12))
         q = np.where(met, q, np.clip(q + move, low, high))
     return q, met
+
+
+def _without_free(error: Array, J: Array, rotations: Array, free: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Return errors (K, 6) and Jacobians in the axes of the wanted poses, zero in free directions (K, 6)."""
+    back, count = rotations.swapaxes(1, 2)[:, None], len(error)
+    turned = (back @ error.reshape(count, 2, 3, 1)).reshape(count, 6)
+    rows = (back @ J.reshape(count, 2, 3, -1)).reshape(J.shape)
+    return np.where(free, 0.0, turned), np.where(free[..., None], 0.0, rows)
+
+
+def rotation_matrices(vectors: Array) -> Array:
+    """Return the rotation matrices of rotation vectors [rad], shape (K, 3, 3) (Rodrigues' formula)."""
+    angle = np.linalg.norm(vectors, axis=1)[:, None, None]
+    x, y, z = vectors.T
+    zero = np.zeros_like(x)
+    cross = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
+    half = np.sinc(angle / (2 * np.pi))  # sin(angle / 2) / (angle / 2)
+    return np.asarray(np.eye(3) + np.sinc(angle / np.pi) * cross + half**2 / 2 * cross @ cross)
 
 
 def rotation_vectors(rotations: Array) -> Array:

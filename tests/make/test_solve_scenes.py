@@ -11,6 +11,7 @@ from cnpgen.cli.main import main
 from cnpgen.errors import UsageError
 from cnpgen.plans.scene_plans import capacity_of
 from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.scenes.scene_problem import make_mesh
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.solid import place_obstacles, solids_of
 from cnpgen.scenes import GoalPose, SceneError, SceneProblem, load_scenes, save_scenes, scene_plans, solve_scenes
@@ -28,6 +29,8 @@ START, GOAL = np.array([-0.9, -0.5, 0.9, 0.0]), np.array([0.9, -0.5, 0.9, 0.0])
 POST = Obstacle(name="post", kind="cylinder", position=(0.6, 0.0, 0.25), radius=0.04, length=0.5)
 BOARD = Obstacle(name="board", kind="box", position=(0.0, 0.8, 0.4), size=(1.0, 0.05, 0.8), rotation=(0.0, 0.0, 0.2))
 BALL = Obstacle(name="ball", kind="sphere", position=(-0.5, -0.3, 0.5), radius=0.1)
+CORNERS = np.array([[-0.1, -0.1, 0.0], [0.1, -0.1, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.5]])
+WEDGE = make_mesh("wedge", CORNERS, np.array([0.6, 0.0, 0.0]), np.eye(3), place="")
 SCENES = [
     SceneProblem(name="post", obstacles=(POST,), start_q=START, goal_q=GOAL[None]),
     SceneProblem(name="all", obstacles=(BALL, BOARD, POST), start_q=START, goal_q=GOAL[None]),
@@ -90,8 +93,11 @@ def test_scenes_are_solved_and_judged(crane: Path, tmp_path: Path) -> None:
     inside = replace(SCENES[0], name="inside", goal_q=np.array([[0.0, -0.5, 0.9, 0.0]]))
     several = replace(SCENES[0], name="several", goal_q=np.array([inside.goal_q[0], GOAL, START + 0.1]))
     posed = replace(SCENES[0], name="posed", goal_q=np.zeros((0, 4)), goal_pose=pose)
-    solved = solve_scenes(problem, [SCENES[0], inside, several, posed], workers=1)
-    assert solved.valid.tolist() == [True, False, True, True]
+    meshed = replace(SCENES[1], name="meshed", obstacles=(WEDGE, BALL))
+    solved = solve_scenes(problem, [SCENES[0], inside, several, posed, meshed], workers=1)
+    assert solved.valid.tolist() == [True, False, True, True, True]
+    (wedge,) = [body for body in solved.plans.scene.bodies(4) if len(body.corners) == 4 and body.position[2] > -10]
+    assert wedge.low[:2] == pytest.approx([0.5, -0.1])
     assert cnpgen.evaluate_plans(solved.plans, workers=1).valid.tolist() == solved.valid.tolist()
     assert solved.plans.boundary.goal_q[2] == pytest.approx(START + 0.1)  # the nearest goal that is free
     reached, turned, _ = PoseKinematics(robot).evaluate(solved.plans.boundary.goal_q[3][:, None])

@@ -17,7 +17,8 @@ from cnpgen.refine import initial_guesses, strategy
 from cnpgen.refine.grid_levels import GridLevel
 from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.refine_engine import load_refiner, prepare, tasks_of
-from cnpgen.refine.refine_plans import Refinement, refine_plans, solve_plans
+from cnpgen.refine.refine_plans import refine_plans, solve_plans
+from cnpgen.refine.refinement import Refinement
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.solver import compiled_backend, qp_subproblem, sqp
 from cnpgen.refine.solver.bounds import INTERVAL_FRACTION, Bounds

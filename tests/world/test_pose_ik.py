@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.robots.robot import Robot
-from cnpgen.world.pose_ik import PoseKinematics, rotation_vectors, solve_pose_ik
+from cnpgen.world.pose_ik import PoseKinematics, PoseTolerance, rotation_matrices, rotation_vectors, solve_pose_ik
 
 
 @pytest.fixture(scope="module")
@@ -21,6 +21,7 @@ def test_rotation_vectors_agree_with_scipy() -> None:
     small = Rotation.from_rotvec(1e-12 * np.eye(3))
     for each in (rotations, small):
         assert rotation_vectors(each.as_matrix()) == pytest.approx(each.as_rotvec(), abs=1e-9)
+        assert rotation_matrices(each.as_rotvec()) == pytest.approx(each.as_matrix(), abs=1e-12)
 
 
 def test_poses_and_jacobians_are_pinocchios(robot: Robot) -> None:
@@ -58,3 +59,23 @@ def test_unreachable_poses_are_not_reported_as_met(robot: Robot) -> None:
     seeds = np.zeros((robot.n, 4))
     _, met = solve_pose_ik(PoseKinematics(robot), np.full((4, 3), 3.0), np.repeat(np.eye(3)[None], 4, axis=0), seeds)
     assert not met.any()
+
+
+def test_tolerances_and_free_axes_accept_more_poses(robot: Robot) -> None:
+    random, count = np.random.default_rng(3), 64
+    kinematics, span = PoseKinematics(robot), robot.position_upper - robot.position_lower
+    goal = robot.position_lower + span * random.uniform(0.2, 0.8, robot.n)
+    positions, rotations, _ = kinematics.evaluate(np.repeat(goal[:, None], count, axis=1))
+    seeds = robot.position_lower[:, None] + span[:, None] * random.uniform(size=(robot.n, count))
+    limits = np.array([[0.02, 0.0, 0.1], [0.0, 0.3, np.pi]])
+    tolerance = PoseTolerance(*np.repeat(limits[:, None], count, axis=1))
+    q, met = solve_pose_ik(kinematics, positions, rotations, seeds, tolerance=tolerance)
+    reached, turned, _ = kinematics.evaluate(q)
+    back = Rotation.from_matrix(rotations).inv()
+    shift = np.abs(back.apply(reached - positions))[met]
+    turn = np.abs((back * Rotation.from_matrix(turned)).as_rotvec())[met]
+    assert met.sum() > solve_pose_ik(kinematics, positions, rotations, seeds)[1].sum()
+    assert (shift <= limits[0] + 1e-6).all()
+    assert (turn <= limits[1] + 1e-6).all()
+    assert turn[:, 2].max() > 0.35  # any rotation about z
+    assert shift[:, 0].max() > 0.01

@@ -2,6 +2,8 @@
 another kernel; collision.c precedes this file. They have the interface of compiled kernels (arrays.h). Their context is set
 before, for each thread. */
 
+#define FAR_RESIDUAL 100.0 /* of columns beyond the measured range: solvers select only residuals near their bounds */
+
 typedef struct {
   kernel *values, *jacobian; /* of the other rows: w, poses -> g, d(g)/d(w) column by column */
   const robot_scene *scene;
@@ -37,14 +39,14 @@ static double rate(const robot_scene *s, const memory *m, long j, const double *
   return dot(speed, normal);
 }
 
-/* Distances of all columns at one state, divided by the scale, and their gradients (columns, n) unless null. */
+/* Distances of all columns at one state, divided by the scale, and unless null the gradients (columns, n) of those within the
+range. */
 static void measure_columns(const row_context *c, const double *q, double *values, double *gradients) {
   const robot_scene *s = c->scene;
   long n = s->n;
   int finite = 1;
   for (long j = 0; j < n; j++) finite &= isfinite(q[j]);
-  for (long i = 0; i < c->columns; i++) values[i] = finite ? (c->required[i] + c->range) / c->scale : NAN;
-  if (gradients) memset(gradients, 0, c->columns * n * sizeof(double));
+  for (long i = 0; i < c->columns; i++) values[i] = finite ? FAR_RESIDUAL : NAN;
   if (!finite) return;
   double *distance = c->scratch, *normal = distance + c->capacity, *points = normal + 3 * c->capacity;
   long *pair = (long *)(points + 6 * c->capacity), *k = pair + c->capacity;
@@ -58,7 +60,7 @@ static void measure_columns(const row_context *c, const double *q, double *value
     for (long i = 0; i < list.count && i < c->capacity; i++) {
       long column = group ? c->pair_column[pair[i]] : c->obstacle_column[pair[i]], first = 0, second;
       double value = distance[i] / c->scale;
-      if (!(value < values[column])) continue;
+      if (!(value < values[column]) || value * c->scale >= c->required[column] + c->range) continue;
       values[column] = value;
       if (!gradients) continue;
       if (group) first = s->parts[s->pairs[2 * pair[i]]].frame, second = s->parts[s->pairs[2 * pair[i] + 1]].frame;
@@ -76,13 +78,15 @@ static void append_columns(long points, const double *const *in, const long *str
   const row_context *c = current;
   long n = c->scene->n, rows = c->rows + c->columns;
   double *values = c->scratch + 12 * c->capacity, *gradients = jacobian ? values + c->columns : 0, q[64];
+  for (long j = 0; jacobian && j < c->width; j++)
+    memset(jacobian + (j * rows + c->rows) * points, 0, c->columns * points * sizeof(double));
   for (long k = 0; k < points; k++) {
     for (long j = 0; j < n; j++) q[j] = in[0][j * strides[0] + k];
     measure_columns(c, q, values, gradients);
     for (long i = 0; i < c->columns; i++) {
       g[(c->rows + i) * points + k] = values[i];
-      for (long j = 0; jacobian && j < c->width; j++)
-        jacobian[(j * rows + c->rows + i) * points + k] = j < n ? gradients[i * n + j] : 0.0;
+      if (!jacobian || !(values[i] < FAR_RESIDUAL)) continue;
+      for (long j = 0; j < n; j++) jacobian[(j * rows + c->rows + i) * points + k] = gradients[i * n + j];
     }
   }
 }

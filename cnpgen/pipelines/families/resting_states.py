@@ -15,7 +15,7 @@ from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.solid import Solid, place_obstacles, solids_of
 from cnpgen.world.forward_kinematics import ForwardKinematics
-from cnpgen.world.pose_ik import PoseKinematics, solve_pose_ik
+from cnpgen.world.pose_ik import PoseKinematics, PoseTolerance, solve_pose_ik
 from cnpgen.world.rigid_bodies import RigidBodies
 
 Array = NDArray[np.float64]
@@ -100,6 +100,7 @@ def pose_states(
     random: np.random.Generator,
     *,
     margin: float = 0.0,
+    tolerance: PoseTolerance | None = None,
 ) -> Array:
     """Return collision-free joint positions with given poses [rad], shape (G, n); G may be 0.
 
@@ -110,9 +111,10 @@ def pose_states(
         rotations: Rotation matrices of the frame, shape (K, 3, 3).
         random: Random numbers for the seeds.
         margin: See ``RestingStates.are_ends``.
+        tolerance: Accepted differences from the poses; by default none.
     """
     seeds = seeds_of(kinematics.robot, len(positions), random)
-    q, met = solve_pose_ik(kinematics, positions, rotations, seeds)
+    q, met = solve_pose_ik(kinematics, positions, rotations, seeds, tolerance=tolerance)
     found = q[:, met]
     return found[:, states.are_ends(found, margin=margin)].T.copy()
 

@@ -15,7 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.problems.scenes.quaternions import quaternion_mistake, quaternion_of, rotation_matrix
-from cnpgen.problems.scenes.scene_problem import GoalPose, SceneError, SceneProblem, check_count, make_obstacle
+from cnpgen.problems.scenes.scene_problem import (
+    GoalPose,
+    SceneError,
+    SceneProblem,
+    check_count,
+    make_mesh,
+    make_obstacle,
+)
 from cnpgen.problems.scenes.yaml_document import part, scalar, vector
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.convex_part import turned
@@ -124,12 +131,13 @@ def _pose_goal(goal: Any, where: str) -> GoalPose | None:
     dimensions = vector(part(primitives[0], "dimensions", list, where), "", f"{where}: dimensions of the goal region")
     is_sphere = _kind(primitives[0]) == "sphere"
     angles = [orientations[0].get(f"absolute_{axis}_axis_tolerance", 0.01) for axis in "xyz"]
+    radius = float(dimensions[0] if is_sphere else dimensions.min() / 2)
     return GoalPose(
         frame=frame,
         position=_pose(poses[0], where)[0],
         rotation=_rotation(orientations[0].get("orientation"), where),
-        position_tolerance=float(dimensions[0] if is_sphere else dimensions.min() / 2),
-        rotation_tolerance=min(scalar(angle, f"{where}: orientation tolerance") for angle in angles),
+        position_tolerance=radius / np.sqrt(3),  # a cube in the region, for any orientation
+        rotation_tolerance=np.array([scalar(angle, f"{where}: orientation tolerance") for angle in angles]),
     )
 
 
@@ -145,15 +153,29 @@ def _obstacles(scene: Any, place: str) -> Iterator[Obstacle]:
     for entry in objects:
         name = str(entry.get("id", "object"))
         where = f"{place}: obstacle {name!r}"
-        if part(entry, "meshes", list, where) or part(entry, "planes", list, where):
-            raise SceneError(f"{where} has meshes or planes, expected primitives")
-        primitives, poses = part(entry, "primitives", list, where), part(entry, "primitive_poses", list, where)
-        if len(primitives) != len(poses) or not primitives:
-            raise SceneError(f"{where} has {len(primitives)} primitives and {len(poses)} poses, expected equal numbers")
-        check_count(count := count + len(primitives), place)
+        if part(entry, "planes", list, where):
+            raise SceneError(f"{where} has planes, expected primitives or meshes")
+        primitives, meshes = _with_poses(entry, "primitive", where), _with_poses(entry, "mesh", where)
+        if not primitives and not meshes:
+            raise SceneError(f"{where} has neither primitives nor meshes")
+        check_count(count := count + len(primitives) + len(meshes), place)
         outer = _pose(entry["pose"], where) if entry.get("pose") is not None else (np.zeros(3), np.eye(3))
-        for primitive, pose in zip(primitives, poses, strict=True):
+        for primitive, pose in primitives:
             yield _obstacle(name, primitive, outer, _pose(pose, where), place)
+        for mesh, pose in meshes:
+            vertices = part(mesh, "vertices", list, where)
+            points = np.array([vector(each, "xyz", f"{where}: vertex") for each in vertices]).reshape(-1, 3)
+            inner = _pose(pose, where)
+            yield make_mesh(name, points, outer[0] + outer[1] @ inner[0], outer[1] @ inner[1], place=place)
+
+
+def _with_poses(entry: Any, what: str, where: str) -> list[tuple[Any, Any]]:
+    """Return the primitives or meshes of an object with their poses."""
+    plural = "meshes" if what == "mesh" else f"{what}s"
+    shapes, poses = part(entry, plural, list, where), part(entry, f"{what}_poses", list, where)
+    if len(shapes) != len(poses):
+        raise SceneError(f"{where} has {len(shapes)} {plural} and {len(poses)} poses, expected equal numbers")
+    return list(zip(shapes, poses, strict=True))
 
 
 def _check_transforms(scene: Any, frames: set[str], place: str) -> None:

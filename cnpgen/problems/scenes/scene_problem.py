@@ -14,7 +14,8 @@ from cnpgen.problems.scenes.quaternions import quaternion_mistake, roll_pitch_ya
 from cnpgen.robots.observation.primitives import KINDS, primitives_of
 from cnpgen.robots.observation.signed_distance import signed_distances
 from cnpgen.robots.obstacle import Obstacle
-from cnpgen.robots.shape.hull import MAX_COORDINATE_M
+from cnpgen.robots.shape.hull import MAX_COORDINATE_M, check_solid, hull_corners
+from cnpgen.robots.shape.inline import address_of, corners_of, is_inline
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.schema.argument_types import check_fields
 
@@ -39,15 +40,22 @@ class GoalPose:
         frame: Name of the link or frame; empty for the problem's tip.
         position: Position [m], shape (3,).
         rotation: Rotation matrix, shape (3, 3).
-        position_tolerance: Accepted distance from the position [m].
-        rotation_tolerance: Accepted angle from the rotation [rad].
+        position_tolerance: Accepted displacements along the axes of the pose [m], a number or shape (3,).
+        rotation_tolerance: Accepted components of the rotation vector in these axes [rad], a number or shape (3,).
+            About an axis with pi or more, any rotation is accepted.
     """
 
     frame: str
     position: Array
     rotation: Array
-    position_tolerance: float = 1e-3
-    rotation_tolerance: float = 1e-2
+    position_tolerance: float | Array = 0.0
+    rotation_tolerance: float | Array = 0.0
+
+    @property
+    def tolerances(self) -> tuple[Array, Array]:
+        """Tolerances of position [m] and rotation [rad], shape (3,) each."""
+        position, rotation = (np.asarray(each, float) for each in (self.position_tolerance, self.rotation_tolerance))
+        return np.broadcast_to(position, 3), np.broadcast_to(rotation, 3)
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -129,6 +137,35 @@ def make_obstacle(
     return Obstacle(name=name, kind=kind, position=(x, y, z), rotation=turn, radius=radius, length=length)
 
 
+def make_mesh(name: str, points: Array, position: Array, rotation: Array, *, place: str) -> Obstacle:
+    """Build an obstacle from the points of a mesh; it is their convex hull.
+
+    Args:
+        name: Name of the obstacle.
+        points: Points in the frame of the mesh [m], shape (V, 3).
+        position: Origin of that frame in the frame of the robot's base [m], shape (3,).
+        rotation: Rotation matrix of that frame, shape (3, 3).
+        place: File and scene, for messages.
+
+    Raises:
+        SceneError: A number is not finite, or the points are not those of a body.
+    """
+    where = f"{place}: obstacle {name!r}"
+    if not len(points):
+        raise SceneError(f"{where} is a mesh without vertices")
+    if not (np.abs([*points.ravel(), *position]) <= MAX_COORDINATE_M).all():
+        raise SceneError(f"{where}: points and position must be finite and at most {MAX_COORDINATE_M:g}")
+    try:
+        corners = hull_corners(points)
+        check_solid(corners)
+    except ValueError as error:
+        raise SceneError(f"{where}: {error}") from error
+    x, y, z = position.tolist()
+    return Obstacle(
+        name=name, kind="mesh", mesh=address_of(corners), position=(x, y, z), rotation=roll_pitch_yaw(rotation)
+    )
+
+
 def check_count(count: int, place: str) -> None:
     """Raise SceneError for more obstacles than a scene may have, before any is built."""
     if count > MAX_SCENE_OBSTACLES:
@@ -156,14 +193,21 @@ def checked_scene(scene: SceneProblem) -> SceneProblem:
     """
     check_count(len(scene.obstacles), scene.place)
     pose = scene.goal_pose
-    if pose is not None and not (np.abs([*pose.position, pose.position_tolerance]) <= MAX_COORDINATE_M).all():
-        raise SceneError(f"{scene.place}: the goal pose has numbers that are not finite or too large")
+    if pose is not None:
+        if not (np.abs([*pose.position, *pose.rotation.ravel()]) <= MAX_COORDINATE_M).all():
+            raise SceneError(f"{scene.place}: the goal pose has numbers that are not finite or too large")
+        if not all((each >= 0).all() for each in pose.tolerances):
+            raise SceneError(f"{scene.place}: tolerances of the goal pose must not be negative, got {pose.tolerances}")
     for what, values in (("start", scene.start_q), ("goal", scene.goal_q)):
         if not np.isfinite(values).all():
             raise SceneError(f"{scene.place}: the {what} has joint positions that are not finite")
+    for obstacle in scene.obstacles:
+        if obstacle.kind == "mesh" and not is_inline(obstacle.mesh):
+            raise SceneError(
+                f"{scene.place}: obstacle {obstacle.name!r} is a mesh file, expected corners: see make_mesh"
+            )
     scene = replace(scene, obstacles=_uniquely_named(scene.obstacles))
-    primitives = primitives_of(scene.obstacles, place_obstacles(scene.obstacles))
-    depths = -signed_distances(primitives, np.zeros((1, 3)))[:, 0]
+    depths = np.array([_depth_of_base(obstacle) for obstacle in scene.obstacles])
     if len(depths) and depths.max() > MAX_BASE_DEPTH_M:
         name, depth = scene.obstacles[int(depths.argmax())].name, float(depths.max())
         raise SceneError(
@@ -171,6 +215,18 @@ def checked_scene(scene: SceneProblem) -> SceneProblem:
             f" expected at most {MAX_BASE_DEPTH_M:g} m: poses are relative to the base"
         )
     return scene
+
+
+def _depth_of_base(obstacle: Obstacle) -> float:
+    """Return the depth of the base, the origin, in an obstacle [m]; negative outside."""
+    numbers = place_obstacles([obstacle])
+    if obstacle.kind != "mesh":
+        return -float(signed_distances(primitives_of([obstacle], numbers), np.zeros((1, 3)))[0, 0])
+    from scipy.spatial import ConvexHull
+
+    origin = numbers[3:].reshape(3, 3).T @ -numbers[:3]
+    faces = ConvexHull(corners_of(obstacle.mesh)).equations  # normals and offsets: n x + d <= 0 inside
+    return float(-(faces[:, :3] @ origin + faces[:, 3]).max())
 
 
 def _uniquely_named(obstacles: tuple[Obstacle, ...]) -> tuple[Obstacle, ...]:

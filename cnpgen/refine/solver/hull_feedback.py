@@ -1,6 +1,7 @@
 """Collisions between grid points, fed back to the solver as larger required distances at the neighboring points.
 
-A corner that passes a thin edge may collide between two grid points without a violation at either of them.
+A corner that passes a thin edge may collide between two grid points without a violation at either of them. Some
+collisions are found by the verdict only, which names their phase.
 """
 
 import numpy as np
@@ -29,6 +30,7 @@ class HullFeedback:
     def __init__(self, spec: TrajectorySpec, s: Array) -> None:
         fractions = np.arange(STATES_PER_INTERVAL) / STATES_PER_INTERVAL
         phases = (s[:-1, None] + np.diff(s)[:, None] * fractions).ravel()
+        self._spec, self._phases = spec, s
         self._basis = basis(phases, spec.path_control_points, spec.degree)
         self._margins = FEEDBACK_MARGIN_M * np.clip(np.minimum(phases, 1 - phases) / MARGIN_EDGE, 0, 1)
         self._intervals = len(s) - 1
@@ -51,3 +53,25 @@ class HullFeedback:
         between = missing.reshape(self._intervals, STATES_PER_INTERVAL, -1).max(axis=1)
         edge = np.zeros((1, between.shape[1]))
         return np.asarray(np.maximum(np.concatenate([between, edge]), np.concatenate([edge, between])))
+
+    def clearance_at(self, path: Array, hulls: Hulls, obstacle_poses: Array, *, phase: float, depth: float) -> Array:
+        """Return by how much the required distances must grow around the phase of a rejected collision [m].
+
+        Args:
+            path: Path control points, shape (C, n).
+            hulls: Clearances of the hulls.
+            obstacle_poses: Poses and sizes of the obstacles, shape (width,).
+            phase: Phase of the collision.
+            depth: Depth of the collision by the verdict [m]; it is the least increase for the pairs that are closest.
+
+        Returns:
+            Shape (K, columns).
+        """
+        interval = int(np.searchsorted(self._phases, phase)) - 1
+        first, last = max(interval - 1, 0), min(interval + 2, self._intervals)
+        window = np.linspace(self._phases[first], self._phases[last], STATES_PER_INTERVAL * (last - first) + 1)
+        q = basis(window, self._spec.path_control_points, self._spec.degree) @ path
+        margins = np.full(len(q), depth + FEEDBACK_MARGIN_M)
+        extra = np.zeros((self._intervals + 1, len(hulls.min_distances)))
+        extra[first : last + 1] = hulls.missing(q.T, margins, obstacle_poses).max(axis=0)
+        return extra

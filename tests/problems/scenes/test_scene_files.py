@@ -13,6 +13,7 @@ from cnpgen.problems.scenes.quaternions import quaternion_of, roll_pitch_yaw, ro
 from cnpgen.problems.scenes.scene_problem import checked_scene, make_obstacle
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.convex_part import turned
+from cnpgen.robots.solid import place_obstacles, solids_of
 from cnpgen.scenes import SceneError, SceneProblem, load_scenes, save_scenes
 from tests.examples.scene_files import REQUEST, ROBOMETRICS, SCENE
 
@@ -75,7 +76,7 @@ def test_moveit_scenes_and_requests_are_read_with_composed_poses(tmp_path: Path)
     assert scene.goal_pose.frame == "panda_hand"
     assert scene.goal_pose.position == pytest.approx([0.4, 0.1, 0.6])
     assert scene.goal_pose.rotation == pytest.approx(np.diag([1.0, -1.0, -1.0]))
-    assert (scene.goal_pose.position_tolerance, scene.goal_pose.rotation_tolerance) == (0.002, 0.01)
+    assert np.array(scene.goal_pose.tolerances) == pytest.approx(np.array([[0.002 / 3**0.5] * 3, [0.05, 0.01, 0.01]]))
 
 
 def test_one_file_of_a_pair_reads_the_other_one_too(tmp_path: Path) -> None:
@@ -185,7 +186,10 @@ BAD_SCENES = {  # damage of the text of a scene -> part of the message
     "translation: [0, 0, 0]|translation: [0, 0, 1]": "frame 'base_link' is not the planning frame",
     "collision_objects:|collision_objects: &a": "anchor 'a'",
     "name: shelf|name: [shelf": "is not YAML",
-    "primitives:|meshes: [{}]\n      primitives:": "obstacle 'Can1' has meshes or planes",
+    "primitives:|planes: [{}]\n      primitives:": "obstacle 'Can1' has planes, expected primitives or meshes",
+    "primitives:|meshes: [{}]\n      primitives:": "obstacle 'Can1' has 1 meshes and 0 poses, expected equal numbers",
+    "primitives:|meshes: [{vertices: []}]\n      mesh_poses: [{position: [0, 0, 0], orientation:"
+    " [0, 0, 0, 1]}]\n      primitives:": "obstacle 'Can1' is a mesh without vertices",
 }
 
 
@@ -209,6 +213,28 @@ def test_requests_must_fit_the_joints(tmp_path: Path) -> None:
     (tmp_path / "request0001.yaml").unlink()
     with pytest.raises(SceneError, match="has no request"):
         load_scenes(tmp_path)
+
+
+def test_meshes_of_moveit_are_hulls_with_composed_poses(tmp_path: Path) -> None:
+    corners = np.array([[0, 0, 0], [0.2, 0, 0], [0, 0.3, 0], [0, 0, 0.4]])
+    inside = [[0.05, 0.05, 0.05]]
+    vertices = [dict(zip("xyz", map(float, point), strict=True)) for point in [*corners.tolist(), *inside]]
+    wedge = f"""\
+    - header: {{frame_id: base_link}}
+      id: wedge
+      pose: {{position: [1.0, 0, 0], orientation: [0, 0, 1, 0]}}
+      meshes: [{{triangles: [], vertices: {vertices}}}]
+      mesh_poses: [{{position: [0.5, 0, 0.1], orientation: [0, 0, 0, 1]}}]
+"""
+    (tmp_path / "scene1.yaml").write_text(SCENE + wedge)
+    (tmp_path / "request1.yaml").write_text(REQUEST)
+    (scene,) = load_scenes(tmp_path)
+    mesh = scene.obstacles[-1]
+    assert (mesh.kind, mesh.name) == ("mesh", "wedge")
+    (solid,) = solids_of([mesh], place_obstacles([mesh]))
+    placed = np.array([1.0, 0, 0]) + (corners + np.array([0.5, 0, 0.1])) * [-1, -1, 1]
+    assert solid.low == pytest.approx(placed.min(axis=0))
+    assert solid.high == pytest.approx(placed.max(axis=0))
 
 
 def test_too_many_obstacles_are_refused_before_they_are_built(tmp_path: Path) -> None:

@@ -1,0 +1,106 @@
+"""Tasks with several goal states: the fastest valid motion to any of them.
+
+The rows of a task have the same ``sample_id``, and the column ``goal_option`` numbers its goal states, the nearest
+first. No motion is faster than the straight line at the velocity limits. Goal states that cannot improve on the best
+motion so far are therefore not tried.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.machine.times import Times
+from cnpgen.plans.concatenate import concatenate
+from cnpgen.plans.format import GOAL_OPTION
+from cnpgen.plans.plans import Plans
+from cnpgen.problems.constraints.joint import JointVelocity
+from cnpgen.problems.problem_record import open_problem
+from cnpgen.refine.refinement import Refinement
+
+Array = NDArray[np.float64]
+Progress = Callable[[int, int], None]
+
+
+def refine_goal_options(
+    plans: Plans,
+    refine: Callable[..., Refinement],
+    *,
+    journal: str | Path | None,
+    begin: Callable[[int, int], None] | None,
+    progress: Progress | None,
+) -> Refinement:
+    """Refine plans to several goal states of each task; return the best one of each task.
+
+    Args:
+        plans: Plans with the column ``goal_option``.
+        refine: ``refine_plans`` with its other arguments.
+        journal: File for finished plans; later rounds have files beside it.
+        begin: See ``refine_plans``; it is called with the number of tasks.
+        progress: See ``refine_plans``; tasks count as finished after their first goal state.
+
+    Returns:
+        The refinement of the chosen rows, one for each task, in the order of the tasks.
+    """
+    tasks = list(dict.fromkeys(plans.sample_id.tolist()))
+    chosen: dict[int, tuple[Refinement, int]] = {}
+    lowest, files = dict[int, float](), list[Path]()
+    if begin is not None:
+        begin(len(tasks), 0)
+    for round_number, rows in enumerate(_rounds(plans, min_durations(plans), lowest)):
+        file = Path(f"{journal}.{round_number}" if round_number else f"{journal}") if journal is not None else None
+        files += [] if file is None or not round_number else [file]
+        refinement = refine(plans[rows], journal=file)
+        for row, result in enumerate(refinement.results):
+            task = int(refinement.plans.sample_id[row])
+            first, improves = task not in chosen, result.valid and result.cost < lowest.get(task, np.inf)
+            if progress is not None and (first or improves):
+                progress(int(first), int(improves and task not in lowest))
+            if first or improves:
+                chosen[task] = refinement, row
+            if improves:
+                lowest[task] = result.cost
+    for file in files:
+        file.unlink(missing_ok=True)
+    return _of_rows([chosen[task] for task in tasks])
+
+
+def min_durations(plans: Plans) -> Array:
+    """Return a lower bound of the duration of every plan [s], shape (N,): its joints at their velocity limits."""
+    problem, robot = open_problem(plans.problem)
+    velocity = problem.first(JointVelocity)
+    if velocity is None:
+        return np.zeros(len(plans))
+    distance = np.abs(plans.boundary.goal_q - plans.boundary.start_q)
+    return np.asarray((distance / (robot.velocity_limit * (1 + velocity.tolerance))).max(axis=1))
+
+
+def _rounds(plans: Plans, min_duration: Array, lowest: dict[int, float]) -> Iterator[NDArray[np.int64]]:
+    """Yield the rows of each round: the next goal state of every task that it may improve."""
+    options = np.asarray(plans.columns[GOAL_OPTION])
+    for option in np.unique(options):
+        rows = np.flatnonzero(options == option)
+        bound = np.array([lowest.get(int(task), np.inf) for task in plans.sample_id[rows]])
+        waiting = rows[min_duration[rows] < bound]
+        if len(waiting):
+            yield waiting
+
+
+def _of_rows(chosen: list[tuple[Refinement, int]]) -> Refinement:
+    """Return one refinement of single results of several."""
+    parts = list({id(refinement): refinement for refinement, _ in chosen}.values())
+    starts = np.cumsum([0, *(len(part.results) for part in parts)])
+    position = {id(part): int(start) for part, start in zip(parts, starts, strict=False)}
+    rows = np.array([position[id(refinement)] + row for refinement, row in chosen])
+    times = [vars(part.times) for part in parts]
+    return replace(
+        parts[0],
+        input_plans=concatenate([part.input_plans for part in parts])[rows],
+        plans=concatenate([part.plans for part in parts])[rows],
+        results=tuple(refinement.results[row] for refinement, row in chosen),
+        times=Times(**{name: sum(part[name] for part in times) for name in times[0]}),
+    )

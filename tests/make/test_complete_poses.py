@@ -1,0 +1,151 @@
+"""Tasks whose goals are poses of the tip: goal states with tolerances, reasons, and the best motion to any of them."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import cnpgen
+from cnpgen.cli.main import main
+from cnpgen.errors import DatasetError, UsageError
+from cnpgen.plans.plans import Plans
+from cnpgen.problems.problem import Problem
+from cnpgen.refine.goal_options import min_durations, refine_goal_options
+from cnpgen.refine.refinement import Refinement
+from cnpgen.refine.task import Attempt, Outcome
+from tests.examples.shaped_robot import SELF, write_problem
+
+VELOCITY = '[[constraint]]\nuse = "joint-velocity"\ntolerance = "0.2 %"\n'
+GOALS = [[0.4, 0.4, 0.5], [3.0, 0.0, 0.3], [0.0, 0.0, 0.32]]  # m; the second is out of reach, the third in the arm
+OUT_OF_REACH = "no inverse kinematics of the goal"
+
+
+@pytest.fixture(scope="module")
+def crane(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_problem(tmp_path_factory.mktemp("crane"), obstacles="", more=SELF + VELOCITY)
+
+
+@pytest.fixture(scope="module")
+def problem(crane: Path) -> Problem:
+    return cnpgen.load_problem(crane)
+
+
+def test_a_task_has_several_goal_states_with_its_pose(problem: Problem) -> None:
+    found = cnpgen.complete(problem, goal_xyz=GOALS[:2], goal_xyz_tolerance=[0.0, 0.0, 0.02])
+    assert found.reasons == ("", OUT_OF_REACH)
+    assert len(found) == 1
+    plans = found.plans
+    assert len(plans) > 1
+    assert set(plans.sample_id) == {0}
+    assert plans.columns["goal_option"].tolist() == list(range(len(plans)))
+    error = np.abs(plans.columns["goal_xyz"] - GOALS[0])
+    assert error[:, :2].max() < 1e-5
+    assert error[:, 2].max() < 0.02 + 1e-5
+    assert (np.diff(min_durations(plans)) >= 0).all()
+    difference = np.abs(plans.boundary.goal_q[:, None] - plans.boundary.goal_q).max(axis=2)
+    assert difference[~np.eye(len(plans), dtype=bool)].min() > 0.29
+
+
+def test_a_quaternion_is_met_and_pi_frees_an_axis(problem: Problem) -> None:
+    (aim,) = cnpgen.complete(problem, goal_xyz=GOALS[0]).plans[0]
+    model = cnpgen.RobotModel(problem)
+    (rotation,) = model.forward_kinematics(aim.boundary.goal_q)[1]
+    w = np.sqrt(1 + np.trace(rotation)) / 2
+    skew = np.array([rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]])
+    task = {"goal_xyz": GOALS[0], "goal_wxyz": [w, *(skew / (4 * w))]}
+    exact = cnpgen.complete(problem, **task).plans
+    free = cnpgen.complete(problem, **task, goal_rotation_tolerance=[np.pi, 0.0, 0.0]).plans
+    poses = model.forward_kinematics(exact.boundary.goal_q)[1]
+    assert np.abs(poses - rotation).max() < 1e-4
+    axes = model.forward_kinematics(free.boundary.goal_q)[1][:, :, 0]
+    assert np.abs(axes - rotation[:, 0]).max() < 1e-4  # turned about x only
+    assert len(free) >= len(exact)
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ({"goal_q": [0.0] * 4}, r"has no column to give 'goal_q'.*only start_q, goal_xyz, goal_wxyz"),
+        ({"start_q": [0.0] * 4}, "must give goal_xyz"),
+        (
+            {"goal_xyz": GOALS[0], "goal_wxyz": [0.0] * 4},
+            "goal_wxyz quaternion .* is zero, expected length 1 in task 0",
+        ),
+        ({"goal_xyz": GOALS[0], "goal_xyz_tolerance": [-1, 0, 0]}, "goal_xyz_tolerance must not be negative"),
+        ({"goal_xyz": [400, 400, 500]}, "did you mean 400 mm = 0.4 m"),
+    ],
+)
+def test_wrong_columns_are_refused(problem: Problem, columns: dict[str, list[float]], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        cnpgen.complete(problem, **columns)
+
+
+def test_the_command_takes_tables_of_poses(crane: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    table, out = tmp_path / "tasks.csv", tmp_path / "problems.h5"
+    table.write_text("goal_xyz.x,goal_xyz.y,goal_xyz.z\n0.4,0.4,0.5\n3,0,0.3\n", encoding="utf-8")
+    assert main(["complete", str(crane), str(table), "-o", str(out)]) == 0
+    captured = capsys.readouterr()
+    assert "1 of 2 tasks completed" in captured.err
+    assert f"1 {OUT_OF_REACH}: task 1" in captured.err
+    problems = cnpgen.load_boundary_problems(out)
+    assert len(problems) == len(problems.columns["goal_option"]) > 1
+    table.write_text("goal_xyz.x,goal_xyz.y\n1,2\n", encoding="utf-8")
+    with pytest.raises(DatasetError, match=r"lacks goal_xyz\.z"):
+        cnpgen.complete(crane, table)
+
+
+def refined(cost: dict[int, float]) -> Callable[..., Refinement]:
+    """Return a stand-in for ``refine_plans``: row -> cost, invalid if there is none."""
+
+    def refine(plans: Plans, **_: object) -> Refinement:
+        results = []
+        for plan, row in zip(plans, plans.columns["row"].astype(int).tolist(), strict=True):
+            path, rate = plan.path_control_points[0], plan.rate_control_points[0]
+            reason = "ok" if row in cost else "robot in collision"
+            value = cost.get(row, np.inf)
+            results.append(Attempt(path=path, rate=rate, cost=value, outcome=Outcome.SOLVED, reason=reason))
+        return Refinement(plans, plans, tuple(results))
+
+    return refine
+
+
+def test_the_best_valid_motion_to_any_goal_state_is_chosen(problem: Problem) -> None:
+    plans = cnpgen.complete(problem, goal_xyz=[GOALS[0], [0.4, -0.4, 0.5]]).plans
+    plans = replace(plans, columns={**plans.columns, "row": np.arange(len(plans), dtype=float)})
+    counts, bounds = np.bincount(plans.sample_id), min_durations(plans)
+    assert (counts >= 3).all()
+    first, second = 0, int(counts[0])
+    reported = list[tuple[int, int]]()
+    chosen = refine_goal_options(
+        plans,
+        refined({first: 9.0, first + 1: 8.0, first + 2: 8.5, second + 1: 7.0}),
+        journal=None,
+        begin=None,
+        progress=lambda *numbers: reported.append(numbers),
+    )
+    assert chosen.plans.columns["row"].tolist() == [first + 1, second + 1]
+    assert chosen.valid.all()
+    assert np.sum(reported, axis=0).tolist() == [2, 2]
+    fast = dict.fromkeys(range(len(plans)), bounds[first + 1] * 0.999)  # later goal states cannot be nearer
+    tried = list[int]()
+
+    def refine(rows: Plans, **options: object) -> Refinement:
+        tried.extend(rows.columns["row"].astype(int).tolist())
+        return refined(fast)(rows, **options)
+
+    refine_goal_options(plans[plans.sample_id == 0], refine, journal=None, begin=None, progress=None)
+    assert tried == [first]
+
+
+@pytest.mark.slow
+def test_tasks_with_goal_poses_are_solved(problem: Problem) -> None:
+    completed = cnpgen.complete(problem, goal_xyz=[GOALS[0], [0.4, -0.4, 0.5]])
+    solved = cnpgen.solve_plans(completed.plans, workers=1)
+    assert solved.plans.sample_id.tolist() == [0, 1]
+    assert solved.valid.all()
+    for row in range(2):
+        options = completed.plans[completed.plans.sample_id == row]
+        single = replace(options, columns={k: v for k, v in options.columns.items() if k != "goal_option"})
+        assert solved.plans.duration[row] == pytest.approx(cnpgen.solve_plans(single, workers=1).plans.duration.min())
