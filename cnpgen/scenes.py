@@ -1,4 +1,4 @@
-"""Planning problems in scenes: files of other software, families, observations and plans ('cnpgen docs scene-files')."""
+"""Planning problems in scenes: files of other software, families, observations, plans ('cnpgen docs scene-files')."""
 
 from cnpgen.make.solve_scenes import SolvedScenes, solve_scenes
 from cnpgen.pipelines.families.catalog import load_family

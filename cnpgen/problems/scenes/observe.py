@@ -8,10 +8,9 @@ from typing import Any
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
-from cnpgen.kernels.observation.compiled_observations import observation_backend
 from cnpgen.machine.threads import one_thread
 from cnpgen.problems.scenes.scene_problem import SceneProblem
-from cnpgen.robots.observation.observations import Observation, as_observation
+from cnpgen.robots.observation.observations import Observation, SceneBatch, as_observation
 from cnpgen.robots.observation.primitives import Primitives
 from cnpgen.robots.observation.scene_primitives import scene_primitives
 from cnpgen.robots.observation.surface_points import scene_seeds
@@ -43,9 +42,11 @@ def observe(
     Raises:
         UsageError: There is no such observation, an obstacle is a mesh, or there are no scenes.
     """
+    from cnpgen.kernels.observation.compiled_observations import observation_backend
+
     observation, seed = as_observation(kind), integer("seed", seed, least=0, most=MAX_SEED)
     bodies = scene_bodies(scenes)
-    return observation.observe(bodies, scene_seeds(seed, len(bodies)), observation_backend(backend))
+    return observation.observe(SceneBatch(bodies, scene_seeds(seed, len(bodies)), observation_backend(backend)))
 
 
 def scene_bodies(scenes: Scenes) -> Primitives:
@@ -61,7 +62,7 @@ def scene_bodies(scenes: Scenes) -> Primitives:
         return scenes
     if isinstance(scenes, SceneProblem):
         scenes = [scenes]
-    if not len(scenes):
+    if len(scenes) == 0:
         raise UsageError("there are no scenes", concerns="scenes")
     if isinstance(scenes, Scene):
         return scene_primitives(scenes)

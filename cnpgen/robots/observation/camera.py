@@ -26,7 +26,7 @@ class Camera:
 
     Attributes:
         position: Position in the world frame [m].
-        target: Point in the middle of the image [m].
+        target: Point at the center of the image [m].
         width: Number of pixels of a row.
         height: Number of rows.
         field_of_view: Angle between the left and the right edge of the image [rad].
@@ -51,7 +51,7 @@ class Camera:
 
     @property
     def axes(self) -> Array:
-        """Rows: the unit vector forward, and the vectors from the middle to the right and the lower edge at 1 m."""
+        """Rows: the unit vector forward, and the vectors from the center to the right and the lower edge at 1 m."""
         forward = np.subtract(self.target, self.position, dtype=float)
         forward /= np.linalg.norm(forward)
         up = (0.0, 0.0, 1.0) if math.hypot(*forward[:2]) > MIN_VIEW_DISTANCE_M else (0.0, 1.0, 0.0)
@@ -113,16 +113,16 @@ def _hits(kind: str, size: Array, origin: Array, ray: Array) -> list[Array]:
     """Return where rays enter the parts of a body, in lengths of the rays, shape (P,) each; nan for none."""
     with np.errstate(all="ignore"):
         if kind == "box":
-            middle, width = -origin / ray, np.abs(size / ray)
-            return [_entry((middle - width).max(axis=1), (middle + width).min(axis=1))]
+            center, width = -origin / ray, np.abs(size / ray)
+            return [_entry((center - width).max(axis=1), (center + width).min(axis=1))]
         radius, half = size[0], size[1]
         a = (ray[:, :2] ** 2).sum(axis=1)
         f = ray[:, :2] @ origin[:2]
         root = np.sqrt(f**2 - a * (origin[:2] @ origin[:2] - radius**2))  # nan: no intersection
         enter, leave = (-f - root) / a, (-f + root) / a
         if kind == "cylinder":
-            middle, width = -origin[2] / ray[:, 2], np.abs(half / ray[:, 2])
-            return [_entry(np.maximum(enter, middle - width), np.minimum(leave, middle + width))]
+            center, width = -origin[2] / ray[:, 2], np.abs(half / ray[:, 2])
+            return [_entry(np.maximum(enter, center - width), np.minimum(leave, center + width))]
         side = np.where(np.abs(origin[2] + enter * ray[:, 2]) <= half, enter, np.nan)
         return [side, *(_ball(radius, origin - [0, 0, end * half], ray) for end in (-1, 1))]
 

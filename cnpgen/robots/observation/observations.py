@@ -22,9 +22,24 @@ Array = NDArray[Any]
 Corner = tuple[float, float, float]
 
 MAX_POINTS = 10_000_000  # of one observation of one scene
-MIN_EXTENT_M = 1e-6
+MIN_GRID_EXTENT_M = 1e-6
 WORKSPACE = (-0.9, -0.9, -0.1), (0.9, 0.9, 1.1)  # corners of the default grids, around an arm like the Panda [m]
 TOKEN_NUMBERS = len(KINDS) + 3 + 6 + 3  # kind, center, two columns of the rotation matrix, sizes
+
+
+@dataclass(frozen=True, eq=False)
+class SceneBatch:
+    """N scenes to observe.
+
+    Attributes:
+        bodies: The bodies, arrays with a first axis of length N.
+        seeds: Seeds of the scenes, shape (N,).
+        backend: Compiled functions or their NumPy reference.
+    """
+
+    bodies: Primitives
+    seeds: Seeds
+    backend: ObservationBackend
 
 
 class Observation(ABC):
@@ -33,13 +48,11 @@ class Observation(ABC):
     name: ClassVar[str]
 
     @abstractmethod
-    def observe(self, scenes: Primitives, seeds: Seeds, backend: ObservationBackend) -> dict[str, Array]:
+    def observe(self, scenes: SceneBatch) -> dict[str, Array]:
         """Observe N scenes.
 
         Args:
-            scenes: The bodies, arrays with a first axis of length N.
-            seeds: Seeds of the scenes, shape (N,).
-            backend: Compiled functions or their NumPy reference.
+            scenes: The scenes.
 
         Returns:
             Name -> array with a first axis of length N.
@@ -61,9 +74,9 @@ class SurfaceCloud(Observation):
         check_fields(self)
         integer("points", self.points, least=1, most=MAX_POINTS)
 
-    def observe(self, scenes: Primitives, seeds: Seeds, backend: ObservationBackend) -> dict[str, Array]:
+    def observe(self, scenes: SceneBatch) -> dict[str, Array]:
         """See ``Observation``."""
-        return {"cloud": backend.surface_points(scenes, self.points, seeds)}
+        return {"cloud": scenes.backend.surface_points(scenes.bodies, self.points, scenes.seeds)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,10 +96,10 @@ class CameraCloud(Observation):
         check_fields(self)
         integer("points", self.points, least=1, most=MAX_POINTS)
 
-    def observe(self, scenes: Primitives, seeds: Seeds, backend: ObservationBackend) -> dict[str, Array]:
+    def observe(self, scenes: SceneBatch) -> dict[str, Array]:
         """See ``Observation``."""
-        depth = backend.depth_images(scenes, self.camera)
-        return {"camera_cloud": backend.depth_points(depth, self.camera, self.points, seeds)}
+        depth = scenes.backend.depth_images(scenes.bodies, self.camera)
+        return {"camera_cloud": scenes.backend.depth_points(depth, self.camera, self.points, scenes.seeds)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,11 +123,11 @@ class DistanceGrid(Observation):
         if min(self.shape) < 1 or np.prod(self.shape, dtype=float) > MAX_POINTS:
             raise UsageError(f"must be positive with at most {MAX_POINTS:,} points, got {self.shape}", argument="shape")
 
-    def observe(self, scenes: Primitives, seeds: Seeds, backend: ObservationBackend) -> dict[str, Array]:
+    def observe(self, scenes: SceneBatch) -> dict[str, Array]:
         """See ``Observation``."""
         axes = [np.linspace(*ends) for ends in zip(self.low, self.high, self.shape, strict=True)]
         points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-        return {"distances": backend.distances(scenes, points).reshape(-1, *self.shape)}
+        return {"distances": scenes.backend.distances(scenes.bodies, points).reshape(-1, *self.shape)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,9 +157,9 @@ class BasisPoints(Observation):
         steps = np.arange(1, self.points + 1)[:, None] / root ** np.arange(1, 4)
         return np.asarray(np.array(self.low) + (steps + 0.5) % 1.0 * np.subtract(self.high, self.low))
 
-    def observe(self, scenes: Primitives, seeds: Seeds, backend: ObservationBackend) -> dict[str, Array]:
+    def observe(self, scenes: SceneBatch) -> dict[str, Array]:
         """See ``Observation``."""
-        return {"basis": backend.distances(scenes, self.positions)}
+        return {"basis": scenes.backend.distances(scenes.bodies, self.positions)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,21 +181,24 @@ class ObjectTokens(Observation):
         if self.capacity is not None:
             integer("capacity", self.capacity, least=1)
 
-    def observe(self, scenes: Primitives, seeds: Seeds, backend: ObservationBackend) -> dict[str, Array]:
+    def observe(self, scenes: SceneBatch) -> dict[str, Array]:
         """See ``Observation``."""
-        bodies = scenes.kinds >= 0
-        order = np.argsort(~bodies, axis=1, kind="stable")  # bodies first
-        most = int(bodies.sum(axis=1).max(initial=0))
+        bodies = scenes.bodies
+        real = bodies.kinds >= 0
+        order = np.argsort(~real, axis=1, kind="stable")  # bodies first
+        most = int(real.sum(axis=1).max(initial=0))
         capacity = most if self.capacity is None else self.capacity
         if most > capacity:
             raise UsageError(f"must be at least {most}, the largest number of bodies", argument="capacity")
-        axes = scenes.rotations[..., :2].swapaxes(2, 3).reshape(*scenes.kinds.shape, 6)
-        kinds = scenes.kinds[..., None] == np.arange(len(KINDS))
-        rows = np.concatenate([kinds, scenes.centers, axes, scenes.sizes], axis=2, dtype=np.float32)
-        rows[~bodies] = 0
-        rows, mask = (np.take_along_axis(values, order[..., None], axis=1) for values in (rows, bodies[..., None]))
-        padding = ((0, 0), (0, max(capacity - rows.shape[1], 0)), (0, 0))
-        rows, mask = (np.pad(values, padding)[:, :capacity] for values in (rows, mask))
+        axes = bodies.rotations[..., :2].swapaxes(2, 3).reshape(*real.shape, 6)
+        kinds = bodies.kinds[..., None] == np.arange(len(KINDS))
+        rows: Array = np.concatenate([kinds, bodies.centers, axes, bodies.sizes], axis=2).astype(np.float32)
+        rows[~real] = 0
+        padding = ((0, 0), (0, max(capacity - real.shape[1], 0)), (0, 0))
+        rows, mask = (
+            np.pad(np.take_along_axis(values, order[..., None], axis=1), padding)[:, :capacity]
+            for values in (rows, real[..., None])
+        )
         return {"tokens": rows, "mask": mask[..., 0]}
 
 
@@ -209,5 +225,5 @@ def as_observation(kind: str | Observation) -> Observation:
 
 
 def _check_corners(low: Corner, high: Corner) -> None:
-    if not (np.isfinite([*low, *high]).all() and (np.subtract(high, low) >= MIN_EXTENT_M).all()):
+    if not (np.isfinite([*low, *high]).all() and (np.subtract(high, low) >= MIN_GRID_EXTENT_M).all()):
         raise UsageError(f"must be finite and above the lower corner {low}, got {high}", argument="high")

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from cnpgen.errors import UsageError
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.convex_part import PRISM_SIDES
-from cnpgen.robots.shape.hull import frame_along
+from cnpgen.robots.shape.hull import frames_along
 from cnpgen.robots.solid import UNBOUNDED_OBSTACLE_HEIGHT_M, number_slices
 from cnpgen.schema.keys import Range
 
@@ -87,6 +87,6 @@ def _fill(obstacle: Obstacle, numbers: Array, center: Array, rotation: Array, si
         size[:, 0] = rest[:, 0]
     else:
         half = np.linalg.norm(rest[:, :3], axis=1)
-        rotation[:] = [frame_along(axis.tolist(), float(length)) for axis, length in zip(rest[:, :3], half, strict=True)]
+        rotation[:] = frames_along(rest[:, :3], half)
         size[:, 0] = rest[:, 3] * (math.cos(math.pi / PRISM_SIDES) if obstacle.kind == "cylinder" else 1.0)
         size[:, 1] = half

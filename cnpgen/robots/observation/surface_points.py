@@ -92,7 +92,7 @@ def surface_points(primitives: Primitives, count: int, seed: np.uint64) -> Array
     for patch, start, number in zip(patches, starts, numbers, strict=True):
         first = np.array([start >> np.uint64(32), start & np.uint64(0xFFFFFFFF)], np.uint32)
         with np.errstate(over="ignore"):
-            steps = first + np.arange(number, dtype=np.uint32)[:, None] * STEPS
+            steps = np.asarray(first + np.arange(number, dtype=np.uint32)[:, None] * STEPS, np.uint32)
         u, v = (steps >> np.uint32(8)).T * 2.0**-24
         parts.append(patch.points(u, v))
     return np.concatenate(parts)
