@@ -15,6 +15,7 @@ from cnpgen.errors import UsageError, counted, nearest
 from cnpgen.kernels.grid_kernel import GridKernel
 from cnpgen.kernels.library import Backend, choose_backend, problem_kernels
 from cnpgen.kernels.tape import DTYPES, Dtype
+from cnpgen.losses.hull_loss import HullLoss, make_hull_loss
 from cnpgen.losses.integrand import grid_specs, loss_gradient, loss_values, relaxation_argument
 from cnpgen.losses.margins import Margins, constraint_terms
 from cnpgen.losses.plan_batch import PLANS_PER_BLOCK, PlanBatch, check_batch, check_shapes
@@ -31,7 +32,7 @@ from cnpgen.store.dataset_spec import StoredProblem
 
 Array = NDArray[Any]
 FORMS = ("signed", "paper")
-_BUILT = {"_gradient", "_values", "_time_varying_bound"}
+_BUILT = {"_gradient", "_values", "_time_varying_bound", "_hulls"}
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,8 @@ class LossValue:
 
 class PlanLoss:
     """``integral of (task loss + sum of weight_i Huber(violation_i)) dt`` of plans of one problem, and its gradient.
+
+    If samples place the obstacles, their distances are those of the links' hulls, at every fourth node (``HullLoss``).
 
     Args:
         problem: The problem, its record (``plans.problem``, ``dataset.problem``), or the name or the file of a problem,
@@ -106,7 +109,7 @@ class PlanLoss:
         self._robot = load_robot(self.problem)
         chosen, folder = choose_backend(backend)
         folder = folder if cache_folder is None else Path(cache_folder)
-        self._kernels = problem_kernels(self.problem, self._robot, chosen, folder)
+        self._kernels = problem_kernels(self.problem.for_planning, self._robot, chosen, folder)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state without the kernels, which are loaded again when needed."""
@@ -154,6 +157,8 @@ class PlanLoss:
             for rows in (slice(first, first + PLANS_PER_BLOCK) for first in range(0, n, PLANS_PER_BLOCK)):
                 part = batch[rows]
                 results = self._integrate(part, checked, table, gradient=gradient)
+                if self._hulls is not None:
+                    self._hulls.add(results, part, checked, table, shift=shift)
                 terms[rows], path_gradient[rows], rate_gradient[rows] = (part.samples(values) for values in results)
             total = terms[:, 0] + terms[:, 1:] @ checked
         return LossValue(total, terms, path_gradient, rate_gradient)
@@ -167,13 +172,13 @@ class PlanLoss:
     ) -> tuple[Array, Array, Array]:
         """Return terms and gradients of a block, samples last; the gradients are empty if they are not requested."""
         nodes, orders, (points, n) = len(table.s), self.problem.path_orders, batch.path.shape[1:]
-        rates = batch.lanes(batch.rate)
+        rates, poses = batch.lanes(batch.rate), batch.obstacle_poses[:, : self.problem.for_planning.scene_width]
         lanes = rates.shape[1]
         path = (table.path @ batch.lanes(batch.path).reshape(points, -1)).reshape(orders, nodes, n, lanes)
         rate = (table.rate @ rates).reshape(orders - 1, nodes, lanes)
         terms = np.zeros((len(self.terms), lanes), self.dtype)
         arguments = (
-            *path.swapaxes(1, 2), rate, batch.lanes(batch.obstacle_poses),
+            *path.swapaxes(1, 2), rate, batch.lanes(poses),
             self._relaxation(batch, table, lanes, gradient=gradient), table.weights, self._tightening, weights,
         )  # fmt: skip
         if not gradient:
@@ -253,6 +258,12 @@ class PlanLoss:
     @cached_property
     def _values(self) -> GridKernel:
         return self._kernels.load_grid(loss_values, grid_specs(self.problem)[0], dtype=self.dtype, form=self.form)
+
+    @cached_property
+    def _hulls(self) -> HullLoss | None:
+        if not self.problem.has_sample_obstacles:
+            return None
+        return make_hull_loss(self.problem, self._robot, self._kernels, self._tightening)
 
     @cached_property
     def _time_varying_bound(self) -> TimeVaryingBound:
