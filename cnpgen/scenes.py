@@ -4,8 +4,9 @@ from cnpgen.make.solve_scenes import SolvedScenes, solve_scenes
 from cnpgen.pipelines.families.catalog import load_family
 from cnpgen.pipelines.families.family import Grasp, Layout, SceneFamily
 from cnpgen.pipelines.families.scene_generator import make_scenes
+from cnpgen.planner.scene_requests import plan_scenes
 from cnpgen.plans.scene_plans import scene_plans
-from cnpgen.problems.scenes.observe import observe, scene_bodies
+from cnpgen.problems.scenes.observe import BatchObserver, observe, scene_bodies
 from cnpgen.problems.scenes.scene_files import load_scenes, save_scenes
 from cnpgen.problems.scenes.scene_problem import GoalPose, SceneError, SceneProblem
 from cnpgen.robots.observation.camera import Camera
@@ -19,6 +20,7 @@ from cnpgen.robots.observation.observations import (
 
 __all__ = [
     "BasisPoints",
+    "BatchObserver",
     "Camera",
     "CameraCloud",
     "DistanceGrid",
@@ -35,6 +37,7 @@ __all__ = [
     "load_scenes",
     "make_scenes",
     "observe",
+    "plan_scenes",
     "save_scenes",
     "scene_bodies",
     "scene_plans",

@@ -4,6 +4,10 @@ import numpy as np
 import pytest
 
 from cnpgen.errors import UsageError
+from cnpgen.loader.batch import Batch
+from cnpgen.loader.load import load_dataset
+from cnpgen.problems.obstacles import scene_of
+from cnpgen.problems.problem_record import as_problem
 from cnpgen.recipes import Obstacle
 from cnpgen.robots.observation.camera import depth_image
 from cnpgen.robots.observation.observations import OBSERVATIONS, Observation
@@ -14,6 +18,7 @@ from cnpgen.robots.scene import PARKED_POSITION_M, Scene
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.scenes import (
     BasisPoints,
+    BatchObserver,
     Camera,
     CameraCloud,
     DistanceGrid,
@@ -186,3 +191,24 @@ def test_wrong_observations_are_refused() -> None:
     ):
         with pytest.raises(UsageError, match=message):
             make()
+
+
+def test_batches_of_a_dataset_have_the_observations_of_their_scenes(tiny) -> None:
+    dataset = load_dataset(tiny("heavy-object"))
+    problem = as_problem(dataset.problem)
+
+    def scenes_of(batch: Batch) -> Scene:
+        ends = [np.asarray(batch[name], float) for name in ("start_xyz", "goal_xyz")]
+        return scene_of(problem, *ends)
+
+    fields = ["start_q", "start_xyz", "goal_xyz"]
+    observer = BatchObserver(BasisPoints(points=40), scenes_of, seed=3)
+    options = {"fields": fields, "normalize": False, "drop_last": False, "shuffle": False}
+    batches = list(dataset.batches(16, observe=observer, **options))
+    for batch, plain in zip(batches, dataset.batches(16, **options), strict=True):
+        assert list(batch) == [*fields, "basis"]
+        assert batch["basis"].shape == (batch.rows, 40)
+        np.testing.assert_array_equal(batch["basis"], observe(scenes_of(plain), BasisPoints(points=40))["basis"])
+    cloud = BatchObserver(SurfaceCloud(points=9), scenes_of)
+    first, again = (next(iter(dataset.batches(16, observe=cloud, **options)))["cloud"] for _ in range(2))
+    np.testing.assert_array_equal(first, again)
