@@ -18,12 +18,13 @@ if TYPE_CHECKING:
     from cnpgen.plans import Plans
 
 _TEXT = """\
-The problems are samples of a dataset, fresh draws of a recipe as 'cnpgen solve' makes them, or boundary conditions in
-an HDF5 file (a shard, a plan file, or any other), or scenes of a model for scenes: start_q and goal_q of shape (N, joints), optionally start_dq,
-start_ddq and goal_dq, and goal_ddq for models that hold the goal's acceleration. Plans meet the boundary conditions to
-rounding; 'cnpgen evaluate' checks the constraints. With --refine the plans are optimized as by 'cnpgen refine', and the
-exit code is 1 if a plan is invalid in the end. Finished plans are kept in PLANS.part, and the same command resumes. The
-plan file is printed on stdout; an existing one is replaced only with --force.
+The problems are samples of a dataset, fresh draws of a recipe as 'cnpgen solve' makes them, scenes ('cnpgen docs
+scene-files') for a model that was trained on scenes, or boundary conditions in an HDF5 file (a shard, a plan file, or
+any other): start_q and goal_q of shape (N, joints), optionally start_dq, start_ddq and goal_dq, and goal_ddq for models
+that hold the goal's acceleration. Plans meet the boundary conditions to rounding; 'cnpgen evaluate' checks the
+constraints. With --refine the plans are optimized as by 'cnpgen refine', and the exit code is 1 if a plan is invalid in
+the end. Finished plans are kept in PLANS.part, and the same command resumes. The plan file is printed on stdout; an
+existing one is replaced only with --force.
 """
 
 

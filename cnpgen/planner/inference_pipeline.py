@@ -113,9 +113,7 @@ class InferencePipeline:
             status=np.zeros(len(boundary), np.uint8),  # unknown
         )
 
-    def planned(
-        self, model: Model, boundary: Boundary, obstacle_poses: Array | None = None
-    ) -> tuple[Tasks, Motion]:
+    def planned(self, model: Model, boundary: Boundary, obstacle_poses: Array | None = None) -> tuple[Tasks, Motion]:
         """Plan N motions; return the tasks with the selected lines, and the motions."""
         ends = ends_of(boundary)
         tasks = self.prepare(boundary, ends=ends, obstacle_poses=obstacle_poses)

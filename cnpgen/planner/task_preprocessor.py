@@ -85,7 +85,8 @@ class TaskPreprocessor:
             via_point: Via points of the lines at half their length before projection [rad], shape (N, n); none by
                 default.
             ends: Result of ``ends_of``, if already computed.
-            obstacle_poses: Poses and sizes of obstacles that samples place, shape (N, width); by default they are parked.
+            obstacle_poses: Poses and sizes of obstacles that samples place, shape (N, width); by default, they stay
+                parked.
 
         Raises:
             UsageError: The obstacle poses have a wrong shape or are not finite, or the problem places the obstacles.

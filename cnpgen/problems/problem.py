@@ -16,10 +16,10 @@ from cnpgen.problems.constraints.object_clearance import ObjectClearance
 from cnpgen.problems.objectives import Centrifugal, ObjectiveTerm
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot_spec import HeldObject, LimitSpec, Payload, RobotSpec
+from cnpgen.robots.scene import PARKED_POSITION_M
 from cnpgen.robots.shape.inline import with_inline_meshes
 from cnpgen.robots.shape.mesh_files import find_urdf
 from cnpgen.robots.shape.srdf import with_disabled_pairs, with_ignored_pairs
-from cnpgen.robots.scene import PARKED_POSITION_M
 from cnpgen.robots.solid import pose_width
 from cnpgen.robots.urdf import read_urdf
 from cnpgen.schema import registry

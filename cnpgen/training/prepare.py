@@ -116,9 +116,7 @@ def _rows(
             features = published_features(blocks, robot.velocity_limit, robot.acceleration_limit)
         return prepare_rows(boundary, inference.prepare, features=features, blocks=blocks, obstacle_poses=poses)
     lines = None if inference.via_points is None else lambda some: inference.planned(initial_model, some)[0]
-    return prepare_rows(
-        boundary, inference.prepare, features=initial_model.features, lines=lines, obstacle_poses=poses
-    )
+    return prepare_rows(boundary, inference.prepare, features=initial_model.features, lines=lines, obstacle_poses=poses)
 
 
 def identity(source: TrainingData, settings: TrainingSettings) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from cnpgen.trajectory.boundary import Boundary
 Array = NDArray[np.float64]
 
 VALIDATION_SHARE = 0.05  # of the problems, the last ones
-MAX_VALIDATION_ROWS = 1000
+MAX_VALIDATION_ROWS = 200  # verdicts among obstacles take a quarter of a second
 MIN_SCENE_ROWS = 40
 
 

@@ -46,7 +46,9 @@ def test_losses_of_states_are_those_of_measured_distances(problem):
     close = checker.close_bodies(q.T, REQUIRED, of_obstacles=True)
     expected = np.bincount(close.k, (REQUIRED - close.distance) ** 2 / 2, minlength=200)
     assert (expected > 0).mean() > 0.1
-    np.testing.assert_allclose(losses[:, 0], expected, rtol=2e-2, atol=1e-5)  # cylinders there contain the judges' prism
+    np.testing.assert_allclose(
+        losses[:, 0], expected, rtol=2e-2, atol=1e-5
+    )  # cylinders there contain the judges' prism
     step, e = np.random.default_rng(1).normal(size=q.shape), 1e-6
     above, below = (ClearanceLoss(kernels, robot)((q + s * e * step)[:, :, None], bodies, REQUIRED)[0] for s in (1, -1))
     numeric, analytic = (above - below)[:, 0] / (2 * e), (gradients[:, :, 0] * step).sum(axis=1)

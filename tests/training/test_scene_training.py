@@ -129,9 +129,7 @@ def test_a_planner_is_trained_on_a_scene_file_and_plans_its_scenes(problem, tmp_
     path = write_problem(tmp_path)
     save_scenes(file, items)
     own = load_problem(path)
-    trained = train_model(
-        file, tmp_path / "model.h5", steps=8, settings=TINY, check_rows=1, workers=1, robot=str(path)
-    )
+    trained = train_model(file, tmp_path / "model.h5", steps=8, settings=TINY, check_rows=1, workers=1, robot=str(path))
     model = load_model(trained.path)
     assert "scene" in model.features.blocks
     assert robot.exists()
@@ -142,9 +140,7 @@ def test_a_planner_is_trained_on_a_scene_file_and_plans_its_scenes(problem, tmp_
     empty = planner.plan_batch(plans.boundary)  # obstacles stay parked
     assert not np.array_equal(empty.path_control_points, plans.path_control_points)
     shuffled = [replace(item, obstacles=item.obstacles[::-1]) for item in items[:4]]
-    np.testing.assert_allclose(
-        plan_scenes(planner, shuffled).path_control_points, plans.path_control_points, atol=1e-5
-    )
+    np.testing.assert_allclose(plan_scenes(planner, shuffled).path_control_points, plans.path_control_points, atol=1e-5)
     assert main(["plan", str(file), "--model", str(trained.path), "--n", "4", "-o", str(tmp_path / "plans.h5")]) == 0
     capsys.readouterr()
     again = load_plans(tmp_path / "plans.h5")
@@ -154,5 +150,3 @@ def test_a_planner_is_trained_on_a_scene_file_and_plans_its_scenes(problem, tmp_
         plan_scenes(planner, [crowded])
     with pytest.raises(UsageError, match="do not differ from plan to plan"):
         plan_scenes(Planner("heavy-object"), items[:1])
-
-

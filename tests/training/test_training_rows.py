@@ -45,9 +45,7 @@ def test_the_order_of_rows_is_that_of_the_loader():
 @pytest.mark.parametrize("checks", [2, 20, 1000])
 def test_check_rows_and_scored_rows_are_disjoint(tiny, checks):
     source = open_training_data(tiny("airhockey-hit"))
-    checked, judged = (
-        rows.boundary.start_q for rows in (source.checked(checks), source.judged(2000, after=checks))
-    )
+    checked, judged = (rows.boundary.start_q for rows in (source.checked(checks), source.judged(2000, after=checks)))
     assert len(checked) == min(checks, 30)
     assert len(checked) + len(judged) == 60
     assert len(np.unique(np.concatenate([checked, judged]), axis=0)) == 60

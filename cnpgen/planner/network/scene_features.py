@@ -66,9 +66,9 @@ def _shares(axis: Array) -> list[float]:
 class SceneFeatures:
     """Features of the obstacles of tasks, made by ``make_scene_features``.
 
-    They are, along the straight line, the smallest clearance of points of the links, the sum of their clearances below
-    ``LINE_RANGE_M``, and its differences if each joint moves by ``LINE_STEP_RAD`` to both sides; and signed distances at
-    the points of ``BASIS``.
+    At some phases of the straight line they are the smallest clearance of points of the links, the sum of what their
+    clearances lack of ``LINE_RANGE_M``, and its differences if each joint moves by ``LINE_STEP_RAD`` to both sides. The
+    others are signed distances at the points of ``BASIS``.
 
     Attributes:
         points: Kernel of ``link_points``.
