@@ -179,7 +179,7 @@ def test_options_override_the_preset_and_are_in_the_command(tiny, tmp_path, monk
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"features": "sines"}, "features must be one of full, states, paper, got 'sines'"),
+        ({"features": "sines"}, "features must be one of full, no-scene, states, paper, got 'sines'"),
         ({"keep": "first"}, "keep must be one of best, last, got 'first'"),
         ({"constraint_terms": "some"}, "constraint_terms must be one of all, budgeted, got 'some'"),
         ({"loss_form": "plain"}, "loss_form must be one of signed, paper, got 'plain'"),

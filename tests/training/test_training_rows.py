@@ -23,7 +23,9 @@ def test_rows_prepared_in_blocks_equal_those_prepared_at_once(tiny, monkeypatch,
     whole, features = prepare_rows(boundary, prepare)
     monkeypatch.setattr(rows_module, "PREPARED_ROWS_PER_BLOCK", 16)
     seen, call = [], type(prepare).__call__
-    monkeypatch.setattr(type(prepare), "__call__", lambda self, part: seen.append(len(part)) or call(self, part))
+    monkeypatch.setattr(
+        type(prepare), "__call__", lambda self, part, **poses: seen.append(len(part)) or call(self, part, **poses)
+    )
     parts, again = prepare_rows(boundary, prepare)
     assert max(seen) == 16
     np.testing.assert_allclose(again.mean, features.mean, rtol=1e-12, atol=1e-14)

@@ -68,7 +68,7 @@ class BatchObserver:
 
     def __call__(self, batch: Batch) -> dict[str, NDArray[Any]]:
         """Observe the scenes of a batch."""
-        return observe(self.scenes(batch), self.kind, seed=(self.seed << 32) + zlib.crc32(batch.table))
+        return observe(self.scenes(batch), self.kind, seed=(self.seed << 32) + zlib.crc32(batch.table.tobytes()))
 
 
 def scene_bodies(scenes: Scenes) -> Primitives:
