@@ -8,7 +8,9 @@ refining without another initial guess, and of ``solve``, with CPU times. The ve
 
 import argparse
 import time
+from collections import Counter
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +32,7 @@ from cnpgen.refine.refine_engine import refine_serially
 from cnpgen.refine.task import Attempt, Outcome
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.solid import place_obstacles
-from cnpgen.scenes import SceneError, SceneProblem, make_scenes, plan_scenes, save_scenes
+from cnpgen.scenes import SceneError, SceneProblem, load_scenes, make_scenes, plan_scenes, save_scenes
 
 Array = NDArray[np.float64]
 
@@ -43,6 +45,19 @@ STARTS = ("neutral", "grasp", "random")
 START_SHARES = (0.4, 0.4, 0.2)
 
 
+def make_checker(robot: Robot) -> CollisionChecker:
+    """Return the compiled collision checks of a robot."""
+    library = load_collision_library(KernelLibrary(*choose_backend("compiled"), "", {}))
+    assert library is not None
+    return CollisionChecker(library, robot)
+
+
+def is_line_clear(checker: CollisionChecker, start: Array, goal: Array) -> bool:
+    """Return whether the straight line between two states is free of collisions."""
+    count = int(np.ceil(np.abs(goal - start).max() / LINE_SPACING_RAD)) + 2
+    return bool(checker.clear_states(np.linspace(start, goal, count).T.copy()).all())
+
+
 class TrainingProblems:
     """Generator of training problems of a robot.
 
@@ -52,9 +67,7 @@ class TrainingProblems:
     """
 
     def __init__(self, robot: Robot, random: np.random.Generator) -> None:
-        library = load_collision_library(KernelLibrary(*choose_backend("compiled"), "", {}))
-        assert library is not None
-        self.robot, self.random, self.checker = robot, random, CollisionChecker(library, robot)
+        self.robot, self.random, self.checker = robot, random, make_checker(robot)
         self.any_states = self._clear(self._uniform(20_000), of_obstacles=False)
         self.down, self.tips = self._states_pointing_down()
 
@@ -98,7 +111,7 @@ class TrainingProblems:
             if len(states) == 0 or made == count:
                 continue
             start, goal = (each[self.random.integers(len(each))] for each in (states, grasps[target]))
-            if self.random.random() > STRAIGHT_SHARE and self._line_is_clear(start, goal):
+            if self.random.random() > STRAIGHT_SHARE and is_line_clear(self.checker, start, goal):
                 continue
             made += 1
             yield SceneProblem(
@@ -112,10 +125,6 @@ class TrainingProblems:
     def _near(self, position: Array) -> Array:
         near = np.flatnonzero(((self.tips - position) ** 2).sum(axis=1) < GRASP_DISTANCE_M**2)
         return self._clear(self.down[self.random.permutation(near)[:40]])
-
-    def _line_is_clear(self, start: Array, goal: Array) -> bool:
-        count = int(np.ceil(np.abs(goal - start).max() / LINE_SPACING_RAD)) + 2
-        return bool(self.checker.clear_states(np.linspace(start, goal, count).T.copy()).all())
 
 
 def make(robot: str, families: Sequence[str], scenes: int, per_scene: int, seed: int) -> list[SceneProblem]:
@@ -132,14 +141,10 @@ def make(robot: str, families: Sequence[str], scenes: int, per_scene: int, seed:
 
 def colliding_lines(problem: str, scenes: Sequence[SceneProblem]) -> list[SceneProblem]:
     """Return the scenes whose straight line collides."""
-    generator = TrainingProblems.__new__(TrainingProblems)
-    library = load_collision_library(KernelLibrary(*choose_backend("compiled"), "", {}))
-    assert library is not None
-    generator.checker = CollisionChecker(library, load_robot(as_problem(problem)))
-    chosen = []
+    checker, chosen = make_checker(load_robot(as_problem(problem))), []
     for scene in scenes:
-        generator.checker.place(scene.obstacles, place_obstacles(scene.obstacles))
-        if not generator._line_is_clear(scene.start_q, scene.goal_q[0]):
+        checker.place(scene.obstacles, place_obstacles(scene.obstacles))
+        if not is_line_clear(checker, scene.start_q, scene.goal_q[0]):
             chosen.append(scene)
     return chosen
 
@@ -153,8 +158,6 @@ def refined(plans: Plans) -> tuple[list[Attempt], float]:
 
 def without_motions(plans: Plans) -> Plans:
     """Return the boundary problems of plans, without motions."""
-    from dataclasses import replace
-
     return replace(
         plans,
         path_control_points=np.full_like(plans.path_control_points, np.nan),
@@ -162,12 +165,21 @@ def without_motions(plans: Plans) -> Plans:
     )
 
 
-def measure(models: Sequence[str], robot: str, family: str, count: int, seed: int) -> list[dict[str, Any]]:
-    """Return the figures of models and of ``solve`` for one family."""
-    scenes = colliding_lines(robot, make_scenes(family, robot, count, seed=seed, per_scene=2))
+def fitting(planner: Planner, scenes: Sequence[SceneProblem]) -> list[SceneProblem]:
+    """Return the scenes with at most as many obstacles of each kind as the problem of the planner's model."""
+    with planner.model.problem.restored() as problem:
+        most = Counter(obstacle.kind for obstacle in problem.obstacle)
+    return [scene for scene in scenes if Counter(obstacle.kind for obstacle in scene.obstacles) <= most]
+
+
+def measure(models: Sequence[str], robot: str, family: str, scenes: Sequence[SceneProblem]) -> list[dict[str, Any]]:
+    """Return the figures of models and of ``solve`` for the scenes of one family."""
+    planners = [Planner(name if not Path(name).exists() else Path(name)) for name in models]
+    scenes = fitting(planners[0], colliding_lines(robot, scenes))
+    if not scenes:
+        return []
     results, solved = [], None
-    for name in models:
-        planner = Planner(name if not Path(name).exists() else Path(name))
+    for name, planner in zip(models, planners, strict=True):
         plan_scenes(planner, scenes[:2])
         begun = time.process_time()
         plans = plan_scenes(planner, scenes)
@@ -209,6 +221,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--per-scene", type=int, default=8, help="largest number of training problems in one scene")
     parser.add_argument("--out", type=Path, default=Path("training-scenes.h5"), help="file of the training problems")
     parser.add_argument("--models", nargs="*", default=["panda-scenes"], help="models by name or file")
+    parser.add_argument("--suite", type=Path, help="file of test problems, such as datasets/suites/clutter.h5")
     parser.add_argument("--count", type=int, default=100, help="test problems of every family, before the selection")
 
 
@@ -225,7 +238,11 @@ def main() -> None:
     with one_thread(), np.errstate(all="ignore"):
         for family in families:
             progress(family)
-            results += measure(chosen.models, chosen.robot, family, chosen.count, chosen.seed)
+            if chosen.suite is None:
+                scenes = make_scenes(family, chosen.robot, chosen.count, seed=chosen.seed, per_scene=2)
+            else:
+                scenes = [scene for scene in load_scenes(chosen.suite) if scene.name.rsplit(" ", 2)[0] == family]
+            results += measure(chosen.models, chosen.robot, family, scenes)
     head = ("family", "model", "problems", "alone", "refined", "with others", "solve", "cpu: plan", "refine", "solve")
     rows = [
         (

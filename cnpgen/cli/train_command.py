@@ -129,6 +129,8 @@ def _command(arguments: argparse.Namespace) -> str:
     said += [*passed_settings(arguments), ("check", arguments.check)]
     if arguments.start_from is not None:
         said.insert(0, ("from", shlex.quote(Path(arguments.start_from).name)))
+    if arguments.robot is not None:
+        said.insert(0, ("robot", shlex.quote(Path(arguments.robot).name)))
     default = arguments.parser.get_default
     options = [f"--{name.replace('_', '-')} {value!s}" for name, value in said if value not in {None, default(name)}]
     options = [option.removesuffix(" True") for option in options]
