@@ -77,7 +77,7 @@ def time_steps(folder: Path, hidden: int, batch: int, *, steps: int, backend: st
     """Measure steps of one network: the time [ms] and the fraction of every part."""
     settings = TrainingSettings(hidden=hidden, batch_size=batch)
     source, clock, times = open_training_data(folder), Clock({}), []
-    with one_thread(), loaded_problem(as_record(source.dataset.problem), backend) as loaded:
+    with one_thread(), loaded_problem(as_record(source.problem), backend) as loaded:
         run, _ = prepare_run(source, loaded, settings, check_rows=1)
         state = begin_run(run, Length(steps=10**6))
         gradient = np.empty_like(state.adam.parameters)

@@ -18,12 +18,13 @@ if TYPE_CHECKING:
     from cnpgen.plans import Plans
 
 _TEXT = """\
-The problems are samples of a dataset, fresh draws of a recipe as 'cnpgen solve' makes them, or boundary conditions in
-an HDF5 file (a shard, a plan file, or any other): start_q and goal_q of shape (N, joints), optionally start_dq,
-start_ddq and goal_dq, and goal_ddq for models that hold the goal's acceleration. Plans meet the boundary conditions to
-rounding; 'cnpgen evaluate' checks the constraints. With --refine the plans are optimized as by 'cnpgen refine', and the
-exit code is 1 if a plan is invalid in the end. Finished plans are kept in PLANS.part, and the same command resumes. The
-plan file is printed on stdout; an existing one is replaced only with --force.
+The problems are samples of a dataset, fresh draws of a recipe as 'cnpgen solve' makes them, scenes ('cnpgen docs
+scene-files') for a model that was trained on scenes, or boundary conditions in an HDF5 file (a shard, a plan file, or
+any other): start_q and goal_q of shape (N, joints), optionally start_dq, start_ddq and goal_dq, and goal_ddq for models
+that hold the goal's acceleration. Plans meet the boundary conditions to rounding; 'cnpgen evaluate' checks the
+constraints. With --refine the plans are optimized as by 'cnpgen refine', and the exit code is 1 if a plan is invalid in
+the end. Finished plans are kept in PLANS.part, and the same command resumes. The plan file is printed on stdout; an
+existing one is replaced only with --force.
 """
 
 
@@ -31,7 +32,7 @@ def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
     parser = add_command(commands, "plan", run, title="plan with a trained model", text=_TEXT)
     option = parser.add_argument
-    text = "a dataset's folder; a dataset or pipeline by name, or a recipe file; or boundary conditions in HDF5"
+    text = "a dataset's folder; a dataset or pipeline by name, or a recipe file; boundary conditions in HDF5; or scenes"
     option("problems", metavar="DIR|NAME|FILE", help=text)
     text = "a shipped model, or a model file (default for a shipped dataset by name: the model of this name)"
     option("--model", metavar="NAME|FILE", help=text)
@@ -135,12 +136,15 @@ def _save(arguments: argparse.Namespace, plans: "Plans", seconds: float) -> int:
 def _requests(arguments: argparse.Namespace, model: "Model") -> "Requests":
     from cnpgen.errors import UsageError
     from cnpgen.planner.plan_requests import read_file, read_rows
+    from cnpgen.problems.scenes.scene_files import holds_scenes
 
     if is_recipe(arguments.problems):
         return _draws(arguments, model)
     if arguments.seed is not None:
         raise UsageError(f"--seed is for fresh draws of a recipe, got {arguments.problems}")
     problems = Path(arguments.problems)
+    if problems.exists() and holds_scenes(problems):
+        return _scenes(arguments, model)
     if problems.is_dir():
         return read_rows(
             problems,
@@ -153,6 +157,17 @@ def _requests(arguments: argparse.Namespace, model: "Model") -> "Requests":
     if arguments.split is not None or arguments.first is not None or arguments.n is not None:
         raise UsageError("--split, --first and --n need the folder of a dataset, got a file")
     return read_file(problems, model, other=arguments.other_rows, allow_large_angles=arguments.allow_large_angles)
+
+
+def _scenes(arguments: argparse.Namespace, model: "Model") -> "Requests":
+    """Read the problems of scenes."""
+    from cnpgen.errors import UsageError
+    from cnpgen.planner.scene_requests import scene_requests
+    from cnpgen.problems.scenes.scene_files import load_scenes
+
+    if arguments.split is not None or arguments.other_rows:
+        raise UsageError("--split and --other-rows are for datasets; scenes have --first and --n")
+    return scene_requests(model, load_scenes(arguments.problems, start=arguments.first or 0, n=arguments.n))
 
 
 def _draws(arguments: argparse.Namespace, model: "Model") -> "Requests":

@@ -36,11 +36,12 @@ def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
     parser = add_command(commands, "train", run, title="train a planner on a dataset", text=_TEXT)
     option = parser.add_argument
-    option("folder", metavar="DIR", type=Path, help="the dataset")
+    option("folder", metavar="DIR", type=Path, help="the dataset; or, with --robot, scenes")
     option("-o", "--out", metavar="MODEL", type=Path, required=True, help="model file to write, .h5")
     _add_length(parser)
     _add_how(parser)
     option("--check", metavar="N", type=values.positive, default=200, help=_CHECK)
+    option("--robot", metavar="NAME|FILE", help="train on scenes with this problem of a robot, such as panda")
     option("--workers", metavar="W", type=values.positive, help="processes of the last validation, on up to 2,000 rows")
     option("--force", action="store_true", help="replace MODEL, its log and another run's checkpoint")
     option("--quiet", action="store_true", help="no progress and no summary")
@@ -98,6 +99,7 @@ def _train(arguments: argparse.Namespace, watch: Watch) -> "Trained":
         command=_command(arguments),
         force=arguments.force,
         workers=arguments.workers,
+        robot=arguments.robot,
         begin=watch.begin,
         watch=watch,
     )
@@ -127,6 +129,8 @@ def _command(arguments: argparse.Namespace) -> str:
     said += [*passed_settings(arguments), ("check", arguments.check)]
     if arguments.start_from is not None:
         said.insert(0, ("from", shlex.quote(Path(arguments.start_from).name)))
+    if arguments.robot is not None:
+        said.insert(0, ("robot", shlex.quote(Path(arguments.robot).name)))
     default = arguments.parser.get_default
     options = [f"--{name.replace('_', '-')} {value!s}" for name, value in said if value not in {None, default(name)}]
     options = [option.removesuffix(" True") for option in options]

@@ -46,8 +46,8 @@ _OPTIONS: dict[str, _Setting] = {
     "hidden": _Setting(values.positive, "W", "width of the network's layers (default: 128)"),
     "layers": _Setting(values.positive, "L", "depth of its trunk (default: 5)"),
     "features": _Setting(
-        str, None, "inputs: all features; the boundary states, standardized; or divided by pi and by the limits"
-        " (default: full)", ("full", "states", "paper"),
+        str, None, "inputs: all features; all but those of obstacles that samples place; the boundary states,"
+        " standardized; or divided by pi and by the limits (default: full)", ("full", "no-scene", "states", "paper"),
     ),
     "path_scale": _Setting(_real, "RAD", "factor of the configuration head's output (default: 0.5; pi in the paper)"),
     "head_scale": _Setting(_real, "X", "factor of the first weights of both heads (default: 0.1; 1 in the paper)"),

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.loader.batch import Batch
@@ -20,6 +21,8 @@ from cnpgen.loader.shard_reader import SplitShards
 from cnpgen.loader.windows import Windows
 from cnpgen.schema.arguments import integer
 
+Observe = Callable[[Batch], Mapping[str, NDArray[Any]]]
+
 
 class Batches:
     """Iterable over batches: every loop yields the remaining batches of an epoch; then the next epoch begins.
@@ -32,6 +35,7 @@ class Batches:
         row_format: Fields, normalization and type of the rows.
         partition: Partition of the rows into batches.
         position: Initial position.
+        observe: Function that returns observations of a batch, which are added to it.
 
     Attributes:
         times_set: Number of times that ``epoch`` or ``load_state`` set the position.
@@ -43,7 +47,12 @@ class Batches:
     """
 
     def __init__(
-        self, source: SplitShards, row_format: RowFormat, partition: BatchPartition, position: Position
+        self,
+        source: SplitShards,
+        row_format: RowFormat,
+        partition: BatchPartition,
+        position: Position,
+        observe: Observe | None = None,
     ) -> None:
         if partition.drop_last and partition.batch_size > source.rows:
             raise UsageError(
@@ -54,6 +63,7 @@ class Batches:
         partition.check_ranks(source.rows, first=position.row)
         self._source, self._row_format, self._partition, self._position = source, row_format, partition, position
         self._in_memory: InMemoryRows | None = None
+        self._observe = observe
         self.times_set = 0
         self.worker_positions: Any = None
 
@@ -106,7 +116,7 @@ class Batches:
             )
             row = min(row + partition.workers * partition.batch_size, end)
             self._position = position = self._forward(Position(begin.seed, begin.shuffle, begin.epoch, row))
-            yield batch
+            yield batch if self._observe is None else replace(batch, observations=self._observe(batch))
             if self._position is not position:
                 raise UsageError("within this loop, another loop over the same batches ran or load_state was called")
 
@@ -171,4 +181,4 @@ class Batches:
         """Return the batches of one of several workers, which share the remaining batches or those of an epoch."""
         partition = replace(self._partition, worker=worker, workers=workers)
         position = self._position if epoch is None else replace(self._position, epoch=epoch, row=0)
-        return Batches(self._source, self._row_format, partition, position)
+        return Batches(self._source, self._row_format, partition, position, self._observe)

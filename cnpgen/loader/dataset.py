@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, DTypeLike
 
 from cnpgen.errors import DatasetError, lacks
 from cnpgen.loader.batch_partition import BatchPartition
-from cnpgen.loader.batches import Batches
+from cnpgen.loader.batches import Batches, Observe
 from cnpgen.loader.frame import make_frame
 from cnpgen.loader.gather import Rows, gather
 from cnpgen.loader.normalization import Normalization, make_normalization
@@ -109,6 +109,7 @@ class Dataset:
         dtype: DTypeLike = "float32",
         drop_last: bool = True,
         shuffle: bool = True,
+        observe: Observe | None = None,
     ) -> Batches:
         """Return the batches of a split, in an order that depends on seed and epoch only.
 
@@ -124,6 +125,8 @@ class Dataset:
             dtype: Type of float fields.
             drop_last: Whether to omit an incomplete last batch of an epoch.
             shuffle: Whether to shuffle the rows; otherwise they are in their stored order.
+            observe: Function that returns observations of a batch, name -> array with a first axis of length B, which
+                are added to it; ``cnpgen.scenes.BatchObserver`` observes scenes.
 
         Raises:
             UsageError: An argument is invalid, or there are fewer rows than in one batch, or fewer in the last batch
@@ -133,7 +136,7 @@ class Dataset:
         partition = BatchPartition(batch_size=batch_size, rank=rank, world=world, drop_last=drop_last)
         position = checked_position(seed=seed, shuffle=shuffle, epoch=epoch)
         row_format = self._row_format(fields=fields, normalize=normalize, dtype=dtype)
-        return Batches(self._source(split), row_format, partition, position)
+        return Batches(self._source(split), row_format, partition, position, observe)
 
     @checked_arguments
     def rows(

@@ -16,6 +16,7 @@ from cnpgen.errors import UsageError, counted, nearest
 from cnpgen.kernels.grid_kernel import GridKernel
 from cnpgen.kernels.library import Backend, choose_backend, problem_kernels
 from cnpgen.kernels.tape import DTYPES, Dtype
+from cnpgen.losses.hull_loss import HullLoss, make_hull_loss
 from cnpgen.losses.integrand import grid_specs, loss_gradient, loss_values, relaxation_argument
 from cnpgen.losses.margins import Margins, constraint_terms
 from cnpgen.losses.plan_batch import MAX_VECTOR_LANES, PLANS_PER_BLOCK, PlanBatch, check_batch, check_shapes
@@ -33,7 +34,7 @@ from cnpgen.store.dataset_spec import StoredProblem
 Array = NDArray[Any]
 FORMS = ("signed", "paper")
 MAX_LOSS_THREADS = 1024
-_BUILT = {"_gradient", "_values", "_time_varying_bound"}
+_BUILT = {"_gradient", "_values", "_time_varying_bound", "_hulls"}
 
 
 @dataclass(frozen=True)
@@ -61,6 +62,8 @@ class LossValue:
 
 class PlanLoss:
     """``integral of (task loss + sum of weight_i Huber(violation_i)) dt`` of plans of one problem, and its gradient.
+
+    If samples place the obstacles, their distances are those of the links' hulls, at every fourth node (``HullLoss``).
 
     Args:
         problem: The problem, its record (``plans.problem``, ``dataset.problem``), or the name or the file of a problem,
@@ -112,7 +115,7 @@ class PlanLoss:
         self._robot = load_robot(self.problem)
         chosen, folder = choose_backend(backend)
         folder = folder if cache_folder is None else Path(cache_folder)
-        self._kernels = problem_kernels(self.problem, self._robot, chosen, folder)
+        self._kernels = problem_kernels(self.problem.for_planning, self._robot, chosen, folder)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state without the kernels, which are loaded again when needed."""
@@ -161,9 +164,12 @@ class PlanLoss:
             part = batch[rows]
             with one_thread(), np.errstate(all="ignore"):  # an overflow affects its own plan only
                 results = self._integrate(part, checked, table, gradient=gradient)
+                if self._hulls is not None:
+                    self._hulls.add(results, part, checked, table, shift=shift)
                 terms[rows], path_gradient[rows], rate_gradient[rows] = (part.samples(values) for values in results)
 
-        kernel = self._gradient if gradient else self._values  # loaded before threads start, as is the bound
+        self._hulls  # noqa: B018 - a cached property, loaded before threads start, as are the kernel and the bound
+        kernel = self._gradient if gradient else self._values
         if kernel.tape.inputs[relaxation_argument(self.problem)] and batch.start_tip is not None:
             self._time_varying_bound  # noqa: B018 - a cached property
         self._run(evaluate_block, n)
@@ -192,13 +198,13 @@ class PlanLoss:
     ) -> tuple[Array, Array, Array]:
         """Return terms and gradients of a block, samples last; the gradients are empty if they are not requested."""
         nodes, orders, (points, n) = len(table.s), self.problem.path_orders, batch.path.shape[1:]
-        rates = batch.lanes(batch.rate)
+        rates, poses = batch.lanes(batch.rate), batch.obstacle_poses[:, : self.problem.for_planning.scene_width]
         lanes = rates.shape[1]
         path = (table.path @ batch.lanes(batch.path).reshape(points, -1)).reshape(orders, nodes, n, lanes)
         rate = (table.rate @ rates).reshape(orders - 1, nodes, lanes)
         terms = np.zeros((len(self.terms), lanes), self.dtype)
         arguments = (
-            *path.swapaxes(1, 2), rate, batch.lanes(batch.obstacle_poses),
+            *path.swapaxes(1, 2), rate, batch.lanes(poses),
             self._relaxation(batch, table, lanes, gradient=gradient), table.weights, self.tightening, weights,
         )  # fmt: skip
         if not gradient:
@@ -278,6 +284,12 @@ class PlanLoss:
     @cached_property
     def _values(self) -> GridKernel:
         return self._kernels.load_grid(loss_values, grid_specs(self.problem)[0], dtype=self.dtype, form=self.form)
+
+    @cached_property
+    def _hulls(self) -> HullLoss | None:
+        if not self.problem.has_sample_obstacles:
+            return None
+        return make_hull_loss(self.problem, self._robot, self._kernels, self._tightening)
 
     @cached_property
     def _time_varying_bound(self) -> TimeVaryingBound:

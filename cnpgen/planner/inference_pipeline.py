@@ -19,6 +19,7 @@ from cnpgen.planner.tasks import Tasks
 from cnpgen.planner.time_parametrization import TimeParametrization, make_time_parametrization
 from cnpgen.planner.time_scaling import TimeScaling, make_time_scaling
 from cnpgen.planner.via_points import MAX_LINES, ViaPoints, make_via_points
+from cnpgen.plans.format import OBSTACLE_POSES
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
@@ -40,7 +41,7 @@ class LoadedProblem:
         record: Text of the problem and its URDF.
         problem: The problem; its URDF file exists only inside ``loaded_problem``.
         robot: Its robot.
-        kernels: Library of its kernels.
+        kernels: Library of the kernels of ``problem.for_planning``.
     """
 
     record: ProblemRecord
@@ -63,7 +64,7 @@ def loaded_problem(record: ProblemRecord, backend: str | None = None) -> Iterato
     chosen, folder = choose_backend(backend)
     with record.restored() as problem:
         robot = load_robot(problem)
-        yield LoadedProblem(record, problem, robot, problem_kernels(problem, robot, chosen, folder))
+        yield LoadedProblem(record, problem, robot, problem_kernels(problem.for_planning, robot, chosen, folder))
 
 
 @dataclass(frozen=True)
@@ -100,7 +101,7 @@ class InferencePipeline:
             sample_id: Dataset samples of the tasks, shape (N,); 0, 1, ... by default.
             columns: Further columns of the tasks, as ``Plans.columns``.
         """
-        tasks, motion = self.planned(model, boundary)
+        tasks, motion = self.planned(model, boundary, (columns or {}).get(OBSTACLE_POSES))
         return Plans(
             problem=model.problem,
             boundary=boundary,
@@ -112,10 +113,10 @@ class InferencePipeline:
             status=np.zeros(len(boundary), np.uint8),  # unknown
         )
 
-    def planned(self, model: Model, boundary: Boundary) -> tuple[Tasks, Motion]:
+    def planned(self, model: Model, boundary: Boundary, obstacle_poses: Array | None = None) -> tuple[Tasks, Motion]:
         """Plan N motions; return the tasks with the selected lines, and the motions."""
         ends = ends_of(boundary)
-        tasks = self.prepare(boundary, ends=ends)
+        tasks = self.prepare(boundary, ends=ends, obstacle_poses=obstacle_poses)
         motion = self._fitted(self._projected(model, tasks, ends), tasks.scene.poses)
         if self.via_points is None:
             return tasks, motion
@@ -171,7 +172,12 @@ class InferencePipeline:
 
 
 def make_inference_pipeline(
-    loaded: LoadedProblem, config: ModelConfig, *, scale_time: bool, fixed_at_goal: int = 2
+    loaded: LoadedProblem,
+    config: ModelConfig,
+    *,
+    scale_time: bool,
+    fixed_at_goal: int = 2,
+    observed: bool = True,
 ) -> InferencePipeline:
     """Load the inference pipeline of a problem.
 
@@ -180,8 +186,9 @@ def make_inference_pipeline(
         config: Configuration of the model.
         scale_time: Whether to scale motions in time; only for motions from rest to rest.
         fixed_at_goal: Number of control points that the goal fixes (``Boundary.fixed_at_goal``).
+        observed: Whether the model has features of obstacles that samples place.
     """
-    problem, robot, kernels = loaded.problem, loaded.robot, loaded.kernels
+    problem, robot, kernels = loaded.problem.for_planning, loaded.robot, loaded.kernels
     with kernels.compile_in_parallel():
         prepare = make_task_preprocessor(
             problem,
@@ -192,6 +199,8 @@ def make_inference_pipeline(
             fixed_at_goal=fixed_at_goal,
             within_limits=config.within_limits,
             via_lines=bool(config.via_points),
+            placed=loaded.problem.obstacle if loaded.problem.has_sample_obstacles else (),
+            observed=observed,
         )
         path = kernels.load(
             projected_path,

@@ -16,6 +16,7 @@ from cnpgen.machine.threads import one_thread
 from cnpgen.planner.inference_pipeline import loaded_problem, make_inference_pipeline
 from cnpgen.planner.model import Model
 from cnpgen.planner.model_file import load_model, model_for
+from cnpgen.planner.network.features import SCENE
 from cnpgen.planner.plan_reuse import reuse_previous_plan
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.plausible import check_boundary_units
@@ -73,6 +74,7 @@ class Planner:
                 config,
                 scale_time=scale_time and self.model.is_rest_to_rest,
                 fixed_at_goal=self.model.fixed_at_goal,
+                observed=SCENE in self.model.features.blocks,
             )
             limits = {"dq": loaded.robot.velocity_limit, "ddq": loaded.robot.acceleration_limit}
             ends = ("start", "goal")
@@ -140,7 +142,8 @@ class Planner:
         Args:
             boundary: Boundary conditions, shape (N, n) each, float64 and finite.
             sample_id: Dataset samples of the tasks, shape (N,); 0, 1, ... by default.
-            columns: Further columns of the tasks, as ``Plans.columns``.
+            columns: Further columns of the tasks, as ``Plans.columns``; ``obstacle_poses`` places the obstacles of a
+                model for scenes (``cnpgen.scenes.scene_plans``).
             allow_large_angles: See ``plan``.
 
         Raises:

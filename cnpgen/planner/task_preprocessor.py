@@ -8,14 +8,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.errors import UsageError
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.planner.control_point_functions import line_change, tips_at_ends
 from cnpgen.planner.control_points import along_line
 from cnpgen.planner.expressions import effective_steps
+from cnpgen.planner.network.scene_features import SceneFeatures, make_scene_features
 from cnpgen.planner.tasks import MIN_EXPECTED_TIME_S, MIN_TRAVEL_TIME_S, Tasks, expected_time, reaching_time
 from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem import Problem
+from cnpgen.robots.obstacle import Obstacle
+from cnpgen.robots.scene import Scene
+from cnpgen.robots.solid import place_obstacles
 from cnpgen.trajectory.boundary import Boundary
 
 if TYPE_CHECKING:
@@ -44,13 +49,15 @@ class TaskPreprocessor:
     """Preprocessor of one problem's tasks; made by ``make_task_preprocessor``.
 
     Attributes:
-        problem: The problem.
+        problem: The problem, ``Problem.for_planning``.
         velocity_limit: Planning limits [rad/s], shape (n,).
         tips: Kernel of ``control_point_functions.tips_at_ends``.
         line: Kernel of ``control_point_functions.line_change``; None if the line is not projected.
         reaching_time: Kernel of ``tasks.reaching_time``; None if the expected time is that of the distance.
         via_line: The same kernel with offsets; None if there are no via points, or no projection.
         least_time: Lower bound of the expected time of the distance [s].
+        placed: Obstacles that samples place.
+        scene_features: Features of these obstacles; None if the model has none.
     """
 
     problem: Problem
@@ -60,8 +67,17 @@ class TaskPreprocessor:
     reaching_time: Kernel | None = None
     via_line: Kernel | None = None
     least_time: float = MIN_EXPECTED_TIME_S
+    placed: tuple[Obstacle, ...] = ()
+    scene_features: SceneFeatures | None = None
 
-    def __call__(self, boundary: Boundary, via_point: Array | None = None, *, ends: Array | None = None) -> Tasks:
+    def __call__(
+        self,
+        boundary: Boundary,
+        via_point: Array | None = None,
+        *,
+        ends: Array | None = None,
+        obstacle_poses: Array | None = None,
+    ) -> Tasks:
         """Prepare N tasks, in float64.
 
         Args:
@@ -69,6 +85,11 @@ class TaskPreprocessor:
             via_point: Via points of the lines at half their length before projection [rad], shape (N, n); none by
                 default.
             ends: Result of ``ends_of``, if already computed.
+            obstacle_poses: Poses and sizes of obstacles that samples place, shape (N, width); by default, they stay
+                parked.
+
+        Raises:
+            UsageError: The obstacle poses have a wrong shape or are not finite, or the problem places the obstacles.
         """
         ends = ends_of(boundary) if ends is None else ends
         start_xyz, goal_xyz, *velocity = (tip.T for tip in self.tips(ends))
@@ -83,7 +104,20 @@ class TaskPreprocessor:
         if kernel is not None:
             (change,) = kernel(ends, *offsets, 1 / time[None], scene.lanes)
             correction = rows(change, boundary.start_q.shape[1])
-        return Tasks(boundary, start_xyz, goal_xyz, time, scene, correction)
+        placed = self._placed_scene(len(boundary), obstacle_poses)
+        observation = None
+        if placed is not None and self.scene_features is not None:
+            observation = self.scene_features(boundary, placed)
+        return Tasks(boundary, start_xyz, goal_xyz, time, scene, correction, placed, observation)
+
+    def _placed_scene(self, count: int, obstacle_poses: Array | None) -> Scene | None:
+        if not self.placed:
+            if obstacle_poses is not None:
+                text = f"the model's problem {self.problem.name!r} has no obstacles that plans place"
+                raise UsageError(text, concerns="obstacle_poses")
+            return None
+        scene = Scene(self.placed, np.tile(place_obstacles(self.placed), (count, 1)))
+        return scene if obstacle_poses is None else scene.with_poses(np.asarray(obstacle_poses, np.float64))
 
     def _via_offsets(self, boundary: Boundary, via_point: Array) -> Array:
         """Return offsets of lines through via points from straight ones at interior points [rad], shape (N, m, n)."""
@@ -102,6 +136,8 @@ def make_task_preprocessor(
     fixed_at_goal: int = 2,
     within_limits: bool = False,
     via_lines: bool = False,
+    placed: tuple[Obstacle, ...] = (),
+    observed: bool = False,
 ) -> TaskPreprocessor:
     """Load the preprocessor of a problem's tasks.
 
@@ -114,6 +150,8 @@ def make_task_preprocessor(
         fixed_at_goal: Number of control points that the goal fixes (``Boundary.fixed_at_goal``).
         within_limits: Whether control points are clipped to the joint limits (``ModelConfig``).
         via_lines: Whether to load the kernel of lines through via points.
+        placed: Obstacles that samples place.
+        observed: Whether to compute features of them.
     """
     steps = effective_steps(kernels, line_projection_steps)
     load = partial(kernels.load, steps=steps, fixed_at_goal=fixed_at_goal, within_limits=within_limits)
@@ -122,4 +160,5 @@ def make_task_preprocessor(
     time = kernels.load(reaching_time, fixed_at_goal=fixed_at_goal) if expected_time == "reach" else None
     via_line = load(line_change, with_offsets=True) if steps and via_lines else None
     least_time = MIN_TRAVEL_TIME_S if expected_time == "travel" else MIN_EXPECTED_TIME_S
-    return TaskPreprocessor(problem, robot.velocity_limit, tips, line, time, via_line, least_time)
+    features = make_scene_features(robot, kernels) if placed and observed else None
+    return TaskPreprocessor(problem, robot.velocity_limit, tips, line, time, via_line, least_time, placed, features)

@@ -34,6 +34,8 @@ class Tasks:
         expected_time: Unit of durations [s], shape (N,): network outputs are rates times this.
         scene: Obstacles of the tasks.
         correction: Offsets of the projected line from the straight one [rad], shape (N, m, n); None if it is straight.
+        placed: Obstacles of a problem whose samples place them; ``scene`` has none then. None for other problems.
+        observation: Features of the placed obstacles, shape (N, F), or None.
     """
 
     boundary: Boundary
@@ -42,12 +44,19 @@ class Tasks:
     expected_time: Array
     scene: Scene
     correction: Array | None = None
+    placed: Scene | None = None
+    observation: Array | None = None
 
     def __repr__(self) -> str:
         return f"<Tasks of shape {np.shape(self.boundary.start_q)}>"
 
     def __len__(self) -> int:
         return len(self.expected_time)
+
+    @property
+    def obstacle_poses(self) -> Array:
+        """Poses and sizes of all obstacles, as losses take them, shape (N, width)."""
+        return (self.scene if self.placed is None else self.placed).poses
 
     def take(self, rows: slice | NDArray[Any]) -> Tasks:
         """Return a subset of the tasks."""
@@ -58,6 +67,8 @@ class Tasks:
             self.expected_time[rows],
             self.scene[rows],
             None if self.correction is None else self.correction[rows],
+            None if self.placed is None else self.placed[rows],
+            None if self.observation is None else self.observation[rows],
         )
 
     def astype(self, dtype: str) -> Tasks:
@@ -70,6 +81,8 @@ class Tasks:
             self.expected_time.astype(dtype),
             self.scene.astype(dtype),
             None if self.correction is None else self.correction.astype(dtype),
+            None if self.placed is None else self.placed.astype(dtype),
+            None if self.observation is None else self.observation.astype(dtype),
         )
 
 

@@ -16,6 +16,7 @@ from cnpgen.problems.constraints.object_clearance import ObjectClearance
 from cnpgen.problems.objectives import Centrifugal, ObjectiveTerm
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot_spec import HeldObject, LimitSpec, Payload, RobotSpec
+from cnpgen.robots.scene import PARKED_POSITION_M
 from cnpgen.robots.shape.inline import with_inline_meshes
 from cnpgen.robots.shape.mesh_files import find_urdf
 from cnpgen.robots.shape.srdf import with_disabled_pairs, with_ignored_pairs
@@ -86,6 +87,16 @@ class Problem:
         other = dataclasses.replace(self, obstacle=tuple(obstacles))
         vars(other)["urdf_text"] = self.urdf_text  # a cached property, expensive to read again
         return other
+
+    @property
+    def has_sample_obstacles(self) -> bool:
+        """Whether samples place obstacles: some are parked far below the robot by default."""
+        return any(obstacle.position == PARKED_POSITION_M for obstacle in self.obstacle)
+
+    @property
+    def for_planning(self) -> "Problem":
+        """The problem without obstacles if samples place them: kernels of planners and losses do not depend on them."""
+        return self.with_obstacles(()) if self.has_sample_obstacles else self
 
     @property
     def arm_radius(self) -> float | None:

@@ -16,14 +16,14 @@ from cnpgen.machine.versions import __version__
 from cnpgen.planner.inference_pipeline import InferencePipeline, LoadedProblem, make_inference_pipeline
 from cnpgen.planner.model import Model, ModelConfig, is_rest_to_rest
 from cnpgen.planner.network.architecture import Architecture, initial_parameters
-from cnpgen.planner.network.features import Features, count_features, feature_blocks, published_features
+from cnpgen.planner.network.features import SCENE, Features, count_features, feature_blocks, published_features
 from cnpgen.planner.projection import make_projection
 from cnpgen.store.files.documents import plain
 from cnpgen.training.data import TrainingData
 from cnpgen.training.score import validate
 from cnpgen.training.settings import Length, TrainingSettings
 from cnpgen.training.step import Learner
-from cnpgen.training.training_rows import Rows, prepare_rows, zero_conditions
+from cnpgen.training.training_rows import Rows, TrainingProblems, prepare_rows, zero_conditions
 from cnpgen.training.training_run import Run
 from cnpgen.training.training_state import State, start_state
 from cnpgen.trajectory.boundary import Boundary
@@ -56,23 +56,27 @@ def prepare_run(
     Raises:
         UsageError: The dataset has no plans to imitate, or the initial model does not fit.
     """
-    boundary = source.training()
+    problems = source.training()
+    boundary = problems.boundary
     zero, spec = zero_conditions(boundary), loaded.problem.trajectory
     fixed = boundary.fixed_at_goal
     config = settings.config
     if initial_model is not None:
         config = replace(config, via_points=initial_model.config.via_points)
-    inference = make_inference_pipeline(loaded, config, scale_time=is_rest_to_rest(zero, fixed), fixed_at_goal=fixed)
+    observed = settings.features == "full" if initial_model is None else SCENE in initial_model.features.blocks
+    inference = make_inference_pipeline(
+        loaded, config, scale_time=is_rest_to_rest(zero, fixed), fixed_at_goal=fixed, observed=observed
+    )
     architecture = _architecture(loaded, settings, boundary, initial_model)
     if initial_model is not None:
         _check_initial_model(initial_model, architecture, settings, loaded, zero)
-    rows, features = _rows(boundary, inference, loaded, settings, initial_model)
+    rows, features = _rows(problems, inference, loaded, settings, initial_model)
     if settings.imitation:
         rows = _with_demonstrations(rows, source, loaded)
     loss = _loss(loaded, settings)
     held_out = source.checked(check_rows)
     projection = make_projection(
-        loaded.problem,
+        loaded.problem.for_planning,
         loaded.kernels,
         steps=settings.projection_steps,
         fixed_at_goal=fixed,
@@ -90,27 +94,29 @@ def prepare_run(
         validate=lambda model: validate(model, inference, held_out),
         zero_conditions=zero,
         initial_parameters=None if initial_model is None else initial_model.parameters,
-        training={"command": command, **identity(source, settings), "stages": source.dataset.spec.stages},
+        training={"command": command, **identity(source, settings), "stages": source.stages},
     )
     return run, inference
 
 
 def _rows(
-    boundary: Boundary,
+    problems: TrainingProblems,
     inference: InferencePipeline,
     loaded: LoadedProblem,
     settings: TrainingSettings,
     initial_model: Model | None,
 ) -> tuple[Rows, Features]:
     """Prepare the rows, with the lines of the initial model's plans."""
+    boundary, poses = problems.boundary, problems.obstacle_poses
     if initial_model is None:
-        blocks, robot = feature_blocks(boundary, settings.features), loaded.robot
+        robot = loaded.robot
+        blocks = feature_blocks(boundary, settings.features, placed=loaded.problem.has_sample_obstacles)
         features = None
         if settings.features == "paper":
             features = published_features(blocks, robot.velocity_limit, robot.acceleration_limit)
-        return prepare_rows(boundary, inference.prepare, features=features, blocks=blocks)
+        return prepare_rows(boundary, inference.prepare, features=features, blocks=blocks, obstacle_poses=poses)
     lines = None if inference.via_points is None else lambda some: inference.planned(initial_model, some)[0]
-    return prepare_rows(boundary, inference.prepare, features=initial_model.features, lines=lines)
+    return prepare_rows(boundary, inference.prepare, features=initial_model.features, lines=lines, obstacle_poses=poses)
 
 
 def identity(source: TrainingData, settings: TrainingSettings) -> dict[str, Any]:
@@ -122,7 +128,7 @@ def _with_demonstrations(rows: Rows, source: TrainingData, loaded: LoadedProblem
     target = source.demonstrations(loaded.robot.n)
     if target is None:
         raise UsageError(
-            f"{source.dataset.folder} has no plans to imitate: make it with"
+            f"{source.place} has no plans to imitate: make it with"
             " make_dataset(..., certify=True) or 'cnpgen make-dataset --certify', or train without imitation"
         )
     spec = loaded.problem.trajectory
@@ -160,7 +166,12 @@ def _architecture(
     check_memory("hidden", settings.hidden, settings.layers * settings.hidden**2)
     check_memory("batch_size", settings.batch_size, settings.batch_size * settings.nodes)
     spec = loaded.problem.trajectory
-    blocks = feature_blocks(boundary, settings.features) if initial_model is None else initial_model.features.blocks
+    placed = loaded.problem.has_sample_obstacles
+    blocks = (
+        feature_blocks(boundary, settings.features, placed=placed)
+        if initial_model is None
+        else initial_model.features.blocks
+    )
     return Architecture(
         inputs=count_features(blocks, loaded.robot.n),
         hidden=settings.hidden,

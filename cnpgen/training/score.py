@@ -8,20 +8,21 @@ import numpy as np
 from cnpgen.planner.inference_pipeline import InferencePipeline
 from cnpgen.planner.model import Model
 from cnpgen.plans.evaluate import evaluate_plans
-from cnpgen.trajectory.boundary import Boundary
+from cnpgen.plans.format import OBSTACLE_POSES
+from cnpgen.training.training_rows import TrainingProblems
 
 MEANS = ("duration_s", "z_error_mm_s", "vertical_error_rad_s")
 
 
 def validate(
-    model: Model, inference: InferencePipeline, boundary: Boundary, *, workers: int | None = 1
+    model: Model, inference: InferencePipeline, problems: TrainingProblems, *, workers: int | None = 1
 ) -> dict[str, Any]:
     """Plan for validation rows and judge the plans.
 
     Args:
         model: The model.
         inference: Inference pipeline of its problem.
-        boundary: Boundary conditions of N validation rows.
+        problems: N validation rows.
         workers: Number of processes that judge.
 
     Returns:
@@ -29,7 +30,9 @@ def validate(
         metrics; ``broken``, condition -> number of violating plans; ``score``, which compares models: 1 % of the plans
         counts as much as 1 % of the motion time.
     """
-    plans = inference.plan(model, boundary)
+    poses = problems.obstacle_poses
+    columns = None if poses is None else {OBSTACLE_POSES: poses}
+    plans = inference.plan(model, problems.boundary, columns=columns)
     summary = evaluate_plans(plans, workers=workers).summary()
     metrics = summary["metrics_of_all"]
     duration = float(np.mean(plans.duration))

@@ -35,13 +35,15 @@ def with_via_points(model: Model, boundary: Boundary, *, count: int = 24, seed: 
         seed: Seed of the random configurations.
 
     Raises:
-        UsageError: ``count`` is no positive integer, or the model already has via points.
+        UsageError: ``count`` is no positive integer, the model already has via points, or samples place obstacles.
     """
     count = integer("count", count, least=1)
     if model.config.via_points:
         raise UsageError(f"the model already has {len(model.config.via_points)} via points")
     random = np.random.default_rng(seed)
     with loaded_problem(model.problem) as loaded:
+        if loaded.problem.has_sample_obstacles:
+            raise UsageError("via points are for problems that place their obstacles", concerns="model")
         placeholder = (tuple(loaded.robot.base.tolist()),)  # its value is not used
         config = replace(model.config, via_points=placeholder)
         inference = make_inference_pipeline(loaded, config, scale_time=False, fixed_at_goal=model.fixed_at_goal)

@@ -72,8 +72,8 @@ class TrainingSettings:
         margins: Constraint term -> factor of its limits, in (0, 1], that replaces the usual one.
         usual_margins: Whether the other bounds are tightened as the constraint classes suggest.
         imitation: Fraction of the run, at its beginning, that imitates the plans of a certified dataset.
-        features: Inputs of the network: "full"; "states", the standardized boundary states; or "paper", the boundary
-            states divided by pi and by the limits.
+        features: Inputs of the network: "full"; "no-scene", without obstacles that samples place; "states", the
+            standardized boundary states; or "paper", the boundary states divided by pi and by the limits.
         loss_form: Form of the loss, "signed" or "paper" (``PlanLoss``); empty for the one that suits the metric.
         constraint_terms: "all", or "budgeted": only those with a budget, which are those of the paper.
         time_varying_bounds: Whether motions that start off the manifold have the time-varying bounds of the verdict.

@@ -81,7 +81,7 @@ class Learner:
                 points.path,
                 points.rate,
                 weights=weights,
-                obstacle_poses=rows.tasks.scene.poses,
+                obstacle_poses=rows.tasks.obstacle_poses,
                 start_tip=start_tip,
                 shift=shift,
             )

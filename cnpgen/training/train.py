@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -67,6 +68,7 @@ def train_model(
     command: str = "",
     force: bool = False,
     workers: int | None = None,
+    robot: str | Path | None = None,
     begin: Callable[[State, Run], None] | None = None,
     watch: Watcher | None = None,
 ) -> Trained:
@@ -76,7 +78,7 @@ def train_model(
     interrupted and resumed run gives the same parameters to the bit as an uninterrupted one.
 
     Args:
-        folder: The dataset.
+        folder: The dataset; with ``robot`` a scene file, or a folder of scene files.
         out: The model's file, ``.h5``.
         steps: Length in steps.
         epochs: Length in epochs.
@@ -90,6 +92,7 @@ def train_model(
         command: Command recorded in the model.
         force: Replace an existing model, log and picture; discard another run's checkpoint.
         workers: Number of processes of the final validation; training itself uses one process.
+        robot: Problem of the robot that moves in the scenes, such as "panda".
         begin: Called once before the first step.
         watch: Called with every line of the log.
 
@@ -102,14 +105,15 @@ def train_model(
     clock = Stopwatch()
     lengths = {"steps": steps, "epochs": epochs, "cpu_seconds": cpu_seconds}
     settings = settings or TrainingSettings()
-    job = _job(folder, Path(out), settings, lengths, check_rows=check_rows, start_from=start_from)
+    source = partial(open_training_data, folder, robot)
+    job = _job(source, Path(out), settings, lengths, check_rows=check_rows, start_from=start_from)
     if not force:
         if job.out.exists() and not job.checkpoints.path.exists():
             return _finished(job)
         check_beside(job.out)
     lock = output_lock(job.out, job.out.with_suffix(LOCK))
     record = with_control_points(
-        as_record(job.source.dataset.problem), settings.path_control_points, settings.rate_control_points
+        as_record(job.source.problem), settings.path_control_points, settings.rate_control_points
     )
     with lock, one_thread(), loaded_problem(with_objective(record, settings.objective)) as loaded:
         run, inference = prepare_run(
@@ -146,7 +150,7 @@ class _Job:
 
 
 def _job(
-    folder: str | Path,
+    open_source: Callable[[], TrainingData],
     out: Path,
     settings: TrainingSettings,
     lengths: Mapping[str, Any],
@@ -161,7 +165,7 @@ def _job(
     length, check_rows = Length(**passed), integer("check_rows", check_rows, least=1)
     check_out(out)
     remove_temporary_files(out)
-    source = open_training_data(folder)
+    source = open_source()
     initial_model, digest = _read_initial_model(start_from)
     run_identity = identity(source, settings) | {
         "length": plain(passed),

@@ -43,6 +43,19 @@ class Rows:
         return Rows(self.tasks.take(which), self.features[which], target)
 
 
+@dataclass(frozen=True)
+class TrainingProblems:
+    """N boundary problems to train on or to validate with.
+
+    Attributes:
+        boundary: Boundary conditions, shape (N, n) each.
+        obstacle_poses: Poses and sizes of obstacles that samples place, shape (N, width); None for other problems.
+    """
+
+    boundary: Boundary
+    obstacle_poses: Array | None = None
+
+
 def boundary_columns(columns: dict[str, Array]) -> Boundary:
     """Return the boundary conditions among the columns of a dataset; missing ones are zero, goal accelerations free."""
     zero = np.zeros_like(columns["start_q"], np.float64)
@@ -58,6 +71,7 @@ def prepare_rows(
     blocks: tuple[str, ...] | None = None,
     lines: Callable[[Boundary], Tasks] | None = None,
     dtype: str = "float32",
+    obstacle_poses: Array | None = None,
 ) -> tuple[Rows, Features]:
     """Prepare rows in blocks, because temporary arrays take four times the memory of the result.
 
@@ -68,6 +82,7 @@ def prepare_rows(
         blocks: Blocks of features to standardize by these rows; all if None.
         lines: Preprocessor of tasks along other lines; ``prepare`` if None.
         dtype: Float type of the rows.
+        obstacle_poses: Poses and sizes of obstacles that samples place, shape (N, width).
 
     Returns:
         The rows, and the standardization of their features.
@@ -77,24 +92,31 @@ def prepare_rows(
         for first in range(0, max(len(boundary), 1), PREPARED_ROWS_PER_BLOCK)
     ]
     straight = replace(prepare, line=None)  # features do not depend on the projected line, which takes most of the time
+    placed = bool(prepare.placed)
+    poses = [None if obstacle_poses is None else obstacle_poses[part] for part in parts]
     definition = features or fit_features(
-        (straight(boundary[part]) for part in parts), blocks or feature_blocks(boundary)
+        (straight(boundary[part], obstacle_poses=own) for part, own in zip(parts, poses, strict=True)),
+        blocks or feature_blocks(boundary, placed=placed),
     )
     arrays: dict[str, Array] = {}
-    for part in parts:
-        for name, values in _arrays((lines or prepare)(boundary[part]), definition, dtype).items():
+    for part, own in zip(parts, poses, strict=True):
+        tasks = prepare(boundary[part], obstacle_poses=own) if lines is None else lines(boundary[part])
+        for name, values in _arrays(tasks, definition, dtype).items():
             if name not in arrays:
                 arrays[name] = np.empty((len(boundary), *values.shape[1:]), dtype)
             arrays[name][part] = values
     ends = Boundary(**{name: arrays.pop(name) for name in boundary.conditions()})
     row_features, scene = arrays.pop("features"), Scene(tuple(prepare.problem.obstacle), arrays.pop("poses"))
-    return Rows(features=row_features, tasks=Tasks(ends, scene=scene, **arrays)), definition
+    obstacles = Scene(prepare.placed, arrays.pop("placed")) if placed else None
+    return Rows(features=row_features, tasks=Tasks(ends, scene=scene, placed=obstacles, **arrays)), definition
 
 
 def _arrays(tasks: Tasks, features: Features, dtype: str) -> dict[str, Array]:
     """Return all arrays of a block of rows with one entry per task, by name."""
     arrays = tasks.boundary.conditions()
     parts = {name: values for name, values in vars(tasks).items() if isinstance(values, np.ndarray)}
+    parts.pop("observation", None)  # it is part of the features
+    parts |= {} if tasks.placed is None else {"placed": tasks.placed.poses}
     return arrays | parts | {"features": features.of(tasks, dtype), "poses": tasks.scene.poses}
 
 

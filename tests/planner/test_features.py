@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cnpgen.planner.network.features import BLOCKS, USUAL, feature_blocks, fit_features, raw_features
+from cnpgen.planner.network.features import ARRIVAL, USUAL, feature_blocks, fit_features, raw_features
 from tests.planner.test_control_points import tasks
 
 
@@ -45,8 +45,8 @@ def test_features_are_states_their_sines_tips_and_the_expected_time():
 def test_the_goal_acceleration_is_a_feature_if_it_is_given():
     assert feature_blocks(tasks().boundary) == USUAL
     given = tasks(goal_ddq=True)
-    assert feature_blocks(given.boundary) == BLOCKS
-    raw = raw_features(given, BLOCKS)
+    assert feature_blocks(given.boundary) == (*USUAL, ARRIVAL)
+    raw = raw_features(given, (*USUAL, ARRIVAL))
     np.testing.assert_array_equal(raw[:, :-3], raw_features(given, USUAL))
     np.testing.assert_array_equal(raw[:, -3:], given.boundary.goal_ddq)
 

@@ -84,7 +84,7 @@ def test_inputs_are_the_states_divided_by_pi_and_the_limits(tiny):
     """Check the network's inputs of the paper, normalized as in the authors' implementation."""
     source = open_training_data(tiny("airhockey-hit"))
     run, _ = prepare_run(source, _airhockey(), SMALL, check_rows=2)
-    b, robot = source.training(), _airhockey().robot
+    b, robot = source.training().boundary, _airhockey().robot
     parts = (b.start_q / np.pi, b.start_dq / robot.velocity_limit, b.start_ddq / robot.acceleration_limit)
     expected = np.concatenate([*parts, b.goal_q / np.pi, b.goal_dq / robot.velocity_limit], axis=1)
     assert run.features.blocks == STATES
@@ -147,7 +147,7 @@ def test_a_model_of_the_preset_is_the_last_one_plans_and_round_trips(trained, ti
     assert loaded.config.expected_time == "travel"
     cnpgen.save_model(tmp_path / "again.h5", loaded)
     assert (tmp_path / "again.h5").read_bytes() == trained.path.read_bytes()
-    b = open_training_data(tiny("airhockey-hit")).checked(3)
+    b = open_training_data(tiny("airhockey-hit")).checked(3).boundary
     plans = cnpgen.Planner(trained.path).plan(b.start_q, b.goal_q, goal_dq=b.goal_dq)
     q, dq, _ = plans.states_at(plans.duration)
     np.testing.assert_allclose(q, b.goal_q, atol=1e-10)
@@ -172,14 +172,14 @@ def test_options_override_the_preset_and_are_in_the_command(tiny, tmp_path, monk
     assert model.training["command"].startswith(
         "cnpgen train airhockey-hit -o p.h5 --preset paper --steps 2 --hidden 8"
     )
-    b = open_training_data(tiny("airhockey-hit")).checked(2)
+    b = open_training_data(tiny("airhockey-hit")).checked(2).boundary
     assert cnpgen.Planner(out).plan(b.start_q, b.goal_q, goal_dq=b.goal_dq).path_control_points.shape == (2, 12, 6)
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"features": "sines"}, "features must be one of full, states, paper, got 'sines'"),
+        ({"features": "sines"}, "features must be one of full, no-scene, states, paper, got 'sines'"),
         ({"keep": "first"}, "keep must be one of best, last, got 'first'"),
         ({"constraint_terms": "some"}, "constraint_terms must be one of all, budgeted, got 'some'"),
         ({"loss_form": "plain"}, "loss_form must be one of signed, paper, got 'plain'"),
@@ -204,7 +204,7 @@ def _airhockey():
 
 
 def _one(tiny):
-    return open_training_data(tiny("airhockey-hit")).checked(1)
+    return open_training_data(tiny("airhockey-hit")).checked(1).boundary
 
 
 def _clipping():

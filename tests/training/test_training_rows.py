@@ -23,7 +23,9 @@ def test_rows_prepared_in_blocks_equal_those_prepared_at_once(tiny, monkeypatch,
     whole, features = prepare_rows(boundary, prepare)
     monkeypatch.setattr(rows_module, "PREPARED_ROWS_PER_BLOCK", 16)
     seen, call = [], type(prepare).__call__
-    monkeypatch.setattr(type(prepare), "__call__", lambda self, part: seen.append(len(part)) or call(self, part))
+    monkeypatch.setattr(
+        type(prepare), "__call__", lambda self, part, **poses: seen.append(len(part)) or call(self, part, **poses)
+    )
     parts, again = prepare_rows(boundary, prepare)
     assert max(seen) == 16
     np.testing.assert_allclose(again.mean, features.mean, rtol=1e-12, atol=1e-14)
@@ -45,11 +47,11 @@ def test_the_order_of_rows_is_that_of_the_loader():
 @pytest.mark.parametrize("checks", [2, 20, 1000])
 def test_check_rows_and_scored_rows_are_disjoint(tiny, checks):
     source = open_training_data(tiny("airhockey-hit"))
-    checked, judged = source.checked(checks).start_q, source.judged(2000, after=checks).start_q
+    checked, judged = (rows.boundary.start_q for rows in (source.checked(checks), source.judged(2000, after=checks)))
     assert len(checked) == min(checks, 30)
     assert len(checked) + len(judged) == 60
     assert len(np.unique(np.concatenate([checked, judged]), axis=0)) == 60
-    assert len(source.judged(5, after=checks)) == 5
+    assert len(source.judged(5, after=checks).boundary) == 5
 
 
 @pytest.mark.slow

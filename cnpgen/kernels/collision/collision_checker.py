@@ -59,9 +59,14 @@ class CloseBodies(NamedTuple):
     points: Array
 
 
-def load_collision_library(kernels: KernelLibrary) -> ctypes.CDLL | None:
-    """Return the library of collision checks, the same for all robots; None where kernels are not compiled."""
-    library = kernels.load_source(*SOURCES)
+def load_collision_library(kernels: KernelLibrary, sources: Sequence[Path] = SOURCES) -> ctypes.CDLL | None:
+    """Return the library of collision checks, the same for all robots; None where kernels are not compiled.
+
+    Args:
+        kernels: Library of kernels.
+        sources: Source files, convex.c and collision.c first.
+    """
+    library = kernels.load_source(*sources)
     if library is not None:
         library.clear_states.restype = library.joint_poses.restype = None
         library.clear_states.argtypes = (c_void_p, c_void_p, c_long, c_double, c_double, c_void_p)

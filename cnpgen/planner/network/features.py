@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.planner.network.scene_features import count_scene_features
 from cnpgen.planner.tasks import Tasks
 from cnpgen.trajectory.boundary import Boundary
 
@@ -17,8 +18,9 @@ Array = NDArray[Any]
 STATES = ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq")
 USUAL = (*STATES, "sin_cos", "tips", "expected_time")
 ARRIVAL = "goal_ddq"  # only if goal accelerations are given
-BLOCKS = (*USUAL, ARRIVAL)
-FEATURE_SETS = ("full", "states", "paper")
+SCENE = "scene"  # only if samples place obstacles
+BLOCKS = (*USUAL, ARRIVAL, SCENE)
+FEATURE_SETS = ("full", "no-scene", "states", "paper")
 MIN_DEVIATION = 1e-7  # SI units; features with a smaller standard deviation are constant
 
 
@@ -44,15 +46,18 @@ class Features:
         return raw.astype(dtype)
 
 
-def feature_blocks(boundary: Boundary, features: str = "full") -> tuple[str, ...]:
+def feature_blocks(boundary: Boundary, features: str = "full", *, placed: bool = False) -> tuple[str, ...]:
     """Return the feature blocks of tasks with such boundary conditions.
 
     Args:
         boundary: The boundary conditions.
-        features: One of ``FEATURE_SETS``: all blocks ("full"), or the boundary states ("states", "paper").
+        features: One of ``FEATURE_SETS``: all blocks ("full"), all but those of placed obstacles ("no-scene"), or the
+            boundary states ("states", "paper").
+        placed: Whether samples place obstacles.
     """
-    blocks = USUAL if features == "full" else STATES
-    return blocks if boundary.goal_ddq is None else (*blocks, ARRIVAL)
+    blocks = USUAL if features in {"full", "no-scene"} else STATES
+    blocks = blocks if boundary.goal_ddq is None else (*blocks, ARRIVAL)
+    return (*blocks, SCENE) if placed and features == "full" else blocks
 
 
 def published_features(blocks: tuple[str, ...], velocity_limit: Array, acceleration_limit: Array) -> Features:
@@ -89,7 +94,8 @@ def raw_features(tasks: Tasks, blocks: tuple[str, ...]) -> Array:
     * ``start_q`` to ``goal_dq``, and ``goal_ddq`` if it is given: the states [rad, rad/s, rad/s^2];
     * ``sin_cos``: sines and cosines of start and goal positions, whose products appear in the forward kinematics;
     * ``tips``: tip positions at start and goal [m];
-    * ``expected_time``: its logarithm.
+    * ``expected_time``: its logarithm;
+    * ``scene``: features of the obstacles that samples place (``scene_features``).
 
     Args:
         tasks: The tasks.
@@ -105,6 +111,7 @@ def raw_features(tasks: Tasks, blocks: tuple[str, ...]) -> Array:
 def count_features(blocks: tuple[str, ...], joints: int) -> int:
     """Return the number of features of some of ``BLOCKS``, for a number of planned joints."""
     widths = {**dict.fromkeys((*STATES, ARRIVAL), joints), "sin_cos": 4 * joints, "tips": 6, "expected_time": 1}
+    widths[SCENE] = count_scene_features(joints)
     return sum(widths[name] for name in blocks)
 
 
@@ -119,4 +126,6 @@ def _block(tasks: Tasks, name: str) -> tuple[Array, ...]:
         return tasks.start_xyz, tasks.goal_xyz
     if name == "expected_time":
         return (np.log(tasks.expected_time)[:, None],)
+    if name == SCENE and tasks.observation is not None:
+        return (tasks.observation,)
     raise ValueError(f"unknown feature block {name!r}: expected one of {', '.join(BLOCKS)}")

@@ -1,4 +1,4 @@
-"""Obstacles of one sample as arrays of boxes, spheres, cylinders and capsules with poses."""
+"""Obstacles of samples as arrays of boxes, spheres, cylinders and capsules with poses."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from cnpgen.errors import UsageError
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.convex_part import PRISM_SIDES
-from cnpgen.robots.shape.hull import frame_along
+from cnpgen.robots.shape.hull import frames_along
 from cnpgen.robots.solid import UNBOUNDED_OBSTACLE_HEIGHT_M, number_slices
 from cnpgen.schema.keys import Range
 
@@ -24,10 +24,10 @@ KINDS = ("box", "sphere", "cylinder", "capsule")  # index: the code of a kind
 
 @dataclass(frozen=True, eq=False)
 class Primitives:
-    """M bodies of simple shapes in the world frame.
+    """M bodies of simple shapes in the world frame; or those of N scenes, with a first axis of length N.
 
     Attributes:
-        kinds: Index of each shape in ``KINDS``, shape (M,).
+        kinds: Index of each shape in ``KINDS``, shape (M,); -1 where a scene has fewer bodies.
         centers: Centers [m], shape (M, 3).
         rotations: Rotation matrices; columns are the axes of a body, shape (M, 3, 3).
         sizes: Sizes [m], shape (M, 3): half the edge lengths of a box; otherwise the radius, half the length along z
@@ -42,19 +42,8 @@ class Primitives:
     def __len__(self) -> int:
         return len(self.kinds)
 
-    def __getitem__(self, which: NDArray[Any]) -> Primitives:
+    def __getitem__(self, which: int | slice | NDArray[Any]) -> Primitives:
         return Primitives(self.kinds[which], self.centers[which], self.rotations[which], self.sizes[which])
-
-    def areas(self) -> Array:
-        """Return the areas of the surfaces [m^2], shape (M,)."""
-        a, b, c = self.sizes.T
-        by_kind = [
-            8 * (a * b + b * c + c * a),
-            4 * np.pi * a**2,
-            2 * np.pi * a * (a + 2 * b),
-            4 * np.pi * a * (a + b),
-        ]
-        return np.choose(self.kinds, by_kind)
 
 
 def primitives_of(obstacles: Sequence[Obstacle], numbers: Array) -> Primitives:
@@ -62,36 +51,42 @@ def primitives_of(obstacles: Sequence[Obstacle], numbers: Array) -> Primitives:
 
     Args:
         obstacles: The obstacles.
-        numbers: Their poses and sizes (``cnpgen.robots.solid``), shape (pose_width,).
+        numbers: Their poses and sizes (``cnpgen.robots.solid``), shape (pose_width,); or of N samples, shape
+            (N, pose_width), which gives arrays with a first axis of length N.
 
     Raises:
         UsageError: An obstacle is a mesh.
     """
-    rows = [_row(obstacle, numbers[part]) for obstacle, part in zip(obstacles, number_slices(obstacles), strict=True)]
-    kinds, centers, rotations, sizes = zip(*rows, strict=True) if rows else ((), (), (), ())
-    return Primitives(
-        np.array(kinds, np.int64),
-        np.array(centers).reshape(-1, 3),
-        np.array(rotations).reshape(-1, 3, 3),
-        np.array(sizes).reshape(-1, 3),
-    )
+    shape, rows, count = numbers.shape[:-1], np.atleast_2d(numbers), len(obstacles)
+    kinds, centers = np.empty((len(rows), count), np.int64), np.empty((len(rows), count, 3))
+    rotations, sizes = np.tile(np.eye(3), (len(rows), count, 1, 1)), np.zeros((len(rows), count, 3))
+    for index, (obstacle, part) in enumerate(zip(obstacles, number_slices(obstacles), strict=True)):
+        if obstacle.kind not in KINDS:
+            raise UsageError(f"obstacle {obstacle.name!r} is a {obstacle.kind}, expected one of {', '.join(KINDS)}")
+        kinds[:, index] = KINDS.index(obstacle.kind)
+        _fill(obstacle, rows[:, part], centers[:, index], rotations[:, index], sizes[:, index])
+    arrays = (array.reshape(*shape, *array.shape[1:]) for array in (kinds, centers, rotations, sizes))
+    return Primitives(*arrays)  # type: ignore[arg-type]
 
 
-def _row(obstacle: Obstacle, numbers: Array) -> tuple[int, Array, Array, Any]:
-    """Return kind, center, rotation and size of an obstacle."""
-    if obstacle.kind not in KINDS:
-        raise UsageError(f"obstacle {obstacle.name!r} is a {obstacle.kind}, expected one of {', '.join(KINDS)}")
-    kind = KINDS.index(obstacle.kind)
+def _fill(obstacle: Obstacle, numbers: Array, center: Array, rotation: Array, size: Array) -> None:
+    """Fill in centers (N, 3), rotations (N, 3, 3), which are units, and sizes (N, 3), which are 0, of an obstacle."""
     if obstacle.upright:
         x, y = obstacle.x or Range(0, 0), obstacle.y or Range(0, 0)
         height = obstacle.height or UNBOUNDED_OBSTACLE_HEIGHT_M
-        low, high = np.array([x.low, y.low, numbers[0] - height]), np.array([x.high, y.high, numbers[0]])
-        return kind, (low + high) / 2, np.eye(3), (high - low) / 2
-    center, rest = numbers[:3], numbers[3:]
+        center[:, :2] = (x.low + x.high) / 2, (y.low + y.high) / 2
+        center[:, 2] = numbers[:, 0] - height / 2
+        size[:] = (x.high - x.low) / 2, (y.high - y.low) / 2, height / 2
+        return
+    center[:], rest = numbers[:, :3], numbers[:, 3:]
     if obstacle.kind == "box":
-        return kind, center, rest[3:].reshape(3, 3) if obstacle.is_turned else np.eye(3), rest[:3]
-    if obstacle.kind == "sphere":
-        return kind, center, np.eye(3), (rest[0], 0.0, 0.0)
-    half = float(np.linalg.norm(rest[:3]))
-    radius = rest[3] * (math.cos(math.pi / PRISM_SIDES) if obstacle.kind == "cylinder" else 1.0)
-    return kind, center, frame_along(rest[:3].tolist(), half), (radius, half, 0.0)
+        size[:] = rest[:, :3]
+        if obstacle.is_turned:
+            rotation[:] = rest[:, 3:].reshape(-1, 3, 3)
+    elif obstacle.kind == "sphere":
+        size[:, 0] = rest[:, 0]
+    else:
+        half = np.linalg.norm(rest[:, :3], axis=1)
+        rotation[:] = frames_along(rest[:, :3], half)
+        size[:, 0] = rest[:, 3] * (math.cos(math.pi / PRISM_SIDES) if obstacle.kind == "cylinder" else 1.0)
+        size[:, 1] = half

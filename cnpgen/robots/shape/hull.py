@@ -158,3 +158,14 @@ def frame_along(vector: Sequence[float], length: float) -> Array:
     a = -1.0 / (sign + z)
     b = x * y * a
     return np.array([[1.0 + sign * x * x * a, b, x], [sign * b, sign + y * y * a, y], [-sign * x, -y, z]])
+
+
+def frames_along(vectors: Array, lengths: Array) -> Array:
+    """Return the matrices of ``frame_along`` for vectors, shape (N, 3), with their lengths, shape (N,): (N, 3, 3)."""
+    x, y, z = (vectors / np.where(lengths > 0, lengths, 1.0)[:, None]).T
+    z = np.where(lengths > 0, z, 1.0)
+    sign = np.copysign(1.0, z)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    rows = [1.0 + sign * x * x * a, b, x, sign * b, sign + y * y * a, y, -sign * x, -y, z]
+    return np.stack(rows, axis=1).reshape(-1, 3, 3)

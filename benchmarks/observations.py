@@ -1,0 +1,99 @@
+"""Observations of scenes: compiled code against the NumPy reference, on one core, in CPU time.
+
+Scenes are those of a family with their own numbers of bodies; each is observed by every kind of observation.
+"""
+
+import argparse
+import time
+from typing import Any
+
+import numpy as np
+from common import arguments, median, progress, report, table
+
+from cnpgen.machine.threads import one_thread
+from cnpgen.pipelines.families.catalog import FAMILIES, load_family
+from cnpgen.scenes import (
+    BasisPoints,
+    CameraCloud,
+    DistanceGrid,
+    ObjectTokens,
+    SurfaceCloud,
+    observe,
+    scene_bodies,
+)
+
+TARGETS = {"cloud": 10_000.0, "camera": 1_000.0}  # scenes/s
+REPETITIONS = 5
+KINDS = (SurfaceCloud(), CameraCloud(), DistanceGrid(), BasisPoints(), ObjectTokens(capacity=40))
+
+
+def measure(family: str, count: int, reference_count: int, seed: int) -> list[dict[str, Any]]:
+    """Return the rates of all observations of scenes of a family."""
+    random, drawer = np.random.default_rng(seed), load_family(family)
+    bodies = scene_bodies([drawer.draw(random).obstacles for _ in range(count)])
+    results = []
+    for kind in KINDS:
+        times = []
+        compiled = observe(bodies, kind)
+        for _ in range(REPETITIONS):
+            begun = time.process_time()
+            observe(bodies, kind)
+            times.append(time.process_time() - begun)
+        few = bodies[: min(reference_count, count)]
+        begun = time.process_time()
+        reference = observe(few, kind, backend="numpy")
+        seconds = time.process_time() - begun
+        difference = max(
+            float(np.nanmax(np.abs(compiled[name][: len(few)].astype(float) - values), initial=0.0))
+            for name, values in reference.items()
+        )
+        rate = count / median(times)
+        results.append(
+            {
+                "family": family,
+                "kind": kind.name,
+                "bodies": float((bodies.kinds >= 0).sum(axis=1).mean()),
+                "scenes/s": rate,
+                "numpy scenes/s": len(few) / seconds,
+                "ratio": rate * seconds / len(few),
+                "largest difference": difference,
+            }
+        )
+    return results
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of this benchmark."""
+    parser.add_argument("--families", nargs="*", default=["tabletop", "cubby"], choices=list(FAMILIES), help="families")
+    parser.add_argument("--count", type=int, default=500, help="scenes")
+    parser.add_argument("--reference", type=int, default=10, help="scenes that are observed by the NumPy reference")
+    parser.add_argument("--seed", type=int, default=1, help="seed of the scenes")
+
+
+def main() -> None:
+    """Run the benchmark."""
+    chosen = arguments(__doc__, options)
+    results = []
+    with one_thread():
+        for family in chosen.families:
+            progress(family)
+            results += measure(family, chosen.count, chosen.reference, chosen.seed)
+    head = ("family", "observation", "bodies", "scenes/s", "target", "NumPy scenes/s", "ratio", "difference")
+    rows = [
+        (
+            each["family"],
+            each["kind"],
+            f"{each['bodies']:.1f}",
+            f"{each['scenes/s']:,.0f}",
+            f"{TARGETS[each['kind']]:,.0f}" if each["kind"] in TARGETS else "",
+            f"{each['numpy scenes/s']:,.0f}",
+            f"{each['ratio']:.0f}",
+            f"{each['largest difference']:.1e}",
+        )
+        for each in results
+    ]
+    report({"observations": results}, [table("observations of scenes", head, rows, left=2)], as_json=chosen.json)
+
+
+if __name__ == "__main__":
+    main()

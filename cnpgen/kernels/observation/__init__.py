@@ -1,0 +1,1 @@
+"""Observations of scenes in compiled code."""

@@ -1,0 +1,107 @@
+"""Observations of scenes in compiled code, for ``observe.c``; ``reference.py`` is the same in NumPy."""
+
+import ctypes
+from ctypes import c_int, c_long, c_void_p
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.kernels.compiled_kernel import address_of
+from cnpgen.kernels.library import KernelLibrary, choose_backend
+from cnpgen.robots.observation.camera import Camera
+from cnpgen.robots.observation.primitives import Primitives
+from cnpgen.robots.observation.reference import NumpyObservations, ObservationBackend
+from cnpgen.robots.observation.surface_points import Seeds
+
+Array = NDArray[np.float64]
+Values = NDArray[np.float32]
+
+SOURCE = Path(__file__).with_name("observe.c")
+
+
+class _SceneArrays(ctypes.Structure):
+    """``scene_arrays`` of observe.c."""
+
+    _fields_ = (
+        ("scenes", c_long),
+        ("bodies", c_long),
+        *((name, c_void_p) for name in ("kind", "center", "rotation", "size")),
+    )
+
+
+class CompiledObservations:
+    """``ObservationBackend`` in compiled code.
+
+    Args:
+        library: Library of observe.c.
+    """
+
+    def __init__(self, library: ctypes.CDLL) -> None:
+        self._library = library
+        pointer, number, flag = c_void_p, c_long, c_int
+        library.scene_distances.argtypes = (pointer, pointer, number, flag, pointer)
+        library.scene_clouds.argtypes = (pointer, pointer, number, pointer)
+        library.scene_depths.argtypes = (pointer, pointer, number, number, pointer)
+        library.depth_clouds.argtypes = (number, pointer, number, number, pointer, pointer, number, pointer)
+
+    def distances(self, scenes: Primitives, points: Array) -> Values:
+        """See ``ObservationBackend``."""
+        coordinates = np.ascontiguousarray(points.swapaxes(-1, -2), np.float32)
+        distances = np.empty((len(scenes), points.shape[-2]), np.float32)
+        shared = points.ndim == 2
+        arrays = _Arrays(scenes)
+        addresses = address_of(coordinates), address_of(distances)
+        self._library.scene_distances(arrays.address, addresses[0], points.shape[-2], shared, addresses[1])
+        return distances
+
+    def surface_points(self, scenes: Primitives, count: int, seeds: Seeds) -> Values:
+        """See ``ObservationBackend``."""
+        points, seeds = np.empty((len(scenes), count, 3), np.float32), np.ascontiguousarray(seeds)
+        arrays = _Arrays(scenes)
+        self._library.scene_clouds(arrays.address, address_of(seeds), count, address_of(points))
+        return points
+
+    def depth_images(self, scenes: Primitives, camera: Camera) -> Values:
+        """See ``ObservationBackend``."""
+        depth, view = np.empty((len(scenes), camera.height, camera.width), np.float32), _view(camera)
+        arrays = _Arrays(scenes)
+        self._library.scene_depths(arrays.address, address_of(view), camera.width, camera.height, address_of(depth))
+        return depth
+
+    def depth_points(self, depth: Values, camera: Camera, count: int, seeds: Seeds) -> Values:
+        """See ``ObservationBackend``."""
+        points, view = np.empty((len(depth), count, 3), np.float32), _view(camera)
+        depth, seeds = np.ascontiguousarray(depth, np.float32), np.ascontiguousarray(seeds)
+        pointers = (address_of(array) for array in (depth, seeds))
+        self._library.depth_clouds(
+            len(depth), address_of(view), camera.width, camera.height, *pointers, count, address_of(points)
+        )
+        return points
+
+
+class _Arrays:
+    """Arrays of scenes for the library, and the address of their structure."""
+
+    def __init__(self, scenes: Primitives) -> None:
+        types: tuple[Any, ...] = (np.int64, np.float64, np.float64, np.float64)
+        parts = (scenes.kinds, scenes.centers, scenes.rotations, scenes.sizes)
+        self._keep = [np.ascontiguousarray(part, dtype) for part, dtype in zip(parts, types, strict=True)]
+        self._structure = _SceneArrays(*scenes.kinds.shape, *map(address_of, self._keep))
+        self.address = ctypes.addressof(self._structure)
+
+
+def _view(camera: Camera) -> Array:
+    """Return the ``view`` of observe.c."""
+    return np.concatenate([camera.position, camera.axes.ravel()])
+
+
+def observation_backend(backend: str | None = None) -> ObservationBackend:
+    """Return the compiled functions, or their NumPy reference where kernels are not compiled.
+
+    Args:
+        backend: A backend of kernels; by default the fastest that works on this machine.
+    """
+    library = KernelLibrary(*choose_backend(backend), "").load_source(SOURCE)
+    return NumpyObservations() if library is None else CompiledObservations(library)

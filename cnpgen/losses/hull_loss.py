@@ -1,0 +1,97 @@
+"""Loss of the distances of a robot's convex parts from obstacles that each sample places."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import UsageError
+from cnpgen.kernels.library import KernelLibrary
+from cnpgen.losses.plan_batch import PlanBatch
+from cnpgen.losses.quadrature import BasisTable
+from cnpgen.problems.constraints.clearance import RobotClearance
+from cnpgen.problems.problem import Problem
+from cnpgen.robots.observation.scene_primitives import scene_primitives
+from cnpgen.robots.scene import Scene
+
+if TYPE_CHECKING:
+    from cnpgen.kernels.collision.clearance_loss import ClearanceLoss
+    from cnpgen.robots.robot import Robot
+
+Array = NDArray[Any]
+
+NODE_STRIDE, SHIFTS = 4, 16  # every fourth node; which ones depends on 16ths of the shift
+TRAINING_DISTANCE_M = 0.02  # in addition to the required one, so that plans keep it after training
+
+
+@dataclass(frozen=True)
+class HullLoss:
+    """Loss of the first constraint ``robot-clearance``, which the kernels of the loss omit.
+
+    Attributes:
+        problem: The problem.
+        losses: Losses of states.
+        term: Index of the constraint among the terms, the task loss first.
+        required: Distance below which a convex part and an obstacle have a loss [m].
+    """
+
+    problem: Problem
+    losses: ClearanceLoss
+    term: int
+    required: float
+
+    def add(
+        self, results: tuple[Array, Array, Array], batch: PlanBatch, weights: Array, table: BasisTable, *, shift: float
+    ) -> None:
+        """Add the loss to the results of a block, and its weighted gradients if there are any.
+
+        Args:
+            results: Terms, shape (1 + m, lanes), and gradients, samples last; changed in place.
+            batch: The N plans of the block.
+            weights: Weights of the constraints, shape (m,).
+            table: Basis functions at the nodes.
+            shift: Shift of the nodes.
+        """
+        terms, by_path, by_rate = results
+        nodes, count, stride = len(table.s), len(batch), min(NODE_STRIDE, len(table.s))
+        chosen = slice(int(shift * SHIFTS) % stride, nodes, stride)  # distances take most of the time of a step
+        path = np.where(batch.valid[:, None, None], batch.path, np.nan)
+        values, rates = table.path[:nodes][chosen].astype(float), table.rate[:nodes][chosen].astype(float)
+        node_weights = table.weights[0, chosen].astype(float)
+        node_weights /= node_weights.sum()
+        q = np.moveaxis(values @ path, 0, -1)
+        r = rates @ batch.rate.T
+        bodies = scene_primitives(Scene(self.problem.obstacle, batch.obstacle_poses.astype(float)))
+        losses, gradients = self.losses(q, bodies, self.required)
+        step, weight = node_weights[:, None] / r, float(weights[self.term - 1])
+        terms[self.term, :count] += (step * losses).sum(axis=0)
+        if by_path.size:
+            by_path[..., :count] += weight * np.einsum("kc,kjs->cjs", values, step[:, None] * gradients)
+            by_rate[..., :count] -= weight * (rates.T @ (step / r * losses))
+
+
+def make_hull_loss(problem: Problem, robot: Robot, kernels: KernelLibrary, tightening: Array) -> HullLoss:
+    """Load the loss of a problem whose samples place obstacles.
+
+    Args:
+        problem: The problem.
+        robot: Its robot.
+        kernels: Library of its kernels.
+        tightening: Factors, then insets of all constraints, shape (2 m,).
+
+    Raises:
+        UsageError: The problem has no constraint ``robot-clearance``, or its robot no link geometry.
+        MachineError: Kernels are not compiled on this machine.
+    """
+    from cnpgen.kernels.collision.clearance_loss import ClearanceLoss
+
+    constraint = problem.first(RobotClearance)
+    if constraint is None:
+        raise UsageError(f"the problem {problem.name!r} has no constraint robot-clearance", concerns="problem")
+    index = problem.constraint.index(constraint)
+    inset = float(tightening[len(problem.constraint) + index])
+    required = constraint.distance + TRAINING_DISTANCE_M + inset
+    return HullLoss(problem, ClearanceLoss(kernels, robot), 1 + index, required)

@@ -1,0 +1,91 @@
+"""Observe scenes: point clouds, camera views, signed distances, basis points and object tokens."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from numpy.typing import NDArray
+
+from cnpgen.errors import UsageError
+from cnpgen.loader.batch import Batch
+from cnpgen.machine.threads import one_thread
+from cnpgen.problems.scenes.scene_problem import SceneProblem
+from cnpgen.robots.observation.observations import Observation, SceneBatch, as_observation
+from cnpgen.robots.observation.primitives import Primitives
+from cnpgen.robots.observation.scene_primitives import scene_primitives
+from cnpgen.robots.observation.surface_points import scene_seeds
+from cnpgen.robots.obstacle import Obstacle
+from cnpgen.robots.scene import Scene
+from cnpgen.schema.arguments import integer
+
+Scenes = Scene | Primitives | SceneProblem | Sequence[SceneProblem | Sequence[Obstacle]]
+MAX_SEED = 2**63 - 1
+
+
+@one_thread()
+def observe(
+    scenes: Scenes, kind: str | Observation, *, seed: int = 0, backend: str | None = None
+) -> dict[str, NDArray[Any]]:
+    """Observe N scenes, in compiled code if there is a C compiler.
+
+    Args:
+        scenes: N scene problems or sequences of obstacles, one scene problem, the scenes of plans or tasks, or their
+            bodies (``scene_bodies``), which saves the conversion of scenes that are observed repeatedly.
+        kind: "cloud", "camera", "distances", "basis" or "tokens", or an observation with parameters, such as
+            ``SurfaceCloud(points=1024)``.
+        seed: Seed of the points of clouds.
+        backend: "compiled" or "numpy"; by default the fastest that works on this machine.
+
+    Returns:
+        Name -> array with a first axis of length N; see the kinds of observations.
+
+    Raises:
+        UsageError: There is no such observation, an obstacle is a mesh, or there are no scenes.
+    """
+    from cnpgen.kernels.observation.compiled_observations import observation_backend
+
+    observation, seed = as_observation(kind), integer("seed", seed, least=0, most=MAX_SEED)
+    bodies = scene_bodies(scenes)
+    return observation.observe(SceneBatch(bodies, scene_seeds(seed, len(bodies)), observation_backend(backend)))
+
+
+@dataclass(frozen=True)
+class BatchObserver:
+    """Observer of the scenes of batches, for ``dataset.batches(256, observe=...)``.
+
+    Attributes:
+        kind: See ``observe``.
+        scenes: Function that returns the scenes of the rows of a batch, as ``observe`` takes them.
+        seed: Seed of the points of clouds, which also depend on the rows of the batch.
+    """
+
+    kind: str | Observation
+    scenes: Callable[[Batch], Scenes]
+    seed: int = 0
+
+    def __call__(self, batch: Batch) -> dict[str, NDArray[Any]]:
+        """Observe the scenes of a batch."""
+        return observe(self.scenes(batch), self.kind, seed=(self.seed << 32) + zlib.crc32(batch.table.tobytes()))
+
+
+def scene_bodies(scenes: Scenes) -> Primitives:
+    """Return the bodies of N scenes, as ``observe`` takes them.
+
+    Args:
+        scenes: See ``observe``.
+
+    Raises:
+        UsageError: An obstacle is a mesh, or there are no scenes.
+    """
+    if isinstance(scenes, Primitives):
+        return scenes
+    if isinstance(scenes, SceneProblem):
+        scenes = [scenes]
+    if len(scenes) == 0:
+        raise UsageError("there are no scenes", concerns="scenes")
+    if isinstance(scenes, Scene):
+        return scene_primitives(scenes)
+    return scene_primitives([scene.obstacles if isinstance(scene, SceneProblem) else scene for scene in scenes])

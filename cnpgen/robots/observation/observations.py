@@ -1,0 +1,229 @@
+"""Kinds of observations of scenes: point clouds, camera views, signed distances, basis points and object tokens."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import UsageError, nearest
+from cnpgen.robots.observation.camera import Camera
+from cnpgen.robots.observation.primitives import KINDS, Primitives
+from cnpgen.robots.observation.reference import ObservationBackend
+from cnpgen.robots.observation.surface_points import Seeds
+from cnpgen.schema.argument_types import check_fields
+from cnpgen.schema.arguments import integer
+
+Array = NDArray[Any]
+Corner = tuple[float, float, float]
+
+MAX_POINTS = 10_000_000  # of one observation of one scene
+MIN_GRID_EXTENT_M = 1e-6
+WORKSPACE = (-0.9, -0.9, -0.1), (0.9, 0.9, 1.1)  # corners of the default grids, around an arm like the Panda [m]
+TOKEN_NUMBERS = len(KINDS) + 3 + 6 + 3  # kind, center, two columns of the rotation matrix, sizes
+
+
+@dataclass(frozen=True, eq=False)
+class SceneBatch:
+    """N scenes to observe.
+
+    Attributes:
+        bodies: The bodies, arrays with a first axis of length N.
+        seeds: Seeds of the scenes, shape (N,).
+        backend: Compiled functions or their NumPy reference.
+    """
+
+    bodies: Primitives
+    seeds: Seeds
+    backend: ObservationBackend
+
+
+class Observation(ABC):
+    """Kind of observation with its parameters; frozen dataclasses."""
+
+    name: ClassVar[str]
+
+    @abstractmethod
+    def observe(self, scenes: SceneBatch) -> dict[str, Array]:
+        """Observe N scenes.
+
+        Args:
+            scenes: The scenes.
+
+        Returns:
+            Name -> array with a first axis of length N.
+        """
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurfaceCloud(Observation):
+    """Points on the full surface of all bodies: ``cloud``, shape (N, points, 3), float32, m; nan without bodies.
+
+    Attributes:
+        points: Number of points.
+    """
+
+    name = "cloud"
+    points: int = 4096
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        integer("points", self.points, least=1, most=MAX_POINTS)
+
+    def observe(self, scenes: SceneBatch) -> dict[str, Array]:
+        """See ``Observation``."""
+        return {"cloud": scenes.backend.surface_points(scenes.bodies, self.points, scenes.seeds)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraCloud(Observation):
+    """Points that a camera sees: ``camera_cloud``, shape (N, points, 3), float32, m; nan if it sees no body.
+
+    Attributes:
+        points: Number of points; they repeat where fewer pixels see a body.
+        camera: The camera. The robot does not hide bodies from it.
+    """
+
+    name = "camera"
+    points: int = 4096
+    camera: Camera = field(default_factory=Camera)
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        integer("points", self.points, least=1, most=MAX_POINTS)
+
+    def observe(self, scenes: SceneBatch) -> dict[str, Array]:
+        """See ``Observation``."""
+        depth = scenes.backend.depth_images(scenes.bodies, self.camera)
+        return {"camera_cloud": scenes.backend.depth_points(depth, self.camera, self.points, scenes.seeds)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class DistanceGrid(Observation):
+    """Signed distances at the points of a grid: ``distances``, shape (N, *shape), float32, m; inf without bodies.
+
+    Attributes:
+        low: Lower corner of the grid in the world frame [m].
+        high: Upper corner [m].
+        shape: Numbers of points along x, y and z, both ends included.
+    """
+
+    name = "distances"
+    low: Corner = WORKSPACE[0]
+    high: Corner = WORKSPACE[1]
+    shape: tuple[int, int, int] = (32, 32, 32)
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        _check_corners(self.low, self.high)
+        if min(self.shape) < 1 or np.prod(self.shape, dtype=float) > MAX_POINTS:
+            raise UsageError(f"must be positive with at most {MAX_POINTS:,} points, got {self.shape}", argument="shape")
+
+    def observe(self, scenes: SceneBatch) -> dict[str, Array]:
+        """See ``Observation``."""
+        axes = [np.linspace(*ends) for ends in zip(self.low, self.high, self.shape, strict=True)]
+        points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+        return {"distances": scenes.backend.distances(scenes.bodies, points).reshape(-1, *self.shape)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class BasisPoints(Observation):
+    """Signed distances at fixed points that fill a box: ``basis``, shape (N, points), float32, m; inf without bodies.
+
+    Attributes:
+        points: Number of points.
+        low: Lower corner of the box in the world frame [m].
+        high: Upper corner [m].
+    """
+
+    name = "basis"
+    points: int = 512
+    low: Corner = WORKSPACE[0]
+    high: Corner = WORKSPACE[1]
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        integer("points", self.points, least=1, most=MAX_POINTS)
+        _check_corners(self.low, self.high)
+
+    @property
+    def positions(self) -> Array:
+        """The points, a Kronecker sequence [m], shape (points, 3)."""
+        root = 1.2207440846057596  # of x^4 = x + 1
+        steps = np.arange(1, self.points + 1)[:, None] / root ** np.arange(1, 4)
+        return np.asarray(np.array(self.low) + (steps + 0.5) % 1.0 * np.subtract(self.high, self.low))
+
+    def observe(self, scenes: SceneBatch) -> dict[str, Array]:
+        """See ``Observation``."""
+        return {"basis": scenes.backend.distances(scenes.bodies, self.positions)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObjectTokens(Observation):
+    """A row per body: ``tokens``, shape (N, capacity, 16), float32, and ``mask``, shape (N, capacity).
+
+    The numbers of a row are the kind (one of box, sphere, cylinder and capsule is 1), the center [m], the first two
+    columns of the rotation matrix, and the sizes [m] as in ``Primitives``. Rows without a body are 0.
+
+    Attributes:
+        capacity: Number of rows; by default the largest number of bodies.
+    """
+
+    name = "tokens"
+    capacity: int | None = None
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        if self.capacity is not None:
+            integer("capacity", self.capacity, least=1)
+
+    def observe(self, scenes: SceneBatch) -> dict[str, Array]:
+        """See ``Observation``."""
+        bodies = scenes.bodies
+        real = bodies.kinds >= 0
+        order = np.argsort(~real, axis=1, kind="stable")  # bodies first
+        most = int(real.sum(axis=1).max(initial=0))
+        capacity = most if self.capacity is None else self.capacity
+        if most > capacity:
+            raise UsageError(f"must be at least {most}, the largest number of bodies", argument="capacity")
+        axes = bodies.rotations[..., :2].swapaxes(2, 3).reshape(*real.shape, 6)
+        kinds = bodies.kinds[..., None] == np.arange(len(KINDS))
+        rows: Array = np.concatenate([kinds, bodies.centers, axes, bodies.sizes], axis=2).astype(np.float32)
+        rows[~real] = 0
+        padding = ((0, 0), (0, max(capacity - real.shape[1], 0)), (0, 0))
+        rows, mask = (
+            np.pad(np.take_along_axis(values, order[..., None], axis=1), padding)[:, :capacity]
+            for values in (rows, real[..., None])
+        )
+        return {"tokens": rows, "mask": mask[..., 0]}
+
+
+OBSERVATIONS: Mapping[str, type[Observation]] = {
+    kind.name: kind for kind in (SurfaceCloud, CameraCloud, DistanceGrid, BasisPoints, ObjectTokens)
+}
+
+
+def as_observation(kind: str | Observation) -> Observation:
+    """Return an observation by its name, with default parameters; return observations unchanged.
+
+    Raises:
+        UsageError: There is no such observation.
+    """
+    if isinstance(kind, Observation):
+        return kind
+    if kind not in OBSERVATIONS:
+        known = ", ".join(OBSERVATIONS)
+        raise UsageError(
+            f"must be one of {known}, or an Observation, got {kind!r:.100}{nearest(str(kind), OBSERVATIONS)}",
+            argument="kind",
+        )
+    return OBSERVATIONS[kind]()
+
+
+def _check_corners(low: Corner, high: Corner) -> None:
+    if not (np.isfinite([*low, *high]).all() and (np.subtract(high, low) >= MIN_GRID_EXTENT_M).all()):
+        raise UsageError(f"must be finite and above the lower corner {low}, got {high}", argument="high")

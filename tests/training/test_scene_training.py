@@ -1,0 +1,152 @@
+"""Planners of scenes: features, rows of scene files, training, model files and planning."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cnpgen.cli.main import main
+from cnpgen.errors import UsageError
+from cnpgen.kernels.library import problem_kernels
+from cnpgen.planner.model_file import load_model
+from cnpgen.planner.network.scene_features import (
+    BASIS,
+    LINE_PHASES,
+    MAX_DISTANCE_M,
+    MIN_DISTANCE_M,
+    count_scene_features,
+    make_scene_features,
+)
+from cnpgen.planner.planner import Planner
+from cnpgen.planner.scene_requests import plan_scenes
+from cnpgen.plans.format import OBSTACLE_POSES
+from cnpgen.plans.plan_file import load_plans
+from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.problem_file import load_problem
+from cnpgen.robots.observation.primitives import primitives_of
+from cnpgen.robots.observation.signed_distance import signed_distances
+from cnpgen.robots.obstacle import Obstacle
+from cnpgen.robots.scene import Scene
+from cnpgen.robots.solid import number_slices, place_obstacles
+from cnpgen.scenes import SceneProblem, save_scenes
+from cnpgen.training.scene_rows import make_scene_rows
+from cnpgen.training.settings import TrainingSettings
+from cnpgen.training.train import train_model
+from cnpgen.trajectory.boundary import Boundary
+from cnpgen.world.forward_kinematics import ForwardKinematics
+from tests.conftest import needs_compiler
+from tests.examples.shaped_robot import write_problem
+
+TINY = TrainingSettings(hidden=8, layers=1, batch_size=16, nodes=8, validations=1)
+
+
+@pytest.fixture(scope="module")
+def problem(tmp_path_factory):
+    path = write_problem(tmp_path_factory.mktemp("crane"))
+    return load_problem(path).with_obstacles(())
+
+
+def obstacles(random: np.random.Generator, count: int) -> tuple[Obstacle, ...]:
+    boxes = [
+        Obstacle(
+            name=f"box {index}",
+            kind="box",
+            position=tuple(random.uniform([0.3, -0.4, 0.0], [0.6, 0.4, 0.6])),
+            size=tuple(random.uniform(0.05, 0.2, 3)),
+            rotation=(0.0, 0.0, float(random.uniform(-1, 1))),
+        )
+        for index in range(count - 1)
+    ]
+    place = tuple(random.uniform([0.3, -0.4, 0.0], [0.6, 0.4, 0.6]))
+    return (*boxes, Obstacle(name="can", kind="cylinder", position=place, radius=0.04, length=0.2))
+
+
+def scenes(problem, count: int) -> list[SceneProblem]:
+    random, robot = np.random.default_rng(1), load_robot(problem)
+    ends = random.uniform(robot.position_lower, robot.position_upper, (count, 2, robot.n))
+    return [
+        SceneProblem(name=f"{i}", obstacles=obstacles(random, 2 + i % 3), start_q=start, goal_q=goal[None])
+        for i, (start, goal) in enumerate(ends)
+    ]
+
+
+def test_features_do_not_depend_on_the_order_of_obstacles(problem, tmp_path):
+    robot, random = load_robot(problem), np.random.default_rng(2)
+    items = [item for item in obstacles(random, 5) if item.kind == "box"]
+    numbers, slices = place_obstacles(items), number_slices(items)
+    turned = np.concatenate([numbers[slices[index]] for index in (2, 0, 3, 1)])
+    ends = random.uniform(robot.position_lower, robot.position_upper, (2, 3, robot.n))
+    zero = np.zeros((3, robot.n))
+    boundary = Boundary(ends[0], zero, zero, ends[1], zero)
+    features = make_scene_features(robot, problem_kernels(problem, robot, "numpy", tmp_path))
+    found, other = (features(boundary, Scene(tuple(items), np.tile(poses, (3, 1)))) for poses in (numbers, turned))
+    assert found.shape == (3, count_scene_features(robot.n))
+    np.testing.assert_allclose(found, other, atol=1e-12)
+    bodies = primitives_of(items, numbers)
+    expected = np.clip(signed_distances(bodies, BASIS.positions).min(axis=0), MIN_DISTANCE_M, MAX_DISTANCE_M)
+    np.testing.assert_allclose(found[0, -BASIS.points :], expected, atol=1e-6)
+
+
+def test_clearances_along_the_line_are_those_of_the_capsules(problem, tmp_path):
+    robot, random = load_robot(problem), np.random.default_rng(3)
+    items = obstacles(random, 4)
+    start, goal = random.uniform(robot.position_lower, robot.position_upper, (2, robot.n))
+    zero = np.zeros((1, robot.n))
+    features = make_scene_features(robot, problem_kernels(problem, robot, "numpy", tmp_path))
+    scene = Scene(items, place_obstacles(items)[None])
+    found = features(Boundary(start[None], zero, zero, goal[None], zero), scene)[0]
+    phases = (np.arange(LINE_PHASES) + 1) / (LINE_PHASES + 1)
+    rotations, positions = ForwardKinematics(robot.model).poses((start + (goal - start) * phases[:, None]).T)
+    bodies = primitives_of(items, scene.poses[0])
+    for phase in range(LINE_PHASES):
+        smallest = MAX_DISTANCE_M
+        for capsule in robot.shape.moving_capsules:
+            joint = robot.shape.joints[capsule.link]
+            ends = np.array([capsule.first, capsule.second]) @ rotations[joint][..., phase].T
+            distances = signed_distances(bodies, ends + positions[joint][:, phase])
+            smallest = min(smallest, float(distances.min()) - capsule.radius)
+        entry = found[phase * (robot.n + 2)]
+        assert entry <= max(smallest, MIN_DISTANCE_M) + 1e-6  # ends of the axes, and points between them
+        assert entry >= max(smallest - 0.12, MIN_DISTANCE_M) - 1e-6
+
+
+def test_training_rows_are_problems_and_their_reverses(problem):
+    items = scenes(problem, 60)
+    rows = make_scene_rows(problem, items, "here")
+    training, checked, judged = rows.training(), rows.checked(1), rows.judged(100, after=1)
+    assert len(training.boundary) == 2 * 57
+    assert len(checked.boundary) + len(judged.boundary) == 3
+    np.testing.assert_array_equal(training.boundary.start_q[57:], training.boundary.goal_q[:57])
+    np.testing.assert_array_equal(training.obstacle_poses[57:], training.obstacle_poses[:57])
+    np.testing.assert_array_equal(judged.boundary.goal_q[-1], items[-1].goal_q[0])
+    with pytest.raises(UsageError, match="at least 40"):
+        make_scene_rows(problem, items[:3], "here")
+
+
+@needs_compiler
+def test_a_planner_is_trained_on_a_scene_file_and_plans_its_scenes(problem, tmp_path, capsys):
+    robot, items, file = tmp_path / "crane", scenes(problem, 60), tmp_path / "scenes.h5"
+    path = write_problem(tmp_path)
+    save_scenes(file, items)
+    own = load_problem(path)
+    trained = train_model(file, tmp_path / "model.h5", steps=8, settings=TINY, check_rows=1, workers=1, robot=str(path))
+    model = load_model(trained.path)
+    assert "scene" in model.features.blocks
+    assert robot.exists()
+    planner = Planner(model)
+    plans = plan_scenes(planner, items[:4])
+    assert len(plans.scene.obstacles) == len(own.obstacle) + 8
+    np.testing.assert_allclose(plans.path_control_points[:, 0], [item.start_q for item in items[:4]], atol=1e-12)
+    empty = planner.plan_batch(plans.boundary)  # obstacles stay parked
+    assert not np.array_equal(empty.path_control_points, plans.path_control_points)
+    shuffled = [replace(item, obstacles=item.obstacles[::-1]) for item in items[:4]]
+    np.testing.assert_allclose(plan_scenes(planner, shuffled).path_control_points, plans.path_control_points, atol=1e-5)
+    assert main(["plan", str(file), "--model", str(trained.path), "--n", "4", "-o", str(tmp_path / "plans.h5")]) == 0
+    capsys.readouterr()
+    again = load_plans(tmp_path / "plans.h5")
+    np.testing.assert_allclose(again.columns[OBSTACLE_POSES], plans.columns[OBSTACLE_POSES], atol=1e-5)
+    crowded = replace(items[0], obstacles=obstacles(np.random.default_rng(5), 12))
+    with pytest.raises(UsageError, match="more obstacles of the kind box"):
+        plan_scenes(planner, [crowded])
+    with pytest.raises(UsageError, match="do not differ from plan to plan"):
+        plan_scenes(Planner("heavy-object"), items[:1])
