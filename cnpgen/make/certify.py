@@ -12,7 +12,7 @@ from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.make.stage_planner import SHA256, load_stage_planner, model_sha256, planner_boundary
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.stage import CandidateBatch, Stage, StageFunction
-from cnpgen.plans.format import BOUNDARY
+from cnpgen.plans.format import BOUNDARY, OBSTACLE_POSES
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
 
@@ -79,6 +79,8 @@ class CertifiedPlan(Stage):
 
         def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
             columns = {name: np.ascontiguousarray(values.T) for name, values in candidates.columns.items()}
+            if candidates.scenes is not None:
+                columns[OBSTACLE_POSES] = candidates.scenes.poses[candidates.scene]
             guess = None if planner is None else planner.plan_batch(planner_boundary(columns, planner)).motion
             with one_thread():
                 motion, valid = solve(columns, guess)

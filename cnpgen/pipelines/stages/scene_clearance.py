@@ -1,0 +1,119 @@
+"""Clearance of states in the scenes of a batch, by compiled collision checks, or by Coal without a compiler."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.kernels.collision.body_arrays import LANES, PADDING_DISTANCE_M, obstacle_bodies
+from cnpgen.kernels.collision.collision_checker import MAX_JOINTS, CollisionChecker, load_collision_library
+from cnpgen.kernels.compiled_kernel import address_of
+from cnpgen.pipelines.context import Context
+from cnpgen.pipelines.families.resting_states import RestingStates
+from cnpgen.pipelines.stages.batch_scenes import BatchScenes
+from cnpgen.problems.constraints.clearance import RobotClearance
+from cnpgen.problems.constraints.self_clearance import SelfClearance
+from cnpgen.problems.problem import Problem
+from cnpgen.robots.obstacle import Obstacle
+from cnpgen.robots.scene import PARKED_POSITION_M
+from cnpgen.robots.solid import place_obstacles, solids_of
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+class _SceneChecker(CollisionChecker):
+    """Compiled checks whose obstacles are replaced by arrays of ``BatchScenes.bodies``."""
+
+    def place_fixed(self, obstacles: list[Obstacle]) -> None:
+        """Set the obstacles that all scenes have."""
+        numbers = place_obstacles(obstacles)
+        self.place(obstacles, numbers)
+        self._fixed, _, boxes = obstacle_bodies(obstacles, numbers, len(self._vertices))
+        self._fixed_boxes = boxes[:, : len(obstacles)]
+
+    def prepare_scenes(self, scenes: BatchScenes) -> None:
+        """Build the arrays of all scenes of a batch, for ``place_scene``."""
+        fixed, (bodies, boxes) = len(self._fixed), scenes.bodies
+        together = np.zeros((len(scenes), fixed + bodies.shape[1]), bodies.dtype)
+        together[:, :fixed], together[:, fixed:] = self._fixed, bodies
+        self._counts = (fixed + scenes.table.obstacle_count).tolist()
+        self._boxes = []
+        for box, count in zip(boxes, self._counts, strict=True):
+            padded = np.zeros((16, count + -count % LANES))
+            padded[:, :fixed], padded[:, fixed:count] = self._fixed_boxes, box[:, : count - fixed]
+            padded[:3, count:] = PADDING_DISTANCE_M
+            self._boxes.append(padded)
+        self._addresses = [address_of(padded) if padded.size else None for padded in self._boxes]
+        self._set("obstacles", together)
+        self._first, self._stride = address_of(self._arrays["obstacles"]), together.strides[0]
+
+    def place_scene(self, scene: int) -> None:
+        """Set the obstacles to those of one scene of ``prepare_scenes``."""
+        native = self._scene
+        native.obstacles, native.n_obstacles = self._first + scene * self._stride, self._counts[scene]
+        native.boxes, native.lanes = self._addresses[scene], self._boxes[scene].shape[1]
+
+
+class SceneClearance:
+    """Clearance of states from the obstacles of their scene and of links from each other.
+
+    Args:
+        context: Loaded problem, with link geometry.
+    """
+
+    def __init__(self, context: Context) -> None:
+        problem, robot = context.problem, context.robot
+        self._obstacles = problem.obstacle
+        self.obstacle_distance, self.self_distance = required_distances(problem)
+        library = load_collision_library(context.kernels) if robot.n <= MAX_JOINTS else None
+        self._checker: _SceneChecker | None = None
+        self._prepared: BatchScenes | None = None
+        if library is None:
+            self._states = RestingStates(problem, robot)
+            return
+        self._checker = _SceneChecker(library, robot)
+        self._checker.place_fixed([each for each in self._obstacles if each.position != PARKED_POSITION_M])
+
+    def are_clear(
+        self, q: Array, scene: NDArray[np.int64], scenes: BatchScenes, margin: float = 0.0, self_margin: float = 0.0
+    ) -> Mask:
+        """Return a mask of the states with sufficient distances, shape (K,).
+
+        Args:
+            q: Joint positions [rad], shape (n, K).
+            scene: Index of the scene of each state, ascending, shape (K,).
+            scenes: The scenes.
+            margin: Distance from obstacles in addition to the problem's clearance [m].
+            self_margin: Distance of links from each other in addition to the required one [m].
+        """
+        clear = np.empty(len(scene), bool)
+        bounds = [0, *(np.flatnonzero(np.diff(scene)) + 1).tolist(), len(scene)]
+        for first, end in zip(bounds, bounds[1:], strict=False):
+            if end > first:
+                clear[first:end] = self._of_scene(
+                    q[:, first:end], scenes, int(scene[first]), (margin, self_margin)
+                )
+        return clear
+
+    def _of_scene(self, q: Array, scenes: BatchScenes, scene: int, margins: tuple[float, float]) -> Mask:
+        if self._checker is None:
+            self._states.place_solids(solids_of(self._obstacles, scenes.poses[scene]))
+            return self._states.are_clear(q, margin=max(margins))
+        if self._prepared is not scenes:
+            self._checker.prepare_scenes(scenes)
+            self._prepared = scenes
+        self._checker.place_scene(scene)
+        distances = self.obstacle_distance, self.self_distance
+        of_obstacles, of_links = (
+            None if distance is None else distance + margin
+            for distance, margin in zip(distances, margins, strict=True)
+        )
+        return self._checker.clear_states(q, obstacle_distance=of_obstacles, self_distance=of_links)
+
+
+def required_distances(problem: Problem) -> tuple[float | None, float | None]:
+    """Return the required distances from obstacles and of links from each other [m]; None without a constraint."""
+    of = [
+        [item.distance for item in problem.constraint if isinstance(item, kind)]
+        for kind in (RobotClearance, SelfClearance)
+    ]
+    return max(of[0], default=None), max(of[1], default=None)
