@@ -51,7 +51,7 @@ class SceneEnds(Stage):
         "share of the samples whose straight line may be free of collisions", default=0.1, low=0.0, high=1.0
     )
     grasps: int = field("grasps of a scene that are tried", default=8, low=1, high=100)
-    poses: int = field("random poses at each grasp", default=6, low=1, high=100)
+    poses: int = field("random poses at each grasp", default=12, low=1, high=100)
 
     def find_mistakes(self) -> Iterator[tuple[str, str]]:
         """Yield (key, mistake) pairs."""
@@ -216,30 +216,38 @@ class _EndStates:
         stage, size = self._stage, (self._robot.n, len(scene))
         start, goal = np.full(size, np.nan), np.full(size, np.nan)
         may_be_straight, pending = numbers[0] < stage.straight, np.arange(len(scene))
+        used = np.empty(0, np.int64)
         for attempt in range(MAX_PAIRS):
             first = 1 + NUMBERS_PER_PAIR * attempt
-            q, aim = self._pair(pools, scene[pending], numbers[first : first + NUMBERS_PER_PAIR, pending])
-            exists = np.isfinite(q).all(axis=0)
+            q, aim, key = self._pair(pools, scene[pending], numbers[first : first + NUMBERS_PER_PAIR, pending])
+            is_new = ~np.isin(key, used)
+            is_new[is_new] = _is_first(key[is_new])
+            exists = is_new & np.isfinite(q).all(axis=0)
             accepted = exists & may_be_straight[pending]
             lines = np.flatnonzero(exists & ~accepted)
             accepted[lines] = self._lines_collide(scenes, q[:, lines], aim[:, lines], scene[pending[lines]])
+            used = np.append(used, key[accepted])
             start[:, pending[accepted]], goal[:, pending[accepted]] = q[:, accepted], aim[:, accepted]
             pending = pending[~accepted]
             if not len(pending):
                 break
         return start, goal
 
-    def _pair(self, pools: dict[str, _Pool], scene: Indices, u: Array) -> tuple[Array, Array]:
-        """Choose a start and a goal of each scene, nan without one, shape (n, P) each."""
-        group, state = pools["grasp"].choose(scene, u[0], u[1])
-        goal = _taken(pools["grasp"].q, state)
-        other = pools["grasp"].choose(scene, u[3], u[4], other_than=group)[1]
-        single = u[3:]
-        free = [pools[name].choose(scene, single[0], single[1])[1] for name in ("neutral", "random")]
-        kinds = [u[2] < self._stage.grasp, u[2] < self._stage.grasp + self._stage.neutral]
-        starts = [_taken(pools["grasp"].q, other), *(_taken(pools[name].q, f) for name, f in zip(("neutral", "random"), free, strict=True))]
-        start = np.where(kinds[0], starts[0], np.where(kinds[1], starts[1], starts[2]))
-        return np.where(np.isfinite(goal), start, np.nan), goal
+    def _pair(self, pools: dict[str, _Pool], scene: Indices, u: Array) -> tuple[Array, Array, Indices]:
+        """Choose a start and a goal of each scene, nan without one, shape (n, P) each, and a key of each pair."""
+        group, target = pools["grasp"].choose(scene, u[0], u[1])
+        chosen = {
+            "grasp": pools["grasp"].choose(scene, u[3], u[4], other_than=group)[1],
+            "neutral": pools["neutral"].choose(scene, u[3], u[4])[1],
+            "random": pools["random"].choose(scene, u[3], u[4])[1],
+        }
+        ends = np.cumsum([getattr(self._stage, name) for name in chosen])
+        kind = np.minimum(np.searchsorted(ends, u[2], side="right"), len(ends) - 1)
+        start = np.choose(kind, [_taken(pools[name].q, state) for name, state in chosen.items()])
+        state = np.choose(kind, list(chosen.values()))
+        goal = _taken(pools["grasp"].q, target)
+        key = (target * len(ends) + kind) * 2**31 + state
+        return np.where(np.isfinite(goal), start, np.nan), goal, key
 
     def _lines_collide(self, scenes: BatchScenes, start: Array, goal: Array, scene: Indices) -> NDArray[np.bool_]:
         """Return which straight lines have a state that is not clear, shape (P,); a few states are checked."""
@@ -255,7 +263,16 @@ class _EndStates:
 
 def _taken(q: Array, state: Indices) -> Array:
     """Return states by index, nan for -1, shape (n, P)."""
-    return np.where(state >= 0, q[:, np.maximum(state, 0)], np.nan) if q.shape[1] else np.full((len(q), len(state)), np.nan)
+    if not q.shape[1]:
+        return np.full((len(q), len(state)), np.nan)
+    return np.where(state >= 0, q[:, np.maximum(state, 0)], np.nan)
+
+
+def _is_first(key: Indices) -> NDArray[np.bool_]:
+    """Return which entries do not occur before, shape (P,)."""
+    first = np.zeros(len(key), bool)
+    first[np.unique(key, return_index=True)[1]] = True
+    return first
 
 
 def _rotations(approach: Array, tilt: Array, u: Array) -> Array:
