@@ -35,8 +35,9 @@ class Dataset:
     """The rows of a dataset. It can be pickled, forked and used by several threads.
 
     In all methods, ``fields`` are field names in the requested order; by default, all float fields except for
-    diagnostics. Fields of scenes, such as ``obstacle_poses``, have to be named. ``normalize`` may be the :class:`Normalization` of another dataset. ``dtype`` is the type of float
-    fields, "float32" or "float64". Integer fields are int64; they and those of scenes are never normalized.
+    diagnostics. Fields of scenes, such as ``obstacle_poses``, have to be named. ``normalize`` may be the
+    :class:`Normalization` of another dataset. ``dtype`` is the type of float fields, "float32" or "float64". Integer
+    fields are int64; they and those of scenes are never normalized.
 
     Attributes:
         folder: Folder of the dataset.

@@ -238,7 +238,9 @@ class BlockChunk:
         columns[SCENE_ID] = first_row + columns[SCENE_ID]
         scenes = concatenate_scenes(self._scenes)
         return Block(
-            columns, self._statistics.sampling(), replace(scenes, scene_ids=(first_row + scenes.scene_ids).astype(np.int64))
+            columns,
+            self._statistics.sampling(),
+            replace(scenes, scene_ids=(first_row + scenes.scene_ids).astype(np.int64)),
         )
 
 

@@ -86,9 +86,7 @@ def _of_folder(folder: Path, split: str, start: int, n: int | None) -> Plans:
     columns, record = dataset.read(split, start=rows.start, stop=rows.stop), as_record(dataset.spec.problem)
     if dataset.spec.scene_obstacles:
         table = dataset.read_scenes(split, start=rows.start, stop=rows.stop)
-        columns[OBSTACLE_POSES] = scene_poses(
-            open_problem(record)[0].obstacle, table[table.rows_of(columns[SCENE_ID])]
-        )
+        columns[OBSTACLE_POSES] = scene_poses(open_problem(record)[0].obstacle, table[table.rows_of(columns[SCENE_ID])])
     return plans_of_rows(record, columns, source=source)
 
 

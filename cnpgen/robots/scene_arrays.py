@@ -51,9 +51,7 @@ def make_scene_table(layouts: Sequence[Sequence[Obstacle]], families: Sequence[i
         size[real] = [obstacle.size or (obstacle.radius, obstacle.length or 0.0, 0.0) for obstacle in flat]
         position[real] = [obstacle.position for obstacle in flat]
         quaternion[real] = _quaternions(np.array([obstacle.rotation for obstacle in flat]))
-    return SceneTable(
-        np.arange(len(layouts)), np.array(families, np.int64), count, kind, size, position, quaternion
-    )
+    return SceneTable(np.arange(len(layouts)), np.array(families, np.int64), count, kind, size, position, quaternion)
 
 
 def _quaternions(rotation: Array) -> Array:

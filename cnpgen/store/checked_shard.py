@@ -119,9 +119,7 @@ def read_scenes(shard: Shard, placements: Mapping[str, Placement] | None = None)
     try:
         check_shapes({name: placements[name].shape for name in names if name in placements}, shard.scene_obstacles)
         columns = read_columns(shard, placements, [SCENE_ID, *names])
-        table = SceneTable(**{name: columns[name] for name in names})
-        if any(values.dtype != dict(table.astype(shard.dtype).arrays())[name].dtype for name, values in table.arrays()):
-            raise DatasetError("the scenes have other types than the dataset")
+        table = SceneTable(**{name: columns[name] for name in names}).astype(shard.dtype)
         check_scenes(table, shard.scene_obstacles, columns[SCENE_ID], shard.scene_families)
     except DatasetError as error:
         raise DatasetError(f"{shard.path}: {error}") from error

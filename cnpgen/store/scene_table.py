@@ -119,9 +119,7 @@ class SceneTable:
         """Return the scenes in the stored types of a dataset with a float type."""
         stored = {"float": np.dtype(dtype).newbyteorder("<"), "int64": np.dtype("<i8")}
         kinds = {item.name: item.dtype for item in SCENE_ARRAYS}
-        return SceneTable(
-            **{name: np.ascontiguousarray(values, stored[kinds[name]]) for name, values in self.arrays()}
-        )
+        return SceneTable(**{name: np.ascontiguousarray(values, stored[kinds[name]]) for name, values in self.arrays()})
 
 
 def concatenate_scenes(tables: Sequence[SceneTable]) -> SceneTable:
@@ -190,8 +188,8 @@ def check_scenes(table: SceneTable, obstacles: int, scene_id: NDArray[np.int64],
 
 def check_shapes(shapes: Mapping[str, tuple[int, ...]], obstacles: int) -> None:
     """Raise DatasetError if the arrays of a scene table do not have the shapes for up to ``obstacles`` obstacles."""
-    scenes = shapes.get("scene_ids", (0,))[:1]
+    scenes = shapes.get("scene_ids") or (0,)
     for item in SCENE_ARRAYS:
-        expected = item.shape(*scenes, obstacles)
+        expected = item.shape(scenes[0], obstacles)
         if shapes.get(item.name) != expected:
             raise DatasetError(f"{item.name} must have shape {expected}, got {shapes.get(item.name)}")

@@ -87,7 +87,10 @@ def write_shard(
     rows = int(attributes["rows"])
     _check_columns(columns, fields, rows, dtype)
     arrays = {} if scenes is None else dict(scenes.arrays())
-    content = _encode(columns, fields, attributes, dtype, arrays, families)
+    about_scenes = scene_attributes(families)
+    parts = [(f.name, np.asarray(columns[f.name], storage_dtype(f, dtype)), field_attributes(f)) for f in fields]
+    parts += [(name, values, about_scenes[name]) for name, values in arrays.items()]
+    content = _encode(parts, attributes)
     with committing(path, work) as temporary:
         temporary.write_bytes(content)
         with opened_hdf5(temporary) as file:
@@ -120,25 +123,21 @@ def _check_columns(columns: Mapping[str, NDArray[Any]], fields: Sequence[Field],
 
 
 def _encode(
-    columns: Mapping[str, NDArray[Any]],
-    fields: Sequence[Field],
-    attributes: Mapping[str, str | int],
-    dtype: str,
-    scenes: Mapping[str, NDArray[Any]],
-    families: Sequence[str],
+    parts: Sequence[tuple[str, NDArray[Any], dict[str, Any]]], attributes: Mapping[str, str | int]
 ) -> memoryview:
-    """Build the file in memory: a full disk then causes a plain system error, and no partial file."""
+    """Build the file in memory: a full disk then causes a plain system error, and no partial file.
+
+    Args:
+        parts: Name, values and attributes of every dataset.
+        attributes: Attributes of the file.
+    """
     import h5py
 
     buffer = io.BytesIO()
     with h5py.File(create_hdf5(buffer)) as file:
-        for field in fields:
-            stored = storage_dtype(field, dtype)
-            dataset = file.create_dataset(field.name, data=columns[field.name], dtype=stored, track_times=False)
-            dataset.attrs.update(field_attributes(field))
-        for name, values in scenes.items():
+        for name, values, about in parts:
             dataset = file.create_dataset(name, data=values, dtype=values.dtype, track_times=False)
-            dataset.attrs.update(scene_attributes(families)[name])
+            dataset.attrs.update(about)
         file.attrs.update({"format": SHARD_FORMAT, "format_version": SHARD_VERSION, **attributes})
     return buffer.getbuffer()
 

@@ -158,8 +158,10 @@ def commit_shard(
     if is_committed(folder, spec, task):  # another process made the same shard
         return load_record(folder, task)
     about = {"sampling": sampling, "started": started, "seconds": seconds, "versions": versions or {}}
+    if scenes is not None:
+        check_scenes(scenes, spec.scene_obstacles, columns[SCENE_ID], len(spec.scene_families))
     try:
-        return _write(folder, spec, task, columns, scenes, about)
+        return _write(folder, spec, task, (columns, scenes), about)
     except CnpgenError:
         # Another process may have committed the shard, finished the dataset and removed all temporary files.
         if is_committed(folder, spec, task):
@@ -171,14 +173,12 @@ def _write(
     folder: Path,
     spec: DatasetSpec,
     task: ShardTask,
-    columns: Mapping[str, NDArray[Any]],
-    scenes: SceneTable | None,
+    content: tuple[Mapping[str, NDArray[Any]], SceneTable | None],
     about: Mapping[str, Any],
 ) -> ShardRecord:
     """Write a shard and then its sidecar, unless another process has committed the shard in the meantime."""
     path = folder / task.file
-    if scenes is not None:
-        check_scenes(scenes, spec.scene_obstacles, columns[SCENE_ID], len(spec.scene_families))
+    columns, scenes = content
     size = write_shard(
         path,
         columns,

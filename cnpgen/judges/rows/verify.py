@@ -63,8 +63,8 @@ def verify_rows(
         robot: Its robot.
         columns: Field -> values in SI units, shape (rows, width) or (rows,): ``start_q``, ``start_dq``, ``start_ddq``,
             ``goal_q``, ``goal_dq``, ``start_xyz``, ``goal_xyz``; optionally ``goal_ddq``, ``hit_angle``, ``hit_speed``,
-            ``hit_speed_max``, diagnostics, and ``obstacle_poses``, which replace those of the problem. Other fields must
-            be finite.
+            ``hit_speed_max``, diagnostics, and ``obstacle_poses``, which replace those of the problem. Other fields
+            must be finite.
         dtype: Float type of the stored rows, which determines the tolerances.
         rule: Rule by which the stages chose the goals; none by default.
 

@@ -124,7 +124,8 @@ def base_depths(table: SceneTable) -> NDArray[np.float64]:
         np.minimum(radius - across, half - up),
         radius - np.hypot(across, np.maximum(up - half, 0.0)),
     ]
-    return np.select([kind == code for code in range(len(depths))], depths, -np.inf).max(axis=1)
+    depth = np.select([kind == code for code in range(len(depths))], depths, -np.inf)
+    return np.asarray(depth.max(axis=1))
 
 
 def scenes_of(candidates: CandidateBatch) -> BatchScenes:

@@ -32,14 +32,9 @@ def pose_ik_step(robot: "Robot") -> Any:
     stretch = METERS_PER_RADIAN * 2.0 / ca.fmax(1.0 + trace, 1e-2)
     turn = [relative[2][1] - relative[1][2], relative[0][2] - relative[2][0], relative[1][0] - relative[0][1]]
     error = [*subtract(p, kin.tip), *scale(turn, stretch)]
+    axes = [axis if turns else [0.0] * 3 for axis, turns in zip(kin.axes, kin.turning, strict=True)]
     rows = [[column[row] for column in kin.jacobian] for row in range(3)]
-    for row in range(3):
-        rows.append(
-            [
-                METERS_PER_RADIAN * axis[row] if turns else 0.0
-                for axis, turns in zip(kin.axes, kin.turning, strict=True)
-            ]
-        )
+    rows += [[METERS_PER_RADIAN * axis[row] for axis in axes] for row in range(3)]
     square = dot(error, error)
     step = _limited_step(rows, error, POSE_DAMPING * square + MIN_DAMPING)
     moved = add(q, step)

@@ -1,5 +1,7 @@
 """Clearance of states in the scenes of a batch, by compiled collision checks, or by Coal without a compiler."""
 
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -87,11 +89,9 @@ class SceneClearance:
         """
         clear = np.empty(len(scene), bool)
         bounds = [0, *(np.flatnonzero(np.diff(scene)) + 1).tolist(), len(scene)]
-        for first, end in zip(bounds, bounds[1:], strict=False):
+        for first, end in pairwise(bounds):
             if end > first:
-                clear[first:end] = self._of_scene(
-                    q[:, first:end], scenes, int(scene[first]), (margin, self_margin)
-                )
+                clear[first:end] = self._of_scene(q[:, first:end], scenes, int(scene[first]), (margin, self_margin))
         return clear
 
     def _of_scene(self, q: Array, scenes: BatchScenes, scene: int, margins: tuple[float, float]) -> Mask:
@@ -104,8 +104,7 @@ class SceneClearance:
         self._checker.place_scene(scene)
         distances = self.obstacle_distance, self.self_distance
         of_obstacles, of_links = (
-            None if distance is None else distance + margin
-            for distance, margin in zip(distances, margins, strict=True)
+            None if distance is None else distance + margin for distance, margin in zip(distances, margins, strict=True)
         )
         return self._checker.clear_states(q, obstacle_distance=of_obstacles, self_distance=of_links)
 

@@ -35,7 +35,7 @@ class CandidateBatch:
         origins: Reason -> label of the stage that used it first.
         drawn: Name -> values of all candidates, shape (width, N), for columns written before any rejection.
         last: Whether this is the last batch of the pipeline, so that all its candidates are counted.
-        scenes: Scenes of the candidates, whose column ``scene`` has the index of the scene of each; None without scenes.
+        scenes: Scenes of the candidates, whose column ``scene`` has the index of the scene of each, or None.
     """
 
     def __init__(self, size: int, *, last: bool = False) -> None:
@@ -52,7 +52,8 @@ class CandidateBatch:
     @property
     def scene(self) -> NDArray[np.int64]:
         """Index in ``scenes`` of the scene of each remaining candidate, ascending, shape (n,)."""
-        return self.columns["scene"][0].astype(np.int64)
+        index: NDArray[np.int64] = self.columns["scene"][0].astype(np.int64)
+        return index
 
     def __getitem__(self, name: str) -> Array:
         return self.columns[name]
