@@ -34,7 +34,7 @@ class SceneArray:
         long_name: Description in a few words.
         dtype: "float" or "int64".
         per_obstacle: Number of values of each obstacle, 0 for one value; None for one value of each scene.
-        convention: Order and meaning of the values.
+        convention: Order of the values, or their code.
     """
 
     name: str

@@ -2,6 +2,9 @@
 
 from pathlib import Path
 
+from cnpgen.problems.scenes.scene_problem import make_obstacle
+from cnpgen.robots.obstacle import Obstacle
+from cnpgen.store.scene_table import OBSTACLE_KINDS, SceneTable
 from tests.examples.chains import chain
 
 SPHERE = '<collision><origin xyz="0.05 0 0"/><geometry><sphere radius="0.02"/></geometry></collision></link>'
@@ -49,3 +52,14 @@ def write_scene_pipeline(folder: Path, text: str = PIPELINE) -> Path:
     path = folder / "scenes.toml"
     path.write_text(text)
     return path
+
+
+def obstacles_of(table: SceneTable, scene: int) -> tuple[Obstacle, ...]:
+    """The obstacles of one scene of a dataset."""
+    numbers, obstacles = {"box": 3, "sphere": 1, "cylinder": 2, "capsule": 2}, list[Obstacle]()
+    for index in range(int(table.obstacle_count[scene])):
+        kind = OBSTACLE_KINDS[int(table.obstacle_kind[scene, index])]
+        sizes = table.obstacle_size[scene, index, : numbers[kind]]
+        pose = table.obstacle_position[scene, index], table.obstacle_quaternion[scene, index]
+        obstacles.append(make_obstacle(f"{kind} {index + 1}", kind, sizes, *pose, place="a dataset"))
+    return tuple(obstacles)

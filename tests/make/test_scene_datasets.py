@@ -15,13 +15,12 @@ from cnpgen.errors import DatasetError
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_record import as_record, open_problem
-from cnpgen.problems.scenes.stored_scenes import obstacles_of
 from cnpgen.robots.solid import place_obstacles, solids_of
 from cnpgen.store.reader import open_dataset
 from cnpgen.world.world import World
 from tests.conftest import needs_compiler
 from tests.examples.forged_shards import edit
-from tests.examples.scene_arm import PIPELINE, write_scene_pipeline
+from tests.examples.scene_arm import PIPELINE, obstacles_of, write_scene_pipeline
 
 pytestmark = needs_compiler  # NumPy takes minutes
 ROWS = 240

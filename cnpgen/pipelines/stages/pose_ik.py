@@ -10,8 +10,8 @@ if TYPE_CHECKING:
 
 METERS_PER_RADIAN = 0.3  # weight of an angle against a distance
 POSE_TOLERANCE = 1e-9  # m and weighted rad, before the last step
-MAX_POSE_STEPS = 30
-MAX_STEP_RAD = 0.5  # of any joint
+MAX_POSE_IK_STEPS = 30
+MAX_POSE_IK_STEP_RAD = 0.5  # of any joint
 POSE_DAMPING = 1e-3  # relative to the squared error (Sugihara 2011)
 MIN_DAMPING = 1e-12
 
@@ -46,7 +46,7 @@ def pose_ik_step(robot: "Robot") -> Any:
 
 
 def _limited_step(rows: list[Vec], error: Vec, damping: Scalar) -> Vec:
-    """Return the damped least-squares step, shortened to ``MAX_STEP_RAD``."""
+    """Return the damped least-squares step, shortened to ``MAX_POSE_IK_STEP_RAD``."""
     import casadi as ca
 
     weights = solve(gram(rows, damping), error)
@@ -54,4 +54,4 @@ def _limited_step(rows: list[Vec], error: Vec, damping: Scalar) -> Vec:
     largest: Scalar = ca.fabs(step[0])
     for x in step[1:]:
         largest = ca.fmax(largest, ca.fabs(x))
-    return scale(step, ca.fmin(1.0, MAX_STEP_RAD / ca.fmax(largest, 1e-9)))
+    return scale(step, ca.fmin(1.0, MAX_POSE_IK_STEP_RAD / ca.fmax(largest, 1e-9)))

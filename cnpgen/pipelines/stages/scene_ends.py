@@ -14,7 +14,7 @@ from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.batch_scenes import BatchScenes
 from cnpgen.pipelines.stages.draw import position_field
 from cnpgen.pipelines.stages.draw_scenes import scenes_of
-from cnpgen.pipelines.stages.pose_ik import MAX_POSE_STEPS, POSE_TOLERANCE, pose_ik_step
+from cnpgen.pipelines.stages.pose_ik import MAX_POSE_IK_STEPS, POSE_TOLERANCE, pose_ik_step
 from cnpgen.pipelines.stages.scene_clearance import SceneClearance
 from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Stage, StageFunction, leave
 from cnpgen.pipelines.stages.torque import torque_ratio
@@ -24,7 +24,7 @@ from cnpgen.store.field import Field
 
 Indices = NDArray[np.int64]
 
-MAX_PAIRS = 8  # of a start and a goal that are tried for one candidate
+MAX_PAIRS_PER_CANDIDATE = 8  # of a start and a goal that are tried for one candidate
 NEUTRAL_STATES = 12  # of a scene
 RANDOM_STATES = 16  # of a scene, most of which collide
 FIRST_PHASES = (0.5, 0.25, 0.75)  # of a straight line, checked first
@@ -94,7 +94,7 @@ class SceneEnds(Stage):
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
             scenes = scenes_of(candidates)
             pools = states.pools(scenes, random)
-            numbers = candidates.draw(random, 1 + NUMBERS_PER_PAIR * MAX_PAIRS)
+            numbers = candidates.draw(random, 1 + NUMBERS_PER_PAIR * MAX_PAIRS_PER_CANDIDATE)
             start, goal = states.pairs(scenes, pools, candidates.scene, numbers)
             candidates["start_q"], candidates["goal_q"] = start, goal
             candidates.reject(np.isfinite(start).all(axis=0), NO_ENDS)
@@ -158,7 +158,7 @@ class _EndStates:
     def __init__(self, context: Context, stage: SceneEnds) -> None:
         self._robot: Robot = context.robot
         self._stage, self._clearance = stage, SceneClearance(context)
-        loop = Loop(POSE_TOLERANCE, MAX_POSE_STEPS)
+        loop = Loop(POSE_TOLERANCE, MAX_POSE_IK_STEPS)
         self._ik: Kernel = context.kernels.load(pose_ik_step, loop)
         self._torque: Kernel = context.kernels.load(torque_ratio)
 
@@ -217,7 +217,7 @@ class _EndStates:
         start, goal = np.full(size, np.nan), np.full(size, np.nan)
         may_be_straight, pending = numbers[0] < stage.straight, np.arange(len(scene))
         used = np.empty(0, np.int64)
-        for attempt in range(MAX_PAIRS):
+        for attempt in range(MAX_PAIRS_PER_CANDIDATE):
             first = 1 + NUMBERS_PER_PAIR * attempt
             q, aim, key = self._pair(pools, scene[pending], numbers[first : first + NUMBERS_PER_PAIR, pending])
             is_new = ~np.isin(key, used)
