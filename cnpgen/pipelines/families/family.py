@@ -67,7 +67,7 @@ class SceneFamily(ABC):
 
 def uniform(random: np.random.Generator, interval: Range) -> float:
     """Draw a number from an interval."""
-    return float(random.uniform(interval.low, interval.high))
+    return interval.low + (interval.high - interval.low) * random.random()
 
 
 def whole(random: np.random.Generator, interval: Range) -> int:

@@ -48,11 +48,31 @@ class _SceneChecker(CollisionChecker):
         self._set("obstacles", together)
         self._first, self._stride = address_of(self._arrays["obstacles"]), together.strides[0]
 
-    def place_scene(self, scene: int) -> None:
-        """Set the obstacles to those of one scene of ``prepare_scenes``."""
-        native = self._scene
-        native.obstacles, native.n_obstacles = self._first + scene * self._stride, self._counts[scene]
-        native.boxes, native.lanes = self._addresses[scene], self._boxes[scene].shape[1]
+    def clear_of_scenes(
+        self, q: Array, runs: list[tuple[int, int, int]], limits: tuple[float | None, float | None]
+    ) -> Mask:
+        """Return a mask of the states with sufficient distances from the obstacles of their scene, shape (K,).
+
+        Args:
+            q: Joint positions [rad], shape (n, K).
+            runs: Scene, first state and end of every run of states in one scene.
+            limits: Required distances from obstacles and of links from each other [m]; None for no check.
+        """
+        states, clear = np.ascontiguousarray(q.T), np.empty(q.shape[1], np.uint8)
+        native, check, (obstacle_limit, self_limit) = self._scene, self.library.clear_states, _finite(limits)
+        first_state, first_flag, stride = address_of(states), address_of(clear), states.strides[0]
+        for scene, first, end in runs:
+            native.obstacles, native.n_obstacles = self._first + scene * self._stride, self._counts[scene]
+            native.boxes, native.lanes = self._addresses[scene], self._boxes[scene].shape[1]
+            place = first_state + first * stride
+            check(self.address, place, end - first, obstacle_limit, self_limit, first_flag + first)
+        return clear.astype(bool)
+
+
+def _finite(limits: tuple[float | None, float | None]) -> tuple[float, float]:
+    """Return limits for functions in C, where minus infinity stands for no check."""
+    obstacle_limit, self_limit = (-np.inf if limit is None else limit for limit in limits)
+    return obstacle_limit, self_limit
 
 
 class SceneClearance:
@@ -87,26 +107,27 @@ class SceneClearance:
             margin: Distance from obstacles in addition to the problem's clearance [m].
             self_margin: Distance of links from each other in addition to the required one [m].
         """
-        clear = np.empty(len(scene), bool)
+        if not len(scene):
+            return np.zeros(0, bool)
         bounds = [0, *(np.flatnonzero(np.diff(scene)) + 1).tolist(), len(scene)]
-        for first, end in pairwise(bounds):
-            if end > first:
-                clear[first:end] = self._of_scene(q[:, first:end], scenes, int(scene[first]), (margin, self_margin))
-        return clear
-
-    def _of_scene(self, q: Array, scenes: BatchScenes, scene: int, margins: tuple[float, float]) -> Mask:
+        runs = [(int(scene[first]), first, end) for first, end in pairwise(bounds)]
         if self._checker is None:
-            self._states.place_solids(solids_of(self._obstacles, scenes.poses[scene]))
-            return self._states.are_clear(q, margin=max(margins))
+            return np.concatenate(
+                [self._by_coal(q[:, first:end], scenes, run, max(margin, self_margin)) for run, first, end in runs]
+            )
         if self._prepared is not scenes:
             self._checker.prepare_scenes(scenes)
             self._prepared = scenes
-        self._checker.place_scene(scene)
-        distances = self.obstacle_distance, self.self_distance
-        of_obstacles, of_links = (
-            None if distance is None else distance + margin for distance, margin in zip(distances, margins, strict=True)
-        )
-        return self._checker.clear_states(q, obstacle_distance=of_obstacles, self_distance=of_links)
+        limits = _plus(self.obstacle_distance, margin), _plus(self.self_distance, self_margin)
+        return self._checker.clear_of_scenes(q, runs, limits)
+
+    def _by_coal(self, q: Array, scenes: BatchScenes, scene: int, margin: float) -> Mask:
+        self._states.place_solids(solids_of(self._obstacles, scenes.poses[scene]))
+        return self._states.are_clear(q, margin=margin)
+
+
+def _plus(distance: float | None, margin: float) -> float | None:
+    return None if distance is None else distance + margin
 
 
 def required_distances(problem: Problem) -> tuple[float | None, float | None]:

@@ -169,23 +169,25 @@ class _EndStates:
         neutral = robot.base[:, None] + self._stage.spread * random.standard_normal((robot.n, count * NEUTRAL_STATES))
         anywhere = low + (high - low) * random.random((robot.n, count * RANDOM_STATES))
         q, key = self._grasp_states(scenes, random)
-        owner = [np.repeat(np.arange(count), each) for each in (NEUTRAL_STATES, RANDOM_STATES)]
-        return {
-            "grasp": self._valid(scenes, q, key, self._stage.grasps),
-            "neutral": self._valid(scenes, neutral, owner[0], 1),
-            "random": self._valid(scenes, anywhere, owner[1], 1),
-        }
+        owners = [np.repeat(np.arange(count), each) for each in (NEUTRAL_STATES, RANDOM_STATES)]
+        states = np.concatenate([q, neutral, anywhere], axis=1)
+        valid = self._are_valid(scenes, states, np.concatenate([key // self._stage.grasps, *owners]))
+        masks = np.split(valid, np.cumsum([q.shape[1], neutral.shape[1]]))
+        parts = zip(("grasp", "neutral", "random"), (q, neutral, anywhere), (key, *owners), masks, strict=True)
+        groups = {"grasp": self._stage.grasps, "neutral": 1, "random": 1}
+        return {name: _make_pool(each[:, mask], own[mask], count, groups[name]) for name, each, own, mask in parts}
 
-    def _valid(self, scenes: BatchScenes, q: Array, key: Indices, groups: int) -> _Pool:
-        """Return the states that are within limits, can be held, and are clear."""
+    def _are_valid(self, scenes: BatchScenes, q: Array, scene: Indices) -> NDArray[np.bool_]:
+        """Return which states are within limits, can be held, and are clear in their scene, shape (K,)."""
         robot = self._robot
-        inside = ((q >= robot.position_lower[:, None]) & (q <= robot.position_upper[:, None])).all(axis=0)
-        valid = np.flatnonzero(inside)
-        (ratio,) = self._torque(np.ascontiguousarray(q[:, valid]))
-        valid = valid[ratio[0] <= 1.0]
-        states, margin = np.ascontiguousarray(q[:, valid]), self._stage.margin
-        clear = self._clearance.are_clear(states, key[valid] // groups, scenes, margin)
-        return _make_pool(np.ascontiguousarray(states[:, clear]), key[valid][clear], len(scenes), groups)
+        valid = ((q >= robot.position_lower[:, None]) & (q <= robot.position_upper[:, None])).all(axis=0)
+        (ratio,) = self._torque(np.ascontiguousarray(q))
+        chosen = np.flatnonzero(valid & (ratio[0] <= 1.0))
+        chosen = chosen[np.argsort(scene[chosen], kind="stable")]
+        clear = self._clearance.are_clear(q[:, chosen], scene[chosen], scenes, self._stage.margin)
+        valid = np.zeros(q.shape[1], bool)
+        valid[chosen[clear]] = True
+        return valid
 
     def _grasp_states(self, scenes: BatchScenes, random: np.random.Generator) -> tuple[Array, Indices]:
         """Solve for poses at random grasps of each scene; return joint positions and keys of the solved ones."""
