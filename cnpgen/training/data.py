@@ -78,9 +78,11 @@ def open_training_data(folder: str | Path) -> TrainingData:
     """Open a dataset for training.
 
     Raises:
-        DatasetError: It is missing, unfinished or damaged, or has no rows for training or validation.
+        DatasetError: It is missing, unfinished or damaged, has scenes, or has no rows for training or validation.
     """
     dataset = load_dataset(folder)
+    if dataset.spec.scene_obstacles:
+        raise DatasetError(f"{folder} has scenes, which networks do not observe yet: train with other data")
     names = [name for name, rows in dataset.splits.items() if rows]
     if len(names) < 2:
         raise DatasetError(f"{folder} needs a split to train on and another one to validate with, it has {names}")

@@ -17,6 +17,7 @@ from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_record import as_record, open_problem
 from cnpgen.robots.solid import place_obstacles, solids_of
 from cnpgen.store.reader import open_dataset
+from cnpgen.training.data import open_training_data
 from cnpgen.world.world import World
 from tests.conftest import needs_compiler
 from tests.examples.forged_shards import edit
@@ -67,6 +68,7 @@ def test_scene_ids_are_those_of_the_first_samples(dataset: Path) -> None:
     assert (np.diff(columns["scene_id"]) >= 0).all()
 
 
+@pytest.mark.slow
 def test_two_workers_another_shard_size_and_an_extension_give_equal_scenes(
     pipeline: Path, dataset: Path, tmp_path: Path
 ) -> None:
@@ -82,6 +84,7 @@ def test_two_workers_another_shard_size_and_an_extension_give_equal_scenes(
             assert np.array_equal(one.arrays(split, fields=[name])[name], other.arrays(split, fields=[name])[name])
 
 
+@pytest.mark.slow
 def test_an_interrupted_dataset_is_finished_and_parts_are_merged(pipeline: Path, dataset: Path, tmp_path: Path) -> None:
     broken, merged = tmp_path / "broken", tmp_path / "merged"
     shutil.copytree(dataset, broken)
@@ -96,6 +99,7 @@ def test_an_interrupted_dataset_is_finished_and_parts_are_merged(pipeline: Path,
     assert shard_bytes(merged) == shard_bytes(dataset)
 
 
+@pytest.mark.slow
 def test_a_deep_check_accepts_the_dataset_and_finds_a_moved_obstacle(
     dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -178,6 +182,12 @@ def test_batches_contain_the_scene_without_normalization(dataset: Path) -> None:
     assert "obstacle_poses" not in next(iter(loaded.batches(32)))
 
 
+def test_training_refuses_scenes_that_the_network_would_ignore(dataset: Path) -> None:
+    with pytest.raises(DatasetError, match="has scenes, which networks do not observe yet"):
+        open_training_data(dataset)
+
+
+@pytest.mark.slow
 def test_float32_datasets_are_valid_as_stored(pipeline: Path, tmp_path: Path) -> None:
     folder = tmp_path / "single"
     cnpgen.make_dataset(pipeline, folder, n=60, dtype="float32", workers=1)

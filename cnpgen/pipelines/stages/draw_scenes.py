@@ -100,7 +100,7 @@ class DrawScenes(Stage):
         if places != self.capacity:
             mistakes.append(
                 f"capacity: the problem has places for {places or 'no obstacles of samples'}, expected"
-                f" {self.capacity}: extend it with cnpgen.recipes.with_capacity, as pipeline files do"
+                f" {self.capacity}: load the pipeline from a file, which adds them"
             )
         if any(obstacle.below for obstacle in problem.obstacle):
             mistakes.append("obstacles below the object are not supported in scenes: give them a height")
