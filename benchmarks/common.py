@@ -14,7 +14,7 @@ from typing import Any
 import cnpgen
 
 LIBRARIES = ("numpy", "scipy", "casadi", "pin", "coal", "h5py", "joblib")
-ROBOT_RECIPES = ("panda-cup", "ur5-wipe")  # recipes of robots that come with the extra cnpgen[robots]
+ROBOT_RECIPES = ("panda-cup", "panda-scenes", "ur5-wipe")  # recipes of robots that come with the extra cnpgen[robots]
 INSTRUCTION_SETS = ("avx512f", "avx2", "avx", "asimd")  # best first
 
 

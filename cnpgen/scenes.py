@@ -6,8 +6,8 @@ from cnpgen.pipelines.families.family import Grasp, Layout, SceneFamily
 from cnpgen.pipelines.families.scene_generator import make_scenes
 from cnpgen.planner.scene_requests import plan_scenes
 from cnpgen.plans.scene_plans import scene_plans
-from cnpgen.problems.scenes.point_cloud import obstacles_of_points
 from cnpgen.problems.scenes.observe import BatchObserver, observe, scene_bodies
+from cnpgen.problems.scenes.point_cloud import obstacles_of_points
 from cnpgen.problems.scenes.scene_files import load_scenes, save_scenes
 from cnpgen.problems.scenes.scene_problem import GoalPose, SceneError, SceneProblem
 from cnpgen.robots.observation.camera import Camera
@@ -37,8 +37,8 @@ __all__ = [
     "load_family",
     "load_scenes",
     "make_scenes",
-    "obstacles_of_points",
     "observe",
+    "obstacles_of_points",
     "plan_scenes",
     "save_scenes",
     "scene_bodies",

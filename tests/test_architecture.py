@@ -18,8 +18,8 @@ PACKAGE = Path(__file__).parents[1] / "cnpgen"
 LAYERS = (
     ("errors",),
     ("schema", "store"),
-    ("machine", "robots", "trajectory", "loader"),
-    ("kernels", "world"),
+    ("machine", "robots", "trajectory"),
+    ("kernels", "world", "loader"),
     ("problems",),
     ("pipelines", "judges", "losses"),
     ("plans",),

@@ -6,6 +6,7 @@ from functools import cached_property
 from typing import Any
 
 from cnpgen.errors import UsageError
+from cnpgen.loader.scene_columns import scene_fields
 from cnpgen.store.dataset_spec import DatasetSpec
 from cnpgen.store.field import Field
 
@@ -66,7 +67,7 @@ def select_columns(spec: DatasetSpec, names: Iterable[str] | None) -> Columns:
     Args:
         spec: Specification of the dataset.
         names: Names in the requested order; by default all float fields except for diagnostics, in the order of the
-            specification.
+            specification. Fields of scenes have to be named.
 
     Raises:
         DatasetError: There is no such field.
@@ -83,4 +84,5 @@ def select_columns(spec: DatasetSpec, names: Iterable[str] | None) -> Columns:
     texts = all(isinstance(name, str) for name in selected)
     if not selected or not texts or len(set(selected)) != len(selected):
         raise UsageError(f"must be one or more different names, got {list(selected)!s:.200}", argument="fields")
-    return Columns(tuple(spec.field_named(name) for name in selected))
+    of_scenes = {field.name: field for field in scene_fields(spec)}
+    return Columns(tuple(of_scenes.get(name) or spec.field_named(name) for name in selected))

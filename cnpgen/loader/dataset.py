@@ -19,8 +19,10 @@ from cnpgen.loader.gather import Rows, gather
 from cnpgen.loader.normalization import Normalization, make_normalization
 from cnpgen.loader.position import checked_position
 from cnpgen.loader.row_format import RowFormat, make_row_format
+from cnpgen.loader.scene_columns import OBSTACLE_POSES, problem_obstacles, scene_fields
 from cnpgen.loader.shard_reader import ShardReader, SplitShards
 from cnpgen.loader.split import Split
+from cnpgen.robots.scene import Scene
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.store.checked_shard import Shard
 from cnpgen.store.dataset_spec import DatasetSpec, StoredProblem
@@ -33,8 +35,9 @@ class Dataset:
     """The rows of a dataset. It can be pickled, forked and used by several threads.
 
     In all methods, ``fields`` are field names in the requested order; by default, all float fields except for
-    diagnostics. ``normalize`` may be the :class:`Normalization` of another dataset. ``dtype`` is the type of float
-    fields, "float32" or "float64". Integer fields are int64 and never normalized.
+    diagnostics. Fields of scenes, such as ``obstacle_poses``, have to be named. ``normalize`` may be the
+    :class:`Normalization` of another dataset. ``dtype`` is the type of float fields, "float32" or "float64". Integer
+    fields are int64; they and those of scenes are never normalized.
 
     Attributes:
         folder: Folder of the dataset.
@@ -63,8 +66,8 @@ class Dataset:
 
     @cached_property
     def fields(self) -> dict[str, Field]:
-        """Name -> field, with unit, role, and names and limits of its columns."""
-        return {field.name: field for field in self.spec.fields}
+        """Name -> field, with unit, role, and names and limits of its columns; those of scenes last."""
+        return {field.name: field for field in (*self.spec.fields, *scene_fields(self.spec))}
 
     @property
     def problem(self) -> StoredProblem:
@@ -186,6 +189,23 @@ class Dataset:
         """
         indices = np.arange(self._source(split).rows)
         return self.rows(split, indices, fields=fields, normalize=normalize, dtype=dtype)
+
+    @checked_arguments
+    def scenes(self, split: str, indices: ArrayLike) -> Scene:
+        """Return the scenes of rows, for example for ``PlanLoss`` or the planner.
+
+        Args:
+            split: Name of the split.
+            indices: Indices of rows, shape (k,); see :meth:`rows`.
+
+        Raises:
+            RowError: There is no such row; this is also an IndexError.
+            DatasetError: The dataset has no scenes, there is no such split, or a shard is damaged.
+        """
+        if not self.spec.scene_obstacles:
+            raise DatasetError(f"{self.folder} has no scenes: the obstacles of all samples are those of its problem")
+        poses = self.rows(split, indices, fields=[OBSTACLE_POSES])[OBSTACLE_POSES]
+        return Scene(problem_obstacles(self.spec), poses.astype(np.float64))
 
     @checked_arguments
     def frame(self, split: str = "train", *, fields: Iterable[str] | None = None, library: str | None = None) -> Any:

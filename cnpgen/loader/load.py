@@ -6,6 +6,7 @@ from typing import Any
 
 from cnpgen.errors import DatasetError
 from cnpgen.loader.dataset import Dataset
+from cnpgen.loader.scene_columns import problem_obstacles
 from cnpgen.loader.shard_reader import ShardReader
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import flag
@@ -61,7 +62,8 @@ def load_dataset(folder: str | Path, *, allow_incomplete: bool = False, verify: 
     fingerprint = data_fingerprint(
         (shard.path.relative_to(folder).as_posix(), shard.sha256) for part in present.values() for shard in part
     )
-    return Dataset(folder, stored.spec, fingerprint, present, statistics, ShardReader(verify=verify))
+    reader = ShardReader(verify=verify, obstacles=problem_obstacles(stored.spec))
+    return Dataset(folder, stored.spec, fingerprint, present, statistics, reader)
 
 
 def _recorded(folder: Path, summary: DatasetSummary) -> dict[str, list[Shard]]:

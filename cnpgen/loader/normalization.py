@@ -11,7 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError
+from cnpgen.loader.scene_columns import OBSTACLE_POSES
 from cnpgen.store.field import Field
+from cnpgen.store.scene_table import SCENE_ARRAYS
 from cnpgen.store.statistics import FieldStatistics
 
 Floats = NDArray[np.float64]
@@ -75,14 +77,20 @@ class Normalization:
         Raises:
             DatasetError: A field has no statistics here.
         """
-        missing = [field.name for field in fields if field.name not in self.mean]
+        missing = [field.name for field in fields if field.name not in self.mean and not _is_of_scene(field)]
         if missing:
             raise DatasetError(
                 f"there are no statistics to normalize {', '.join(missing)} with, only those of {', '.join(self.mean)}"
             )
-        empty = np.empty(0)
-        mean = np.concatenate([empty, *(self.mean[field.name] for field in fields)])
-        return mean, np.concatenate([empty, *(self.scale[field.name] for field in fields)])
+        empty, width = np.empty(0), {field.name: max(field.width, 1) for field in fields}
+        mean = [self.mean.get(name, np.zeros(count)) for name, count in width.items()]
+        scale = [self.scale.get(name, np.ones(count)) for name, count in width.items()]
+        return np.concatenate([empty, *mean]), np.concatenate([empty, *scale])
+
+
+def _is_of_scene(field: Field) -> bool:
+    """Return whether a field is one of scenes, which is never normalized."""
+    return field.name == OBSTACLE_POSES or field.name in {item.name for item in SCENE_ARRAYS}
 
 
 def _as_type_of(values: Any, numbers: Floats) -> Any:

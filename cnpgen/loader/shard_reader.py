@@ -10,11 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError
-from cnpgen.store.checked_shard import Shard, check_field, check_header, check_values, read_columns
+from cnpgen.loader.scene_columns import SceneColumn
+from cnpgen.robots.obstacle import Obstacle
+from cnpgen.store.checked_shard import Shard, check_field, check_header, check_values, read_columns, read_scenes
 from cnpgen.store.field import Field
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.intact import RERUN_HINT, digest_problem
-from cnpgen.store.shard import Placement
+from cnpgen.store.scene_table import SCENE_ID, SceneTable
+from cnpgen.store.shard import Placement, storage_dtype
 
 Rows = dict[str, NDArray[Any]]
 
@@ -29,10 +32,12 @@ class ShardReader:
 
     Args:
         verify: Whether to verify the sha256 of each shard; otherwise its size, header and values are checked.
+        obstacles: Obstacles of the problem of a dataset with scenes.
     """
 
-    def __init__(self, *, verify: bool) -> None:
-        self._verify = verify
+    def __init__(self, *, verify: bool, obstacles: Sequence[Obstacle] = ()) -> None:
+        self._verify, self._obstacles = verify, tuple(obstacles)
+        self._scenes: tuple[Path, SceneTable] | None = None  # of the last shard whose scenes were read
         self._placements: dict[Path, dict[str, Placement]] = {}  # of the checked shards
         self._checked: dict[Path, dict[str, Field]] = {}  # name -> field whose shape, type and values are checked
         self._maps: dict[Path, mmap.mmap] = {}
@@ -54,14 +59,17 @@ class ShardReader:
             DatasetError: The shard is missing, damaged, of another specification or lacks a field.
             MachineError: The shard cannot be read.
         """
+        fields, of_scenes = self._split(shard, fields)
         placements = self._header(shard, fields)
         columns = read_columns(shard, placements, [field.name for field in fields])
+        columns |= {name: column[:] for name, column in self._scene_columns(shard, of_scenes).items()}
         checked = self._checked.setdefault(shard.path, {})
-        check_values(shard, {name: item for name, item in columns.items() if name not in checked})
+        stored = {field.name for field in fields} - checked.keys()
+        check_values(shard, {name: columns[name] for name in stored})
         checked.update((field.name, field) for field in fields)
         return columns
 
-    def map(self, shard: Shard, fields: Sequence[Field]) -> Rows:
+    def map(self, shard: Shard, fields: Sequence[Field]) -> dict[str, NDArray[Any] | SceneColumn]:
         """Map fields of a shard into memory, to use some of their rows; they are read the first time.
 
         The system ends a process that uses a part of a map after the file was cut off there.
@@ -71,12 +79,14 @@ class ShardReader:
             fields: The fields.
 
         Returns:
-            As ``read`` does; read-only if mapped.
+            As ``read`` does, but read-only if mapped; fields of scenes are computed for the rows that are used.
 
         Raises:
             DatasetError: The shard is missing, damaged, of another specification or lacks a field.
             MachineError: The shard cannot be read.
         """
+        fields, of_scenes = self._split(shard, fields)
+        scenes = self._scene_columns(shard, of_scenes)
         placements = self._header(shard, fields)
         selected = {field.name: placements[field.name] for field in fields}
         mapped = None
@@ -84,8 +94,27 @@ class ShardReader:
         if checked and all(place.offset is not None and place.dtype.isnative for place in selected.values()):
             mapped = self._map(shard)
         if mapped is None:
-            return self.read(shard, fields)
-        return {name: np.ndarray(p.shape, p.dtype, mapped, p.offset or 0) for name, p in selected.items()}
+            return {**self.read(shard, fields), **scenes}
+        return {name: np.ndarray(p.shape, p.dtype, mapped, p.offset or 0) for name, p in selected.items()} | scenes
+
+    @staticmethod
+    def _split(shard: Shard, fields: Sequence[Field]) -> tuple[list[Field], list[Field]]:
+        """Separate the fields of rows from those of scenes."""
+        stored = {field.name for field in shard.fields}
+        return [f for f in fields if f.name in stored], [f for f in fields if f.name not in stored]
+
+    def _scene_columns(self, shard: Shard, fields: Sequence[Field]) -> dict[str, SceneColumn]:
+        """Return fields of the scenes of a shard."""
+        if not fields:
+            return {}
+        scene_id = next(field for field in shard.fields if field.name == SCENE_ID)
+        index = self.read(shard, [scene_id])[SCENE_ID]
+        if self._scenes is None or self._scenes[0] != shard.path:
+            self._scenes = shard.path, read_scenes(shard, self._placements[shard.path])
+        table = self._scenes[1]
+        rows = table.rows_of(index)
+        dtypes = {field.name: storage_dtype(field, shard.dtype) for field in fields}
+        return {name: SceneColumn(name, table, rows, self._obstacles, dtype) for name, dtype in dtypes.items()}
 
     def _header(self, shard: Shard, fields: Sequence[Field]) -> dict[str, Placement]:
         """Check a shard; return the locations of its fields."""

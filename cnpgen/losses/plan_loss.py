@@ -289,7 +289,7 @@ class PlanLoss:
     def _hulls(self) -> HullLoss | None:
         if not self.problem.has_sample_obstacles:
             return None
-        return make_hull_loss(self.problem, self._robot, self._kernels, self._tightening)
+        return make_hull_loss(self.problem, self._robot, self._kernels, self.tightening)
 
     @cached_property
     def _time_varying_bound(self) -> TimeVaryingBound:

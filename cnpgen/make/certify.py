@@ -9,6 +9,7 @@ import numpy as np
 from cnpgen.errors import RecipeError
 from cnpgen.machine.threads import one_thread
 from cnpgen.make.recipe import DatasetRecipe
+from cnpgen.make.scene_solver import SceneSolver
 from cnpgen.make.stage_planner import SHA256, load_stage_planner, model_sha256, planner_boundary
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.stage import CandidateBatch, Stage, StageFunction
@@ -74,14 +75,18 @@ class CertifiedPlan(Stage):
             raise RecipeError([f"plans meet their boundary conditions in float64 only: needs it, got {context.dtype}"])
         from cnpgen.refine.refine_engine import load_solver
 
-        solve = load_solver(context.problem, context.robot, context.kernels)
+        solver = load_solver(context.problem, context.robot, context.kernels)
+        solver_of_scenes = SceneSolver(context)
         planner = load_stage_planner(self.model, self.sha256, context) if self.model else None
 
         def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
             columns = {name: np.ascontiguousarray(values.T) for name, values in candidates.columns.items()}
             guess = None if planner is None else planner.plan_batch(planner_boundary(columns, planner)).motion
             with one_thread():
-                motion, valid = solve(columns, guess)
+                if candidates.scenes is None:
+                    motion, valid = solver(columns, guess)
+                else:
+                    motion, valid = solver_of_scenes(columns, candidates.scenes.table[candidates.scene], guess)
             count, points, joints = motion.path.shape
             candidates["path_control_points"] = np.ascontiguousarray(motion.path.reshape(count, points * joints).T)
             candidates["rate_control_points"] = np.ascontiguousarray(motion.rate.T)

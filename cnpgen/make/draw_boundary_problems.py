@@ -9,10 +9,13 @@ from cnpgen.machine.memory import check_memory
 from cnpgen.make.recipe import MAX_SEED, DatasetRecipe
 from cnpgen.make.recipe_file import as_dataset_recipe
 from cnpgen.plans.boundary_problems import plans_of_rows
+from cnpgen.plans.format import OBSTACLE_POSES
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import record_problem
+from cnpgen.robots.scene_arrays import scene_poses
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
+from cnpgen.store.scene_table import SCENE_ID, concatenate_scenes
 
 SPLIT = "(fresh draws)"  # an invalid name of a split: no dataset contains these rows
 
@@ -42,13 +45,17 @@ def draw_boundary_problems(recipe: str | Path | DatasetRecipe, n: int, *, seed: 
     rows = prepared.block_rows
     check_memory("n", n, n * sum(max(field.width, 1) for field in prepared.fields))
     root = loaded.seed if root is None else root
-    parts = [
-        prepared.block(root, SPLIT, index, first=0, stop=min(n - index * rows, rows)).columns
-        for index in range(-(-n // rows))
+    blocks = [
+        prepared.block(root, SPLIT, index, first=0, stop=min(n - index * rows, rows)) for index in range(-(-n // rows))
     ]
+    parts = [block.columns for block in blocks]
     columns = {}
     for field in prepared.fields:
         values = np.concatenate([part[field.name] for part in parts], axis=1).T
         columns[field.name] = np.ascontiguousarray(values if field.width else values[:, 0])
+    if tables := [block.scenes for block in blocks if block.scenes is not None]:
+        scenes = concatenate_scenes(tables)
+        table = scenes[scenes.rows_of(columns[SCENE_ID])]
+        columns[OBSTACLE_POSES] = scene_poses(loaded.pipeline.problem.obstacle, table)
     source = f"fresh draws of {loaded.name}, seed {root}"
     return plans_of_rows(record_problem(loaded.pipeline.problem), columns, source=source)

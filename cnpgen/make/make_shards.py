@@ -18,9 +18,11 @@ from cnpgen.machine.versions import versions
 from cnpgen.make.recipe_file import makes_its_rows, restored
 from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.prepared import Block, PreparedPipeline
+from cnpgen.robots.scene_arrays import scene_poses
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask
 from cnpgen.store.field import Field
 from cnpgen.store.sampling_statistics import SamplingStatistics, merge_sampling
+from cnpgen.store.scene_table import SCENE_ID, SceneTable, concatenate_scenes
 from cnpgen.store.shard import storage_dtype
 from cnpgen.store.shard_record import commit_shard
 from cnpgen.store.workspace import require_dataset_spec
@@ -83,8 +85,8 @@ def make_shards(job: Job, tasks: Sequence[ShardTask]) -> Iterator[tuple[int, Sam
     """
     started, clock = datetime.now(UTC).isoformat(timespec="seconds"), time.perf_counter()
     prepared = _prepared(job)
-    for task, (columns, sampling) in zip(tasks, shard_columns(prepared, job.spec, tasks), strict=True):
-        checked = replace(sampling, verification=spot_check(prepared, columns, job.spec, task))
+    for task, (columns, sampling, scenes) in zip(tasks, shard_columns(prepared, job.spec, tasks), strict=True):
+        checked = replace(sampling, verification=spot_check(prepared, columns, job.spec, task, scenes))
         require_dataset_spec(job.folder, job.spec)
         seconds = round(time.perf_counter() - clock, 3)
         commit_shard(
@@ -93,6 +95,7 @@ def make_shards(job: Job, tasks: Sequence[ShardTask]) -> Iterator[tuple[int, Sam
             task,
             columns=columns,
             sampling=checked,
+            scenes=scenes,
             started=started,
             seconds=seconds,
             versions=versions(),
@@ -103,7 +106,7 @@ def make_shards(job: Job, tasks: Sequence[ShardTask]) -> Iterator[tuple[int, Sam
 
 def shard_columns(
     prepared: PreparedPipeline, spec: DatasetSpec, tasks: Sequence[ShardTask]
-) -> Iterator[tuple[dict[str, NDArray[Any]], SamplingStatistics]]:
+) -> Iterator[tuple[dict[str, NDArray[Any]], SamplingStatistics, SceneTable | None]]:
     """Compute the rows of shards of one split; every block is computed once.
 
     Args:
@@ -112,8 +115,8 @@ def shard_columns(
         tasks: Shards, in order.
 
     Yields:
-        ``(columns, sampling)`` of every shard: field name -> values as stored, shape (rows, width) or (rows,), and the
-        sampling statistics.
+        ``(columns, sampling, scenes)`` of every shard: field name -> values as stored, shape (rows, width) or (rows,),
+        the sampling statistics, and the scenes of the rows, None without scenes.
     """
     chunks = _chunks(prepared, spec.seed, tasks)
     for task in tasks:
@@ -123,7 +126,9 @@ def shard_columns(
         columns = {
             field.name: _stored([part.columns[field.name] for part in parts], field, spec) for field in spec.fields
         }
-        yield columns, merge_sampling([part.sampling for part in parts])
+        tables = [part.scenes.astype(spec.dtype) for part in parts if part.scenes is not None]
+        scenes = concatenate_scenes(tables) if tables else None
+        yield columns, merge_sampling([part.sampling for part in parts]), scenes
 
 
 def _chunks(prepared: PreparedPipeline, seed: int, tasks: Sequence[ShardTask]) -> Iterator[Block]:
@@ -152,9 +157,20 @@ def _stored(parts: list[NDArray[Any]], field: Field, spec: DatasetSpec) -> NDArr
 
 
 def spot_check(
-    prepared: PreparedPipeline, columns: dict[str, NDArray[Any]], spec: DatasetSpec, task: ShardTask
+    prepared: PreparedPipeline,
+    columns: dict[str, NDArray[Any]],
+    spec: DatasetSpec,
+    task: ShardTask,
+    scenes: SceneTable | None = None,
 ) -> dict[str, float]:
     """Recompute some rows with Pinocchio and Coal, to detect errors of the compiler or backend.
+
+    Args:
+        prepared: Prepared pipeline.
+        columns: Rows of the shard.
+        spec: Specification of the dataset.
+        task: The shard.
+        scenes: Scenes of the rows.
 
     Returns:
         Largest violation of every check, in its unit.
@@ -162,10 +178,13 @@ def spot_check(
     Raises:
         MachineError: A row fails a check.
     """
-    from cnpgen.judges.rows.verify import verify_rows
+    from cnpgen.judges.rows.verify import OBSTACLE_POSES, verify_rows
 
     rows = np.unique(np.linspace(0, task.rows - 1, MAX_SPOT_CHECK_ROWS).astype(int))
     some = {name: values[rows] for name, values in columns.items()}
+    if scenes is not None:
+        table = scenes[scenes.rows_of(some[SCENE_ID])]
+        some[OBSTACLE_POSES] = scene_poses(prepared.context.problem.obstacle, table)
     report = verify_rows(prepared.context.problem, prepared.context.robot, some, dtype=spec.dtype)
     if len(report.failed_rows):
         wrong = ", ".join(f"{check.name} {check.worst:.3g} {check.unit}" for check in report.failed)

@@ -14,6 +14,7 @@ from cnpgen.make.make_shards import Job
 from cnpgen.make.recipe import MAX_SEED, DatasetRecipe, recipe_digest, split_rows
 from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.problems.problem import resolved
+from cnpgen.robots.scene_arrays import scene_capacity
 from cnpgen.schema.arguments import integer
 from cnpgen.store.dataset_spec import DatasetSpec, default_shard_size
 from cnpgen.store.workspace import Workspace
@@ -97,6 +98,8 @@ def draw_up(
         robot=_robot_record(prepared),
         versions=versions(),
         previous_splits=begun.previous_splits if begun is not None and begun.splits == splits else (),
+        scene_obstacles=scene_capacity(recipe.pipeline.problem.obstacle) if prepared.families else 0,
+        scene_families=prepared.families,
     )
     return Job(workspace.folder, spec, recipe.pipeline, chosen, cache_folder)
 

@@ -17,7 +17,6 @@ from cnpgen.plans.concatenate import concatenate
 from cnpgen.plans.format import GOAL_OPTION
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.scene_plans import (
-    Capacity,
     capacity_of,
     goal_states,
     joint_order,
@@ -27,6 +26,7 @@ from cnpgen.plans.scene_plans import (
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import as_problem
+from cnpgen.problems.scene_capacity import Capacity
 from cnpgen.problems.scenes.scene_problem import GoalPose, SceneError, SceneProblem, check_scenes, checked_scene
 from cnpgen.refine.options import DEFAULT_OPTIONS, RefineOptions
 from cnpgen.refine.proof.explain import explain_plans

@@ -12,12 +12,14 @@ from cnpgen.kernels.symbolic.linalg import Scalar, Vec, dot, subtract, symbols
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.collision import candidate_poses
-from cnpgen.pipelines.stages.narrow_phase import narrow_phase_of, unmet
+from cnpgen.pipelines.stages.narrow_phase import narrow_phase_of, narrow_phase_of_scenes, unmet
 from cnpgen.pipelines.stages.stage import CandidateBatch, StageFunction
 from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES, End
 from cnpgen.problems.constraints.needs import symbolic_needs
 from cnpgen.problems.problem import Problem
+from cnpgen.robots.scene_arrays import scene_capacity
 from cnpgen.store.field import Field
+from cnpgen.store.scene_table import SCENE_ID
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
@@ -51,7 +53,9 @@ def acceptance(context: Context, written: set[str], *, given: Collection[End] = 
         )
         for end in ends
     }
-    decisions = {end: narrow_phase_of(context, end, exact=end not in given) for end in ends}
+    has_scenes = bool(scene_capacity(context.problem.obstacle)) and context.robot.shape is not None
+    narrow_phase = narrow_phase_of_scenes if has_scenes else narrow_phase_of
+    decisions = {end: narrow_phase(context, end, exact=end not in given) for end in ends}
     n, constraints = context.robot.n, len(context.problem.constraint)
     reasons = [*(constraint.reason for constraint in context.problem.constraint), "tip not at its position"]
     reasons += ["hit not along its direction"] if hit["goal"] else []
@@ -68,7 +72,8 @@ def acceptance(context: Context, written: set[str], *, given: Collection[End] = 
                 *state, obstacle_poses, candidates[f"{end}_xyz"], *(candidates[name] for name in hit[end])
             )
             if decide := decisions[end]:
-                count[:constraints] += decide(state, obstacle_poses, count[: constraints + 1].max(axis=0) <= 0)
+                remaining = count[: constraints + 1].max(axis=0) <= 0
+                count[:constraints] += decide(state, obstacle_poses, remaining, candidates)
             counts.append(count)
         start, goal = counts
         np.maximum(start, goal[: len(start)], out=goal[: len(start)])
@@ -150,9 +155,11 @@ def _direction_unmet(velocity: Vec, angle: Scalar, speed: Scalar, *, dtype: str)
     return ca.logic_not(met)
 
 
-def bookkeeping_fields() -> tuple[Field, ...]:
-    """Return the bookkeeping fields of every dataset."""
+def bookkeeping_fields(*, scenes: bool = False) -> tuple[Field, ...]:
+    """Return the bookkeeping fields of every dataset, and with ``scenes`` that of the scene of a row."""
+    text = "sample_id of the first row in the same scene"
     return (
+        *((Field(SCENE_ID, "1", text, role="context", dtype="int64"),) if scenes else ()),
         Field("attempts", "1", "candidates per accepted row, including this row", role="diagnostic", dtype="int64"),
         Field("sample_id", "1", "index of the row in its split", role="diagnostic", dtype="int64"),
     )

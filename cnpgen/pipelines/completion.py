@@ -44,7 +44,7 @@ class Completion:
         fields = given_fields(steps, context)
         _check(pipeline, fields, given)
         self.context, self.given = context, {name: fields[name] for name in given}
-        self._fields = stored_fields(steps, context)[:-2]  # without the bookkeeping fields
+        self._fields = stored_fields(steps, context)  # tasks have no columns of the bookkeeping fields
         self.height = table_height(context)
         self._derived = _derived(given)
         known = {*given, *self._derived}

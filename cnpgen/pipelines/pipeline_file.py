@@ -6,11 +6,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from cnpgen.errors import PluginError, RecipeError
+from cnpgen.errors import PluginError, RecipeError, UsageError
 from cnpgen.pipelines.pipeline import Pipeline
+from cnpgen.pipelines.stages.draw_scenes import DrawScenes
 from cnpgen.pipelines.stages.stage import Stage
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import missing_kinds, read_problem, without_defaults
+from cnpgen.problems.scene_capacity import with_capacity
 from cnpgen.schema import registry
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.catalogue import load_recipe, read_kind, reference
@@ -42,8 +44,23 @@ def read_pipeline(path: Path, mistakes: list[str]) -> Pipeline | None:
         Stage: partial(read_kind, registry.STAGES),
         Problem: reference("problem", read_problem, path.parent),
     }
-    pipeline = parse(Pipeline, table, where=RecipeLocation(str(path)), mistakes=mistakes, readers=readers)
-    return pipeline and replace(pipeline, path=path.absolute())
+    where = RecipeLocation(str(path))
+    pipeline = parse(Pipeline, table, where=where, mistakes=mistakes, readers=readers)
+    if pipeline is None:
+        return None
+    return replace(pipeline, path=path.absolute(), problem=_with_places(pipeline, where, mistakes))
+
+
+def _with_places(pipeline: Pipeline, where: RecipeLocation, mistakes: list[str]) -> Problem:
+    """Return the problem with places for the obstacles of scenes that a stage draws."""
+    drawn = [(index, stage) for index, stage in enumerate(pipeline.stage) if isinstance(stage, DrawScenes)]
+    if len(drawn) > 1:
+        mistakes.append((where / "stage" / drawn[1][0]).message("a second stage draws scenes, expected one"))
+    try:
+        return with_capacity(pipeline.problem, drawn[0][1].capacity) if drawn else pipeline.problem
+    except UsageError as error:
+        mistakes.append((where / "problem").message(str(error)))
+        return pipeline.problem
 
 
 def restore_pipeline(name: str, stages: Sequence[Mapping[str, Any]], problem: Problem) -> Pipeline:

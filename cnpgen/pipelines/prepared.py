@@ -3,7 +3,7 @@
 import hashlib
 from collections import deque
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +15,18 @@ from cnpgen.kernels.library import Backend
 from cnpgen.pipelines.acceptance import acceptance
 from cnpgen.pipelines.context import load_context
 from cnpgen.pipelines.pipeline import Pipeline, listed_tasks
+from cnpgen.pipelines.stages.draw_scenes import DrawScenes
 from cnpgen.pipelines.stages.stage import Array, CandidateBatch
 from cnpgen.pipelines.steps import prepare_steps, steps_of, stored_fields, written_columns
 from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES
 from cnpgen.store.field import Field
 from cnpgen.store.sampling_statistics import DensityMap, SamplingStatistics
+from cnpgen.store.scene_table import SCENE_ID, SceneTable, concatenate_scenes
 
 MIN_ACCEPTANCE = 1e-4  # accepted fraction below which a pipeline raises an error
 MIN_CANDIDATES_BEFORE_ERROR = 100_000  # candidates before the accepted fraction is checked
 DENSITY_CELLS = 24  # along each side of a density map
+BOOKKEEPING = (SCENE_ID, "attempts", "sample_id")  # fields that no stage writes
 
 
 @dataclass(frozen=True)
@@ -33,10 +36,12 @@ class Block:
     Attributes:
         columns: Field name -> values, shape (width, rows); (1, rows) for scalars.
         sampling: Counts of candidates and rejections, and density maps.
+        scenes: Scenes of the rows, whose IDs are those of the column ``scene_id``; None without scenes.
     """
 
     columns: dict[str, NDArray[Any]]
     sampling: SamplingStatistics
+    scenes: SceneTable | None = None
 
 
 class PreparedPipeline:
@@ -53,6 +58,7 @@ class PreparedPipeline:
         fields: Fields of a row, in stored order.
         block_rows: Rows per block.
         tasks: Number of listed tasks, all in one block; None for an unlimited pipeline.
+        families: Names of the families of scenes; empty without scenes.
 
     Raises:
         RecipeError: The stages are inconsistent with each other or with the problem.
@@ -66,6 +72,8 @@ class PreparedPipeline:
         self.block_rows = min(stage.block_rows for stage in pipeline.stage) if self.tasks is None else self.tasks
         self.context = load_context(pipeline.problem, backend, cache_folder, dtype)
         steps = steps_of(pipeline)
+        drawn = [stage for stage in pipeline.stage if isinstance(stage, DrawScenes)]
+        self.families = drawn[0].family_names if drawn else ()
         self.fields = stored_fields(steps, self.context)
         written = written_columns(pipeline.path, steps, self.context)
         with self.context.kernels.compile_in_parallel():
@@ -172,16 +180,17 @@ class BlockChunk:
     """Rows ``first`` to ``stop`` of a block, collected batch by batch.
 
     Args:
-        fields: Fields of a row; the last two are the bookkeeping fields.
+        fields: Fields of a row, bookkeeping fields included.
         first: First row.
         stop: End of the rows, exclusive.
     """
 
     def __init__(self, fields: tuple[Field, ...], first: int, stop: int) -> None:
         self.first, self.stop = first, stop
-        self._fields = fields
+        self._fields = [field for field in fields if field.name not in BOOKKEEPING]
         self._statistics = BlockStatistics(fields)
         self._parts: list[dict[str, NDArray[Any]]] = []
+        self._scenes: list[SceneTable] = []
 
     def take(self, candidates: CandidateBatch, accepted: int) -> bool:
         """Append the rows of a batch that belong to the chunk.
@@ -203,9 +212,18 @@ class BlockChunk:
         attempts = self._statistics.count(candidates, taken, first=skip, last=end == self.stop and not final)
         if final:
             attempts[-1:] += self._statistics.waiting
-        part = {field.name: candidates[field.name][:, skip : len(taken)] for field in self._fields[:-2]}
+        part = {field.name: candidates[field.name][:, skip : len(taken)] for field in self._fields}
         self._parts.append({**part, "attempts": attempts[None]})
+        if candidates.scenes is not None:
+            self._take_scenes(candidates.scenes.table, candidates.scene, slice(skip, len(taken)), accepted)
         return end == self.stop
+
+    def _take_scenes(self, table: SceneTable, scene: NDArray[np.int64], rows: slice, accepted: int) -> None:
+        """Append the scenes of some rows of a batch; IDs are rows of the block."""
+        first_rows = accepted + np.searchsorted(scene, scene)  # of the scene of each row
+        ids, index = np.unique(first_rows[rows], return_index=True)
+        self._parts[-1][SCENE_ID] = first_rows[rows][None]
+        self._scenes.append(replace(table[scene[rows][index]], scene_ids=ids))
 
     def block(self, first_row: int) -> Block:
         """Return the rows of a complete chunk.
@@ -215,7 +233,15 @@ class BlockChunk:
         """
         columns = {name: np.concatenate([part[name] for part in self._parts], axis=1) for name in self._parts[0]}
         columns["sample_id"] = first_row + np.arange(self.first, self.stop, dtype=np.int64)[None]
-        return Block(columns, self._statistics.sampling())
+        if not self._scenes:
+            return Block(columns, self._statistics.sampling())
+        columns[SCENE_ID] = first_row + columns[SCENE_ID]
+        scenes = concatenate_scenes(self._scenes)
+        return Block(
+            columns,
+            self._statistics.sampling(),
+            replace(scenes, scene_ids=(first_row + scenes.scene_ids).astype(np.int64)),
+        )
 
 
 class BlockStatistics:
@@ -265,6 +291,7 @@ class BlockStatistics:
         self._stages.update(candidates.origins)
         self.tried += stop - start
         self.accepted += len(rows)
+        self._maps = [field for field in self._maps if field.name in candidates.drawn]  # not those of scenes
         for field in self._maps:
             cells = _cells(candidates.drawn[field.name][:, start:stop], field)
             self._drawn[field.name] += np.bincount(cells, minlength=DENSITY_CELLS * DENSITY_CELLS)

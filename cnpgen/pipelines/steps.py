@@ -79,7 +79,7 @@ def stored_fields(steps: Sequence[PipelineStep], context: Context) -> tuple[Fiel
     if mistakes:
         raise RecipeError(mistakes)
     known = [fields.pop(name) for name in FIELD_ORDER if name in fields]
-    return (*known, *fields.values(), *bookkeeping_fields())
+    return (*known, *fields.values(), *bookkeeping_fields(scenes=any(step.stage.draws_scenes for step in steps)))
 
 
 def _definition(field: Field) -> dict[str, object]:

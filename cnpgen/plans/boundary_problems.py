@@ -16,11 +16,13 @@ from cnpgen.plans.plan_file import agreed_problem
 from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import ProblemRecord, as_record, open_problem
+from cnpgen.robots.scene_arrays import scene_poses
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.store.paths import require_folder
 from cnpgen.store.reader import open_dataset
+from cnpgen.store.scene_table import SCENE_ID
 from cnpgen.trajectory.boundary import Boundary
 
 if TYPE_CHECKING:
@@ -81,8 +83,11 @@ def _of_folder(folder: Path, split: str, start: int, n: int | None) -> Plans:
     dataset = open_dataset(folder)
     rows = chosen_rows(folder, dataset.spec, split=split, start=start, n=n)
     source = f"dataset {dataset.spec.name}, seed {dataset.spec.seed}, split {split}"
-    columns = dataset.read(split, start=rows.start, stop=rows.stop)
-    return plans_of_rows(as_record(dataset.spec.problem), columns, source=source)
+    columns, record = dataset.read(split, start=rows.start, stop=rows.stop), as_record(dataset.spec.problem)
+    if dataset.spec.scene_obstacles:
+        table = dataset.read_scenes(split, start=rows.start, stop=rows.stop)
+        columns[OBSTACLE_POSES] = scene_poses(open_problem(record)[0].obstacle, table[table.rows_of(columns[SCENE_ID])])
+    return plans_of_rows(record, columns, source=source)
 
 
 def chosen_rows(folder: Path, spec: DatasetSpec, *, split: str, start: int, n: int | None) -> range:

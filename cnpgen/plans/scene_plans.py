@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,26 +12,23 @@ from numpy.typing import NDArray
 from cnpgen.errors import UsageError
 from cnpgen.plans.format import OBSTACLE_POSES
 from cnpgen.plans.plans import Plans, make_plans
-from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import record_problem
+from cnpgen.problems.scene_capacity import Capacity, with_capacity
 from cnpgen.problems.scenes.scene_problem import SceneError, SceneProblem, check_scenes
 from cnpgen.robots.observation.primitives import KINDS, primitives_of
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot import Robot
-from cnpgen.robots.scene import PARKED_POSITION_M
 from cnpgen.robots.solid import number_slices, place_obstacles, pose_width
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import numbers
 from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]
-Capacity = Mapping[str, int]  # kind, or corners of a mesh -> number of obstacles
 
 OBSTACLES_PER_STEP = 4  # capacities are multiples of it, so that scenes share compiled kernels
 JOINT_TOLERANCE_RAD = 1e-3  # outside a limit, which rounding of files to float32 may cause
-_PARKED_ROTATION = (0.1, 0.1, 0.1)  # any rotation: boxes of scenes have rotation matrices
 
 
 def capacity_of(scenes: Sequence[SceneProblem]) -> dict[str, int]:
@@ -49,38 +45,6 @@ def capacity_of(scenes: Sequence[SceneProblem]) -> dict[str, int]:
 
 def _shape(obstacle: Obstacle) -> str:
     return obstacle.mesh or obstacle.kind
-
-
-def with_capacity(problem: Problem, capacity: Capacity) -> Problem:
-    """Return a problem with further obstacles, which stand far below the robot until a plan places them.
-
-    Args:
-        problem: The problem; its own obstacles stay where they are.
-        capacity: Numbers of further obstacles.
-
-    Raises:
-        UsageError: No constraint keeps the robot away from obstacles.
-    """
-    if problem.first(RobotClearance) is None:
-        raise UsageError(
-            f"the problem {problem.name!r} has no constraint robot-clearance: obstacles would be ignored",
-            concerns="problem",
-        )
-    shapes = [*KINDS, *sorted(capacity.keys() - set(KINDS))]
-    parked = [_parked(shape, index) for shape in shapes for index in range(1, capacity.get(shape, 0) + 1)]
-    return problem.with_obstacles((*problem.obstacle, *parked))
-
-
-def _parked(kind: str, index: int) -> Obstacle:
-    if kind not in KINDS:
-        name = f"mesh {hashlib.sha256(kind.encode()).hexdigest()[:8]} {index}"
-        return Obstacle(name=name, kind="mesh", mesh=kind, position=PARKED_POSITION_M, rotation=_PARKED_ROTATION)
-    name, small = f"{kind} {index}", 0.01
-    if kind == "box":
-        return Obstacle(name=name, kind=kind, position=PARKED_POSITION_M, size=(small,) * 3, rotation=_PARKED_ROTATION)
-    if kind == "sphere":
-        return Obstacle(name=name, kind=kind, position=PARKED_POSITION_M, radius=small)
-    return Obstacle(name=name, kind=kind, position=PARKED_POSITION_M, radius=small, length=small)
 
 
 @checked_arguments

@@ -18,7 +18,13 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 
-def scene_of(problem: Problem, start_xyz: Array, goal_xyz: Array, goal_velocity: Array | None = None) -> Scene:
+def scene_of(
+    problem: Problem,
+    start_xyz: Array,
+    goal_xyz: Array,
+    goal_velocity: Array | None = None,
+    obstacle_poses: Array | None = None,
+) -> Scene:
     """Place the obstacles of N samples and compute the values that a constraint depends on.
 
     An obstacle with ``below`` ends at the bottom of the object (at the tip without an object) at that end.
@@ -28,9 +34,10 @@ def scene_of(problem: Problem, start_xyz: Array, goal_xyz: Array, goal_velocity:
         start_xyz: Tip positions at the start [m], shape (N, 3).
         goal_xyz: Tip positions at the goal [m], shape (N, 3).
         goal_velocity: Tip velocities at the goal [m/s], shape (N, 3), for problems with a ``scene_constraint``.
+        obstacle_poses: Poses and sizes of the obstacles of each sample, shape (N, width), in place of the problem's.
 
     Raises:
-        UsageError: The problem needs the velocities, and they are missing.
+        UsageError: The problem needs the velocities, and they are missing, or the poses do not fit the problem.
     """
     half = 0.0 if problem.object is None else problem.object.size[2] / 2
     bottoms = {"start": np.asarray(start_xyz)[..., 2] - half, "goal": np.asarray(goal_xyz)[..., 2] - half}
@@ -42,7 +49,8 @@ def scene_of(problem: Problem, start_xyz: Array, goal_xyz: Array, goal_velocity:
         if len(set(shapes)) > 1 or shapes[0][1:] != (3,):
             raise UsageError(f"positions and velocities must have one shape (N, 3), got {shapes}")
         poses = np.concatenate([poses, constraint.scene_values(np.asarray(goal_xyz), goal_velocity)], axis=1)
-    return Scene(tuple(problem.obstacle), poses)
+    scene = Scene(tuple(problem.obstacle), poses)
+    return scene if obstacle_poses is None else scene.with_poses(obstacle_poses)
 
 
 def goal_velocities(problem: Problem, robot: Robot, goal_q: Array, goal_dq: Array) -> Array | None:

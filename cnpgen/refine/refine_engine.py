@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.kernels.library import KernelLibrary, choose_backend, problem_kernels
+from cnpgen.plans.format import OBSTACLE_POSES
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.obstacles import goal_velocities, scene_of
 from cnpgen.problems.problem_record import ProblemRecord, open_problem
@@ -82,7 +83,8 @@ def load_solver(problem: "Problem", robot: "Robot", kernels: KernelLibrary) -> S
         kernels: Library of kernels.
 
     Returns:
-        A function of the columns of N rows, shape (N, width) each, and of N motions as initial guesses, or None. It
+        A function of the columns of N rows, shape (N, width) each, among them ``obstacle_poses`` of scenes, and of N
+        motions as initial guesses, or None. It
         returns N motions and the mask of those that the verdict accepts, shape (N,).
     """
     refiner = load_refiner(problem, robot, kernels=kernels)
@@ -91,7 +93,8 @@ def load_solver(problem: "Problem", robot: "Robot", kernels: KernelLibrary) -> S
     def solve(columns: Mapping[str, Array], initial_guess: Motion | None = None) -> tuple[Motion, NDArray[np.bool_]]:
         ends = columns["start_xyz"], columns["goal_xyz"]
         boundary = Boundary.from_batch(columns, None)
-        scene = scene_of(problem, *ends, goal_velocities(problem, robot, boundary.goal_q, boundary.goal_dq))
+        velocity = goal_velocities(problem, robot, boundary.goal_q, boundary.goal_dq)
+        scene = scene_of(problem, *ends, velocity, columns.get(OBSTACLE_POSES))
         tasks = _tasks(boundary, scene, *ends)
         if initial_guess is not None:
             tasks = [

@@ -2,12 +2,13 @@
 
 import os
 from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 from cnpgen.errors import RecipeError, UsageError, either, nearest
 from cnpgen.schema import registry
-from cnpgen.schema.keys import RecipeLocation
+from cnpgen.schema.keys import RecipeLocation, keys
 from cnpgen.schema.parsing import Reader, parse
 from cnpgen.schema.toml import Kind
 from cnpgen.schema.units import show
@@ -108,4 +109,8 @@ def read_kind(group: str, value: Any, where: RecipeLocation, mistakes: list[str]
         mistakes.extend((where / "use").message(text) for text in error.mistakes)
         return None
     rest = {key: entry for key, entry in value.items() if key != "use"}
-    return parse(kind, rest, where=where, mistakes=mistakes)
+    hints = {hint for key in keys(kind) for hint in get_args(key.hint) if isinstance(hint, type)}
+    readers: dict[type, Reader] = {
+        hint: partial(read_kind, nested) for hint in hints if (nested := registry.group_of(hint))
+    }
+    return parse(kind, rest, where=where, mistakes=mistakes, readers=readers)

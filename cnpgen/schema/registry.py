@@ -1,4 +1,4 @@
-"""Registry of stages, constraints, objectives, planners and exporters, built-in and of installed packages."""
+"""Registry of stages, constraints, objectives, planners, exporters and families, built-in and of installed packages."""
 
 import contextlib
 import dataclasses
@@ -19,6 +19,7 @@ CONSTRAINTS = "cnpgen.constraints"
 OBJECTIVES = "cnpgen.objectives"
 PLANNERS = "cnpgen.planners"
 EXPORTERS = "cnpgen.exporters"
+FAMILIES = "cnpgen.families"
 
 CONTRACTS: dict[str, str] = {  # base class of the kinds of a group
     STAGES: "cnpgen.pipelines.stages.stage:Stage",
@@ -26,6 +27,7 @@ CONTRACTS: dict[str, str] = {  # base class of the kinds of a group
     OBJECTIVES: "cnpgen.problems.objectives:ObjectiveTerm",
     PLANNERS: "cnpgen.benchmark.benchmark_planner:BenchmarkPlanner",
     EXPORTERS: "cnpgen.plans.exporter:Exporter",
+    FAMILIES: "cnpgen.pipelines.families.family:SceneFamily",
 }
 
 BUILT_IN: dict[str, dict[str, str]] = {
@@ -48,6 +50,8 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "braking-reach": "cnpgen.pipelines.stages.braking:BrakingReach",
         "collision": "cnpgen.pipelines.stages.collision:Collision",
         "gravity-torque": "cnpgen.pipelines.stages.torque:GravityTorque",
+        "draw-scenes": "cnpgen.pipelines.stages.draw_scenes:DrawScenes",
+        "scene-ends": "cnpgen.pipelines.stages.scene_ends:SceneEnds",
         "start-on-plan": "cnpgen.make.on_plan:StartOnPlan",
         "goal-of-plan": "cnpgen.make.on_plan:GoalOfPlan",
         "certified-plan": "cnpgen.make.certify:CertifiedPlan",
@@ -103,6 +107,20 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "lerobot": "cnpgen.plans.lerobot_dataset:LeRobotDataset",
         "mpd": "cnpgen.plans.spline_table:PathSplines",
     },
+    FAMILIES: {
+        "tabletop": "cnpgen.pipelines.families.tables:Tabletop",
+        "cubby": "cnpgen.pipelines.families.shelves:Cubby",
+        "merged-cubby": "cnpgen.pipelines.families.shelves:MergedCubby",
+        "dresser": "cnpgen.pipelines.families.containers:Dresser",
+        "bookshelf-small": "cnpgen.pipelines.families.shelves:BookshelfSmall",
+        "bookshelf-tall": "cnpgen.pipelines.families.shelves:BookshelfTall",
+        "bookshelf-thin": "cnpgen.pipelines.families.shelves:BookshelfThin",
+        "cage": "cnpgen.pipelines.families.containers:Cage",
+        "box": "cnpgen.pipelines.families.containers:OpenBox",
+        "table-pick": "cnpgen.pipelines.families.tables:TablePick",
+        "table-under-pick": "cnpgen.pipelines.families.tables:TableUnderPick",
+        "free": "cnpgen.pipelines.families.free_mix:FreeMix",
+    },
 }
 
 RENAMED: dict[str, dict[str, str]] = {PLANNERS: {"cnp-b": "cnpgen", "cnp-b+refine": "cnpgen+refine"}}  # old -> new
@@ -112,7 +130,7 @@ def names(group: str) -> tuple[str, ...]:
     """List the kinds of a group: the built-in ones in their order, then those of installed packages by name.
 
     Args:
-        group: ``STAGES``, ``CONSTRAINTS``, ``OBJECTIVES``, ``PLANNERS`` or ``EXPORTERS``.
+        group: ``STAGES``, ``CONSTRAINTS``, ``OBJECTIVES``, ``PLANNERS``, ``EXPORTERS`` or ``FAMILIES``.
     """
     others = {entry.name for entry in installed(group)} - BUILT_IN[group].keys()
     return (*BUILT_IN[group], *sorted(others))
@@ -122,7 +140,7 @@ def load(group: str, name: str) -> type[Any]:
     """Import the class of a kind.
 
     Args:
-        group: ``STAGES``, ``CONSTRAINTS``, ``OBJECTIVES``, ``PLANNERS`` or ``EXPORTERS``.
+        group: ``STAGES``, ``CONSTRAINTS``, ``OBJECTIVES``, ``PLANNERS``, ``EXPORTERS`` or ``FAMILIES``.
         name: Name of the kind, as ``use`` has it in a recipe.
 
     Returns:
@@ -158,7 +176,7 @@ def contract(group: str) -> type[Any]:
 
 def noun_of(group: str) -> str:
     """Return the noun of a group, such as "stage"."""
-    return group.removeprefix("cnpgen.").removesuffix("s")
+    return group.removeprefix("cnpgen.").replace("ies", "ys").removesuffix("s")
 
 
 def group_of(kind: type) -> str:
@@ -171,7 +189,7 @@ def name_of(group: str, kind: type) -> str:
     """Return the name under which a class is registered, or ``"module:Class"`` if it is not.
 
     Args:
-        group: ``STAGES``, ``CONSTRAINTS``, ``OBJECTIVES``, ``PLANNERS`` or ``EXPORTERS``.
+        group: ``STAGES``, ``CONSTRAINTS``, ``OBJECTIVES``, ``PLANNERS``, ``EXPORTERS`` or ``FAMILIES``.
         kind: The class.
     """
     spec = f"{kind.__module__}:{kind.__qualname__}"
@@ -218,7 +236,7 @@ def why_missing(group: str, use: str, package: str) -> str:
     """Return the missing package of a kind in a recipe; empty if the kind exists.
 
     Args:
-        group: ``STAGES``, ``CONSTRAINTS``, ``OBJECTIVES``, ``PLANNERS`` or ``EXPORTERS``.
+        group: ``STAGES``, ``CONSTRAINTS``, ``OBJECTIVES``, ``PLANNERS``, ``EXPORTERS`` or ``FAMILIES``.
         use: Name of the kind.
         package: The package that had it, empty if that is not known.
     """

@@ -6,8 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from cnpgen.store.dataset_spec import DatasetSpec
 from cnpgen.store.dataset_summary import DatasetSummary
 from cnpgen.store.field import Field
+from cnpgen.store.scene_table import SCENE_ARRAYS
 from cnpgen.store.statistics import FieldStatistics
 
 _SIZES = (
@@ -85,6 +87,7 @@ def card_text(summary: DatasetSummary, *, folder: str, notes: str = "", shards: 
         f"{_AFTER_NOTES}\n\n{_making(summary)}",
         f"## How to load it\n\n{load.replace('SPLIT', split)}",
         f"## Fields\n\n{_field_table(spec.fields)}",
+        f"## Scenes\n\n{_scene_table(spec)}" if spec.scene_obstacles else "",
         f"## Yield\n\n{_yield_table(summary)}",
         f"## Ranges ({split})\n\n{_range_table(spec.fields, summary.statistics[split])}",
         f"## How to verify it\n\n{_VERIFY.replace('validate .', f'validate {shards}') if shards else _VERIFY}",
@@ -122,9 +125,11 @@ def _front_matter(summary: DatasetSummary, files: str) -> str:
     lines = [f"license: {json.dumps(spec.license.lower())}"] if spec.license else []
     lines += [f"pretty_name: {json.dumps(spec.title or spec.name, ensure_ascii=False)}"]
     lines += ["task_categories:", "- robotics", "tags:", "- robotics", "- motion-planning", "- trajectory-optimization"]
-    lines += ["- cnpgen", "size_categories:", f'- "{size}"', "configs:", "- config_name: default", "  data_files:"]
+    lines += ["- cnpgen", "size_categories:", f'- "{size}"']
+    if not spec.scene_obstacles:  # Hugging Face reads files whose HDF5 datasets have equally many rows only
+        lines += ["configs:", "- config_name: default", "  data_files:"]
     for split, count in spec.splits.items():
-        if count:
+        if count and not spec.scene_obstacles:
             lines += [f"  - split: {split}", f'    path: "{files.format(split)}"']
     return "\n".join(["---", *lines, "---"])
 
@@ -162,6 +167,28 @@ def _field_table(fields: Sequence[Field]) -> str:
         for f in fields
     ]
     return _table(head, rows)
+
+
+def _scene_table(spec: DatasetSpec) -> str:
+    """Describe the scenes beside the rows of every shard."""
+    head = ("HDF5 dataset", "unit", "shape", "description", "convention")
+    symbols = {spec.scene_obstacles: "O", 1: "S"}
+    rows = [
+        (
+            f"`{item.name}`",
+            item.unit,
+            " x ".join(symbols.get(size, str(size)) for size in item.shape(1, spec.scene_obstacles)),
+            item.long_name,
+            item.convention or "-",
+        )
+        for item in SCENE_ARRAYS
+    ]
+    families = ", ".join(f"{index} {name}" for index, name in enumerate(spec.scene_families))
+    return (
+        f"Every shard has each of its S scenes once, in arrays for up to O = {spec.scene_obstacles} obstacles."
+        " The scene of row `i` is `numpy.searchsorted(scene_ids, scene_id[i])`."
+        f" Poses are in the frame of the robot's base.\n\n{_table(head, rows)}\n\nFamilies: {families}."
+    )
 
 
 def _yield_table(summary: DatasetSummary) -> str:

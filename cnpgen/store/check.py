@@ -1,6 +1,6 @@
 """Shallow check of a dataset: every file exists, is undamaged and fits the specification. No sample is recomputed."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.intact import COPY_HINT, OUTSIDE, RERUN_HINT, leads_outside, outside_links
 from cnpgen.store.layout import CARD, CROISSANT, MANIFEST, SPECIFICATION, STATS, WORK
 from cnpgen.store.manifest import data_fingerprint, lists_shards_of, load_manifest
+from cnpgen.store.scene_table import SCENE_ARRAYS, scene_attributes
 from cnpgen.store.shard import (
     SHARD_FORMAT,
     SHARD_VERSION,
@@ -228,12 +229,14 @@ def check_content(folder: Path, spec: DatasetSpec, task: ShardTask) -> list[Find
         for name, value in expected.items()
         if attributes.get(name) != value
     ]
-    names = {field.name for field in spec.fields}
+    names = {field.name for field in spec.fields} | {item.name for item in SCENE_ARRAYS if spec.scene_obstacles}
     problems += [f"lacks the field {name!r}" for name in sorted(names - schema.keys())]
     problems += [f"has an unknown field {name!r}" for name in sorted(schema.keys() - names)]
     for field in spec.fields:
         if field.name in schema:
             problems += _check_field(field, schema[field.name], spec, task)
+    if spec.scene_obstacles:
+        problems += _check_scene_attributes(spec, schema)
     if not problems:
         problems = _check_rows(folder, spec, task)
     return [Finding(task.file, problem, hint=DELETE_HINT) for problem in problems]
@@ -264,6 +267,15 @@ def _check_field(field: Field, stored: StoredField, spec: DatasetSpec, task: Sha
         f"field {field.name!r} has {name} {actual!r}, expected {wanted!r} by {SPECIFICATION}"
         for name, (actual, wanted) in pairs.items()
         if not np.array_equal(actual, wanted)
+    ]
+
+
+def _check_scene_attributes(spec: DatasetSpec, schema: Mapping[str, StoredField]) -> list[str]:
+    """Compare the attributes of the scenes of a shard with the specification."""
+    return [
+        f"{name} has the attributes {schema[name].attributes}, expected {expected}"
+        for name, expected in scene_attributes(spec.scene_families).items()
+        if name in schema and schema[name].attributes != expected
     ]
 
 

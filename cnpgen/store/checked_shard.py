@@ -14,6 +14,7 @@ from cnpgen.store.field import Field
 from cnpgen.store.files.atomic import machine_error
 from cnpgen.store.intact import RERUN_HINT, require_intact, size_problem
 from cnpgen.store.layout import SPECIFICATION
+from cnpgen.store.scene_table import SCENE_ARRAYS, SCENE_ID, SceneTable, check_scenes, check_shapes
 from cnpgen.store.shard import Placement, read_placements, read_shard, storage_dtype
 from cnpgen.store.shard_record import ShardRecord
 
@@ -33,6 +34,8 @@ class Shard:
         key: Key of the specification, which the file contains, too.
         dtype: Stored type of float fields, "float64" or "float32".
         fields: Fields of the specification.
+        scene_obstacles: Largest number of obstacles of a scene; 0 for a dataset without scenes.
+        scene_families: Number of families of scenes.
     """
 
     path: Path
@@ -43,6 +46,8 @@ class Shard:
     key: int
     dtype: str
     fields: tuple[Field, ...] = field(repr=False)
+    scene_obstacles: int = 0
+    scene_families: int = 0
 
     def problem(self) -> str:
         """Describe the problem of the file without opening it; empty if it has the recorded size."""
@@ -60,7 +65,9 @@ def recorded_shard(folder: Path, spec: DatasetSpec, task: ShardTask, *, size: in
         sha256: Recorded sha256 of the file.
     """
     key = spec.version_with(task).key
-    return Shard(folder / task.file, task.rows, task.first_row, size, sha256, key, spec.dtype, tuple(spec.fields))
+    scenes = spec.scene_obstacles, len(spec.scene_families)
+    path, fields = folder / task.file, tuple(spec.fields)
+    return Shard(path, task.rows, task.first_row, size, sha256, key, spec.dtype, fields, *scenes)
 
 
 def shard_of_record(folder: Path, spec: DatasetSpec, task: ShardTask, record: ShardRecord) -> Shard:
@@ -91,7 +98,32 @@ def read_rows(shard: Shard, names: Iterable[str] | None = None) -> dict[str, NDA
     placements = check_header(shard)
     columns = read_columns(shard, placements, [item.name for item in shard.fields] if names is None else names)
     check_values(shard, columns)
+    if names is None and shard.scene_obstacles:
+        read_scenes(shard, placements)
     return columns
+
+
+def read_scenes(shard: Shard, placements: Mapping[str, Placement] | None = None) -> SceneTable:
+    """Read and check the scenes of a shard whose sha256 was compared before.
+
+    Args:
+        shard: The shard, of a dataset with scenes.
+        placements: Result of ``check_header``, which is called by default.
+
+    Raises:
+        DatasetError: The scenes are missing or invalid.
+        MachineError: The shard cannot be read.
+    """
+    placements = check_header(shard) if placements is None else placements
+    names = [item.name for item in SCENE_ARRAYS]
+    try:
+        check_shapes({name: placements[name].shape for name in names if name in placements}, shard.scene_obstacles)
+        columns = read_columns(shard, placements, [SCENE_ID, *names])
+        table = SceneTable(**{name: columns[name] for name in names}).astype(shard.dtype)
+        check_scenes(table, shard.scene_obstacles, columns[SCENE_ID], shard.scene_families)
+    except DatasetError as error:
+        raise DatasetError(f"{shard.path}: {error}") from error
+    return table
 
 
 def check_header(shard: Shard) -> dict[str, Placement]:

@@ -9,6 +9,7 @@ from typing import Any
 
 from cnpgen.store.dataset_summary import DatasetSummary
 from cnpgen.store.field import Field
+from cnpgen.store.scene_table import SCENE_ARRAYS
 
 _CONTEXT: dict[str, Any] = {
     "@language": "en",
@@ -88,7 +89,11 @@ def _description(summary: DatasetSummary) -> str:
     rows = ", ".join(f"{count} {split}" for split, count in spec.splits.items())
     fields = "; ".join(f"{item.name} ({item.long_name}) [{item.unit}]" for item in spec.fields)
     title = spec.title.rstrip(".") or spec.name
-    return f"{title}. Rows: {rows}. Every HDF5 file holds one dataset per field, one entry per row: {fields}."
+    text = f"{title}. Rows: {rows}. Every HDF5 file holds one dataset per field, one entry per row: {fields}."
+    if not spec.scene_obstacles:
+        return text
+    arrays = "; ".join(f"{item.name} ({item.long_name}) [{item.unit}]" for item in SCENE_ARRAYS)
+    return f"{text} One entry per scene: {arrays}."
 
 
 def _file(name: str, size: int, sha256: str) -> dict[str, str]:

@@ -30,6 +30,7 @@ from cnpgen.store.files.document_structure import (
 from cnpgen.store.files.documents import canonical_sha256, load_document, parse_json, plain, save_document
 from cnpgen.store.files.size_limits import MAX_COLUMNS, MAX_DOCUMENT_BYTES, MAX_FIELDS, MAX_SHARDS
 from cnpgen.store.layout import OLD_SPECIFICATION, SPECIFICATION, SPLIT_NAME, WORK, shard_stem
+from cnpgen.store.scene_table import SCENE_ARRAYS
 
 SPECIFICATION_FORMAT = "cnpgen-specification"
 GENERATOR_REVISION = 2  # raised by every change of the generator after which an equal specification gives other samples
@@ -54,6 +55,7 @@ SPECIFICATION_STRUCTURE = {
 }
 # Keys that may differ between equal specifications. The key recipe_sha256 may not.
 INFORMATIONAL = ("title", "license", "versions", "recipe")
+_SCENE_KEYS = ("scene_obstacles", "scene_families")  # of datasets with scenes only
 
 
 @dataclass(frozen=True)
@@ -124,6 +126,8 @@ class DatasetSpec:
             identity.
         previous_splits: The splits before each extension, the oldest first. An extension does not change existing
             shards, so shards also end where a previous split ended.
+        scene_obstacles: Largest number of obstacles of a scene; 0 for samples without scenes of their own.
+        scene_families: Names of the families of the scenes.
     """
 
     name: str
@@ -144,6 +148,8 @@ class DatasetSpec:
     robot: Mapping[str, Any] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
     previous_splits: tuple[Mapping[str, int], ...] = ()
+    scene_obstacles: int = 0
+    scene_families: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("recipe", "splits", "robot", "versions"):  # equal to what is read from JSON
@@ -208,6 +214,11 @@ class DatasetSpec:
         except ValueError as error:
             raise DatasetError(f"the specification of {self.name} does not contain {content}: {error}") from error
 
+    @cached_property
+    def scene_fields(self) -> tuple[Field, ...]:
+        """The fields of the scene of each sample, flattened; they are stored once for each scene."""
+        return tuple(item.field(self.scene_obstacles) for item in SCENE_ARRAYS[1:]) if self.scene_obstacles else ()
+
     def field_named(self, name: str) -> Field:
         """Return the field called ``name``.
 
@@ -227,6 +238,8 @@ def _check_sizes(spec: DatasetSpec) -> None:
         raise UsageError(f"the seed must not be negative, got {spec.seed}", concerns="seed")
     if spec.dtype not in {"float64", "float32"}:
         raise UsageError(f"must be 'float64' or 'float32', got {spec.dtype!r}", argument="dtype")
+    if not 0 <= spec.scene_obstacles <= MAX_COLUMNS:
+        raise UsageError(f"scenes must have at most {MAX_COLUMNS:,} obstacles, got {spec.scene_obstacles}")
     count = sum(-(-rows // spec.shard_size) for rows in spec.splits.values())
     if count > MAX_SHARDS:
         raise UsageError(
@@ -311,13 +324,15 @@ def shard_attributes(spec: DatasetSpec, task: ShardTask) -> dict[str, str | int]
 
 def to_json(spec: DatasetSpec) -> dict[str, Any]:
     """Return a specification as a JSON-able dict."""
-    converted_names = {"seed", "fields", "previous_splits"}
+    converted_names = {"seed", "fields", "previous_splits", *_SCENE_KEYS}
     content = {name: getattr(spec, name) for name in DatasetSpec.__dataclass_fields__ if name not in converted_names}
     converted = {
         "seed": str(spec.seed),  # JSON numbers of other readers have 53 bits
         "fields": plain([asdict(item) for item in spec.fields]),
         "previous_splits": plain(spec.previous_splits),
     }
+    if spec.scene_obstacles:  # absent in specifications without scenes, whose fingerprints stay the same
+        converted |= {name: plain(getattr(spec, name)) for name in _SCENE_KEYS}
     return content | converted
 
 
@@ -328,7 +343,11 @@ def from_json(content: Mapping[str, Any]) -> DatasetSpec:
         DatasetError: A key is missing or has the wrong type.
     """
     try:
-        arguments = {name: content[name] for name in DatasetSpec.__dataclass_fields__}
+        required = [name for name in DatasetSpec.__dataclass_fields__ if name not in _SCENE_KEYS]
+        arguments = {name: content[name] for name in required}
+        if "scene_obstacles" in content:
+            arguments["scene_obstacles"] = int(content["scene_obstacles"])
+            arguments["scene_families"] = tuple(map(str, content["scene_families"]))
         arguments["previous_splits"] = tuple(content["previous_splits"])
         arguments["seed"] = int(content["seed"])
         arguments["fields"] = tuple(_field(item) for item in content["fields"])

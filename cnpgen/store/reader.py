@@ -10,12 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, lacks
-from cnpgen.store.checked_shard import read_checked, recorded_shard
+from cnpgen.store.checked_shard import Shard, read_checked, read_scenes, recorded_shard
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, load_dataset_spec, shards
 from cnpgen.store.dataset_summary import summarize_dataset, unfinished
+from cnpgen.store.intact import require_intact
 from cnpgen.store.layout import MANIFEST, SPECIFICATION
 from cnpgen.store.manifest import lists_shards_of, load_manifest
 from cnpgen.store.paths import require_folder
+from cnpgen.store.scene_table import SceneTable, distinct_scenes
 from cnpgen.store.shard import storage_dtype
 from cnpgen.store.shard_record import is_committed, load_record
 
@@ -99,6 +101,38 @@ class StoredDataset:
                 for name in names:
                     parts[name].append(columns[name][low:high])
         return {name: np.concatenate(items) for name, items in parts.items()}
+
+    def read_scenes(self, split: str, *, start: int = 0, stop: int | None = None) -> SceneTable:
+        """Read the scenes of rows ``start`` to ``stop`` of a split, and those of other rows in the same shards.
+
+        ``table.rows_of(scene_id)`` returns the index of the scene of each row.
+
+        Args:
+            split: Name of the split.
+            start: First row.
+            stop: Row after the last one; by default the end of the split.
+
+        Raises:
+            DatasetError: The dataset has no scenes, or a shard is missing or damaged.
+        """
+        if not self.spec.scene_obstacles:
+            raise DatasetError(f"{self.folder} has no scenes")
+        end = self.spec.splits[split] if stop is None else stop
+        tables = [
+            read_scenes(self._checked(task))
+            for task in self.tasks(split)
+            if task.first_row < end and task.first_row + task.rows > start
+        ]
+        if not tables:
+            raise DatasetError(f"split {split!r} of {self.folder} has no rows {start} to {end}")
+        return distinct_scenes(tables)
+
+    def _checked(self, task: ShardTask) -> Shard:
+        """Verify a shard and return it."""
+        size, sha256 = self._recorded.get(task.file) or _size_and_sha256(self.folder, task)
+        shard = recorded_shard(self.folder, self.spec, task, size=size, sha256=sha256)
+        require_intact(shard.path, size=shard.size, sha256=shard.sha256)
+        return shard
 
     def _read(self, task: ShardTask, names: Sequence[str]) -> dict[str, NDArray[Any]]:
         """Verify a shard and read fields of it."""

@@ -18,6 +18,7 @@ from cnpgen.errors import DatasetError, nearest
 from cnpgen.store.field import Field
 from cnpgen.store.files.atomic import committing
 from cnpgen.store.files.hdf5 import create_hdf5, opened_hdf5
+from cnpgen.store.scene_table import SceneTable, scene_attributes
 
 SHARD_FORMAT = "cnpgen-shard"
 SHARD_VERSION = 2
@@ -60,6 +61,8 @@ def write_shard(
     attributes: Mapping[str, str | int],
     *,
     dtype: str = "float64",
+    scenes: SceneTable | None = None,
+    families: Sequence[str] = (),
     work: Path | None = None,
 ) -> int:
     """Write a shard atomically, and read it back before it is renamed.
@@ -70,6 +73,8 @@ def write_shard(
         fields: The fields, in order; each must have a column.
         attributes: Attributes of the file; "rows" must be the number of rows.
         dtype: Float type of the dataset, "float64" or "float32".
+        scenes: Scenes of the rows in their stored types; None for a dataset without scenes.
+        families: Names of the families of the scenes.
         work: Folder of the temporary file.
 
     Returns:
@@ -81,12 +86,17 @@ def write_shard(
     """
     rows = int(attributes["rows"])
     _check_columns(columns, fields, rows, dtype)
-    content = _encode(columns, fields, attributes, dtype)
+    arrays = {} if scenes is None else dict(scenes.arrays())
+    about_scenes = scene_attributes(families)
+    parts = [(f.name, np.asarray(columns[f.name], storage_dtype(f, dtype)), field_attributes(f)) for f in fields]
+    parts += [(name, values, about_scenes[name]) for name, values in arrays.items()]
+    content = _encode(parts, attributes)
     with committing(path, work) as temporary:
         temporary.write_bytes(content)
         with opened_hdf5(temporary) as file:
             shapes = {name: item.shape for name, item in file.columns().items()}
-        if shapes != {field.name: _shape(field, rows) for field in fields}:
+        expected = {field.name: _shape(field, rows) for field in fields}
+        if shapes != expected | {name: values.shape for name, values in arrays.items()}:
             raise DatasetError(f"{path} was not written correctly: it has the shapes {shapes}")
     return len(content)
 
@@ -113,17 +123,21 @@ def _check_columns(columns: Mapping[str, NDArray[Any]], fields: Sequence[Field],
 
 
 def _encode(
-    columns: Mapping[str, NDArray[Any]], fields: Sequence[Field], attributes: Mapping[str, str | int], dtype: str
+    parts: Sequence[tuple[str, NDArray[Any], dict[str, Any]]], attributes: Mapping[str, str | int]
 ) -> memoryview:
-    """Build the file in memory: a full disk then causes a plain system error, and no partial file."""
+    """Build the file in memory: a full disk then causes a plain system error, and no partial file.
+
+    Args:
+        parts: Name, values and attributes of every dataset.
+        attributes: Attributes of the file.
+    """
     import h5py
 
     buffer = io.BytesIO()
     with h5py.File(create_hdf5(buffer)) as file:
-        for field in fields:
-            stored = storage_dtype(field, dtype)
-            dataset = file.create_dataset(field.name, data=columns[field.name], dtype=stored, track_times=False)
-            dataset.attrs.update(field_attributes(field))
+        for name, values, about in parts:
+            dataset = file.create_dataset(name, data=values, dtype=values.dtype, track_times=False)
+            dataset.attrs.update(about)
         file.attrs.update({"format": SHARD_FORMAT, "format_version": SHARD_VERSION, **attributes})
     return buffer.getbuffer()
 

@@ -14,6 +14,7 @@ from cnpgen.store.files.document_structure import ANY_KEY, NUMBER, TEXT, WHOLE, 
 from cnpgen.store.files.documents import load_document, save_document
 from cnpgen.store.layout import WORK
 from cnpgen.store.sampling_statistics import SAMPLING_STRUCTURE, SamplingStatistics, sampling_from_json
+from cnpgen.store.scene_table import SCENE_ID, SceneTable, check_scenes
 from cnpgen.store.shard import write_shard
 from cnpgen.store.statistics import STATISTICS_STRUCTURE, FieldStatistics, column_statistics, statistics_from_json
 
@@ -129,6 +130,7 @@ def commit_shard(
     *,
     columns: Mapping[str, NDArray[Any]],
     sampling: SamplingStatistics,
+    scenes: SceneTable | None = None,
     started: str = "",
     seconds: float = 0.0,
     versions: Mapping[str, str] | None = None,
@@ -141,6 +143,7 @@ def commit_shard(
         task: The shard.
         columns: Field name -> values in their stored type, shape (rows, width) or (rows,).
         sampling: Sampling statistics of the shard.
+        scenes: Scenes of the rows, in their stored types; None for a dataset without scenes.
         started: Start time of the computation, ISO 8601 in UTC.
         seconds: Computing time [s].
         versions: Versions of cnpgen, Python and libraries that made the shard.
@@ -155,8 +158,10 @@ def commit_shard(
     if is_committed(folder, spec, task):  # another process made the same shard
         return load_record(folder, task)
     about = {"sampling": sampling, "started": started, "seconds": seconds, "versions": versions or {}}
+    if scenes is not None:
+        check_scenes(scenes, spec.scene_obstacles, columns[SCENE_ID], len(spec.scene_families))
     try:
-        return _write(folder, spec, task, columns, about)
+        return _write(folder, spec, task, (columns, scenes), about)
     except CnpgenError:
         # Another process may have committed the shard, finished the dataset and removed all temporary files.
         if is_committed(folder, spec, task):
@@ -168,12 +173,22 @@ def _write(
     folder: Path,
     spec: DatasetSpec,
     task: ShardTask,
-    columns: Mapping[str, NDArray[Any]],
+    content: tuple[Mapping[str, NDArray[Any]], SceneTable | None],
     about: Mapping[str, Any],
 ) -> ShardRecord:
     """Write a shard and then its sidecar, unless another process has committed the shard in the meantime."""
     path = folder / task.file
-    size = write_shard(path, columns, spec.fields, shard_attributes(spec, task), dtype=spec.dtype, work=folder / WORK)
+    columns, scenes = content
+    size = write_shard(
+        path,
+        columns,
+        spec.fields,
+        shard_attributes(spec, task),
+        dtype=spec.dtype,
+        scenes=scenes,
+        families=spec.scene_families,
+        work=folder / WORK,
+    )
     record = ShardRecord(
         file=task.file,
         bytes=size,

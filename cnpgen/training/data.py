@@ -133,13 +133,17 @@ def open_training_data(folder: str | Path, robot: str | Path | None = None) -> T
         robot: Problem of the robot in these scenes.
 
     Raises:
-        DatasetError: It is missing, unfinished or damaged, or has no rows for training or validation.
+        DatasetError: It is missing, unfinished or damaged, has scenes, or has no rows for training or validation.
         UsageError: There is no such robot or file.
         SceneError: A scene does not fit the robot.
     """
     if robot is not None:
         return make_scene_rows(as_problem(robot), load_scenes(folder), str(folder))
     dataset = load_dataset(folder)
+    if dataset.spec.scene_obstacles:
+        raise DatasetError(
+            f"{folder} has scenes: networks train on scene files ({'cnpgen train SCENES --robot NAME'!r})"
+        )
     names = [name for name, rows in dataset.splits.items() if rows]
     if len(names) < 2:
         raise DatasetError(f"{folder} needs a split to train on and another one to validate with, it has {names}")

@@ -15,6 +15,7 @@ from cnpgen.make.recipe_file import restored
 from cnpgen.store.check import Finding
 from cnpgen.store.dataset_spec import GENERATOR_REVISION, DatasetSpec, ShardTask
 from cnpgen.store.reader import StoredDataset
+from cnpgen.store.scene_table import SCENE_ID
 
 MAX_REGENERATION_ERROR = 1e-9  # in SI units; accepted difference of rows made on another machine or backend
 MAX_REGENERATION_ERROR_FLOAT32 = 1e-5  # in SI units; accepted difference of rows stored as float32
@@ -63,8 +64,15 @@ def regenerate_blocks(folder: Path, spec: DatasetSpec, tasks: list[ShardTask], c
         for task, block in (blocks[index] for index in chosen):
             start = max(block * size, task.first_row)
             stop = min((block + 1) * size, task.first_row + task.rows)
-            again, _ = next(shard_columns(prepared, spec, [ShardTask(task.split, task.index, start, stop - start)]))
-            same, problem = _compare(dataset.read(task.split, start=start, stop=stop), again)
+            again, _, scenes = next(
+                shard_columns(prepared, spec, [ShardTask(task.split, task.index, start, stop - start)])
+            )
+            stored = dataset.read(task.split, start=start, stop=stop)
+            if scenes is not None:
+                table = dataset.read_scenes(task.split, start=start, stop=stop)
+                stored |= dict(table[table.rows_of(np.unique(stored[SCENE_ID]))].arrays())
+                again |= dict(scenes.arrays())
+            same, problem = _compare(stored, again)
             identical += same
             if problem:
                 text = f"block {block} made again from the seed: {problem}{_explanation(spec, recipe)}"
@@ -92,6 +100,8 @@ def _compare(stored: dict[str, Any], again: dict[str, Any]) -> tuple[bool, str]:
     """Return whether the values are bitwise identical, and the first difference above the tolerance."""
     same = all(np.array_equal(stored[name], values) for name, values in again.items())
     for name, values in again.items():
+        if stored[name].shape != values.shape:
+            return False, f"{name} has the shape {stored[name].shape}, not {values.shape}"
         difference = np.abs(stored[name].astype(float) - values.astype(float))
         if not (difference <= _regeneration_tolerance(values.dtype)).all():
             return same, f"{name} differs by {difference.max():.3g}"

@@ -14,13 +14,15 @@ from cnpgen.errors import CnpgenError, counted
 from cnpgen.judges.rows.certified_plans import PlanCheck, check_plans
 from cnpgen.judges.rows.hits import hit_rule, repeated_fraction, speed_fractions
 from cnpgen.judges.rows.row_report import RowReport, merge
-from cnpgen.judges.rows.verify import verify_rows
+from cnpgen.judges.rows.verify import OBSTACLE_POSES, verify_rows
 from cnpgen.machine.engine import Engine, assembled
 from cnpgen.make.recipe_file import restored
 from cnpgen.problems.load_robot import load_robot
+from cnpgen.robots.scene_arrays import scene_poses
 from cnpgen.store.check import DELETE_HINT, Finding
-from cnpgen.store.checked_shard import read_checked, shard_of_record
+from cnpgen.store.checked_shard import read_checked, read_scenes, shard_of_record
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask
+from cnpgen.store.scene_table import SCENE_ID
 from cnpgen.store.shard_record import load_record
 from cnpgen.validate.numbers import check_numbers
 
@@ -101,12 +103,17 @@ def _verify_shard(folder: Path, spec: DatasetSpec, task: ShardTask) -> _ShardChe
     """Verify one shard; a shard that cannot be read is a finding, not an exception."""
     try:
         record = load_record(folder, task)
-        columns = read_checked(shard_of_record(folder, spec, task, record))
+        shard = shard_of_record(folder, spec, task, record)
+        columns = read_checked(shard)
+        scenes = read_scenes(shard) if spec.scene_obstacles else None
     except CnpgenError as error:
         return _ShardCheck(None, [str(error)], np.empty(0, np.uint64), PlanCheck(), np.empty(0), np.empty(0, np.uint64))
     with restored(spec) as recipe:
         problem = recipe.pipeline.problem
         robot = load_robot(problem)
+        if scenes is not None:
+            table = scenes[scenes.rows_of(columns[SCENE_ID])]
+            columns[OBSTACLE_POSES] = scene_poses(problem.obstacle, table)
         report = verify_rows(problem, robot, columns, dtype=spec.dtype, rule=hit_rule(spec.stages))
         plans = check_plans(problem, robot, columns)
     problems = [*plans.problems, *check_numbers(spec, task, columns, record)]

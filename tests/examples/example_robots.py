@@ -25,7 +25,8 @@ SHIPPED = ("panda-cup", "ur5-wipe")  # problems, pipelines and datasets of these
 
 def with_robots(names: Iterable[str]) -> list[Any]:
     """The names of recipes as parameters of a test, those of robots that are not installed to be skipped."""
-    return [pytest.param(name, marks=needs_robots) if name in SHIPPED else name for name in names]
+    own = (*SHIPPED, "panda-scenes")
+    return [pytest.param(name, marks=needs_robots) if name in own else name for name in names]
 
 
 PANDA = """

@@ -7,6 +7,7 @@ import pytest
 
 from cnpgen.benchmark.benchmark_planner import BenchmarkPlanner
 from cnpgen.errors import RecipeError
+from cnpgen.pipelines.families.family import SceneFamily
 from cnpgen.pipelines.stages.stage import Stage
 from cnpgen.plans.exporter import Exporter
 from cnpgen.problems.constraints.constraint import Constraint
@@ -157,6 +158,7 @@ def test_every_group_has_a_base():
         registry.OBJECTIVES: ObjectiveTerm,
         registry.PLANNERS: BenchmarkPlanner,
         registry.EXPORTERS: Exporter,
+        registry.FAMILIES: SceneFamily,
     }
     assert registry.CONTRACTS.keys() == registry.BUILT_IN.keys()
 

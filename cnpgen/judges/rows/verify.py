@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
 
 NO_RULE = HitRule()
+OBSTACLE_POSES = "obstacle_poses"
 VERIFICATION_BLOCK_ROWS = 1024  # measurements of a block need less than 10 MB
 
 _REQUIRED = ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq", "start_xyz", "goal_xyz")
@@ -62,7 +63,8 @@ def verify_rows(
         robot: Its robot.
         columns: Field -> values in SI units, shape (rows, width) or (rows,): ``start_q``, ``start_dq``, ``start_ddq``,
             ``goal_q``, ``goal_dq``, ``start_xyz``, ``goal_xyz``; optionally ``goal_ddq``, ``hit_angle``, ``hit_speed``,
-            ``hit_speed_max`` and diagnostics. Other fields must be finite.
+            ``hit_speed_max``, diagnostics, and ``obstacle_poses``, which replace those of the problem. Other fields
+            must be finite.
         dtype: Float type of the stored rows, which determines the tolerances.
         rule: Rule by which the stages chose the goals; none by default.
 
@@ -155,7 +157,7 @@ def _measure(problem: "Problem", world: World, columns: dict[str, Array], finite
     """Move the world to both ends of every finite row and record the measurements."""
     rows = len(columns["start_q"])
     velocity = goal_velocities(problem, world.robot, columns["goal_q"], columns["goal_dq"])
-    poses = scene_of(problem, columns["start_xyz"], columns["goal_xyz"], velocity).poses
+    poses = scene_of(problem, columns["start_xyz"], columns["goal_xyz"], velocity, columns.get(OBSTACLE_POSES)).poses
     position, velocity, jacobian = (np.full((rows, *shape), np.nan) for shape in ((2, 3), (3,), (3, world.robot.n)))
     measurements = _Measurements(position, velocity, jacobian, stored_diagnostics(problem, columns))
     for index, end in enumerate(ENDS):

@@ -56,6 +56,7 @@ class SceneFamily(ABC):
     )
     bearing: Range = field("direction of the furniture from the base", unit="rad", default=Range(-0.7, 0.7))
     turn: Range = field("rotation of the furniture against its direction", unit="rad", default=Range(-0.3, 0.3))
+    share: float = field("share of the family among the scenes of a pipeline, relative to others", default=1.0, low=0.0)
 
     @classmethod
     def describe(cls) -> str:
@@ -73,7 +74,7 @@ class SceneFamily(ABC):
 
 def uniform(random: np.random.Generator, interval: Range) -> float:
     """Draw a number from an interval."""
-    return float(random.uniform(interval.low, interval.high))
+    return interval.low + (interval.high - interval.low) * random.random()
 
 
 def whole(random: np.random.Generator, interval: Range) -> int:

@@ -56,8 +56,9 @@ class Furniture:
     def grasp(self, position: Point, approach: Point, tilt: float = 0.3) -> None:
         """Add a grasp; the approach is normalized."""
         cos, sin = math.cos(self.yaw), math.sin(self.yaw)
-        x, y, z = np.array(approach) / np.linalg.norm(approach)
-        direction = np.array([cos * x - sin * y, sin * x + cos * y, z])
+        x, y, z = approach
+        length = math.hypot(x, y, z)
+        direction = np.array([cos * x - sin * y, sin * x + cos * y, z]) / length
         self.grasps.append(Grasp(np.array(self.point(position)), direction, tilt))
 
     def layout(self, *others: Furniture) -> Layout:
@@ -116,7 +117,8 @@ def place_objects(
         is_box = bool(random.random() < 0.5)
         radius = math.hypot(a, b) / 2 if is_box else a / 2
         for _ in range(MAX_PLACEMENTS):
-            x, y = random.uniform(area[0], area[1]), random.uniform(area[2], area[3])
+            x = area[0] + (area[1] - area[0]) * random.random()
+            y = area[2] + (area[3] - area[2]) * random.random()
             if all(math.hypot(x - u, y - v) > radius + r + OBJECT_GAP_M for u, v, r in circles):
                 break
         else:

@@ -130,7 +130,8 @@ def candidate_poses(problem: Problem, candidates: CandidateBatch) -> Array:
     if angle is not None:
         with np.errstate(invalid="ignore"):  # columns that are not finite are rejected
             direction[:, :2] = np.concatenate([np.cos(angle), np.sin(angle)]).T
-    return scene_of(problem, candidates["start_xyz"].T, goal, direction).lanes
+    poses = None if candidates.scenes is None else candidates.scenes.poses[candidates.scene]
+    return scene_of(problem, candidates["start_xyz"].T, goal, direction, poses).lanes
 
 
 def capsule_axes_distance(robot: "Robot", problem: Problem) -> Any:

@@ -5,7 +5,7 @@ checked.
 """
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,11 @@ from numpy.typing import NDArray
 from cnpgen.kernels.symbolic.linalg import Scalar, symbols
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
 from cnpgen.pipelines.context import Context
+from cnpgen.pipelines.stages.scene_clearance import SceneClearance
+from cnpgen.pipelines.stages.stage import CandidateBatch
+from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES, Condition, Constraint, End
+from cnpgen.problems.constraints.self_clearance import SelfClearance
 from cnpgen.problems.problem import Problem
 from cnpgen.world.path import PathWorld
 from cnpgen.world.world import World
@@ -22,7 +26,23 @@ if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
-Decide = Callable[[tuple[Array, Array, Array], Array, NDArray[np.bool_]], NDArray[np.bool_]]
+States = tuple[Array, Array, Array]
+
+MIN_SCENE_MARGIN_M = 1e-6  # of distances in compiled code, above which Coal does not measure them again
+
+
+class Decide(Protocol):
+    """Function of the narrow phase, see ``narrow_phase_of``."""
+
+    def __call__(
+        self,
+        state: States,
+        obstacle_poses: Array,
+        mask: NDArray[np.bool_],
+        candidates: CandidateBatch | None = None,
+        /,
+    ) -> NDArray[np.bool_]:
+        """Return a mask of the violated constraints, shape (constraints, N)."""
 
 
 def narrow_phase_of(context: Context, end: End, *, exact: bool = True) -> Decide | None:
@@ -34,18 +54,17 @@ def narrow_phase_of(context: Context, end: End, *, exact: bool = True) -> Decide
         exact: Whether the tolerances of boundary states apply; otherwise those of motions apply.
 
     Returns:
-        A function of states ``(q, dq, ddq)``, shape (n, N) each, obstacle poses, shape (width, N), and a mask of the
-        states to check, shape (N,). It returns a mask of the violated constraints, shape (constraints, N).
+        A function of states ``(q, dq, ddq)``, shape (n, N) each, obstacle poses, shape (width, N), a mask of the states
+        to check, shape (N,), and the candidates. It returns a mask of the violated constraints, shape (constraints, N).
     """
     problem, robot = context.problem, context.robot
     if robot.shape is None and robot.held_shape is None and all(obstacle.upright for obstacle in problem.obstacle):
         return None
     kernel = context.kernels.load(narrow_phase, end=end, dtype=context.dtype)
-    world = World(robot, problem.obstacle, problem.object_size)
     path = PathWorld(robot, problem.obstacle, problem.object_size)
 
     def decide_states(
-        state: tuple[Array, Array, Array], obstacle_poses: Array, mask: NDArray[np.bool_]
+        state: States, obstacle_poses: Array, mask: NDArray[np.bool_], _candidates: CandidateBatch | None = None
     ) -> NDArray[np.bool_]:
         (unmet_counts,) = kernel(*state, obstacle_poses)
         remaining, violated = (unmet_counts > 0) & mask, np.zeros(unmet_counts.shape, bool)
@@ -60,6 +79,62 @@ def narrow_phase_of(context: Context, end: End, *, exact: bool = True) -> Decide
             met = problem.constraint[row].met(path, tolerance)
             if met is not None:
                 remaining[row, candidates], violated[row, candidates] = False, ~met
+        return violated | measure_one_by_one(state, obstacle_poses, remaining)
+
+    measure_one_by_one = _one_by_one(context, end, exact=exact)
+    return decide_states
+
+
+def narrow_phase_of_scenes(context: Context, end: End, *, exact: bool = True) -> Decide:
+    """Prepare the narrow phase of one end among the obstacles of scenes, see ``narrow_phase_of``.
+
+    Compiled collision checks accept states whose distances are more than ``MIN_SCENE_MARGIN_M`` above the required
+    ones; Coal measures the others.
+    """
+    problem, clearance = context.problem, SceneClearance(context)
+    kinds = [isinstance(constraint, RobotClearance | SelfClearance) for constraint in problem.constraint]
+    by_distance = np.array(kinds, bool)
+    measure_one_by_one = _one_by_one(context, end, exact=exact)
+    conservative = _conservative(context, end) & ~by_distance
+
+    def decide_states(
+        state: States, obstacle_poses: Array, mask: NDArray[np.bool_], candidates: CandidateBatch | None = None
+    ) -> NDArray[np.bool_]:
+        q, remaining = np.ascontiguousarray(state[0], float), np.zeros((len(by_distance), len(mask)), bool)
+        clear = np.zeros(len(mask), bool)
+        if candidates is not None and candidates.scenes is not None:
+            margins = MIN_SCENE_MARGIN_M, MIN_SCENE_MARGIN_M
+            clear = clearance.are_clear(q, candidates.scene, candidates.scenes, *margins)
+        remaining[by_distance] = ~clear & mask
+        remaining[conservative] = mask
+        return measure_one_by_one(state, obstacle_poses, remaining)
+
+    return decide_states
+
+
+def _conservative(context: Context, end: End) -> NDArray[np.bool_]:
+    """Return which constraints have conservative conditions at an end, shape (constraints,)."""
+    robot, problem = context.robot, context.problem
+    names = ("q", "dq", "ddq")
+    q, dq, ddq = (symbols(name, robot.n)[1] for name in names)
+    poses = symbols("obstacle_poses", problem.scene_width)[1]
+    state = SymbolicState(robot, q, dq, ddq, poses, problem.obstacle, problem.object_size)
+    each = (
+        () if isinstance(constraint, RobotClearance | SelfClearance) else constraint.symbolic_at(state, end)
+        for constraint in problem.constraint
+    )
+    return np.array([any(condition.sufficient for condition in conditions) for conditions in each], bool)
+
+
+def _one_by_one(
+    context: Context, end: End, *, exact: bool
+) -> Callable[[States, Array, NDArray[np.bool_]], NDArray[np.bool_]]:
+    """Return a function that measures chosen constraints of states, one by one, with Pinocchio and Coal."""
+    problem = context.problem
+    world = World(context.robot, problem.obstacle, problem.object_size)
+
+    def measure(state: States, obstacle_poses: Array, remaining: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        violated = np.zeros(remaining.shape, bool)
         for candidate in np.flatnonzero(remaining.any(axis=0)):
             q, dq, ddq = (np.ascontiguousarray(values[:, candidate]) for values in state)
             world.set_state(q, dq, ddq, obstacle_poses[:, candidate])
@@ -67,7 +142,7 @@ def narrow_phase_of(context: Context, end: End, *, exact: bool = True) -> Decide
                 violated[row, candidate] = _violates(problem.constraint[row], world, end, context.dtype, exact=exact)
         return violated
 
-    return decide_states
+    return measure
 
 
 def _tolerance(constraint: Constraint, dtype: str, *, exact: bool) -> float:

@@ -15,6 +15,7 @@ from cnpgen.store.field import Field
 
 if TYPE_CHECKING:
     from cnpgen.pipelines.context import Context
+    from cnpgen.pipelines.stages.batch_scenes import BatchScenes
 
 Array = NDArray[np.float64]
 
@@ -34,6 +35,7 @@ class CandidateBatch:
         origins: Reason -> label of the stage that used it first.
         drawn: Name -> values of all candidates, shape (width, N), for columns written before any rejection.
         last: Whether this is the last batch of the pipeline, so that all its candidates are counted.
+        scenes: Scenes of the candidates, whose column ``scene`` has the index of the scene of each, or None.
     """
 
     def __init__(self, size: int, *, last: bool = False) -> None:
@@ -45,6 +47,13 @@ class CandidateBatch:
         self.drawn: dict[str, Array] = {}
         self.stage = ""
         self.origins: dict[str, str] = {}
+        self.scenes: BatchScenes | None = None
+
+    @property
+    def scene(self) -> NDArray[np.int64]:
+        """Index in ``scenes`` of the scene of each remaining candidate, ascending, shape (n,)."""
+        index: NDArray[np.int64] = self.columns["scene"][0].astype(np.int64)
+        return index
 
     def __getitem__(self, name: str) -> Array:
         return self.columns[name]
@@ -99,10 +108,12 @@ class Stage(ABC):
         block_rows: Maximum number of rows per block; expensive stages use smaller blocks.
         replaces: Columns that later stages compute again. For tasks, earlier stages that write or read them
             are omitted.
+        draws_scenes: Whether it sets ``CandidateBatch.scenes``.
     """
 
     block_rows: ClassVar[int] = BLOCK_ROWS
     replaces: ClassVar[tuple[str, ...]] = ()
+    draws_scenes: ClassVar[bool] = False
 
     @property
     def tasks(self) -> int | None:

@@ -23,10 +23,9 @@ from cnpgen.robots.solid import place_obstacles, solids_of
 from cnpgen.scenes import Grasp, Layout, SceneFamily, SceneProblem, load_family, load_scenes, make_scenes, scene_plans
 from cnpgen.world.certified import CertifiedDistance, convex_body
 from cnpgen.world.pose_ik import PoseKinematics
-from tests.examples.chains import chain
 from tests.examples.example_robots import needs_robots
+from tests.examples.scene_arm import write_arm
 
-SPHERE = '<collision><origin xyz="0.05 0 0"/><geometry><sphere radius="0.02"/></geometry></collision></link>'
 ENDS_MARGIN = 0.005
 
 
@@ -119,14 +118,7 @@ class Posts(SceneFamily):
 @pytest.fixture(scope="module")
 def arm(tmp_path_factory: pytest.TempPathFactory) -> Problem:
     """Return an arm of seven joints whose links are spheres."""
-    folder = tmp_path_factory.mktemp("arm")
-    chain(folder, 7, jerk=False)
-    urdf = folder / "chain.urdf"
-    urdf.write_text(urdf.read_text().replace("</link>", SPHERE))
-    file = folder / "problem.toml"
-    clearance = '[[constraint]]\nuse = "robot-clearance"\ntolerance = "0.1 mm"\n'
-    file.write_text(file.read_text().replace("[limits]", 'geometry = "urdf"\n[limits]') + clearance)
-    return cnpgen.load_problem(file)
+    return cnpgen.load_problem(write_arm(tmp_path_factory.mktemp("arm")))
 
 
 def check_problems(problem: Problem, scenes: list[SceneProblem]) -> float:

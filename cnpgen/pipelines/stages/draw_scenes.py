@@ -1,0 +1,139 @@
+"""Stage: draw scenes from families; several candidates share a scene."""
+
+from collections import Counter
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import RecipeError
+from cnpgen.pipelines.context import Context
+from cnpgen.pipelines.families.family import Layout, SceneFamily
+from cnpgen.pipelines.stages.batch_scenes import BatchScenes, batch_scenes
+from cnpgen.pipelines.stages.stage import CandidateBatch, Stage, StageFunction, leave
+from cnpgen.problems.constraints.clearance import RobotClearance
+from cnpgen.problems.scenes.scene_problem import MAX_BASE_DEPTH_M
+from cnpgen.robots.scene_arrays import rotations_of, sample_obstacles
+from cnpgen.schema import registry
+from cnpgen.schema.keys import field
+from cnpgen.store.field import Field
+from cnpgen.store.scene_table import OBSTACLE_KINDS, SceneTable
+
+TOO_MANY = "scene with more obstacles than the capacity"
+AT_BASE = "obstacle at the robot's base"
+
+
+@dataclass(frozen=True, kw_only=True)
+class DrawScenes(Stage):
+    """Stage: draw scenes from families with given shares; consecutive candidates share a scene."""
+
+    draws_scenes = True
+    capacity: dict[str, int] = field(
+        "largest numbers of obstacles of a scene by kind: box, sphere, cylinder, capsule",
+        low=1,
+        high=60,
+        pattern=f"^({'|'.join(OBSTACLE_KINDS)})$",
+    )
+    per_scene: int = field("candidates of a scene, on average in each batch", default=10, low=1, high=4096)
+    family: tuple[SceneFamily, ...] = field("families of the scenes", form="[[stage.family]] tables")
+
+    @property
+    def family_names(self) -> tuple[str, ...]:
+        """Registered names of the families, in order."""
+        return tuple(registry.name_of(registry.FAMILIES, type(family)) for family in self.family)
+
+    def describe(self) -> str:
+        """Describe the stage in one sentence."""
+        shares = self._shares()
+        each = (f"{name} {100 * share:.3g} %" for name, share in zip(self.family_names, shares, strict=True))
+        return f"draw scenes for {self.per_scene} candidates each ({', '.join(each)})"
+
+    def outputs(self, context: Context) -> tuple[Field, ...]:
+        """Return no fields: scenes are stored beside the rows."""
+        del context
+        return ()
+
+    def writes(self, context: Context) -> tuple[str, ...]:
+        """List the index of the scene."""
+        del context
+        return ("scene",)
+
+    def prepare(self, context: Context) -> StageFunction:
+        """Check the obstacles of the problem and return the stage function."""
+        self._check(context)
+        obstacles, capacity, shares = context.problem.obstacle, sum(self.capacity.values()), self._shares()
+
+        def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
+            count = max(round(candidates.size / self.per_scene), 1)
+            seeds, families = random.integers(0, 2**63, count), random.choice(len(shares), count, p=shares)
+            layouts = [
+                self.family[family].draw(np.random.Generator(np.random.SFC64(seed)))
+                for family, seed in zip(families.tolist(), seeds.tolist(), strict=True)
+            ]
+            fits = np.array([self._fits(layout) for layout in layouts], bool)
+            kept = [layout if fit else Layout((), ()) for layout, fit in zip(layouts, fits, strict=True)]
+            candidates.scenes = batch_scenes(kept, families.tolist(), obstacles, capacity, context.dtype)
+            candidates["scene"] = (np.arange(candidates.size) * count // candidates.size)[None].astype(float)
+            of_scene = np.stack([fits, base_depths(candidates.scenes.table) <= MAX_BASE_DEPTH_M])
+            candidates.reject_first(of_scene[:, candidates.scene], [TOO_MANY, AT_BASE])
+
+        return work
+
+    def complete(self, context: Context, given: Collection[str]) -> StageFunction:
+        """Draw no scenes for tasks: their obstacles are given."""
+        del context, given
+        return leave
+
+    def _shares(self) -> NDArray[np.float64]:
+        shares = np.array([family.share for family in self.family])
+        return np.asarray(shares / max(shares.sum(), 1e-300))
+
+    def _fits(self, layout: Layout) -> bool:
+        counts = Counter(obstacle.kind for obstacle in layout.obstacles)
+        return all(count <= self.capacity.get(kind, 0) for kind, count in counts.items())
+
+    def _check(self, context: Context) -> None:
+        """Raise RecipeError if the problem cannot have these scenes."""
+        problem, mistakes = context.problem, list[str]()
+        places = {kind: len(parked) for kind, parked in sample_obstacles(problem.obstacle).items() if parked}
+        if places != self.capacity:
+            mistakes.append(
+                f"capacity: the problem has places for {places or 'no obstacles of samples'}, expected"
+                f" {self.capacity}: load the pipeline from a file, which adds them"
+            )
+        if any(obstacle.below for obstacle in problem.obstacle):
+            mistakes.append("obstacles below the object are not supported in scenes: give them a height")
+        if context.robot.shape is None or problem.first(RobotClearance) is None:
+            mistakes.append('needs a constraint robot-clearance and geometry = "urdf" in [robot] of the problem')
+        if not any(family.share for family in self.family):
+            mistakes.append("family: all shares are 0, expected at least one larger")
+        if mistakes:
+            raise RecipeError(mistakes)
+
+
+def base_depths(table: SceneTable) -> NDArray[np.float64]:
+    """Return the depth of the robot's base, the origin, in the obstacles of each scene [m], negative outside."""
+    local = np.abs(np.einsum("soji,soj->soi", rotations_of(table), -table.obstacle_position.astype(float)))
+    size, kind = table.obstacle_size.astype(float), table.obstacle_kind
+    across, up = np.hypot(local[..., 0], local[..., 1]), local[..., 2]
+    radius, half = size[..., 0], size[..., 1] / 2
+    depths = [
+        (size / 2 - local).min(axis=-1),
+        radius - np.linalg.norm(local, axis=-1),
+        np.minimum(radius - across, half - up),
+        radius - np.hypot(across, np.maximum(up - half, 0.0)),
+    ]
+    depth = np.select([kind == code for code in range(len(depths))], depths, -np.inf)
+    return np.asarray(depth.max(axis=1))
+
+
+def scenes_of(candidates: CandidateBatch) -> BatchScenes:
+    """Return the scenes of candidates.
+
+    Raises:
+        RecipeError: No stage has drawn scenes.
+    """
+    if candidates.scenes is None:
+        raise RecipeError(["needs scenes: expected a stage draw-scenes before it"])
+    return candidates.scenes

@@ -1,0 +1,139 @@
+"""Clearance of states in the scenes of a batch, by compiled collision checks, or by Coal without a compiler."""
+
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.kernels.collision.body_arrays import LANES, PADDING_DISTANCE_M, obstacle_bodies
+from cnpgen.kernels.collision.collision_checker import MAX_JOINTS, CollisionChecker, load_collision_library
+from cnpgen.kernels.compiled_kernel import address_of
+from cnpgen.pipelines.context import Context
+from cnpgen.pipelines.families.resting_states import RestingStates
+from cnpgen.pipelines.stages.batch_scenes import BatchScenes
+from cnpgen.problems.constraints.clearance import RobotClearance
+from cnpgen.problems.constraints.self_clearance import SelfClearance
+from cnpgen.problems.problem import Problem
+from cnpgen.robots.obstacle import Obstacle
+from cnpgen.robots.scene import PARKED_POSITION_M
+from cnpgen.robots.solid import place_obstacles, solids_of
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+class _SceneChecker(CollisionChecker):
+    """Compiled checks whose obstacles are replaced by arrays of ``BatchScenes.bodies``."""
+
+    def place_fixed(self, obstacles: list[Obstacle]) -> None:
+        """Set the obstacles that all scenes have."""
+        numbers = place_obstacles(obstacles)
+        self.place(obstacles, numbers)
+        self._fixed, _, boxes = obstacle_bodies(obstacles, numbers, len(self._vertices))
+        self._fixed_boxes = boxes[:, : len(obstacles)]
+
+    def prepare_scenes(self, scenes: BatchScenes) -> None:
+        """Build the arrays of all scenes of a batch, for ``place_scene``."""
+        fixed, (bodies, boxes) = len(self._fixed), scenes.bodies
+        together = np.zeros((len(scenes), fixed + bodies.shape[1]), bodies.dtype)
+        together[:, :fixed], together[:, fixed:] = self._fixed, bodies
+        self._counts = (fixed + scenes.table.obstacle_count).tolist()
+        self._boxes = []
+        for box, count in zip(boxes, self._counts, strict=True):
+            padded = np.zeros((16, count + -count % LANES))
+            padded[:, :fixed], padded[:, fixed:count] = self._fixed_boxes, box[:, : count - fixed]
+            padded[:3, count:] = PADDING_DISTANCE_M
+            self._boxes.append(padded)
+        self._addresses = [address_of(padded) if padded.size else None for padded in self._boxes]
+        self._set("obstacles", together)
+        self._first, self._stride = address_of(self._arrays["obstacles"]), together.strides[0]
+
+    def clear_of_scenes(
+        self, q: Array, runs: list[tuple[int, int, int]], limits: tuple[float | None, float | None]
+    ) -> Mask:
+        """Return a mask of the states with sufficient distances from the obstacles of their scene, shape (K,).
+
+        Args:
+            q: Joint positions [rad], shape (n, K).
+            runs: Scene, first state and end of every run of states in one scene.
+            limits: Required distances from obstacles and of links from each other [m]; None for no check.
+        """
+        states, clear = np.ascontiguousarray(q.T), np.empty(q.shape[1], np.uint8)
+        native, check, (obstacle_limit, self_limit) = self._scene, self.library.clear_states, _finite(limits)
+        first_state, first_flag, stride = address_of(states), address_of(clear), states.strides[0]
+        for scene, first, end in runs:
+            native.obstacles, native.n_obstacles = self._first + scene * self._stride, self._counts[scene]
+            native.boxes, native.lanes = self._addresses[scene], self._boxes[scene].shape[1]
+            place = first_state + first * stride
+            check(self.address, place, end - first, obstacle_limit, self_limit, first_flag + first)
+        return clear.astype(bool)
+
+
+def _finite(limits: tuple[float | None, float | None]) -> tuple[float, float]:
+    """Return limits for functions in C, where minus infinity stands for no check."""
+    obstacle_limit, self_limit = (-np.inf if limit is None else limit for limit in limits)
+    return obstacle_limit, self_limit
+
+
+class SceneClearance:
+    """Clearance of states from the obstacles of their scene and of links from each other.
+
+    Args:
+        context: Loaded problem, with link geometry.
+    """
+
+    def __init__(self, context: Context) -> None:
+        problem, robot = context.problem, context.robot
+        self._obstacles = problem.obstacle
+        self.obstacle_distance, self.self_distance = required_distances(problem)
+        library = load_collision_library(context.kernels) if robot.n <= MAX_JOINTS else None
+        self._checker: _SceneChecker | None = None
+        self._prepared: BatchScenes | None = None
+        if library is None:
+            self._states = RestingStates(problem, robot)
+            return
+        self._checker = _SceneChecker(library, robot)
+        self._checker.place_fixed([each for each in self._obstacles if each.position != PARKED_POSITION_M])
+
+    def are_clear(
+        self, q: Array, scene: NDArray[np.int64], scenes: BatchScenes, margin: float = 0.0, self_margin: float = 0.0
+    ) -> Mask:
+        """Return a mask of the states with sufficient distances, shape (K,).
+
+        Args:
+            q: Joint positions [rad], shape (n, K).
+            scene: Index of the scene of each state, ascending, shape (K,).
+            scenes: The scenes.
+            margin: Distance from obstacles in addition to the problem's clearance [m].
+            self_margin: Distance of links from each other in addition to the required one [m].
+        """
+        if not len(scene):
+            return np.zeros(0, bool)
+        bounds = [0, *(np.flatnonzero(np.diff(scene)) + 1).tolist(), len(scene)]
+        runs = [(int(scene[first]), first, end) for first, end in pairwise(bounds)]
+        if self._checker is None:
+            return np.concatenate(
+                [self._by_coal(q[:, first:end], scenes, run, max(margin, self_margin)) for run, first, end in runs]
+            )
+        if self._prepared is not scenes:
+            self._checker.prepare_scenes(scenes)
+            self._prepared = scenes
+        limits = _plus(self.obstacle_distance, margin), _plus(self.self_distance, self_margin)
+        return self._checker.clear_of_scenes(q, runs, limits)
+
+    def _by_coal(self, q: Array, scenes: BatchScenes, scene: int, margin: float) -> Mask:
+        self._states.place_solids(solids_of(self._obstacles, scenes.poses[scene]))
+        return self._states.are_clear(q, margin=margin)
+
+
+def _plus(distance: float | None, margin: float) -> float | None:
+    return None if distance is None else distance + margin
+
+
+def required_distances(problem: Problem) -> tuple[float | None, float | None]:
+    """Return the required distances from obstacles and of links from each other [m]; None without a constraint."""
+    of = [
+        [item.distance for item in problem.constraint if isinstance(item, kind)]
+        for kind in (RobotClearance, SelfClearance)
+    ]
+    return max(of[0], default=None), max(of[1], default=None)

@@ -1,0 +1,306 @@
+"""Stage: collision-free joint positions of start and goal among the obstacles of a scene."""
+
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.kernels.kernel import Kernel
+from cnpgen.kernels.symbolic.kinematics import tip_position
+from cnpgen.kernels.tape import Loop
+from cnpgen.pipelines.context import Context
+from cnpgen.pipelines.stages.batch_scenes import BatchScenes
+from cnpgen.pipelines.stages.draw import position_field
+from cnpgen.pipelines.stages.draw_scenes import scenes_of
+from cnpgen.pipelines.stages.pose_ik import MAX_POSE_IK_STEPS, POSE_TOLERANCE, pose_ik_step
+from cnpgen.pipelines.stages.scene_clearance import SceneClearance
+from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Stage, StageFunction, leave
+from cnpgen.pipelines.stages.torque import torque_ratio
+from cnpgen.robots.robot import Robot
+from cnpgen.schema.keys import field
+from cnpgen.store.field import Field
+
+Indices = NDArray[np.int64]
+
+MAX_PAIRS_PER_CANDIDATE = 8  # of a start and a goal that are tried for one candidate
+NEUTRAL_STATES = 12  # of a scene
+RANDOM_STATES = 16  # of a scene, most of which collide
+FIRST_PHASES = (0.5, 0.25, 0.75)  # of a straight line, checked first
+OTHER_PHASES = tuple(k / 16 for k in range(1, 16, 2))
+NO_ENDS = "no collision-free start and goal in the scene"
+NUMBERS_PER_PAIR = 5  # random numbers: kind of start, and two for each of two states, less one
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneEnds(Stage):
+    """Stage: goals at grasps of the scene, and starts at other grasps, near the base configuration or random."""
+
+    inputs = ("scene",)
+    neutral: float = field("share of starts near the base configuration", default=0.4, low=0.0, high=1.0)
+    grasp: float = field("share of starts at another grasp", default=0.4, low=0.0, high=1.0)
+    random: float = field("share of random starts", default=0.2, low=0.0, high=1.0)
+    spread: float = field(
+        "standard deviation of starts around the base configuration", unit="rad", default=0.1, low=0.0
+    )
+    margin: float = field(
+        "distance of both ends from obstacles, in addition to that of the problem", unit="m", default=0.005, low=0.0
+    )
+    straight: float = field(
+        "share of the samples whose straight line may be free of collisions", default=0.1, low=0.0, high=1.0
+    )
+    grasps: int = field("grasps of a scene that are tried", default=8, low=1, high=100)
+    poses: int = field("random poses at each grasp", default=12, low=1, high=100)
+
+    def find_mistakes(self) -> Iterator[tuple[str, str]]:
+        """Yield (key, mistake) pairs."""
+        if abs(self.neutral + self.grasp + self.random - 1) > 1e-9:
+            total = self.neutral + self.grasp + self.random
+            yield "random", f"the shares of starts must add up to 1, got {total:g}"
+
+    def describe(self) -> str:
+        """Describe the stage in one sentence."""
+        kinds = f"near the base configuration {100 * self.neutral:.3g} %, at other grasps {100 * self.grasp:.3g} %"
+        return (
+            f"choose collision-free goals at grasps and starts ({kinds}, random {100 * self.random:.3g} %) that a"
+            f" straight line connects in at most {100 * self.straight:.3g} % of the cases"
+        )
+
+    def outputs(self, context: Context) -> tuple[Field, ...]:
+        """List the fields of joint positions and tip positions."""
+        center, reach = context.robot.chain.joints[0].translation, context.robot.chain.reach
+        low, high = (np.asarray(center) - reach).tolist(), (np.asarray(center) + reach).tolist()
+        return (
+            context.joint_field("start_q", "rad", "joint positions at the start"),
+            context.joint_field("goal_q", "rad", "joint positions at the goal", "target"),
+            position_field("start", low, high),
+            position_field("goal", low, high),
+        )
+
+    def task_inputs(self, context: Context) -> tuple[Field, ...]:
+        """List the joint positions, which tasks give."""
+        return self.outputs(context)[:2]
+
+    def complete(self, context: Context, given: Collection[str]) -> StageFunction:
+        """Keep the joint positions of tasks."""
+        del context, given
+        return leave
+
+    def prepare(self, context: Context) -> StageFunction:
+        """Load the kernels and the collision checks."""
+        states, tip = _EndStates(context, self), context.kernels.load(tip_position)
+
+        def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
+            scenes = scenes_of(candidates)
+            pools = states.pools(scenes, random)
+            numbers = candidates.draw(random, 1 + NUMBERS_PER_PAIR * MAX_PAIRS_PER_CANDIDATE)
+            start, goal = states.pairs(scenes, pools, candidates.scene, numbers)
+            candidates["start_q"], candidates["goal_q"] = start, goal
+            candidates.reject(np.isfinite(start).all(axis=0), NO_ENDS)
+            for end in ("start", "goal"):
+                (candidates[f"{end}_xyz"],) = tip(candidates[f"{end}_q"])
+
+        return work
+
+
+class _Pool(NamedTuple):
+    """Valid states by scene and group, such as those of one grasp.
+
+    Attributes:
+        q: Joint positions [rad], shape (n, M).
+        first_state: First state of each group, shape (groups + 1,).
+        first_group: First group of each scene, shape (S + 1,).
+    """
+
+    q: Array
+    first_state: Indices
+    first_group: Indices
+
+    def choose(self, scene: Indices, u: Array, v: Array, other_than: Indices | None = None) -> tuple[Indices, Indices]:
+        """Choose a group of each scene and one of its states; both are -1 where there is none.
+
+        Args:
+            scene: Scenes, shape (P,).
+            u: Random numbers in [0, 1) for the groups, shape (P,).
+            v: Random numbers for the states, shape (P,).
+            other_than: Groups that are not chosen, -1 for none, shape (P,).
+        """
+        first = self.first_group[scene]
+        count = self.first_group[scene + 1] - first
+        excluded = np.full(len(scene), -1) if other_than is None else other_than
+        without = count - (excluded >= 0)
+        group = first + np.minimum((u * without).astype(np.int64), np.maximum(without - 1, 0))
+        group += (excluded >= 0) & (group >= excluded)
+        group = np.where(without > 0, group, 0)
+        begin = self.first_state[group]
+        size = self.first_state[np.minimum(group + 1, len(self.first_state) - 1)] - begin
+        state = begin + np.minimum((v * size).astype(np.int64), np.maximum(size - 1, 0))
+        exists = (without > 0) & (size > 0)
+        return np.where(exists, group, -1), np.where(exists, state, -1)
+
+
+def _make_pool(q: Array, key: Indices, scenes: int, groups: int) -> _Pool:
+    """Return a pool of states, sorted by ``key``, which is the scene times ``groups`` plus the group."""
+    present, first_state = np.unique(key, return_index=True)
+    first_group = np.searchsorted(present // groups, np.arange(scenes + 1))
+    return _Pool(q, np.append(first_state, len(key)), first_group)
+
+
+class _EndStates:
+    """Valid states of the scenes of a batch, and pairs of them.
+
+    Args:
+        context: Loaded problem.
+        stage: The stage.
+    """
+
+    def __init__(self, context: Context, stage: SceneEnds) -> None:
+        self._robot: Robot = context.robot
+        self._stage, self._clearance = stage, SceneClearance(context)
+        loop = Loop(POSE_TOLERANCE, MAX_POSE_IK_STEPS)
+        self._ik: Kernel = context.kernels.load(pose_ik_step, loop)
+        self._torque: Kernel = context.kernels.load(torque_ratio)
+
+    def pools(self, scenes: BatchScenes, random: np.random.Generator) -> dict[str, _Pool]:
+        """Draw states of all scenes and keep the valid ones."""
+        robot, count = self._robot, len(scenes)
+        low, high = robot.position_lower[:, None], robot.position_upper[:, None]
+        neutral = robot.base[:, None] + self._stage.spread * random.standard_normal((robot.n, count * NEUTRAL_STATES))
+        anywhere = low + (high - low) * random.random((robot.n, count * RANDOM_STATES))
+        q, key = self._grasp_states(scenes, random)
+        owners = [np.repeat(np.arange(count), each) for each in (NEUTRAL_STATES, RANDOM_STATES)]
+        states = np.concatenate([q, neutral, anywhere], axis=1)
+        valid = self._are_valid(scenes, states, np.concatenate([key // self._stage.grasps, *owners]))
+        masks = np.split(valid, np.cumsum([q.shape[1], neutral.shape[1]]))
+        parts = zip(("grasp", "neutral", "random"), (q, neutral, anywhere), (key, *owners), masks, strict=True)
+        groups = {"grasp": self._stage.grasps, "neutral": 1, "random": 1}
+        return {name: _make_pool(each[:, mask], own[mask], count, groups[name]) for name, each, own, mask in parts}
+
+    def _are_valid(self, scenes: BatchScenes, q: Array, scene: Indices) -> NDArray[np.bool_]:
+        """Return which states are within limits, can be held, and are clear in their scene, shape (K,)."""
+        robot = self._robot
+        valid = ((q >= robot.position_lower[:, None]) & (q <= robot.position_upper[:, None])).all(axis=0)
+        (ratio,) = self._torque(np.ascontiguousarray(q))
+        chosen = np.flatnonzero(valid & (ratio[0] <= 1.0))
+        chosen = chosen[np.argsort(scene[chosen], kind="stable")]
+        clear = self._clearance.are_clear(q[:, chosen], scene[chosen], scenes, self._stage.margin)
+        valid = np.zeros(q.shape[1], bool)
+        valid[chosen[clear]] = True
+        return valid
+
+    def _grasp_states(self, scenes: BatchScenes, random: np.random.Generator) -> tuple[Array, Indices]:
+        """Solve for poses at random grasps of each scene; return joint positions and keys of the solved ones."""
+        stage, robot, count = self._stage, self._robot, len(scenes)
+        order = random.random((count, scenes.grasp_tilt.shape[1]))
+        order[np.arange(order.shape[1]) >= scenes.grasp_count[:, None]] = np.inf
+        chosen = np.argsort(order, axis=1, kind="stable")[:, : stage.grasps]
+        numbers = random.random((3 + robot.n, count, chosen.shape[1], stage.poses))
+        exists = np.take_along_axis(order, chosen, axis=1) < 1.0
+        scene, grasp = np.nonzero(exists)
+        place = chosen[scene, grasp]
+        u = numbers[:, scene, grasp].reshape(len(numbers), -1)  # pose by pose of every grasp
+        approach, tilt, position = (
+            np.repeat(values[scene, place], stage.poses, axis=0)
+            for values in (scenes.grasp_approach, scenes.grasp_tilt, scenes.grasp_position)
+        )
+        rotation = _rotations(approach, tilt, u[:3])
+        low, high = robot.position_lower[:, None], robot.position_upper[:, None]
+        lanes = [np.ascontiguousarray(each) for each in (low + (high - low) * u[3:], position.T, rotation)]
+        q, error = self._ik(*lanes)
+        met = error[0] < POSE_TOLERANCE
+        return q[:, met], np.repeat(scene * stage.grasps + grasp, stage.poses)[met]
+
+    def pairs(
+        self, scenes: BatchScenes, pools: dict[str, _Pool], scene: Indices, numbers: Array
+    ) -> tuple[Array, Array]:
+        """Return starts and goals of the candidates [rad], nan without one, shape (n, N) each."""
+        stage, size = self._stage, (self._robot.n, len(scene))
+        start, goal = np.full(size, np.nan), np.full(size, np.nan)
+        may_be_straight, pending = numbers[0] < stage.straight, np.arange(len(scene))
+        used = np.empty(0, np.int64)
+        for attempt in range(MAX_PAIRS_PER_CANDIDATE):
+            first = 1 + NUMBERS_PER_PAIR * attempt
+            q, aim, key = self._pair(pools, scene[pending], numbers[first : first + NUMBERS_PER_PAIR, pending])
+            is_new = ~np.isin(key, used)
+            is_new[is_new] = _is_first(key[is_new])
+            exists = is_new & np.isfinite(q).all(axis=0)
+            accepted = exists & may_be_straight[pending]
+            lines = np.flatnonzero(exists & ~accepted)
+            accepted[lines] = self._lines_collide(scenes, q[:, lines], aim[:, lines], scene[pending[lines]])
+            used = np.append(used, key[accepted])
+            start[:, pending[accepted]], goal[:, pending[accepted]] = q[:, accepted], aim[:, accepted]
+            pending = pending[~accepted]
+            if not len(pending):
+                break
+        return start, goal
+
+    def _pair(self, pools: dict[str, _Pool], scene: Indices, u: Array) -> tuple[Array, Array, Indices]:
+        """Choose a start and a goal of each scene, nan without one, shape (n, P) each, and a key of each pair."""
+        group, target = pools["grasp"].choose(scene, u[0], u[1])
+        chosen = {
+            "grasp": pools["grasp"].choose(scene, u[3], u[4], other_than=group)[1],
+            "neutral": pools["neutral"].choose(scene, u[3], u[4])[1],
+            "random": pools["random"].choose(scene, u[3], u[4])[1],
+        }
+        ends = np.cumsum([getattr(self._stage, name) for name in chosen])
+        kind = np.minimum(np.searchsorted(ends, u[2], side="right"), len(ends) - 1)
+        start = np.choose(kind, [_taken(pools[name].q, state) for name, state in chosen.items()])
+        state = np.choose(kind, list(chosen.values()))
+        goal = _taken(pools["grasp"].q, target)
+        key = (target * len(ends) + kind) * 2**31 + state
+        return np.where(np.isfinite(goal), start, np.nan), goal, key
+
+    def _lines_collide(self, scenes: BatchScenes, start: Array, goal: Array, scene: Indices) -> NDArray[np.bool_]:
+        """Return which straight lines have a state that is not clear, shape (P,); a few states are checked."""
+        collides = np.zeros(len(scene), bool)
+        for phases in (FIRST_PHASES, OTHER_PHASES):
+            rest = np.flatnonzero(~collides)
+            line = start[:, rest, None] + (goal - start)[:, rest, None] * np.array(phases)
+            states = np.ascontiguousarray(line.reshape(len(start), -1))
+            clear = self._clearance.are_clear(states, np.repeat(scene[rest], len(phases)), scenes)
+            collides[rest] = ~clear.reshape(-1, len(phases)).all(axis=1)
+        return collides
+
+
+def _taken(q: Array, state: Indices) -> Array:
+    """Return states by index, nan for -1, shape (n, P)."""
+    if not q.shape[1]:
+        return np.full((len(q), len(state)), np.nan)
+    return np.where(state >= 0, q[:, np.maximum(state, 0)], np.nan)
+
+
+def _is_first(key: Indices) -> NDArray[np.bool_]:
+    """Return which entries do not occur before, shape (P,)."""
+    first = np.zeros(len(key), bool)
+    first[np.unique(key, return_index=True)[1]] = True
+    return first
+
+
+def _rotations(approach: Array, tilt: Array, u: Array) -> Array:
+    """Return rotations whose z axis is within the tilt of an approach, by rows.
+
+    Args:
+        approach: Unit vectors, shape (K, 3).
+        tilt: Largest angles [rad], shape (K,).
+        u: Random numbers in [0, 1), shape (3, K).
+
+    Returns:
+        Shape (9, K).
+    """
+    cosine = 1 - u[0] * (1 - np.cos(tilt))
+    sine, angle, roll = np.sqrt(1 - cosine**2), 2 * np.pi * u[1], 2 * np.pi * u[2]
+    first, second = _across(approach)
+    z = (sine * np.cos(angle))[:, None] * first + (sine * np.sin(angle))[:, None] * second + cosine[:, None] * approach
+    first, second = _across(z)
+    x = np.cos(roll)[:, None] * first + np.sin(roll)[:, None] * second
+    y = np.cross(z, x)
+    return np.stack([x, y, z], axis=2).reshape(-1, 9).T
+
+
+def _across(axis: Array) -> tuple[Array, Array]:
+    """Return two unit vectors that form a right-handed frame with unit vectors, shape (K, 3) each."""
+    helper = np.where(np.abs(axis[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    first = np.cross(helper, axis)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return first, np.cross(axis, first)

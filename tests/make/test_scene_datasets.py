@@ -1,0 +1,238 @@
+"""Datasets whose samples have scenes: storage, reproduction, checks, loading, and plans."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+import cnpgen
+from cnpgen.cli.main import main
+from cnpgen.errors import DatasetError
+from cnpgen.make.draw_boundary_problems import draw_boundary_problems
+from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.problem_record import as_record, open_problem
+from cnpgen.robots.solid import place_obstacles, solids_of
+from cnpgen.store.reader import open_dataset
+from cnpgen.training.data import open_training_data
+from cnpgen.world.world import World
+from tests.conftest import needs_compiler
+from tests.examples.forged_shards import edit
+from tests.examples.scene_arm import PIPELINE, obstacles_of, write_scene_pipeline
+
+pytestmark = needs_compiler  # NumPy takes minutes
+ROWS = 240
+ENDS_MARGIN_M = 0.005 - 1e-9
+
+
+@pytest.fixture(scope="module")
+def pipeline(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_scene_pipeline(tmp_path_factory.mktemp("scene_arm"))
+
+
+@pytest.fixture(scope="module")
+def dataset(pipeline: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("scenes") / "scenes"
+    cnpgen.make_dataset(pipeline, folder, n=ROWS, shard_size=100, workers=1)
+    return folder
+
+
+def shard_bytes(folder: Path) -> dict[str, bytes]:
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in sorted(folder.rglob("*.h5"))}
+
+
+def test_h5py_reads_the_scene_of_every_sample(dataset: Path) -> None:
+    with h5py.File(dataset / "train" / "shard-00001.h5") as file:
+        ids, scenes, counts = file["scene_id"][:], file["scene_ids"][:], file["obstacle_count"][:]
+        kinds, sizes, quaternions = (file[f"obstacle_{name}"][:] for name in ("kind", "size", "quaternion"))
+        assert file["obstacle_position"].shape == (len(scenes), 14, 3)
+        assert file["obstacle_quaternion"].attrs["convention"] == "w, x, y, z"
+        assert json.loads(file["scene_family"].attrs["names"]) == ["free", "tabletop"]
+        assert set(file["scene_family"][:].tolist()) <= {0, 1}
+    assert np.array_equal(np.unique(ids), scenes)
+    assert np.array_equal(scenes[np.searchsorted(scenes, ids)], ids)
+    assert len(scenes) < 100 / 2.5
+    real = np.arange(14) < counts[:, None]
+    assert np.array_equal(kinds >= 0, real)
+    assert (sizes[real][:, 0] > 0).all()
+    assert np.linalg.norm(quaternions, axis=-1) == pytest.approx(1)
+
+
+def test_scene_ids_are_those_of_the_first_samples(dataset: Path) -> None:
+    columns = open_dataset(dataset).read("train", fields=["scene_id", "sample_id"])
+    first = np.unique(columns["scene_id"])
+    assert np.array_equal(columns["scene_id"][first], first)
+    assert (np.diff(columns["scene_id"]) >= 0).all()
+
+
+@pytest.mark.slow
+def test_two_workers_another_shard_size_and_an_extension_give_equal_scenes(
+    pipeline: Path, dataset: Path, tmp_path: Path
+) -> None:
+    two, small = tmp_path / "two", tmp_path / "small"
+    cnpgen.make_dataset(pipeline, two, n=ROWS, shard_size=100, workers=2)
+    assert shard_bytes(two) == shard_bytes(dataset)
+    cnpgen.make_dataset(pipeline, small, n=100, shard_size=37, workers=1)
+    cnpgen.extend_dataset(small, ROWS, workers=1)
+    one, other = cnpgen.load_dataset(dataset), cnpgen.load_dataset(small)
+    names = ["start_q", "goal_q", "scene_id", "obstacle_poses", "scene_family"]
+    for split in one:
+        for name in names:
+            assert np.array_equal(one.arrays(split, fields=[name])[name], other.arrays(split, fields=[name])[name])
+
+
+@pytest.mark.slow
+def test_an_interrupted_dataset_is_finished_and_parts_are_merged(pipeline: Path, dataset: Path, tmp_path: Path) -> None:
+    broken, merged = tmp_path / "broken", tmp_path / "merged"
+    shutil.copytree(dataset, broken)
+    (broken / "train" / "shard-00001.h5").write_bytes(b"damaged")
+    with pytest.warns(RuntimeWarning, match="damaged"):
+        cnpgen.make_dataset(pipeline, broken, n=ROWS, shard_size=100, workers=1)
+    assert shard_bytes(broken) == shard_bytes(dataset)
+    parts = [tmp_path / "part0", tmp_path / "part1"]
+    for index, part in enumerate(parts):
+        cnpgen.make_dataset(pipeline, part, n=ROWS, shard_size=100, workers=1, part=(index, 2))
+    cnpgen.merge_datasets(parts, merged)
+    assert shard_bytes(merged) == shard_bytes(dataset)
+
+
+@pytest.mark.slow
+def test_a_deep_check_accepts_the_dataset_and_finds_a_moved_obstacle(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["validate", str(dataset), "--deep", "--regenerate", "2", "--workers", "1"]) == 0
+    forged = tmp_path / "forged"
+    shutil.copytree(dataset, forged)
+
+    def move(file: h5py.File) -> None:
+        file["obstacle_position"][0, 0] = file["start_xyz"][0]
+
+    edit(forged, "train/shard-00000.h5", move)
+    assert main(["validate", str(forged), "--workers", "1"]) == 0
+    assert main(["validate", str(forged), "--deep", "--workers", "1"]) == 1
+    assert "robot clearance" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("obstacle_kind", -1), "obstacle_kind of 1 scenes are invalid, first those of scene 0"),
+        (("obstacle_quaternion", 0.0), "obstacle_quaternion of 1 scenes"),
+        (("scene_ids", 3), "scene_ids are not the scene_id of the samples"),
+    ],
+)
+def test_invalid_scenes_are_refused(dataset: Path, tmp_path: Path, change: tuple[str, float], message: str) -> None:
+    damaged, (name, value) = tmp_path / "damaged", change
+    shutil.copytree(dataset, damaged)
+
+    def overwrite(file: h5py.File) -> None:
+        file[name][(0,) * min(file[name].ndim, 2)] = value
+
+    edit(damaged, "train/shard-00000.h5", overwrite)
+    with pytest.raises(DatasetError, match=message):
+        cnpgen.load_dataset(damaged).rows("train", [0], fields=["obstacle_poses"])
+    assert main(["validate", str(damaged), "--workers", "1"]) == 1
+
+
+def test_ends_are_clear_of_their_scene_by_coal(dataset: Path) -> None:
+    stored = open_dataset(dataset)
+    problem, _ = open_problem(as_record(stored.spec.problem))
+    columns, table = stored.read("train"), stored.read_scenes("train")
+    robot, index = load_robot(problem), table.rows_of(columns["scene_id"])
+    for row in range(0, len(index), 7):
+        obstacles = obstacles_of(table, int(index[row]))
+        world = World(robot, obstacles, None)
+        numbers = place_obstacles(obstacles)
+        for end in ("start", "goal"):
+            q = columns[f"{end}_q"][row].astype(float)
+            world.set_state(q, 0 * q, 0 * q, numbers)
+            assert min(world.shape_distances(0.1)) > ENDS_MARGIN_M
+            assert world.tip_position == pytest.approx(columns[f"{end}_xyz"][row], abs=1e-9)
+
+
+def test_the_loader_places_the_obstacles_of_the_problem(dataset: Path) -> None:
+    loaded, stored = cnpgen.load_dataset(dataset), open_dataset(dataset)
+    table, ids = stored.read_scenes("train"), stored.read("train", fields=["scene_id"])["scene_id"]
+    for row in (0, 101, -1):
+        scene = loaded.scenes("train", [row])
+        bodies = [body for body in scene.bodies() if body.position[2] > -50]
+        wanted = obstacles_of(table, int(table.rows_of(ids)[row]))
+        assert len(bodies) == len(wanted)
+        by_place = {tuple(np.round(body.position, 9)): body for body in bodies}
+        for body in solids_of(wanted, place_obstacles(wanted)):
+            same = by_place[tuple(np.round(body.position, 9))]
+            assert same.low == pytest.approx(body.low, abs=2e-3)  # prisms may be turned about their axes
+            assert same.high == pytest.approx(body.high, abs=2e-3)
+    with pytest.raises(DatasetError, match="no field 'obstacle_posse'"):
+        loaded.rows("train", [0], fields=["obstacle_posse"])
+
+
+def test_batches_contain_the_scene_without_normalization(dataset: Path) -> None:
+    loaded = cnpgen.load_dataset(dataset)
+    fields = ["start_q", "obstacle_poses", "obstacle_count", "obstacle_position", "sample_id"]
+    batch = next(iter(loaded.batches(32, fields=fields, seed=3)))
+    rows = loaded.rows("train", batch["sample_id"], fields=fields)
+    assert np.array_equal(batch["obstacle_poses"], rows["obstacle_poses"].astype(np.float32))
+    assert np.array_equal(batch["obstacle_count"], rows["obstacle_count"])
+    assert batch["obstacle_position"].shape == (32, 3 * 14)
+    assert not np.array_equal(batch["start_q"], rows["start_q"].astype(np.float32))  # normalized
+    assert "obstacle_poses" not in next(iter(loaded.batches(32)))
+
+
+def test_training_refuses_scenes_that_the_network_would_ignore(dataset: Path) -> None:
+    with pytest.raises(DatasetError, match="has scenes, which networks do not observe yet"):
+        open_training_data(dataset)
+
+
+@pytest.mark.slow
+def test_float32_datasets_are_valid_as_stored(pipeline: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "single"
+    cnpgen.make_dataset(pipeline, folder, n=60, dtype="float32", workers=1)
+    with h5py.File(folder / "train" / "shard-00000.h5") as file:
+        assert file["obstacle_size"].dtype == np.float32
+    assert main(["validate", str(folder), "--deep", "--workers", "1"]) == 0
+
+
+def test_fresh_boundary_problems_have_scenes(pipeline: Path) -> None:
+    plans = draw_boundary_problems(pipeline, 12, seed=5)
+    assert plans.columns["obstacle_poses"].shape == (12, len(plans.scene.poses[0]))
+    assert (plans.scene.poses != plans.scene.poses[0]).any()
+
+
+def changed(pipeline: Path, folder: Path, old: str, new: str) -> Path:
+    shutil.copytree(pipeline.parent, folder, dirs_exist_ok=True)
+    path = folder / "scenes.toml"
+    assert old in PIPELINE
+    path.write_text(PIPELINE.replace(old, new))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('use = "tabletop"', 'use = "tabletops"', "tabletop"),
+        ("tables = [1, 1]", 'tables = [1, 1]\nheights = "3 cm"', "height"),
+        ("sphere = 4", "cone = 4", "does not match"),
+        ("straight = 0.5", "straight = 0.5\nneutral = 0.9", "add up to 1"),
+    ],
+)
+def test_mistakes_name_file_and_key(
+    pipeline: Path, tmp_path: Path, capsys: Any, old: str, new: str, message: str
+) -> None:
+    path = changed(pipeline, tmp_path / "changed", old, new)
+    assert main(["make-dataset", str(path), "--n", "10", "--out", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert "scenes.toml" in error
+
+
+@pytest.mark.slow
+def test_certified_samples_have_valid_plans_in_their_scenes(pipeline: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "certified"
+    cnpgen.make_dataset(pipeline, folder, n=12, certify=True, workers=1)
+    assert main(["validate", str(folder), "--deep", "--workers", "1"]) == 0
+    plans = cnpgen.load_boundary_problems(folder)
+    assert cnpgen.evaluate_plans(plans).valid.all()
