@@ -18,7 +18,7 @@ from cnpgen.pipelines.stages.stage import TaskBatch
 from cnpgen.planner.inference_pipeline import loaded_problem
 from cnpgen.planner.model import Model
 from cnpgen.planner.plan_requests import drawing_stages
-from cnpgen.plans.format import BOUNDARY, CONDITIONS
+from cnpgen.plans.format import CONDITIONS
 from cnpgen.robots.plausible_values import check_plausible
 from cnpgen.schema.arguments import numbers
 from cnpgen.trajectory.boundary import Boundary
@@ -108,8 +108,8 @@ def _check_distance(completion: Completion, contact_distance: float, positions: 
 
 def boundary_of_tasks(tasks: TaskBatch, fixed_at_goal: int) -> Boundary:
     """Return the boundary conditions of the tasks that have an answer, with goal accelerations if they are fixed."""
-    names = BOUNDARY if fixed_at_goal == 2 else CONDITIONS
-    return Boundary(*(np.ascontiguousarray(tasks[name].T) for name in names))
+    names = [name for name in CONDITIONS if name in tasks.columns and (name != "goal_ddq" or fixed_at_goal == 3)]
+    return Boundary(**{name: np.ascontiguousarray(tasks[name].T) for name in names})
 
 
 def lanes(name: str, values: ArrayLike, widths: set[int]) -> Array:

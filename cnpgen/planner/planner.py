@@ -95,6 +95,7 @@ class Planner:
         start_ddq: ArrayLike | None = None,
         goal_dq: ArrayLike | None = None,
         goal_ddq: ArrayLike | None = None,
+        parameters: ArrayLike | None = None,
     ) -> Plans:
         """Plan motions; boundary conditions hold to rounding for any network output.
 
@@ -110,6 +111,7 @@ class Planner:
             goal_dq: Goal velocities [rad/s], shape (n,) or (N, n); zero by default.
             goal_ddq: Goal accelerations [rad/s^2], shape (n,) or (N, n), for models trained on rows with goal
                 accelerations; zero by default. Other models leave them free.
+            parameters: Parameters of the problem, shape (width,) or (N, width), if it has any.
 
         Returns:
             One plan or N, not checked yet (status UNKNOWN).
@@ -118,7 +120,8 @@ class Planner:
             UsageError: A shape is wrong, a value is not finite, a condition is not zero that was zero in all training
                 rows, or goal accelerations are given that the model leaves free.
         """
-        return self.plan_batch(boundary_of(self.robot.n, start_q, start_dq, start_ddq, goal_q, goal_dq, goal_ddq))
+        states = start_q, start_dq, start_ddq, goal_q, goal_dq, goal_ddq
+        return self.plan_batch(boundary_of(self.robot.n, *states, parameters))
 
     @checked_arguments
     @one_thread()
@@ -151,6 +154,7 @@ class Planner:
         goal_q: ArrayLike,
         goal_dq: ArrayLike | None = None,
         goal_ddq: ArrayLike | None = None,
+        parameters: ArrayLike | None = None,
     ) -> Plans:
         """Replan from states on plans that are being executed: q, dq and ddq are continuous.
 
@@ -169,6 +173,7 @@ class Planner:
             goal_q: New goal positions [rad], shape (n,) or (N, n).
             goal_dq: New goal velocities [rad/s], shape (n,) or (N, n); zero by default.
             goal_ddq: New goal accelerations [rad/s^2], as for ``plan``.
+            parameters: Parameters of the problem, as for ``plan``; those of the plans by default.
 
         Raises:
             UsageError: The number of times differs from that of plans, a time is outside its plan, the plans are of
@@ -180,7 +185,9 @@ class Planner:
                 concerns="plans",
             )
         q, dq, ddq = plans.states_at(time)
-        new = self.plan(q, goal_q, start_dq=dq, start_ddq=ddq, goal_dq=goal_dq, goal_ddq=goal_ddq)
+        parameters = plans.boundary.parameters if parameters is None else parameters
+        states = q, dq, ddq, goal_q, goal_dq, goal_ddq
+        new = self.plan_batch(boundary_of(self.robot.n, *states, parameters))
         times = np.broadcast_to(numbers("time", time), (len(plans),))
         if len(plans) == 1:
             plans, times = plans[np.zeros(len(new), int)], np.repeat(times, len(new))

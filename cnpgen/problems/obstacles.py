@@ -18,8 +18,14 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 
-def scene_of(problem: Problem, start_xyz: Array, goal_xyz: Array, goal_velocity: Array | None = None) -> Scene:
-    """Place the obstacles of N samples and compute the values that a constraint depends on.
+def scene_of(
+    problem: Problem,
+    start_xyz: Array,
+    goal_xyz: Array,
+    goal_velocity: Array | None = None,
+    parameters: Array | None = None,
+) -> Scene:
+    """Place the obstacles of N samples, compute the values that a constraint depends on, and append the parameters.
 
     An obstacle with ``below`` ends at the bottom of the object (at the tip without an object) at that end.
 
@@ -28,6 +34,8 @@ def scene_of(problem: Problem, start_xyz: Array, goal_xyz: Array, goal_velocity:
         start_xyz: Tip positions at the start [m], shape (N, 3).
         goal_xyz: Tip positions at the goal [m], shape (N, 3).
         goal_velocity: Tip velocities at the goal [m/s], shape (N, 3), for problems with a ``scene_constraint``.
+
+        parameters: Parameters of the samples, shape (N, width), for problems with parameters; nominal by default.
 
     Raises:
         UsageError: The problem needs the velocities, and they are missing.
@@ -42,6 +50,11 @@ def scene_of(problem: Problem, start_xyz: Array, goal_xyz: Array, goal_velocity:
         if len(set(shapes)) > 1 or shapes[0][1:] != (3,):
             raise UsageError(f"positions and velocities must have one shape (N, 3), got {shapes}")
         poses = np.concatenate([poses, constraint.scene_values(np.asarray(goal_xyz), goal_velocity)], axis=1)
+    if problem.parameters:
+        if parameters is None:
+            mass = 0.0 if problem.payload is None else problem.payload.mass
+            parameters = np.tile(problem.parameters.nominal(mass), (len(poses), 1))
+        poses = np.concatenate([poses, parameters], axis=1)
     return Scene(tuple(problem.obstacle), poses)
 
 

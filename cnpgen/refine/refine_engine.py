@@ -91,7 +91,8 @@ def load_solver(problem: "Problem", robot: "Robot", kernels: KernelLibrary) -> S
     def solve(columns: Mapping[str, Array], initial_guess: Motion | None = None) -> tuple[Motion, NDArray[np.bool_]]:
         ends = columns["start_xyz"], columns["goal_xyz"]
         boundary = Boundary.from_batch(columns, None)
-        scene = scene_of(problem, *ends, goal_velocities(problem, robot, boundary.goal_q, boundary.goal_dq))
+        velocity = goal_velocities(problem, robot, boundary.goal_q, boundary.goal_dq)
+        scene = scene_of(problem, *ends, velocity, boundary.parameters)
         tasks = _tasks(boundary, scene, *ends)
         if initial_guess is not None:
             tasks = [

@@ -86,14 +86,14 @@ def prepare_rows(
             if name not in arrays:
                 arrays[name] = np.empty((len(boundary), *values.shape[1:]), dtype)
             arrays[name][part] = values
-    ends = Boundary(**{name: arrays.pop(name) for name in boundary.conditions()})
+    ends = Boundary(**{name: arrays.pop(name) for name in boundary.arrays()})
     row_features, scene = arrays.pop("features"), Scene(tuple(prepare.problem.obstacle), arrays.pop("poses"))
     return Rows(features=row_features, tasks=Tasks(ends, scene=scene, **arrays)), definition
 
 
 def _arrays(tasks: Tasks, features: Features, dtype: str) -> dict[str, Array]:
     """Return all arrays of a block of rows with one entry per task, by name."""
-    arrays = tasks.boundary.conditions()
+    arrays = tasks.boundary.arrays()
     parts = {name: values for name, values in vars(tasks).items() if isinstance(values, np.ndarray)}
     return arrays | parts | {"features": features.of(tasks, dtype), "poses": tasks.scene.poses}
 

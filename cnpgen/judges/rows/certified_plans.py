@@ -45,7 +45,7 @@ def check_plans(problem: Problem, robot: Robot, columns: Mapping[str, NDArray[An
     motion = Motion(path, columns["rate_control_points"], spec.degree)
     boundary = Boundary.from_batch(columns, None)
     velocity = goal_velocities(problem, robot, boundary.goal_q, boundary.goal_dq)
-    scene = scene_of(problem, columns["start_xyz"], columns["goal_xyz"], velocity)
+    scene = scene_of(problem, columns["start_xyz"], columns["goal_xyz"], velocity, boundary.parameters)
     verdicts = judge(problem, robot, motion, boundary, scene, columns["goal_xyz"])
     invalid = [(row, verdict.reason) for row, verdict in enumerate(verdicts) if not verdict.valid]
     problems = []

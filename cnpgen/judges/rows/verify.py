@@ -155,7 +155,7 @@ def _measure(problem: "Problem", world: World, columns: dict[str, Array], finite
     """Move the world to both ends of every finite row and record the measurements."""
     rows = len(columns["start_q"])
     velocity = goal_velocities(problem, world.robot, columns["goal_q"], columns["goal_dq"])
-    poses = scene_of(problem, columns["start_xyz"], columns["goal_xyz"], velocity).poses
+    poses = scene_of(problem, columns["start_xyz"], columns["goal_xyz"], velocity, columns.get("parameters")).poses
     position, velocity, jacobian = (np.full((rows, *shape), np.nan) for shape in ((2, 3), (3,), (3, world.robot.n)))
     measurements = _Measurements(position, velocity, jacobian, stored_diagnostics(problem, columns))
     for index, end in enumerate(ENDS):

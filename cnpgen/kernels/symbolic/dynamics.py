@@ -1,6 +1,6 @@
 """Dynamics of a chain as CasADi SX: recursive Newton-Euler in the frames of its joints."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from cnpgen.kernels.symbolic.kinematics import joint_rotation
 from cnpgen.kernels.symbolic.linalg import (
@@ -16,6 +16,7 @@ from cnpgen.kernels.symbolic.linalg import (
     times,
     transposed_times,
 )
+from cnpgen.robots.attached import PayloadBody
 from cnpgen.robots.chain import Chain, Joint
 
 
@@ -67,7 +68,9 @@ def body_motions(chain: Chain, q: Vec, dq: Vec, ddq: Vec) -> list[BodyMotion]:
     return motions
 
 
-def inverse_dynamics(chain: Chain, q: Vec, dq: Vec, ddq: Vec) -> Vec:
+def inverse_dynamics(
+    chain: Chain, q: Vec, dq: Vec, ddq: Vec, *, load: tuple[PayloadBody, Scalar] | None = None
+) -> Vec:
     """Return joint torques [N m] by recursive Newton-Euler in joint frames.
 
     Args:
@@ -75,9 +78,14 @@ def inverse_dynamics(chain: Chain, q: Vec, dq: Vec, ddq: Vec) -> Vec:
         q: Joint positions [rad], n scalars.
         dq: Joint velocities [rad/s].
         ddq: Joint accelerations [rad/s^2].
+        load: A body at the tip, and the factor by which the last body holds more of it.
     """
     motions = body_motions(chain, q, dq, ddq)
     wrenches = [_body_wrench(joint, motion) for joint, motion in zip(chain.joints, motions, strict=True)]
+    if load is not None:
+        body, factor = load
+        added = _body_wrench(_at_tip(chain, body), motions[-1])
+        wrenches[-1] = tuple(add(old, scale(new, factor)) for old, new in zip(wrenches[-1], added, strict=True))
     force: Vec = [0.0, 0.0, 0.0]
     torque: Vec = [0.0, 0.0, 0.0]
     torques: Vec = []
@@ -100,6 +108,13 @@ def _body_wrench(joint: Joint, motion: BodyMotion) -> tuple[Vec, Vec]:
     force = scale(acceleration_at(motion.acceleration, omega, motion.alpha, com), joint.mass)
     spin = add(times(inertia, motion.alpha), cross(omega, times(inertia, omega)))
     return force, add(spin, cross(com, force))
+
+
+def _at_tip(chain: Chain, body: PayloadBody) -> Joint:
+    """Return the last joint with a body at the tip in place of its own."""
+    turn = chain.tip_rotation
+    com, inertia = chain.tip_translation + turn @ body.com, turn @ body.inertia @ turn.T
+    return replace(chain.joints[-1], mass=body.mass, com=com, inertia=inertia)
 
 
 def _offset(joint: Joint, angle: Scalar) -> Vec:

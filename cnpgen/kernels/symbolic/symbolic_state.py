@@ -26,7 +26,8 @@ class SymbolicState:
         q: Joint positions [rad], n scalars.
         dq: Joint velocities [rad/s].
         ddq: Joint accelerations [rad/s^2].
-        obstacle_poses: Poses and sizes of the obstacles (``cnpgen.robots.solid``), then values for a constraint.
+        obstacle_poses: Poses and sizes of the obstacles (``cnpgen.robots.solid``), then values for a constraint, then
+            the parameters of the problem.
         obstacles: The obstacles.
         object_size: Edge lengths of the held object [m], or None.
         jerk: Joint jerks [rad/s^3], or None.
@@ -44,7 +45,18 @@ class SymbolicState:
     @property
     def scene_values(self) -> Vec:
         """Values of the motion for a constraint (``Constraint.scene_values``)."""
-        return self.obstacle_poses[pose_width(self.obstacles) :]
+        values: Vec = self._after_obstacles[0]
+        return values
+
+    @property
+    def parameters(self) -> dict[str, Scalar]:
+        """Parameters of the sample, by name."""
+        return self._after_obstacles[1]
+
+    @cached_property
+    def _after_obstacles(self) -> tuple[Vec, dict[str, Scalar]]:
+        values = self.obstacle_poses[pose_width(self.obstacles) :]
+        return self.robot.parameters.split(values, self.robot.nominal_parameters)
 
     @cached_property
     def kinematics(self) -> Kinematics:
@@ -54,7 +66,14 @@ class SymbolicState:
     @cached_property
     def torque(self) -> Vec:
         """Inverse dynamics [N m]."""
-        return inverse_dynamics(self.robot.chain, self.q, self.dq, self.ddq)
+        return self.inverse_dynamics(self.ddq)
+
+    def inverse_dynamics(self, ddq: Vec) -> Vec:
+        """Return the torque [N m] of the sample's load at other accelerations [rad/s^2]."""
+        chain, mass, payload = self.robot.chain, self.parameters.get("payload_mass"), self.robot.attached.payload
+        if mass is None or payload is None:
+            return inverse_dynamics(chain, self.q, self.dq, ddq)
+        return inverse_dynamics(chain, self.q, self.dq, ddq, load=(payload, (mass - payload.mass) / payload.mass))
 
     @cached_property
     def tip_velocity(self) -> Vec:

@@ -130,7 +130,8 @@ def candidate_poses(problem: Problem, candidates: CandidateBatch) -> Array:
     if angle is not None:
         with np.errstate(invalid="ignore"):  # columns that are not finite are rejected
             direction[:, :2] = np.concatenate([np.cos(angle), np.sin(angle)]).T
-    return scene_of(problem, candidates["start_xyz"].T, goal, direction).lanes
+    parameters = candidates["parameters"].T if problem.parameters else None
+    return scene_of(problem, candidates["start_xyz"].T, goal, direction, parameters).lanes
 
 
 def capsule_axes_distance(robot: "Robot", problem: Problem) -> Any:

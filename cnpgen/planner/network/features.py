@@ -17,7 +17,8 @@ Array = NDArray[Any]
 STATES = ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq")
 USUAL = (*STATES, "sin_cos", "tips", "expected_time")
 ARRIVAL = "goal_ddq"  # only if goal accelerations are given
-BLOCKS = (*USUAL, ARRIVAL)
+PARAMETERS = "parameters"  # only for problems with parameters
+BLOCKS = (*USUAL, ARRIVAL, PARAMETERS)
 FEATURE_SETS = ("full", "states", "paper")
 MIN_DEVIATION = 1e-7  # SI units; features with a smaller standard deviation are constant
 
@@ -52,7 +53,8 @@ def feature_blocks(boundary: Boundary, features: str = "full") -> tuple[str, ...
         features: One of ``FEATURE_SETS``: all blocks ("full"), or the boundary states ("states", "paper").
     """
     blocks = USUAL if features == "full" else STATES
-    return blocks if boundary.goal_ddq is None else (*blocks, ARRIVAL)
+    optional = {ARRIVAL: boundary.goal_ddq, PARAMETERS: boundary.parameters}
+    return (*blocks, *(name for name, values in optional.items() if values is not None))
 
 
 def published_features(blocks: tuple[str, ...], velocity_limit: Array, acceleration_limit: Array) -> Features:
@@ -89,7 +91,8 @@ def raw_features(tasks: Tasks, blocks: tuple[str, ...]) -> Array:
     * ``start_q`` to ``goal_dq``, and ``goal_ddq`` if it is given: the states [rad, rad/s, rad/s^2];
     * ``sin_cos``: sines and cosines of start and goal positions, whose products appear in the forward kinematics;
     * ``tips``: tip positions at start and goal [m];
-    * ``expected_time``: its logarithm.
+    * ``expected_time``: its logarithm;
+    * ``parameters``: the parameters of the problem, if it has any.
 
     Args:
         tasks: The tasks.
@@ -102,15 +105,16 @@ def raw_features(tasks: Tasks, blocks: tuple[str, ...]) -> Array:
     return np.concatenate(parts, axis=1, dtype=np.float64)
 
 
-def count_features(blocks: tuple[str, ...], joints: int) -> int:
-    """Return the number of features of some of ``BLOCKS``, for a number of planned joints."""
-    widths = {**dict.fromkeys((*STATES, ARRIVAL), joints), "sin_cos": 4 * joints, "tips": 6, "expected_time": 1}
+def count_features(blocks: tuple[str, ...], joints: int, parameters: int = 0) -> int:
+    """Return the number of features of some of ``BLOCKS``, for a number of planned joints and of parameters."""
+    widths = {**dict.fromkeys((*STATES, ARRIVAL), joints), "sin_cos": 4 * joints, "tips": 6}
+    widths |= {"expected_time": 1, PARAMETERS: parameters}
     return sum(widths[name] for name in blocks)
 
 
 def _block(tasks: Tasks, name: str) -> tuple[Array, ...]:
     boundary = tasks.boundary
-    if name in STATES or name == ARRIVAL:
+    if name in {*STATES, ARRIVAL, PARAMETERS}:
         return (getattr(boundary, name),)
     if name == "sin_cos":
         angles = np.concatenate([boundary.start_q, boundary.goal_q], axis=1)
