@@ -67,7 +67,8 @@ class Completion:
         """
         candidates = TaskBatch(max(values.shape[1] for values in columns.values()))
         for name, values in columns.items():
-            whole = values if len(values) != 2 or not name.endswith("_xyz") else self._on_table(values)
+            flat = len(values) == 2 and name.endswith("_xyz")
+            whole = self._on_table(values, columns.get("parameters")) if flat else values
             same = whole if whole.shape[1] == candidates.size else np.broadcast_to(whole, (len(whole), candidates.size))
             candidates[name] = np.ascontiguousarray(same)
         self._derive(candidates)
@@ -97,8 +98,14 @@ class Completion:
             else:
                 (candidates[name],) = self._tip(candidates[name.replace("xyz", "q")])
 
-    def _on_table(self, values: Array) -> Array:
-        return np.concatenate([values, np.full((1, values.shape[1]), self.height)])
+    def _on_table(self, values: Array, parameters: Array | None) -> Array:
+        """Return positions on the table of the tasks, shape (2, N), in the world frame, shape (3, N)."""
+        positions = np.concatenate([values, np.full((1, values.shape[1]), self.height)])
+        frame = self.context.problem.table_frame(None if parameters is None else parameters.T)
+        if frame is None:
+            return positions
+        count = max(positions.shape[1], parameters.shape[1])
+        return frame.to_world(np.repeat(positions.T, count // positions.shape[1], axis=0)).T
 
 
 def table_height(context: Context) -> float | None:

@@ -48,7 +48,8 @@ def load_completion(model: Model, backend: str | None) -> Completion:
     name = str(model.training.get("dataset", {}).get("name", model.problem.name))
     with loaded_problem(model.problem, backend) as loaded:
         context = Context(loaded.problem, loaded.robot, loaded.kernels)
-        return Completion(restore_pipeline(name, drawing_stages(stages), loaded.problem), context, HIT_COLUMNS)
+        given = (*HIT_COLUMNS, "parameters") if loaded.problem.parameters else HIT_COLUMNS
+        return Completion(restore_pipeline(name, drawing_stages(stages), loaded.problem), context, given)
 
 
 def hit_tasks(
@@ -60,6 +61,7 @@ def hit_tasks(
     contact_distance: float,
     share: ArrayLike,
     angle: Array | None = None,
+    parameters: ArrayLike | None = None,
 ) -> TaskBatch:
     """Complete the tasks of N hits; see ``plan_hits``.
 
@@ -71,6 +73,7 @@ def hit_tasks(
         contact_distance: Distance of the centres at the goal [m].
         share: Speed as a fraction of the highest possible one.
         angle: Direction of the hit, shape (N,) [rad]; by default towards the target.
+        parameters: Parameters of the problem, shape (width,) or (N, width); nominal by default.
     """
     n = completion.context.robot.n
     if len(state) != 3 or np.ndim(state[0]) == 0:
@@ -85,16 +88,30 @@ def hit_tasks(
     angles = np.arctan2(direction[1:], direction[:1]) if angle is None else angle[None]
     shares = lanes("speed_share", np.reshape(numbers("speed_share", share), (-1, 1)), {1})
     _check_distance(completion, contact_distance, {"puck": centre, "target": goal})
-    columns = [*parts, behind(centre, angles, contact_distance), angles, shares]
-    counts = {name: values.shape[1] for name, values in zip(HIT_COLUMNS, columns, strict=True)}
+    columns = dict(
+        zip(HIT_COLUMNS, [*parts, behind(centre, angles, contact_distance), angles, shares], strict=True)
+    )
+    columns |= _parameter_columns(completion.context, parameters)
+    counts = {name: values.shape[1] for name, values in columns.items()}
     largest = max(counts.values())
     for column, count in counts.items():
-        name = _ARGUMENT_OF[column]
+        name = _ARGUMENT_OF.get(column, column)
         if count == 0:
             raise UsageError("is empty, expected at least 1 hit", argument=name)
         if count not in {1, largest}:
             raise UsageError(f"has {count:,} hits, another argument has {largest:,}", argument=name)
-    return completion(dict(zip(HIT_COLUMNS, columns, strict=True)))
+    return completion(columns)
+
+
+def _parameter_columns(context: Context, parameters: ArrayLike | None) -> dict[str, Array]:
+    """Return the column of the parameters, shape (width, N), if the problem has any."""
+    ranges = context.problem.parameters
+    if not ranges:
+        if parameters is not None:
+            raise UsageError(f"must be None: {context.problem.name!r} has no parameters", argument="parameters")
+        return {}
+    values = context.robot.nominal_parameters if parameters is None else numbers("parameters", parameters)
+    return {"parameters": ranges.checked(values).T}
 
 
 def _check_distance(completion: Completion, contact_distance: float, positions: Mapping[str, Array]) -> None:

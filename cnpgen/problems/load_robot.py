@@ -64,20 +64,12 @@ def load_robot(problem: Problem) -> Robot:
         base=np.array(spec.base),
         chain=chain,
         parameters=problem.parameters,
-        table_origin=_table_origin(problem),
+        table_origin=problem.table_origin,
     )
     if mistakes := list(_mistakes(problem, robot)):
         raise RecipeError(mistakes)
     shape = _shape(problem, robot) if spec.geometry == "urdf" else None
     return replace(robot, shape=shape, held_shape=_held_shape(problem, robot))
-
-
-def _table_origin(problem: Problem) -> Array:
-    """Return the middle of the rectangle of the table [m], shape (3,); zero without a table."""
-    table = problem.first(Table)
-    if table is None:
-        return np.zeros(3)
-    return np.array([(table.x.low + table.x.high) / 2, (table.y.low + table.y.high) / 2, table.z])
 
 
 def _attached(problem: Problem) -> Attached:

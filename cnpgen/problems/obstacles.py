@@ -43,17 +43,22 @@ def scene_of(
     half = 0.0 if problem.object is None else problem.object.size[2] / 2
     bottoms = {"start": np.asarray(start_xyz)[..., 2] - half, "goal": np.asarray(goal_xyz)[..., 2] - half}
     poses, constraint = place_obstacles(problem.obstacle, bottoms), problem.scene_constraint
+    if not problem.parameters:
+        parameters = None
+    elif parameters is None:
+        mass = 0.0 if problem.payload is None else problem.payload.mass
+        parameters = np.tile(problem.parameters.nominal(mass), (len(poses), 1))
     if constraint is not None:
         if goal_velocity is None:
             raise UsageError(f"is missing: the problem {problem.name!r} needs it", argument="goal_velocity")
         shapes = [np.shape(xyz) for xyz in (start_xyz, goal_xyz, goal_velocity)]
         if len(set(shapes)) > 1 or shapes[0][1:] != (3,):
             raise UsageError(f"positions and velocities must have one shape (N, 3), got {shapes}")
-        poses = np.concatenate([poses, constraint.scene_values(np.asarray(goal_xyz), goal_velocity)], axis=1)
-    if problem.parameters:
-        if parameters is None:
-            mass = 0.0 if problem.payload is None else problem.payload.mass
-            parameters = np.tile(problem.parameters.nominal(mass), (len(poses), 1))
+        goal_xyz = np.asarray(goal_xyz)
+        if (frame := problem.table_frame(parameters)) is not None:
+            goal_xyz, goal_velocity = frame.to_table(goal_xyz), frame.along_table(goal_velocity)
+        poses = np.concatenate([poses, constraint.scene_values(goal_xyz, goal_velocity)], axis=1)
+    if parameters is not None:
         poses = np.concatenate([poses, parameters], axis=1)
     return Scene(tuple(problem.obstacle), poses)
 

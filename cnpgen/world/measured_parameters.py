@@ -49,10 +49,9 @@ class MeasuredParameters:
         if self._robot.parameters.tilts_table:
             self._set_table()
 
-    @property
-    def tilts_table(self) -> bool:
-        """Whether the table differs from sample to sample."""
-        return self._robot.parameters.tilts_table
+    def along_world(self, vector: Array) -> Array:
+        """Return vectors along the axes of the table along those of the world, shape (3,) or (3, K)."""
+        return np.asarray(self._turn @ vector)
 
     def on_table(self, position: Array) -> Array:
         """Return positions in the frame of the table, whose axes and origin are the world's if it is not moved.
@@ -60,12 +59,15 @@ class MeasuredParameters:
         Args:
             position: Positions in the world frame [m], shape (3,) or (3, K).
         """
-        origin = self._robot.table_origin.reshape(3, *[1] * (position.ndim - 1))
-        return np.asarray(self.along_table(position - self._origin.reshape(origin.shape)) + origin)
+        if not self._robot.parameters.tilts_table:
+            return position
+        shape = 3, *[1] * (position.ndim - 1)
+        pivot = self._robot.table_origin.reshape(shape)
+        return np.asarray(self._turn.T @ (position - self._origin.reshape(shape)) + pivot)
 
     def along_table(self, vector: Array) -> Array:
         """Return vectors along the axes of the table, shape (3,) or (3, K)."""
-        return np.asarray(self._turn.T @ vector)
+        return np.asarray(self._turn.T @ vector) if self._robot.parameters.tilts_table else vector
 
     def _hold_load(self) -> None:
         """Copy the model, and keep the last body without its load."""

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 from cnpgen.kernels.symbolic.dynamics import acceleration_at, body_motions, inverse_dynamics
 from cnpgen.kernels.symbolic.kinematics import Kinematics, bias_acceleration, forward_kinematics, tip_velocity
-from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, constants, cross, dot, scale, times
+from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, constants, cross, dot, scale, subtract, times
 from cnpgen.robots.solid import pose_width
+from cnpgen.robots.table_frame import table_axes
 
 if TYPE_CHECKING:
     from cnpgen.robots.obstacle import Obstacle
@@ -57,6 +58,30 @@ class SymbolicState:
     def _after_obstacles(self) -> tuple[Vec, dict[str, Scalar]]:
         values = self.obstacle_poses[pose_width(self.obstacles) :]
         return self.robot.parameters.split(values, self.robot.nominal_parameters)
+
+    def on_table(self, position: Vec) -> Vec:
+        """Return a position [m] in the frame of the table, which is the world's unless parameters move the table."""
+        axes = self._table_axes
+        if axes is None:
+            return position
+        pivot: Vec = constants(self.robot.table_origin)
+        relative = subtract(position, pivot)
+        relative[2] = relative[2] - self.parameters.get("table_height", 0.0)
+        return add([dot(axis, relative) for axis in axes], pivot)
+
+    def along_table(self, vector: Vec) -> Vec:
+        """Return a vector along the axes of the table."""
+        axes = self._table_axes
+        return vector if axes is None else [dot(axis, vector) for axis in axes]
+
+    @cached_property
+    def _table_axes(self) -> tuple[Vec, ...] | None:
+        import casadi as ca
+
+        if not self.robot.parameters.tilts_table:
+            return None
+        roll, pitch = (ca.SX(self.parameters.get(name, 0.0)) for name in ("table_roll", "table_pitch"))
+        return table_axes(ca.sin(roll), ca.cos(roll), ca.sin(pitch), ca.cos(pitch))
 
     @cached_property
     def kinematics(self) -> Kinematics:

@@ -131,6 +131,8 @@ def candidate_poses(problem: Problem, candidates: CandidateBatch) -> Array:
         with np.errstate(invalid="ignore"):  # columns that are not finite are rejected
             direction[:, :2] = np.concatenate([np.cos(angle), np.sin(angle)]).T
     parameters = candidates["parameters"].T if problem.parameters else None
+    if (frame := problem.table_frame(parameters)) is not None:
+        direction = frame.along_world(direction)
     return scene_of(problem, candidates["start_xyz"].T, goal, direction, parameters).lanes
 
 
