@@ -101,11 +101,12 @@ class Completion:
     def _on_table(self, values: Array, parameters: Array | None) -> Array:
         """Return positions on the table of the tasks, shape (2, N), in the world frame, shape (3, N)."""
         positions = np.concatenate([values, np.full((1, values.shape[1]), self.height)])
-        frame = self.context.problem.table_frame(None if parameters is None else parameters.T)
-        if frame is None:
+        if parameters is None or not self.context.problem.parameters.tilts_table:
             return positions
         count = max(positions.shape[1], parameters.shape[1])
-        return frame.to_world(np.repeat(positions.T, count // positions.shape[1], axis=0)).T
+        frame = self.context.problem.table_frame(np.broadcast_to(parameters.T, (count, len(parameters))))
+        assert frame is not None
+        return frame.to_world(np.broadcast_to(positions.T, (count, 3))).T
 
 
 def table_height(context: Context) -> float | None:

@@ -88,9 +88,7 @@ def hit_tasks(
     angles = np.arctan2(direction[1:], direction[:1]) if angle is None else angle[None]
     shares = lanes("speed_share", np.reshape(numbers("speed_share", share), (-1, 1)), {1})
     _check_distance(completion, contact_distance, {"puck": centre, "target": goal})
-    columns = dict(
-        zip(HIT_COLUMNS, [*parts, behind(centre, angles, contact_distance), angles, shares], strict=True)
-    )
+    columns = dict(zip(HIT_COLUMNS, [*parts, behind(centre, angles, contact_distance), angles, shares], strict=True))
     columns |= _parameter_columns(completion.context, parameters)
     counts = {name: values.shape[1] for name, values in columns.items()}
     largest = max(counts.values())

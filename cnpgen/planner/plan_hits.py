@@ -123,8 +123,9 @@ def plan_hits(
     contact = as_problem(planner.model.problem).first(PuckContact)
     distance, overlap = _contact_distance(contact, contact_distance), 0.0 if contact is None else contact.overlap
     if puck_velocity is None and meeting_time is None:
-        options = {"contact_distance": distance, "share": speed_share, "parameters": parameters}
-        tasks = hit_tasks(completion, state, puck, target, **options)
+        tasks = hit_tasks(
+            completion, state, puck, target, contact_distance=distance, share=speed_share, parameters=parameters
+        )
         columns = {name: tasks[name][0] for name in CONTEXT}
         boundary = boundary_of_tasks(tasks, planner.model.fixed_at_goal)
         plans = planner.plan_batch(boundary, sample_id=tasks.alive, columns=columns)

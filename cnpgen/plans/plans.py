@@ -327,12 +327,7 @@ def _mistakes(plans: Plans, rows: int | None = None) -> Iterator[str]:
     for name, values in plans.boundary.conditions().items():
         if values.shape != (rows, n):
             yield f"{name} must have shape {(rows, n)} (plans, joints), got {values.shape}"
-    parameters, width = plans.boundary.parameters, len(plans.problem.parameters)
-    if width and parameters is None:
-        names = ", ".join(plans.problem.parameters.names)
-        yield f"parameters are missing: plans of {plans.problem.name!r} have {names}"
-    elif parameters is not None and parameters.shape != (rows, width):
-        yield f"parameters must have shape {(rows, width)} (plans, parameters of the problem), got {parameters.shape}"
+    yield from _parameter_mistakes(plans, rows)
     for name in ("sample_id", "status"):
         if getattr(plans, name).shape != (rows,):
             yield f"{name} must have shape {(rows,)}, got {getattr(plans, name).shape}"
@@ -340,6 +335,15 @@ def _mistakes(plans: Plans, rows: int | None = None) -> Iterator[str]:
     for name in NOTES:
         if not isinstance(getattr(plans, name), str):
             yield f"{name} must be a text, got {getattr(plans, name)!r:.60}"
+
+
+def _parameter_mistakes(plans: Plans, rows: int) -> Iterator[str]:
+    parameters, width = plans.boundary.parameters, len(plans.problem.parameters)
+    if width and parameters is None:
+        names = ", ".join(plans.problem.parameters.names)
+        yield f"parameters are missing: plans of {plans.problem.name!r} have {names}"
+    elif parameters is not None and parameters.shape != (rows, width):
+        yield f"parameters must have shape {(rows, width)} (plans, parameters of the problem), got {parameters.shape}"
 
 
 def _rows(plans: Plans) -> int:

@@ -19,8 +19,8 @@ from cnpgen.errors import RecipeError, UsageError
 from cnpgen.problems.objectives import read_objective
 from cnpgen.problems.problem import FILES, Objective, Problem, resolved
 from cnpgen.problems.problem_file import load_problem_behind, restore_problem
-from cnpgen.robots.urdf import urdf_tree
 from cnpgen.robots.parameter_ranges import ParameterRanges
+from cnpgen.robots.urdf import urdf_tree
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import numbers
 from cnpgen.schema.keys import RecipeLocation

@@ -23,12 +23,24 @@ RANGE_ROUNDING = 1e-12  # of values at the ends of a range
 class ParameterRanges:
     """Ranges of the parameters that samples of a problem have, in the order of their columns."""
 
-    table_height: Range | None = field("height of the table above that of the constraint 'table'", unit="m", default=None, since_version=2)
+    table_height: Range | None = field(
+        "height of the table above that of the constraint 'table'", unit="m", default=None, since_version=2
+    )
     table_roll: Range | None = field(
-        "turn of the table about its x axis", unit="rad", default=None, since_version=2, low=-MAX_TILT_RAD, high=MAX_TILT_RAD
+        "turn of the table about its x axis",
+        unit="rad",
+        default=None,
+        since_version=2,
+        low=-MAX_TILT_RAD,
+        high=MAX_TILT_RAD,
     )
     table_pitch: Range | None = field(
-        "turn of the table about world y, after the roll", unit="rad", default=None, since_version=2, low=-MAX_TILT_RAD, high=MAX_TILT_RAD
+        "turn of the table about world y, after the roll",
+        unit="rad",
+        default=None,
+        since_version=2,
+        low=-MAX_TILT_RAD,
+        high=MAX_TILT_RAD,
     )
     velocity_factor: Range | None = field(
         "joint velocity limit, as a fraction of that of [limits]", default=None, since_version=2, low=1e-3, high=1.0
@@ -74,7 +86,7 @@ class ParameterRanges:
         values |= {"velocity_factor": 1.0, "acceleration_factor": 1.0, "payload_mass": payload_mass}
         return np.array([values[name] for name in self.names], np.float64)
 
-    def split(self, values: Sequence[Any], nominal: Array) -> tuple[Any, dict[str, Any]]:
+    def split(self, values: Sequence[Any] | Array, nominal: Array) -> tuple[Any, dict[str, Any]]:
         """Split the values of a scene after its obstacles: those for a constraint, and the parameters by name.
 
         Args:

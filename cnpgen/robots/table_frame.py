@@ -35,7 +35,7 @@ class TableFrame:
 
     def along_world(self, vectors: Array) -> Array:
         """Return vectors along the axes of the table along those of the world, shape (N, 3)."""
-        return np.einsum("nij,nj->ni", self.axes, vectors)
+        return np.asarray(np.einsum("nij,nj->ni", self.axes, vectors))
 
     def to_table(self, positions: Array) -> Array:
         """Return positions in the frame of the table [m], shape (N, 3)."""
@@ -45,7 +45,7 @@ class TableFrame:
 
     def along_table(self, vectors: Array) -> Array:
         """Return vectors along the axes of the table, shape (N, 3)."""
-        return np.einsum("nji,nj->ni", self.axes, vectors)
+        return np.asarray(np.einsum("nji,nj->ni", self.axes, vectors))
 
 
 def table_frame(ranges: ParameterRanges, pivot: Array, parameters: Array) -> TableFrame:

@@ -92,4 +92,4 @@ class MeasuredParameters:
 
         roll, pitch = (self.values.get(name, 0.0) for name in ("table_roll", "table_pitch"))
         self._turn = pin.rpy.rpyToMatrix(roll, pitch, 0.0)  # Ry(pitch) Rx(roll)
-        self._origin = self._robot.table_origin + [0.0, 0.0, self.values.get("table_height", 0.0)]
+        self._origin = self._robot.table_origin + np.array([0.0, 0.0, self.values.get("table_height", 0.0)])

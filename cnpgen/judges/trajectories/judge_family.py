@@ -12,6 +12,7 @@ from itertools import chain, product
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.errors import UsageError
 from cnpgen.judges.plans.bernstein import find_maximum
 from cnpgen.judges.plans.continuous_collision import check_continuous_collision, is_contact, pairs_of
 from cnpgen.judges.plans.evaluated_trajectory import EvaluatedTrajectory

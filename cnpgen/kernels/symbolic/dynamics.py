@@ -68,9 +68,7 @@ def body_motions(chain: Chain, q: Vec, dq: Vec, ddq: Vec) -> list[BodyMotion]:
     return motions
 
 
-def inverse_dynamics(
-    chain: Chain, q: Vec, dq: Vec, ddq: Vec, *, load: tuple[PayloadBody, Scalar] | None = None
-) -> Vec:
+def inverse_dynamics(chain: Chain, q: Vec, dq: Vec, ddq: Vec, *, load: tuple[PayloadBody, Scalar] | None = None) -> Vec:
     """Return joint torques [N m] by recursive Newton-Euler in joint frames.
 
     Args:
@@ -85,9 +83,9 @@ def inverse_dynamics(
     if load is not None:
         body, factor = load
         added = _body_wrench(_at_tip(chain, body), motions[-1])
-        wrenches[-1] = tuple(add(old, scale(new, factor)) for old, new in zip(wrenches[-1], added, strict=True))
-    force: Vec = [0.0, 0.0, 0.0]
-    torque: Vec = [0.0, 0.0, 0.0]
+        (force, torque), (more_force, more_torque) = wrenches[-1], added
+        wrenches[-1] = add(force, scale(more_force, factor)), add(torque, scale(more_torque, factor))
+    force, torque = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
     torques: Vec = []
     for joint, motion, wrench in zip(chain.joints[::-1], motions[::-1], wrenches[::-1], strict=True):
         force, torque = add(force, wrench[0]), add(torque, wrench[1])

@@ -20,7 +20,9 @@ def in_world(context: Context, candidates: CandidateBatch, positions: Array) -> 
     return positions if frame is None else np.ascontiguousarray(frame.to_world(positions.T).T)
 
 
-def in_world_box(context: Context, low: Sequence[float], high: Sequence[float]) -> tuple[Sequence[float], Sequence[float]]:
+def in_world_box(
+    context: Context, low: Sequence[float], high: Sequence[float]
+) -> tuple[Sequence[float], Sequence[float]]:
     """Return the corners of a box that contains a box on the tables of all candidates, in the world frame [m]."""
     ranges = context.problem.parameters
     if not ranges.tilts_table:

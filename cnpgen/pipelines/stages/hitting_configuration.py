@@ -14,6 +14,7 @@ from cnpgen.errors import RecipeError
 from cnpgen.kernels.symbolic.linalg import Scalar, Vec, symbols
 from cnpgen.kernels.tape import Loop
 from cnpgen.pipelines.context import Context
+from cnpgen.pipelines.stages.candidate_table import hit_direction
 from cnpgen.pipelines.stages.hitting_limits import held_step, within_limits
 from cnpgen.pipelines.stages.hitting_newton import (
     MAX_NEWTON_STEPS,
@@ -22,7 +23,6 @@ from cnpgen.pipelines.stages.hitting_newton import (
     newton_step,
     objective,
 )
-from cnpgen.pipelines.stages.candidate_table import hit_direction
 from cnpgen.pipelines.stages.ik import IK_TOLERANCE, MAX_IK_STEPS, ik_step
 from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Stage, StageFunction
 from cnpgen.schema.keys import field

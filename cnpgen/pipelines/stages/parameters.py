@@ -27,9 +27,7 @@ class DrawParameters(Stage):
             raise RecipeError([f"needs [parameters], which the problem {context.problem.path} does not have"])
         low, high = (tuple(getattr(span, end) for span in ranges.ranges) for end in ("low", "high"))
         text = "parameters of the problem"
-        return (
-            Field("parameters", ranges.units, text, len(ranges), ranges.names, valid_min=low, valid_max=high),
-        )
+        return (Field("parameters", ranges.units, text, len(ranges), ranges.names, valid_min=low, valid_max=high),)
 
     def prepare(self, context: Context) -> StageFunction:
         """Return the stage function."""
