@@ -13,6 +13,7 @@ from cnpgen.pipelines.stages.stage import Array, TaskBatch
 from cnpgen.pipelines.steps import PipelineStep, prepare_steps, steps_of, stored_fields, written_columns
 from cnpgen.problems.constraints.constraint import End
 from cnpgen.problems.constraints.table import Table
+from cnpgen.problems.obstacles import table_frame_of
 from cnpgen.store.field import Field
 
 _EXCLUSIVE_COLUMNS = (("start_q", "start_xyz"), ("goal_q", "goal_xyz"))  # joint positions or a tip position
@@ -104,7 +105,7 @@ class Completion:
         if parameters is None or not self.context.problem.parameters.tilts_table:
             return positions
         count = max(positions.shape[1], parameters.shape[1])
-        frame = self.context.problem.table_frame(np.broadcast_to(parameters.T, (count, len(parameters))))
+        frame = table_frame_of(self.context.problem, np.broadcast_to(parameters.T, (count, len(parameters))))
         assert frame is not None
         return frame.to_world(np.broadcast_to(positions.T, (count, 3))).T
 

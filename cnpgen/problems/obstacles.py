@@ -11,6 +11,7 @@ from cnpgen.errors import UsageError
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.scene import Scene
 from cnpgen.robots.solid import place_obstacles
+from cnpgen.robots.table_frame import TableFrame, table_frame
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
@@ -55,12 +56,19 @@ def scene_of(
         if len(set(shapes)) > 1 or shapes[0][1:] != (3,):
             raise UsageError(f"positions and velocities must have one shape (N, 3), got {shapes}")
         goal_xyz = np.asarray(goal_xyz)
-        if (frame := problem.table_frame(parameters)) is not None:
+        if (frame := table_frame_of(problem, parameters)) is not None:
             goal_xyz, goal_velocity = frame.to_table(goal_xyz), frame.along_table(goal_velocity)
         poses = np.concatenate([poses, constraint.scene_values(goal_xyz, goal_velocity)], axis=1)
     if parameters is not None:
         poses = np.concatenate([poses, parameters], axis=1)
     return Scene(tuple(problem.obstacle), poses)
+
+
+def table_frame_of(problem: Problem, parameters: Array | None) -> TableFrame | None:
+    """Return the frame of the table of N samples, with parameters of shape (N, width); None if none move it."""
+    if not problem.parameters.tilts_table or parameters is None:
+        return None
+    return table_frame(problem.parameters, problem.table_origin, parameters)
 
 
 def goal_velocities(problem: Problem, robot: Robot, goal_q: Array, goal_dq: Array) -> Array | None:

@@ -25,7 +25,6 @@ from cnpgen.robots.shape.inline import with_inline_meshes
 from cnpgen.robots.shape.mesh_files import find_urdf
 from cnpgen.robots.shape.srdf import with_disabled_pairs, with_ignored_pairs
 from cnpgen.robots.solid import pose_width
-from cnpgen.robots.table_frame import TableFrame, table_frame
 from cnpgen.robots.urdf import read_urdf
 from cnpgen.schema import registry
 from cnpgen.schema.argument_types import checked_arguments
@@ -137,17 +136,11 @@ class Problem:
 
     @property
     def table_origin(self) -> NDArray[np.float64]:
-        """Middle of the rectangle of the table, about which it turns [m], shape (3,); zero without a table."""
+        """Center of the rectangle of the table, about which it turns [m], shape (3,); zero without a table."""
         table = self.first(Table)
         if table is None:
             return np.zeros(3)
         return np.array([(table.x.low + table.x.high) / 2, (table.y.low + table.y.high) / 2, table.z])
-
-    def table_frame(self, parameters: NDArray[np.float64] | None) -> TableFrame | None:
-        """Return the frame of the table of N samples, with parameters of shape (N, width); None if none move it."""
-        if not self.parameters.tilts_table or parameters is None:
-            return None
-        return table_frame(self.parameters, self.table_origin, parameters)
 
     @property
     def scene_constraint(self) -> Constraint | None:

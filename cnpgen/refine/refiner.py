@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from cnpgen.kernels.collision.collision_checker import load_collision_library
 from cnpgen.kernels.library import KernelLibrary, problem_kernels
+from cnpgen.problems.obstacles import table_frame_of
 from cnpgen.problems.problem import Problem
 from cnpgen.refine import initial_guesses
 from cnpgen.refine.fine_check import FineCheck
@@ -251,7 +252,7 @@ class Refiner:
         """Yield the variables of motions along the initial tip paths of the problem's constraint."""
         constraint = self.problem.scene_constraint
         values, parameters = self._values_of(task)
-        frame = self.problem.table_frame(parameters)
+        frame = table_frame_of(self.problem, parameters)
         start = task.start_xyz if frame is None else frame.to_table(task.start_xyz[None])[0]
         for polyline in [] if constraint is None else constraint.initial_tip_paths(values, start):
             path = polyline if frame is None else np.array([frame.to_world(point[None])[0] for point in polyline])

@@ -111,8 +111,8 @@ class ParameterRanges:
             )
         rows = values.reshape(-1, len(self))
         for column, (name, span) in enumerate(zip(self.names, self.ranges, strict=True)):
-            slack = RANGE_ROUNDING * max(abs(span.low), abs(span.high))
-            outside = ~((rows[:, column] >= span.low - slack) & (rows[:, column] <= span.high + slack))
+            rounding = RANGE_ROUNDING * max(abs(span.low), abs(span.high))
+            outside = ~((rows[:, column] >= span.low - rounding) & (rows[:, column] <= span.high + rounding))
             if outside.any():
                 row = int(outside.argmax())
                 raise UsageError(

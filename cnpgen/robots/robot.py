@@ -50,7 +50,7 @@ class Robot:
         shape: Collision geometry; None for the paper's, a line through the joint origins.
         held_shape: Link geometry and the held object, for collisions between the two; None if these are not checked.
         parameters: Parameters that differ from sample to sample.
-        table_origin: Point about which the table turns, the middle of its rectangle [m], shape (3,).
+        table_origin: Point about which the table turns, the center of its rectangle [m], shape (3,).
     """
 
     urdf: Path

@@ -1,4 +1,4 @@
-"""Frame of the table of samples, which is raised and turned about the middle of the table's rectangle."""
+"""Frame of the table of samples, which is raised and turned about the center of the table's rectangle."""
 
 from __future__ import annotations
 

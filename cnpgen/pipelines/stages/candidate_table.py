@@ -6,12 +6,13 @@ import numpy as np
 
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.stage import Array, CandidateBatch
+from cnpgen.problems.obstacles import table_frame_of
 from cnpgen.robots.table_frame import TableFrame, moved_box
 
 
 def candidate_table(context: Context, candidates: CandidateBatch) -> TableFrame | None:
     """Return the frame of the table of every candidate; None if no parameters move the table."""
-    return context.problem.table_frame(candidates["parameters"].T if context.problem.parameters else None)
+    return table_frame_of(context.problem, candidates["parameters"].T if context.problem.parameters else None)
 
 
 def in_world(context: Context, candidates: CandidateBatch, positions: Array) -> Array:

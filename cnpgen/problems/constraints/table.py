@@ -14,7 +14,7 @@ class Table(TipManifold):
     """Constraint: the tip stays in a rectangle at the table's height, with ``dz/dt = d2z/dt2 = 0`` at the ends.
 
     It equals a ``plane`` normal to z with a rectangle along x and y. Parameters of the problem may raise the table and
-    turn it about the middle of its rectangle; then all coordinates are those of the table.
+    turn it about the center of its rectangle; then all coordinates are those of the table.
     """
 
     reason = "off the table"
