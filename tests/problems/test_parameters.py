@@ -123,7 +123,9 @@ def test_gradients_agree_with_finite_differences_at_other_values(name: str) -> N
 
     both = [loss(path, rate, weights=weights, obstacle_poses=poses) for weights in (loss.weights0, 0 * loss.weights0)]
     gradients = [(each.path_gradient * by_path).sum((1, 2)) + (each.rate_gradient * by_rate).sum(1) for each in both]
-    np.testing.assert_allclose(gradients[0] - gradients[1], (violation(step) - violation(-step)) / (2 * step), rtol=1e-6)
+    np.testing.assert_allclose(
+        gradients[0] - gradients[1], (violation(step) - violation(-step)) / (2 * step), rtol=1e-6
+    )
     other = poses.copy()
     other[:, -len(loss.problem.parameters) :] = boundary.parameters[::-1]
     assert not np.allclose(loss(path, rate, weights=loss.weights0, obstacle_poses=other).total, both[0].total)
