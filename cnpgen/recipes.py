@@ -7,6 +7,7 @@ from cnpgen.pipelines.pipeline_file import load_pipeline
 from cnpgen.problems.problem import Objective
 from cnpgen.problems.problem_record import ProblemRecord
 from cnpgen.robots.obstacle import Obstacle
+from cnpgen.robots.parameter_ranges import ParameterRanges
 from cnpgen.robots.robot_spec import HeldObject, LimitSpec, Payload, RobotSpec
 from cnpgen.schema.catalogue import list_recipes
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
@@ -17,6 +18,7 @@ __all__ = [
     "LimitSpec",
     "Objective",
     "Obstacle",
+    "ParameterRanges",
     "Payload",
     "Pipeline",
     "ProblemRecord",

@@ -80,6 +80,7 @@ def describe_problem(problem: Problem) -> str:
     facts = [("robot", f"{spec.urdf}, {len(spec.joints)} planned joints, tip {spec.tip!r}")]
     facts += [("object", numbers(problem.object))] if problem.object else []
     facts += [("payload", numbers(problem.payload))] if problem.payload else []
+    facts += [("parameter", text) for text in problem.parameters.describe()]
     facts += [("obstacle", f"{each.name}: {_obstacle(each)}") for each in problem.obstacle]
     facts += [("motion", numbers(problem.trajectory))]
     objective = numbers(problem.objective)

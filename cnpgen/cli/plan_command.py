@@ -190,6 +190,5 @@ def _draws(arguments: argparse.Namespace, model: "Model") -> "Requests":
     stages = plain(resolved(recipe.pipeline))["stage"]
     check_stages(name, record_problem(recipe.pipeline.problem), stages, model, other=arguments.other_rows)
     problems = draw_boundary_problems(recipe, arguments.n, seed=arguments.seed)
-    conditions = {name: values for name, values in vars(problems.boundary).items() if values is not None}
     columns = {name: problems.columns[name] for name in CONTEXT if name in problems.columns}
-    return Requests(checked_boundary(name, conditions, model), problems.sample_id, columns)
+    return Requests(checked_boundary(name, problems.boundary.arrays(), model), problems.sample_id, columns)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
 from cnpgen.pipelines.context import Context
-from cnpgen.plans.format import BOUNDARY, CONDITIONS
+from cnpgen.plans.format import CONDITIONS
 from cnpgen.problems.problem_record import record_problem
 from cnpgen.trajectory.boundary import Boundary
 
@@ -65,5 +65,5 @@ def planner_boundary(columns: Mapping[str, Array], planner: "Planner") -> Bounda
 
     Goal accelerations are omitted if the planner leaves them free.
     """
-    names = BOUNDARY if planner.model.fixed_at_goal == 2 else CONDITIONS
+    names = [name for name in CONDITIONS if name != "goal_ddq" or planner.model.fixed_at_goal == 3]
     return Boundary(**{name: columns[name] for name in names if name in columns})

@@ -137,12 +137,12 @@ def boundary_unmet(
     miss = subtract(p, state.kinematics.tip)
     rows.append(ca.logic_not(ca.sqrt(dot(miss, miss)) <= BOUNDARY_TOLERANCES[dtype]["position"]))
     hit = [ca.SX.sym("angle"), ca.SX.sym("speed")] if hitting else []
-    rows += [_direction_unmet(state.tip_velocity, *hit, dtype=dtype)] if hit else []
+    rows += [_direction_unmet(state.along_table(state.tip_velocity), *hit, dtype=dtype)] if hit else []
     return ca.Function(f"boundary_{end}", [q_sx, dq_sx, ddq_sx, poses_sx, p_sx, *hit], [ca.vertcat(*rows)])
 
 
 def _direction_unmet(velocity: Vec, angle: Scalar, speed: Scalar, *, dtype: str) -> Scalar:
-    """Build a flag that is 1 unless the tip velocity is horizontal, along the angle, at the speed."""
+    """Build a flag that is 1 unless the tip velocity on the table is along the angle, at the speed."""
     import casadi as ca
 
     cosine, sine = ca.cos(angle), ca.sin(angle)

@@ -13,6 +13,7 @@ from cnpgen.pipelines.stages.stage import Array, TaskBatch
 from cnpgen.pipelines.steps import PipelineStep, prepare_steps, steps_of, stored_fields, written_columns
 from cnpgen.problems.constraints.constraint import End
 from cnpgen.problems.constraints.table import Table
+from cnpgen.problems.obstacles import table_frame_of
 from cnpgen.store.field import Field
 
 _EXCLUSIVE_COLUMNS = (("start_q", "start_xyz"), ("goal_q", "goal_xyz"))  # joint positions or a tip position
@@ -67,7 +68,8 @@ class Completion:
         """
         candidates = TaskBatch(max(values.shape[1] for values in columns.values()))
         for name, values in columns.items():
-            whole = values if len(values) != 2 or not name.endswith("_xyz") else self._on_table(values)
+            flat = len(values) == 2 and name.endswith("_xyz")
+            whole = self._on_table(values, columns.get("parameters")) if flat else values
             same = whole if whole.shape[1] == candidates.size else np.broadcast_to(whole, (len(whole), candidates.size))
             candidates[name] = np.ascontiguousarray(same)
         self._derive(candidates)
@@ -97,8 +99,15 @@ class Completion:
             else:
                 (candidates[name],) = self._tip(candidates[name.replace("xyz", "q")])
 
-    def _on_table(self, values: Array) -> Array:
-        return np.concatenate([values, np.full((1, values.shape[1]), self.height)])
+    def _on_table(self, values: Array, parameters: Array | None) -> Array:
+        """Return positions on the table of the tasks, shape (2, N), in the world frame, shape (3, N)."""
+        positions = np.concatenate([values, np.full((1, values.shape[1]), self.height)])
+        if parameters is None or not self.context.problem.parameters.tilts_table:
+            return positions
+        count = max(positions.shape[1], parameters.shape[1])
+        frame = table_frame_of(self.context.problem, np.broadcast_to(parameters.T, (count, len(parameters))))
+        assert frame is not None
+        return frame.to_world(np.broadcast_to(positions.T, (count, 3))).T
 
 
 def table_height(context: Context) -> float | None:

@@ -17,7 +17,7 @@ REQUIRED_COLUMNS = ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq", "st
 # Stored order of the fields of the shipped stages; other fields follow in the order of their stages.
 FIELD_ORDER = (
     "start_q", "start_dq", "start_ddq", "goal_q", "goal_dq", "goal_ddq", "start_xyz", "goal_xyz",
-    "hit_angle", "hit_speed", "hit_speed_max",
+    "parameters", "hit_angle", "hit_speed", "hit_speed_max",
 )  # fmt: skip
 
 # Attributes that every stage must declare equally for a field; a later stage may change the role and the limits.

@@ -141,9 +141,10 @@ class BoundaryLayer:
             )
         if boundary.fixed_at_goal < self._fixed_at_goal:
             raise UsageError('goal_ddq is missing: goal_acceleration is "given"', concerns="boundary")
-        arrays = {name: numbers(name, values, differentiable=True) for name, values in boundary.conditions().items()}
-        shape = (len(np.atleast_1d(arrays["start_q"])), len(self.problem.robot.joints))
+        arrays = {name: numbers(name, values, differentiable=True) for name, values in boundary.arrays().items()}
+        count, joints = len(np.atleast_1d(arrays["start_q"])), len(self.problem.robot.joints)
         for name, array in arrays.items():
+            shape = count, len(self.problem.parameters) if name == "parameters" else joints
             if array.shape != shape:
                 raise UsageError(f"must have shape (N, {shape[1]}), N = {shape[0]}, got {array.shape}", argument=name)
         checked = Boundary(**arrays)

@@ -18,7 +18,7 @@ from cnpgen.pipelines.stages.stage import TaskBatch
 from cnpgen.planner.inference_pipeline import loaded_problem
 from cnpgen.planner.model import Model
 from cnpgen.planner.plan_requests import drawing_stages
-from cnpgen.plans.format import BOUNDARY, CONDITIONS
+from cnpgen.plans.format import CONDITIONS
 from cnpgen.plans.plausible import UNITS, is_usual
 from cnpgen.robots.plausible_values import check_plausible
 from cnpgen.robots.robot import Robot
@@ -50,7 +50,8 @@ def load_completion(model: Model, backend: str | None) -> Completion:
     name = str(model.training.get("dataset", {}).get("name", model.problem.name))
     with loaded_problem(model.problem, backend) as loaded:
         context = Context(loaded.problem, loaded.robot, loaded.kernels)
-        return Completion(restore_pipeline(name, drawing_stages(stages), loaded.problem), context, HIT_COLUMNS)
+        given = (*HIT_COLUMNS, "parameters") if loaded.problem.parameters else HIT_COLUMNS
+        return Completion(restore_pipeline(name, drawing_stages(stages), loaded.problem), context, given)
 
 
 def hit_tasks(
@@ -62,6 +63,7 @@ def hit_tasks(
     contact_distance: float,
     share: ArrayLike,
     angle: Array | None = None,
+    parameters: ArrayLike | None = None,
 ) -> TaskBatch:
     """Complete the tasks of N hits; see ``plan_hits``.
 
@@ -73,6 +75,7 @@ def hit_tasks(
         contact_distance: Distance of the centres at the goal [m].
         share: Speed as a fraction of the highest possible one.
         angle: Direction of the hit, shape (N,) [rad]; by default towards the target.
+        parameters: Parameters of the problem, shape (width,) or (N, width); nominal by default.
     """
     n = completion.context.robot.n
     if len(state) != 3 or np.ndim(state[0]) == 0:
@@ -88,16 +91,28 @@ def hit_tasks(
     angles = np.arctan2(direction[1:], direction[:1]) if angle is None else angle[None]
     shares = lanes("speed_share", np.reshape(numbers("speed_share", share), (-1, 1)), {1})
     _check_distance(completion, contact_distance, {"puck": centre, "target": goal})
-    columns = [*parts, behind(centre, angles, contact_distance), angles, shares]
-    counts = {name: values.shape[1] for name, values in zip(HIT_COLUMNS, columns, strict=True)}
+    columns = dict(zip(HIT_COLUMNS, [*parts, behind(centre, angles, contact_distance), angles, shares], strict=True))
+    columns |= _parameter_columns(completion.context, parameters)
+    counts = {name: values.shape[1] for name, values in columns.items()}
     largest = max(counts.values())
     for column, count in counts.items():
-        name = _ARGUMENT_OF[column]
+        name = _ARGUMENT_OF.get(column, column)
         if count == 0:
             raise UsageError("is empty, expected at least 1 hit", argument=name)
         if count not in {1, largest}:
             raise UsageError(f"has {count:,} hits, another argument has {largest:,}", argument=name)
-    return completion(dict(zip(HIT_COLUMNS, columns, strict=True)))
+    return completion(columns)
+
+
+def _parameter_columns(context: Context, parameters: ArrayLike | None) -> dict[str, Array]:
+    """Return the column of the parameters, shape (width, N), if the problem has any."""
+    ranges = context.problem.parameters
+    if not ranges:
+        if parameters is not None:
+            raise UsageError(f"must be None: {context.problem.name!r} has no parameters", argument="parameters")
+        return {}
+    values = context.robot.nominal_parameters if parameters is None else numbers("parameters", parameters)
+    return {"parameters": ranges.checked(values).T}
 
 
 def _check_state(robot: Robot, parts: Sequence[Array]) -> None:
@@ -122,8 +137,8 @@ def _check_distance(completion: Completion, contact_distance: float, positions: 
 
 def boundary_of_tasks(tasks: TaskBatch, fixed_at_goal: int) -> Boundary:
     """Return the boundary conditions of the tasks that have an answer, with goal accelerations if they are fixed."""
-    names = BOUNDARY if fixed_at_goal == 2 else CONDITIONS
-    return Boundary(*(np.ascontiguousarray(tasks[name].T) for name in names))
+    names = [name for name in CONDITIONS if name in tasks.columns and (name != "goal_ddq" or fixed_at_goal == 3)]
+    return Boundary(**{name: np.ascontiguousarray(tasks[name].T) for name in names})
 
 
 def lanes(name: str, values: ArrayLike, widths: set[int]) -> Array:

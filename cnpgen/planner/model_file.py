@@ -215,7 +215,7 @@ def _check_sizes(problem: ProblemRecord, architecture: Architecture, features: F
     if unknown:
         raise ValueError(f"unknown features {', '.join(sorted(unknown))}")
     joints, spec = len(problem.joint_names), problem.trajectory
-    inputs, rates = count_features(features.blocks, joints), spec.rate_control_points
+    inputs, rates = count_features(features.blocks, joints, len(problem.parameters)), spec.rate_control_points
     interior = [(spec.path_control_points - 3 - fixed) * joints for fixed in (2, 3)]
     widths = (architecture.inputs, architecture.path_outputs, architecture.rate_outputs)
     if widths not in [(inputs, outputs, rates) for outputs in interior]:

@@ -83,6 +83,7 @@ def plan_hits(
     meeting_time: ArrayLike | None = None,
     puck_model: PuckModel | None = None,
     home: ArrayLike | None = None,
+    parameters: ArrayLike | None = None,
 ) -> PlannedHits:
     """Plan hits from a state of the arm that send a puck towards a target.
 
@@ -106,6 +107,8 @@ def plan_hits(
             possible. A hit that cannot be in time has a reason.
         puck_model: Drag, restitution and friction of a moving puck; by default those of the simulator.
         home: Joint positions at which the arm rests after the hit [rad], shape (n,) or (N, n).
+        parameters: Parameters of the problem, shape (width,) or (N, width); nominal by default. Positions are those on
+            a table that they move.
 
     Returns:
         Plans of the hits that have an answer, not checked yet, and the reasons why the others have none.
@@ -120,12 +123,16 @@ def plan_hits(
     contact = as_problem(planner.model.problem).first(PuckContact)
     distance, overlap = _contact_distance(contact, contact_distance), 0.0 if contact is None else contact.overlap
     if puck_velocity is None and meeting_time is None:
-        tasks = hit_tasks(completion, state, puck, target, contact_distance=distance, share=speed_share)
+        tasks = hit_tasks(
+            completion, state, puck, target, contact_distance=distance, share=speed_share, parameters=parameters
+        )
         columns = {name: tasks[name][0] for name in CONTEXT}
         boundary = boundary_of_tasks(tasks, planner.model.fixed_at_goal)
         plans = planner.plan_batch(boundary, sample_id=tasks.alive, columns=columns)
         hits = PlannedHits(plans, tasks.why(), np.zeros(len(plans)), overlap)
     else:
+        if parameters is not None:
+            raise UsageError("must be None for moving pucks", argument="parameters")
         velocity = np.zeros(2) if puck_velocity is None else puck_velocity
         meeting = Meeting(puck_model or PuckModel(), distance, overlap, meeting_time)
         found = plan_moving_hits(planner, completion, meeting, state, puck, velocity, target, share=speed_share)

@@ -98,6 +98,7 @@ class Planner:
         start_ddq: ArrayLike | None = None,
         goal_dq: ArrayLike | None = None,
         goal_ddq: ArrayLike | None = None,
+        parameters: ArrayLike | None = None,
         allow_large_angles: bool = False,
     ) -> Plans:
         """Plan motions; boundary conditions hold to rounding for any network output.
@@ -113,6 +114,7 @@ class Planner:
             goal_dq: Goal velocities [rad/s], shape (n,) or (N, n); zero by default.
             goal_ddq: Goal accelerations [rad/s^2], shape (n,) or (N, n), for models trained on rows with goal
                 accelerations; zero by default. Other models leave them free.
+            parameters: Parameters of the problem, shape (width,) or (N, width), if it has any.
             allow_large_angles: Whether to accept values that are probably in degrees or millimetres, with a warning.
 
         Returns:
@@ -123,7 +125,8 @@ class Planner:
                 rows, or goal accelerations are given that the model leaves free.
             UnitError: A condition is probably in degrees or millimetres.
         """
-        boundary = boundary_of(self.robot.n, start_q, start_dq, start_ddq, goal_q, goal_dq, goal_ddq)
+        states = start_q, start_dq, start_ddq, goal_q, goal_dq, goal_ddq
+        boundary = boundary_of(self.robot.n, *states, parameters)
         check_boundary_units(self.robot, boundary, allow_large_angles=allow_large_angles)
         return self._inference.plan(self.model, self._checked(boundary))
 
@@ -161,6 +164,7 @@ class Planner:
         goal_q: ArrayLike,
         goal_dq: ArrayLike | None = None,
         goal_ddq: ArrayLike | None = None,
+        parameters: ArrayLike | None = None,
     ) -> Plans:
         """Replan from states on plans that are being executed: q, dq and ddq are continuous.
 
@@ -179,6 +183,7 @@ class Planner:
             goal_q: New goal positions [rad], shape (n,) or (N, n).
             goal_dq: New goal velocities [rad/s], shape (n,) or (N, n); zero by default.
             goal_ddq: New goal accelerations [rad/s^2], as for ``plan``.
+            parameters: Parameters of the problem, as for ``plan``; those of the plans by default.
 
         Raises:
             UsageError: The number of times differs from that of plans, a time is outside its plan, the plans are of
@@ -190,7 +195,9 @@ class Planner:
                 concerns="plans",
             )
         q, dq, ddq = plans.states_at(time)
-        new = self.plan(q, goal_q, start_dq=dq, start_ddq=ddq, goal_dq=goal_dq, goal_ddq=goal_ddq)
+        parameters = plans.boundary.parameters if parameters is None else parameters
+        states = q, dq, ddq, goal_q, goal_dq, goal_ddq
+        new = self.plan_batch(boundary_of(self.robot.n, *states, parameters))
         times = np.broadcast_to(numbers("time", time), (len(plans),))
         if len(plans) == 1:
             plans, times = plans[np.zeros(len(new), int)], np.repeat(times, len(new))

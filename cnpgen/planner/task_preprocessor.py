@@ -93,10 +93,12 @@ class TaskPreprocessor:
         """
         ends = ends_of(boundary) if ends is None else ends
         start_xyz, goal_xyz, *velocity = (tip.T for tip in self.tips(ends))
-        scene = scene_of(self.problem, start_xyz, goal_xyz, *velocity)
+        parameters = self._parameters(boundary)
+        scene = scene_of(self.problem, start_xyz, goal_xyz, velocity[0] if velocity else None, parameters)
         reaching = self.reaching_time
         if reaching is None:
-            time = expected_time(boundary, self.velocity_limit, least=self.least_time)
+            factor = self._factor(parameters)
+            time = expected_time(boundary, self.velocity_limit * factor, least=self.least_time)
         else:
             time = reaching(ends)[0][0]
         correction = None if via_point is None else self._via_offsets(boundary, via_point)
@@ -118,6 +120,22 @@ class TaskPreprocessor:
             return None
         scene = Scene(self.placed, np.tile(place_obstacles(self.placed), (count, 1)))
         return scene if obstacle_poses is None else scene.with_poses(np.asarray(obstacle_poses, np.float64))
+
+    def _parameters(self, boundary: Boundary) -> Array | None:
+        """Return the parameters of the tasks, shape (N, width), or None without any; check their shape and ranges."""
+        ranges, values = self.problem.parameters, boundary.parameters
+        if values is None:
+            if ranges:
+                raise UsageError(f"is missing: tasks have {', '.join(ranges.names)}", argument="parameters")
+            return None
+        return ranges.checked(np.asarray(values, np.float64))
+
+    def _factor(self, parameters: Array | None) -> Array | float:
+        """Return the factor of the velocity limits of every task, shape (N, 1), or 1."""
+        names = self.problem.parameters.names
+        if parameters is None or "velocity_factor" not in names:
+            return 1.0
+        return parameters[:, names.index("velocity_factor"), None]
 
     def _via_offsets(self, boundary: Boundary, via_point: Array) -> Array:
         """Return offsets of lines through via points from straight ones at interior points [rad], shape (N, m, n)."""

@@ -180,6 +180,7 @@ def boundary_in(where: str, columns: Mapping[str, NDArray[Any]], n: int) -> Boun
     except UsageError as error:
         raise DatasetError(f"{where}: {error}") from error
     for name, values in given.items():  # in files, one row does not broadcast to all
-        if values.size != len(boundary) * n:
-            raise DatasetError(f"{where}: {name} has shape {values.shape}, expected ({len(boundary)}, {n})")
+        width = values.shape[-1] if name == "parameters" else n
+        if values.size != len(boundary) * width:
+            raise DatasetError(f"{where}: {name} has shape {values.shape}, expected ({len(boundary)}, {width})")
     return boundary

@@ -123,8 +123,7 @@ def _of_file(path: Path, wanted: ProblemRecord | None, *, allow_large_angles: bo
     if (said := file.text("problem_sha256")) and said != problem.comparable_sha256:
         raise DatasetError(f"{path} is of another problem than {problem.name!r}: its problem_sha256 is not this one's")
     boundary = file.boundary(open_problem(problem)[1], allow_large_angles=allow_large_angles)
-    conditions = {name: values for name, values in vars(boundary).items() if values is not None}
-    columns = {**file.columns, **conditions, "sample_id": file.sample_id(len(boundary))}
+    columns = {**file.columns, **boundary.arrays(), "sample_id": file.sample_id(len(boundary))}
     try:
         plans = plans_of_rows(problem, columns, source=f"boundary conditions in {path.name}")
     except UsageError as error:

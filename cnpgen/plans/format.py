@@ -12,10 +12,10 @@ FORMAT = "cnpgen-plans"
 PLAN_FILE_VERSION = 1
 
 BOUNDARY = ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq")
-CONDITIONS = (*BOUNDARY, "goal_ddq")  # the last one only for given goal accelerations
+CONDITIONS = (*BOUNDARY, "goal_ddq", "parameters")  # only for given goal accelerations, and problems with parameters
 REQUIRED = (*BOUNDARY, "path_control_points", "rate_control_points")
 
-FLOATS = (*REQUIRED, "goal_ddq", "duration")
+FLOATS = (*REQUIRED, "goal_ddq", "parameters", "duration")
 INTEGERS = ("sample_id", "status")
 NOTES = ("source", "refined_with")
 ATTRIBUTES = ("format", "format_version", "degree", "problem", "problem_recipe", "problem_urdf", "problem_sha256")

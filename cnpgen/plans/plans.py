@@ -115,7 +115,8 @@ class Plans:
         """
         problem, robot = open_problem(self.problem)
         velocity = goal_velocities(problem, robot, self.boundary.goal_q, self.boundary.goal_dq)
-        scene = scene_of(problem, self.columns["start_xyz"], self.columns["goal_xyz"], velocity)
+        ends = self.columns["start_xyz"], self.columns["goal_xyz"]
+        scene = scene_of(problem, *ends, velocity, self.boundary.parameters)
         return scene.with_poses(self.columns[OBSTACLE_POSES]) if OBSTACLE_POSES in self.columns else scene
 
     @cached_property
@@ -325,9 +326,10 @@ def _mistakes(plans: Plans, rows: int | None = None) -> Iterator[str]:
         yield f"splines have at most {MAX_CONTROL_POINTS} control points, got {most}"
     if rate.ndim != 2 or len(rate) != rows or rate.shape[1] <= degree:
         yield f"rate_control_points must have shape ({rows}, R) with R > {degree}, the degree, got {rate.shape}"
-    for name, values in vars(plans.boundary).items():
-        if values is not None and values.shape != (rows, n):
+    for name, values in plans.boundary.conditions().items():
+        if values.shape != (rows, n):
             yield f"{name} must have shape {(rows, n)} (plans, joints), got {values.shape}"
+    yield from _parameter_mistakes(plans, rows)
     for name in ("sample_id", "status"):
         if getattr(plans, name).shape != (rows,):
             yield f"{name} must have shape {(rows,)}, got {getattr(plans, name).shape}"
@@ -335,6 +337,15 @@ def _mistakes(plans: Plans, rows: int | None = None) -> Iterator[str]:
     for name in NOTES:
         if not isinstance(getattr(plans, name), str):
             yield f"{name} must be a text, got {getattr(plans, name)!r:.60}"
+
+
+def _parameter_mistakes(plans: Plans, rows: int) -> Iterator[str]:
+    parameters, width = plans.boundary.parameters, len(plans.problem.parameters)
+    if width and parameters is None:
+        names = ", ".join(plans.problem.parameters.names)
+        yield f"parameters are missing: plans of {plans.problem.name!r} have {names}"
+    elif parameters is not None and parameters.shape != (rows, width):
+        yield f"parameters must have shape {(rows, width)} (plans, parameters of the problem), got {parameters.shape}"
 
 
 def _rows(plans: Plans) -> int:

@@ -66,7 +66,7 @@ def check_replaceable(path: Path) -> None:
 
 def _datasets(plans: Plans) -> dict[str, NDArray[Any]]:
     """Return the stored datasets, in order and in their stored types."""
-    floats = plans.boundary.conditions() | dict(sorted(plans.columns.items()))
+    floats = plans.boundary.arrays() | dict(sorted(plans.columns.items()))
     floats |= {"path_control_points": plans.path_control_points, "rate_control_points": plans.rate_control_points}
     floats["duration"] = plans.duration
     stored: dict[str, NDArray[Any]] = {name: np.ascontiguousarray(values, "<f8") for name, values in floats.items()}

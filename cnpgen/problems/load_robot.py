@@ -63,6 +63,8 @@ def load_robot(problem: Problem) -> Robot:
         rated_velocity=rated,
         base=np.array(spec.base),
         chain=chain,
+        parameters=problem.parameters,
+        table_origin=problem.table_origin,
     )
     if mistakes := list(_mistakes(problem, robot)):
         raise RecipeError(mistakes)

@@ -11,6 +11,7 @@ from cnpgen.errors import UsageError
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.scene import Scene
 from cnpgen.robots.solid import place_obstacles
+from cnpgen.robots.table_frame import TableFrame, table_frame
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
@@ -23,9 +24,11 @@ def scene_of(
     start_xyz: Array,
     goal_xyz: Array,
     goal_velocity: Array | None = None,
+    parameters: Array | None = None,
+    *,
     obstacle_poses: Array | None = None,
 ) -> Scene:
-    """Place the obstacles of N samples and compute the values that a constraint depends on.
+    """Place the obstacles of N samples, compute the values that a constraint depends on, and append the parameters.
 
     An obstacle with ``below`` ends at the bottom of the object (at the tip without an object) at that end.
 
@@ -34,6 +37,7 @@ def scene_of(
         start_xyz: Tip positions at the start [m], shape (N, 3).
         goal_xyz: Tip positions at the goal [m], shape (N, 3).
         goal_velocity: Tip velocities at the goal [m/s], shape (N, 3), for problems with a ``scene_constraint``.
+        parameters: Parameters of the samples, shape (N, width), for problems with parameters; nominal by default.
         obstacle_poses: Poses and sizes of the obstacles of each sample, shape (N, width), in place of the problem's.
 
     Raises:
@@ -42,15 +46,32 @@ def scene_of(
     half = 0.0 if problem.object is None else problem.object.size[2] / 2
     bottoms = {"start": np.asarray(start_xyz)[..., 2] - half, "goal": np.asarray(goal_xyz)[..., 2] - half}
     poses, constraint = place_obstacles(problem.obstacle, bottoms), problem.scene_constraint
+    if not problem.parameters:
+        parameters = None
+    elif parameters is None:
+        mass = 0.0 if problem.payload is None else problem.payload.mass
+        parameters = np.tile(problem.parameters.nominal(mass), (len(poses), 1))
     if constraint is not None:
         if goal_velocity is None:
             raise UsageError(f"is missing: the problem {problem.name!r} needs it", argument="goal_velocity")
         shapes = [np.shape(xyz) for xyz in (start_xyz, goal_xyz, goal_velocity)]
         if len(set(shapes)) > 1 or shapes[0][1:] != (3,):
             raise UsageError(f"positions and velocities must have one shape (N, 3), got {shapes}")
-        poses = np.concatenate([poses, constraint.scene_values(np.asarray(goal_xyz), goal_velocity)], axis=1)
+        goal_xyz = np.asarray(goal_xyz)
+        if (frame := table_frame_of(problem, parameters)) is not None:
+            goal_xyz, goal_velocity = frame.to_table(goal_xyz), frame.along_table(goal_velocity)
+        poses = np.concatenate([poses, constraint.scene_values(goal_xyz, goal_velocity)], axis=1)
+    if parameters is not None:
+        poses = np.concatenate([poses, parameters], axis=1)
     scene = Scene(tuple(problem.obstacle), poses)
     return scene if obstacle_poses is None else scene.with_poses(obstacle_poses)
+
+
+def table_frame_of(problem: Problem, parameters: Array | None) -> TableFrame | None:
+    """Return the frame of the table of N samples, with parameters of shape (N, width); None if none move it."""
+    if not problem.parameters.tilts_table or parameters is None:
+        return None
+    return table_frame(problem.parameters, problem.table_origin, parameters)
 
 
 def goal_velocities(problem: Problem, robot: Robot, goal_q: Array, goal_dq: Array) -> Array | None:

@@ -9,12 +9,17 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from cnpgen.errors import MachineError
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.constraints.object_clearance import ObjectClearance
+from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.objectives import Centrifugal, ObjectiveTerm
 from cnpgen.robots.obstacle import Obstacle
+from cnpgen.robots.parameter_ranges import NO_PARAMETERS, ParameterRanges
 from cnpgen.robots.robot_spec import HeldObject, LimitSpec, Payload, RobotSpec
 from cnpgen.robots.scene import PARKED_POSITION_M
 from cnpgen.robots.shape.inline import with_inline_meshes
@@ -68,6 +73,9 @@ class Problem:
     limits: LimitSpec = field("planning limits, as fractions of the URDF's or in their place")
     object: HeldObject | None = field("upright cuboid that the tip holds", default=None)
     payload: Payload | None = field("additional load at the tip", default=None, since_version=2)
+    parameters: ParameterRanges = field(
+        "ranges of the parameters that differ from sample to sample", default=NO_PARAMETERS, since_version=2
+    )
     obstacle: tuple[Obstacle, ...] = field("obstacles around the robot", default=(), form="[[obstacle]] tables")
     constraint: tuple[Constraint, ...] = field(
         "constraints on every state of a valid motion", default=(), form="[[constraint]] tables"
@@ -119,10 +127,31 @@ class Problem:
                 " expected more than twice the depth",
             )
 
+        yield from self._parameter_mistakes()
+
+    def _parameter_mistakes(self) -> Iterator[tuple[str, str]]:
+        if self.parameters.payload_mass is not None and self.payload is None:
+            yield "parameters", "payload_mass needs the body of the load: give [payload], too"
+        if not self.parameters.tilts_table:
+            return
+        tables = [constraint for constraint in self.constraint if isinstance(constraint, Table)]
+        if len(tables) != 1:
+            yield "parameters", f"table parameters need one constraint 'table', the problem has {len(tables)}"
+        if any(table.start_band for table in tables):
+            yield "parameters", "table parameters need starts on the table: remove start_band of the constraint 'table'"
+
     @property
     def object_size(self) -> tuple[float, float, float] | None:
         """Edge lengths of the held object [m], None if nothing is held."""
         return None if self.object is None else self.object.size
+
+    @property
+    def table_origin(self) -> NDArray[np.float64]:
+        """Center of the rectangle of the table, about which it turns [m], shape (3,); zero without a table."""
+        table = self.first(Table)
+        if table is None:
+            return np.zeros(3)
+        return np.array([(table.x.low + table.x.high) / 2, (table.y.low + table.y.high) / 2, table.z])
 
     @property
     def scene_constraint(self) -> Constraint | None:
@@ -131,9 +160,10 @@ class Problem:
 
     @property
     def scene_width(self) -> int:
-        """Number of values of a scene: poses and sizes of the obstacles, and those of the constraint above."""
+        """Number of values of a scene: poses and sizes of obstacles, those of the constraint above, parameters."""
         constraint = self.scene_constraint
-        return pose_width(self.obstacle) + (0 if constraint is None else constraint.scene_width)
+        width = pose_width(self.obstacle) + (0 if constraint is None else constraint.scene_width)
+        return width + len(self.parameters)
 
     @property
     def uses_link_geometry(self) -> bool:

@@ -19,6 +19,7 @@ from cnpgen.errors import RecipeError, UsageError
 from cnpgen.problems.objectives import read_objective
 from cnpgen.problems.problem import FILES, Objective, Problem, resolved
 from cnpgen.problems.problem_file import load_problem_behind, restore_problem
+from cnpgen.robots.parameter_ranges import ParameterRanges
 from cnpgen.robots.urdf import urdf_tree
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import numbers
@@ -104,6 +105,20 @@ class ProblemRecord(StoredProblem):
         if spec is None:
             raise RecipeError(mistakes)
         return spec
+
+    @cached_property
+    def parameters(self) -> ParameterRanges:
+        """Parameters that differ from motion to motion.
+
+        Raises:
+            RecipeError: There are no such parameters.
+        """
+        mistakes: list[str] = []
+        where = RecipeLocation("problem_recipe", "parameters")
+        ranges = parse(ParameterRanges, self.content.get("parameters", {}), where=where, mistakes=mistakes)
+        if ranges is None:
+            raise RecipeError(mistakes)
+        return ranges
 
     @cached_property
     def comparable_sha256(self) -> str:

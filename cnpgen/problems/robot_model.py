@@ -159,7 +159,14 @@ class RobotModel:
         return torque.T.copy()
 
     @checked_arguments
-    def scene(self, start_xyz: ArrayLike, goal_xyz: ArrayLike, goal_velocity: ArrayLike | None = None) -> Scene:
+    def scene(
+        self,
+        start_xyz: ArrayLike,
+        goal_xyz: ArrayLike,
+        goal_velocity: ArrayLike | None = None,
+        *,
+        parameters: ArrayLike | None = None,
+    ) -> Scene:
         """Place the obstacles of N samples; some stand below the object at the start or at the goal.
 
         Args:
@@ -167,6 +174,7 @@ class RobotModel:
             goal_xyz: Tip positions at the goal [m], shape (N, 3) or (3,).
             goal_velocity: Tip velocities at the goal [m/s], shape (N, 3) or (3,), from which the pucks of hits follow;
                 zero by default.
+            parameters: Parameters of the problem, shape (N, width) or (width,); nominal by default.
         """
         from cnpgen.problems.obstacles import scene_of
 
@@ -178,7 +186,11 @@ class RobotModel:
         for name, xyz in given.items():
             if xyz.shape != (len(start), 3):
                 raise UsageError(f"must have shape ({len(start)}, 3) or (3,), got {xyz.shape}", argument=name)
-        return scene_of(self.problem, start, goal, given.get("goal_velocity", np.zeros(goal.shape)))
+        velocity = given.get("goal_velocity", np.zeros(goal.shape))
+        if parameters is None:
+            return scene_of(self.problem, start, goal, velocity)
+        rows = self.problem.parameters.checked(numbers("parameters", parameters))
+        return scene_of(self.problem, start, goal, velocity, np.broadcast_to(rows, (len(start), rows.shape[1])))
 
     @checked_arguments
     def constraint_values(

@@ -187,7 +187,9 @@ def _powers_of_rate(problem: Problem, world: "World", kernels: ResidualKernels) 
     w = np.zeros((orders * n + orders - 1, 2))
     w[: 2 * n] = random.uniform(0.1, 1.0, (2 * n, 1))
     w[orders * n] = 1.0, 2.0
-    (g,) = kernels.values(w, np.zeros((problem.scene_width, 2)))
+    scene = np.zeros((problem.scene_width, 2))
+    scene[problem.scene_width - len(problem.parameters) :] = world.robot.nominal_parameters[:, None]
+    (g,) = kernels.values(w, scene)
     with np.errstate(divide="ignore", invalid="ignore"):
         powers = np.log2(g[:, 1] / g[:, 0]).round()
     return np.asarray(np.maximum(np.nan_to_num(powers, nan=1.0, posinf=1.0), 1.0))

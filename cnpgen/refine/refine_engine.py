@@ -94,7 +94,8 @@ def load_solver(problem: "Problem", robot: "Robot", kernels: KernelLibrary) -> S
         ends = columns["start_xyz"], columns["goal_xyz"]
         boundary = Boundary.from_batch(columns, None)
         velocity = goal_velocities(problem, robot, boundary.goal_q, boundary.goal_dq)
-        scene = scene_of(problem, *ends, velocity, columns.get(OBSTACLE_POSES))
+        poses = columns.get(OBSTACLE_POSES)
+        scene = scene_of(problem, *ends, velocity, boundary.parameters, obstacle_poses=poses)
         tasks = _tasks(boundary, scene, *ends)
         if initial_guess is not None:
             tasks = [

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from cnpgen.kernels.collision.collision_checker import load_collision_library
 from cnpgen.kernels.library import KernelLibrary, problem_kernels
+from cnpgen.problems.obstacles import table_frame_of
 from cnpgen.problems.problem import Problem
 from cnpgen.refine import initial_guesses
 from cnpgen.refine.fine_check import FineCheck
@@ -273,11 +274,20 @@ class Refiner:
 
     def tip_path_guesses(self, task: RefinementTask) -> Iterator[Array]:
         """Yield the variables of motions along the initial tip paths of the problem's constraint."""
-        constraint, values = self.problem.scene_constraint, task.scene.poses[0, pose_width(self.problem.obstacle) :]
-        paths = [] if constraint is None else constraint.initial_tip_paths(values, task.start_xyz)
-        for path in paths:
+        constraint = self.problem.scene_constraint
+        values, parameters = self._values_of(task)
+        frame = table_frame_of(self.problem, parameters)
+        start = task.start_xyz if frame is None else frame.to_table(task.start_xyz[None])[0]
+        for polyline in [] if constraint is None else constraint.initial_tip_paths(values, start):
+            path = polyline if frame is None else np.array([frame.to_world(point[None])[0] for point in polyline])
             ends = task.boundary.start_q[0], task.boundary.goal_q[0]
             yield self.path_guess(task, initial_guesses.along_tip_path(self._world, *ends, path))
+
+    def _values_of(self, task: RefinementTask) -> tuple[Array, Array]:
+        """Return the values of a task for a constraint, shape (width,), and its parameters, shape (1, width)."""
+        width = self.problem.scene_width - len(self.problem.parameters)
+        poses = task.scene.poses
+        return poses[0, pose_width(self.problem.obstacle) : width], poses[:, width:]
 
     def even_line_guess(self, task: RefinementTask) -> Array:
         """Return the variables of the straight line at constant rate."""

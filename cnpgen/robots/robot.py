@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -16,6 +16,7 @@ from cnpgen.robots.attached import Attached, attach, bounded
 from cnpgen.robots.chain import Chain, frame_of, name_links_uniquely
 from cnpgen.robots.mimic import check_mimic
 from cnpgen.robots.model_comparison import check_model
+from cnpgen.robots.parameter_ranges import NO_PARAMETERS, ParameterRanges
 from cnpgen.robots.shape.shape import Shape
 from cnpgen.robots.urdf import urdf_tree
 from cnpgen.robots.urdf_parameters import urdf_parameters
@@ -48,6 +49,8 @@ class Robot:
         chain: Parameters of the kinematic chain from the world to the tip.
         shape: Collision geometry; None for the paper's, a line through the joint origins.
         held_shape: Link geometry and the held object, for collisions between the two; None if these are not checked.
+        parameters: Parameters that differ from sample to sample.
+        table_origin: Point about which the table turns, the center of its rectangle [m], shape (3,).
     """
 
     urdf: Path
@@ -66,6 +69,8 @@ class Robot:
     chain: Chain
     shape: Shape | None = None
     held_shape: Shape | None = None
+    parameters: ParameterRanges = NO_PARAMETERS
+    table_origin: Array = field(default_factory=lambda: np.zeros(3))
 
     @property
     def n(self) -> int:
@@ -76,6 +81,12 @@ class Robot:
     def sliding(self) -> tuple[bool, ...]:
         """Whether each joint is prismatic [m] and not revolute [rad]."""
         return tuple(joint.prismatic for joint in self.chain.joints)
+
+    @cached_property
+    def nominal_parameters(self) -> Array:
+        """Parameters of a sample for which none are given, shape (width,)."""
+        payload = self.attached.payload
+        return self.parameters.nominal(0.0 if payload is None else payload.mass)
 
     def units(self, turning: str) -> str:
         """Return the units of a joint quantity from its unit for revolute joints; see ``units_of_joints``."""

@@ -33,6 +33,7 @@ CONTRACTS: dict[str, str] = {  # base class of the kinds of a group
 BUILT_IN: dict[str, dict[str, str]] = {
     STAGES: {
         "draw-positions": "cnpgen.pipelines.stages.draw:DrawPositions",
+        "draw-parameters": "cnpgen.pipelines.stages.parameters:DrawParameters",
         "draw-goal": "cnpgen.pipelines.stages.draw:DrawGoal",
         "given-positions": "cnpgen.pipelines.stages.given_positions:GivenPositions",
         "start-ik": "cnpgen.pipelines.stages.ik:StartIK",

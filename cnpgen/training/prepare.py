@@ -173,7 +173,7 @@ def _architecture(
         else initial_model.features.blocks
     )
     return Architecture(
-        inputs=count_features(blocks, loaded.robot.n),
+        inputs=count_features(blocks, loaded.robot.n, len(loaded.problem.parameters)),
         hidden=settings.hidden,
         layers=settings.layers,
         path_outputs=loaded.robot.n * (spec.path_control_points - 3 - boundary.fixed_at_goal),

@@ -105,7 +105,7 @@ def prepare_rows(
             if name not in arrays:
                 arrays[name] = np.empty((len(boundary), *values.shape[1:]), dtype)
             arrays[name][part] = values
-    ends = Boundary(**{name: arrays.pop(name) for name in boundary.conditions()})
+    ends = Boundary(**{name: arrays.pop(name) for name in boundary.arrays()})
     row_features, scene = arrays.pop("features"), Scene(tuple(prepare.problem.obstacle), arrays.pop("poses"))
     obstacles = Scene(prepare.placed, arrays.pop("placed")) if placed else None
     return Rows(features=row_features, tasks=Tasks(ends, scene=scene, placed=obstacles, **arrays)), definition
@@ -113,7 +113,7 @@ def prepare_rows(
 
 def _arrays(tasks: Tasks, features: Features, dtype: str) -> dict[str, Array]:
     """Return all arrays of a block of rows with one entry per task, by name."""
-    arrays = tasks.boundary.conditions()
+    arrays = tasks.boundary.arrays()
     parts = {name: values for name, values in vars(tasks).items() if isinstance(values, np.ndarray)}
     parts.pop("observation", None)  # it is part of the features
     parts |= {} if tasks.placed is None else {"placed": tasks.placed.poses}

@@ -35,6 +35,9 @@ class Missing(Enum):
 MISSING = Missing.MISSING
 
 
+OPTIONAL = ("goal_ddq", "parameters")  # fields that may be None
+
+
 class MotionIndexError(UsageError, IndexError):
     """Index of a motion that does not exist."""
 
@@ -50,6 +53,7 @@ class Boundary:
         goal_q: Goal positions [rad].
         goal_dq: Goal velocities [rad/s].
         goal_ddq: Goal accelerations [rad/s^2], or None where they are free.
+        parameters: Parameters of the problem that differ from motion to motion, shape (N, width), or None.
     """
 
     start_q: Array
@@ -58,6 +62,7 @@ class Boundary:
     goal_q: Array
     goal_dq: Array
     goal_ddq: Array | None = None
+    parameters: Array | None = None
 
     @classmethod
     def from_batch(cls, batch: Mapping[str, Any], normalization: Scaling | Missing | None = MISSING) -> Boundary:
@@ -86,7 +91,7 @@ class Boundary:
                 f"must be dataset.normalization, or None for SI units, got {got}", argument="normalization"
             )
         names = [entry.name for entry in fields(cls)]
-        missing = [name for name in names if name not in batch and name != "goal_ddq"]
+        missing = [name for name in names if name not in batch and name not in OPTIONAL]
         if missing:
             present = ", ".join(map(str, batch))
             text = f"the batch lacks {', '.join(missing)}: it has the fields {present:.200}"
@@ -109,6 +114,10 @@ class Boundary:
 
     def conditions(self) -> dict[str, Array]:
         """Return the boundary conditions that are not None: name -> values."""
+        return {name: values for name, values in self.arrays().items() if name != "parameters"}
+
+    def arrays(self) -> dict[str, Array]:
+        """Return the boundary conditions and the parameters that are not None: name -> values."""
         return {name: values for name, values in vars(self).items() if values is not None}
 
     def __len__(self) -> int:
@@ -122,7 +131,7 @@ class Boundary:
                 self.start_ddq[index],
                 self.goal_q[index],
                 self.goal_dq[index],
-                None if self.goal_ddq is None else self.goal_ddq[index],
+                *(None if part is None else part[index] for part in (self.goal_ddq, self.parameters)),
             )
         except (IndexError, TypeError, ValueError) as error:
             raise MotionIndexError(
@@ -177,7 +186,7 @@ def goal_points(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> Array:
 
 def _check_joints(boundary: Boundary) -> None:
     """Raise an error if the conditions have different numbers of joints."""
-    joints = {name: np.shape(values)[-1:] for name, values in vars(boundary).items() if values is not None}
+    joints = {name: np.shape(values)[-1:] for name, values in boundary.conditions().items()}
     if len(set(joints.values())) > 1:
         counts = ", ".join(f"{name} {n[0] if n else None}" for name, n in joints.items())
         raise UsageError(f"boundary conditions must have the same number of joints, got: {counts}")

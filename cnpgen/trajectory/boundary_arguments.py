@@ -20,6 +20,7 @@ def boundary_of(  # noqa: PLR0917 - in the order of the paper
     goal_q: ArrayLike,
     goal_dq: ArrayLike | None,
     goal_ddq: ArrayLike | None = None,
+    parameters: ArrayLike | None = None,
 ) -> Boundary:
     """Check boundary conditions and bring them to shape (N, n).
 
@@ -31,6 +32,7 @@ def boundary_of(  # noqa: PLR0917 - in the order of the paper
         goal_q: Goal positions [rad].
         goal_dq: Goal velocities [rad/s], or None for zero.
         goal_ddq: Goal accelerations [rad/s^2], or None if they are free.
+        parameters: Parameters of the problem, shape (width,) or (N, width), or None if it has none.
 
     Raises:
         UsageError: A shape is wrong, or a value is not finite.
@@ -44,6 +46,8 @@ def boundary_of(  # noqa: PLR0917 - in the order of the paper
         "goal_ddq": goal_ddq,
     }
     arrays = {name: _rows(name, values, n) for name, values in arguments.items() if values is not None}
+    if parameters is not None:
+        arrays["parameters"] = _rows("parameters", parameters, np.shape(parameters)[-1] if np.ndim(parameters) else 0)
     rows = max(len(values) for values in arrays.values())
     for name, values in arrays.items():
         if len(values) not in {1, rows}:
@@ -51,7 +55,7 @@ def boundary_of(  # noqa: PLR0917 - in the order of the paper
     if goal_ddq is None:
         del arguments["goal_ddq"]
     zero = np.zeros((1, n))
-    return Boundary(**{name: _repeated(arrays.get(name, zero), rows) for name in arguments})
+    return Boundary(**{name: _repeated(arrays.get(name, zero), rows) for name in {**arguments, **arrays}})
 
 
 def _rows(name: str, values: ArrayLike, n: int) -> Array:

@@ -82,7 +82,7 @@ def largest_error(motion: Motion, t: ArrayLike, q: ArrayLike) -> float:
 
 def _checked_boundary(boundary: Boundary, n: int) -> Boundary:
     """Return the boundary conditions of one motion as arrays; check their shapes."""
-    arrays = {name: numbers("boundary", row) for name, row in vars(boundary).items() if row is not None}
+    arrays = {name: numbers("boundary", row) for name, row in boundary.conditions().items()}
     for name, row in arrays.items():
         if row.shape != (1, n):
             raise UsageError(f"the boundary's {name} must have shape (1, {n}), got {row.shape}", concerns="boundary")

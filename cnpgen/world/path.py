@@ -12,6 +12,7 @@ from cnpgen.robots.shape.hull import CUBE
 from cnpgen.robots.solid import place_obstacles, pose_width, solids_of
 from cnpgen.world.collision_world import CollisionWorld
 from cnpgen.world.forward_kinematics import ForwardKinematics
+from cnpgen.world.measured_parameters import MeasuredParameters
 from cnpgen.world.pair_distances import PairDistances
 from cnpgen.world.rigid_bodies import NO_HELD_SHAPE, NO_SHAPE, RigidBodies
 from cnpgen.world.separation import cuboid_gaps, cuboid_separation, gaps, separation
@@ -45,6 +46,7 @@ class PathWorld:
         ddq: Joint accelerations [rad/s^2], shape (n, K).
         jerk: Joint jerks [rad/s^3], shape (n, K); None if no constraint needs them.
         tip_position: Positions of the tip [m], shape (3, K).
+        parameters: Parameters of the sample.
     """
 
     def __init__(
@@ -57,7 +59,8 @@ class PathWorld:
 
         self.robot = robot
         self.obstacles = tuple(obstacles)
-        self._model = robot.model
+        self.parameters = MeasuredParameters(robot)
+        self._model = self.parameters.model
         self._data, self._kinematics = self._model.createData(), ForwardKinematics(self._model)
         self._pool = pin.ModelPool(self._model, 1)
         self._tip = robot.tip_frame
@@ -82,10 +85,12 @@ class PathWorld:
             dq: Joint velocities [rad/s], shape (n, K).
             ddq: Joint accelerations [rad/s^2], shape (n, K).
             obstacle_poses: Poses and sizes of the obstacles (``cnpgen.robots.solid``), then values for a constraint,
-                shape (width,).
+                then the parameters of the problem, shape (width,).
             jerk: Joint jerks [rad/s^3], shape (n, K), or None if no constraint needs them.
             exact: Whether the smallest distance must be exact even if bounds prove that all distances are sufficient.
         """
+        import pinocchio as pin
+
         self.q, self.dq, self.ddq, self.jerk, self._exact = q, dq, ddq, jerk, exact
         self._placed = False
         self._torque: Array | None = None
@@ -93,7 +98,9 @@ class PathWorld:
         self._segments: Array | None = None
         self._pairs: dict[str, PairDistances] = {}
         self._solids = solids_of(self.obstacles, obstacle_poses)
-        self.scene_values = obstacle_poses[pose_width(self.obstacles) :]
+        self.parameters.set(obstacle_poses[pose_width(self.obstacles) :])
+        if "payload_mass" in self.parameters.values:
+            self._pool = pin.ModelPool(self._model, 1)  # a pool has its own copy of the model
         self._collisions.place(self._solids)
         self._move()
 
@@ -115,6 +122,11 @@ class PathWorld:
         if self._tip_rotation is None:
             self._tip_rotation = (self._turn.T @ self._axes_of_tip()).reshape(3, 3, -1).swapaxes(0, 1)
         return self._tip_rotation
+
+    @property
+    def scene_values(self) -> Array:
+        """Values for a constraint (``Constraint.scene_values``); empty if none were given."""
+        return self.parameters.scene_values
 
     @property
     def torque(self) -> Array:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from cnpgen.errors import RecipeError
 from cnpgen.robots.solid import place_obstacles, pose_width, solids_of
 from cnpgen.world.collision_world import CollisionWorld
+from cnpgen.world.measured_parameters import MeasuredParameters
 from cnpgen.world.rigid_bodies import NO_HELD_SHAPE, NO_SHAPE, RigidBodies
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ class World:
         dq: Joint velocities [rad/s], shape (n,).
         ddq: Joint accelerations [rad/s^2], shape (n,).
         jerk: Joint jerks [rad/s^3], shape (n,); None at a boundary state or if no constraint needs them.
-        scene_values: Values for a constraint (``Constraint.scene_values``); empty if none were given.
+        parameters: Parameters of the sample.
     """
 
     def __init__(
@@ -49,7 +50,8 @@ class World:
         object_size: tuple[float, float, float] | None = None,
     ) -> None:
         self.robot, self.obstacles = robot, obstacles
-        self._model = robot.model
+        self.parameters = MeasuredParameters(robot)
+        self._model = self.parameters.model
         self._data = self._model.createData()
         self._dynamics_data = self._model.createData()  # separate: RNEA's accelerations include gravity
         self._tip = robot.tip_frame
@@ -70,7 +72,7 @@ class World:
             dq: Joint velocities [rad/s], shape (n,).
             ddq: Joint accelerations [rad/s^2], shape (n,).
             obstacle_poses: Poses and sizes of the obstacles (``cnpgen.robots.solid``), then values for a constraint,
-                shape (width,).
+                then the parameters of the problem, shape (width,).
             jerk: Joint jerks [rad/s^3], shape (n,), if the state has any.
         """
         import pinocchio as pin
@@ -79,9 +81,14 @@ class World:
         pin.forwardKinematics(self._model, self._data, q, dq, ddq)
         self._T_world_tip = pin.updateFramePlacement(self._model, self._data, self._tip)
         self._solids, self._placed = solids_of(self.obstacles, obstacle_poses), False
-        self.scene_values = obstacle_poses[pose_width(self.obstacles) :]
+        self.parameters.set(obstacle_poses[pose_width(self.obstacles) :])
         self._collisions.place(self._solids)
         self._distances: list[float] | None = None
+
+    @property
+    def scene_values(self) -> Array:
+        """Values for a constraint (``Constraint.scene_values``); empty if none were given."""
+        return self.parameters.scene_values
 
     @property
     def torque(self) -> Array:

@@ -41,6 +41,10 @@ def wide(columns: Columns) -> Columns:
     return {name: values.reshape(ROWS, -1) for name, values in columns.items()}
 
 
+def direction(angle: float) -> np.ndarray:
+    return np.array([[np.cos(angle), np.sin(angle), 0.0]])
+
+
 def test_the_gradient_agrees_with_differences_up_to_rows_of_the_jacobian() -> None:
     random = np.random.default_rng(0)
     for _ in range(5):
@@ -49,7 +53,7 @@ def test_the_gradient_agrees_with_differences_up_to_rows_of_the_jacobian() -> No
         differences = [
             (value(q + e, home, angle) - value(q - e, home, angle)) / (2 * step) for e in step * np.eye(ROBOT.n)
         ]
-        (J,), (gradient,) = _gradients(ROBOT, q[None], home[None], np.array([angle]))
+        (J,), (gradient,) = _gradients(ROBOT, q[None], home[None], direction(angle))
         np.testing.assert_array_equal(J, jacobian(q))
         outside = np.eye(ROBOT.n) - np.linalg.pinv(J) @ J
         np.testing.assert_allclose(outside @ gradient, outside @ differences, atol=1e-8)
@@ -101,7 +105,7 @@ def test_f_may_increase_towards_an_active_joint_limit() -> None:
     """A goal is valid if f increases towards its active limit, and invalid if f increases away from it."""
     random = np.random.default_rng(3)
     q = ROBOT.base + random.uniform(-0.2, 0.2, ROBOT.n)
-    (J,), (gradient,) = _gradients(ROBOT, q[None], q[None], np.array([0.3]))
+    (J,), (gradient,) = _gradients(ROBOT, q[None], q[None], direction(0.3))
     columns = {"goal_q": q[None], "start_q": q[None], "hit_angle": np.array([[0.3]])}
     free = [0, 1, 3]  # as many as tip coordinates, so f cannot increase along them
     projected = gradient - J.T @ np.linalg.lstsq(J[:, free].T, gradient[free], rcond=None)[0]

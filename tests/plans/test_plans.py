@@ -603,9 +603,9 @@ def test_everything_that_is_known_of_plans_follows_them_as_numpy_would_have_it(w
     assert isinstance(found, Plans)
     assert (found.source, found.refined_with) == ("here", "{}")
     assert set(found.columns) == {"w", "refine_outcome", "start_xyz", "goal_xyz"}
-    parts = vars(plans.boundary) | plans.columns | {name: getattr(plans, name) for name in ARRAYS}
+    parts = plans.boundary.arrays() | plans.columns | {name: getattr(plans, name) for name in ARRAYS}
     for name, values in (
-        vars(found.boundary) | found.columns | {name: getattr(found, name) for name in ARRAYS}
+        found.boundary.arrays() | found.columns | {name: getattr(found, name) for name in ARRAYS}
     ).items():
         np.testing.assert_array_equal(values, parts[name][numbers], err_msg=name)
     np.testing.assert_array_equal(found.motion.path, plans.motion[numbers].path)
@@ -763,7 +763,7 @@ class Tensor:
 
 def test_plans_are_made_of_tensors_that_carry_gradients() -> None:
     plans = draw_plans(goal_ddq=True)
-    boundary = Boundary(**{name: Tensor(part) for name, part in vars(plans.boundary).items()})
+    boundary = Boundary(**{name: Tensor(part) for name, part in plans.boundary.arrays().items()})
     given = {name: Tensor(getattr(plans, name)) for name in ("path_control_points", "rate_control_points")}
     assert_equal(make_plans(AIRHOCKEY, boundary, **given), plans)
 

@@ -20,6 +20,7 @@ from cnpgen.problems.constraints.puck_contact import (
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.obstacles import goal_velocities, scene_of
 from cnpgen.problems.problem_file import load_problem
+from cnpgen.world.measured_parameters import MeasuredParameters
 from cnpgen.world.path import PathWorld
 from cnpgen.world.world import World
 
@@ -39,6 +40,7 @@ def violation(points: np.ndarray) -> np.ndarray:
     class Tip:
         tip_position = np.column_stack([points, np.full(len(points), 0.16)]).T
         scene_values = SCENE
+        parameters = MeasuredParameters(ROBOT)
 
     (condition,) = CONTACT.measured(Tip())
     return condition.lower[0] - condition.g[0]

@@ -95,12 +95,18 @@ def simulate_plans(
         progress: Called with the number of plans executed since the last call.
 
     Raises:
-        UsageError: The plant is unknown, there is less than one worker, or ``environment`` is not a clone or
-            does not support the plans.
+        UsageError: The plant is unknown, there is less than one worker, the problem has parameters, or ``environment``
+            is not a clone or does not support the plans.
         RecipeError: MuJoCo cannot simulate the robot, or the problem needs a plug-in that is not installed.
         MachineError: MuJoCo is missing, the environment cannot be imported, or a worker died.
     """
     plant, plans = as_plant(plant), correct_tips(plans)
+    if plans.problem.parameters:
+        raise UsageError(
+            f"plans of {plans.problem.name!r} are not simulated: the simulator has no"
+            f" {', '.join(plans.problem.parameters.names)}",
+            concerns="plans",
+        )
     load_mujoco()
     if environment is not None:
         plant = challenge_plant(environment)

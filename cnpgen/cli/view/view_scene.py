@@ -14,7 +14,7 @@ from cnpgen.judges.plans.verdict import Verdict
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.constraints.puck_contact import PUCK_OUT_OF_REACH_M, PuckContact
 from cnpgen.problems.constraints.table import Table
-from cnpgen.problems.obstacles import scene_of
+from cnpgen.problems.obstacles import scene_of, table_frame_of
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene import PARKED_POSITION_M, Scene
@@ -188,7 +188,9 @@ def _scene(
         kind=kind,
         capsules=tuple(capsule_bodies(robot)),
         held=() if size is None else (wrapped("object", tip, CUBE * np.array(size), 0.0),),
-        mallet=() if contact is None else (_disc("mallet", np.zeros(3), contact.mallet_radius, MALLET_HEIGHT_M, tip),),
+        mallet=()
+        if contact is None
+        else (wrapped("mallet", tip, _disc_corners(np.zeros(3), contact.mallet_radius, MALLET_HEIGHT_M), 0.0),),
         triad=tuple(
             wrapped(f"axis {name}", tip, np.array([np.zeros(3), TRIAD_LENGTH_M * axis]), TRIAD_RADIUS_M)
             for name, axis in zip("xyz", np.eye(3), strict=True)
@@ -218,26 +220,38 @@ def _world(problem: Problem, scene: Scene) -> Iterator[Body]:
             continue
         if obstacle.upright and obstacle.height is None:
             bottom = min(0.0, solid.high[2] - MIN_DRAWN_HEIGHT_M)
-            yield _box(obstacle.name, np.array([*solid.low[:2], bottom]), solid.high)
+            yield wrapped(obstacle.name, 0, _corners(np.array([*solid.low[:2], bottom]), solid.high), 0.0)
         else:
             yield wrapped(obstacle.name, 0, solid.position + solid.corners, solid.radius)
     contact, table = problem.first(PuckContact), problem.first(Table)
     if table is not None:
-        low, high = (table.x.low, table.y.low, table.z - DRAWN_TABLE_M), (table.x.high, table.y.high, table.z)
-        yield _box("table", np.array(low), np.array(high))
+        low = np.array([table.x.low, table.y.low, table.z - DRAWN_TABLE_M])
+        corners = _corners(low, np.array([table.x.high, table.y.high, table.z]))
+        yield wrapped("table", 0, _on_table(problem, scene, corners), 0.0)
     if contact is not None:
         x, y = scene.poses[0, pose_width(scene.obstacles) :][2:4]
         if x < PUCK_OUT_OF_REACH_M:
-            height = table.z if table else 0.0
-            yield _disc("puck", np.array([x, y, height]), contact.puck_radius, PUCK_HEIGHT_M, 0)
+            corners = _disc_corners(np.array([x, y, table.z if table else 0.0]), contact.puck_radius, PUCK_HEIGHT_M)
+            yield wrapped("puck", 0, _on_table(problem, scene, corners), 0.0)
 
 
-def _disc(name: str, bottom: Array, radius: float, height: float, joint: int) -> Body:
-    """Return an upright disc on a point [m], shape (3,)."""
+def _mallet(contact: PuckContact, tip: int) -> Body:
+    return wrapped("mallet", tip, _disc_corners(np.zeros(3), contact.mallet_radius, MALLET_HEIGHT_M), 0.0)
+
+
+def _on_table(problem: Problem, scene: Scene, corners: Array) -> Array:
+    """Return corners in the frame of the table in the world frame [m], shape (V, 3)."""
+    parameters = np.repeat(scene.poses[:1, problem.scene_width - len(problem.parameters) :], len(corners), axis=0)
+    frame = table_frame_of(problem, parameters)
+    return corners if frame is None else frame.to_world(corners)
+
+
+def _disc_corners(bottom: Array, radius: float, height: float) -> Array:
+    """Return the corners of an upright disc on a point [m], shape (V, 3)."""
     angles = np.arange(DISC_CORNERS) * 2 * np.pi / DISC_CORNERS
     circle = np.column_stack([radius * np.cos(angles), radius * np.sin(angles), np.zeros(DISC_CORNERS)])
-    return wrapped(name, joint, bottom + np.concatenate([circle, circle + np.array([0, 0, height])]), 0.0)
+    return np.asarray(bottom + np.concatenate([circle, circle + np.array([0, 0, height])]))
 
 
-def _box(name: str, low: Array, high: Array) -> Body:
-    return wrapped(name, 0, (low + high) / 2 + CUBE * (high - low), 0.0)
+def _corners(low: Array, high: Array) -> Array:
+    return np.asarray((low + high) / 2 + CUBE * (high - low))

@@ -1,5 +1,6 @@
 """Joint limits over a whole motion, including all times between samples: proven, because the motion is a polynomial."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, cast
@@ -35,6 +36,15 @@ def is_proven(constraint: Constraint) -> bool:
 def quantity_of(constraint: Constraint) -> str:
     """Return the quantity that a proven constraint limits: "q", "dq", "ddq" or "jerk"."""
     return _QUANTITIES[type(constraint)]
+
+
+def _factor_of(constraint: Constraint, parameters: Mapping[str, float]) -> float:
+    """Return the factor by which a sample scales the limit of a proven constraint."""
+    return parameters.get(getattr(constraint, "factor_name", ""), 1.0)
+
+
+def _per_factor(values: Array, factor: float) -> Array:
+    return values if factor == 1 else values / factor
 
 
 @dataclass(frozen=True)
@@ -78,8 +88,10 @@ class ProvenJointLimits:
         if not self.constraints:
             return []
         names = [quantity_of(constraint) for constraint in self.constraints]
-        functions = [getattr(polynomials, name) for name in names]
-        maxima = self._at_samples(np.array([getattr(world, name) for name in names]), s)
+        factors = [_factor_of(constraint, world.parameters.values) for constraint in self.constraints]
+        pairs = list(zip(names, factors, strict=True))
+        functions = [_per_factor(getattr(polynomials, name), factor) for name, factor in pairs]
+        maxima = self._at_samples(np.array([_per_factor(getattr(world, name), factor) for name, factor in pairs]), s)
         upper_bounds = self._upper_bounds(functions)
         skippable = self.tolerant & early_exit
         for limit in np.flatnonzero(~skippable | ~(upper_bounds.max(axis=1) <= 1)).tolist():

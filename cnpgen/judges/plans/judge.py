@@ -208,7 +208,7 @@ def _check_shapes(robot: Robot, motion: Motion, boundary: Boundary, scene: Scene
         "path control points": (motion.path, (n_plans, *motion.path.shape[1:2], n)),
         "rate control points": (motion.rate, (n_plans, *motion.rate.shape[1:2])),
         "goal_xyz": (goal_xyz, (n_plans, 3)),
-        **{name: (values, (n_plans, n)) for name, values in vars(boundary).items() if values is not None},
+        **{name: (values, (n_plans, n)) for name, values in boundary.conditions().items()},
     }
     if len(scene) != n_plans:
         raise UsageError(f"must have {n_plans} samples, one for each plan, got {len(scene)}", argument="scene")

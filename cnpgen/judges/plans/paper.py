@@ -63,7 +63,7 @@ def _checks(problem: "Problem", world: "PathWorld", obstacle_poses: Array) -> It
         ):
             yield constraint.reason, _is_nominal(constraint, problem, world)
         elif isinstance(constraint, Table):
-            yield constraint.reason, _is_on_table(constraint, world.tip_position)
+            yield constraint.reason, _is_on_table(constraint, world.parameters.on_table(world.tip_position))
         elif isinstance(constraint, Vertical):
             yield constraint.reason, bool(np.all(1 - world.tip_rotation[2, 2] < MAX_TILT))
         elif isinstance(constraint, ObjectContact):
@@ -75,9 +75,11 @@ def _is_nominal(constraint: Constraint, problem: "Problem", world: "PathWorld") 
     if isinstance(constraint, JointTorque):
         values, limit = world.torque, robot.torque_limit / limits.torque_scale
     elif isinstance(constraint, JointVelocity):
-        values, limit = world.dq, robot.velocity_limit / limits.velocity_scale
+        factor = world.parameters.values.get("velocity_factor", 1.0)
+        values, limit = world.dq, factor * robot.velocity_limit / limits.velocity_scale
     else:
-        values, limit = world.ddq, robot.acceleration_limit / limits.velocity_scale
+        factor = world.parameters.values.get("acceleration_factor", 1.0)
+        values, limit = world.ddq, factor * robot.acceleration_limit / limits.velocity_scale
     return bool(np.all(np.abs(values) <= limit[:, None]))
 
 
@@ -121,14 +123,14 @@ def metrics_of(problem: "Problem", world: "PathWorld", samples: Samples, jerk: A
     """
     robot = world.robot
     torque_ratio = world.torque / robot.torque_limit[:, None]
-    table = problem.first(Table)
+    table, tip = problem.first(Table), world.parameters.on_table(world.tip_position)
     upright = any(isinstance(constraint, Vertical) for constraint in problem.constraint)
     return Metrics(
         duration=float(samples.t[-1]),
         effort=samples.integral(np.sum(torque_ratio**2, axis=0)),
         jerk=float(np.max(np.abs(jerk) / robot.jerk_limit[:, None])),
         hit_speed=float(np.linalg.norm(world.tip_velocity_at(-1))),
-        z_error=np.nan if table is None else samples.integral(np.abs(world.tip_position[2] - table.z)),
+        z_error=np.nan if table is None else samples.integral(np.abs(tip[2] - table.z)),
         vertical_error=samples.integral(tilt(world.tip_rotation)) if upright else np.nan,
     )
 

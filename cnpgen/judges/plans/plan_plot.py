@@ -138,12 +138,12 @@ def along(
 
 def shares_of_limits(world: PathWorld) -> dict[str, Array]:
     """Return q, dq, ddq, torque and, if constrained, jerk as fractions of their limits, each of shape (n, K)."""
-    robot = world.robot
+    robot, factors = world.robot, world.parameters.values
     center, half = (robot.position_upper + robot.position_lower) / 2, (robot.position_upper - robot.position_lower) / 2
     return {
         "position": (world.q - center[:, None]) / half[:, None],
-        "velocity": world.dq / robot.velocity_limit[:, None],
-        "acceleration": world.ddq / robot.acceleration_limit[:, None],
+        "velocity": world.dq / (factors.get("velocity_factor", 1.0) * robot.velocity_limit[:, None]),
+        "acceleration": world.ddq / (factors.get("acceleration_factor", 1.0) * robot.acceleration_limit[:, None]),
         **({} if world.jerk is None else {"jerk": world.jerk / robot.jerk_limit[:, None]}),
         "torque": world.torque / robot.torque_limit[:, None],
     }
@@ -216,7 +216,7 @@ def _draw_limits(axis: "Axes", largest: float) -> None:
 def _draw_over_table(figure: "SubFigure", table: Table, world: PathWorld, s: Array, t: Array) -> None:
     """Draw the tip from above in the rectangle, and its height over time in the valid band."""
     above, beside = figure.subplots(2, 1, height_ratios=[1.5, 1.0])
-    x, y, z = world.tip_position
+    x, y, z = world.parameters.on_table(world.tip_position)
     _draw_rectangle(above, (table.x.low, table.x.high), (table.y.low, table.y.high), fill=False)
     _draw_tip_path(above, x, y)
     above.set_aspect("equal")

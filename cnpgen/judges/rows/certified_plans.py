@@ -46,7 +46,10 @@ def check_plans(problem: Problem, robot: Robot, columns: Mapping[str, NDArray[An
     motion = Motion(path, columns["rate_control_points"], spec.degree)
     boundary = Boundary.from_batch(columns, None)
     velocity = goal_velocities(problem, robot, boundary.goal_q, boundary.goal_dq)
-    scene = scene_of(problem, columns["start_xyz"], columns["goal_xyz"], velocity, columns.get(OBSTACLE_POSES))
+    poses = columns.get(OBSTACLE_POSES)
+    scene = scene_of(
+        problem, columns["start_xyz"], columns["goal_xyz"], velocity, boundary.parameters, obstacle_poses=poses
+    )
     verdicts = judge(problem, robot, motion, boundary, scene, columns["goal_xyz"])
     invalid = [(row, verdict.reason) for row, verdict in enumerate(verdicts) if not verdict.valid]
     problems = []

@@ -22,6 +22,7 @@ import numpy as np
 
 from cnpgen.judges.rows.row_report import Array, Check, Index, compare
 from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES
+from cnpgen.world.measured_parameters import MeasuredParameters
 
 if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
@@ -68,14 +69,16 @@ def judge_goals(
     """
     judged = []
     if rule.near and "hit_angle" in columns:
-        q, angle = columns["goal_q"][finite], columns["hit_angle"][finite, 0]
+        q = columns["goal_q"][finite]
         near_base = np.broadcast_to(robot.base, q.shape)
         home = near_base if rule.near == "base" else columns[f"{rule.near}_q"][finite]
-        error = _projected_gradients(robot, q, home, angle, ACTIVE_LIMIT_TOLERANCES_RAD[dtype])
+        direction = _directions(robot, columns, finite)
+        error = _projected_gradients(robot, q, home, direction, ACTIVE_LIMIT_TOLERANCES_RAD[dtype])
         judged.append(_compared("hitting configuration", "m^2/rad", error, STATIONARITY_TOLERANCES[dtype], finite))
     if rule.full_speed is not None and "hit_speed_max" in columns:
         fraction = speed_fractions(columns)[finite]
-        violation = np.abs(columns["goal_dq"][finite]) - fraction[:, None] * robot.velocity_limit
+        share = fraction * velocity_factors(robot, columns)[finite]
+        violation = np.abs(columns["goal_dq"][finite]) - share[:, None] * robot.velocity_limit
         too_slow = np.where(fraction == 1, 0.0, np.inf) if rule.full_speed == 1 else np.zeros(len(finite))
         error = np.maximum(np.maximum(violation.max(axis=1, initial=0.0), 0.0), too_slow)
         judged.append(_compared("hitting velocity", "rad/s", error, BOUNDARY_TOLERANCES[dtype]["velocity"], finite))
@@ -115,9 +118,29 @@ def _compared(name: str, unit: str, error: Array, tolerance: float, rows: Index)
     return compare(name, unit, violation=error, tolerance=np.full(len(rows), tolerance), row=rows, end=ones)
 
 
-def _projected_gradients(robot: "Robot", q: Array, home: Array, angle: Array, at_limit: float) -> Array:
+def velocity_factors(robot: "Robot", columns: Mapping[str, Array]) -> Array:
+    """Return the factor of the velocity limits of every row, shape (rows,)."""
+    names = robot.parameters.names
+    if "velocity_factor" not in names:
+        return np.ones(len(columns["goal_q"]))
+    return columns["parameters"][:, names.index("velocity_factor")]
+
+
+def _directions(robot: "Robot", columns: Mapping[str, Array], finite: Index) -> Array:
+    """Return the unit directions of hits on the tables of finite rows, in the world frame, shape (rows, 3)."""
+    angle = columns["hit_angle"][finite, 0]
+    direction = np.stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))], axis=1)
+    if robot.parameters.tilts_table:
+        table = MeasuredParameters(robot)
+        for row, values in enumerate(columns["parameters"][finite]):
+            table.set(values)
+            direction[row] = table.along_world(direction[row])
+    return direction
+
+
+def _projected_gradients(robot: "Robot", q: Array, home: Array, direction: Array, at_limit: float) -> Array:
     """Compute the gradient of f in the directions that the constraints leave free [m^2/rad], shape (rows,)."""
-    jacobian, gradient = _gradients(robot, q, home, angle)
+    jacobian, gradient = _gradients(robot, q, home, direction)
     low, high = q - robot.position_lower < at_limit, robot.position_upper - q < at_limit
     free = jacobian * ~(low | high)[:, None]
     multiplier = np.linalg.pinv(free @ free.swapaxes(1, 2)) @ (free @ gradient[:, :, None])
@@ -127,7 +150,7 @@ def _projected_gradients(robot: "Robot", q: Array, home: Array, angle: Array, at
     return np.asarray(ascent.max(axis=1, initial=0.0))
 
 
-def _gradients(robot: "Robot", q: Array, home: Array, angle: Array) -> tuple[Array, Array]:
+def _gradients(robot: "Robot", q: Array, home: Array, direction: Array) -> tuple[Array, Array]:
     """Return J and the gradient of f, by Pinocchio's derivatives of the tip's velocity.
 
     Pinocchio differentiates the velocity of the tip's frame as if its axes turned with it. That adds a combination of
@@ -137,7 +160,7 @@ def _gradients(robot: "Robot", q: Array, home: Array, angle: Array) -> tuple[Arr
         robot: The robot.
         q: Joint positions [rad], shape (rows, n).
         home: Configurations to stay close to [rad], shape (rows, n).
-        angle: Directions of the hits [rad], shape (rows,).
+        direction: Unit directions of the hits, shape (rows, 3).
 
     Returns:
         Arrays of shapes (rows, 3, n) and (rows, n).
@@ -146,7 +169,6 @@ def _gradients(robot: "Robot", q: Array, home: Array, angle: Array) -> tuple[Arr
 
     model, tip, frame = robot.model, robot.tip_frame, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
     data, zero = model.createData(), np.zeros(robot.n)
-    direction = np.stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))], axis=1)
     jacobian, gradient = np.empty((len(q), 3, robot.n)), np.empty((len(q), robot.n))
     for row in range(len(q)):
         jacobian[row] = pin.computeFrameJacobian(model, data, q[row], tip, frame)[:3]

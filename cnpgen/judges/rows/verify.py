@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from cnpgen.errors import DatasetError
 from cnpgen.judges.rows.diagnostics import DIAGNOSTIC_TOLERANCES, Diagnostic, stored_diagnostics
-from cnpgen.judges.rows.hits import HitRule, highest_speed, judge_goals
+from cnpgen.judges.rows.hits import HitRule, highest_speed, judge_goals, velocity_factors
 from cnpgen.judges.rows.row_report import ENDS, Array, Check, Index, RowReport, compare, merge
 from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES, Condition
 from cnpgen.problems.constraints.needs import measured_needs
@@ -122,8 +122,8 @@ class _Measurements:
 
     Attributes:
         position: Tip positions [m], shape (rows, 2, 3); nan in rows that were not measured, as in the next two arrays.
-        hit_velocity: Tip velocities at the goal [m/s], shape (rows, 3).
-        hit_jacobian: Jacobians of the tip at the goal [m], shape (rows, 3, n).
+        hit_velocity: Tip velocities at the goal along the axes of the table [m/s], shape (rows, 3).
+        hit_jacobian: Jacobians of the tip at the goal along these axes [m], shape (rows, 3, n).
         diagnostics: Diagnostics that the rows store.
         conditions: Conditions of the constraints, in order of first use.
     """
@@ -157,7 +157,8 @@ def _measure(problem: "Problem", world: World, columns: dict[str, Array], finite
     """Move the world to both ends of every finite row and record the measurements."""
     rows = len(columns["start_q"])
     velocity = goal_velocities(problem, world.robot, columns["goal_q"], columns["goal_dq"])
-    poses = scene_of(problem, columns["start_xyz"], columns["goal_xyz"], velocity, columns.get(OBSTACLE_POSES)).poses
+    given = {"parameters": columns.get("parameters"), "obstacle_poses": columns.get(OBSTACLE_POSES)}
+    poses = scene_of(problem, columns["start_xyz"], columns["goal_xyz"], velocity, **given).poses
     position, velocity, jacobian = (np.full((rows, *shape), np.nan) for shape in ((2, 3), (3,), (3, world.robot.n)))
     measurements = _Measurements(position, velocity, jacobian, stored_diagnostics(problem, columns))
     for index, end in enumerate(ENDS):
@@ -173,9 +174,9 @@ def _measure(problem: "Problem", world: World, columns: dict[str, Array], finite
             for diagnostic in measurements.diagnostics:
                 diagnostic.note(world, row, index)
             if end == "goal" and "hit_speed" in columns:
-                measurements.hit_velocity[row] = world.tip_velocity
+                measurements.hit_velocity[row] = world.parameters.along_table(world.tip_velocity)
             if end == "goal" and "hit_speed_max" in columns:
-                measurements.hit_jacobian[row] = world.tip_jacobian
+                measurements.hit_jacobian[row] = world.parameters.along_table(world.tip_jacobian)
     return measurements
 
 
@@ -213,7 +214,7 @@ def _judge_position(block: _Measurements, columns: dict[str, Array], finite: Ind
 def _judge_hit(
     block: _Measurements, columns: dict[str, Array], finite: Index, dtype: str
 ) -> Iterator[tuple[Check, Index]]:
-    """Check direction and speed of the tip at the goal in the x-y plane."""
+    """Check direction and speed of the tip at the goal in the plane of the table."""
     if "hit_angle" not in columns or "hit_speed" not in columns:
         return
     angle, speed = columns["hit_angle"][finite, 0], columns["hit_speed"][finite, 0]
@@ -238,6 +239,7 @@ def _judge_highest(
     """Check the stored highest possible speed of a hit."""
     if "hit_angle" in columns and "hit_speed_max" in columns:
         highest = highest_speed(block.hit_jacobian[finite], columns["hit_angle"][finite, 0], robot.velocity_limit)
+        highest *= velocity_factors(robot, columns)[finite]
         error = np.abs(columns["hit_speed_max"][finite, 0] - highest)
         tolerance, end = np.full(len(finite), DIAGNOSTIC_TOLERANCES[dtype]), np.ones(len(finite), np.int64)
         yield compare("highest hit speed", "m/s", violation=error, tolerance=tolerance, row=finite, end=end)

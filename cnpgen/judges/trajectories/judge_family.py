@@ -12,6 +12,7 @@ from itertools import chain, product
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.errors import UsageError
 from cnpgen.judges.plans.bernstein import find_maximum
 from cnpgen.judges.plans.continuous_collision import check_continuous_collision, is_contact, pairs_of
 from cnpgen.judges.plans.evaluated_trajectory import EvaluatedTrajectory
@@ -44,11 +45,14 @@ class FamilyJudge:
         step: Maximum time between checked times [s].
 
     Raises:
-        UsageError: The step is not positive, or too long.
+        UsageError: The step is not positive, or too long, or the problem has parameters.
     """
 
     def __init__(self, problem: Problem, robot: Robot, *, step: float = 1e-3) -> None:
         check_step(step)
+        if problem.parameters:
+            names = ", ".join(problem.parameters.names)
+            raise UsageError(f"sampled trajectories of {problem.name!r} are not judged: they have no values of {names}")
         self._problem, self._robot, self._step = problem, robot, step
         self._world, self._moved = (PathWorld(robot, problem.obstacle, problem.object_size) for _ in range(2))
         self._limits = joint_limits(problem, self._world)

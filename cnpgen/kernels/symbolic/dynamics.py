@@ -1,6 +1,6 @@
 """Dynamics of a chain as CasADi SX: recursive Newton-Euler in the frames of its joints."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from cnpgen.kernels.symbolic.kinematics import joint_rotation
 from cnpgen.kernels.symbolic.linalg import (
@@ -16,6 +16,7 @@ from cnpgen.kernels.symbolic.linalg import (
     times,
     transposed_times,
 )
+from cnpgen.robots.attached import PayloadBody
 from cnpgen.robots.chain import Chain, Joint
 
 
@@ -67,7 +68,7 @@ def body_motions(chain: Chain, q: Vec, dq: Vec, ddq: Vec) -> list[BodyMotion]:
     return motions
 
 
-def inverse_dynamics(chain: Chain, q: Vec, dq: Vec, ddq: Vec) -> Vec:
+def inverse_dynamics(chain: Chain, q: Vec, dq: Vec, ddq: Vec, *, load: tuple[PayloadBody, Scalar] | None = None) -> Vec:
     """Return joint torques [N m] by recursive Newton-Euler in joint frames.
 
     Args:
@@ -75,11 +76,16 @@ def inverse_dynamics(chain: Chain, q: Vec, dq: Vec, ddq: Vec) -> Vec:
         q: Joint positions [rad], n scalars.
         dq: Joint velocities [rad/s].
         ddq: Joint accelerations [rad/s^2].
+        load: A body at the tip, and the factor by which the last body holds more of it.
     """
     motions = body_motions(chain, q, dq, ddq)
     wrenches = [_body_wrench(joint, motion) for joint, motion in zip(chain.joints, motions, strict=True)]
-    force: Vec = [0.0, 0.0, 0.0]
-    torque: Vec = [0.0, 0.0, 0.0]
+    if load is not None:
+        body, factor = load
+        added = _body_wrench(_at_tip(chain, body), motions[-1])
+        (force, torque), (more_force, more_torque) = wrenches[-1], added
+        wrenches[-1] = add(force, scale(more_force, factor)), add(torque, scale(more_torque, factor))
+    force, torque = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
     torques: Vec = []
     for joint, motion, wrench in zip(chain.joints[::-1], motions[::-1], wrenches[::-1], strict=True):
         force, torque = add(force, wrench[0]), add(torque, wrench[1])
@@ -100,6 +106,13 @@ def _body_wrench(joint: Joint, motion: BodyMotion) -> tuple[Vec, Vec]:
     force = scale(acceleration_at(motion.acceleration, omega, motion.alpha, com), joint.mass)
     spin = add(times(inertia, motion.alpha), cross(omega, times(inertia, omega)))
     return force, add(spin, cross(com, force))
+
+
+def _at_tip(chain: Chain, body: PayloadBody) -> Joint:
+    """Return the last joint with a body at the tip in place of its own."""
+    turn = chain.tip_rotation
+    com, inertia = chain.tip_translation + turn @ body.com, turn @ body.inertia @ turn.T
+    return replace(chain.joints[-1], mass=body.mass, com=com, inertia=inertia)
 
 
 def _offset(joint: Joint, angle: Scalar) -> Vec:

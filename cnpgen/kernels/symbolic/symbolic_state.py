@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 from cnpgen.kernels.symbolic.dynamics import acceleration_at, body_motions, inverse_dynamics
 from cnpgen.kernels.symbolic.kinematics import Kinematics, bias_acceleration, forward_kinematics, tip_velocity
-from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, constants, cross, dot, scale, times
+from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, constants, cross, dot, scale, subtract, times
 from cnpgen.robots.solid import pose_width
+from cnpgen.robots.table_frame import table_axes
 
 if TYPE_CHECKING:
     from cnpgen.robots.obstacle import Obstacle
@@ -26,7 +27,8 @@ class SymbolicState:
         q: Joint positions [rad], n scalars.
         dq: Joint velocities [rad/s].
         ddq: Joint accelerations [rad/s^2].
-        obstacle_poses: Poses and sizes of the obstacles (``cnpgen.robots.solid``), then values for a constraint.
+        obstacle_poses: Poses and sizes of the obstacles (``cnpgen.robots.solid``), then values for a constraint, then
+            the parameters of the problem.
         obstacles: The obstacles.
         object_size: Edge lengths of the held object [m], or None.
         jerk: Joint jerks [rad/s^3], or None.
@@ -44,7 +46,42 @@ class SymbolicState:
     @property
     def scene_values(self) -> Vec:
         """Values of the motion for a constraint (``Constraint.scene_values``)."""
-        return self.obstacle_poses[pose_width(self.obstacles) :]
+        values: Vec = self._after_obstacles[0]
+        return values
+
+    @property
+    def parameters(self) -> dict[str, Scalar]:
+        """Parameters of the sample, by name."""
+        return self._after_obstacles[1]
+
+    @cached_property
+    def _after_obstacles(self) -> tuple[Vec, dict[str, Scalar]]:
+        values = self.obstacle_poses[pose_width(self.obstacles) :]
+        return self.robot.parameters.split(values, self.robot.nominal_parameters)
+
+    def on_table(self, position: Vec) -> Vec:
+        """Return a position [m] in the frame of the table, which is the world's unless parameters move the table."""
+        axes = self._table_axes
+        if axes is None:
+            return position
+        pivot: Vec = constants(self.robot.table_origin)
+        relative = subtract(position, pivot)
+        relative[2] = relative[2] - self.parameters.get("table_height", 0.0)
+        return add([dot(axis, relative) for axis in axes], pivot)
+
+    def along_table(self, vector: Vec) -> Vec:
+        """Return a vector along the axes of the table."""
+        axes = self._table_axes
+        return vector if axes is None else [dot(axis, vector) for axis in axes]
+
+    @cached_property
+    def _table_axes(self) -> tuple[Vec, ...] | None:
+        import casadi as ca
+
+        if not self.robot.parameters.tilts_table:
+            return None
+        roll, pitch = (ca.SX(self.parameters.get(name, 0.0)) for name in ("table_roll", "table_pitch"))
+        return table_axes(ca.sin(roll), ca.cos(roll), ca.sin(pitch), ca.cos(pitch))
 
     @cached_property
     def kinematics(self) -> Kinematics:
@@ -54,7 +91,14 @@ class SymbolicState:
     @cached_property
     def torque(self) -> Vec:
         """Inverse dynamics [N m]."""
-        return inverse_dynamics(self.robot.chain, self.q, self.dq, self.ddq)
+        return self.inverse_dynamics(self.ddq)
+
+    def inverse_dynamics(self, ddq: Vec) -> Vec:
+        """Return the torque [N m] of the sample's load at other accelerations [rad/s^2]."""
+        chain, mass, payload = self.robot.chain, self.parameters.get("payload_mass"), self.robot.attached.payload
+        if mass is None or payload is None:
+            return inverse_dynamics(chain, self.q, self.dq, ddq)
+        return inverse_dynamics(chain, self.q, self.dq, ddq, load=(payload, (mass - payload.mass) / payload.mass))
 
     @cached_property
     def tip_velocity(self) -> Vec:

@@ -21,7 +21,7 @@ from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Stage, StageFunction
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
-from cnpgen.problems.obstacles import scene_of
+from cnpgen.problems.obstacles import scene_of, table_frame_of
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.shape.hull import coal_hull
 from cnpgen.robots.shape.shape import Shape
@@ -131,7 +131,10 @@ def candidate_poses(problem: Problem, candidates: CandidateBatch) -> Array:
         with np.errstate(invalid="ignore"):  # columns that are not finite are rejected
             direction[:, :2] = np.concatenate([np.cos(angle), np.sin(angle)]).T
     poses = None if candidates.scenes is None else candidates.scenes.poses[candidates.scene]
-    return scene_of(problem, candidates["start_xyz"].T, goal, direction, poses).lanes
+    parameters = candidates["parameters"].T if problem.parameters else None
+    if (frame := table_frame_of(problem, parameters)) is not None:
+        direction = frame.along_world(direction)
+    return scene_of(problem, candidates["start_xyz"].T, goal, direction, parameters, obstacle_poses=poses).lanes
 
 
 def capsule_axes_distance(robot: "Robot", problem: Problem) -> Any:

@@ -7,6 +7,7 @@ import numpy as np
 
 from cnpgen.errors import RecipeError
 from cnpgen.pipelines.context import Context
+from cnpgen.pipelines.stages.candidate_table import in_world, in_world_box
 from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Stage, StageFunction
 from cnpgen.schema.keys import Range, field
 from cnpgen.store.field import Field
@@ -14,7 +15,10 @@ from cnpgen.store.field import Field
 
 @dataclass(frozen=True, kw_only=True)
 class DrawPositions(Stage):
-    """Stage: start and goal positions uniform in two boxes, with a minimum distance."""
+    """Stage: start and goal positions uniform in two boxes, with a minimum distance.
+
+    If parameters of the problem move the table, the boxes are in the frame of the table.
+    """
 
     start: tuple[Range, Range, Range] = field("box of start positions: x, y, z", unit="m")
     goal: tuple[Range, Range, Range] = field("box of goal positions: x, y, z", unit="m")
@@ -27,9 +31,8 @@ class DrawPositions(Stage):
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
         """List the fields of both positions."""
-        del context
         return tuple(
-            position_field(end, [axis.low for axis in box], [axis.high for axis in box])
+            position_field(end, *in_world_box(context, [axis.low for axis in box], [axis.high for axis in box]))
             for end, box in (("start", self.start), ("goal", self.goal))
         )
 
@@ -41,6 +44,8 @@ class DrawPositions(Stage):
             candidates["start_xyz"] = uniform(candidates.draw(random, 3), self.start)
             candidates["goal_xyz"] = uniform(candidates.draw(random, 3), self.goal)
             distance = np.hypot(*(candidates["goal_xyz"] - candidates["start_xyz"])[:2])
+            for end in ("start_xyz", "goal_xyz"):
+                candidates[end] = in_world(context, candidates, candidates[end])
             candidates.reject(distance >= self.min_distance, "too close together")
 
         return work

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cnpgen.pipelines.context import Context
+from cnpgen.pipelines.stages.candidate_table import on_table
 from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Stage, StageFunction
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
@@ -42,10 +43,9 @@ class HitAngleToGoal(Stage):
 
     def prepare(self, context: Context) -> StageFunction:
         """Return the stage function."""
-        del context
 
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
-            x, y = candidates["goal_xyz"][:2]
+            x, y = on_table(context, candidates, candidates["goal_xyz"])[:2]
             noise = self.noise * (2 * candidates.draw(random, 1) - 1)
             candidates["hit_angle"] = wrap(np.arctan2(self.target[1] - y, self.target[0] - x) + noise)
 

@@ -14,6 +14,7 @@ from cnpgen.errors import RecipeError
 from cnpgen.kernels.symbolic.linalg import Scalar, Vec, symbols
 from cnpgen.kernels.tape import Loop
 from cnpgen.pipelines.context import Context
+from cnpgen.pipelines.stages.candidate_table import hit_direction
 from cnpgen.pipelines.stages.hitting_limits import held_step, within_limits
 from cnpgen.pipelines.stages.hitting_newton import (
     MAX_NEWTON_STEPS,
@@ -65,7 +66,7 @@ class HittingConfiguration(Stage):
         def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
             n = len(candidates.alive)
             home = np.repeat(robot.base[:, None], n, axis=1) if self.near == "base" else candidates[f"{self.near}_q"]
-            direction = np.concatenate([np.cos(candidates["hit_angle"]), np.sin(candidates["hit_angle"])])
+            direction = hit_direction(context, candidates)
             candidates["goal_q"], solved, value = search.solve(candidates["goal_xyz"], direction, home)
             candidates.reject_first(np.array([solved, value > -np.inf]), REASONS)
 

@@ -26,7 +26,14 @@ from cnpgen.kernels.symbolic.linalg import (
     subtract,
     symbols,
 )
-from cnpgen.pipelines.stages.hitting_newton import NEWTON_TOLERANCE_RAD, Expansion, expand, safeguard, shortened
+from cnpgen.pipelines.stages.hitting_newton import (
+    NEWTON_TOLERANCE_RAD,
+    Expansion,
+    direction_symbols,
+    expand,
+    safeguard,
+    shortened,
+)
 from cnpgen.pipelines.stages.stage import Array
 
 if TYPE_CHECKING:
@@ -87,13 +94,14 @@ def held_step(robot: "Robot") -> Any:
         robot: Robot with revolute joints only.
 
     Returns:
-        A ``casadi.Function`` with arguments of width 2 n, 3, 2, n, n.
+        A ``casadi.Function`` with arguments of width 2 n, 3, 2 or 3, n, n.
     """
     import casadi as ca
 
     n = robot.n
-    widths = (("state", 2 * n), ("p", 3), ("d", 2), ("q0", n), ("held", n))
-    (state_sx, state), (p_sx, p), (d_sx, d), (home_sx, home), (held_sx, held) = (symbols(*item) for item in widths)
+    widths = (("state", 2 * n), ("p", 3), ("q0", n), ("held", n))
+    (state_sx, state), (p_sx, p), (home_sx, home), (held_sx, held) = (symbols(*item) for item in widths)
+    d_sx, d = direction_symbols(robot)
     q = state[:n]
     here = expand(robot, q, d, home)
     step, pull = _step(here, subtract(p, here.kin.tip), [1.0 - x for x in held])

@@ -43,11 +43,22 @@ def objective(robot: "Robot") -> Any:
     """Build ``(q, d, q0) -> f``: the squared manipulability along d minus the penalty on the distance from q0."""
     import casadi as ca
 
-    (q_sx, q), (d_sx, d), (home_sx, home) = symbols("q", robot.n), symbols("d", 2), symbols("q0", robot.n)
+    (q_sx, q), (d_sx, d), (home_sx, home) = symbols("q", robot.n), direction_symbols(robot), symbols("q0", robot.n)
     jacobian = forward_kinematics(robot.chain, q).jacobian
-    gain = [d[0] * column[0] + d[1] * column[1] for column in jacobian]
+    gain = [along(d, column) for column in jacobian]
     away = [(b - a) / float(rated) for a, b, rated in zip(q, home, robot.rated_velocity, strict=True)]
     return ca.Function("objective", [q_sx, d_sx, home_sx], [dot(gain, gain) - dot(away, away)])
+
+
+def direction_symbols(robot: "Robot") -> tuple[Any, Vec]:
+    """Return the symbols of a hitting direction: x and y, and z if samples tilt the table."""
+    return symbols("d", 3 if robot.parameters.tilts_table else 2)
+
+
+def along(direction: Vec, vector: Vec) -> Scalar:
+    """Return the component of a vector along a direction of 2 or 3 components."""
+    first = direction[0] * vector[0] + direction[1] * vector[1]
+    return first if len(direction) == 2 else first + direction[2] * vector[2]
 
 
 @dataclass(frozen=True)
@@ -98,15 +109,15 @@ def expand(robot: "Robot", q: Vec, d: Vec, home: Vec) -> Expansion:
     Args:
         robot: Robot with revolute joints only.
         q: Joint positions [rad], n scalars.
-        d: Unit hitting direction in the table plane, 2.
+        d: Unit hitting direction in the table plane, 2, or 3 for tables that samples tilt.
         home: Home configuration [rad], n.
     """
     kin = forward_kinematics(robot.chain, q)
-    direction = [d[0], d[1], 0.0]
+    direction = [*d, 0.0] if len(d) == 2 else d
     weight = [1.0 / float(value) ** 2 for value in robot.rated_velocity]
-    gain = [d[0] * column[0] + d[1] * column[1] for column in kin.jacobian]
+    gain = [along(d, column) for column in kin.jacobian]
     second = _second_derivatives(kin)
-    gain_gradient = [[d[0] * entry[0] + d[1] * entry[1] for entry in row] for row in second]
+    gain_gradient = [[along(d, entry) for entry in row] for row in second]
     gradient = [2.0 * dot(gain_gradient[j], gain) + 2.0 * weight[j] * (home[j] - q[j]) for j in range(robot.n)]
     return Expansion(kin, gradient, direction, gain, second, gain_gradient, weight)
 
@@ -143,13 +154,12 @@ def newton_step(robot: "Robot") -> Any:
         robot: Robot with revolute joints only.
 
     Returns:
-        A ``casadi.Function`` with arguments of width n, 3, 2, n.
+        A ``casadi.Function`` with arguments of width n, 3, 2 or 3, n.
     """
     import casadi as ca
 
-    (q_sx, q), (p_sx, p), (d_sx, d), (home_sx, home) = (
-        symbols(name, width) for name, width in (("q", robot.n), ("p", 3), ("d", 2), ("q0", robot.n))
-    )
+    (q_sx, q), (p_sx, p), (home_sx, home) = symbols("q", robot.n), symbols("p", 3), symbols("q0", robot.n)
+    d_sx, d = direction_symbols(robot)
     here = expand(robot, q, d, home)
     following, length = shortened(q, _reduced_step(here, subtract(p, here.kin.tip), basic_joints(robot)))
     return ca.Function("hitting_configuration", [q_sx, p_sx, d_sx, home_sx], [following, length])

@@ -19,8 +19,10 @@ import numpy as np
 
 from cnpgen.errors import UsageError
 from cnpgen.kernels.symbolic.kinematics import forward_kinematics
-from cnpgen.kernels.symbolic.linalg import Scalar, Vec, dot, symbols
+from cnpgen.kernels.symbolic.linalg import Scalar, Vec, cross, dot, symbols
 from cnpgen.pipelines.context import Context
+from cnpgen.pipelines.stages.candidate_table import hit_direction, table_normal, velocity_factor
+from cnpgen.pipelines.stages.hitting_newton import along, direction_symbols
 from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Stage, StageFunction
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
@@ -103,8 +105,11 @@ class HittingVelocity(Stage):
         kernel = context.kernels.load(hitting_velocity, min_speed=self.min_speed)
 
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
-            direction = np.concatenate([np.cos(candidates["hit_angle"]), np.sin(candidates["hit_angle"])])
-            velocity, speed, found = kernel(candidates["goal_q"], direction)
+            directions = [hit_direction(context, candidates), *table_normal(context, candidates)]
+            velocity, speed, found = kernel(candidates["goal_q"], *directions)
+            limit = velocity_factor(context, candidates)
+            if limit is not None:  # the solution is proportional to the limits
+                velocity, speed = velocity * limit, speed * limit
             factor = share(candidates, random, speed)
             candidates["goal_dq"], candidates["hit_speed"], candidates["hit_speed_max"] = (
                 velocity * factor,
@@ -117,27 +122,33 @@ class HittingVelocity(Stage):
 
 
 def hitting_velocity(robot: "Robot", *, min_speed: float) -> Any:
-    """Build the linear program as an SX function ``(q, d) -> (dq, speed, found)``.
+    """Build the linear program as an SX function ``(q, d) -> (dq, speed, found)``, or of (q, d, normal).
 
     Args:
         robot: Robot.
         min_speed: Minimum speed of a hit [m/s].
 
     Returns:
-        A ``casadi.Function`` with arguments of width n, 2; dq [rad/s] maximizes the tip's speed [m/s] along d.
+        A ``casadi.Function`` with arguments of width n, 2; dq [rad/s] maximizes the tip's speed [m/s] along d. If
+        samples tilt the table, the directions have width 3, and the normal of the table is the third argument.
         ``found`` is 0 for slower hits, and if the Jacobian is singular and dq is not finite.
     """
     import casadi as ca
 
-    (q_sx, q), (d_sx, d) = symbols("q", robot.n), symbols("d", 2)
+    (q_sx, q), (d_sx, d), (normal_sx, normal) = symbols("q", robot.n), direction_symbols(robot), symbols("normal", 3)
     jacobian = forward_kinematics(robot.chain, q).jacobian
-    along = [d[0] * column[0] + d[1] * column[1] for column in jacobian]
-    across = [[d[0] * column[1] - d[1] * column[0], column[2]] for column in jacobian]
-    velocity, speed = maximise(along, across, [float(x) for x in robot.velocity_limit])
+    forward = [along(d, column) for column in jacobian]
+    if robot.parameters.tilts_table:
+        side = cross(normal, d)
+        across = [[dot(side, column), dot(normal, column)] for column in jacobian]
+    else:
+        across = [[d[0] * column[1] - d[1] * column[0], column[2]] for column in jacobian]
+    velocity, speed = maximise(forward, across, [float(x) for x in robot.velocity_limit])
     found = ca.logic_and(min_speed <= speed, speed < np.inf)
     for rate in velocity:
         found = ca.logic_and(found, ca.fabs(rate) < np.inf)
-    return ca.Function("hitting_velocity", [q_sx, d_sx], [ca.vertcat(*velocity), speed, found])
+    arguments = [q_sx, d_sx, normal_sx] if robot.parameters.tilts_table else [q_sx, d_sx]
+    return ca.Function("hitting_velocity", arguments, [ca.vertcat(*velocity), speed, found])
 
 
 def maximise(a: Vec, b: list[Vec], limit: list[float]) -> tuple[Vec, Scalar]:

@@ -8,6 +8,7 @@ import numpy as np
 
 from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, subtract, symbols
 from cnpgen.pipelines.context import Context
+from cnpgen.pipelines.stages.candidate_table import on_table
 from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Stage, StageFunction
 from cnpgen.problems.constraints.table import Table
 from cnpgen.schema.keys import field
@@ -61,7 +62,8 @@ class BallisticReach(Stage):
                 ahead, _ = over(candidates["start_xyz"][:2], displacement)
                 candidates.reject(ahead[0] > 0, f"the start {reason}")
             if self.goal_time:
-                _, both = over(candidates["goal_xyz"][:2], self.goal_time * hit_velocity(candidates))
+                goal = on_table(context, candidates, candidates["goal_xyz"])[:2]
+                _, both = over(goal, self.goal_time * hit_velocity(candidates))
                 candidates.reject(both[0] > 0, f"the hit {reason}")
 
         return work
@@ -86,6 +88,6 @@ def over_table(*, sides: list[list[float]]) -> Any:
 
 
 def hit_velocity(candidates: CandidateBatch) -> Array:
-    """Return the horizontal velocity of the tip at the goal [m/s], shape (2, n)."""
+    """Return the velocity of the tip on the table at the goal [m/s], shape (2, n)."""
     angle, speed = candidates["hit_angle"], candidates["hit_speed"]
     return np.concatenate([speed * np.cos(angle), speed * np.sin(angle)])

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cnpgen.kernels.symbolic.dynamics import inverse_dynamics
 from cnpgen.kernels.symbolic.linalg import symbols
+from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.stage import CandidateBatch, Stage, StageFunction
 from cnpgen.schema.keys import field
@@ -44,7 +44,8 @@ class GravityTorque(Stage):
         kernel = context.kernels.load(torque_ratio)
 
         def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
-            (ratio,) = kernel(candidates[f"{self.end}_q"])
+            load = [candidates["parameters"]] if context.problem.parameters else []
+            (ratio,) = kernel(candidates[f"{self.end}_q"], *load)
             candidates[f"{self.end}_torque_ratio"] = ratio
             candidates.reject(ratio[0] <= 1.0, f"joint torque limit at the {self.end}")
 
@@ -52,12 +53,13 @@ class GravityTorque(Stage):
 
 
 def torque_ratio(robot: "Robot") -> Any:
-    """Build ``q -> max_i |gravity torque_i| / limit_i``."""
+    """Build ``q -> max_i |gravity torque_i| / limit_i``, with the problem's parameters ``(q, parameters) -> ...``."""
     import casadi as ca
 
-    q_sx, q = symbols("q", robot.n)
+    (q_sx, q), (parameters_sx, parameters) = symbols("q", robot.n), symbols("parameters", len(robot.parameters))
     zero = [0.0] * robot.n
     largest = ca.SX(0)
-    for torque, limit in zip(inverse_dynamics(robot.chain, q, zero, zero), robot.torque_limit, strict=True):
+    state = SymbolicState(robot, q, zero, zero, parameters, (), None)
+    for torque, limit in zip(state.torque, robot.torque_limit, strict=True):
         largest = ca.fmax(largest, ca.fabs(torque) / float(limit))
-    return ca.Function("torque_ratio", [q_sx], [largest])
+    return ca.Function("torque_ratio", [q_sx, parameters_sx] if parameters else [q_sx], [largest])

@@ -19,7 +19,8 @@ STATES = ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq")
 USUAL = (*STATES, "sin_cos", "tips", "expected_time")
 ARRIVAL = "goal_ddq"  # only if goal accelerations are given
 SCENE = "scene"  # only if samples place obstacles
-BLOCKS = (*USUAL, ARRIVAL, SCENE)
+PARAMETERS = "parameters"  # only for problems with parameters
+BLOCKS = (*USUAL, ARRIVAL, PARAMETERS, SCENE)
 FEATURE_SETS = ("full", "no-scene", "states", "paper")
 MIN_DEVIATION = 1e-7  # SI units; features with a smaller standard deviation are constant
 
@@ -56,7 +57,8 @@ def feature_blocks(boundary: Boundary, features: str = "full", *, placed: bool =
         placed: Whether samples place obstacles.
     """
     blocks = USUAL if features in {"full", "no-scene"} else STATES
-    blocks = blocks if boundary.goal_ddq is None else (*blocks, ARRIVAL)
+    optional = {ARRIVAL: boundary.goal_ddq, PARAMETERS: boundary.parameters}
+    blocks = (*blocks, *(name for name, values in optional.items() if values is not None))
     return (*blocks, SCENE) if placed and features == "full" else blocks
 
 
@@ -96,6 +98,7 @@ def raw_features(tasks: Tasks, blocks: tuple[str, ...]) -> Array:
     * ``tips``: tip positions at start and goal [m];
     * ``expected_time``: its logarithm;
     * ``scene``: features of the obstacles that samples place (``scene_features``).
+    * ``parameters``: the parameters of the problem, if it has any.
 
     Args:
         tasks: The tasks.
@@ -108,16 +111,16 @@ def raw_features(tasks: Tasks, blocks: tuple[str, ...]) -> Array:
     return np.concatenate(parts, axis=1, dtype=np.float64)
 
 
-def count_features(blocks: tuple[str, ...], joints: int) -> int:
-    """Return the number of features of some of ``BLOCKS``, for a number of planned joints."""
-    widths = {**dict.fromkeys((*STATES, ARRIVAL), joints), "sin_cos": 4 * joints, "tips": 6, "expected_time": 1}
-    widths[SCENE] = count_scene_features(joints)
+def count_features(blocks: tuple[str, ...], joints: int, parameters: int = 0) -> int:
+    """Return the number of features of some of ``BLOCKS``, for a number of planned joints and of parameters."""
+    widths = {**dict.fromkeys((*STATES, ARRIVAL), joints), "sin_cos": 4 * joints, "tips": 6}
+    widths |= {"expected_time": 1, PARAMETERS: parameters, SCENE: count_scene_features(joints)}
     return sum(widths[name] for name in blocks)
 
 
 def _block(tasks: Tasks, name: str) -> tuple[Array, ...]:
     boundary = tasks.boundary
-    if name in STATES or name == ARRIVAL:
+    if name in {*STATES, ARRIVAL, PARAMETERS}:
         return (getattr(boundary, name),)
     if name == "sin_cos":
         angles = np.concatenate([boundary.start_q, boundary.goal_q], axis=1)

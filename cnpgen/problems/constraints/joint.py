@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 class _RelativeLimit(Constraint):
     """Base class: symmetric limit with a relative tolerance."""
 
+    factor_name: ClassVar[str] = ""  # parameter by which samples scale the limit
+
     tolerance: float = field("violation that a valid motion may have, as a fraction of the limit", low=0.0)
 
     def allowed(self, condition: Condition) -> NDArray[np.float64]:
@@ -31,6 +33,11 @@ class _RelativeLimit(Constraint):
 
 def _within(name: str, unit: str, g: list[Any], limit: NDArray[np.float64]) -> tuple[Condition, ...]:
     return (Condition(name, unit, g, -limit, limit, "limit"),)
+
+
+def _per_factor(rates: list[Any], factor: Any) -> list[Any]:
+    """Return rates divided by the factor of their limits, so that the bounds are the same for all samples."""
+    return rates if factor is None else [rate / factor for rate in rates]
 
 
 def _between(robot: "Robot", q: list[Any]) -> tuple[Condition, ...]:
@@ -61,14 +68,17 @@ class JointVelocity(_RelativeLimit):
 
     reason = "joint velocity limit"
     training_weight, training_factor = 100.0, 0.99
+    factor_name = "velocity_factor"
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the limits on dq [rad/s]."""
-        return _within("joint velocity", state.robot.units("rad/s"), state.dq, state.robot.velocity_limit)
+        rates = _per_factor(state.dq, state.parameters.get(self.factor_name))
+        return _within("joint velocity", state.robot.units("rad/s"), rates, state.robot.velocity_limit)
 
     def measured(self, world: "World") -> tuple[Condition, ...]:
         """Compare dq [rad/s] with the limits."""
-        return _within("joint velocity", world.robot.units("rad/s"), list(world.dq), world.robot.velocity_limit)
+        rates = _per_factor(list(world.dq), world.parameters.values.get(self.factor_name))
+        return _within("joint velocity", world.robot.units("rad/s"), rates, world.robot.velocity_limit)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,16 +87,17 @@ class JointAcceleration(_RelativeLimit):
 
     reason = "joint acceleration limit"
     training_weight, training_factor = 5.0, 0.985
+    factor_name = "acceleration_factor"
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the limits on ddq [rad/s^2]."""
-        return _within("joint acceleration", state.robot.units("rad/s^2"), state.ddq, state.robot.acceleration_limit)
+        rates = _per_factor(state.ddq, state.parameters.get(self.factor_name))
+        return _within("joint acceleration", state.robot.units("rad/s^2"), rates, state.robot.acceleration_limit)
 
     def measured(self, world: "World") -> tuple[Condition, ...]:
         """Compare ddq [rad/s^2] with the limits."""
-        return _within(
-            "joint acceleration", world.robot.units("rad/s^2"), list(world.ddq), world.robot.acceleration_limit
-        )
+        rates = _per_factor(list(world.ddq), world.parameters.values.get(self.factor_name))
+        return _within("joint acceleration", world.robot.units("rad/s^2"), rates, world.robot.acceleration_limit)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -120,7 +120,7 @@ class PuckContact(Constraint):
     def _symbolic(self, state: SymbolicState, margin: float | None) -> tuple[Condition, ...]:
         import casadi as ca
 
-        tip = state.kinematics.tip
+        tip = state.on_table(state.kinematics.tip)
         values = state.scene_values or [PUCK_OUT_OF_REACH_M] * self.scene_width
         from_goal, from_puck = ((tip[0] - x) ** 2 + (tip[1] - y) ** 2 for x, y in (values[:2], values[2:]))
         distance = ca.sqrt(from_puck + MIN_SQUARED_PUCK_DISTANCE_M2)
@@ -128,7 +128,7 @@ class PuckContact(Constraint):
 
     def _measured(self, world: World, margin: float | None) -> tuple[Condition, ...]:
         values = world.scene_values if len(world.scene_values) else [PUCK_OUT_OF_REACH_M] * self.scene_width
-        (x, y), (goal_x, goal_y, puck_x, puck_y) = world.tip_position[:2], values
+        (x, y), (goal_x, goal_y, puck_x, puck_y) = world.parameters.on_table(world.tip_position)[:2], values
         from_goal, distance = (x - goal_x) ** 2 + (y - goal_y) ** 2, np.hypot(x - puck_x, y - puck_y)
         return self._condition(from_goal, distance) if margin is None else self._cone(from_goal, distance, margin)
 

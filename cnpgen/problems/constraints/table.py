@@ -13,12 +13,14 @@ from cnpgen.schema.keys import Range, field
 class Table(TipManifold):
     """Constraint: the tip stays in a rectangle at the table's height, with ``dz/dt = d2z/dt2 = 0`` at the ends.
 
-    It equals a ``plane`` normal to z with a rectangle along x and y.
+    It equals a ``plane`` normal to z with a rectangle along x and y. Parameters of the problem may raise the table and
+    turn it about the center of its rectangle; then all coordinates are those of the table.
     """
 
     reason = "off the table"
     training_inset = 1e-3  # m
     kinks = BOUND_KINKS
+    moves_with_table = True
     inside_name, held_name = "table rectangle", "table height"
     velocity_name, acceleration_name = "vertical velocity", "vertical acceleration"
     parts = (("x", "y"), ())

@@ -66,6 +66,7 @@ class TipManifold(Constraint):
     velocity_name: ClassVar[str]
     acceleration_name: ClassVar[str]
     parts: ClassVar[tuple[tuple[str, ...], tuple[str, ...]]] = ((), ())
+    moves_with_table: ClassVar[bool] = False  # whether parameters of the problem move it
 
     @property
     @abstractmethod
@@ -79,21 +80,33 @@ class TipManifold(Constraint):
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the tip position [m]."""
-        return self._position(state.kinematics.tip, 0.0)
+        return self._position(self._symbolic_tip(state), 0.0)
 
     def measured(self, world: "World") -> tuple[Condition, ...]:
         """Evaluate Pinocchio's tip position [m]."""
-        return self._position(list(world.tip_position), 0.0)
+        return self._position(self._measured_tip(world), 0.0)
 
     def symbolic_at(self, state: "SymbolicState", end: End) -> tuple[Condition, ...]:
         """State position, velocity and acceleration of a boundary state."""
-        position = self._position(state.kinematics.tip, self._band_at(end))
-        return (*position, *self._moving(state.tip_velocity, state.tip_acceleration))
+        position = self._position(self._symbolic_tip(state), self._band_at(end))
+        rates = state.tip_velocity, state.tip_acceleration
+        return (*position, *self._moving(*(map(state.along_table, rates) if self.moves_with_table else rates)))
 
     def measured_at(self, world: "World", end: End) -> tuple[Condition, ...]:
         """Evaluate position, velocity and acceleration with Pinocchio."""
-        position = self._position(list(world.tip_position), self._band_at(end))
-        return (*position, *self._moving(list(world.tip_velocity), list(world.tip_acceleration)))
+        position = self._position(self._measured_tip(world), self._band_at(end))
+        velocity, acceleration = world.tip_velocity, world.tip_acceleration
+        if self.moves_with_table:
+            velocity, acceleration = map(world.parameters.along_table, (velocity, acceleration))
+        return (*position, *self._moving(list(velocity), list(acceleration)))
+
+    def _symbolic_tip(self, state: "SymbolicState") -> Sequence[Any]:
+        tip = state.kinematics.tip
+        return state.on_table(tip) if self.moves_with_table else tip
+
+    def _measured_tip(self, world: "World") -> Sequence[Any]:
+        tip = world.tip_position
+        return list(world.parameters.on_table(tip) if self.moves_with_table else tip)
 
     def bound_relaxation(self, condition: Condition, s: Array, start_tip: Array) -> Array:
         """Relax the bounds for a start off the manifold: by ``start_off`` until s = 0.1, by zero from s = 0.3 on."""

@@ -51,7 +51,7 @@ def end_violations(problem: Problem, robot: Robot, boundary: Boundary, scene: Sc
         for (constraint, condition), order in zip(pairs, orders, strict=True):
             if not (free and order == 2):
                 yield from _violation(constraint, condition, tip, end, BOUNDARY_MARGIN[order])
-    if boundary.goal_ddq is None and not _has_acceleration(problem, robot, *ends["goal"][:2]):
+    if boundary.goal_ddq is None and not _has_acceleration(problem, world):
         yield "at the goal there is no acceleration within its limits whose torques are within theirs"
 
 
@@ -74,7 +74,7 @@ def _violation(
         )
 
 
-def _has_acceleration(problem: Problem, robot: Robot, q: Array, dq: Array) -> bool:
+def _has_acceleration(problem: Problem, world: World) -> bool:
     """Return whether an acceleration within its limits, tolerances included, has torques within theirs."""
     import pinocchio as pin
     from scipy.optimize import linprog
@@ -82,12 +82,13 @@ def _has_acceleration(problem: Problem, robot: Robot, q: Array, dq: Array) -> bo
     torque = [constraint for constraint in problem.constraint if isinstance(constraint, JointTorque)]
     if not torque:
         return True
+    robot, q, dq = world.robot, world.q, world.dq
     acceleration = joint_limits(problem, robot, tolerances=1.0).acceleration
     tolerance = min(constraint.tolerance for constraint in torque)
     limit = robot.torque_limit * (1 + tolerance + BOUNDARY_MARGIN[2]) + BOUNDARY_MARGIN[2]
-    data = robot.model.createData()
-    bias = np.array(pin.rnea(robot.model, data, q, dq, np.zeros(robot.n)))
-    inertia = np.array([pin.rnea(robot.model, data, q, dq, unit) - bias for unit in np.eye(robot.n)]).T
+    model, data = world.parameters.model, world.parameters.model.createData()
+    bias = np.array(pin.rnea(model, data, q, dq, np.zeros(robot.n)))
+    inertia = np.array([pin.rnea(model, data, q, dq, unit) - bias for unit in np.eye(robot.n)]).T
     solved = linprog(
         np.zeros(robot.n),
         A_ub=np.vstack([inertia, -inertia]),

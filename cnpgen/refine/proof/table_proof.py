@@ -53,7 +53,7 @@ class TableBounds:
 
 
 def table_bounds(problem: Problem, start_tip: Array, *, tolerances: float) -> TableBounds | None:
-    """Return the bounds of the problem's tables, or None if it has none.
+    """Return the bounds of the problem's tables, or None if it has none or they differ from sample to sample.
 
     The height is bounded by its tolerance. A motion that starts off the table may be off by the table's ``start_off``
     at any time, since the time-varying bound depends on its phase.
@@ -64,7 +64,7 @@ def table_bounds(problem: Problem, start_tip: Array, *, tolerances: float) -> Ta
         tolerances: Fraction of the tolerance by which the rectangles are enlarged.
     """
     tables = [constraint for constraint in problem.constraint if isinstance(constraint, Table)]
-    if not tables:
+    if not tables or problem.parameters.tilts_table:
         return None
     limits = []
     for table in tables:

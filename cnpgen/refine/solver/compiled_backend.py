@@ -181,7 +181,7 @@ class CompiledBackend:
         grid, kernels = motion.grid, motion.kernels
         groups = np.empty((0, 3)) if kernels.cost_term is None else kernels.cost_term.groups(kernels.cost_counts)
         arrays = {
-            **vars(motion.boundary),
+            **{name: values for name, values in vars(motion.boundary).items() if name != "parameters"},
             "obstacle_poses": motion.poses_along,
             "time_basis": grid.time_basis,
             "time_weights": grid.time_weights,

@@ -1,0 +1,131 @@
+"""Parameters of a problem: quantities of its manifold, limits and load that differ from sample to sample."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import UsageError
+from cnpgen.schema.keys import Range, field, keys
+
+Array = NDArray[np.float64]
+
+TABLE_PARAMETERS = ("table_height", "table_roll", "table_pitch")
+MAX_TILT_RAD = 0.5  # of a table about each axis
+RANGE_ROUNDING = 1e-12  # of values at the ends of a range
+
+
+@dataclass(frozen=True, kw_only=True)
+class ParameterRanges:
+    """Ranges of the parameters that samples of a problem have, in the order of their columns."""
+
+    table_height: Range | None = field(
+        "height of the table above that of the constraint 'table'", unit="m", default=None, since_version=2
+    )
+    table_roll: Range | None = field(
+        "turn of the table about its x axis",
+        unit="rad",
+        default=None,
+        since_version=2,
+        low=-MAX_TILT_RAD,
+        high=MAX_TILT_RAD,
+    )
+    table_pitch: Range | None = field(
+        "turn of the table about world y, after the roll",
+        unit="rad",
+        default=None,
+        since_version=2,
+        low=-MAX_TILT_RAD,
+        high=MAX_TILT_RAD,
+    )
+    velocity_factor: Range | None = field(
+        "joint velocity limit, as a fraction of that of [limits]", default=None, since_version=2, low=1e-3, high=1.0
+    )
+    acceleration_factor: Range | None = field(
+        "joint acceleration limit, as a fraction of that of [limits]", default=None, since_version=2, low=1e-3, high=1.0
+    )
+    payload_mass: Range | None = field(
+        "mass of the payload, whose inertia is proportional to it", unit="kg", default=None, since_version=2, low=1e-9
+    )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters that samples have."""
+        return tuple(key.name for key in keys(type(self)) if getattr(self, key.name) is not None)
+
+    @property
+    def units(self) -> str:
+        """Unit of all values, or one per value, separated by commas, if they differ."""
+        units = [key.unit for key in keys(type(self)) if key.name in self.names]
+        return units[0] if len(set(units)) == 1 else ", ".join(units)
+
+    @property
+    def ranges(self) -> tuple[Range, ...]:
+        """Ranges of the parameters that samples have."""
+        return tuple(getattr(self, name) for name in self.names)
+
+    @property
+    def tilts_table(self) -> bool:
+        """Whether the table is raised or tilted."""
+        return any(name in TABLE_PARAMETERS for name in self.names)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def nominal(self, payload_mass: float = 0.0) -> Array:
+        """Return the values of a sample without parameters, shape (width,).
+
+        Args:
+            payload_mass: Mass of the problem's payload [kg].
+        """
+        values = dict.fromkeys(TABLE_PARAMETERS, 0.0)
+        values |= {"velocity_factor": 1.0, "acceleration_factor": 1.0, "payload_mass": payload_mass}
+        return np.array([values[name] for name in self.names], np.float64)
+
+    def split(self, values: Sequence[Any] | Array, nominal: Array) -> tuple[Any, dict[str, Any]]:
+        """Split the values of a scene after its obstacles: those for a constraint, and the parameters by name.
+
+        Args:
+            values: The values; empty for an undefined sample, whose parameters are nominal.
+            nominal: Result of ``nominal``.
+        """
+        if not len(self):
+            return values, {}
+        first = max(len(values) - len(self), 0)
+        return values[:first], dict(zip(self.names, values[first:] if len(values) else nominal, strict=True))
+
+    def checked(self, values: Array) -> Array:
+        """Return parameters of N samples, or of one for all, shape (N, width); check their shape and ranges.
+
+        Raises:
+            UsageError: The shape is wrong, or a value is outside its range.
+        """
+        if values.ndim not in {1, 2} or values.shape[-1] != len(self):
+            raise UsageError(
+                f"must have shape (N, {len(self)}) for {', '.join(self.names)}, got {values.shape}",
+                argument="parameters",
+            )
+        rows = values.reshape(-1, len(self))
+        for column, (name, span) in enumerate(zip(self.names, self.ranges, strict=True)):
+            rounding = RANGE_ROUNDING * max(abs(span.low), abs(span.high))
+            outside = ~((rows[:, column] >= span.low - rounding) & (rows[:, column] <= span.high + rounding))
+            if outside.any():
+                row = int(outside.argmax())
+                raise UsageError(
+                    f"{name} must be from {span.low:g} to {span.high:g}, got {rows[row, column]:g} in row {row}",
+                    argument="parameters",
+                )
+        return rows
+
+    def describe(self) -> Iterator[str]:
+        """Yield a text of every parameter with its range in SI units."""
+        for key in keys(type(self)):
+            if (span := getattr(self, key.name)) is not None:
+                yield f"{key.name} in [{span.low:.4g}, {span.high:.4g}]" + ("" if key.unit == "1" else f" {key.unit}")
+
+
+NO_PARAMETERS = ParameterRanges()

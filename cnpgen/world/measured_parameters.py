@@ -1,0 +1,95 @@
+"""Parameters of a sample in Pinocchio's terms: the inertia of the load and the pose of the table."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.robots.chain import frame_of
+from cnpgen.robots.robot import reduced_model
+
+if TYPE_CHECKING:
+    import pinocchio as pin
+
+    from cnpgen.robots.robot import Robot
+
+Array = NDArray[np.float64]
+
+
+class MeasuredParameters:
+    """Parameters of the sample of a world; ``set`` replaces them.
+
+    Args:
+        robot: The robot.
+
+    Attributes:
+        model: Pinocchio's model with the load of the sample, a copy of the robot's if loads differ.
+        values: Parameters of the sample, by name.
+        scene_values: Values for a constraint (``Constraint.scene_values``); empty if none were given.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        self._robot = robot
+        self.model = robot.model
+        self.values: dict[str, float] = {}
+        self.scene_values = np.empty(0)
+        self._turn, self._origin = np.eye(3), np.zeros(3)
+        self._load: tuple[int, pin.Inertia, pin.SE3] | None = None
+        if "payload_mass" in robot.parameters.names:
+            self._hold_load()
+
+    def set(self, values: Array) -> None:
+        """Take the values of a scene after its obstacles: those for a constraint, then parameters, shape (width,)."""
+        self.scene_values, self.values = self._robot.parameters.split(values, self._robot.nominal_parameters)
+        if self._load is not None:
+            self._set_mass(self.values["payload_mass"])
+        if self._robot.parameters.tilts_table:
+            self._set_table()
+
+    def along_world(self, vector: Array) -> Array:
+        """Return vectors along the axes of the table along those of the world, shape (3,) or (3, K)."""
+        return np.asarray(self._turn @ vector)
+
+    def on_table(self, position: Array) -> Array:
+        """Return positions in the frame of the table, whose axes and origin are the world's if it is not moved.
+
+        Args:
+            position: Positions in the world frame [m], shape (3,) or (3, K).
+        """
+        if not self._robot.parameters.tilts_table:
+            return position
+        shape = 3, *[1] * (position.ndim - 1)
+        pivot = self._robot.table_origin.reshape(shape)
+        return np.asarray(self._turn.T @ (position - self._origin.reshape(shape)) + pivot)
+
+    def along_table(self, vector: Array) -> Array:
+        """Return vectors along the axes of the table, shape (3,) or (3, K)."""
+        return np.asarray(self._turn.T @ vector) if self._robot.parameters.tilts_table else vector
+
+    def _hold_load(self) -> None:
+        """Copy the model, and keep the last body without its load."""
+        robot = self._robot
+        bare = reduced_model(robot.urdf, robot.urdf_text, robot.joint_names, replace(robot.attached, payload=None))
+        self.model = robot.model.copy()
+        frame = bare.frames[frame_of(bare, robot.tip)]
+        self._load = frame.parentJoint, bare.inertias[frame.parentJoint].copy(), frame.placement.copy()
+
+    def _set_mass(self, mass: float) -> None:
+        import pinocchio as pin
+
+        payload = self._robot.attached.payload
+        assert self._load is not None
+        assert payload is not None
+        joint, bare, placement = self._load
+        body = pin.Inertia(mass, payload.com, payload.inertia * (mass / payload.mass))
+        self.model.inertias[joint] = bare + placement.act(body)
+
+    def _set_table(self) -> None:
+        import pinocchio as pin
+
+        roll, pitch = (self.values.get(name, 0.0) for name in ("table_roll", "table_pitch"))
+        self._turn = pin.rpy.rpyToMatrix(roll, pitch, 0.0)  # Ry(pitch) Rx(roll)
+        self._origin = self._robot.table_origin + np.array([0.0, 0.0, self.values.get("table_height", 0.0)])
