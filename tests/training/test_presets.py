@@ -102,8 +102,8 @@ def test_the_loss_has_the_published_terms_without_tightening_or_time_varying_bou
     run, _ = prepare_run(open_training_data(tiny("airhockey-hit")), _airhockey(), SMALL, check_rows=2)
     loss = run.learner.loss
     assert loss.form == "paper"
-    assert (loss._tightening[: len(loss.budgets)] == 1).all()
-    assert not loss._tightening[len(loss.budgets) :].any()
+    assert (loss.tightening[: len(loss.budgets)] == 1).all()
+    assert not loss.tightening[len(loss.budgets) :].any()
     omitted = {name for name, weight in zip(loss.terms[1:], run.metric.weights(0.5), strict=True) if weight == 0}
     assert omitted == {"joint-position", "puck-contact"}
     rows = run.rows.take(np.arange(4))
