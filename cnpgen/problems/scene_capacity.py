@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Mapping
+from dataclasses import replace
 
 from cnpgen.errors import UsageError
 from cnpgen.problems.constraints.clearance import RobotClearance
@@ -32,7 +33,7 @@ def with_capacity(problem: Problem, capacity: Capacity) -> Problem:
         )
     shapes = [*KINDS, *sorted(capacity.keys() - set(KINDS))]
     parked = [_parked(shape, index) for shape in shapes for index in range(1, capacity.get(shape, 0) + 1)]
-    return problem.with_obstacles((*problem.obstacle, *parked))
+    return replace(problem, obstacle=(*problem.obstacle, *parked))  # without reading the URDF
 
 
 def _parked(kind: str, index: int) -> Obstacle:

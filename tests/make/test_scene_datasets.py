@@ -183,7 +183,7 @@ def test_batches_contain_the_scene_without_normalization(dataset: Path) -> None:
 
 
 def test_training_refuses_scenes_that_the_network_would_ignore(dataset: Path) -> None:
-    with pytest.raises(DatasetError, match="has scenes, which networks do not observe yet"):
+    with pytest.raises(DatasetError, match="has scenes: networks train on scene files"):
         open_training_data(dataset)
 
 
