@@ -87,7 +87,7 @@ def scene_plans(
         path_control_points=np.full((count, spec.path_control_points, robot.n), np.nan),
         rate_control_points=np.full((count, spec.rate_control_points), np.nan),
         columns={OBSTACLE_POSES: poses},
-        sample_id=np.arange(count) if sample_id is None else np.array(sample_id, np.int64),
+        sample_id=np.arange(count) if sample_id is None else numbers("sample_id", sample_id, "int64"),
         source=_source(scenes),
     )
 

@@ -104,6 +104,8 @@ class ParameterRanges:
         Raises:
             UsageError: The shape is wrong, or a value is outside its range.
         """
+        if not len(self):
+            raise UsageError("must be None: the problem has no parameters", argument="parameters")
         if values.ndim not in {1, 2} or values.shape[-1] != len(self):
             raise UsageError(
                 f"must have shape (N, {len(self)}) for {', '.join(self.names)}, got {values.shape}",

@@ -11,6 +11,7 @@ from cnpgen.planner.control_points import ControlPoints
 from cnpgen.plans.format import CONDITIONS
 from cnpgen.problems.problem_record import as_problem
 from cnpgen.problems.scenes.scene_files import load_scenes
+from cnpgen.schema.arguments import concerning
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.training.scene_rows import make_scene_rows
 from cnpgen.training.training_rows import TrainingProblems, boundary_columns
@@ -138,7 +139,9 @@ def open_training_data(folder: str | Path, robot: str | Path | None = None) -> T
         SceneError: A scene does not fit the robot.
     """
     if robot is not None:
-        return make_scene_rows(as_problem(robot), load_scenes(folder), str(folder))
+        with concerning("robot"):
+            problem = as_problem(robot)
+        return make_scene_rows(problem, load_scenes(folder), str(folder))
     dataset = load_dataset(folder)
     if dataset.spec.scene_obstacles:
         raise DatasetError(

@@ -60,7 +60,7 @@ def boundary_of(  # noqa: PLR0917 - in the order of the paper
 
 def _rows(name: str, values: ArrayLike, n: int) -> Array:
     array = numbers(name, values)
-    if array.ndim not in {1, 2} or array.shape[-1] != n:
+    if array.ndim not in {1, 2} or array.shape[-1] != n or n == 0:
         raise UsageError(f"must have shape ({n},) or (N, {n}), got {array.shape}", argument=name)
     rows = array.reshape(-1, n)
     if not math.isfinite(rows.sum()) and not np.isfinite(rows).all():

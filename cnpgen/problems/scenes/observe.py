@@ -19,12 +19,14 @@ from cnpgen.robots.observation.scene_primitives import scene_primitives
 from cnpgen.robots.observation.surface_points import scene_seeds
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.scene import Scene
+from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
 
 Scenes = Scene | Primitives | SceneProblem | Sequence[SceneProblem | Sequence[Obstacle]]
 MAX_SEED = 2**63 - 1
 
 
+@checked_arguments
 @one_thread()
 def observe(
     scenes: Scenes, kind: str | Observation, *, seed: int = 0, backend: str | None = None
@@ -84,8 +86,14 @@ def scene_bodies(scenes: Scenes) -> Primitives:
         return scenes
     if isinstance(scenes, SceneProblem):
         scenes = [scenes]
+    if not isinstance(scenes, Scene | list | tuple):
+        raise UsageError(f"must be scenes, got {type(scenes).__name__}", argument="scenes")
     if len(scenes) == 0:
         raise UsageError("there are no scenes", concerns="scenes")
     if isinstance(scenes, Scene):
         return scene_primitives(scenes)
-    return scene_primitives([scene.obstacles if isinstance(scene, SceneProblem) else scene for scene in scenes])
+    bodies = [scene.obstacles if isinstance(scene, SceneProblem) else scene for scene in scenes]
+    for scene, obstacles in enumerate(bodies):
+        if not isinstance(obstacles, list | tuple) or not all(isinstance(body, Obstacle) for body in obstacles):
+            raise UsageError(f"must contain scene problems or obstacles, not so at scene {scene}", argument="scenes")
+    return scene_primitives(bodies)
