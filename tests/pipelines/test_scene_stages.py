@@ -90,7 +90,7 @@ def test_candidates_share_scenes_evenly(pipeline: Pipeline, context: Context) ->
 
 
 @needs_compiler
-def test_scenes_beyond_the_capacity_are_rejected(pipeline: Pipeline, context: Context) -> None:
+def test_scenes_with_too_many_obstacles_are_rejected(pipeline: Pipeline, context: Context) -> None:
     few = {"box": 3, "cylinder": 2, "sphere": 1}
     problem = with_capacity(replace(pipeline.problem, obstacle=()), few)
     stage = replace(pipeline.stage[0], capacity=few)
