@@ -77,7 +77,7 @@ class DrawScenes(Stage):
             fits = np.array([self._fits(layout) for layout in layouts], bool)
             kept = [layout if fit else Layout((), ()) for layout, fit in zip(layouts, fits, strict=True)]
             candidates.scenes = batch_scenes(kept, families.tolist(), obstacles, capacity, context.dtype)
-            candidates["scene"] = (np.arange(candidates.size) * count // candidates.size)[None].astype(float)
+            candidates["scene"] = (candidates.alive * count // candidates.size)[None].astype(float)
             of_scene = np.stack([fits, base_depths(candidates.scenes.table) <= MAX_BASE_DEPTH_M])
             candidates.reject_first(of_scene[:, candidates.scene], [TOO_MANY, AT_BASE])
 
