@@ -100,6 +100,8 @@ class ShardReader:
     @staticmethod
     def _split(shard: Shard, fields: Sequence[Field]) -> tuple[list[Field], list[Field]]:
         """Separate the fields of rows from those of scenes."""
+        if not shard.scene_obstacles:
+            return list(fields), []
         stored = {field.name for field in shard.fields}
         return [f for f in fields if f.name in stored], [f for f in fields if f.name not in stored]
 
