@@ -43,7 +43,7 @@ class ShardReader:
         self._maps: dict[Path, mmap.mmap] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_maps": {}}
+        return self.__dict__ | {"_maps": {}, "_scenes": None}
 
     def read(self, shard: Shard, fields: Sequence[Field]) -> Rows:
         """Read whole fields of a shard into memory.
@@ -100,6 +100,8 @@ class ShardReader:
     @staticmethod
     def _split(shard: Shard, fields: Sequence[Field]) -> tuple[list[Field], list[Field]]:
         """Separate the fields of rows from those of scenes."""
+        if not shard.scene_obstacles:
+            return list(fields), []
         stored = {field.name for field in shard.fields}
         return [f for f in fields if f.name in stored], [f for f in fields if f.name not in stored]
 
@@ -109,9 +111,10 @@ class ShardReader:
             return {}
         scene_id = next(field for field in shard.fields if field.name == SCENE_ID)
         index = self.read(shard, [scene_id])[SCENE_ID]
-        if self._scenes is None or self._scenes[0] != shard.path:
-            self._scenes = shard.path, read_scenes(shard, self._placements[shard.path])
-        table = self._scenes[1]
+        last = self._scenes  # other threads may replace it
+        if last is None or last[0] != shard.path:
+            last = self._scenes = shard.path, read_scenes(shard, self._placements[shard.path])
+        table = last[1]
         rows = table.rows_of(index)
         dtypes = {field.name: storage_dtype(field, shard.dtype) for field in fields}
         return {name: SceneColumn(name, table, rows, self._obstacles, dtype) for name, dtype in dtypes.items()}

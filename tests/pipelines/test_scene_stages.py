@@ -16,6 +16,7 @@ from cnpgen.pipelines.pipeline_file import load_pipeline
 from cnpgen.pipelines.stages.draw_scenes import TOO_MANY, base_depths
 from cnpgen.pipelines.stages.pose_ik import MAX_POSE_IK_STEPS, POSE_TOLERANCE, pose_ik_step
 from cnpgen.pipelines.stages.scene_clearance import SceneClearance
+from cnpgen.pipelines.stages.scene_ends import NO_ENDS
 from cnpgen.pipelines.stages.stage import CandidateBatch
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.scene_capacity import with_capacity
@@ -90,7 +91,7 @@ def test_candidates_share_scenes_evenly(pipeline: Pipeline, context: Context) ->
 
 
 @needs_compiler
-def test_scenes_beyond_the_capacity_are_rejected(pipeline: Pipeline, context: Context) -> None:
+def test_scenes_with_too_many_obstacles_are_rejected(pipeline: Pipeline, context: Context) -> None:
     few = {"box": 3, "cylinder": 2, "sphere": 1}
     problem = with_capacity(replace(pipeline.problem, obstacle=()), few)
     stage = replace(pipeline.stage[0], capacity=few)
@@ -118,6 +119,15 @@ def test_lines_collide_and_no_pair_occurs_twice(pipeline: Pipeline, context: Con
             assert states.are_ends(np.stack([start, goal], axis=1), margin=0.005 - 1e-6).all()
             assert not states.is_line_clear(start, goal)
     assert len(pairs) == len(candidates.alive)
+
+
+@needs_compiler
+def test_scenes_without_grasps_have_no_samples(pipeline: Pipeline, context: Context) -> None:
+    candidates = drawn(pipeline, context, 20, stages=1)
+    candidates.scenes = replace(candidates.scenes, grasp_count=0 * candidates.scenes.grasp_count)
+    pipeline.stage[1].prepare(context)(candidates, np.random.default_rng(4))
+    assert not len(candidates.alive)
+    assert candidates.reasons[-1] == NO_ENDS
 
 
 @needs_compiler

@@ -56,9 +56,9 @@ class Furniture:
     def grasp(self, position: Point, approach: Point, tilt: float = 0.3) -> None:
         """Add a grasp; the approach is normalized."""
         cos, sin = math.cos(self.yaw), math.sin(self.yaw)
-        x, y, z = approach
-        length = math.hypot(x, y, z)
-        direction = np.array([cos * x - sin * y, sin * x + cos * y, z]) / length
+        length = math.hypot(*approach)
+        x, y, z = approach[0] / length, approach[1] / length, approach[2] / length
+        direction = np.array([cos * x - sin * y, sin * x + cos * y, z])
         self.grasps.append(Grasp(np.array(self.point(position)), direction, tilt))
 
     def layout(self, *others: Furniture) -> Layout:

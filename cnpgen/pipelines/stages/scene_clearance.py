@@ -44,7 +44,7 @@ class _SceneChecker(CollisionChecker):
             padded[:, :fixed], padded[:, fixed:count] = self._fixed_boxes, box[:, : count - fixed]
             padded[:3, count:] = PADDING_DISTANCE_M
             self._boxes.append(padded)
-        self._addresses = [address_of(padded) if padded.size else None for padded in self._boxes]
+        self._places = [(address_of(box) if box.size else None, box.shape[1]) for box in self._boxes]
         self._set("obstacles", together)
         self._first, self._stride = address_of(self._arrays["obstacles"]), together.strides[0]
 
@@ -59,13 +59,14 @@ class _SceneChecker(CollisionChecker):
             limits: Required distances from obstacles and of links from each other [m]; None for no check.
         """
         states, clear = np.ascontiguousarray(q.T), np.empty(q.shape[1], np.uint8)
-        native, check, (obstacle_limit, self_limit) = self._scene, self.library.clear_states, _finite(limits)
+        native, check, address = self._scene, self.library.clear_states, self.address
+        obstacle_limit, self_limit = _finite(limits)
         first_state, first_flag, stride = address_of(states), address_of(clear), states.strides[0]
         for scene, first, end in runs:
             native.obstacles, native.n_obstacles = self._first + scene * self._stride, self._counts[scene]
-            native.boxes, native.lanes = self._addresses[scene], self._boxes[scene].shape[1]
+            native.boxes, native.lanes = self._places[scene]
             place = first_state + first * stride
-            check(self.address, place, end - first, obstacle_limit, self_limit, first_flag + first)
+            check(address, place, end - first, obstacle_limit, self_limit, first_flag + first)
         return clear.astype(bool)
 
 

@@ -207,6 +207,8 @@ class _EndStates:
         rotation = _rotations(approach, tilt, u[:3])
         low, high = robot.position_lower[:, None], robot.position_upper[:, None]
         lanes = [np.ascontiguousarray(each) for each in (low + (high - low) * u[3:], position.T, rotation)]
+        if not len(scene):
+            return lanes[0], np.empty(0, np.int64)
         q, error = self._ik(*lanes)
         met = error[0] < POSE_TOLERANCE
         return q[:, met], np.repeat(scene * stage.grasps + grasp, stage.poses)[met]
