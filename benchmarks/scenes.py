@@ -9,6 +9,7 @@ import argparse
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -307,7 +308,7 @@ def solve_scene(problem: Problem, start: Array, goal: Array) -> dict[str, Any]:
 def solve_suite(count: int) -> dict[str, Any]:
     """Solve the first problems of the suite clutter one by one; the first one, which may compile, is solved twice."""
     problem, scenes = as_problem("panda-3kg"), load_scenes(list_recipes("suite")["clutter"].with_suffix(".h5"), n=count)
-    solved = [solve_problem(lambda scene=scene: scene_plans(problem, [scene])) for scene in (scenes[0], *scenes)]
+    solved = [solve_problem(partial(scene_plans, problem, [scene])) for scene in (scenes[0], *scenes)]
     return summary(solved[1:])
 
 
