@@ -9,6 +9,7 @@ import argparse
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -22,16 +23,20 @@ from cnpgen.kernels.collision.collision_checker import CollisionChecker, load_co
 from cnpgen.kernels.collision.tree_search import TreeSettings, find_tree_path
 from cnpgen.kernels.library import KernelLibrary, choose_backend
 from cnpgen.plans.boundary_problems import plans_of_rows
+from cnpgen.plans.plans import Plans
+from cnpgen.plans.scene_plans import scene_plans
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import load_problem
-from cnpgen.problems.problem_record import record_problem
+from cnpgen.problems.problem_record import as_problem, record_problem
+from cnpgen.problems.scenes.scene_files import load_scenes
 from cnpgen.refine.options import DEFAULT_OPTIONS
 from cnpgen.refine.refine_engine import refine_serially
 from cnpgen.refine.solver.hulls import Hulls
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.solid import place_obstacles
+from cnpgen.schema.catalogue import list_recipes
 
 Array = NDArray[np.float64]
 Random = np.random.Generator
@@ -297,9 +302,20 @@ def boundary_columns(start: Array, goal: Array) -> dict[str, Array]:
 
 def solve_scene(problem: Problem, start: Array, goal: Array) -> dict[str, Any]:
     """Solve a new scene; return CPU time [s], validity, motion time [s] and the outcome."""
+    return solve_problem(lambda: plans_of_rows(record_problem(problem), boundary_columns(start, goal)))
+
+
+def solve_suite(count: int) -> dict[str, Any]:
+    """Solve the first problems of the suite clutter one by one; the first one, which may compile, is solved twice."""
+    problem, scenes = as_problem("panda-3kg"), load_scenes(list_recipes("suite")["clutter"].with_suffix(".h5"), n=count)
+    solved = [solve_problem(partial(scene_plans, problem, [scene])) for scene in (scenes[0], *scenes)]
+    return summary(solved[1:])
+
+
+def solve_problem(set_up: Callable[[], Plans]) -> dict[str, Any]:
+    """Set up one boundary problem and solve it; see ``solve_scene``."""
     begun = time.process_time()
-    plans = plans_of_rows(record_problem(problem), boundary_columns(start, goal))
-    (attempt,) = refine_serially(plans, DEFAULT_OPTIONS)
+    (attempt,) = refine_serially(set_up(), DEFAULT_OPTIONS)
     cpu = time.process_time() - begun
     return {
         "cpu": cpu,
@@ -370,7 +386,11 @@ def solve_family(name: str, family: str, count: int, seed: int) -> dict[str, Any
     base, robot, checker = loaded(name)
     problems = list(generate(base, EndSampler(robot, checker), family, count, seed))
     solve_scene(*problems[0])
-    solved = [solve_scene(*problem) for problem in problems[1:]]
+    return summary([solve_scene(*problem) for problem in problems[1:]])
+
+
+def summary(solved: list[dict[str, Any]]) -> dict[str, Any]:
+    """Summarize solved problems."""
     cpu, valid = np.array([each["cpu"] for each in solved]), [each["valid"] for each in solved]
     return {
         "problems": len(solved),
@@ -390,6 +410,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--families", nargs="*", default=list(FAMILIES), choices=list(FAMILIES), help="families")
     parser.add_argument("--count", type=int, default=21, help="problems of every family; the first is not counted")
     parser.add_argument("--seed", type=int, default=29_110_301, help="seed of the scenes")
+    parser.add_argument("--suite", type=int, default=0, help="problems of the suite clutter")
     parser.add_argument("--states", type=int, default=100_000, help="states of the collision checks")
 
 
@@ -398,12 +419,15 @@ def main() -> None:
     chosen = arguments(__doc__, options)
     with np.errstate(all="ignore"):
         checked, rows, results = checks(chosen.states), list[tuple[str, ...]](), dict[str, Any]()
-        for name in chosen.robots:
-            for family in chosen.families:
-                progress(f"{name}: {family}")
-                figures = solve_family(name, family, chosen.count, chosen.seed)
-                results[f"{name} {family}"] = figures
-                rows.append((name, family, *(f"{value:.4g}" for key, value in figures.items() if key != "reasons")))
+        jobs = [(name, family) for name in chosen.robots for family in chosen.families]
+        if chosen.suite:
+            jobs.insert(0, ("panda-3kg", "clutter"))
+        for name, family in jobs:
+            progress(f"{name}: {family}")
+            of_suite = family == "clutter"
+            figures = solve_suite(chosen.suite) if of_suite else solve_family(name, family, chosen.count, chosen.seed)
+            results[f"{name} {family}"] = figures
+            rows.append((name, family, *(f"{value:.4g}" for key, value in figures.items() if key != "reasons")))
     head = ("robot", "family", "problems", "valid", "median", "p95", "p99", "> 1 s", "motion time")
     tables = [
         table("collision checks", ("figure", "value"), [(key, f"{value:,.4g}") for key, value in checked.items()])

@@ -6,7 +6,7 @@ import hashlib
 import json
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -269,7 +269,20 @@ def open_problem(record: ProblemRecord) -> tuple[Problem, Robot]:
     from cnpgen.problems.load_robot import load_robot
 
     with record.restored() as problem:
+        if problem.obstacle:
+            with suppress(RecipeError):  # mistakes are reported below, with the whole problem
+                content = {**record.content, "obstacle": []}
+                return problem, _robot_of(ProblemRecord(json.dumps(content), record.urdf))
         return problem, load_robot(problem)
+
+
+@lru_cache(maxsize=8)
+def _robot_of(record: ProblemRecord) -> Robot:
+    """Load the robot of a problem without obstacles: scenes of a robot share it."""
+    from cnpgen.problems.load_robot import load_robot
+
+    with record.restored() as problem:
+        return load_robot(problem)
 
 
 def _comparable(record: ProblemRecord) -> dict[str, Any]:

@@ -54,7 +54,7 @@ MIN_END_PENETRATION_M = 1e-5  # of an end: smaller ones may be rounding errors
 MAX_LINE_PENETRATION_M = 0.05  # of the initial line, above which joint-space paths come first
 NEARLY_VALID = 30.0  # tolerances; attempts with larger violations are left for joint-space paths
 MAX_JUDGED_VIOLATION = 3.0  # tolerances on the fine grid; attempts with larger ones are judged only without better ones
-MAX_FEEDBACKS = 3  # of collisions of one attempt from the verdict to the solver
+MAX_VERDICT_FEEDBACKS = 3  # of collisions of one attempt from the verdict to the solver
 FEEDBACK_GROWTH = 3.0  # of the added distance, from one of them to the next: an edge may pass between grid points
 MAX_ROUNDING_ERROR = 1e-12  # rad and 1/s: smaller differences are rounding errors
 COLLISION_REASONS = {RobotClearance.reason, SelfClearance.reason}
@@ -388,7 +388,7 @@ class RefinementSearch:
         The collision becomes a constraint at its phase.
         """
         extra: Array | None = None
-        for earlier in range(MAX_FEEDBACKS):
+        for earlier in range(MAX_VERDICT_FEEDBACKS):
             margin = None if self.verdict is None else self.verdict.worst
             if margin is None or margin.reason not in COLLISION_REASONS or attempt.violation > MAX_JUDGED_VIOLATION:
                 break

@@ -19,8 +19,8 @@ Array = NDArray[np.float64]
 
 TREE_MARGINS_M = (6e-3, 3e-3, 1e-3, 0.0)  # of the trees in turn, added to the required distances
 TREE_ROUNDS = ((12, 4_000), (8, 16_000), (4, 64_000))  # trees and their extensions, until there are enough paths
-MIN_PATHS, MAX_PATHS = 3, 8
-SHORTCUTS = 400  # attempted on a path
+MIN_TREE_PATHS, MAX_TREE_PATHS = 3, 8
+TREE_SHORTCUTS = 400  # attempted on a path
 
 
 def find_obstacle_paths(task: RefinementTask, space: RestSpace, hulls: Hulls) -> list[Array]:
@@ -32,7 +32,7 @@ def find_obstacle_paths(task: RefinementTask, space: RestSpace, hulls: Hulls) ->
         hulls: Clearances of the hulls with compiled checks.
 
     Returns:
-        At most ``MAX_PATHS`` paths, corners of shape (K, n) each. Those that meet all conditions at rest come
+        At most ``MAX_TREE_PATHS`` paths, corners of shape (K, n) each. Those that meet all conditions at rest come
         first, sorted by their estimated duration.
     """
     robot, paths = space.robot, list[Array]()
@@ -42,7 +42,7 @@ def find_obstacle_paths(task: RefinementTask, space: RestSpace, hulls: Hulls) ->
         np.minimum(robot.position_upper, np.maximum(start, goal) + MAX_TURN),
     )
     checker = hulls.placed_checker(task.scene.poses[0])
-    settings = TreeSettings(hulls.obstacle_distance, hulls.self_distance, shortcuts=SHORTCUTS)
+    settings = TreeSettings(hulls.obstacle_distance, hulls.self_distance, shortcuts=TREE_SHORTCUTS)
     seeds = count()
     for trees, extensions in TREE_ROUNDS:
         for seed in islice(seeds, trees):
@@ -53,9 +53,9 @@ def find_obstacle_paths(task: RefinementTask, space: RestSpace, hulls: Hulls) ->
                 paths.append(path)
             if path is not None and len(path) == 2:  # the straight line is free
                 return [path]
-        if len(paths) >= MIN_PATHS:
+        if len(paths) >= MIN_TREE_PATHS:
             break
     durations = [
         (not space.meets_other_conditions(path), estimated_duration(path, robot.velocity_limit)) for path in paths
     ]
-    return [paths[index] for index in sorted(range(len(paths)), key=durations.__getitem__)[:MAX_PATHS]]
+    return [paths[index] for index in sorted(range(len(paths)), key=durations.__getitem__)[:MAX_TREE_PATHS]]

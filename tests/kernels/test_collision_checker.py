@@ -1,5 +1,6 @@
 """Compiled collision checks: agreement with Coal in separation and in penetration, for all kinds of obstacles."""
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -203,3 +204,15 @@ def test_new_obstacles_replace_the_old_ones(library, robot):
     assert not checker.clear_states(q, self_distance=None).all()
     checker.place([], np.empty(0))
     assert checker.clear_states(q, self_distance=None).all()
+
+
+def test_pairs_that_an_srdf_disables_are_not_checked(library, robot):
+    q = np.random.default_rng(5).uniform(robot.position_lower, robot.position_upper, (STATES, robot.n)).T.copy()
+    assert robot.shape is not None
+    checked = [pair for pair in robot.shape.pairs if not pair.left_out]
+    clear = [
+        CollisionChecker(library, replace(robot, shape=replace(robot.shape, pairs=pairs))).clear_states(q)
+        for pairs in (checked, [replace(pair, left_out="disabled") for pair in checked])
+    ]
+    assert not clear[0].all()
+    assert clear[1].all()

@@ -1,5 +1,7 @@
 """Levels on the links' hulls: exact derivatives, and a solution where capsules leave none."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -8,12 +10,12 @@ from cnpgen.kernels.library import KernelLibrary, choose_backend
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.refine import refiner as refiner_module
-from cnpgen.refine import strategy
+from cnpgen.refine import strategy, tree_paths
 from cnpgen.refine.refine_engine import load_refiner
 from cnpgen.refine.solver.hull_feedback import HullFeedback
 from cnpgen.refine.solver.hulls import MEASURED_RANGE_M, Hulls, has_clearance_constraints
 from cnpgen.refine.solver.sqp import DEFAULT_SETTINGS
-from cnpgen.refine.strategy import PlanChecker
+from cnpgen.refine.strategy import PlanChecker, refine_task
 from cnpgen.refine.task import Outcome
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.trajectory.spline_motion import Motion
@@ -123,6 +125,54 @@ def test_collisions_between_grid_points_require_more_clearance(tmp_path):
     distances = tool.hulls.measure(q, poses)[0]
     np.testing.assert_allclose(missing, np.maximum(tool.hulls.min_distances - distances, 0), atol=1e-12)
     assert missing.max() > 0.02
+
+
+@needs_compiler
+def test_a_collision_of_the_verdict_becomes_larger_distances_around_its_phase(tmp_path):
+    problem = narrow(tmp_path, WALL)
+    tool, task = load_refiner(problem, load_robot(problem)), between(problem, BESIDE_WALL)
+    path, _ = tool.check.transcription(task).unpack(tool.line_guess(task))
+    feedback, poses = HullFeedback(tool.spec, np.linspace(0, 1, 9)), task.scene.poses[0]
+    extra = feedback.clearance_at(path, tool.hulls, poses, phase=0.45, depth=0.003)
+    assert extra.shape == (9, len(tool.hulls.min_distances))
+    assert not extra[:2].any()
+    assert not extra[6:].any()
+    assert extra[3:5].max() > 0.003
+    collides = tool.hulls.min_distances - tool.hulls.measure(path[[7]].T, poses)[0][0] > 0
+    assert (extra[3][collides] > 0.003).all()
+
+
+def test_deeper_trees_follow_where_few_connect(monkeypatch):
+    grown = list[tuple[int, float, int]]()
+
+    def find(checker, ends, box, velocity, settings, *, seed):
+        grown.append((seed, settings.margin, settings.max_extensions))
+        return np.zeros((3, 2)) if seed in hits else None
+
+    monkeypatch.setattr(tree_paths, "find_tree_path", find)
+    robot = SimpleNamespace(position_lower=-np.ones(2), position_upper=np.ones(2), velocity_limit=np.ones(2))
+    space = SimpleNamespace(robot=robot, meets_other_conditions=lambda _: True)
+    hulls = SimpleNamespace(obstacle_distance=0.0, self_distance=0.0, placed_checker=lambda _: None)
+    boundary = SimpleNamespace(start_q=np.zeros((1, 2)), goal_q=np.ones((1, 2)))
+    task = SimpleNamespace(boundary=boundary, scene=SimpleNamespace(poses=np.zeros((1, 0))))
+    for hits, trees in (({0, 5, 7}, 12), ({5, 13}, 24), (set(), 24)):
+        grown.clear()
+        assert len(tree_paths.find_obstacle_paths(task, space, hulls)) == len(hits)
+        assert [seed for seed, _, _ in grown] == list(range(trees))
+    assert {extensions for _, _, extensions in grown} == {4_000, 16_000, 64_000}
+    assert [margin for _, margin, _ in grown[:4]] == sorted((margin for _, margin, _ in grown[:4]), reverse=True)
+
+
+@pytest.mark.slow
+@needs_compiler
+def test_a_problem_without_a_path_reports_it(tmp_path, monkeypatch):
+    problem = narrow(tmp_path, WALL)
+    tool, task = refiner(problem), between(problem, BESIDE_WALL)
+    monkeypatch.setattr(strategy, "_path_guesses", lambda *_: iter(()))
+    monkeypatch.setattr(strategy, "_from_other_guesses", lambda *_: iter(()))
+    found = refine_task(tool, PlanChecker(problem, load_robot(problem), degree=tool.spec.degree), task)
+    assert not found.valid
+    assert found.outcome is Outcome.NO_PATH
 
 
 @pytest.mark.slow

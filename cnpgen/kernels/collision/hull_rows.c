@@ -2,7 +2,7 @@
 another kernel; collision.c precedes this file. They have the interface of compiled kernels (arrays.h). Their context is set
 before, for each thread. */
 
-#define FAR_RESIDUAL 100.0 /* of columns beyond the measured range: solvers select only residuals near their bounds */
+#define FAR_RESIDUAL 100.0 /* of columns out of the measured range: solvers select only residuals near their bounds */
 
 typedef struct {
   kernel *values, *jacobian; /* of the other rows: w, poses -> g, d(g)/d(w) column by column */

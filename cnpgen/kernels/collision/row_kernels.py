@@ -42,7 +42,7 @@ class DistanceColumns:
         of_links: Row of every pair of ``CollisionChecker.link_pairs``.
         obstacle_distance: Largest required distance from obstacles [m], None without such rows.
         self_distance: Largest required distance of links from each other [m], None without such rows.
-        range: Distance above the required one [m] at which measured values end. The residual beyond it is 100, so that
+        range: Distance above the required one [m] at which measured values end. The residual of larger ones is 100:
             solvers do not select rows without a gradient.
         scale: Distance of a residual of 1 [m].
     """

@@ -23,8 +23,8 @@ TEMPLATE_POINTS = 32  # of a grid that is only used to find equalities
 
 
 def can_measure_hulls(problem: "Problem", robot: "Robot", world: "World") -> bool:
-    """Return whether hulls replace capsules: link geometry among obstacles, and no equalities of states."""
-    if not problem.obstacle or robot.n > MAX_JOINTS or not has_clearance_constraints(problem, robot):
+    """Return whether hulls replace capsules: clearances of link geometry, and no equalities of states."""
+    if robot.n > MAX_JOINTS or not has_clearance_constraints(problem, robot):
         return False
     others = without_distances(problem)
     if not others.constraint:
