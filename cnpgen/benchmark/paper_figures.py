@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 MIN_LOGARITHMIC_RATIO = 20.0  # of the largest to the smallest positive value, from which axes are logarithmic
-MAX_COLUMNS = 4
+PANELS_PER_ROW = 4
 STYLES = ("-", "--", "-.", ":")  # with the ten colors of matplotlib, forty planners differ
 COLORS = 10
 
@@ -82,11 +82,11 @@ def success_figure(values: dict[str, list[Values]], plant: str) -> "Figure":
     """
     figure = new_figure(4.5, 3.2)
     axes, flag = figure.add_subplot(), "success" if plant else "valid"
-    longest = max((float(known["planning_cpu_ms"]) for rows in values.values() for known in rows), default=1.0)
+    max_time = max((float(known["planning_cpu_ms"]) for rows in values.values() for known in rows), default=1.0)
     for index, (name, rows) in enumerate(values.items()):
         times, ratios = success_over_time(rows, flag)
         end = ratios[-1] if len(ratios) else 0.0
-        line = np.append(times, max(longest, 1e-3)), np.append(ratios, end)
+        line = np.append(times, max(max_time, 1e-3)), np.append(ratios, end)
         style = {"linestyle": STYLES[index // COLORS % len(STYLES)], "color": f"C{index % COLORS}"}
         axes.step(*line, where="post", label=f"{name} ({100 * end:.0f} %)", **style)  # type: ignore[arg-type]
     axes.set_xscale("log")
@@ -105,7 +105,7 @@ def distribution_figure(values: dict[str, list[Values]]) -> "Figure":
         values: Result of ``benchmark_values``.
     """
     keys = [key for key in FIGURES if any(key in known for rows in values.values() for known in rows)]
-    columns = max(min(len(keys), MAX_COLUMNS), 1)
+    columns = max(min(len(keys), PANELS_PER_ROW), 1)
     count = max(-(-len(keys) // columns), 1)
     figure = new_figure(4 * columns, 3 * count, dpi=100)
     for place, key in enumerate(keys, start=1):

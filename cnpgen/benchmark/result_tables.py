@@ -2,6 +2,7 @@
 
 import csv
 import io
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -58,8 +59,9 @@ def table_rows(benchmark: Benchmark, plant: str) -> list[tuple[str, ...]]:
     summary = benchmark.summary(plant)
     printed = PRINTED.get(benchmark.suite.name, {})
     rows: list[tuple[str, ...]] = [(f"{plant} plant" if plant else "planned", *summary)]
-    if unsuitable := [name for name in summary if not summary[name]["ratios"]]:
-        rows.append(("applicability", *(NOT_APPLICABLE if name in unsuitable else "" for name in summary)))
+    missing = {name: _missing_text(benchmark.results[name]) for name in summary if not summary[name]["ratios"]}
+    if missing:
+        rows.append(("applicability", *(missing.get(name, "") for name in summary)))
     for group, texts in (("ratios", FLAGS), ("figures", FIGURES)):
         for key, text in texts.items():
             statistics = [summary[name][group].get(key) for name in summary]
@@ -72,6 +74,11 @@ def table_rows(benchmark: Benchmark, plant: str) -> list[tuple[str, ...]]:
             if key in TAIL_FIGURES:
                 rows.append((f"{text}: p99, p99.9, maximum", *map(tail_text, statistics)))
     return rows
+
+
+def _missing_text(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return the reason why a planner has no values: it does not apply, or the plant has not executed its plans."""
+    return NOT_APPLICABLE if all(row["ending"] == NOT_APPLICABLE for row in rows) else "not executed"
 
 
 def cell_text(statistic: dict[str, Any] | None, printed: str | None = None) -> str:

@@ -151,7 +151,8 @@ def _search(arguments: argparse.Namespace) -> int:
     except KeyboardInterrupt as interruption:
         kept = f"{folder} keeps all finished problems; run the same command again to resume"
         raise type(interruption)(kept) from interruption
-    print(json.dumps([asdict(trial) for trial in trials], indent=2) if arguments.json else csv_of(trials, list(ranges)))
+    documents = json.dumps([asdict(trial) for trial in trials], indent=2) + "\n"
+    sys.stdout.write(documents if arguments.json else csv_of(trials, list(ranges)))
     print(f"trials: {folder / SEARCH_FILE}", file=sys.stderr)
     return 0
 

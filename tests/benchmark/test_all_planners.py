@@ -13,16 +13,19 @@ from tests.conftest import some
 pytest.importorskip("mujoco")
 MODULES = {"cbirrt": ("ompl",), "rrtconnect": ("ompl", "toppra"), "ruckig": ("ruckig",)}
 MODULES |= {"sscbirrt": ("sscbirrt",), "drake": ("pydrake",), "crocoddyl": ("crocoddyl",)}
-ALL = tuple(name for name in registry.BUILT_IN[registry.PLANNERS] if all(map(find_spec, MODULES.get(name, ()))))
-NEED_A_MODEL_FILE = ("cnp-b-paper",)  # tests/benchmark/test_learned_planners.py has it
+NEEDS_A_FILE = "cnp-b-paper"
+ALL = tuple(
+    name
+    for name in registry.BUILT_IN[registry.PLANNERS]
+    if name != NEEDS_A_FILE and all(map(find_spec, MODULES.get(name, ())))
+)
 PLANTS = ("nominal", "heavier", "delayed")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("suite", some(["heavy-100", "hits-81"]))  # tests/cli has hits
 def test_every_planner_has_a_row_in_one_table(suite: str, tmp_path: Path) -> None:
-    unsuitable = {*NEED_A_MODEL_FILE, *(() if suite == "hits-81" else ("aqp",))}
-    planners = [name for name in ALL if name not in unsuitable]
+    planners = [name for name in ALL if name != "aqp" or suite == "hits-81"]
     benchmark = run_benchmark(suite, tmp_path, planners=planners, n=1, time_limit=1, plants=["nominal"], workers=1)
     summary = benchmark.summary("nominal")
     assert list(summary) == planners

@@ -268,6 +268,8 @@ def test_an_unsuitable_planner_is_reported_as_not_applicable(tmp_path: Path) -> 
     rows = {head: cells for head, *cells in table_rows(benchmark, "")}
     assert rows["applicability"] == ["", "not applicable"]
     assert rows["a plan was found"] == ["2 of 2 (34.2 to 100 %)", ""]
+    on_a_plant = {head: cells for head, *cells in table_rows(benchmark, "nominal")}
+    assert on_a_plant["applicability"] == ["not executed", "not applicable"]
 
 
 def test_answers_are_read_back_exactly(tmp_path: Path) -> None:

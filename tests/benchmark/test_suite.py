@@ -96,3 +96,13 @@ def test_pucks_need_a_table(tmp_path: Path) -> None:
 def test_an_unknown_suite_is_refused_by_name() -> None:
     with pytest.raises(RecipeError, match="hits-81"):
         load_suite("hits-82")
+
+
+@pytest.mark.slow
+def test_replans_200_has_distinct_problems_from_moving_states() -> None:
+    problems, prefix = load_suite("replans-200").problems()
+    assert prefix is not None
+    assert len(problems) == 200
+    assert len({tuple(row) for row in problems.columns["goal_xyz"].round(6).tolist()}) == 200
+    assert np.all(np.abs(problems.boundary.start_dq).max(axis=1) > 0.1)
+    assert np.all(prefix.until == 0.25)

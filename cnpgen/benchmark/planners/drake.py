@@ -24,7 +24,7 @@ from cnpgen.trajectory.sampled_trajectory import Trajectory
 Array = NDArray[np.float64]
 
 SPLINE_ORDER = 4  # cubic, the default of Drake
-OUTPUT_PERIOD_S = 0.005
+MIN_KNOT_DISTANCE_S = 1e-9  # closer knots are one
 MIN_DURATION_S, MAX_DURATION_S = 0.05, 20.0
 
 
@@ -35,6 +35,8 @@ class Drake(BenchmarkPlanner):
     control_points: int = field("number of control points", default=15, low=6)
     samples: int = field("equidistant samples of manifold, obstacles and torques", default=25, low=2)
     path_length_weight: float = field("weight of the path's length beside the duration", default=0.01, low=0.0)
+    optimality_tolerance: float = field("optimality tolerance of SNOPT", default=1e-4, low=1e-9)
+    iterations: int = field("largest number of iterations of SNOPT", default=300, low=1)
 
     def prepare(self, setting: Setting) -> Plan:
         """Import Drake and check that it can model the problem."""
@@ -49,18 +51,24 @@ class Drake(BenchmarkPlanner):
 
     def _plan(self, problem: Problem, robot: Robot, task: Plans) -> Trajectory | None:
         """Solve both programs; return None if the second one has no solution."""
-        from pydrake.solvers import Solve
-
         arm, samples = DrakeArm(problem, robot, task.scene), np.linspace(0, 1, self.samples)
         free = self._program(problem, robot, task.boundary)
         program = self._program(problem, robot, task.boundary)
-        program.SetInitialGuess(free.ReconstructTrajectory(Solve(free.prog())))
+        program.SetInitialGuess(free.ReconstructTrajectory(self._solve(free)))
         for constraint in arm.path_constraints():
             for s in samples[1:-1].tolist():
                 program.AddPathPositionConstraint(constraint, s)
         arm.limit_torques(program, samples)
-        result = Solve(program.prog())
+        result = self._solve(program)
         return sampled(program.ReconstructTrajectory(result)) if result.is_success() else None
+
+    def _solve(self, program: Any) -> Any:
+        from pydrake.solvers import SnoptSolver, Solve, SolverOptions
+
+        options, solver = SolverOptions(), SnoptSolver.id()
+        options.SetOption(solver, "Major optimality tolerance", self.optimality_tolerance)
+        options.SetOption(solver, "Major iterations limit", self.iterations)
+        return Solve(program.prog(), None, options)
 
     def _program(self, problem: Problem, robot: Robot, boundary: Boundary) -> Any:
         """Return the program with the limits of the joints and the boundary conditions, guessed as a straight line."""
@@ -112,8 +120,8 @@ def add_boundary_conditions(program: Any, boundary: Boundary) -> None:
 
 
 def sampled(spline: Any) -> Trajectory:
-    """Sample a trajectory of Drake; quintics interpolate positions, velocities and accelerations."""
-    duration = float(spline.end_time())
-    t = np.linspace(0.0, duration, max(int(np.ceil(duration / OUTPUT_PERIOD_S)), 1) + 1)
+    """Sample a cubic spline of Drake at its knots, between which quintics with accelerations equal it."""
+    t = np.unique(spline.basis().knots())
+    t = np.append(t[:-1][np.diff(t) > MIN_KNOT_DISTANCE_S], t[-1])
     states = (spline, spline.MakeDerivative(1), spline.MakeDerivative(2))
-    return Trajectory(t, *(np.array([state.value(time)[:, 0] for time in t.tolist()]) for state in states))
+    return Trajectory(t - t[0], *(np.array([state.value(time)[:, 0] for time in t.tolist()]) for state in states))

@@ -54,7 +54,7 @@ class {kind}(BenchmarkPlanner):
                 q = on_table(robot, q, height)
             # Obstacles: problem.scene.bodies(0) are convex bodies with low and high corners [m].
             # Whether states are free of collisions: robot.is_collision_free(q[:1], scene=problem.scene).
-            duration = shortest_duration(robot, q, s)
+            duration = min_duration(robot, q, s)
             return Trajectory(duration * s, q, np.gradient(q, duration * s, axis=0))
 
         return plan
@@ -69,7 +69,7 @@ def on_table(robot, q, height):
     return q
 
 
-def shortest_duration(robot, q, s):
+def min_duration(robot, q, s):
     """Return the duration at which one joint reaches its limit of velocity, acceleration or torque."""
     dq = np.gradient(q, s, axis=0)
     ddq = np.gradient(dq, s, axis=0)

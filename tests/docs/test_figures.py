@@ -1,0 +1,59 @@
+"""The commands that print the figures of README and docs again."""
+
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+NOT_QUOTED = {"common", "figures", "loader_methods", "pinocchio_scipy", "process_memory", "refiner_problems"}
+NOT_QUOTED |= {"ipopt", "slsqp"}  # parts of benchmarks/refiner.py
+
+
+@pytest.fixture
+def figures(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    specification = importlib.util.spec_from_file_location("figures", ROOT / "benchmarks" / "figures.py")
+    assert specification is not None
+    assert specification.loader is not None
+    module = importlib.util.module_from_spec(specification)
+    monkeypatch.setitem(sys.modules, "figures", module)
+    specification.loader.exec_module(module)
+    return module
+
+
+def test_every_script_with_figures_is_quoted_and_its_options_exist(figures: ModuleType) -> None:
+    commands = figures.quoted_commands()
+    scripts = {Path(command.text.split()[0]).stem for command in commands} - {"cnpgen"}
+    assert scripts >= {path.stem for path in (ROOT / "benchmarks").glob("*.py")} - NOT_QUOTED - {"puck_contact"}
+    for command in commands:
+        script, *words = command.text.split()
+        known = (ROOT / ("cnpgen/cli/benchmark_command.py" if script == "cnpgen" else script)).read_text()
+        options = {word for word in words if word.startswith("--")} - {"--json"}
+        assert all(f'"{option}"' in known for option in options), command.text
+    suites = [command.text.split()[2] for command in commands if command.text.startswith("cnpgen")]
+    assert {"hits-81", "heavy-100", "replans-200", "clutter"} <= set(suites)
+    assert len({command.file_name for command in commands}) == len(commands)
+
+
+def test_outputs_are_kept_and_commands_without_their_files_skipped(figures: ModuleType, tmp_path: Path) -> None:
+    in_challenge = figures.QuotedCommand("a", "benchmarks/challenge_mallet.py air_hockey_challenge")
+    assert figures.run(in_challenge, tmp_path, None, 1.0).startswith("skipped")
+    assert in_challenge.arguments(tmp_path, tmp_path)[2] == str(tmp_path)
+    suite = figures.QuotedCommand("a", "cnpgen benchmark hits-81 --simulate")
+    assert suite.arguments(tmp_path, None)[1:] == [
+        *("-m", "cnpgen", "benchmark", "hits-81", "--simulate", "-o", str(tmp_path / "work" / "hits-81"))
+    ]
+    failing = figures.QuotedCommand("a", "benchmarks/common.py.missing")
+    assert figures.run(failing, tmp_path, None, 60.0) == "failed: exit code 2"
+    assert not (tmp_path / failing.file_name).exists()
+    (tmp_path / failing.file_name).write_text("kept")
+    assert figures.run(failing, tmp_path, None, 60.0) == "kept"
+
+
+def test_the_script_lists_its_commands() -> None:
+    command = [sys.executable, str(ROOT / "benchmarks" / "figures.py"), "--list", "--pages", "loss"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert "loss: benchmarks/loss.py" in done.stdout.splitlines()
