@@ -7,7 +7,7 @@ from pathlib import Path
 from cnpgen.cli import values
 from cnpgen.cli.parser import Commands, Parser, add_command
 from cnpgen.cli.plan_files import check_suffix
-from cnpgen.cli.trajectory_options import add_trajectory_options, load_file
+from cnpgen.cli.trajectory_options import add_trajectory_options, load_file, problem_of
 
 _TEXT = """\
 The plans are initial guesses: 'cnpgen refine' optimizes them and keeps their ends, and 'cnpgen evaluate' judges them.
@@ -45,10 +45,11 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError(f"{out} must be in a folder that exists")
     if out.exists() and not arguments.force:
         raise UsageError(f"{out} exists", remedies={"force": True})
-    loaded = load_file(arguments)
+    problem = problem_of(arguments)
+    loaded = load_file(arguments, problem)
     noise = arguments.noise or (0.0,)
     imported = import_trajectories(
-        arguments.problem,
+        problem,
         loaded.trajectories,
         noise=noise[0] if len(noise) == 1 else noise,
         at_rest=arguments.at_rest,

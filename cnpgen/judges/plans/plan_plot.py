@@ -17,6 +17,7 @@ from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene import Scene
 from cnpgen.robots.solid import Solid, place_obstacles
 from cnpgen.store.files.figure_file import new_figure, save_figure
+from cnpgen.trajectory.sampled_trajectory import Trajectory
 from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.world.forward_kinematics import ForwardKinematics
 from cnpgen.world.path import PathWorld
@@ -71,6 +72,55 @@ def plot_plan(
     margins = [] if verdict is None else [margin for margin in verdict.margins.values() if not margin.ok]
     with np.errstate(all="ignore"):
         world, s, t = along(problem, robot, one, index, extra_times=[margin.time for margin in margins])
+    title = f"{problem.name}, plan {index}: {t[-1]:.3f} s" + (f"\n{note}" if note else "")
+    _draw(problem, world, s, t, Path(path), scene=scene, title=title, margins=margins)
+
+
+def plot_trajectory(
+    problem: Problem,
+    robot: Robot,
+    trajectory: Trajectory,
+    path: str | Path,
+    *,
+    title: str,
+    margins: Sequence[Margin] = (),
+) -> None:
+    """Draw a sampled trajectory as ``plot_plan`` draws plans, by the interpolation that its derivatives determine.
+
+    Args:
+        problem: The problem.
+        robot: Its robot.
+        trajectory: The trajectory.
+        path: Image file, ``.png``, ``.pdf`` or ``.svg``; overwritten if it exists.
+        title: Title of the figure.
+        margins: Violations to mark.
+
+    Raises:
+        MachineError: matplotlib is missing, or the file cannot be written.
+    """
+    times = np.clip([margin.time for margin in margins], 0, trajectory.duration)
+    t = np.union1d(np.linspace(0, trajectory.duration, PLOT_SAMPLES), times)
+    world = PathWorld(robot, problem.obstacle, problem.object_size)
+    q, dq, ddq = (np.ascontiguousarray(values.T) for values in trajectory.states(t))
+    jerk = np.ascontiguousarray(trajectory.jerks(t).T) if problem.uses_jerk else None
+    with np.errstate(all="ignore"):
+        world.set_path(q, dq, ddq, place_obstacles(problem.obstacle), jerk)
+    _draw(problem, world, t / trajectory.duration, t, Path(path), scene=None, title=title, margins=margins)
+
+
+def _draw(
+    problem: Problem,
+    world: PathWorld,
+    s: Array,
+    t: Array,
+    path: Path,
+    *,
+    scene: Scene | None,
+    title: str,
+    margins: Sequence[Margin],
+) -> None:
+    """Draw joints, conditions and tip of a path in a figure; without a scene, its ends place the obstacles."""
+    with np.errstate(all="ignore"):
         if scene is None:
             ends = world.tip_position[:, :1].T, world.tip_position[:, -1:].T
             scene = scene_of(problem, *ends, world.tip_velocity[:, -1:].T)
@@ -78,7 +128,7 @@ def plot_plan(
     curves = [curve for curve in condition_curves(problem, world, s, scene.bodies()) if curve.name != TABLE_HEIGHT]
     columns = [1.15, 0.85, 1.0] if curves else [1.15, 1.0]
     figure = new_figure(20 if curves else 15, 9)
-    figure.suptitle(f"{problem.name}, plan {index}: {t[-1]:.3f} s" + (f"\n{note}" if note else ""))
+    figure.suptitle(title)
     joints, *conditions, tip = figure.subfigures(1, len(columns), width_ratios=columns, squeeze=False)[0]
     _draw_joints(joints, world, t, margins)
     if curves:
@@ -90,7 +140,7 @@ def plot_plan(
         _draw_over_table(tip, table, world, s, t)
     named = {name: item for axis in tip.axes for item, name in zip(*axis.get_legend_handles_labels(), strict=True)}
     tip.legend(named.values(), named.keys(), loc="outside lower center", ncols=len(named), fontsize=8)
-    save_figure(figure, Path(path))
+    save_figure(figure, path)
 
 
 def along(
