@@ -201,6 +201,14 @@ def payload(text: str) -> tuple[float, ...]:
     return found
 
 
+def angle(text: str) -> float:
+    """Read an angle or a length above 0: ``2deg``, ``0.035`` or ``5mm``."""
+    found = tracking_errors(text)
+    if len(found) != 1 or not found[0] > 0:
+        raise ArgumentTypeError(f"expected one angle above 0, such as 2deg; got {text[:60]!r}")
+    return found[0]
+
+
 def amounts(text: str) -> tuple[float, ...]:
     """Read positive numbers separated by commas: ``500`` or ``7500,3750,5000``."""
     found = _numbers(text)

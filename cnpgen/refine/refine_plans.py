@@ -28,8 +28,9 @@ from cnpgen.plans.tips import correct_tips
 from cnpgen.refine.options import DEFAULT_OPTIONS, RefineOptions
 from cnpgen.refine.refine_engine import prepare, refine_serially
 from cnpgen.refine.refinement_journal import Journal, open_journal
-from cnpgen.refine.task import Attempt, Outcome
+from cnpgen.refine.task import DISTANCE_PHASES, Attempt, Outcome
 from cnpgen.schema.argument_types import checked_arguments
+from cnpgen.trajectory.spline import basis
 
 REFINEMENT_FORMAT = "cnpgen-refinement"
 REFINEMENT_VERSION = 1
@@ -66,6 +67,14 @@ class Refinement:
     def valid(self) -> NDArray[np.bool_]:
         """Mask of the plans that the independent verdict accepts, shape (N,)."""
         return np.array([result.valid for result in self.results], bool)
+
+    @property
+    def deviation(self) -> Array:
+        """Largest difference of a joint from the input path at the same phase [rad], nan without one, shape (N,)."""
+        s = np.linspace(0, 1, DISTANCE_PHASES)
+        pairs = zip(self.plans.path_control_points, self.input_plans.path_control_points, strict=True)
+        paths = [basis(s, len(path), self.plans.degree) @ (path - before) for path, before in pairs]
+        return np.array([np.abs(path).max() for path in paths])
 
     def summary(self) -> dict[str, Any]:
         """Return a summary of all plans for JSON."""
