@@ -125,14 +125,14 @@ def test_the_command_writes_a_plan_file(tmp_path: Path, capsys: pytest.CaptureFi
 def test_refining_stays_within_a_distance_of_the_imported_path(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Check a motion with a detour of one joint: without the bound, the refiner leaves its path."""
+    """Check a motion whose first joint turns away and back: without the bound, the refiner leaves its path."""
     original = plans_of(load("hit"))
-    bent = original.path_control_points.copy()
-    bent[:, 6:9, 0] += 0.1  # joint 1 turns about the vertical, so that the tip stays on the table
+    turned = original.path_control_points.copy()
+    turned[:, 6:9, 0] += 0.1  # joint 1 turns about the vertical, so that the tip stays on the table
     slow = cnpgen.make_plans(
         original.problem,
         original.boundary,
-        path_control_points=bent,
+        path_control_points=turned,
         rate_control_points=original.rate_control_points,
     )
     export_plans(slow, tmp_path / "slow", to="csv", rate=200)

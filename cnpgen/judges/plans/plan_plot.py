@@ -17,7 +17,6 @@ from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene import Scene
 from cnpgen.robots.solid import Solid, place_obstacles
 from cnpgen.store.files.figure_file import new_figure, save_figure
-from cnpgen.trajectory.sampled_trajectory import Trajectory
 from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.world.forward_kinematics import ForwardKinematics
 from cnpgen.world.path import PathWorld
@@ -73,42 +72,10 @@ def plot_plan(
     with np.errstate(all="ignore"):
         world, s, t = along(problem, robot, one, index, extra_times=[margin.time for margin in margins])
     title = f"{problem.name}, plan {index}: {t[-1]:.3f} s" + (f"\n{note}" if note else "")
-    _draw(problem, world, s, t, Path(path), scene=scene, title=title, margins=margins)
+    draw_path(problem, world, s, t, Path(path), scene=scene, title=title, margins=margins)
 
 
-def plot_trajectory(
-    problem: Problem,
-    robot: Robot,
-    trajectory: Trajectory,
-    path: str | Path,
-    *,
-    title: str,
-    margins: Sequence[Margin] = (),
-) -> None:
-    """Draw a sampled trajectory as ``plot_plan`` draws plans, by the interpolation that its derivatives determine.
-
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        trajectory: The trajectory.
-        path: Image file, ``.png``, ``.pdf`` or ``.svg``; overwritten if it exists.
-        title: Title of the figure.
-        margins: Violations to mark.
-
-    Raises:
-        MachineError: matplotlib is missing, or the file cannot be written.
-    """
-    times = np.clip([margin.time for margin in margins], 0, trajectory.duration)
-    t = np.union1d(np.linspace(0, trajectory.duration, PLOT_SAMPLES), times)
-    world = PathWorld(robot, problem.obstacle, problem.object_size)
-    q, dq, ddq = (np.ascontiguousarray(values.T) for values in trajectory.states(t))
-    jerk = np.ascontiguousarray(trajectory.jerks(t).T) if problem.uses_jerk else None
-    with np.errstate(all="ignore"):
-        world.set_path(q, dq, ddq, place_obstacles(problem.obstacle), jerk)
-    _draw(problem, world, t / trajectory.duration, t, Path(path), scene=None, title=title, margins=margins)
-
-
-def _draw(
+def draw_path(
     problem: Problem,
     world: PathWorld,
     s: Array,
@@ -119,7 +86,18 @@ def _draw(
     title: str,
     margins: Sequence[Margin],
 ) -> None:
-    """Draw joints, conditions and tip of a path in a figure; without a scene, its ends place the obstacles."""
+    """Draw joints, conditions and tip of a path in a figure.
+
+    Args:
+        problem: The problem.
+        world: The robot at K times.
+        s: Phases, shape (K,).
+        t: Times [s], shape (K,).
+        path: Image file.
+        scene: Obstacles of the motion; None if its ends place them.
+        title: Title of the figure.
+        margins: Violations to mark.
+    """
     with np.errstate(all="ignore"):
         if scene is None:
             ends = world.tip_position[:, :1].T, world.tip_position[:, -1:].T
