@@ -10,6 +10,7 @@ With ``--import``, sampled plans are imported and refined, and the valid ones ar
     cnpgen solve airhockey-hit --n 200 -o hits.h5
     python benchmarks/trajectories.py hits.h5
     python benchmarks/trajectories.py hits.h5 --import
+    python benchmarks/trajectories.py hits.h5 --import --stay-within 2
 """
 
 import argparse
@@ -29,6 +30,7 @@ from cnpgen.plans import Plans, load_plans, open_problem
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.exporter import SampledPlan, sample_plan
 from cnpgen.plans.import_trajectories import import_trajectories
+from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.refine_plans import refine_plans
 from cnpgen.trajectory.sampled_trajectory import Trajectory
 from cnpgen.trajectory.spline_motion import Motion
@@ -162,7 +164,7 @@ def measure(plans: Plans, case: Case, truths: tuple[Verdict, ...]) -> Counts:
     return counts
 
 
-def refined(plans: Plans, case: Case) -> tuple[str, ...]:
+def refined(plans: Plans, case: Case, stay_within: float | None) -> tuple[str, ...]:
     """Import and refine sampled plans; return a row of the table."""
     random = np.random.default_rng(0)
     sampled = [
@@ -170,13 +172,16 @@ def refined(plans: Plans, case: Case) -> tuple[str, ...]:
     ]
     imported = import_trajectories(plans.problem, sampled, noise=case.error)
     valid = evaluate_plans(imported.plans, workers=1).valid
-    after = evaluate_plans(refine_plans(imported.plans, workers=1).plans, workers=1)
+    options = RefineOptions(stay_within=None if stay_within is None else np.deg2rad(stay_within))
+    refinement = refine_plans(imported.plans, options=options, workers=1)
+    after = evaluate_plans(refinement.plans, workers=1)
     reasons = Counter(str(verdict.reason) for verdict in after.verdicts if not verdict.valid)
     text = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common())
     counts = str(len(plans)), f"{int(valid.sum())}", f"{int(after.valid.sum())}", f"{after.valid.mean():.1%}"
     moved = float(np.nanmax(imported.snapped, initial=0.0))
     progress(f"{plans.problem.name}, {case.name}: {int(after.valid.sum())} of {len(plans)} valid; {text}")
-    return plans.problem.name, case.name, *counts, f"{imported.deviation.max():.1e}", f"{moved:.1e}", text
+    lengths = [f"{length:.1e}" for length in (imported.deviation.max(), moved, refinement.deviation.max())]
+    return plans.problem.name, case.name, *counts, *lengths, text
 
 
 def import_all(given: argparse.Namespace) -> None:
@@ -190,13 +195,14 @@ def import_all(given: argparse.Namespace) -> None:
         "share",
         "fit [rad]",
         "ends moved [rad]",
+        "refined from [rad]",
         "reasons",
     )
     rows = []
     for file in given.files:
         plans = load_plans(file)
         plans = plans[np.flatnonzero(evaluate_plans(plans, workers=1).valid)[: given.n]]
-        rows += [refined(plans, case) for case in IMPORTS if given.case in case.name]
+        rows += [refined(plans, case, given.stay_within) for case in IMPORTS if given.case in case.name]
         progress(f"{file}: done")
     results = {"rows": [dict(zip(head, row, strict=True)) for row in rows]}
     report(results, [table("imported plans", head, rows, left=2)], as_json=given.json)
@@ -210,6 +216,8 @@ def main() -> None:
         parser.add_argument("--n", type=int, default=200, help="valid plans of each file (default: 200)")
         parser.add_argument("--case", default="", help="only samples whose name contains this text")
         parser.add_argument("--import", dest="imports", action="store_true", help="import and refine instead")
+
+        parser.add_argument("--stay-within", metavar="DEG", type=float, help="largest distance from the imported path")
 
     given = arguments(__doc__, add)
     import_all(given) if given.imports else judge_all(given)

@@ -14,6 +14,7 @@ from cnpgen.cli.trajectory_options import TRAJECTORY_OPTIONS, add_trajectory_opt
 
 if TYPE_CHECKING:
     from cnpgen.plans.evaluate import Evaluation
+    from cnpgen.plans.evaluate_trajectories import TrajectoryEvaluation
 
 _TEXT = """\
 Every plan is checked on a fine time grid and between its samples ('cnpgen docs verdict'). The exit code is 0 if every
@@ -48,12 +49,12 @@ def add(commands: "Commands[Parser]") -> None:
     )
     option("--workers", metavar="W", type=values.positive, help="processes; default one per available core")
     option("--list", action="store_true", help="also list the plans, one per line, invalid ones first")
-    option("--plot", metavar="PICTURE", type=values.plot_file, help="draw one plan: .png, .pdf or .svg")
+    option("--plot", metavar="PICTURE", type=values.plot_file, help="draw one plan or trajectory: .png, .pdf or .svg")
     option(
         "--plan",
         metavar="I",
         type=values.natural,
-        help="plan to draw; default the first invalid one, or plan 0",
+        help="plan or trajectory to draw; default the first that is not valid, or 0",
     )
     add_json(parser)
     sampled = parser.add_argument_group("sampled trajectories")
@@ -111,28 +112,30 @@ def _refuse_trajectory_options(arguments: argparse.Namespace) -> None:
     """Refuse options of sampled trajectories for a plan file."""
     from cnpgen.errors import UsageError
 
-    for name in (*TRAJECTORY_OPTIONS, "interpolation", "max_jerk", "noise"):
+    for name in (*TRAJECTORY_OPTIONS, "payload", "interpolation", "max_jerk", "noise"):
         if getattr(arguments, name) is not None:
             raise UsageError(f"--{name.replace('_', '-')} is for sampled trajectories, {arguments.file} holds plans")
 
 
 def _run_trajectories(arguments: argparse.Namespace) -> int:
     """Judge sampled trajectories."""
-    from cnpgen.cli.trajectory_options import listing_text, load_file, summary_text, write_json
+    from cnpgen.cli.trajectory_options import listing_text, load_file, problem_of, summary_text, write_json
     from cnpgen.errors import UsageError
     from cnpgen.plans.evaluate_trajectories import evaluate_trajectories
 
-    if arguments.plot:
-        raise UsageError("--plot draws plans: 'cnpgen import' makes plans of sampled trajectories")
     if arguments.tracking_error is not None:
         raise UsageError("--tracking-error is for plans: --noise gives the error of sampled trajectories")
-    loaded = load_file(arguments)
+    problem = problem_of(arguments)
+    loaded = load_file(arguments, problem)
+    if arguments.plan is not None and arguments.plan >= len(loaded.trajectories):
+        count = len(loaded.trajectories)
+        raise UsageError(f"{arguments.file} has no trajectory {arguments.plan}: {count} are numbered from 0")
     meter = Meter(quiet=not sys.stderr.isatty(), noun="trajectory")
     meter.begin(f"judging {arguments.file}", len(loaded.trajectories))
     noise, jerk = arguments.noise or (0.0,), arguments.max_jerk
     try:
         found = evaluate_trajectories(
-            arguments.problem,
+            problem,
             loaded.trajectories,
             interpolation=arguments.interpolation,
             noise=noise[0] if len(noise) == 1 else noise,
@@ -149,6 +152,8 @@ def _run_trajectories(arguments: argparse.Namespace) -> int:
         print(summary_text(arguments.file, found))
         if arguments.list:
             print(f"\n{listing_text(found, loaded.labels)}")
+    if arguments.plot:
+        _draw_trajectory(found, arguments.plot, arguments.plan, loaded.labels)
     return 0 if found.valid.all() else 1
 
 
@@ -195,6 +200,22 @@ def _draw(found: "Evaluation", picture: str, index: int | None) -> None:
     note = f"sample {plans.sample_id[chosen]}: {verdict}"
     plot_plan(problem, robot, plans.motion, chosen, picture, scene=plans.scene[chosen], note=note, verdict=verdict)
     print(f"drawn: plan {chosen} in {picture}", file=sys.stderr)
+
+
+def _draw_trajectory(found: "TrajectoryEvaluation", picture: str, index: int | None, labels: tuple[str, ...]) -> None:
+    """Draw a trajectory, by default the first that is not valid, and mark what is not valid."""
+    from cnpgen.judges.trajectories.trajectory_plot import plot_trajectory
+    from cnpgen.plans import open_problem
+
+    verdicts = found.verdicts
+    first = next((at for at, verdict in enumerate(verdicts) if not verdict.valid), 0)
+    chosen = first if index is None else index
+    trajectory, verdict = found.trajectories[chosen], verdicts[chosen]
+    margins = [entry.margin for entry in verdict.conditions.values() if not entry.margin.ok]
+    problem, robot = open_problem(found.problem)
+    title = f"{problem.name}, {labels[chosen]}: {trajectory.duration:.3f} s\n{verdict}"
+    plot_trajectory(problem, robot, trajectory, picture, title=title, margins=margins)
+    print(f"drawn: trajectory {chosen} in {picture}", file=sys.stderr)
 
 
 def _chosen(found: "Evaluation") -> int:

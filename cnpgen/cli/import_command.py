@@ -3,11 +3,15 @@
 import argparse
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from cnpgen.cli import values
 from cnpgen.cli.parser import Commands, Parser, add_command
 from cnpgen.cli.plan_files import check_suffix
-from cnpgen.cli.trajectory_options import add_trajectory_options, load_file
+from cnpgen.cli.trajectory_options import add_trajectory_options, load_file, problem_of
+
+if TYPE_CHECKING:
+    from cnpgen.plans import Plans
 
 _TEXT = """\
 The plans are initial guesses: 'cnpgen refine' optimizes them and keeps their ends, and 'cnpgen evaluate' judges them.
@@ -28,6 +32,8 @@ def add(commands: "Commands[Parser]") -> None:
     text = "largest error of the samples in SI units: one number, or of positions, velocities and accelerations"
     option("--noise", metavar="E,...", type=values.errors, help=text)
     option("--at-rest", action="store_true", help="all motions begin and end at rest")
+    text = "also refine the plans, with at most this difference of every joint from the imported path, such as 2deg"
+    option("--stay-within", metavar="E", type=values.angle, help=text)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -45,16 +51,18 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError(f"{out} must be in a folder that exists")
     if out.exists() and not arguments.force:
         raise UsageError(f"{out} exists", remedies={"force": True})
-    loaded = load_file(arguments)
+    problem = problem_of(arguments)
+    loaded = load_file(arguments, problem)
     noise = arguments.noise or (0.0,)
     imported = import_trajectories(
-        arguments.problem,
+        problem,
         loaded.trajectories,
         noise=noise[0] if len(noise) == 1 else noise,
         at_rest=arguments.at_rest,
         source=f"imported from {arguments.file.name}",
     )
-    save_plans(out, imported.plans)
+    plans = imported.plans if arguments.stay_within is None else _refined(imported.plans, arguments.stay_within)
+    save_plans(out, plans)
     points = imported.plans.path_control_points.shape[1]
     print(
         f"imported {counted(len(imported.plans), 'plan')} with {points} control points of the path;"
@@ -68,3 +76,14 @@ def run(arguments: argparse.Namespace) -> int:
     print(f"ends moved by at most {largest:.2g} rad to meet the constraints", file=sys.stderr)
     print(out)
     return 0
+
+
+def _refined(plans: "Plans", distance: float) -> "Plans":
+    """Refine plans near their paths; report the number of valid plans and the largest distance on stderr."""
+    from cnpgen.refine.options import RefineOptions
+    from cnpgen.refine.refine_plans import refine_plans
+
+    refinement = refine_plans(plans, options=RefineOptions(stay_within=distance))
+    valid, largest = int(refinement.valid.sum()), float(refinement.deviation.max())
+    print(f"refined: {valid} of {len(plans)} valid, at most {largest:.2g} rad from the imported path", file=sys.stderr)
+    return refinement.plans

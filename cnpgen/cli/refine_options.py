@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from cnpgen.plans import Plans
     from cnpgen.refine.refinement import Refinement
 
-REFINING = ("objective", "weight", "max_iterations", "tolerance", "deadline")  # what add_refining adds
+REFINING = ("objective", "weight", "max_iterations", "tolerance", "deadline", "stay_within")  # what add_refining adds
 LARGE_ANGLES = "accept boundary conditions in a file that are probably in degrees or millimetres"
 WORKERS = "processes; default one per available core, or one for up to 60 plans"
 LISTED = 10  # plans without success that are listed
@@ -69,6 +69,12 @@ def add_refining(parser: Options) -> None:
         metavar="S",
         type=values.seconds_with_unit,
         help="time per plan, such as 10ms: returns the best plan until then, never worse than the input",
+    )
+    option(
+        "--stay-within",
+        metavar="E",
+        type=values.angle,
+        help="largest difference of every joint from the input path, such as 2deg (default: only the ends are kept)",
     )
     option(
         "--explain", action="store_true", help="report for every invalid plan whether its problem is proven infeasible"

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,6 +12,7 @@ from cnpgen.cli.parser import Options
 if TYPE_CHECKING:
     from cnpgen.plans.evaluate_trajectories import TrajectoryEvaluation
     from cnpgen.plans.load_trajectories import LoadedTrajectories
+    from cnpgen.problems.problem import Problem
 
 TRAJECTORY_OPTIONS = ("joints", "unit", "rate", "separate_by", "unwrap")  # of load_trajectories
 MAX_IGNORED = 8  # unused columns that are listed
@@ -25,18 +27,34 @@ def add_trajectory_options(option: Options) -> None:
     add("--separate-by", metavar="COLUMN", help="column whose value differs from trajectory to trajectory")
     add("--unwrap", action="store_true", default=None, help="continue angles that jump by more than half a turn")
 
+    text = "body at the tip, in place of the problem's: mass [kg], or mass and centre of mass in the tip frame [m]"
+    add("--payload", metavar="M[,X,Y,Z]", type=values.payload, help=text)
 
-def load_file(arguments: argparse.Namespace) -> "LoadedTrajectories":
+
+def problem_of(arguments: argparse.Namespace) -> "str | Problem":
+    """Return the problem of a command, with the payload of its options."""
+    from cnpgen.errors import UsageError
+    from cnpgen.problems.problem_record import as_problem
+    from cnpgen.robots.robot_spec import Payload
+
+    name: str | None = arguments.problem
+    if name is None:
+        raise UsageError("sampled trajectories need {problem}", remedies={"problem": None})
+    if arguments.payload is None:
+        return name
+    mass, *centre = arguments.payload
+    body = Payload(mass=mass) if not centre else Payload(mass=mass, centre=(centre[0], centre[1], centre[2]))
+    return replace(as_problem(name), payload=body)
+
+
+def load_file(arguments: argparse.Namespace, problem: "str | Problem") -> "LoadedTrajectories":
     """Load the trajectories of a command, and list the columns that are not used on stderr."""
     import sys
 
-    from cnpgen.errors import UsageError
     from cnpgen.plans.load_trajectories import load_trajectories
 
-    if arguments.problem is None:
-        raise UsageError("sampled trajectories need {problem}", remedies={"problem": None})
     given = {name: getattr(arguments, name) for name in TRAJECTORY_OPTIONS if getattr(arguments, name) is not None}
-    loaded = load_trajectories(arguments.file, arguments.problem, **given)
+    loaded = load_trajectories(arguments.file, problem, **given)
     if loaded.ignored:
         more = f" and {len(loaded.ignored) - MAX_IGNORED} more" if len(loaded.ignored) > MAX_IGNORED else ""
         print(f"columns that are not used: {', '.join(loaded.ignored[:MAX_IGNORED])}{more}", file=sys.stderr)

@@ -191,6 +191,24 @@ def tracking_errors(text: str) -> tuple[float, ...]:
     return tuple(found)
 
 
+def payload(text: str) -> tuple[float, ...]:
+    """Read a mass [kg], or a mass and the centre of mass in the tip frame [m]: ``2`` or ``2,0,0,0.1``."""
+    found = _numbers(text)
+    if len(found) not in {1, 4} or not all(map(math.isfinite, found)) or found[0] <= 0:
+        raise ArgumentTypeError(
+            f"expected a mass above 0, with or without the centre of mass, such as 2 or 2,0,0,0.1; got {text[:60]!r}"
+        )
+    return found
+
+
+def angle(text: str) -> float:
+    """Read an angle or a length above 0: ``2deg``, ``0.035`` or ``5mm``."""
+    found = tracking_errors(text)
+    if len(found) != 1 or not found[0] > 0:
+        raise ArgumentTypeError(f"expected one angle above 0, such as 2deg; got {text[:60]!r}")
+    return found[0]
+
+
 def amounts(text: str) -> tuple[float, ...]:
     """Read positive numbers separated by commas: ``500`` or ``7500,3750,5000``."""
     found = _numbers(text)

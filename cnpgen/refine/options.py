@@ -22,6 +22,8 @@ class RefineOptions:
         tolerance: Relative change of the objective at which it has converged; further steps restore feasibility.
             Without an input plan a tenth of it applies, among obstacles a twentieth.
         deadline: Largest time per plan [s], or None. With a deadline results depend on the machine and its load.
+        stay_within: Largest difference of every joint from the input path at the same phase [rad or m], or None. Input
+            plans that the refiner cannot use as initial guesses have no such bound.
 
     Raises:
         UsageError: A value is invalid.
@@ -32,6 +34,7 @@ class RefineOptions:
     max_iterations: int = DEFAULT_SETTINGS.max_iterations
     tolerance: float = DEFAULT_SETTINGS.cost_tolerance
     deadline: float | None = None
+    stay_within: float | None = None
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -43,10 +46,13 @@ class RefineOptions:
             raise UsageError(f"must be above 0 and below 1, got {self.tolerance}", argument="tolerance")
         if self.deadline is not None and number("deadline", self.deadline) <= 0:
             raise UsageError(f"must be above 0 s, got {self.deadline}", argument="deadline")
+        if self.stay_within is not None and number("stay_within", self.stay_within) <= 0:
+            raise UsageError(f"must be above 0, got {self.stay_within}", argument="stay_within")
 
     def document(self) -> dict[str, Any]:
-        """Return the options for JSON, without a deadline of None."""
-        return {name: value for name, value in asdict(self).items() if name != "deadline" or value is not None}
+        """Return the options for JSON, without a deadline or a distance of None."""
+        optional = {"deadline", "stay_within"}
+        return {name: value for name, value in asdict(self).items() if name not in optional or value is not None}
 
 
 DEFAULT_OPTIONS = RefineOptions()

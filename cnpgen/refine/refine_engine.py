@@ -52,9 +52,10 @@ def refine_serially(plans: Plans, options: RefineOptions) -> list[Attempt]:
     """
     refiner = prepare(plans, options)
     checker = _checker(plans.problem, plans.degree, get_ident())
+    tasks = [replace(task, stay_within=options.stay_within) for task in tasks_of(plans)]
     if options.deadline is not None:
-        return [refine_task_until(refiner, checker, task, options.deadline) for task in tasks_of(plans)]
-    return [refine_task(refiner, checker, task) for task in tasks_of(plans)]
+        return [refine_task_until(refiner, checker, task, options.deadline) for task in tasks]
+    return [refine_task(refiner, checker, task) for task in tasks]
 
 
 def prepare(plans: Plans, options: RefineOptions) -> Refiner:
@@ -64,7 +65,7 @@ def prepare(plans: Plans, options: RefineOptions) -> Refiner:
         path_control_points=plans.path_control_points.shape[1],
         rate_control_points=plans.rate_control_points.shape[1],
     )
-    return _refiner(plans.problem, spec, replace(options, deadline=None))
+    return _refiner(plans.problem, spec, replace(options, deadline=None, stay_within=None))
 
 
 def tasks_of(plans: Plans) -> list[RefinementTask]:

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from cnpgen.errors import counted
 from cnpgen.machine.times import NO_TIME, Times
 from cnpgen.plans.plans import Plans
-from cnpgen.refine.task import Attempt
+from cnpgen.refine.task import DISTANCE_PHASES, Attempt
+from cnpgen.trajectory.spline import basis
 
 REFINEMENT_FORMAT = "cnpgen-refinement"
 REFINEMENT_VERSION = 1
@@ -45,6 +46,14 @@ class Refinement:
     def valid(self) -> NDArray[np.bool_]:
         """Mask of the plans that the independent verdict accepts, shape (N,)."""
         return np.array([result.valid for result in self.results], bool)
+
+    @property
+    def deviation(self) -> NDArray[np.float64]:
+        """Largest difference of a joint from the input path at the same phase [rad], nan without one, shape (N,)."""
+        s = np.linspace(0, 1, DISTANCE_PHASES)
+        pairs = zip(self.plans.path_control_points, self.input_plans.path_control_points, strict=True)
+        paths = [basis(s, len(path), self.plans.degree) @ (path - before) for path, before in pairs]
+        return np.array([np.abs(path).max() for path in paths])
 
     def summary(self) -> dict[str, Any]:
         """Return a summary of all plans for JSON."""

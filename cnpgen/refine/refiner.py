@@ -185,7 +185,11 @@ class Refiner:
 
     def bounds(self, task: RefinementTask, level: GridLevel, ends: Array) -> Bounds:
         """Return the bounds of a level for a motion whose boundary states have residuals ``ends``, shape (2, m)."""
-        return self._bounds[level].bounds_for(task.start_xyz, ends=ends)
+        bounds = self._bounds[level].bounds_for(task.start_xyz, ends=ends)
+        reference = task.reference(self._grids[level.points].s, self.spec.degree)
+        if reference is None or task.stay_within is None:
+            return bounds
+        return self._bounds[level].near(bounds, reference, task.stay_within)
 
     def solve(
         self, task: RefinementTask, level: GridLevel, x: Array, outcome: Outcome, hulls: Hulls | None = None

@@ -66,6 +66,16 @@ VERDICT_TIME_S = 5e-3  # of a verdict, before one was timed
 
 
 def make_attempts(refiner: Refiner, task: RefinementTask, x: Array | None) -> Iterator[Attempt]:
+    """Yield attempts at a task that stay near its input path if they must; see ``_all_attempts``."""
+    if x is None:
+        yield from _all_attempts(refiner, replace(task, stay_within=None), x)
+        return
+    for attempt in _all_attempts(refiner, task, x):
+        if task.is_near(attempt.path, refiner.spec.degree):
+            yield attempt
+
+
+def _all_attempts(refiner: Refiner, task: RefinementTask, x: Array | None) -> Iterator[Attempt]:
     """Yield attempts at a task; later ones are more expensive and requested only if the earlier ones were rejected.
 
     Args:
@@ -84,7 +94,7 @@ def make_attempts(refiner: Refiner, task: RefinementTask, x: Array | None) -> It
         best = yield from run_levels(refiner, task, x, adjusted)
     else:
         best = yield from _before_paths(refiner, task, x, adjusted, hulls)
-    if refiner.check.ends_are_invalid(task):
+    if task.stay_within is not None or refiner.check.ends_are_invalid(task):  # the other guesses are other paths
         return
     if hulls is not None:
         best = yield from _best_of(_around_obstacles(refiner, task, best, hulls), best)
@@ -466,6 +476,9 @@ def refine_task(refiner: Refiner, checker: PlanChecker, task: RefinementTask) ->
     for attempt in make_attempts(refiner, task, x):
         if search.add(attempt) or search.continue_rejected(attempt):
             break
+    if not (search.judged or search.skipped):  # no attempt stays near the input path
+        path, rate, outcome = next(_input_plans(refiner, task, x))
+        search.judged.append(search.judge(search.input_attempt(path, rate, outcome)))
     best = search.best()
     for path, rate, outcome in () if search.costs_less_than_input(best, x) else _input_plans(refiner, task, x):
         plan = search.input_attempt(path, rate, outcome)

@@ -12,8 +12,10 @@ from cnpgen.judges.plans.verdict import Reason
 from cnpgen.refine.solver.deadline import Deadline
 from cnpgen.robots.scene import Scene
 from cnpgen.trajectory.boundary import Boundary
+from cnpgen.trajectory.spline import basis
 
 Array = NDArray[np.float64]
+DISTANCE_PHASES = 512  # at which motions are compared with their input path
 
 
 class Outcome(IntEnum):
@@ -61,6 +63,7 @@ class RefinementTask:
         path: Path control points of the input plan [rad], shape (C, n), or None.
         rate: Rate control points of the input plan [1/s], shape (R,), or None.
         deadline: Deadline of the solver's iterations, or None.
+        stay_within: Largest difference of every joint from the path of the input plan [rad or m], or None.
     """
 
     boundary: Boundary
@@ -70,6 +73,22 @@ class RefinementTask:
     path: Array | None = None
     rate: Array | None = None
     deadline: Deadline | None = None
+    stay_within: float | None = None
+
+    def reference(self, s: Array, degree: int) -> Array | None:
+        """Return the input path at phases s, shape (K, n), if motions must stay near it, else None."""
+        if self.stay_within is None or self.path is None or not np.isfinite(self.path).all():
+            return None
+        positions: Array = basis(s, len(self.path), degree) @ self.path
+        return positions
+
+    def is_near(self, path: Array, degree: int) -> bool:
+        """Return whether path control points (C, n) stay within the distance from the input path."""
+        s = np.linspace(0, 1, DISTANCE_PHASES)
+        reference = self.reference(s, degree)
+        if reference is None or self.stay_within is None:
+            return True
+        return bool(np.abs(basis(s, len(path), degree) @ path - reference).max() <= self.stay_within)
 
     @property
     def at_rest(self) -> bool:

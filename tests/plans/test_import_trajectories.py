@@ -119,3 +119,29 @@ def test_the_command_writes_a_plan_file(tmp_path: Path, capsys: pytest.CaptureFi
     assert main(words) == 2
     assert "exists" in capsys.readouterr().err
     assert main([*words, "--force"]) == 0
+
+
+@pytest.mark.slow
+def test_refining_stays_within_a_distance_of_the_imported_path(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Check a motion whose first joint turns away and back: without the bound, the refiner leaves its path."""
+    original = plans_of(load("hit"))
+    turned = original.path_control_points.copy()
+    turned[:, 6:9, 0] += 0.1  # joint 1 turns about the vertical, so that the tip stays on the table
+    slow = cnpgen.make_plans(
+        original.problem,
+        original.boundary,
+        path_control_points=turned,
+        rate_control_points=original.rate_control_points,
+    )
+    export_plans(slow, tmp_path / "slow", to="csv", rate=200)
+    words = ["import", str(tmp_path / "slow"), "--problem", "airhockey", "-o", str(tmp_path / "plans.h5")]
+    assert main([*words, "--stay-within", "1deg"]) == 0
+    assert "1 of 1 valid, at most 0.017 rad from the imported path" in capsys.readouterr().err
+    near = cnpgen.load_plans(tmp_path / "plans.h5")
+    assert cnpgen.evaluate_plans(near, workers=1).valid.all()
+    imported = import_trajectories(original.problem, [positions(slow, 200)])
+    free = cnpgen.refine_plans(imported.plans, workers=1)
+    assert free.valid.all()
+    assert free.deviation.max() > np.deg2rad(1)

@@ -313,3 +313,33 @@ def test_a_damaged_header_of_a_parquet_file_in_a_dataset_of_lerobot_is_an_error(
     path.write_bytes(content)
     with pytest.raises(UsageError, match="is not a Parquet file, or is damaged"):
         load_trajectories(tmp_path / "set", plans.problem)
+
+
+def test_a_payload_of_the_command_line_counts_in_the_torques(
+    plans: Plans, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    export_plans(plans, tmp_path / "out", to="csv", rate=500)
+    words = ["evaluate", str(tmp_path / "out"), "--problem", "airhockey", "--json", "--payload"]
+    torques = []
+    for payload in ("0.001", "40", "40,0,0,0.3"):
+        main([*words, payload])
+        conditions = json.loads(capsys.readouterr().out)["verdicts"][0]["conditions"]
+        torques.append(conditions["joint torque"]["margin"])
+    shares = [abs(margin["value"] / margin["bound"]) for margin in torques]
+    assert shares[0] < 1 < shares[1] != shares[2]
+    assert main([*words, "-1"]) == 2
+    assert "expected a mass above 0" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_trajectory_is_drawn_with_its_verdict(
+    plans: Plans, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    export_plans(plans, tmp_path / "out", to="csv", rate=500)
+    words = ["evaluate", str(tmp_path / "out"), "--problem", "airhockey", "--plot", str(tmp_path / "drawn.svg")]
+    assert main([*words, "--payload", "40"]) == 1
+    assert "drawn: trajectory 0" in capsys.readouterr().err
+    picture = (tmp_path / "drawn.svg").read_text()
+    assert picture.count("<path") > 100
+    assert main([*words, "--plan", "9"]) == 2
+    assert "has no trajectory 9" in capsys.readouterr().err

@@ -71,6 +71,34 @@ def plot_plan(
     margins = [] if verdict is None else [margin for margin in verdict.margins.values() if not margin.ok]
     with np.errstate(all="ignore"):
         world, s, t = along(problem, robot, one, index, extra_times=[margin.time for margin in margins])
+    title = f"{problem.name}, plan {index}: {t[-1]:.3f} s" + (f"\n{note}" if note else "")
+    draw_path(problem, world, s, t, Path(path), scene=scene, title=title, margins=margins)
+
+
+def draw_path(
+    problem: Problem,
+    world: PathWorld,
+    s: Array,
+    t: Array,
+    path: Path,
+    *,
+    scene: Scene | None,
+    title: str,
+    margins: Sequence[Margin],
+) -> None:
+    """Draw joints, conditions and tip of a path in a figure.
+
+    Args:
+        problem: The problem.
+        world: The robot at K times.
+        s: Phases, shape (K,).
+        t: Times [s], shape (K,).
+        path: Image file.
+        scene: Obstacles of the motion; None if its ends place them.
+        title: Title of the figure.
+        margins: Violations to mark.
+    """
+    with np.errstate(all="ignore"):
         if scene is None:
             ends = world.tip_position[:, :1].T, world.tip_position[:, -1:].T
             scene = scene_of(problem, *ends, world.tip_velocity[:, -1:].T)
@@ -78,7 +106,7 @@ def plot_plan(
     curves = [curve for curve in condition_curves(problem, world, s, scene.bodies()) if curve.name != TABLE_HEIGHT]
     columns = [1.15, 0.85, 1.0] if curves else [1.15, 1.0]
     figure = new_figure(20 if curves else 15, 9)
-    figure.suptitle(f"{problem.name}, plan {index}: {t[-1]:.3f} s" + (f"\n{note}" if note else ""))
+    figure.suptitle(title)
     joints, *conditions, tip = figure.subfigures(1, len(columns), width_ratios=columns, squeeze=False)[0]
     _draw_joints(joints, world, t, margins)
     if curves:
@@ -90,7 +118,7 @@ def plot_plan(
         _draw_over_table(tip, table, world, s, t)
     named = {name: item for axis in tip.axes for item, name in zip(*axis.get_legend_handles_labels(), strict=True)}
     tip.legend(named.values(), named.keys(), loc="outside lower center", ncols=len(named), fontsize=8)
-    save_figure(figure, Path(path))
+    save_figure(figure, path)
 
 
 def along(

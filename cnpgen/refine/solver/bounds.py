@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.constraints.constraint import Condition, Constraint
+from cnpgen.problems.constraints.joint import JointPosition
 from cnpgen.problems.constraints.needs import measured_needs
 from cnpgen.problems.constraints.object_clearance import ObjectClearance
 from cnpgen.problems.constraints.self_clearance import SelfClearance
@@ -26,6 +27,7 @@ MIN_END_RELAXATION = 1e-5  # of scaled residuals: iterations end with larger vio
 UNKNOWN_TOLERANCE = 1e9  # in scaled units, of conditions that only the verdict can check
 PHASE_FACTOR = 1.03  # time-varying bounds close earlier by this factor: motions overshoot where they level out
 PRECISE_FRACTION = 0.1  # of the tolerance of an equality: the largest error of a precise plan
+NEAR_FRACTION = 0.97  # of the distance from a path, on the grid: motions overshoot between its points
 INTERVAL_FRACTION = 0.9  # of the tolerance between grid points: the interpolation has an error
 
 
@@ -168,6 +170,10 @@ class BoundsTemplate:
         self.capsules = np.repeat(clearances, widths)
         held = [isinstance(constraint, ObjectClearance) for constraint, _ in pairs]
         self.held_clearances = np.repeat(held, widths)
+        scales = [_scale(*pair) if isinstance(pair[0], JointPosition) else np.nan for pair in pairs]
+        self._position_scale = np.concatenate(
+            [np.broadcast_to(scale, width) for scale, width in zip(scales, widths, strict=True)]
+        )
         self.equal = np.repeat([condition.is_equality for condition in self.conditions], widths)
         with np.errstate(invalid="ignore"):
             interval_tolerance = np.where(self.equal, PRECISE_FRACTION, 1.0) * self.tolerances + np.fmax(
@@ -188,6 +194,24 @@ class BoundsTemplate:
         """
         bounds = self._without_ends(start_tip)
         return bounds if ends is None else self._relaxed_at_ends(bounds, ends)
+
+    def near(self, bounds: Bounds, positions: Array, distance: float) -> Bounds:
+        """Return bounds that also keep the joints near a path.
+
+        Args:
+            bounds: Bounds of one motion.
+            positions: Joint positions of the path on the grid [rad], shape (K, n).
+            distance: Largest difference of every joint from the path [rad].
+        """
+        columns = np.isfinite(self._position_scale)
+        if columns.sum() != positions.shape[1]:
+            return bounds
+        scale, band, inner = self._position_scale[columns], NEAR_FRACTION * distance, self._s < 1
+        rows = np.ix_(inner, columns)
+        lower, upper = bounds.lower.copy("F"), bounds.upper.copy("F")
+        lower[rows] = np.maximum(lower[rows], (positions[inner] - band) / scale)
+        upper[rows] = np.minimum(upper[rows], (positions[inner] + band) / scale)
+        return Bounds(lower, upper, bounds.nonsmooth, bounds.interval_tolerance)
 
     def with_hull_distances(self, bounds: Bounds, min_distances: Array, extra: Array | None = None) -> Bounds:
         """Return bounds without those of capsules and with further columns for the distances of hulls.
