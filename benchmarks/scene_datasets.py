@@ -73,7 +73,7 @@ def measure_rate(blocks: int, seed: int, *, certify: bool) -> dict[str, float]:
 def check_meshes(folder: Path, plans: int, step: float) -> dict[str, float]:
     """Return the number of plans with contacts of the meshes."""
     problem = load_dataset_recipe("panda-scenes").pipeline.problem
-    robot, checked, states, contacts = load_robot(problem), 0, 0, 0
+    robot, checked, states, contacts, depth = load_robot(problem), 0, 0, 0, 0.0
     assert robot.shape is not None
     left_out = {frozenset((pair.first, pair.second)) for pair in robot.shape.pairs if pair.left_out}
     meshes = Meshes(problem.urdf_path.read_text(), robot.joint_names, left_out)
@@ -82,12 +82,13 @@ def check_meshes(folder: Path, plans: int, step: float) -> dict[str, float]:
             meshes.place(obstacles)
         q = plan_states(path, rate, problem.trajectory.degree, step)
         checked, states = checked + 1, states + len(q)
-        if any(meshes.touch(state) for state in q):
-            contacts += 1
+        if touching := [state for state in q if meshes.touch(state)]:
+            contacts, depth = contacts + 1, max(depth, *map(meshes.depth, touching))
             progress(f"contact in row {row} of {name}")
         if checked % 100 == 0:
             progress(f"{checked} plans")
-    return {"plans": checked, "states": states, "plans with contact": contacts}
+    counts = {"plans": checked, "states": states, "plans with contact": contacts}
+    return counts | {"largest penetration [mm]": round(1000 * depth, 3)}
 
 
 def rows_of(folder: Path, n: int, count: int) -> Iterator[tuple[str, int, Array, Array, list[tuple[Any, Any]]]]:
@@ -163,6 +164,11 @@ class Meshes:
     def touch(self, q: Array) -> bool:
         """Return whether any pair collides at a state."""
         return bool(pin.computeCollisions(self.model, self._data, self._geometry, self._results, q, True))
+
+    def depth(self, q: Array) -> float:
+        """Return the largest penetration of any pair at a state [m], at least 0."""
+        pin.computeDistances(self.model, self._data, self._geometry, self._results, q)
+        return float(max(0.0, *(-result.min_distance for result in self._results.distanceResults)))
 
 
 def plan_states(path: Array, rate: Array, degree: int, step: float) -> Array:

@@ -16,8 +16,8 @@ def different(damaged: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     real = blocks.shard_columns
 
     def shard_columns(*arguments):
-        for columns, sampling in real(*arguments):
-            yield {**columns, "start_q": columns["start_q"] + 1e-3}, sampling
+        for columns, sampling, scenes in real(*arguments):
+            yield {**columns, "start_q": columns["start_q"] + 1e-3}, sampling, scenes
 
     monkeypatch.setattr(blocks, "shard_columns", shard_columns)
     return damaged
