@@ -92,7 +92,7 @@ def by_detours(plans: Plans, solved: np.ndarray, seed: int) -> np.ndarray:
     """
     found, spec = solved.copy(), load_problem("airhockey").trajectory
     middles = draw_boundary_problems(NAME, DETOURS, seed=seed).boundary.start_q
-    for index in np.flatnonzero(~solved):
+    for index in np.flatnonzero(~solved).tolist():
         started = time.monotonic()
         for middle in middles:
             if found[index] or time.monotonic() - started > DETOUR_TIME_S:

@@ -56,7 +56,7 @@ def is_usual(robot: Robot, name: str, values: NDArray[Any]) -> bool:
         limit = robot.velocity_limit if name.endswith("_dq") else robot.acceleration_limit
         return bool(np.abs(values).max() <= limit.min())
     within = (robot.position_lower <= values) & (values <= robot.position_upper)
-    return np.count_nonzero(within) == values.size
+    return bool(np.count_nonzero(within) == values.size)
 
 
 def _users_level() -> int:
