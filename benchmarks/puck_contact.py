@@ -5,7 +5,7 @@ of the verdict: any contact with more than 10 mm of path left. With ``--simulate
 MuJoCo on the nominal and on the heavier plant. The last table compares hits of the 81-puck grid from rest with and
 without the constraint. The seed was not used for training or tuning.
 
-With ``--reference``, hits that are not valid after refining are refined again from detours: through 50 configurations
+With ``--reference``, hits that are not valid after refining are refined again through via points: 50 configurations
 on the table, for at most 60 s each. The target is 97 % of all hits that either method solves.
 
     python benchmarks/puck_contact.py
@@ -40,7 +40,7 @@ PUCKS = np.array([[0.75, -0.35], [1.2, 0.35]])  # m, range of the random pucks
 LAST_M = 0.01  # path length of the mallet on which contact is legal
 PHASES = np.linspace(0, 1, 2001)
 DEPTH_TOLERANCE_M = 1e-6
-DETOURS, DETOUR_TIME_S = 50, 60.0  # of the reference, per hit
+MAX_GUESSES, MAX_REFERENCE_TIME_S = 50, 60.0  # of the reference, per hit
 SOLVED_SHARE = 0.97  # target: of the hits that are solved after refining or by the reference
 
 
@@ -82,30 +82,30 @@ def evaluated(plans: Plans, pucks: np.ndarray) -> dict[str, Any]:
     }
 
 
-def by_detours(plans: Plans, solved: np.ndarray, seed: int) -> np.ndarray:
-    """Return a mask of the hits that are solved: as before, or after refining a detour across the table.
+def by_via_points(plans: Plans, solved: np.ndarray, seed: int) -> np.ndarray:
+    """Return a mask of the hits that are solved before or after refining motions through via points on the table.
 
     Args:
         plans: Planned hits.
         solved: Mask of those that are solved.
-        seed: Seed of the configurations of the detours.
+        seed: Seed of the via points.
     """
     found, spec = solved.copy(), load_problem("airhockey").trajectory
-    middles = draw_boundary_problems(NAME, DETOURS, seed=seed).boundary.start_q
-    for index in np.flatnonzero(~solved):
+    configurations = draw_boundary_problems(NAME, MAX_GUESSES, seed=seed).boundary.start_q
+    for index in np.flatnonzero(~solved).tolist():
         started = time.monotonic()
-        for middle in middles:
-            if found[index] or time.monotonic() - started > DETOUR_TIME_S:
+        for via_point in configurations:
+            if found[index] or time.monotonic() - started > MAX_REFERENCE_TIME_S:
                 break
             plan = plans[index]
             rate = plan.rate_control_points / 2
             line = anchor_line(plan.boundary, rate, spec)
             along = np.linspace(0, 1, line.shape[1])[:, None]
-            interior = line + (1 - np.abs(2 * along - 1)) * (middle - line.mean(axis=1))
+            interior = line + (1 - np.abs(2 * along - 1)) * (via_point - line.mean(axis=1))
             path = assemble(plan.boundary, interior, rate, spec)
             guess = replace(plan, path_control_points=path, rate_control_points=rate)
             found[index] = refine_plans(guess, workers=1).valid[0]
-        progress(f"hit {index}: {'solved' if found[index] else 'not solved'} by detours")
+        progress(f"hit {index}: {'solved' if found[index] else 'not solved'} by via points")
     return found
 
 
@@ -140,13 +140,13 @@ def reference_table(solved: np.ndarray, reference: np.ndarray) -> str:
     """Compare the numbers of hits that are solved after refining and by the reference."""
     share = float(solved.sum() / max(reference.sum(), 1))
     row = (str(solved.sum()), str(reference.sum()), f"{share:.4f}", *verdict(share, SOLVED_SHARE))
-    return table("hits that are solved", ("refined", "with detours", "share", "target", ""), [row])
+    return table("hits that are solved", ("refined", "with via points", "share", "target", ""), [row])
 
 
 def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--hits", type=int, default=300)
     parser.add_argument("--seed", type=int, default=20261)
-    parser.add_argument("--reference", action="store_true", help="refine detours of unsolved hits")
+    parser.add_argument("--reference", action="store_true", help="refine unsolved hits through via points")
     parser.add_argument("--simulate", type=int, default=0, help="refined hits that are executed")
 
 
@@ -160,7 +160,7 @@ def main() -> None:
     refined = refine_plans(plans).plans
     results["refined"] = evaluated(refined, pucks)
     solved = evaluate_plans(refined).valid
-    reference = by_detours(plans, solved, chosen.seed) if chosen.reference else None
+    reference = by_via_points(plans, solved, chosen.seed) if chosen.reference else None
     reasons = {reason: planned.reasons.count(reason) for reason in sorted(set(planned.reasons)) if reason}
     simulated = executed(refined, chosen.simulate) if chosen.simulate else {}
     progress("the grid of pucks")
@@ -190,7 +190,7 @@ def main() -> None:
             [(row["problem"], str(row["valid"]), f"{row['time']:.5f}", f"{row['cpu']:.2f}") for row in records],
         ),
     ]
-    counts = {} if reference is None else {"refined": int(solved.sum()), "with detours": int(reference.sum())}
+    counts = {} if reference is None else {"refined": int(solved.sum()), "with via points": int(reference.sum())}
     report(
         {"moving": results, "reference": counts, "reasons": reasons, "executed": simulated, "grid": records},
         tables,

@@ -64,12 +64,8 @@ def test_candidates_are_lines_without_violation_or_else_the_one_with_the_smalles
 @pytest.fixture(scope="module")
 def checks() -> ViaPoints:
     """Three via points, with the check of heavy-object."""
-    middle = np.array(RETRACTED)
-    return make_via_points(
-        PROBLEMS["heavy-object"],
-        quickest("heavy-object").kernels,
-        np.stack([middle + step for step in (0.8, 0.0, 0.3)]),
-    )
+    via_points = np.array(RETRACTED) + np.array([[0.8], [0.0], [0.3]])
+    return make_via_points(PROBLEMS["heavy-object"], quickest("heavy-object").kernels, via_points)
 
 
 def test_the_lower_bound_decides_like_the_violation(checks: ViaPoints) -> None:
