@@ -150,7 +150,8 @@ def _plan_returns(planner: Planner, hits: PlannedHits, home: Array) -> Plans:
     q, dq, ddq = plans.states_at(plans.duration)
     goal = np.broadcast_to(home, q.shape) if len(q) else q
     with concerning("home"):
-        return replace(planner.plan(q, goal, start_dq=dq, start_ddq=ddq), sample_id=plans.sample_id)
+        back = planner.plan(q, goal, start_dq=dq, start_ddq=ddq, parameters=plans.boundary.parameters)
+        return replace(back, sample_id=plans.sample_id)
 
 
 def _contact_distance(contact: PuckContact | None, given: float | None) -> float:

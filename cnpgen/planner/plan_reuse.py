@@ -54,4 +54,6 @@ def _same_goal(old: Boundary, new: Boundary) -> NDArray[np.bool_]:
         if old.goal_ddq is None:  # the old motion's goal acceleration was free
             return np.zeros(len(old), bool)
         pairs.append((old.goal_ddq, new.goal_ddq))
+    if new.parameters is not None and old.parameters is not None:
+        pairs.append((old.parameters, new.parameters))
     return np.asarray(np.all([np.abs(before - after).max(axis=1) <= GOAL_TOLERANCE for before, after in pairs], axis=0))

@@ -85,6 +85,10 @@ class PlanRuntime:
     @checked_arguments
     def __init__(self, planner: Planner, q: ArrayLike, *, time: float = 0.0, judge: bool = True) -> None:
         self._planner, self._judge = planner, judge
+        if names := ", ".join(planner.model.problem.parameters.names):
+            raise UsageError(
+                f"is for a problem with parameters, which set-points do not have: {names}", argument="planner"
+            )
         positions = numbers("q", q)
         if positions.shape != (planner.robot.n,) or not np.isfinite(positions).all():
             raise UsageError(f"must be finite and have shape ({planner.robot.n},), got {q!r:.100}", argument="q")

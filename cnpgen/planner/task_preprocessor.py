@@ -128,6 +128,8 @@ class TaskPreprocessor:
             if ranges:
                 raise UsageError(f"is missing: tasks have {', '.join(ranges.names)}", argument="parameters")
             return None
+        if not ranges:
+            raise UsageError(f"must be None: {self.problem.name!r} has no parameters", argument="parameters")
         return ranges.checked(np.asarray(values, np.float64))
 
     def _factor(self, parameters: Array | None) -> Array | float:

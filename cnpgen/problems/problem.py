@@ -132,6 +132,10 @@ class Problem:
     def _parameter_mistakes(self) -> Iterator[tuple[str, str]]:
         if self.parameters.payload_mass is not None and self.payload is None:
             yield "parameters", "payload_mass needs the body of the load: give [payload], too"
+        nominal = self.parameters.nominal(0.0 if self.payload is None else self.payload.mass)
+        for name, span, value in zip(self.parameters.names, self.parameters.ranges, nominal.tolist(), strict=True):
+            if not span.low <= value <= span.high:
+                yield "parameters", f"{name} must include {value:g}, the value of samples without parameters"
         if not self.parameters.tilts_table:
             return
         tables = [constraint for constraint in self.constraint if isinstance(constraint, Table)]

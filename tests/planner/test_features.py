@@ -1,9 +1,11 @@
 """The network's inputs: their values, and standardization by the training rows."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from cnpgen.planner.network.features import ARRIVAL, USUAL, feature_blocks, fit_features, raw_features
+from cnpgen.planner.network.features import USUAL, count_features, feature_blocks, fit_features, raw_features
 from tests.planner.test_control_points import tasks
 
 
@@ -45,10 +47,20 @@ def test_features_are_states_their_sines_tips_and_the_expected_time():
 def test_the_goal_acceleration_is_a_feature_if_it_is_given():
     assert feature_blocks(tasks().boundary) == USUAL
     given = tasks(goal_ddq=True)
-    assert feature_blocks(given.boundary) == (*USUAL, ARRIVAL)
-    raw = raw_features(given, (*USUAL, ARRIVAL))
+    blocks = (*USUAL, "goal_ddq")
+    assert feature_blocks(given.boundary) == blocks
+    raw = raw_features(given, blocks)
     np.testing.assert_array_equal(raw[:, :-3], raw_features(given, USUAL))
     np.testing.assert_array_equal(raw[:, -3:], given.boundary.goal_ddq)
+
+
+def test_the_parameters_of_a_problem_are_features_if_there_are_any():
+    given = tasks()
+    parameters = np.arange(2.0 * len(given)).reshape(-1, 2)
+    given = replace(given, boundary=replace(given.boundary, parameters=parameters))
+    assert feature_blocks(given.boundary) == (*USUAL, "parameters")
+    np.testing.assert_array_equal(raw_features(given, (*USUAL, "parameters"))[:, -2:], parameters)
+    assert count_features((*USUAL, "parameters"), 7, 2) == count_features(USUAL, 7) + 2
 
 
 def test_an_unknown_feature_block_raises_an_error_with_the_known_ones():

@@ -21,8 +21,10 @@ STRICT = {
     "airhockey-hit": 0.95,
     "airhockey-online": 0.85,
     "airhockey-replan": 0.85,
+    "airhockey-tables": 0.85,
     "heavy-object": 0.95,
     "heavy-object-anywhere": 0.9,
+    "heavy-object-loads": 0.85,
     "panda-cup": 0.9,
     "ur5-wipe": 0.9,
 }

@@ -168,6 +168,7 @@ def test_values_are_checked_against_their_ranges() -> None:
         ('payload_mass = "[4, 14] kg"', 'payload_mass = "[4, 14] m"', "kg"),
         ('payload_mass = "[4, 14] kg"', 'velocity_factor = "[0.5, 2]"', "at most 1"),
         ('payload_mass = "[4, 14] kg"', 'table_roll = "[-5, 5] deg"', "constraint 'table'"),
+        ('payload_mass = "[4, 14] kg"', 'payload_mass = "[4, 11] kg"', "payload_mass must include 12"),
         ("[payload] ", "[trash] ", "payload_mass needs the body"),
     ],
 )

@@ -68,6 +68,6 @@ def _batch_of_one(planner: Planner) -> Callable[[Plans], Plans]:
     def plan(problem: Plans) -> Plans:
         return planner.plan_batch(problem.boundary, sample_id=problem.sample_id, columns=problem.columns)
 
-    base = planner.robot.base
-    planner.plan(base, base)
+    base, nominal = planner.robot.base, planner.robot.nominal_parameters
+    planner.plan(base, base, parameters=nominal if len(nominal) else None)
     return plan
