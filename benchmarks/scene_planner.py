@@ -230,7 +230,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scenes", type=int, default=2400, help="number of training scenes")
     parser.add_argument("--per-scene", type=int, default=8, help="largest number of training problems in one scene")
     parser.add_argument("--out", type=Path, default=Path("training-scenes.h5"), help="file of the training problems")
-    parser.add_argument("--models", nargs="*", default=["panda-scenes"], help="models by name or file")
+    parser.add_argument("--models", nargs="*", default=[], help="models by name or file, of scenes with equal capacity")
     parser.add_argument("--suite", type=Path, help="file of test problems, such as datasets/suites/clutter.h5")
     parser.add_argument("--alone", action="store_true", help="measure the plans alone, without refining")
     parser.add_argument("--count", type=int, default=100, help="test problems of every family, before the selection")
