@@ -124,6 +124,7 @@ def test_training_rows_are_problems_and_their_reverses(problem):
 
 
 @needs_compiler
+@pytest.mark.slow
 def test_a_planner_is_trained_on_a_scene_file_and_plans_its_scenes(problem, tmp_path, capsys):
     robot, items, file = tmp_path / "crane", scenes(problem, 60), tmp_path / "scenes.h5"
     path = write_problem(tmp_path)
