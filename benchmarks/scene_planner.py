@@ -172,8 +172,10 @@ def fitting(planner: Planner, scenes: Sequence[SceneProblem]) -> list[SceneProbl
     return [scene for scene in scenes if Counter(obstacle.kind for obstacle in scene.obstacles) <= most]
 
 
-def measure(models: Sequence[str], robot: str, family: str, scenes: Sequence[SceneProblem]) -> list[dict[str, Any]]:
-    """Return the figures of models and of ``solve`` for the scenes of one family."""
+def measure(
+    models: Sequence[str], robot: str, family: str, scenes: Sequence[SceneProblem], *, refining: bool
+) -> list[dict[str, Any]]:
+    """Return the figures of models for the scenes of one family; with ``refining`` also those of ``solve``."""
     planners = [Planner(name if not Path(name).exists() else Path(name)) for name in models]
     scenes = fitting(planners[0], colliding_lines(robot, scenes))
     if not scenes:
@@ -185,6 +187,11 @@ def measure(models: Sequence[str], robot: str, family: str, scenes: Sequence[Sce
         plans = plan_scenes(planner, scenes)
         planning = (time.process_time() - begun) / len(scenes)
         alone = evaluate_plans(plans, workers=1).summary()
+        facts = {"family": family, "model": Path(name).stem, "problems": len(scenes)}
+        facts |= {"alone": alone["valid_ratio"], "planning cpu [s]": planning}
+        if not refining:
+            results.append(facts)
+            continue
         if solved is None:
             refine_serially(without_motions(plans[:2]), DEFAULT_OPTIONS)
             progress(f"{family}: solve")
@@ -194,14 +201,10 @@ def measure(models: Sequence[str], robot: str, family: str, scenes: Sequence[Sce
         valid = np.array([each.valid for each in attempts])
         own = np.array([each.outcome is not Outcome.RESTARTED for each in attempts])
         results.append(
-            {
-                "family": family,
-                "model": Path(name).stem,
-                "problems": len(scenes),
-                "alone": alone["valid_ratio"],
+            facts
+            | {
                 "refined": float((valid & own).mean()),
                 "refined, other guesses too": float(valid.mean()),
-                "planning cpu [s]": planning,
                 "refining cpu [s]": cpu,
                 "solve": float(np.mean([each.valid for each in solved[0]])),
                 "solve cpu [s]": solved[1],
@@ -209,6 +212,13 @@ def measure(models: Sequence[str], robot: str, family: str, scenes: Sequence[Sce
             }
         )
     return results
+
+
+def cell(facts: dict[str, Any], key: str) -> str:
+    """Return a share, or a time in ms; empty if it was not measured."""
+    if key not in facts:
+        return ""
+    return f"{1e3 * facts[key]:.2f} ms" if key.endswith("[s]") else f"{facts[key]:.3f}"
 
 
 def options(parser: argparse.ArgumentParser) -> None:
@@ -220,8 +230,9 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scenes", type=int, default=2400, help="number of training scenes")
     parser.add_argument("--per-scene", type=int, default=8, help="largest number of training problems in one scene")
     parser.add_argument("--out", type=Path, default=Path("training-scenes.h5"), help="file of the training problems")
-    parser.add_argument("--models", nargs="*", default=["panda-scenes"], help="models by name or file")
+    parser.add_argument("--models", nargs="*", default=[], help="models by name or file, of scenes with equal capacity")
     parser.add_argument("--suite", type=Path, help="file of test problems, such as datasets/suites/clutter.h5")
+    parser.add_argument("--alone", action="store_true", help="measure the plans alone, without refining")
     parser.add_argument("--count", type=int, default=100, help="test problems of every family, before the selection")
 
 
@@ -242,15 +253,15 @@ def main() -> None:
                 scenes = make_scenes(family, chosen.robot, chosen.count, seed=chosen.seed, per_scene=2)
             else:
                 scenes = [scene for scene in load_scenes(chosen.suite) if scene.name.rsplit(" ", 2)[0] == family]
-            results += measure(chosen.models, chosen.robot, family, scenes)
+            results += measure(chosen.models, chosen.robot, family, scenes, refining=not chosen.alone)
     head = ("family", "model", "problems", "alone", "refined", "with others", "solve", "cpu: plan", "refine", "solve")
     rows = [
         (
             each["family"],
             each["model"],
             f"{each['problems']}",
-            *(f"{each[key]:.3f}" for key in ("alone", "refined", "refined, other guesses too", "solve")),
-            *(f"{1e3 * each[key]:.2f} ms" for key in ("planning cpu [s]", "refining cpu [s]", "solve cpu [s]")),
+            *(cell(each, key) for key in ("alone", "refined", "refined, other guesses too", "solve")),
+            *(cell(each, key) for key in ("planning cpu [s]", "refining cpu [s]", "solve cpu [s]")),
         )
         for each in results
     ]

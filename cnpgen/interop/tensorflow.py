@@ -16,11 +16,11 @@ def to_tensorflow(batches: Batches) -> Any:
     TensorFlow may prefetch batches: the position is ``batches.state(epoch=..., batch=...)``.
 
     Args:
-        batches: Batches from ``dataset.batches(...)``.
+        batches: Batches from ``dataset.batches(...)``; observations are left out.
     """
 
     def generate() -> Iterator[dict[str, Any]]:
-        return map(dict, batches)
+        return ({name: batch[name] for name in signature} for batch in batches)
 
     signature = {name: tf.TensorSpec((None, *shape), dtype) for name, (shape, dtype) in batches.signature.items()}
     return tf.data.Dataset.from_generator(generate, output_signature=signature)

@@ -25,7 +25,7 @@ def plan_scenes(
     """Plan the problems of scenes, from rest to rest.
 
     Args:
-        planner: Planner of a model for scenes, such as "panda-scenes".
+        planner: Planner of a model that was trained on scenes.
         scenes: The scenes.
         goals: Joint positions at the goals in the order of the planned joints [rad], shape (n,) each; by default the
             first goal state of each scene.
@@ -52,7 +52,7 @@ def scene_requests(
         if not problem.has_sample_obstacles:
             raise UsageError(
                 f"the model is for {problem.name!r}, whose obstacles do not differ from plan to plan: expected a model"
-                " that was trained on scenes, such as panda-scenes",
+                " that was trained on scenes",
                 concerns="model",
             )
         own = tuple(obstacle for obstacle in problem.obstacle if obstacle.position != PARKED_POSITION_M)

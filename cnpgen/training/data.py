@@ -4,13 +4,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from cnpgen.errors import DatasetError
+from cnpgen.errors import DatasetError, UsageError
 from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.load import load_dataset
 from cnpgen.planner.control_points import ControlPoints
 from cnpgen.plans.format import CONDITIONS
 from cnpgen.problems.problem_record import as_problem
-from cnpgen.problems.scenes.scene_files import load_scenes
+from cnpgen.problems.scenes.scene_files import holds_scenes, load_scenes
 from cnpgen.schema.arguments import concerning
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.training.scene_rows import make_scene_rows
@@ -142,6 +142,8 @@ def open_training_data(folder: str | Path, robot: str | Path | None = None) -> T
         with concerning("robot"):
             problem = as_problem(robot)
         return make_scene_rows(problem, load_scenes(folder), str(folder))
+    if Path(folder).exists() and holds_scenes(Path(folder)):
+        raise UsageError(f"{folder} holds scenes: {{robot}} trains on them", remedies={"robot": "panda"})
     dataset = load_dataset(folder)
     if dataset.spec.scene_obstacles:
         raise DatasetError(

@@ -124,10 +124,13 @@ def test_training_rows_are_problems_and_their_reverses(problem):
 
 
 @needs_compiler
+@pytest.mark.slow
 def test_a_planner_is_trained_on_a_scene_file_and_plans_its_scenes(problem, tmp_path, capsys):
     robot, items, file = tmp_path / "crane", scenes(problem, 60), tmp_path / "scenes.h5"
     path = write_problem(tmp_path)
     save_scenes(file, items)
+    with pytest.raises(UsageError, match=r"holds scenes: robot='panda' trains on them"):
+        train_model(file, tmp_path / "model.h5", steps=8)
     own = load_problem(path)
     trained = train_model(file, tmp_path / "model.h5", steps=8, settings=TINY, check_rows=1, workers=1, robot=str(path))
     model = load_model(trained.path)
