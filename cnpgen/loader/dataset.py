@@ -12,8 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
 from cnpgen.errors import DatasetError, lacks
+from cnpgen.loader.batch_observer import observer_of
 from cnpgen.loader.batch_partition import BatchPartition
 from cnpgen.loader.batches import Batches, Observe
+from cnpgen.loader.columns import select_columns
 from cnpgen.loader.frame import make_frame
 from cnpgen.loader.gather import Rows, gather
 from cnpgen.loader.normalization import Normalization, make_normalization
@@ -22,6 +24,7 @@ from cnpgen.loader.row_format import RowFormat, make_row_format
 from cnpgen.loader.scene_columns import OBSTACLE_POSES, problem_obstacles, scene_fields
 from cnpgen.loader.shard_reader import ShardReader, SplitShards
 from cnpgen.loader.split import Split
+from cnpgen.robots.observation.observations import Observation
 from cnpgen.robots.scene import Scene
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.store.checked_shard import Shard
@@ -112,7 +115,7 @@ class Dataset:
         dtype: DTypeLike = "float32",
         drop_last: bool = True,
         shuffle: bool = True,
-        observe: Observe | None = None,
+        observe: Observe | Observation | str | None = None,
     ) -> Batches:
         """Return the batches of a split, in an order that depends on seed and epoch only.
 
@@ -128,14 +131,20 @@ class Dataset:
             dtype: Type of float fields.
             drop_last: Whether to omit an incomplete last batch of an epoch.
             shuffle: Whether to shuffle the rows; otherwise they are in their stored order.
-            observe: Function that returns observations of a batch, name -> array with a first axis of length B, which
-                are added to it; ``cnpgen.scenes.BatchObserver`` observes scenes.
+            observe: Kind of observation of the scenes of the rows, such as "cloud" (``cnpgen.scenes.observe``), or a
+                function that returns observations of a batch, name -> array with a first axis of length B. They are
+                added to the batch.
 
         Raises:
             UsageError: An argument is invalid, or there are fewer rows than in one batch, or fewer in the last batch
                 than ranks.
-            DatasetError: There is no such split or field, or there are no training rows for the normalization.
+            DatasetError: There is no such split or field, there are no training rows for the normalization, or no
+                scenes to observe.
         """
+        if isinstance(observe, str | Observation):
+            observe = observer_of(self.spec, observe, seed=seed)
+            selected = [field.name for field in select_columns(self.spec, fields).fields]
+            fields = list(dict.fromkeys([*selected, OBSTACLE_POSES]))
         partition = BatchPartition(batch_size=batch_size, rank=rank, world=world, drop_last=drop_last)
         position = checked_position(seed=seed, shuffle=shuffle, epoch=epoch)
         row_format = self._row_format(fields=fields, normalize=normalize, dtype=dtype)

@@ -8,7 +8,7 @@ from cnpgen.errors import DatasetError, UsageError
 from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.load import load_dataset
 from cnpgen.planner.control_points import ControlPoints
-from cnpgen.plans.format import CONDITIONS
+from cnpgen.plans.format import CONDITIONS, OBSTACLE_POSES
 from cnpgen.problems.problem_record import as_problem
 from cnpgen.problems.scenes.scene_files import holds_scenes, load_scenes
 from cnpgen.schema.arguments import concerning
@@ -82,7 +82,7 @@ class DatasetRows:
     def training(self) -> TrainingProblems:
         """See ``TrainingData``."""
         columns = self.dataset.arrays(self.train, fields=self._names, dtype="float64")
-        return TrainingProblems(boundary_columns(columns))
+        return TrainingProblems(boundary_columns(columns), columns.get(OBSTACLE_POSES))
 
     def checked(self, rows: int) -> TrainingProblems:
         """See ``TrainingData``."""
@@ -99,11 +99,12 @@ class DatasetRows:
     def _validation(self, first: int, stop: int) -> TrainingProblems:
         rows = list(range(first, min(stop, self.dataset.splits[self.validation])))
         columns = self.dataset.rows(self.validation, rows, fields=self._names, dtype="float64")
-        return TrainingProblems(boundary_columns(columns))
+        return TrainingProblems(boundary_columns(columns), columns.get(OBSTACLE_POSES))
 
     @property
     def _names(self) -> list[str]:
-        return [name for name in CONDITIONS if name in self.dataset.fields]
+        names = [name for name in CONDITIONS if name in self.dataset.fields]
+        return [*names, OBSTACLE_POSES] if self.dataset.spec.scene_obstacles else names
 
     def demonstrations(self, joints: int) -> ControlPoints | None:
         """See ``TrainingData``."""
@@ -134,7 +135,7 @@ def open_training_data(folder: str | Path, robot: str | Path | None = None) -> T
         robot: Problem of the robot in these scenes.
 
     Raises:
-        DatasetError: It is missing, unfinished or damaged, has scenes, or has no rows for training or validation.
+        DatasetError: It is missing, unfinished or damaged, or has no rows for training or validation.
         UsageError: There is no such robot or file.
         SceneError: A scene does not fit the robot.
     """
@@ -145,10 +146,6 @@ def open_training_data(folder: str | Path, robot: str | Path | None = None) -> T
     if Path(folder).exists() and holds_scenes(Path(folder)):
         raise UsageError(f"{folder} holds scenes: {{robot}} trains on them", remedies={"robot": "panda"})
     dataset = load_dataset(folder)
-    if dataset.spec.scene_obstacles:
-        raise DatasetError(
-            f"{folder} has scenes: networks train on scene files ({'cnpgen train SCENES --robot NAME'!r})"
-        )
     names = [name for name, rows in dataset.splits.items() if rows]
     if len(names) < 2:
         raise DatasetError(f"{folder} needs a split to train on and another one to validate with, it has {names}")

@@ -16,6 +16,7 @@ from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_record import as_record, open_problem
 from cnpgen.robots.solid import place_obstacles, solids_of
+from cnpgen.scenes import BasisPoints, observe
 from cnpgen.store.reader import open_dataset
 from cnpgen.training.data import open_training_data
 from cnpgen.world.world import World
@@ -182,9 +183,28 @@ def test_batches_contain_the_scene_without_normalization(dataset: Path) -> None:
     assert "obstacle_poses" not in next(iter(loaded.batches(32)))
 
 
-def test_training_refuses_scenes_that_the_network_would_ignore(dataset: Path) -> None:
-    with pytest.raises(DatasetError, match="has scenes: networks train on scene files"):
-        open_training_data(dataset)
+def test_training_rows_have_the_obstacles_of_their_scenes(dataset: Path) -> None:
+    data, loaded = open_training_data(dataset), cnpgen.load_dataset(dataset)
+    train, checked = data.training(), data.checked(5)
+    assert train.obstacle_poses.shape[0] == len(train.boundary) == loaded.splits["train"]
+    rows = np.array([0, 7, 101])
+    np.testing.assert_array_equal(train.obstacle_poses[rows], loaded.scenes("train", rows).poses)
+    np.testing.assert_array_equal(checked.obstacle_poses, loaded.scenes("validation", np.arange(5)).poses)
+
+
+def test_batches_observe_the_scenes_of_their_rows(dataset: Path) -> None:
+    loaded = cnpgen.load_dataset(dataset)
+    options = {"split": "validation", "fields": ["start_q"], "shuffle": False}
+    batch = next(iter(loaded.batches(4, observe="basis", **options)))
+    expected = observe(loaded.scenes("validation", np.arange(4)), "basis")["basis"]
+    np.testing.assert_allclose(batch["basis"], expected, atol=1e-5)  # batches have float32 poses
+    again = next(iter(loaded.batches(4, observe=BasisPoints(points=9), **options)))
+    assert again["basis"].shape == (4, 9)
+
+
+def test_a_dataset_without_scenes_has_nothing_to_observe(tiny: Any) -> None:
+    with pytest.raises(DatasetError, match="has no scenes to observe: expected a dataset such as panda-scenes"):
+        cnpgen.load_dataset(tiny("airhockey-hit")).batches(4, observe="cloud")
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ from cnpgen.robots.scene import Scene
 Array = NDArray[np.float64]
 
 MAX_SAMPLED_HEIGHT_ERROR_M = 5e-4  # half of the verdict's tolerance, because samples lie between those of the program
-MAX_TILT_RAD = 0.01
+MAX_PLANE_TILT_RAD = 0.01
 INFLUENCE_DISTANCE_M = 0.05  # closer pairs count in the smooth minimum of distances
 MAX_DEPTH_M = 0.0
 OMITTED_ELEMENTS = ("visual", "collision", "dynamics", "mimic")  # of links and joints; obstacles have own geometry
@@ -105,7 +105,7 @@ class DrakeArm:
             high = np.array([table.x.high, table.y.high, table.z + MAX_SAMPLED_HEIGHT_ERROR_M])
             return [PositionConstraint(plant, world, low, high, tip, np.zeros(3), context)]
         return [
-            AngleBetweenVectorsConstraint(plant, world, up, tip, up, 0.0, MAX_TILT_RAD, context),
+            AngleBetweenVectorsConstraint(plant, world, up, tip, up, 0.0, MAX_PLANE_TILT_RAD, context),
             MinimumDistanceLowerBoundConstraint(plant, MAX_DEPTH_M, context, None, INFLUENCE_DISTANCE_M),
         ]
 

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import zlib
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Any
 
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
-from cnpgen.loader.batch import Batch
 from cnpgen.machine.threads import one_thread
 from cnpgen.problems.scenes.scene_problem import SceneProblem
 from cnpgen.robots.observation.observations import Observation, SceneBatch, as_observation
@@ -52,25 +49,6 @@ def observe(
     observation, seed = as_observation(kind), integer("seed", seed, least=0, most=MAX_SEED)
     bodies = scene_bodies(scenes)
     return observation.observe(SceneBatch(bodies, scene_seeds(seed, len(bodies)), observation_backend(backend)))
-
-
-@dataclass(frozen=True)
-class BatchObserver:
-    """Observer of the scenes of batches, for ``dataset.batches(256, observe=...)``.
-
-    Attributes:
-        kind: See ``observe``.
-        scenes: Function that returns the scenes of the rows of a batch, as ``observe`` takes them.
-        seed: Seed of the points of clouds, which also depend on the rows of the batch.
-    """
-
-    kind: str | Observation
-    scenes: Callable[[Batch], Scenes]
-    seed: int = 0
-
-    def __call__(self, batch: Batch) -> dict[str, NDArray[Any]]:
-        """Observe the scenes of a batch."""
-        return observe(self.scenes(batch), self.kind, seed=(self.seed << 32) + zlib.crc32(batch.table.tobytes()))
 
 
 def scene_bodies(scenes: Scenes) -> Primitives:

@@ -21,7 +21,7 @@ from cnpgen.schema.arguments import integer
 Array = NDArray[Any]
 Corner = tuple[float, float, float]
 
-MAX_POINTS = 10_000_000  # of one observation of one scene
+MAX_OBSERVED_POINTS = 10_000_000  # of one observation of one scene
 MIN_GRID_EXTENT_M = 1e-6
 WORKSPACE = (-0.9, -0.9, -0.1), (0.9, 0.9, 1.1)  # corners of the default grids, around an arm like the Panda [m]
 TOKEN_NUMBERS = len(KINDS) + 3 + 6 + 3  # kind, center, two columns of the rotation matrix, sizes
@@ -72,7 +72,7 @@ class SurfaceCloud(Observation):
 
     def __post_init__(self) -> None:
         check_fields(self)
-        integer("points", self.points, least=1, most=MAX_POINTS)
+        integer("points", self.points, least=1, most=MAX_OBSERVED_POINTS)
 
     def observe(self, scenes: SceneBatch) -> dict[str, Array]:
         """See ``Observation``."""
@@ -94,7 +94,7 @@ class CameraCloud(Observation):
 
     def __post_init__(self) -> None:
         check_fields(self)
-        integer("points", self.points, least=1, most=MAX_POINTS)
+        integer("points", self.points, least=1, most=MAX_OBSERVED_POINTS)
 
     def observe(self, scenes: SceneBatch) -> dict[str, Array]:
         """See ``Observation``."""
@@ -120,8 +120,10 @@ class DistanceGrid(Observation):
     def __post_init__(self) -> None:
         check_fields(self)
         _check_corners(self.low, self.high)
-        if min(self.shape) < 1 or np.prod(self.shape, dtype=float) > MAX_POINTS:
-            raise UsageError(f"must be positive with at most {MAX_POINTS:,} points, got {self.shape}", argument="shape")
+        if min(self.shape) < 1 or np.prod(self.shape, dtype=float) > MAX_OBSERVED_POINTS:
+            raise UsageError(
+                f"must be positive with at most {MAX_OBSERVED_POINTS:,} points, got {self.shape}", argument="shape"
+            )
 
     def observe(self, scenes: SceneBatch) -> dict[str, Array]:
         """See ``Observation``."""
@@ -147,7 +149,7 @@ class BasisPoints(Observation):
 
     def __post_init__(self) -> None:
         check_fields(self)
-        integer("points", self.points, least=1, most=MAX_POINTS)
+        integer("points", self.points, least=1, most=MAX_OBSERVED_POINTS)
         _check_corners(self.low, self.high)
 
     @property
