@@ -31,7 +31,7 @@ def model() -> Model:
 
 @pytest.fixture(scope="module")
 def problems() -> Boundary:
-    return draw_boundary_problems("heavy-object-anywhere", 400, seed=20).boundary
+    return draw_boundary_problems("heavy-object-anywhere", 2000, seed=20).boundary
 
 
 def test_static_violations_agree_with_pinocchio_and_coal() -> None:
@@ -105,7 +105,7 @@ def test_via_points_repair_plans_and_keep_those_without_violation(model: Model, 
     assert same[before <= 1].all()
     assert (after[~same] < before[~same]).all()
     repaired = np.flatnonzero((before > 1) & (after <= 1))
-    assert len(repaired) >= 3
+    assert len(repaired) >= 10
     assert evaluate_plans(found[repaired], workers=1).valid.mean() > 0.5
     certain = repaired[before[repaired] > np.sqrt(2)]  # the planner limits the components of the tilt, conservatively
     assert not evaluate_plans(straight[certain], workers=1).valid.any()
