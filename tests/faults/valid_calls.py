@@ -29,12 +29,8 @@ EXCLUDED = {  # public callables without a valid call, and the reason
     "SceneError": "exceptions are raised, not called",
     "SceneFamily": "abstract contract of families",
     "SolvedScenes": "made by solve_scenes",
-<<<<<<< HEAD
     "make_scenes": "needs a robot with link geometry, and none is in the package",
     "plan_scenes": "needs a model for scenes; its arguments are those of scene_plans",
-=======
-    "make_scenes": "needs link geometry of robots of an optional package",
->>>>>>> usable
     "solve_scenes": "compiles kernels for minutes; its arguments are those of scene_plans and solve_plans",
     "ConditionDecision": "made by evaluate_trajectories",
     "Decision": "an enum",
@@ -400,13 +396,10 @@ def _of_scenes(folder: Path) -> list[ValidCall]:
         ValidCall("save_scenes", scenes.save_scenes, {"path": folder / "saved_scenes.h5", "scenes": [scene]}),
         ValidCall("scene_plans", scenes.scene_plans, {"problem": problem, "scenes": [scene]}),
         ValidCall("load_family", scenes.load_family, {"name": "tabletop"}),
-<<<<<<< HEAD
         ValidCall("observe", scenes.observe, {"scenes": [scene], "kind": "tokens"}),
         ValidCall("scene_bodies", scenes.scene_bodies, {"scenes": [scene]}),
         ValidCall("BatchObserver", scenes.BatchObserver, {"kind": "tokens", "scenes": lambda _: [scene]}),
         ValidCall("obstacles_of_points", scenes.obstacles_of_points, {"points": np.eye(3), "radius": 0.01}),
-=======
->>>>>>> usable
         ValidCall("GoalPose", scenes.GoalPose, {"frame": "", "position": start[:3], "rotation": np.eye(3)}),
         ValidCall("Grasp", scenes.Grasp, _fields(grasp)),
         ValidCall("Layout", scenes.Layout, {"obstacles": (post,), "grasps": (grasp,)}),
