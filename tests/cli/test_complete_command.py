@@ -45,4 +45,5 @@ def test_the_exit_code_says_that_no_task_has_an_answer_or_what_is_wrong(tmp_path
     assert main(["complete", "airhockey-replan", "wrong.csv", "-o", "problems.h5"]) == 1
     assert "did you mean 'hit_angle'?" in capsys.readouterr().err
     assert main(["complete", "airhockey-replan", "nothing.csv", "-o", "problems.h5"]) == 2
-    assert main(["complete", "airhockey", "far.csv", "-o", "problems.h5"]) == 2
+    assert main(["complete", "airhockey", "far.csv", "-o", "problems.h5"]) == 1  # a problem takes poses of the tip
+    assert "far.csv lacks goal_xyz.z" in capsys.readouterr().err

@@ -17,6 +17,7 @@ from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.initial_guesses import straight_line
+from cnpgen.robots.plausible_values import UnitError
 from cnpgen.store.field import Field
 from cnpgen.trajectory.boundary import Boundary
 from tests.problems.test_constraints import gantry_problem
@@ -91,7 +92,7 @@ def test_files_of_plans_and_tables_have_the_units_of_their_joints(plans: Plans, 
 
 def test_a_position_far_outside_the_limits_of_a_sliding_joint_is_perhaps_in_millimetres(gantry: Problem) -> None:
     rest, goal = np.zeros((1, 5)), np.array([[0.0, 800.0, 0.0, 0.0, 0.0]])
-    with pytest.warns(UserWarning, match=r"slide_y = 800 m .* must be in m, are these millimetres, or normalised"):
+    with pytest.raises(UnitError, match=r"got 800 m in plan 0 of slide_y; did you mean 800 mm = 0.8 m\?"):
         make_plans(
             gantry,
             Boundary(rest, rest, rest, goal, rest),

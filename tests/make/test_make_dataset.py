@@ -179,9 +179,9 @@ def test_a_shard_that_pinocchio_disagrees_with_is_not_written(tmp_path, monkeypa
     honest = make.shard_columns
 
     def wrong(*arguments):
-        for columns, sampling in honest(*arguments):
+        for columns, sampling, scenes in honest(*arguments):
             columns["start_q"][-1, 0] += 1e-6
-            yield columns, sampling
+            yield columns, sampling, scenes
 
     monkeypatch.setattr(make, "shard_columns", wrong)
     with pytest.raises(MachineError, match=r"row 249 of split 'train' fails Pinocchio's check .*try another backend="):
@@ -223,7 +223,7 @@ def test_shards_are_the_rows_of_their_blocks_made_together_or_with_gaps(job):
     blocks = [prepared.block(spec.seed, "train", index) for index in range(3)]
     tasks = [task for task in shards(spec) if task.index != 3]
     assert {task.first_row // BLOCK_ROWS for task in tasks} == {0, 1, 2}
-    for task, (columns, sampling) in zip(tasks, shard_columns(prepared, spec, tasks), strict=True):
+    for task, (columns, sampling, _) in zip(tasks, shard_columns(prepared, spec, tasks), strict=True):
         rows = slice(task.first_row, task.first_row + task.rows)
         for name, values in columns.items():
             expected = np.concatenate([block.columns[name] for block in blocks], axis=1)[:, rows].T

@@ -273,7 +273,7 @@ def test_ctrl_c_during_explanations_keeps_finished_plans(
         raise KeyboardInterrupt
 
     problem, out = draw_boundary_problems("airhockey-hit", 1), tmp_path / "out.h5"
-    fast = replace(problem.boundary, goal_dq=30.0 * problem.boundary.goal_dq)
+    fast = replace(problem.boundary, goal_dq=5.0 * problem.boundary.goal_dq)
     save_plans(tmp_path / "hard.h5", replace(problem, boundary=fast))
     command = ["refine", str(tmp_path / "hard.h5"), "-o", str(out), "--explain"]
     with monkeypatch.context() as patch:

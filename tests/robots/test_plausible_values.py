@@ -57,7 +57,7 @@ def test_boundary_files_in_degrees_are_refused_unless_large_angles_are_allowed(
 ) -> None:
     with pytest.raises(UnitError, match=r"start_q must be from .* allow_large_angles=True accepts such values"):
         cnpgen.load_boundary_problems(in_degrees, problem="airhockey")
-    with pytest.warns(UserWarning, match="are these degrees"):
+    with pytest.warns(UserWarning, match=r"did you mean .* deg = "):
         plans = cnpgen.load_boundary_problems(in_degrees, problem="airhockey", allow_large_angles=True)
     np.testing.assert_allclose(plans.boundary.start_q[0], np.rad2deg(BASE))
     out = str(in_degrees.with_name("plans.h5"))
