@@ -175,8 +175,7 @@ def _draws(arguments: argparse.Namespace, model: "Model") -> "Requests":
     from cnpgen.errors import UsageError
     from cnpgen.make.draw_boundary_problems import draw_boundary_problems
     from cnpgen.make.recipe_file import load_dataset_recipe
-    from cnpgen.planner.plan_requests import Requests, check_stages, checked_boundary
-    from cnpgen.plans.boundary_file import CONTEXT
+    from cnpgen.planner.plan_requests import Requests, check_stages, checked_boundary, context_columns
     from cnpgen.problems.problem import resolved
     from cnpgen.problems.problem_record import record_problem
     from cnpgen.store.files.documents import plain
@@ -190,5 +189,5 @@ def _draws(arguments: argparse.Namespace, model: "Model") -> "Requests":
     stages = plain(resolved(recipe.pipeline))["stage"]
     check_stages(name, record_problem(recipe.pipeline.problem), stages, model, other=arguments.other_rows)
     problems = draw_boundary_problems(recipe, arguments.n, seed=arguments.seed)
-    columns = {name: problems.columns[name] for name in CONTEXT if name in problems.columns}
-    return Requests(checked_boundary(name, problems.boundary.arrays(), model), problems.sample_id, columns)
+    boundary = checked_boundary(name, problems.boundary.arrays(), model)
+    return Requests(boundary, problems.sample_id, context_columns(problems.columns))

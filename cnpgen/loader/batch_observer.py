@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from cnpgen.errors import DatasetError
 from cnpgen.loader.batch import Batch
 from cnpgen.loader.scene_columns import OBSTACLE_POSES, problem_obstacles
-from cnpgen.problems.scenes.observe import Scenes, observe
+from cnpgen.problems.scenes.observe import MAX_SEED, Scenes, observe
 from cnpgen.robots.observation.observations import Observation
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.scene import Scene
@@ -37,7 +37,8 @@ class BatchObserver:
 
     def __call__(self, batch: Batch) -> dict[str, NDArray[Any]]:
         """Observe the scenes of a batch."""
-        return observe(self.scenes(batch), self.kind, seed=(self.seed << 32) + zlib.crc32(batch.table.tobytes()))
+        seed = ((self.seed << 32) + zlib.crc32(batch.table.tobytes())) % MAX_SEED
+        return observe(self.scenes(batch), self.kind, seed=seed)
 
 
 def observer_of(spec: DatasetSpec, kind: str | Observation, *, seed: int) -> BatchObserver:

@@ -98,7 +98,7 @@ class BoundaryLayer:
         self.rate_outputs = spec.rate_control_points
         chosen_backend, folder = choose_backend(backend)
         folder = folder if cache_folder is None else Path(cache_folder)
-        self._kernels = problem_kernels(self.problem, load_robot(self.problem), chosen_backend, folder)
+        self._kernels = problem_kernels(self.problem.for_planning, load_robot(self.problem), chosen_backend, folder)
 
     def __getstate__(self) -> dict[str, Any]:
         """Omit the loaded kernels, which are loaded again on first use."""
@@ -106,7 +106,7 @@ class BoundaryLayer:
 
     @cached_property
     def _preprocessor_and_projection(self) -> tuple[TaskPreprocessor, Projection | None]:
-        robot, problem, kernels = self._kernels.arguments["robot"], self.problem, self._kernels
+        robot, problem, kernels = self._kernels.arguments["robot"], self.problem.for_planning, self._kernels
         with kernels.compile_in_parallel():
             prepare = make_task_preprocessor(
                 problem,
@@ -115,6 +115,7 @@ class BoundaryLayer:
                 line_projection_steps=self._line_projection_steps,
                 expected_time=self._expected_time,
                 fixed_at_goal=self._fixed_at_goal,
+                placed=self.problem.obstacle if self.problem.has_sample_obstacles else (),
             )
             return prepare, make_projection(
                 problem, kernels, steps=self.projection_steps, fixed_at_goal=self._fixed_at_goal
@@ -122,16 +123,20 @@ class BoundaryLayer:
 
     @checked_arguments
     @one_thread()
-    def tasks(self, boundary: Boundary, *, allow_large_angles: bool = False) -> Tasks:
+    def tasks(
+        self, boundary: Boundary, *, obstacle_poses: ArrayLike | None = None, allow_large_angles: bool = False
+    ) -> Tasks:
         """Prepare N tasks: compute everything that the network needs from boundary conditions.
 
         Args:
             boundary: Boundary conditions, shape (N, n) each: arrays, or tensors on the CPU.
+            obstacle_poses: Poses and sizes of obstacles that samples place, shape (N, width), as
+                ``dataset.scenes(split, rows).poses`` has them; needed if the problem has such obstacles.
             allow_large_angles: Whether to accept values that are probably in degrees or millimetres, with a warning.
 
         Raises:
-            UsageError: A shape is wrong, a value is no real number, or the presence of goal accelerations does not
-                match ``goal_acceleration``.
+            UsageError: A shape is wrong, a value is no real number, poses are missing, or the presence of goal
+                accelerations does not match ``goal_acceleration``.
             UnitError: A value is probably in degrees or millimetres.
         """
         if boundary.fixed_at_goal > self._fixed_at_goal:
@@ -150,7 +155,8 @@ class BoundaryLayer:
         checked = Boundary(**arrays)
         robot = self._kernels.arguments["robot"]
         check_boundary_units(robot, checked, argument="boundary", allow_large_angles=allow_large_angles)
-        return self._preprocessor_and_projection[0](checked)
+        poses = None if obstacle_poses is None else numbers("obstacle_poses", obstacle_poses)
+        return self._preprocessor_and_projection[0](checked, obstacle_poses=poses)
 
     @checked_arguments
     @one_thread()

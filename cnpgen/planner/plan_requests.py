@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.planner.model import Model
 from cnpgen.plans.boundary_file import ASKED, CONTEXT, BoundaryFile, boundary_in, read_boundary_file
-from cnpgen.plans.boundary_problems import chosen_rows
+from cnpgen.plans.boundary_problems import chosen_rows, scene_columns
+from cnpgen.plans.format import OBSTACLE_POSES
 from cnpgen.plans.plausible import check_boundary_units
 from cnpgen.problems.problem_record import ProblemRecord, as_record, open_problem
 from cnpgen.store.dataset_spec import DatasetSpec
@@ -62,7 +63,7 @@ def read_rows(
     stored = {column.name for column in dataset.spec.fields}
     names = [name for name in ASKED if name in stored]
     arrays = dataset.read(split, fields=names, start=rows.start, stop=rows.stop)
-    columns = {name: np.asarray(arrays[name], np.float64) for name in CONTEXT if name in arrays}
+    columns = context_columns(arrays | scene_columns(dataset, split, rows))
     boundary = checked_boundary(str(folder), arrays, model)
     return Requests(boundary, arrays.get("sample_id", np.array(rows)), columns)
 
@@ -95,8 +96,13 @@ def read_file(path: Path, model: Model, *, other: bool = False, allow_large_angl
     boundary = checked_boundary(str(path), file.columns, model)
     if not allow_large_angles:
         check_boundary_units(open_problem(model.problem)[1], boundary, where=str(path))
-    columns = {name: np.asarray(file.columns[name], np.float64) for name in CONTEXT if name in file.columns}
-    return Requests(boundary, file.sample_id(len(boundary)), columns)
+    file.check_obstacles(model.problem)
+    return Requests(boundary, file.sample_id(len(boundary)), context_columns(file.columns))
+
+
+def context_columns(columns: Mapping[str, NDArray[Any]]) -> dict[str, Array]:
+    """Return the columns of tasks that plans keep: those of hits, and the obstacles of samples."""
+    return {name: np.asarray(columns[name], np.float64) for name in (*CONTEXT, OBSTACLE_POSES) if name in columns}
 
 
 def _check_shard(file: BoundaryFile, model: Model, *, other: bool) -> None:

@@ -18,6 +18,7 @@ from cnpgen.planner.model import Model
 from cnpgen.planner.model_file import load_model, model_for
 from cnpgen.planner.network.features import SCENE
 from cnpgen.planner.plan_reuse import reuse_previous_plan
+from cnpgen.plans.format import OBSTACLE_POSES
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.plausible import check_boundary_units
 from cnpgen.problems.problem import Problem
@@ -197,7 +198,10 @@ class Planner:
         q, dq, ddq = plans.states_at(time)
         parameters = plans.boundary.parameters if parameters is None else parameters
         states = q, dq, ddq, goal_q, goal_dq, goal_ddq
-        new = self.plan_batch(boundary_of(self.robot.n, *states, parameters))
+        boundary, columns = boundary_of(self.robot.n, *states, parameters), dict[str, Array]()
+        if (poses := plans.columns.get(OBSTACLE_POSES)) is not None:
+            columns[OBSTACLE_POSES] = np.broadcast_to(poses, (len(boundary), poses.shape[1]))
+        new = self.plan_batch(boundary, columns=columns)
         times = np.broadcast_to(numbers("time", time), (len(plans),))
         if len(plans) == 1:
             plans, times = plans[np.zeros(len(new), int)], np.repeat(times, len(new))

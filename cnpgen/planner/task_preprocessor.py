@@ -85,11 +85,10 @@ class TaskPreprocessor:
             via_point: Via points of the lines at half their length before projection [rad], shape (N, n); none by
                 default.
             ends: Result of ``ends_of``, if already computed.
-            obstacle_poses: Poses and sizes of obstacles that samples place, shape (N, width); by default, they stay
-                parked.
+            obstacle_poses: Poses and sizes of obstacles that samples place, shape (N, width).
 
         Raises:
-            UsageError: The obstacle poses have a wrong shape or are not finite, or the problem places the obstacles.
+            UsageError: Obstacle poses are missing, have a wrong shape or are not finite, or the problem places them.
         """
         ends = ends_of(boundary) if ends is None else ends
         start_xyz, goal_xyz, *velocity = (tip.T for tip in self.tips(ends))
@@ -118,8 +117,11 @@ class TaskPreprocessor:
                 text = f"the model's problem {self.problem.name!r} has no obstacles that plans place"
                 raise UsageError(text, concerns="obstacle_poses")
             return None
+        if obstacle_poses is None:
+            text = "is missing: the samples of this problem place its obstacles (cnpgen.scenes, Dataset.scenes)"
+            raise UsageError(text, argument="obstacle_poses")
         scene = Scene(self.placed, np.tile(place_obstacles(self.placed), (count, 1)))
-        return scene if obstacle_poses is None else scene.with_poses(np.asarray(obstacle_poses, np.float64))
+        return scene.with_poses(np.asarray(obstacle_poses, np.float64))
 
     def _parameters(self, boundary: Boundary) -> Array | None:
         """Return the parameters of the tasks, shape (N, width), or None without any; check their shape and ranges."""

@@ -14,7 +14,7 @@ from cnpgen.plans.format import FORMAT as PLANS
 from cnpgen.plans.format import PLAN_FILE_VERSION as PLANS_VERSION
 from cnpgen.plans.plan_file import stored_problem
 from cnpgen.plans.plausible import check_boundary_units
-from cnpgen.problems.problem_record import ProblemRecord, as_record
+from cnpgen.problems.problem_record import ProblemRecord, as_record, open_problem
 from cnpgen.robots.robot import Robot
 from cnpgen.store.checked_shard import read_rows, recorded_shard
 from cnpgen.store.dataset_spec import DatasetSpec, load_dataset_spec, shards
@@ -93,6 +93,16 @@ class BoundaryFile:
         return (
             stored_problem(self.path, self.attributes, required=required) if spec is None else as_record(spec.problem)
         )
+
+    def check_obstacles(self, problem: ProblemRecord) -> None:
+        """Check that the file has the obstacles of its samples if they place those of the problem.
+
+        Raises:
+            DatasetError: They are missing.
+        """
+        if OBSTACLE_POSES not in self.columns and open_problem(problem)[0].has_sample_obstacles:
+            remedy = "give the folder of its dataset" if self.is_shard else f"expected {OBSTACLE_POSES}"
+            raise DatasetError(f"{self.path} lacks the obstacles of its samples: {remedy}")
 
     def boundary(self, robot: Robot, *, allow_large_angles: bool = False) -> Boundary:
         """Return the boundary conditions of motions of a robot, shape (N, n) each.

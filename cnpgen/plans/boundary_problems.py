@@ -21,7 +21,7 @@ from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.store.paths import require_folder
-from cnpgen.store.reader import open_dataset
+from cnpgen.store.reader import StoredDataset, open_dataset
 from cnpgen.store.scene_table import SCENE_ID
 from cnpgen.trajectory.boundary import Boundary
 
@@ -83,11 +83,18 @@ def _of_folder(folder: Path, split: str, start: int, n: int | None) -> Plans:
     dataset = open_dataset(folder)
     rows = chosen_rows(folder, dataset.spec, split=split, start=start, n=n)
     source = f"dataset {dataset.spec.name}, seed {dataset.spec.seed}, split {split}"
-    columns, record = dataset.read(split, start=rows.start, stop=rows.stop), as_record(dataset.spec.problem)
-    if dataset.spec.scene_obstacles:
-        table = dataset.read_scenes(split, start=rows.start, stop=rows.stop)
-        columns[OBSTACLE_POSES] = scene_poses(open_problem(record)[0].obstacle, table[table.rows_of(columns[SCENE_ID])])
-    return plans_of_rows(record, columns, source=source)
+    columns = dataset.read(split, start=rows.start, stop=rows.stop) | scene_columns(dataset, split, rows)
+    return plans_of_rows(as_record(dataset.spec.problem), columns, source=source)
+
+
+def scene_columns(dataset: StoredDataset, split: str, rows: range) -> dict[str, NDArray[Any]]:
+    """Return the column with the obstacles of rows of a dataset; none if its samples have no scenes."""
+    if not dataset.spec.scene_obstacles:
+        return {}
+    scenes = dataset.read_scenes(split, start=rows.start, stop=rows.stop)
+    ids = dataset.read(split, fields=[SCENE_ID], start=rows.start, stop=rows.stop)[SCENE_ID]
+    obstacles = open_problem(as_record(dataset.spec.problem))[0].obstacle
+    return {OBSTACLE_POSES: scene_poses(obstacles, scenes[scenes.rows_of(ids)])}
 
 
 def chosen_rows(folder: Path, spec: DatasetSpec, *, split: str, start: int, n: int | None) -> range:
@@ -122,6 +129,7 @@ def _of_file(path: Path, wanted: ProblemRecord | None, *, allow_large_angles: bo
     )
     if (said := file.text("problem_sha256")) and said != problem.comparable_sha256:
         raise DatasetError(f"{path} is of another problem than {problem.name!r}: its problem_sha256 is not this one's")
+    file.check_obstacles(problem)
     boundary = file.boundary(open_problem(problem)[1], allow_large_angles=allow_large_angles)
     columns = {**file.columns, **boundary.arrays(), "sample_id": file.sample_id(len(boundary))}
     try:

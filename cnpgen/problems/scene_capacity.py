@@ -24,11 +24,17 @@ def with_capacity(problem: Problem, capacity: Capacity) -> Problem:
         capacity: Numbers of further obstacles.
 
     Raises:
-        UsageError: No constraint keeps the robot away from obstacles.
+        UsageError: No constraint keeps the robot away from obstacles, or the problem has other values of each sample.
     """
     if problem.first(RobotClearance) is None:
         raise UsageError(
             f"the problem {problem.name!r} has no constraint robot-clearance: obstacles would be ignored",
+            concerns="problem",
+        )
+    if problem.parameters or problem.scene_constraint is not None:
+        raise UsageError(
+            f"the problem {problem.name!r} has values of each sample (parameters or a puck), which are not supported"
+            " among obstacles that samples place",
             concerns="problem",
         )
     shapes = [*KINDS, *sorted(capacity.keys() - set(KINDS))]

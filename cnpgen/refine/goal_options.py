@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.errors import UsageError
 from cnpgen.machine.times import Times
 from cnpgen.plans.concatenate import concatenate
 from cnpgen.plans.format import GOAL_OPTION
@@ -46,6 +47,7 @@ def refine_goal_options(
     Returns:
         The refinement of the chosen rows, one for each task, in the order of the tasks.
     """
+    _check_tasks(plans)
     tasks = list(dict.fromkeys(plans.sample_id.tolist()))
     chosen: dict[int, tuple[Refinement, int]] = {}
     lowest, files = dict[int, float](), list[Path]()
@@ -67,6 +69,21 @@ def refine_goal_options(
     for file in files:
         file.unlink(missing_ok=True)
     return _of_rows([chosen[task] for task in tasks])
+
+
+def _check_tasks(plans: Plans) -> None:
+    """Raise UsageError if rows of different tasks have one number, for example after joining two files of tasks."""
+    rows = zip(plans.sample_id.tolist(), np.asarray(plans.columns[GOAL_OPTION]).tolist(), strict=True)
+    starts: dict[int, Array] = {}
+    seen = set[tuple[int, float]]()
+    for row, key in enumerate(rows):
+        start = plans.boundary.start_q[row]
+        if key in seen or not np.array_equal(starts.setdefault(key[0], start), start):
+            raise UsageError(
+                f"have several tasks with the sample_id {key[0]}: number tasks that are solved together differently",
+                argument="plans",
+            )
+        seen.add(key)
 
 
 def min_durations(plans: Plans) -> Array:

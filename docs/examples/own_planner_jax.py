@@ -73,7 +73,7 @@ def make_step(layer, loss, mean, scale):
 
     def mean_loss(parameters, table, tasks, weights, shift):
         path, rate = control_points(layer, tasks, *outputs(parameters, table, tasks))
-        scene = {"obstacle_poses": tasks.scene.poses, "start_tip": tasks.start_xyz}
+        scene = {"obstacle_poses": tasks.obstacle_poses, "start_tip": tasks.start_xyz}
         return plan_loss(loss, path, rate, weights=weights, **scene, shift=shift)[0].mean()
 
     def step(state, table, tasks, weights, shift, rate):

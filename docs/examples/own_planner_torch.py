@@ -77,7 +77,7 @@ def train(planner, dataset, *, seconds, steps):
                 return average
             tasks, phi, log_rate = planner(batch)
             path, rate = control_points(planner.layer, tasks, phi, log_rate)
-            scene = {"obstacle_poses": tasks.scene.poses, "start_tip": tasks.start_xyz}
+            scene = {"obstacle_poses": tasks.obstacle_poses, "start_tip": tasks.start_xyz}
             shift = rotating_shift(step, SHIFTS)
             total, _ = plan_loss(loss, path, rate, weights=metric.weights(progress), **scene, shift=shift)
             optimizer.zero_grad()

@@ -10,6 +10,7 @@ import pytest
 import cnpgen
 from cnpgen.cli.main import main
 from cnpgen.errors import DatasetError, UsageError
+from cnpgen.plans.concatenate import concatenate
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.goal_options import min_durations, refine_goal_options
@@ -149,3 +150,9 @@ def test_tasks_with_goal_poses_are_solved(problem: Problem) -> None:
         options = completed.plans[completed.plans.sample_id == row]
         single = replace(options, columns={k: v for k, v in options.columns.items() if k != "goal_option"})
         assert solved.plans.duration[row] == pytest.approx(cnpgen.solve_plans(single, workers=1).plans.duration.min())
+
+
+def test_tasks_with_one_number_are_refused_instead_of_merged(problem: Problem) -> None:
+    first, second = (cnpgen.complete(problem, goal_xyz=goal).plans for goal in (GOALS[0], [0.4, 0.3, 0.5]))
+    with pytest.raises(UsageError, match=r"plans have several tasks with the sample_id 0"):
+        cnpgen.solve_plans(concatenate([first, second]), workers=1)

@@ -11,14 +11,16 @@ import pytest
 
 import cnpgen
 from cnpgen.cli.main import main
-from cnpgen.errors import DatasetError
+from cnpgen.errors import DatasetError, UsageError
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_record import as_record, open_problem
+from cnpgen.problems.scene_capacity import with_capacity
 from cnpgen.robots.solid import place_obstacles, solids_of
 from cnpgen.scenes import BasisPoints, observe
 from cnpgen.store.reader import open_dataset
 from cnpgen.training.data import open_training_data
+from cnpgen.training.settings import TrainingSettings
 from cnpgen.world.world import World
 from tests.conftest import needs_compiler
 from tests.examples.forged_shards import edit
@@ -256,3 +258,68 @@ def test_certified_samples_have_valid_plans_in_their_scenes(pipeline: Path, tmp_
     assert main(["validate", str(folder), "--deep", "--workers", "1"]) == 0
     plans = cnpgen.load_boundary_problems(folder)
     assert cnpgen.evaluate_plans(plans).valid.all()
+
+
+@pytest.fixture(scope="module")
+def model(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("model") / "scenes.h5"
+    settings = TrainingSettings(hidden=8, layers=1, batch_size=16, nodes=8, validations=1)
+    cnpgen.train_model(dataset, path, steps=2, settings=settings, check_rows=4)
+    return path
+
+
+@pytest.mark.slow
+def test_plans_have_the_obstacles_of_their_samples(
+    dataset: Path, pipeline: Path, model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    expected = cnpgen.load_dataset(dataset).scenes("validation", np.arange(6)).poses
+    out = tmp_path / "plans.h5"
+    assert main(["plan", str(dataset), "--model", str(model), "--n", "6", "-o", str(out)]) == 0
+    plans = cnpgen.load_plans(out)
+    np.testing.assert_array_equal(plans.columns["obstacle_poses"], expected)
+    again = tmp_path / "again.h5"
+    assert main(["plan", str(out), "--model", str(model), "-o", str(again)]) == 0
+    np.testing.assert_array_equal(cnpgen.load_plans(again).columns["obstacle_poses"], expected)
+    assert main(["plan", str(pipeline), "--n", "3", "--model", str(model), "-o", str(tmp_path / "drawn.h5")]) == 0
+    assert "obstacle_poses" in cnpgen.load_plans(tmp_path / "drawn.h5").columns
+    shard = sorted((dataset / "validation").glob("*.h5"))[0]
+    for command in (["plan", str(shard), "--model", str(model)], ["solve", str(shard)]):
+        assert main([*command, "-o", str(tmp_path / "no.h5")]) != 0
+        assert "lacks the obstacles of its samples: give the folder of its dataset" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_replanning_keeps_the_obstacles_and_planning_without_them_is_refused(dataset: Path, model: Path) -> None:
+    loaded, planner = cnpgen.load_dataset(dataset), cnpgen.Planner(model)
+    scene = loaded.scenes("validation", np.arange(2))
+    plans = planner.plan_batch(
+        draw_boundary(loaded, rows=np.arange(2)), columns={"obstacle_poses": scene.poses.astype(float)}
+    )
+    new = planner.replan(plans, 0.0, goal_q=plans.boundary.goal_q + 0.01)
+    np.testing.assert_array_equal(new.columns["obstacle_poses"], scene.poses)
+    with pytest.raises(UsageError, match="obstacle_poses is missing"):
+        planner.plan(plans.boundary.start_q, plans.boundary.goal_q)
+
+
+def draw_boundary(loaded: Any, *, rows: Any) -> Any:
+    columns = loaded.rows("validation", rows, fields=["start_q", "goal_q"], normalize=False, dtype="float64")
+    zero = np.zeros_like(columns["start_q"])
+    return cnpgen.Boundary(columns["start_q"], zero, zero, columns["goal_q"], zero)
+
+
+@pytest.mark.slow
+def test_the_boundary_layer_takes_the_obstacles_of_samples(dataset: Path) -> None:
+    loaded = cnpgen.load_dataset(dataset)
+    layer, scene = cnpgen.BoundaryLayer(loaded.problem), loaded.scenes("validation", np.arange(2))
+    boundary = draw_boundary(loaded, rows=np.arange(2))
+    tasks = layer.tasks(boundary, obstacle_poses=scene.poses)
+    np.testing.assert_array_equal(tasks.obstacle_poses, scene.poses)
+    with pytest.raises(UsageError, match="obstacle_poses is missing"):
+        layer.tasks(boundary)
+
+
+def test_tasks_and_values_of_samples_are_refused_where_scenes_are_drawn(pipeline: Path) -> None:
+    with pytest.raises(UsageError, match="tasks have no scenes"):
+        cnpgen.complete(pipeline, start_q=np.zeros(4), goal_q=np.ones(4))
+    with pytest.raises(UsageError, match="not supported among obstacles that samples place"):
+        with_capacity(cnpgen.load_problem("heavy-object-loads"), {"box": 1})

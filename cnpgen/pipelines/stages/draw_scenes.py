@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import RecipeError
+from cnpgen.errors import RecipeError, UsageError
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.families.family import Layout, SceneFamily
 from cnpgen.pipelines.stages.batch_scenes import BatchScenes, batch_scenes
-from cnpgen.pipelines.stages.stage import CandidateBatch, Stage, StageFunction, leave
+from cnpgen.pipelines.stages.stage import CandidateBatch, Stage, StageFunction
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.scenes.scene_problem import MAX_BASE_DEPTH_M
 from cnpgen.robots.scene_arrays import rotations_of, sample_obstacles
@@ -84,9 +84,17 @@ class DrawScenes(Stage):
         return work
 
     def complete(self, context: Context, given: Collection[str]) -> StageFunction:
-        """Draw no scenes for tasks: their obstacles are given."""
-        del context, given
-        return leave
+        """Refuse tasks: the obstacles of a task are those of its problem.
+
+        Raises:
+            UsageError: Always.
+        """
+        del given
+        name = context.problem.name
+        raise UsageError(
+            f"tasks have no scenes: complete poses among the obstacles of the problem {name!r}, or use a scene file",
+            concerns="recipe",
+        )
 
     def _shares(self) -> NDArray[np.float64]:
         shares = np.array([family.share for family in self.family])

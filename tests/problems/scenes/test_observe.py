@@ -212,3 +212,10 @@ def test_batches_of_a_dataset_have_the_observations_of_their_scenes(tiny) -> Non
     cloud = BatchObserver(SurfaceCloud(points=9), scenes_of)
     first, again = (next(iter(dataset.batches(16, observe=cloud, **options)))["cloud"] for _ in range(2))
     np.testing.assert_array_equal(first, again)
+
+
+def test_every_seed_of_batches_observes(tiny) -> None:
+    dataset = load_dataset(tiny("heavy-object"))
+    ball = Obstacle(name="ball", kind="sphere", position=(0.4, 0.0, 0.3), radius=0.1)
+    observer = BatchObserver(BasisPoints(points=4), lambda batch: [(ball,)] * batch.rows, seed=2**62)
+    assert next(iter(dataset.batches(4, observe=observer)))["basis"].shape == (4, 4)
