@@ -11,6 +11,7 @@ import json
 import os
 import re
 import shutil
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,12 +24,15 @@ from cnpgen.store.card import PARQUET, card_notes, card_text
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, shards
 from cnpgen.store.dataset_summary import summarize_dataset
 from cnpgen.store.files.atomic import write_file
-from cnpgen.store.layout import CARD, DOCUMENTS
+from cnpgen.store.layout import CARD, DOCUMENTS, SPLIT_NAME
 from cnpgen.store.shard import read_shard
 from cnpgen.store.shard_record import load_record
 
 HDF5 = "hdf5"  # folder of the dataset in the repository
 REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]{0,95}/[A-Za-z0-9][\w.-]{0,95}")
+WRITTEN = re.compile(  # paths of tables and shards in the repository
+    rf"{PARQUET}/{SPLIT_NAME.pattern}/\d{{5,}}\.parquet|{HDF5}/{SPLIT_NAME.pattern}/shard-\d{{5,}}\.(h5|json)"
+)
 SOURCE_KEY = b"cnpgen.sha256"  # metadata of a table: the sha256 of its shard
 
 
@@ -51,6 +55,8 @@ def publish_dataset(
 ) -> Published:
     """Write the repository of a dataset and upload it; a second call continues an interrupted one.
 
+    Tables and shards of an earlier state of the dataset are removed from the folder of the repository.
+
     Args:
         folder: Folder of a finished dataset.
         to: Repository on the Hugging Face Hub, "USER/NAME".
@@ -59,7 +65,7 @@ def publish_dataset(
         dry_run: Whether to write the folder only.
 
     Raises:
-        UsageError: The repository has no valid name, or the dataset has no license.
+        UsageError: The repository has no valid name or is inside the dataset, or the dataset has no license.
         DatasetError: The dataset is unfinished or damaged.
         MissingExtraError: pyarrow or huggingface_hub is not installed.
         MachineError: The upload failed.
@@ -67,6 +73,8 @@ def publish_dataset(
     if not REPOSITORY.fullmatch(to):
         raise UsageError(f"must be the name of a repository, USER/NAME, got {to!r:.200}", argument="to")
     source, target = Path(folder), Path(out)
+    if target.resolve().is_relative_to(source.resolve()):
+        raise UsageError(f"must be a folder outside the dataset {source}, got {target}", argument="out")
     spec = load_dataset(source).spec
     if not spec.license:
         raise UsageError(
@@ -78,15 +86,28 @@ def publish_dataset(
 
 
 def write_repository(source: Path, spec: DatasetSpec, target: Path, *, repository: str) -> None:
-    """Write card, Parquet view and dataset; finished files of an earlier call are kept."""
+    """Write card, Parquet view and dataset; finished files of an earlier call are kept, others removed."""
     tasks = shards(spec)
-    for task in tasks:
-        _write_table(source, spec, task, target / PARQUET / task.split / f"{task.index:05d}.parquet")
-    for name in (*DOCUMENTS, *(name for task in tasks for name in (task.file, task.sidecar))):
+    tables = [target / PARQUET / task.split / f"{task.index:05d}.parquet" for task in tasks]
+    copies = [name for task in tasks for name in (task.file, task.sidecar)]
+    _remove_others(target, {*tables, *(target / HDF5 / name for name in copies)})
+    for task, path in zip(tasks, tables, strict=True):
+        _write_table(source, spec, task, path)
+    for name in (*DOCUMENTS, *copies):
         _copy(source / name, target / HDF5 / name)
     notes = card_notes((source / CARD).read_text(encoding="utf-8"))
     card = card_text(summarize_dataset(source, spec), folder=repository, notes=notes, shards=f"{HDF5}/")
     write_file(target / CARD, card)
+
+
+def _remove_others(target: Path, present: set[Path]) -> None:
+    """Remove tables and shards of an earlier state; files of other names are kept, and links are not followed."""
+    for path in [path for part in (PARQUET, HDF5) for path in target.glob(f"{part}/*/*")]:
+        is_own = WRITTEN.fullmatch(path.relative_to(target).as_posix()) and not path.parent.is_symlink()
+        if is_own and path not in present and path.is_file():
+            path.unlink()
+            with suppress(OSError):  # other files are in it
+                path.parent.rmdir()
 
 
 def _write_table(source: Path, spec: DatasetSpec, task: ShardTask, path: Path) -> None:

@@ -57,7 +57,7 @@ def as_dataset_recipe(recipe: object) -> DatasetRecipe:
     expected = "the name of a dataset or pipeline, the path of a recipe file or a DatasetRecipe"
     if isinstance(recipe, Pipeline):
         rows = f'DatasetRecipe(name={recipe.name!r}, pipeline=..., splits={{"train": 1000}})'
-        raise UsageError(f"must be {expected}, got a Pipeline: make cnpgen.{rows} of it", argument="recipe")
+        raise UsageError(f"must be {expected}, got a Pipeline: make cnpgen.recipes.{rows} of it", argument="recipe")
     raise UsageError(f"must be {expected}, got {recipe!r}", argument="recipe")
 
 

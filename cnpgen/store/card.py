@@ -80,14 +80,15 @@ def card_text(summary: DatasetSummary, *, folder: str, notes: str = "", shards: 
     source = f'"{folder}"' if shards else f'"./{folder}"'
     load = _LOAD.replace('"./FOLDER"', source).replace('f"{split}/', f'f"{shards}{{split}}/')
     split = next(iter(summary.statistics))
+    files = "" if spec.scene_obstacles else "{}/*.h5"  # Hugging Face reads equally many rows of all arrays only
     sections = [
-        _front_matter(summary, f"{PARQUET}/{{}}/*.parquet" if shards else "{}/*.h5"),
+        _front_matter(summary, f"{PARQUET}/{{}}/*.parquet" if shards else files),
         f"# {spec.name} {spec.version}\n\n{spec.title or spec.name}\n\n{_contents(summary)}",
         notes.strip(),
         f"{_AFTER_NOTES}\n\n{_making(summary)}",
         f"## How to load it\n\n{load.replace('SPLIT', split)}",
         f"## Fields\n\n{_field_table(spec.fields)}",
-        f"## Scenes\n\n{_scene_table(spec)}" if spec.scene_obstacles else "",
+        f"## Scenes\n\n{_scene_table(spec, shards)}" if spec.scene_obstacles else "",
         f"## Yield\n\n{_yield_table(summary)}",
         f"## Ranges ({split})\n\n{_range_table(spec.fields, summary.statistics[split])}",
         f"## How to verify it\n\n{_VERIFY.replace('validate .', f'validate {shards}') if shards else _VERIFY}",
@@ -117,7 +118,7 @@ def _front_matter(summary: DatasetSummary, files: str) -> str:
 
     Args:
         summary: The finished shards.
-        files: Pattern of the files of a split.
+        files: Pattern of the files of a split; empty if Hugging Face cannot read them.
     """
     spec = summary.spec
     rows = sum(spec.splits.values())
@@ -126,10 +127,10 @@ def _front_matter(summary: DatasetSummary, files: str) -> str:
     lines += [f"pretty_name: {json.dumps(spec.title or spec.name, ensure_ascii=False)}"]
     lines += ["task_categories:", "- robotics", "tags:", "- robotics", "- motion-planning", "- trajectory-optimization"]
     lines += ["- cnpgen", "size_categories:", f'- "{size}"']
-    if not spec.scene_obstacles:  # Hugging Face reads files whose HDF5 datasets have equally many rows only
+    if files:
         lines += ["configs:", "- config_name: default", "  data_files:"]
     for split, count in spec.splits.items():
-        if count and not spec.scene_obstacles:
+        if count and files:
             lines += [f"  - split: {split}", f'    path: "{files.format(split)}"']
     return "\n".join(["---", *lines, "---"])
 
@@ -169,8 +170,10 @@ def _field_table(fields: Sequence[Field]) -> str:
     return _table(head, rows)
 
 
-def _scene_table(spec: DatasetSpec) -> str:
-    """Describe the scenes beside the rows of every shard."""
+def _scene_table(spec: DatasetSpec, shards: str) -> str:
+    """Describe the scenes beside the rows of every shard; ``shards`` is that of ``card_text``."""
+    only = f" The tables in `{PARQUET}/` have no scenes, only `scene_id`: the shards in `{shards}` have them."
+    where = only if shards else ""
     head = ("HDF5 dataset", "unit", "shape", "description", "convention")
     symbols = {spec.scene_obstacles: "O", 1: "S"}
     rows = [
@@ -187,7 +190,7 @@ def _scene_table(spec: DatasetSpec) -> str:
     return (
         f"Every shard has each of its S scenes once, in arrays for up to O = {spec.scene_obstacles} obstacles."
         " The scene of row `i` is `numpy.searchsorted(scene_ids, scene_id[i])`."
-        f" Poses are in the frame of the robot's base.\n\n{_table(head, rows)}\n\nFamilies: {families}."
+        f" Poses are in the frame of the robot's base.{where}\n\n{_table(head, rows)}\n\nFamilies: {families}."
     )
 
 

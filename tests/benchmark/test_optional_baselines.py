@@ -30,6 +30,9 @@ def test_crocoddyl_with_another_pinocchio_is_refused_before_its_import(monkeypat
         load_crocoddyl()
     monkeypatch.setattr("pinocchio.__version__", "4.0.2")
     assert load_crocoddyl().__name__ == "crocoddyl"
+    monkeypatch.setattr("importlib.metadata.version", lambda _: "3.3.0")
+    with pytest.raises(MachineError, match=r"must be 3.2.\* with Pinocchio 4.0.\*, installed is 3.3.0"):
+        load_crocoddyl()
 
 
 def test_violations_of_the_object_equal_those_of_trajopt_and_have_correct_derivatives() -> None:

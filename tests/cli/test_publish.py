@@ -11,7 +11,9 @@ import pytest
 
 import cnpgen
 from cnpgen.cli.main import main
+from cnpgen.errors import UsageError
 from cnpgen.make.make_dataset import make_dataset
+from cnpgen.make.publish import publish_dataset
 
 RECIPE = """
 name = "hits"
@@ -55,6 +57,29 @@ def test_a_dry_run_writes_card_tables_and_dataset(
     before = (out / "parquet" / "train" / "00000.parquet").stat().st_mtime_ns
     assert main(["publish", str(dataset), "--to", "lab/hits", "--dry-run", "-o", str(out)]) == 0
     assert (out / "parquet" / "train" / "00000.parquet").stat().st_mtime_ns == before
+
+
+@pytest.mark.slow
+def test_files_of_an_earlier_state_are_removed_and_others_kept(dataset: Path, tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    old = ["parquet/train/00007.parquet", "parquet/gone/00000.parquet", "hdf5/train/shard-00007.h5"]
+    old += ["hdf5/gone/shard-00000.h5", "hdf5/gone/shard-00000.json"]
+    own = ["parquet/train/notes.txt", "hdf5/gone/notes.md", "figures/train/00007.parquet"]
+    for name in old + own:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("earlier")
+    publish_dataset(dataset, "lab/hits", out=tmp_path, dry_run=True)
+    assert not [name for name in old if (tmp_path / name).exists()]
+    assert all((tmp_path / name).exists() for name in own)
+    assert not (tmp_path / "parquet" / "gone").exists()
+    assert (tmp_path / "hdf5" / "train" / "shard-00000.h5").exists()
+
+
+@pytest.mark.parametrize("inside", [".", "hub", "train/hub"])
+def test_a_repository_inside_the_dataset_is_refused(inside: str, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="out must be a folder outside the dataset"):
+        publish_dataset(tmp_path, "lab/hits", out=tmp_path / inside, dry_run=True)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.slow

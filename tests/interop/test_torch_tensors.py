@@ -1,6 +1,7 @@
 """Loss, boundary layer and robot in torch operations, against the compiled ones and finite differences."""
 
 # ruff: noqa: E402 - without the framework nothing else is imported
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,18 +13,22 @@ torch = pytest.importorskip("torch")
 import cnpgen
 from cnpgen.errors import UsageError
 from cnpgen.interop.torch import TensorBoundaryLayer, TensorLoss, TensorRobot, joint_states
+from cnpgen.interop.torch.tensor_loss import MAX_KEPT_TABLES
 from cnpgen.interop.torch.tensor_tape import _APPLY, TensorTape
 from cnpgen.kernels.library import choose_backend, problem_kernels
 from cnpgen.kernels.tape import OPERATIONS
 from cnpgen.losses.margins import Margins
 from cnpgen.losses.plan_loss import PlanLoss
 from cnpgen.planner.boundary_layer import BoundaryLayer
+from cnpgen.plans.scene_plans import with_capacity
 from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.problem_file import load_problem
 from cnpgen.problems.robot_model import RobotModel, inverse_dynamics_of
 from cnpgen.trajectory.spline import clamped_knots
 from tests.conftest import some
 from tests.examples.losses import batch
 from tests.examples.plans_of_networks import boundary_for_layer, outputs
+from tests.examples.shaped_robot import write_problem
 
 pytestmark = pytest.mark.slow
 
@@ -112,6 +117,22 @@ def test_plans_that_are_not_finite_do_not_affect_others() -> None:
     assert by_path[0].abs().sum() > 0
     assert not by_path[1:].any()
     assert not by_rate[1:].any()
+
+
+def test_tables_of_many_shifts_do_not_accumulate() -> None:
+    loss, arguments = TensorLoss(PlanLoss("airhockey", nodes=4, backend="numpy")), given("hit", 1)
+    totals = [loss(**arguments, weights=loss.loss.weights0, shift=k / 40)[0].item() for k in (*range(40), 0)]
+    assert len(loss._tables) == MAX_KEPT_TABLES
+    assert totals[0] == totals[-1]
+    assert len(set(totals)) > 20
+
+
+def test_problems_whose_samples_place_obstacles_are_refused(tmp_path: Path) -> None:
+    problem = with_capacity(load_problem(write_problem(tmp_path)), {"box": 1})
+    with pytest.raises(
+        UsageError, match=r"loss must be of a problem whose obstacles samples do not place, got that of"
+    ):
+        TensorLoss(PlanLoss(problem, backend="numpy"))
 
 
 @pytest.mark.extended

@@ -13,6 +13,7 @@ import cnpgen
 from cnpgen.cli.main import main
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
+from cnpgen.make.publish import write_repository
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_record import as_record, open_problem
 from cnpgen.problems.scene_capacity import with_capacity
@@ -69,6 +70,18 @@ def test_scene_ids_are_those_of_the_first_samples(dataset: Path) -> None:
     first = np.unique(columns["scene_id"])
     assert np.array_equal(columns["scene_id"][first], first)
     assert (np.diff(columns["scene_id"]) >= 0).all()
+
+
+def test_the_card_of_a_repository_says_where_the_scenes_are(dataset: Path, tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    write_repository(dataset, cnpgen.load_dataset(dataset).spec, tmp_path, repository="lab/scenes")
+    table, ids = parquet.read_table(tmp_path / "parquet/train/00001.parquet"), open_dataset(dataset)
+    assert np.array_equal(table["scene_id"].to_numpy(), ids.read("train", fields=["scene_id"])["scene_id"][100:200])
+    card, own = ((folder / "README.md").read_text() for folder in (tmp_path, dataset))
+    assert "The tables in `parquet/` have no scenes, only `scene_id`: the shards in `hdf5/` have them." in card
+    assert 'path: "parquet/train/*.parquet"' in card
+    assert "parquet" not in own
+    assert "configs:" not in own
 
 
 @pytest.mark.slow

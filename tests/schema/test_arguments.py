@@ -133,7 +133,7 @@ def test_what_is_no_recipe_is_refused_with_what_is_one(tmp_path: Path, recipe: A
 def test_a_pipeline_is_refused_with_the_dataset_recipe_to_make_of_it() -> None:
     pipeline = load_pipeline("airhockey-hit")
     with pytest.raises(
-        UsageError, match=r"got a Pipeline: make cnpgen\.DatasetRecipe\(name='airhockey-hit', pipeline="
+        UsageError, match=r"got a Pipeline: make cnpgen\.recipes\.DatasetRecipe\(name='airhockey-hit', pipeline="
     ):
         as_dataset_recipe(pipeline)
     recipe = DatasetRecipe(name="airhockey-hit", pipeline=pipeline, splits={"train": 1000})

@@ -32,14 +32,21 @@ def load_crocoddyl() -> Any:
 
     Raises:
         MissingExtraError: Crocoddyl is missing.
-        MachineError: Its wheel is for another version of Pinocchio, with which it would read wrong memory.
+        MachineError: Its version is unknown, or its wheel is for another version of Pinocchio, with which it would read
+            wrong memory.
     """
     import pinocchio
 
     with requires_extra("crocoddyl", "Crocoddyl"):
         number = importlib.metadata.version("crocoddyl")
-        needed = PINOCCHIO.get(number.rpartition(".")[0], "")
-        if not pinocchio.__version__.startswith(needed):
+        needed = PINOCCHIO.get(".".join(number.split(".")[:2]))
+        if needed is None:
+            known = ", ".join(f"{version}.* with Pinocchio {other}.*" for version, other in PINOCCHIO.items())
+            raise MachineError(
+                f"Crocoddyl must be {known}, installed is {number}:"
+                " pip install 'cnpgen[crocoddyl]' in another environment"
+            )
+        if not pinocchio.__version__.startswith(f"{needed}."):
             raise MachineError(
                 f"Crocoddyl {number} needs Pinocchio {needed}, installed is {pinocchio.__version__}:"
                 " pip install 'cnpgen[crocoddyl]' in another environment"

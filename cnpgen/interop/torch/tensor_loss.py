@@ -6,6 +6,7 @@ from typing import Any
 import torch
 from numpy.typing import ArrayLike
 
+from cnpgen.errors import UsageError
 from cnpgen.interop.torch.tensor_tape import TensorTape
 from cnpgen.interop.torch.torch_plans import real_tensor
 from cnpgen.kernels.library import choose_backend, problem_kernels
@@ -17,27 +18,39 @@ from cnpgen.problems.load_robot import load_robot
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import number
 
+MAX_KEPT_TABLES = 16  # of one loss: twice the shifts of ``rotating_shift``
+
 
 class TensorLoss:
     """The loss of ``PlanLoss`` without a copy to the CPU; ``plan_loss`` is faster for tensors on the CPU.
 
     The same operations as those of the compiled loss run in torch, so that results agree to rounding. Gradients are
-    those of torch's automatic differentiation, which may be repeated. ``start_tip`` is read on the CPU.
+    those of torch's automatic differentiation, which may be repeated. ``start_tip`` is read on the CPU. Problems whose
+    obstacles samples place (planners of scenes) are refused: their clearance is compiled code only.
 
     Args:
         loss: The loss whose problem, nodes, rule, form and margins are used.
         compiled: Whether ``torch.compile`` fuses the operations, which takes minutes on first use; the gradient is then
             differentiable once only.
+
+    Raises:
+        UsageError: Samples place the obstacles of the problem.
     """
 
     @checked_arguments
     def __init__(self, loss: PlanLoss, *, compiled: bool = False) -> None:
+        if loss.problem.has_sample_obstacles:
+            raise UsageError(
+                f"must be of a problem whose obstacles samples do not place, got that of {loss.problem.name!r}:"
+                " use cnpgen.interop.torch.plan_loss, which measures their distances on the CPU",
+                argument="loss",
+            )
         self.loss, robot = loss, load_robot(loss.problem)
         kernels = problem_kernels(loss.problem, robot, *choose_backend("numpy"))
         tape = kernels.tape(loss_values, form=loss.form)
         self._tape, self._relaxed_values = TensorTape(tape), tape.inputs[relaxation_argument(loss.problem)]
         self._time_varying_bound = make_time_varying_bound(loss.problem, robot, loss.form)
-        self._tables: dict[tuple[Any, ...], tuple[torch.Tensor, ...]] = {}
+        self._tables: dict[tuple[Any, ...], tuple[torch.Tensor, ...]] = {}  # the latest
         self._integrate = torch.compile(self._terms) if compiled else self._terms
 
     def __repr__(self) -> str:
@@ -111,6 +124,8 @@ class TensorLoss:
         """Return the basis functions of path and rate, shape (orders, K, C), and the quadrature weights, shape (K,)."""
         key = (shift, *kind.values())
         if key not in self._tables:
+            if len(self._tables) == MAX_KEPT_TABLES:
+                self._tables.pop(next(iter(self._tables)))
             table = self._basis(shift)
             path, rate = (x.reshape(-1, self.loss.nodes, x.shape[1]) for x in (table.path, table.rate))
             arrays = (path, rate, table.weights[0])
