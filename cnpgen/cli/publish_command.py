@@ -30,7 +30,8 @@ def run(arguments: argparse.Namespace) -> int:
     from cnpgen.make.publish import publish_dataset
 
     folder = arguments.folder
-    out = arguments.out or folder.with_name(f"{folder.resolve().name}-hub")
+    own = folder.resolve()  # "." has no name
+    out = arguments.out or own.with_name(f"{own.name}-hub")
     published = publish_dataset(folder, arguments.to, out=out, private=arguments.private, dry_run=arguments.dry_run)
     if published.url:
         print(f"cnpgen: uploaded {published.folder}", file=sys.stderr)
