@@ -64,7 +64,7 @@ def test_rows_are_what_pinocchio_and_coal_call_valid_and_touch_nothing(name: str
     columns = drawn.boundary.conditions() | drawn.columns
     found = verify_rows(problem, load_robot(problem), columns)
     assert found.rows == ROWS
-    assert len(found.out) == 0
+    assert len(found.failed_rows) == 0
     assert not ends_touch(name, drawn.boundary)
 
 
