@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
+T = TypeVar("T")
 
 _MOVING = ("revolute", "continuous", "prismatic")
 _SCALES = ("position_scale", "velocity_scale", "acceleration_rate", "acceleration_cap", "torque_scale")
@@ -99,12 +100,7 @@ class ProblemRecord(StoredProblem):
         Raises:
             RecipeError: There is no such parametrization.
         """
-        mistakes: list[str] = []
-        where = RecipeLocation("problem_recipe", "trajectory")
-        spec = parse(TrajectorySpec, self.content["trajectory"], where=where, mistakes=mistakes)
-        if spec is None:
-            raise RecipeError(mistakes)
-        return spec
+        return self._parsed(TrajectorySpec, "trajectory", self.content["trajectory"])
 
     @cached_property
     def parameters(self) -> ParameterRanges:
@@ -113,12 +109,14 @@ class ProblemRecord(StoredProblem):
         Raises:
             RecipeError: There are no such parameters.
         """
+        return self._parsed(ParameterRanges, "parameters", self.content.get("parameters", {}))
+
+    def _parsed(self, kind: type[T], key: str, table: Any) -> T:
         mistakes: list[str] = []
-        where = RecipeLocation("problem_recipe", "parameters")
-        ranges = parse(ParameterRanges, self.content.get("parameters", {}), where=where, mistakes=mistakes)
-        if ranges is None:
+        parsed = parse(kind, table, where=RecipeLocation("problem_recipe", key), mistakes=mistakes)
+        if parsed is None:
             raise RecipeError(mistakes)
-        return ranges
+        return parsed
 
     @cached_property
     def comparable_sha256(self) -> str:
