@@ -77,18 +77,25 @@ class PlanRuntime:
         q: Joint positions of the arm, which is at rest [rad], shape (n,).
         time: Start time [s].
         judge: Whether to check every plan by the independent verdict, which takes a few milliseconds.
+        parameters: Parameters of the problem, such as the mass of the load, which all plans have, shape (width,);
+            nominal by default.
 
     Raises:
-        UsageError: The positions have another shape or are not finite.
+        UsageError: The positions have another shape or are not finite, or a parameter is outside its range.
     """
 
     @checked_arguments
-    def __init__(self, planner: Planner, q: ArrayLike, *, time: float = 0.0, judge: bool = True) -> None:
+    def __init__(
+        self,
+        planner: Planner,
+        q: ArrayLike,
+        *,
+        time: float = 0.0,
+        judge: bool = True,
+        parameters: ArrayLike | None = None,
+    ) -> None:
         self._planner, self._judge = planner, judge
-        if names := ", ".join(planner.model.problem.parameters.names):
-            raise UsageError(
-                f"is for a problem with parameters, which set-points do not have: {names}", argument="planner"
-            )
+        self._parameters = _checked_parameters(planner, parameters)
         positions = numbers("q", q)
         if positions.shape != (planner.robot.n,) or not np.isfinite(positions).all():
             raise UsageError(f"must be finite and have shape ({planner.robot.n},), got {q!r:.100}", argument="q")
@@ -195,7 +202,7 @@ class PlanRuntime:
         current = _part_at(self._timeline, at)
         if at >= current.end_time:
             return Switch(SwitchOutcome.ACCEPTED, at, "the arm is at rest")
-        return self.switch(plan_stop(self._planner, current, at), at)
+        return self.switch(plan_stop(self._planner, current, at, parameters=self._parameters), at)
 
     def _replan(self, make_plan: PlanFunction, at: float) -> Switch:
         """Plan and switch; the boundary of the background thread, where errors become results."""
@@ -217,6 +224,10 @@ class PlanRuntime:
     def _find_reason(self, plan: Plans | JoinedPlans) -> tuple[SwitchOutcome, str] | None:
         """Return the reason why a plan must not be executed at any time; None if there is none."""
         parts: tuple[Any, ...] = plan.parts if isinstance(plan, JoinedPlans) else (plan,)
+        for part in parts:
+            own, expected = part.boundary.parameters, self._parameters
+            if own is not None and expected is not None and not np.array_equal(own[0], expected):
+                return SwitchOutcome.INVALID, f"its parameters are {own[0]}, those of the runtime {expected}"
         duration = plan.duration
         if not np.isfinite(duration).all():
             return SwitchOutcome.INVALID, "its duration is not finite"
@@ -241,6 +252,17 @@ class PlanRuntime:
             if not (gap <= share * limit).all():
                 return f"{name} jumps by {gap.max():.3g}"
         return ""
+
+
+def _checked_parameters(planner: Planner, parameters: ArrayLike | None) -> Array | None:
+    """Return the parameters of all plans, shape (width,); None if the problem has none."""
+    ranges = planner.model.problem.parameters
+    if parameters is None:
+        return planner.robot.nominal_parameters if ranges else None
+    rows = ranges.checked(numbers("parameters", parameters))
+    if len(rows) != 1:
+        raise UsageError(f"must have shape ({len(ranges)},), got {np.shape(parameters)}", argument="parameters")
+    return np.asarray(rows[0])
 
 
 def _part_at(timeline: tuple[SampledMotion, ...], time: float) -> SampledMotion:

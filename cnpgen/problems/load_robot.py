@@ -83,7 +83,7 @@ def _attached(problem: Problem) -> Attached:
         spec.tip,
         rotation=turned(*spec.tip_rotation),
         translation=np.array(spec.tip_offset),
-        payload=PayloadBody(payload.mass, np.array(payload.centre), payload.times) if payload else None,
+        payload=PayloadBody(payload.mass, np.array(payload.centre), payload.inertia_matrix) if payload else None,
         ranges={name: (each.low, each.high) for name, each in zip(spec.joints, ranges, strict=False)},
     )
 

@@ -49,8 +49,7 @@ def scene_of(
     if not problem.parameters:
         parameters = None
     elif parameters is None:
-        mass = 0.0 if problem.payload is None else problem.payload.mass
-        parameters = np.tile(problem.parameters.nominal(mass), (len(poses), 1))
+        parameters = np.tile(problem.nominal_parameters, (len(poses), 1))
     if constraint is not None:
         if goal_velocity is None:
             raise UsageError(f"is missing: the problem {problem.name!r} needs it", argument="goal_velocity")

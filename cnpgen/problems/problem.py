@@ -19,7 +19,7 @@ from cnpgen.problems.constraints.object_clearance import ObjectClearance
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.objectives import Centrifugal, ObjectiveTerm
 from cnpgen.robots.obstacle import Obstacle
-from cnpgen.robots.parameter_ranges import NO_PARAMETERS, ParameterRanges
+from cnpgen.robots.parameter_ranges import NO_PARAMETERS, PAYLOAD_PARAMETERS, ParameterRanges
 from cnpgen.robots.robot_spec import HeldObject, LimitSpec, Payload, RobotSpec
 from cnpgen.robots.scene import PARKED_POSITION_M
 from cnpgen.robots.shape.inline import with_inline_meshes
@@ -130,10 +130,11 @@ class Problem:
         yield from self._parameter_mistakes()
 
     def _parameter_mistakes(self) -> Iterator[tuple[str, str]]:
-        if self.parameters.payload_mass is not None and self.payload is None:
-            yield "parameters", "payload_mass needs the body of the load: give [payload], too"
-        nominal = self.parameters.nominal(0.0 if self.payload is None else self.payload.mass)
-        for name, span, value in zip(self.parameters.names, self.parameters.ranges, nominal.tolist(), strict=True):
+        if self.parameters.changes_payload and self.payload is None:
+            (name, *_) = (name for name in self.parameters.names if name in PAYLOAD_PARAMETERS)
+            yield "parameters", f"{name} needs the body of the load: give [payload], too"
+        nominal = self.nominal_parameters.tolist()
+        for name, span, value in zip(self.parameters.names, self.parameters.ranges, nominal, strict=True):
             if not span.low <= value <= span.high:
                 yield "parameters", f"{name} must include {value:g}, the value of samples without parameters"
         if not self.parameters.tilts_table:
@@ -148,6 +149,12 @@ class Problem:
     def object_size(self) -> tuple[float, float, float] | None:
         """Edge lengths of the held object [m], None if nothing is held."""
         return None if self.object is None else self.object.size
+
+    @property
+    def nominal_parameters(self) -> NDArray[np.float64]:
+        """Parameters of a sample for which none are given, shape (width,)."""
+        payload, ranges = self.payload, self.parameters
+        return ranges.nominal() if payload is None else ranges.nominal(payload.mass, payload.centre)
 
     @property
     def table_origin(self) -> NDArray[np.float64]:

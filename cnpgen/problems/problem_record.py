@@ -7,7 +7,7 @@ import json
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -19,7 +19,7 @@ from cnpgen.errors import RecipeError, UsageError
 from cnpgen.problems.objectives import read_objective
 from cnpgen.problems.problem import FILES, Objective, Problem, resolved
 from cnpgen.problems.problem_file import load_problem_behind, restore_problem
-from cnpgen.robots.parameter_ranges import ParameterRanges
+from cnpgen.robots.parameter_ranges import NO_PARAMETERS, ParameterRanges
 from cnpgen.robots.urdf import urdf_tree
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import numbers
@@ -207,6 +207,19 @@ def with_objective(record: ProblemRecord, objective: str) -> ProblemRecord:
         return record
     content = {**record.content, "objective": resolved(Objective(term=terms))}
     return ProblemRecord(json.dumps(plain(content), ensure_ascii=False, allow_nan=False), record.urdf)
+
+
+def with_payload_of(record: ProblemRecord, parameters: Array) -> ProblemRecord:
+    """Return the record of a problem without parameters, whose payload is that of a sample.
+
+    Args:
+        record: The record.
+        parameters: Parameters of the sample, shape (width,).
+    """
+    with record.restored() as problem:
+        values = dict(zip(problem.parameters.names, parameters.tolist(), strict=True))
+        payload = None if problem.payload is None else problem.payload.at(values)
+        return record_problem(replace(problem, payload=payload, parameters=NO_PARAMETERS))
 
 
 def record_problem(problem: Problem) -> ProblemRecord:

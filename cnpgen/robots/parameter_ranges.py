@@ -15,6 +15,8 @@ from cnpgen.schema.keys import Range, field, keys
 Array = NDArray[np.float64]
 
 TABLE_PARAMETERS = ("table_height", "table_roll", "table_pitch")
+PAYLOAD_CENTRE = ("payload_x", "payload_y", "payload_z")
+PAYLOAD_PARAMETERS = ("payload_mass", *PAYLOAD_CENTRE, "payload_inertia")
 MAX_TILT_RAD = 0.5  # of a table about each axis
 RANGE_ROUNDING = 1e-12  # of values at the ends of a range
 
@@ -51,6 +53,17 @@ class ParameterRanges:
     payload_mass: Range | None = field(
         "mass of the payload, whose inertia is proportional to it", unit="kg", default=None, since_version=2, low=1e-9
     )
+    payload_x: Range | None = field(
+        "centre of mass of the payload along the tip's x axis", unit="m", default=None, since_version=2
+    )
+    payload_y: Range | None = field("the same along its y axis", unit="m", default=None, since_version=2)
+    payload_z: Range | None = field("the same along its z axis", unit="m", default=None, since_version=2)
+    payload_inertia: Range | None = field(
+        "inertia of the payload about its centre, as a fraction of that of [payload] at equal mass",
+        default=None,
+        since_version=2,
+        low=0.0,
+    )
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -73,17 +86,24 @@ class ParameterRanges:
         """Whether the table is raised or tilted."""
         return any(name in TABLE_PARAMETERS for name in self.names)
 
+    @property
+    def changes_payload(self) -> bool:
+        """Whether the payload differs from sample to sample."""
+        return any(name in PAYLOAD_PARAMETERS for name in self.names)
+
     def __len__(self) -> int:
         return len(self.names)
 
-    def nominal(self, payload_mass: float = 0.0) -> Array:
+    def nominal(self, payload_mass: float = 0.0, payload_centre: Sequence[float] = (0.0, 0.0, 0.0)) -> Array:
         """Return the values of a sample without parameters, shape (width,).
 
         Args:
             payload_mass: Mass of the problem's payload [kg].
+            payload_centre: Its centre of mass in the tip frame [m], shape (3,).
         """
-        values = dict.fromkeys(TABLE_PARAMETERS, 0.0)
-        values |= {"velocity_factor": 1.0, "acceleration_factor": 1.0, "payload_mass": payload_mass}
+        values = dict.fromkeys(TABLE_PARAMETERS, 0.0) | dict(zip(PAYLOAD_CENTRE, payload_centre, strict=True))
+        values |= {"velocity_factor": 1.0, "acceleration_factor": 1.0}
+        values |= {"payload_mass": payload_mass, "payload_inertia": 1.0}
         return np.array([values[name] for name in self.names], np.float64)
 
     def split(self, values: Sequence[Any] | Array, nominal: Array) -> tuple[Any, dict[str, Any]]:

@@ -86,7 +86,11 @@ class Robot:
     def nominal_parameters(self) -> Array:
         """Parameters of a sample for which none are given, shape (width,)."""
         payload = self.attached.payload
-        return self.parameters.nominal(0.0 if payload is None else payload.mass)
+        return (
+            self.parameters.nominal()
+            if payload is None
+            else self.parameters.nominal(payload.mass, payload.com.tolist())
+        )
 
     def units(self, turning: str) -> str:
         """Return the units of a joint quantity from its unit for revolute joints; see ``units_of_joints``."""

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from cnpgen.robots.parameter_ranges import PAYLOAD_CENTRE
 from cnpgen.schema.keys import PerJoint, Range, field
 
 GEOMETRIES = ("urdf", "paper-capsules")
@@ -136,13 +137,25 @@ class Payload:
         """Yield (key, mistake) pairs."""
         if self.inertia is not None and self.size is not None:
             yield "size", "the payload has both an 'inertia' and a 'size', expected one of them"
-        principal = np.linalg.eigvalsh(self.times)
+        principal = np.linalg.eigvalsh(self.inertia_matrix)
         if principal[0] < 0 or principal[2] > (principal[0] + principal[1]) * (1 + 1e-9):
             text = ", ".join(f"{each:g}" for each in principal)
-            yield "inertia", f"no body has the principal times {text} kg m^2: none is above the sum of the others"
+            yield (
+                "inertia",
+                f"no body has the principal values {text} kg m^2: each is positive and at most the sum of the others",
+            )
+
+    def at(self, parameters: Mapping[str, float]) -> Payload:
+        """Return the payload of a sample, from its parameters by name."""
+        mass, factor = parameters.get("payload_mass", self.mass), parameters.get("payload_inertia", 1.0)
+        x, y, z = (parameters.get(name, value) for name, value in zip(PAYLOAD_CENTRE, self.centre, strict=True))
+        xx, yy, zz, xy, xz, yz = (
+            self.inertia_matrix[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]] * (factor * mass / self.mass)
+        ).tolist()
+        return replace(self, mass=mass, centre=(x, y, z), inertia=(xx, yy, zz, xy, xz, yz), size=None)
 
     @property
-    def times(self) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+    def inertia_matrix(self) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
         """Inertia about the center of mass [kg m^2], shape (3, 3)."""
         if self.inertia is not None:
             xx, yy, zz, xy, xz, yz = self.inertia

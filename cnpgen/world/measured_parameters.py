@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.robots.chain import frame_of
+from cnpgen.robots.parameter_ranges import PAYLOAD_CENTRE
 from cnpgen.robots.robot import reduced_model
 
 if TYPE_CHECKING:
@@ -38,16 +39,21 @@ class MeasuredParameters:
         self.scene_values = np.empty(0)
         self._turn, self._origin = np.eye(3), np.zeros(3)
         self._load: tuple[int, pin.Inertia, pin.SE3] | None = None
-        if "payload_mass" in robot.parameters.names:
+        if self.changes_payload:
             self._hold_load()
 
     def set(self, values: Array) -> None:
         """Take the values of a scene after its obstacles: those for a constraint, then parameters, shape (width,)."""
         self.scene_values, self.values = self._robot.parameters.split(values, self._robot.nominal_parameters)
         if self._load is not None:
-            self._set_mass(self.values["payload_mass"])
+            self._set_load()
         if self._robot.parameters.tilts_table:
             self._set_table()
+
+    @property
+    def changes_payload(self) -> bool:
+        """Whether ``model`` differs from sample to sample."""
+        return self._robot.parameters.changes_payload
 
     def along_world(self, vector: Array) -> Array:
         """Return vectors along the axes of the table along those of the world, shape (3,) or (3, K)."""
@@ -77,14 +83,17 @@ class MeasuredParameters:
         frame = bare.frames[frame_of(bare, robot.tip)]
         self._load = frame.parentJoint, bare.inertias[frame.parentJoint].copy(), frame.placement.copy()
 
-    def _set_mass(self, mass: float) -> None:
+    def _set_load(self) -> None:
         import pinocchio as pin
 
         payload = self._robot.attached.payload
         assert self._load is not None
         assert payload is not None
         joint, bare, placement = self._load
-        body = pin.Inertia(mass, payload.com, payload.inertia * (mass / payload.mass))
+        mass = self.values.get("payload_mass", payload.mass)
+        centre = [self.values.get(name, value) for name, value in zip(PAYLOAD_CENTRE, payload.com, strict=True)]
+        shape = payload.inertia * self.values.get("payload_inertia", 1.0)
+        body = pin.Inertia(mass, np.array(centre), shape * (mass / payload.mass))
         self.model.inertias[joint] = bare + placement.act(body)
 
     def _set_table(self) -> None:

@@ -99,7 +99,7 @@ class PathWorld:
         self._pairs: dict[str, PairDistances] = {}
         self._solids = solids_of(self.obstacles, obstacle_poses)
         self.parameters.set(obstacle_poses[pose_width(self.obstacles) :])
-        if "payload_mass" in self.parameters.values:
+        if self.parameters.changes_payload:
             self._pool = pin.ModelPool(self._model, 1)  # a pool has its own copy of the model
         self._collisions.place(self._solids)
         self._move()

@@ -9,6 +9,7 @@ from scipy.interpolate import BSpline
 
 from cnpgen.benchmark.simulator.reference import TICK_S, Reference
 from cnpgen.errors import UsageError
+from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.planner.plan_hits import plan_hits
 from cnpgen.planner.plan_runtime import PlanRuntime, SwitchOutcome
 from cnpgen.planner.planner import Planner
@@ -203,3 +204,19 @@ def test_set_points_at_impossible_times_are_refused_and_change_nothing(planner, 
         with pytest.raises(UsageError, match=r"^time must be"):
             evaluate(time)
     assert runtime.switch(planner.plan(planner.robot.base, planner.robot.base), 0.0).outcome != SwitchOutcome.LATE
+
+
+def test_plans_and_stops_have_the_parameters_of_the_runtime():
+    planner = Planner("heavy-object-loads")
+    problems = draw_boundary_problems("heavy-object-loads", 1, seed=2)
+    start, goal = problems.boundary.start_q[0], problems.boundary.goal_q[0]
+    runtime = PlanRuntime(planner, start, parameters=[6.0])
+    plans = {mass: planner.plan(start, goal, parameters=[mass]) for mass in (6.0, 7.0)}
+    refused = runtime.switch(plans[7.0], 0.0)
+    assert refused.outcome is SwitchOutcome.INVALID
+    assert "parameters" in refused.detail
+    assert runtime.switch(plans[6.0], 0.0).accepted
+    with pytest.raises(UsageError, match="payload_mass must be from 4 to 14, got 15"):
+        PlanRuntime(planner, start, parameters=[15.0])
+    with pytest.raises(UsageError, match=r"must have shape \(1,\)"):
+        PlanRuntime(planner, start, parameters=[[5.0], [6.0]])

@@ -8,6 +8,7 @@ import pinocchio as pin
 import pytest
 
 import cnpgen
+from cnpgen.benchmark.simulator.simulate import simulate_plans
 from cnpgen.errors import RecipeError, UsageError
 from cnpgen.judges.rows.verify import verify_rows
 from cnpgen.losses.plan_loss import PlanLoss
@@ -19,7 +20,9 @@ from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem import Problem, resolved
 from cnpgen.problems.problem_file import load_problem
+from cnpgen.problems.problem_record import record_problem
 from cnpgen.robots.table_frame import moved_box, table_frame
+from cnpgen.schema.keys import Range
 from cnpgen.trajectory.boundary import assemble
 from cnpgen.world.path import PathWorld
 from cnpgen.world.world import World
@@ -83,6 +86,48 @@ def test_the_load_of_a_sample_is_that_of_a_problem_with_this_payload() -> None:
     expected = [pin.rnea(other.model, data, *(part[:, k].copy() for part in (q, dq, ddq))) for k in range(5)]
     np.testing.assert_allclose(torque.T, expected, rtol=1e-10)
     assert not np.allclose(torque, PathWorld(other).torque[:, :1])
+
+
+def test_center_and_inertia_of_the_load_differ_from_sample_to_sample() -> None:
+    nominal = replace(LOADS.payload, centre=(0.01, -0.02, 0.05))
+    ranges = replace(
+        LOADS.parameters,
+        payload_x=Range(-0.05, 0.05),
+        payload_y=Range(-0.05, 0.05),
+        payload_z=Range(0.0, 0.1),
+        payload_inertia=Range(0.5, 2.0),
+    )
+    problem = replace(LOADS, payload=nominal, parameters=ranges, constraint=LOADS.constraint[:4])
+    model = cnpgen.RobotModel(problem, backend="numpy")
+    values, state = drawn(problem, 6, seed=8), states(problem, 6, seed=8)
+    tip = model.forward_kinematics(state[0])[0]
+    scene = model.scene(tip, tip + 0.3, parameters=values)
+    found = model.constraint_values(*state, scene=scene).g
+    for row, (mass, x, y, z, factor) in enumerate(values):
+        body = nominal.at({"payload_mass": mass, "payload_inertia": factor})
+        np.testing.assert_allclose(body.inertia_matrix, nominal.inertia_matrix * mass / 12 * factor, rtol=1e-12)
+        own = replace(body, centre=(x, y, z))
+        other = load_robot(replace(problem, payload=own, parameters=type(ranges)()))
+        expected = pin.rnea(other.model, other.model.createData(), *(part[row] for part in state))
+        world = PathWorld(load_robot(problem), LOADS.obstacle, LOADS.object_size)
+        world.set_path(*(part[row][:, None] for part in state), scene.poses[row])
+        np.testing.assert_allclose(world.torque[:, 0], expected, rtol=1e-10)
+        np.testing.assert_allclose(found[row, -7:], expected, rtol=1e-9)
+
+
+def test_the_simulator_holds_the_load_of_each_plan() -> None:
+    plans = cnpgen.solve_plans(draw_boundary_problems("heavy-object-loads", 1, seed=4)).plans
+    found = {}
+    for mass in (4.0, 14.0):
+        one = replace(plans, boundary=replace(plans.boundary, parameters=np.array([[mass]])))
+        problem = replace(LOADS, payload=replace(LOADS.payload, mass=mass), parameters=type(LOADS.parameters)())
+        boundary = replace(plans.boundary, parameters=None)
+        alone = replace(plans, problem=record_problem(problem), boundary=boundary)
+        found[mass] = simulate_plans(one).executed[0]
+        assert found[mass] == simulate_plans(alone).executed[0]
+    assert found[4.0] != found[14.0]
+    with pytest.raises(UsageError, match="tilted tables"):
+        simulate_plans(draw_boundary_problems("airhockey-tables", 1, seed=1))
 
 
 def test_table_coordinates_are_those_of_pinocchio() -> None:

@@ -75,21 +75,21 @@ def test_a_tip_with_an_offset_and_a_payload_are_what_a_tool_in_the_urdf_is(tmp_p
 )
 def test_a_payload_may_be_a_box_of_uniform_density_or_a_point(tmp_path, payload, expected):
     problem = written(tmp_path, more=f"[payload]\nmass = 12.0\n{payload}")
-    np.testing.assert_allclose(problem.payload.times, expected, atol=1e-12)
+    np.testing.assert_allclose(problem.payload.inertia_matrix, expected, atol=1e-12)
     empty = load_robot(load_problem("heavy-object"))
     inertia = load_robot(problem).model.inertias[7]
     assert inertia.mass == pytest.approx(empty.model.inertias[7].mass + 12.0)
     if payload:
         reference = pin.Inertia.FromBox(12.0, 0.1, 0.2, 0.3).inertia
-        np.testing.assert_allclose(problem.payload.times, reference, atol=1e-12)
+        np.testing.assert_allclose(problem.payload.inertia_matrix, reference, atol=1e-12)
 
 
 @pytest.mark.parametrize(
     ("keys", "text"),
     [
         (f"{INERTIA}size = [0.1, 0.1, 0.1]\n", "has both an 'inertia' and a 'size'"),
-        ("inertia = [1.0, 1.0, 3.0, 0.0, 0.0, 0.0]\n", "no body has the principal times 1, 1, 3 kg m^2"),
-        ("inertia = [1.0, 1.0, 1.0, 2.0, 0.0, 0.0]\n", "no body has the principal times -1, 1, 3 kg m^2"),
+        ("inertia = [1.0, 1.0, 3.0, 0.0, 0.0, 0.0]\n", "no body has the principal values 1, 1, 3 kg m^2"),
+        ("inertia = [1.0, 1.0, 1.0, 2.0, 0.0, 0.0]\n", "no body has the principal values -1, 1, 3 kg m^2"),
     ],
 )
 def test_inertias_that_no_body_has_are_refused(tmp_path, keys, text):

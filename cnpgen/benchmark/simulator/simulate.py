@@ -21,7 +21,7 @@ from cnpgen.errors import UsageError, counted
 from cnpgen.machine.workers import distribute, worker_count
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.tips import correct_tips
-from cnpgen.problems.problem_record import open_problem
+from cnpgen.problems.problem_record import open_problem, with_payload_of
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.argument_types import checked_arguments
 
@@ -95,16 +95,15 @@ def simulate_plans(
         progress: Called with the number of plans executed since the last call.
 
     Raises:
-        UsageError: The plant is unknown, there is less than one worker, the problem has parameters, or ``environment``
-            is not a clone or does not support the plans.
+        UsageError: The plant is unknown, there is less than one worker, parameters of the problem move the table, or
+            ``environment`` is not a clone or does not support the plans.
         RecipeError: MuJoCo cannot simulate the robot, or the problem needs a plug-in that is not installed.
         MachineError: MuJoCo is missing, the environment cannot be imported, or a worker died.
     """
     plant, plans = as_plant(plant), correct_tips(plans)
-    if plans.problem.parameters:
+    if plans.problem.parameters.tilts_table:
         raise UsageError(
-            f"plans of {plans.problem.name!r} are not simulated: the simulator has no"
-            f" {', '.join(plans.problem.parameters.names)}",
+            f"plans of {plans.problem.name!r} are not simulated: the simulator has no raised and tilted tables",
             concerns="plans",
         )
     load_mujoco()
@@ -125,9 +124,18 @@ def simulate_plans(
 
 def _simulate(plan: Plans, *, plant: Plant) -> Executed:
     try:
-        return execute_plan(plan, plant)[2].executed
+        return execute_plan(_with_own_payload(plan), plant)[2].executed
     except UsageError as error:
         return Executed(failure=str(error))
+
+
+def _with_own_payload(plan: Plans) -> Plans:
+    """Return a plan of a problem with parameters as one of the problem with the payload of this plan."""
+    values = plan.boundary.parameters
+    if values is None:
+        return plan
+    own = with_payload_of(plan.problem, values[0])
+    return replace(plan, problem=own, boundary=replace(plan.boundary, parameters=None))
 
 
 def execute_plan(plan: Plans, plant: Plant) -> tuple[SimulatorScene, Reference, Execution]:

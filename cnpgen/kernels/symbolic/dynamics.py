@@ -1,6 +1,8 @@
 """Dynamics of a chain as CasADi SX: recursive Newton-Euler in the frames of its joints."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
 from cnpgen.kernels.symbolic.kinematics import joint_rotation
 from cnpgen.kernels.symbolic.linalg import (
@@ -68,7 +70,29 @@ def body_motions(chain: Chain, q: Vec, dq: Vec, ddq: Vec) -> list[BodyMotion]:
     return motions
 
 
-def inverse_dynamics(chain: Chain, q: Vec, dq: Vec, ddq: Vec, *, load: tuple[PayloadBody, Scalar] | None = None) -> Vec:
+class Load(NamedTuple):
+    """A multiple of the payload that the last body holds in addition.
+
+    Attributes:
+        share: Its mass, as a fraction of that of the payload.
+        centre: Center of mass in the tip frame [m], 3 scalars.
+        shape: Its inertia about the center, as a fraction of that of the payload at equal mass.
+    """
+
+    share: Scalar
+    centre: Vec
+    shape: Scalar
+
+
+def inverse_dynamics(
+    chain: Chain,
+    q: Vec,
+    dq: Vec,
+    ddq: Vec,
+    *,
+    payload: PayloadBody | None = None,
+    loads: Sequence[Load] = (),
+) -> Vec:
     """Return joint torques [N m] by recursive Newton-Euler in joint frames.
 
     Args:
@@ -76,15 +100,18 @@ def inverse_dynamics(chain: Chain, q: Vec, dq: Vec, ddq: Vec, *, load: tuple[Pay
         q: Joint positions [rad], n scalars.
         dq: Joint velocities [rad/s].
         ddq: Joint accelerations [rad/s^2].
-        load: A body at the tip, and the factor by which the last body holds more of it.
+        payload: The payload of which ``loads`` are multiples.
+        loads: Loads at the tip beside those of the chain.
     """
     motions = body_motions(chain, q, dq, ddq)
-    wrenches = [_body_wrench(joint, motion) for joint, motion in zip(chain.joints, motions, strict=True)]
-    if load is not None:
-        body, factor = load
-        added = _body_wrench(_at_tip(chain, body), motions[-1])
-        (force, torque), (more_force, more_torque) = wrenches[-1], added
-        wrenches[-1] = add(force, scale(more_force, factor)), add(torque, scale(more_torque, factor))
+    wrenches = [
+        _body_wrench(joint.mass, constants(joint.com), rows_of(joint.inertia), motion)
+        for joint, motion in zip(chain.joints, motions, strict=True)
+    ]
+    for load in loads:
+        assert payload is not None
+        (force, torque), (more_force, more_torque) = wrenches[-1], _load_wrench(chain, payload, load, motions[-1])
+        wrenches[-1] = add(force, scale(more_force, load.share)), add(torque, scale(more_torque, load.share))
     force, torque = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
     torques: Vec = []
     for joint, motion, wrench in zip(chain.joints[::-1], motions[::-1], wrenches[::-1], strict=True):
@@ -100,19 +127,20 @@ def acceleration_at(acceleration: Vec, omega: Vec, alpha: Vec, offset: Vec) -> V
     return add(acceleration, add(cross(alpha, offset), cross(omega, cross(omega, offset))))
 
 
-def _body_wrench(joint: Joint, motion: BodyMotion) -> tuple[Vec, Vec]:
-    """Return the force and the torque about the joint origin that move the body of a joint."""
-    com, inertia, omega = constants(joint.com), rows_of(joint.inertia), motion.omega
-    force = scale(acceleration_at(motion.acceleration, omega, motion.alpha, com), joint.mass)
+def _body_wrench(mass: float, com: Vec, inertia: list[Vec], motion: BodyMotion) -> tuple[Vec, Vec]:
+    """Return the force and the torque about the joint origin that move a body of a joint."""
+    omega = motion.omega
+    force = scale(acceleration_at(motion.acceleration, omega, motion.alpha, com), mass)
     spin = add(times(inertia, motion.alpha), cross(omega, times(inertia, omega)))
     return force, add(spin, cross(com, force))
 
 
-def _at_tip(chain: Chain, body: PayloadBody) -> Joint:
-    """Return the last joint with a body at the tip in place of its own."""
+def _load_wrench(chain: Chain, payload: PayloadBody, load: Load, motion: BodyMotion) -> tuple[Vec, Vec]:
+    """Return the wrench of a load of the payload's mass in the last joint frame; see ``_body_wrench``."""
     turn = chain.tip_rotation
-    com, inertia = chain.tip_translation + turn @ body.com, turn @ body.inertia @ turn.T
-    return replace(chain.joints[-1], mass=body.mass, com=com, inertia=inertia)
+    com = add(constants(chain.tip_translation), times(rows_of(turn), load.centre))
+    inertia = [scale(row, load.shape) for row in rows_of(turn @ payload.inertia @ turn.T)]
+    return _body_wrench(payload.mass, com, inertia, motion)
 
 
 def _offset(joint: Joint, angle: Scalar) -> Vec:

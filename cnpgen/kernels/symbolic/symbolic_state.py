@@ -5,9 +5,10 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from cnpgen.kernels.symbolic.dynamics import acceleration_at, body_motions, inverse_dynamics
+from cnpgen.kernels.symbolic.dynamics import Load, acceleration_at, body_motions, inverse_dynamics
 from cnpgen.kernels.symbolic.kinematics import Kinematics, bias_acceleration, forward_kinematics, tip_velocity
 from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, constants, cross, dot, scale, subtract, times
+from cnpgen.robots.parameter_ranges import PAYLOAD_CENTRE, PAYLOAD_PARAMETERS
 from cnpgen.robots.solid import pose_width
 from cnpgen.robots.table_frame import table_axes
 
@@ -95,10 +96,16 @@ class SymbolicState:
 
     def inverse_dynamics(self, ddq: Vec) -> Vec:
         """Return the torque [N m] of the sample's load at other accelerations [rad/s^2]."""
-        chain, mass, payload = self.robot.chain, self.parameters.get("payload_mass"), self.robot.attached.payload
-        if mass is None or payload is None:
+        chain, payload, values = self.robot.chain, self.robot.attached.payload, self.parameters
+        if payload is None or not self.robot.parameters.changes_payload:
             return inverse_dynamics(chain, self.q, self.dq, ddq)
-        return inverse_dynamics(chain, self.q, self.dq, ddq, load=(payload, (mass - payload.mass) / payload.mass))
+        mass, nominal = values.get("payload_mass", payload.mass), constants(payload.com)
+        if values.keys().isdisjoint(PAYLOAD_PARAMETERS[1:]):
+            loads = [Load((mass - payload.mass) / payload.mass, nominal, 1.0)]
+        else:  # the load in place of the nominal one
+            centre = [values.get(name, value) for name, value in zip(PAYLOAD_CENTRE, nominal, strict=True)]
+            loads = [Load(mass / payload.mass, centre, values.get("payload_inertia", 1.0)), Load(-1.0, nominal, 1.0)]
+        return inverse_dynamics(chain, self.q, self.dq, ddq, payload=payload, loads=loads)
 
     @cached_property
     def tip_velocity(self) -> Vec:
