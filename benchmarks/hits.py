@@ -1,7 +1,8 @@
-"""Online hits, replanning to an unchanged goal, and refining until a deadline.
+"""Online hits with the way back, replanning to an unchanged goal, and refining until a deadline.
 
 * Hits: completion of the task and planning, one puck at a time and 1,024 together. One planner takes the rates of the
   network, the other one computes them by time parametrization.
+* Hits and the way back to the start, one puck at a time, for a grid of 81 pucks: planning time of both, motion times.
 * Replanning to an unchanged goal: durations of the network's plans and of ``replan``, over the remaining time.
 * Refining until a deadline: valid plans, motion times and CPU times.
 
@@ -13,6 +14,7 @@ BLAS thread; the cases of hits are measured in turn.
 
 import argparse
 import time
+from functools import partial
 from typing import Any
 from unittest.mock import patch
 
@@ -34,6 +36,7 @@ NAME, TIME_PARAMETRIZED = "airhockey-replan", "airhockey-online"
 BATCH = 1024
 TARGET = np.array([2.49, 0.0])  # m, target of the pucks
 TARGETS_MS = {(1, "completed"): 0.3, (1, "planned"): 0.3, (1, "both"): 0.6, (BATCH, "both"): 0.04}
+SPEED_SHARES = (0.98, 0.9)  # of the maximum hitting speed: the way back must stay within the velocity limits
 REPLAN_TIMES = (0.1, 0.3, 0.5, 0.7, 0.9, 0.95)  # fractions of the motion time
 DEADLINES = (None, 10e-3, 20e-3, 40e-3, 60e-3, 80e-3)  # s
 
@@ -67,6 +70,32 @@ def hits(planner: Planner, repeat: int) -> dict[str, Any]:
     planned = plan_hits(planner, states, pucks, TARGET)
     results |= {"planned": len(planned.plans) / BATCH, "valid": float(evaluate_plans(planned.plans).valid.mean())}
     return results
+
+
+def hits_and_ways_back(planner: Planner, speed_share: float) -> dict[str, Any]:
+    """Plan hits of a grid of pucks from rest and the ways back, one by one; both are judged."""
+    home, still = planner.robot.base, np.zeros(planner.robot.n)
+    grid = [(x, y) for x in np.linspace(0.8, 1.2, 9) for y in np.linspace(-0.4, 0.4, 9)]
+    plan = partial(plan_hits, planner, (home, still, still), target=TARGET, speed_share=speed_share, home=home)
+    plan(grid[0])
+    found: dict[str, list[float]] = {"planning ms": [], "hit s": [], "both s": [], "speed m/s": [], "valid": []}
+    for puck in grid:
+        start = time.process_time()
+        planned = plan(puck)
+        milliseconds = 1e3 * (time.process_time() - start)
+        if not len(planned.plans):
+            continue
+        parts = planned.sequences.parts
+        values = (
+            milliseconds,
+            float(parts[0].duration[0]),
+            float(planned.sequences.duration[0]),
+            float(parts[0].columns["hit_speed"][0]),
+            float(all(evaluate_plans(part).valid.all() for part in parts)),
+        )
+        for name, value in zip(found, values, strict=True):
+            found[name].append(value)
+    return {"speed share": speed_share, "pucks": len(grid), "answers": len(found["valid"]), **found}
 
 
 def same_goal(planner: Planner, plans: Plans, source: str) -> list[dict[str, Any]]:
@@ -129,6 +158,12 @@ def rows_of(name: str, results: dict[str, Any]) -> list[tuple[str, ...]]:
     return rows
 
 
+def quartiles(values: list[float]) -> str:
+    """Return the median and, in parentheses, the first and the third quartile."""
+    low, middle, high = np.percentile(values, [25, 50, 75])
+    return f"{middle:.2f} ({low:.2f} to {high:.2f})"
+
+
 def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--repeat", type=int, default=300)
     parser.add_argument("--plans", type=int, default=100, help="plans that are replanned and refined")
@@ -147,6 +182,8 @@ def main() -> None:
     same_goal_records = same_goal(planner, valid_plans, "network") + same_goal(
         planner, refine_plans(valid_plans).plans, "refined"
     )
+    progress("hits and ways back")
+    ways_back = [hits_and_ways_back(Planner(TIME_PARAMETRIZED), share) for share in SPEED_SHARES]
     progress("refining until deadlines")
     deadline_records = deadlines(plans)
     head = ("planner", "batch", "part", "ms", "of planning", "target", "")
@@ -155,6 +192,19 @@ def main() -> None:
         *(
             f"{name}: {results['planned']:.1%} of the hits are planned; {results['valid']:.1%} of their plans are valid"
             for name, results in hit_results.items()
+        ),
+        table(
+            f"hits and ways back, one puck at a time, {TIME_PARAMETRIZED}: median, and from first to third quartile",
+            ("speed share", "answers", "planning, ms", "hit, s", "both, s", "hit speed, m/s", "valid"),
+            [
+                (
+                    f"{record['speed share']:g}",
+                    f"{record['answers']} of {record['pucks']}",
+                    *(quartiles(record[name]) for name in ("planning ms", "hit s", "both s", "speed m/s")),
+                    f"{np.mean(record['valid']):.1%}",
+                )
+                for record in ways_back
+            ],
         ),
         table(
             "replanning to the same goal, motion time over the remaining time",
@@ -190,7 +240,7 @@ def main() -> None:
         ),
     ]
     report(
-        {"hits": hit_results, "same goal": same_goal_records, "deadlines": deadline_records},
+        {"hits": hit_results, "ways back": ways_back, "same goal": same_goal_records, "deadlines": deadline_records},
         tables,
         as_json=chosen.json,
     )
