@@ -160,8 +160,8 @@ def rows_of(name: str, results: dict[str, Any]) -> list[tuple[str, ...]]:
 
 def quartiles(values: list[float]) -> str:
     """Return the median and, in parentheses, the first and the third quartile."""
-    low, middle, high = np.percentile(values, [25, 50, 75])
-    return f"{middle:.2f} ({low:.2f} to {high:.2f})"
+    first, half, third = np.percentile(values, [25, 50, 75])
+    return f"{half:.2f} ({first:.2f} to {third:.2f})"
 
 
 def options(parser: argparse.ArgumentParser) -> None:
