@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
+from cnpgen.kernels.collision.clearance_loss import ClearanceLoss
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.losses.plan_batch import PlanBatch
 from cnpgen.losses.quadrature import BasisTable
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.observation.scene_primitives import scene_primitives
+from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene import Scene
-
-if TYPE_CHECKING:
-    from cnpgen.kernels.collision.clearance_loss import ClearanceLoss
-    from cnpgen.robots.robot import Robot
 
 Array = NDArray[Any]
 

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import reduce
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene import Scene
 from cnpgen.trajectory.boundary import Boundary
-
-if TYPE_CHECKING:
-    from cnpgen.robots.robot import Robot
 
 Array = NDArray[Any]
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,16 +20,11 @@ from cnpgen.problems.problem_record import ProblemRecord, as_record, open_proble
 from cnpgen.robots.scene_arrays import scene_poses
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
-from cnpgen.store.dataset_spec import StoredProblem
+from cnpgen.store.dataset_spec import DatasetSpec, StoredProblem
 from cnpgen.store.paths import require_folder
 from cnpgen.store.reader import StoredDataset, open_dataset
 from cnpgen.store.scene_table import SCENE_ID
 from cnpgen.trajectory.boundary import Boundary
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from cnpgen.store.dataset_spec import DatasetSpec
 
 
 @checked_arguments

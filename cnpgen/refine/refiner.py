@@ -4,7 +4,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
 from threading import get_ident
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,13 +27,11 @@ from cnpgen.refine.solver.residuals import stage_jacobian, stage_values
 from cnpgen.refine.solver.sqp import DEFAULT_SETTINGS, Result, Settings, minimize
 from cnpgen.refine.solver.transcription import ResidualKernels, Transcription
 from cnpgen.refine.task import Attempt, Outcome, RefinementTask
+from cnpgen.robots.robot import Robot
 from cnpgen.robots.solid import pose_width
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
-
-if TYPE_CHECKING:
-    from cnpgen.robots.robot import Robot
-    from cnpgen.world.world import World
+from cnpgen.world.world import World
 
 Array = NDArray[np.float64]
 MAX_INPUT_DURATION_S = 60.0  # of an input plan that is used as initial guess; slower ones hardly change in a step
@@ -66,10 +63,10 @@ class Refiner:
     def __init__(
         self,
         problem: Problem,
-        robot: "Robot",
+        robot: Robot,
         *,
         kernels: KernelLibrary,
-        world: "World",
+        world: World,
         spec: TrajectorySpec | None = None,
         cost_term: CostTerm | None = None,
         settings: Settings = DEFAULT_SETTINGS,

@@ -18,7 +18,6 @@ worse than the input plan: it replaces it only if the verdict finds a smaller vi
 import time
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,13 +37,11 @@ from cnpgen.refine.solver.hulls import Hulls, has_clearance_constraints
 from cnpgen.refine.solver.sqp import Result
 from cnpgen.refine.task import Attempt, Outcome, RefinementTask
 from cnpgen.refine.tree_paths import find_obstacle_paths
+from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene import Scene
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.remaining_trajectory import with_fewer_knots, with_finer_knots
 from cnpgen.trajectory.spline_motion import Motion
-
-if TYPE_CHECKING:
-    from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
 
@@ -342,7 +339,7 @@ class PlanChecker:
         degree: Degree of the plans' splines.
     """
 
-    def __init__(self, problem: Problem, robot: "Robot", *, degree: int) -> None:
+    def __init__(self, problem: Problem, robot: Robot, *, degree: int) -> None:
         self._judge, self._degree = Judge(problem, robot), degree
 
     def verdict(self, task: RefinementTask, path: Array, rate: Array) -> Verdict:

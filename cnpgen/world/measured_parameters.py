@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.robots.chain import frame_of
-from cnpgen.robots.robot import reduced_model
+from cnpgen.robots.robot import Robot, reduced_model
 
 if TYPE_CHECKING:
     import pinocchio as pin
 
-    from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
 

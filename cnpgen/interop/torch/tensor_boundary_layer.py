@@ -1,6 +1,6 @@
 """The boundary layer in torch operations, on the device of its arguments, differentiable any number of times."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
@@ -12,11 +12,9 @@ from cnpgen.planner.boundary_layer import BoundaryLayer
 from cnpgen.planner.control_points import along_line
 from cnpgen.planner.expressions import effective_steps, equality_residuals
 from cnpgen.planner.gauss_newton import MAX_STEP_RAD, PROJECTION_DAMPING, collocation
+from cnpgen.planner.tasks import Tasks
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.schema.argument_types import checked_arguments
-
-if TYPE_CHECKING:
-    from cnpgen.planner.tasks import Tasks
 
 
 class TensorBoundaryLayer:
@@ -40,7 +38,7 @@ class TensorBoundaryLayer:
     def __repr__(self) -> str:
         return f"<TensorBoundaryLayer of {self.layer.problem.name!r}>"
 
-    def __call__(self, tasks: "Tasks", phi: torch.Tensor, log_rate: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def __call__(self, tasks: Tasks, phi: torch.Tensor, log_rate: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Compute control points that meet the boundary conditions from network outputs.
 
         Args:

@@ -13,7 +13,7 @@ equations. This is again a linear program, and its dual has its optimum at a ``z
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from itertools import combinations
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -24,11 +24,9 @@ from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.candidate_table import hit_direction, table_normal, velocity_factor
 from cnpgen.pipelines.stages.hitting_newton import along, direction_symbols
 from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Stage, StageFunction
+from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
-
-if TYPE_CHECKING:
-    from cnpgen.robots.robot import Robot
 
 ZERO_RESIDUAL_M = 1e-11  # residuals below this are treated as zero
 SPEED_SHARE_COLUMN = "hit_speed_share"  # task column: hit speed as a fraction of the maximum speed
@@ -121,7 +119,7 @@ class HittingVelocity(Stage):
         return work
 
 
-def hitting_velocity(robot: "Robot", *, min_speed: float) -> Any:
+def hitting_velocity(robot: Robot, *, min_speed: float) -> Any:
     """Build the linear program as an SX function ``(q, d) -> (dq, speed, found)``, or of (q, d, normal).
 
     Args:
