@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from cnpgen.cli import values
 from cnpgen.cli.parser import Commands, Parser, add_command, add_engine, add_json
 from cnpgen.cli.progress import Meter
+from cnpgen.errors import CnpgenError, UsageError
 
 if TYPE_CHECKING:
     from cnpgen.benchmark.run_suite import Benchmark
@@ -96,7 +97,6 @@ def run(arguments: argparse.Namespace) -> int:
     from cnpgen.benchmark.html_report import save_benchmark_report
     from cnpgen.benchmark.paper_figures import save_benchmark_figures
     from cnpgen.benchmark.result_tables import save_benchmark_tables
-    from cnpgen.errors import UsageError
 
     if arguments.list:
         print(_listing(as_json=arguments.json))
@@ -123,7 +123,6 @@ def run(arguments: argparse.Namespace) -> int:
 def _search(arguments: argparse.Namespace) -> int:
     """Search for parameters of one planner and print the trials, the best one first."""
     from cnpgen.benchmark.parameter_search import SEARCH_FILE, csv_of, search_parameters
-    from cnpgen.errors import UsageError
 
     (planner, *others), ranges = {name for name, _, _ in arguments.search}, {k: ends for _, k, ends in arguments.search}
     if others or arguments.planners not in (None, [planner]) or arguments.set or arguments.repeat != 1:
@@ -255,7 +254,6 @@ def _listing(*, as_json: bool) -> str:
 def _summary(planner: str) -> str:
     """Describe a planner in one line, or report why it cannot be used."""
     from cnpgen.cli.describe_keys import kind_summary
-    from cnpgen.errors import CnpgenError
     from cnpgen.schema import registry
 
     try:

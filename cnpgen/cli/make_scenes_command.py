@@ -9,6 +9,7 @@ from typing import Any
 from cnpgen.cli import values
 from cnpgen.cli.parser import Commands, Parser, add_command, add_json
 from cnpgen.cli.progress import Meter
+from cnpgen.errors import UsageError
 
 _TEXT = """\
 A family draws furniture and objects around the robot. Goals are grasp-like poses, for which inverse kinematics finds
@@ -52,7 +53,6 @@ def family_parameter(text: str) -> tuple[str, Any]:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
-    from cnpgen.errors import UsageError
     from cnpgen.pipelines.families.scene_generator import make_scenes
     from cnpgen.problems.scenes.scene_files import save_scenes
 
@@ -90,8 +90,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _check_place(out: Path, *, force: bool) -> None:
-    from cnpgen.errors import UsageError
-
     if out.suffix not in {"", ".h5", ".hdf5"}:
         raise UsageError(f"{out} must end in .h5 or .hdf5, or be a folder for YAML files")
     if not out.parent.is_dir():

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from cnpgen.cli import values
 from cnpgen.cli.parser import Options, Parser, add_engine, add_json
 from cnpgen.cli.progress import Meter
-from cnpgen.errors import counted
+from cnpgen.errors import UsageError, counted
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -143,7 +143,6 @@ def refine_and_save(
 
 def check_place(out: Path, *, force: bool) -> None:
     """Refuse an output path before any work if it cannot be written or exists."""
-    from cnpgen.errors import UsageError
     from cnpgen.plans.save import check_replaceable
 
     if out.is_dir() or not out.parent.is_dir():

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from cnpgen.cli.parser import Commands, Parser, add_command, add_json
 from cnpgen.cli.recipe_names import check_recipe
 from cnpgen.errors import RecipeError, UsageError, nearest
-from cnpgen.schema.toml import MARKS, Kind
+from cnpgen.schema.toml import MARKS, Kind, kind_of_file
 
 if TYPE_CHECKING:
     from cnpgen.cli.describe import Recipe
@@ -92,7 +92,6 @@ def load_any(name_or_path: str, kind: Kind | None = None) -> "Recipe":
 def _kind(name_or_path: str) -> Kind:
     """Determine the kind of a recipe."""
     from cnpgen.schema.catalogue import list_recipes
-    from cnpgen.schema.toml import kind_of_file
 
     path = Path(name_or_path)
     if path.is_file():

@@ -10,6 +10,7 @@ from cnpgen.cli import values
 from cnpgen.cli.parser import Commands, Parser, add_command, add_json
 from cnpgen.cli.plan_files import read_plans
 from cnpgen.cli.progress import Meter
+from cnpgen.errors import UsageError, counted
 
 if TYPE_CHECKING:
     from cnpgen.benchmark.simulator.plant import Plant
@@ -62,7 +63,6 @@ def add(commands: "Commands[Parser]") -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     from cnpgen.benchmark.simulator.simulate import simulate_plans
-    from cnpgen.errors import UsageError
 
     plans = read_plans(arguments.file, problem=arguments.problem)
     if arguments.plan >= len(plans):
@@ -89,7 +89,6 @@ def run(arguments: argparse.Namespace) -> int:
 def _text(file: Path, found: "Simulation") -> str:
     """Lay out what came of all plans together."""
     from cnpgen.cli.describe import table
-    from cnpgen.errors import counted
 
     summary, count = found.summary(), len(found.executed)
     head = f"{file}: {counted(count, 'plan')} of {found.plans.problem.name}, executed by the {found.plant.name} plant"

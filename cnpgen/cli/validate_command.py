@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from cnpgen.cli import values
 from cnpgen.cli.parser import Commands, Parser, add_command, add_engine, add_json
 from cnpgen.cli.progress import Meter
+from cnpgen.errors import DatasetError
 
 if TYPE_CHECKING:
     from cnpgen.validate.validate_dataset import ValidationReport
@@ -80,7 +81,6 @@ def _validate(arguments: argparse.Namespace) -> "ValidationReport":
 
 def _rows(folder: Path) -> int:
     """Return the number of samples to check; 0 if the specification is damaged, which validation reports."""
-    from cnpgen.errors import DatasetError
     from cnpgen.store.dataset_spec import load_dataset_spec, shards
     from cnpgen.store.shard_record import is_committed
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from cnpgen.cli import values
 from cnpgen.cli.parser import Commands, Parser, add_command
+from cnpgen.errors import DatasetError, UsageError
 
 if TYPE_CHECKING:
     from cnpgen.cli.view.view_scene import ViewScene
@@ -122,8 +123,6 @@ def _scene(arguments: argparse.Namespace) -> "ViewScene":
 
 def _check_rows(rows: Sequence[int]) -> None:
     """Refuse more rows than a page may have."""
-    from cnpgen.errors import UsageError
-
     if len(rows) > MAX_ROWS_OF_PAGE:
         raise UsageError(f"--rows: expected at most {MAX_ROWS_OF_PAGE} rows on one page, got {len(rows)}")
 
@@ -139,8 +138,6 @@ def _verdicts(plans: "Plans", *, of_samples: bool) -> "list[Verdict | None]":
 
 def _refuse_for_problem(arguments: argparse.Namespace) -> None:
     """Refuse options that do not apply to a problem."""
-    from cnpgen.errors import UsageError
-
     extra = [name for name in ("row", "rows", "split", "problem") if getattr(arguments, name) is not None]
     if extra:
         raise UsageError(f"--{extra[0]} needs plans or the folder of a dataset, got {arguments.what}")
@@ -148,7 +145,6 @@ def _refuse_for_problem(arguments: argparse.Namespace) -> None:
 
 def _samples(arguments: argparse.Namespace, rows: Sequence[int]) -> "tuple[Plans, int]":
     """Read rows of a dataset, and count those of the split."""
-    from cnpgen.errors import DatasetError
     from cnpgen.plans.boundary_problems import load_boundary_problems
     from cnpgen.plans.concatenate import concatenate
     from cnpgen.problems.problem_file import load_problem_behind
@@ -168,7 +164,6 @@ def _samples(arguments: argparse.Namespace, rows: Sequence[int]) -> "tuple[Plans
 def _plans(arguments: argparse.Namespace, rows: Sequence[int]) -> "tuple[Plans, int]":
     """Read plans, and count those of the file."""
     from cnpgen.cli.plan_files import read_plans
-    from cnpgen.errors import UsageError
 
     if arguments.split:
         raise UsageError(f"--split is for the folder of a dataset, got {arguments.what}")

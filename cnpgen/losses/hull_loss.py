@@ -84,8 +84,6 @@ def make_hull_loss(problem: Problem, robot: Robot, kernels: KernelLibrary, tight
         UsageError: The problem has no constraint ``robot-clearance``, or its robot no link geometry.
         MachineError: Kernels are not compiled on this machine.
     """
-    from cnpgen.kernels.collision.clearance_loss import ClearanceLoss
-
     constraint = problem.first(RobotClearance)
     if constraint is None:
         raise UsageError(f"the problem {problem.name!r} has no constraint robot-clearance", concerns="problem")

@@ -28,6 +28,7 @@ from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.remaining_trajectory import is_finer
 from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
+from cnpgen.world.world import World
 
 Array = NDArray[np.float64]
 
@@ -151,8 +152,6 @@ def load_refiner(
         levels: Grid levels, see ``Refiner``.
         coarser: Refiner with the problem's own control points, see ``Refiner``.
     """
-    from cnpgen.world.world import World
-
     if kernels is None:
         kernels = problem_kernels(problem, robot, *choose_backend(None))
     settings = Settings(cost_tolerance=options.tolerance, max_iterations=options.max_iterations)
