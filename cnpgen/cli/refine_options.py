@@ -173,14 +173,14 @@ def _explain(facts: dict[str, Any], found: "Refinement | SolvedScenes", meter: M
 
 def _summary(facts: dict[str, Any], times: "Times", *, listed: int) -> list[str]:
     """Summarize the refined plans."""
-    from cnpgen.refine.refine_plans import outcome_text
+    from cnpgen.refine.task import Outcome
 
     mean = facts["mean_duration_s"]
     lines = [
         f"{facts['valid']:,} of {counted(facts['plans'], 'plan')} valid in {times}"
         + ("" if mean is None else f"; mean motion time {mean:.4f} s")
     ]
-    lines += [f"  {count:,} {outcome_text(name)}" for name, count in facts["outcomes"].items()]
+    lines += [f"  {count:,} {Outcome[name.upper()].text}" for name, count in facts["outcomes"].items()]
     for failure in facts["not_valid"][:listed]:
         lines += textwrap.wrap(_failure_text(failure), 110, subsequent_indent="  ")
     if len(facts["not_valid"]) > listed:
