@@ -196,7 +196,7 @@ def make_inference_pipeline(
             fixed_at_goal=fixed_at_goal,
             within_limits=config.within_limits,
             via_lines=bool(config.via_points),
-            placed=loaded.problem.obstacle if loaded.problem.has_sample_obstacles else (),
+            placed=loaded.problem.sample_obstacles,
             observed=observed,
         )
         path = kernels.load(
