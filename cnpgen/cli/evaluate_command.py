@@ -133,10 +133,9 @@ def _run_trajectories(arguments: argparse.Namespace) -> int:
     if arguments.plan is not None and arguments.plan >= len(loaded.trajectories):
         count = len(loaded.trajectories)
         raise UsageError(f"{arguments.file} has no trajectory {arguments.plan}: {count} are numbered from 0")
-    meter = Meter(quiet=not sys.stderr.isatty(), noun="trajectory")
-    meter.begin(f"judging {arguments.file}", len(loaded.trajectories))
     noise, jerk = arguments.noise or (0.0,), arguments.max_jerk
-    try:
+    with Meter(quiet=not sys.stderr.isatty(), noun="trajectory") as meter:
+        meter.begin(f"judging {arguments.file}", len(loaded.trajectories))
         found = evaluate_trajectories(
             problem,
             loaded.trajectories,
@@ -147,8 +146,6 @@ def _run_trajectories(arguments: argparse.Namespace) -> int:
             workers=arguments.workers or 1,
             progress=meter,
         )
-    finally:
-        meter.close()
     if arguments.json:
         write_json(arguments.file, found, loaded.labels)
     else:
@@ -166,10 +163,9 @@ def _evaluate(arguments: argparse.Namespace) -> "Evaluation":
     plans = read_plans(arguments.file, problem=arguments.problem)
     if arguments.plan is not None and arguments.plan >= len(plans):
         raise UsageError(f"{arguments.file} has no plan {arguments.plan}: {len(plans)} plans are numbered from 0")
-    meter = Meter(quiet=not sys.stderr.isatty(), noun="plan")
-    meter.begin(f"judging {arguments.file}", len(plans))
-    try:
-        error = arguments.tracking_error
+    error = arguments.tracking_error
+    with Meter(quiet=not sys.stderr.isatty(), noun="plan") as meter:
+        meter.begin(f"judging {arguments.file}", len(plans))
         return evaluate_plans(
             plans,
             step=arguments.step,
@@ -177,8 +173,6 @@ def _evaluate(arguments: argparse.Namespace) -> "Evaluation":
             workers=arguments.workers,
             progress=meter,
         )
-    finally:
-        meter.close()
 
 
 def _write_json(file: Path, found: "Evaluation") -> None:

@@ -65,9 +65,8 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError(f"{' and '.join(missing)} must be given; 'cnpgen make-scenes --list' lists families")
     out = arguments.out or Path(f"{arguments.family}-scenes.h5")
     _check_place(out, force=arguments.force)
-    meter = Meter(quiet=arguments.quiet, noun="problem")
-    meter.begin(f"making {arguments.family}", arguments.n)
-    try:
+    with Meter(quiet=arguments.quiet, noun="problem") as meter:
+        meter.begin(f"making {arguments.family}", arguments.n)
         scenes = make_scenes(
             arguments.family,
             arguments.robot,
@@ -77,8 +76,6 @@ def run(arguments: argparse.Namespace) -> int:
             parameters=dict(arguments.set),
             progress=meter,
         )
-    finally:
-        meter.close()
     save_scenes(out, scenes)
     obstacles = [len(scene.obstacles) for scene in scenes]
     facts = {"file": str(out), "problems": len(scenes), "scenes": len({id(scene.obstacles) for scene in scenes})}

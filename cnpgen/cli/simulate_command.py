@@ -67,14 +67,11 @@ def run(arguments: argparse.Namespace) -> int:
     plans = read_plans(arguments.file, problem=arguments.problem)
     if arguments.plan >= len(plans):
         raise UsageError(f"{arguments.file} has no plan {arguments.plan}: {len(plans)} plans are numbered from 0")
-    meter = Meter(quiet=not sys.stderr.isatty(), noun="plan")
-    meter.begin(f"executing {arguments.file}", len(plans))
-    try:
+    with Meter(quiet=not sys.stderr.isatty(), noun="plan") as meter:
+        meter.begin(f"executing {arguments.file}", len(plans))
         found = simulate_plans(
             plans, plant=arguments.plant, environment=arguments.environment, workers=arguments.workers, progress=meter
         )
-    finally:
-        meter.close()
     if arguments.json:
         rows = [{"plan": index, **each.to_dict()} for index, each in enumerate(found.executed)]
         print(json.dumps({"file": str(arguments.file), **found.summary(), "executed": rows}, indent=2))

@@ -71,12 +71,9 @@ def _validate(arguments: argparse.Namespace) -> "ValidationReport":
     rows = _rows(arguments.folder) if arguments.deep else 0
     if not rows:
         return validate_dataset(arguments.folder, **options)
-    meter = Meter(quiet=arguments.quiet)
-    meter.begin(f"validating {arguments.folder}", rows)
-    try:
+    with Meter(quiet=arguments.quiet) as meter:
+        meter.begin(f"validating {arguments.folder}", rows)
         return validate_dataset(arguments.folder, **options, progress=meter)
-    finally:
-        meter.close()
 
 
 def _rows(folder: Path) -> int:

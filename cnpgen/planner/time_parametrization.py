@@ -136,11 +136,6 @@ class TimeParametrization(PhaseGrid):
 def make_time_parametrization(problem: Problem, robot: Robot, kernels: KernelLibrary) -> TimeParametrization:
     """Load the time parametrization of one problem.
 
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        kernels: Library of kernels.
-
     Raises:
         UsageError: The problem bounds the jerk, which is no quadratic of the rate.
     """

@@ -83,13 +83,7 @@ class TimeScaling(PhaseGrid):
 
 
 def make_time_scaling(problem: Problem, robot: Robot, kernels: KernelLibrary) -> TimeScaling:
-    """Load the time scaling of one problem.
-
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        kernels: Library of kernels.
-    """
+    """Load the time scaling of one problem."""
     speeds, residuals = make_phase_grid(problem, kernels, SCALING_INTERVALS), kernels.load(speed_residuals)
     return TimeScaling(speeds.violation, speeds.path, speeds.rate, residuals, speed_bounds(robot, problem))
 

@@ -37,6 +37,7 @@ Array = NDArray[np.float64]
 MAX_INPUT_DURATION_S = 60.0  # of an input plan that is used as initial guess; slower ones hardly change in a step
 MIN_RATE_FRACTION = 1e-3  # of a plan's largest rate control point
 MAX_END_VIOLATION = 10.0  # of boundary states, in scaled units; DAQP may take hours for larger ones
+MAX_CONTINUATIONS = 4  # of a motion that was scaled in time; most need one
 MAX_FEEDBACKS = 5  # of collisions between grid points to the solver
 SLOWNESS = 1.6  # times slower than the bounds of speeds require: the solver changes such guesses more easily
 
@@ -196,6 +197,20 @@ class Refiner:
         if self.measures_hulls:
             result = self._separated(task, level, result)
         return self.measured(task, result.x, outcome, result.iterations)
+
+    def continue_scaled(self, task: RefinementTask, best: Attempt) -> Attempt:
+        """Optimize a motion that was scaled in time again, while it becomes cheaper.
+
+        Uniform time scaling makes the whole motion slower for the violation at a single phase.
+        """
+        for _ in range(MAX_CONTINUATIONS):
+            if best.outcome is not Outcome.TIME_SCALED:
+                break
+            again = self.solve(task, self.levels.warm, best.variables, Outcome.SOLVED)
+            if not (again.violation <= 1 and again.cost < best.cost):
+                break
+            best = replace(again, iterations=best.iterations + again.iterations)
+        return best
 
     def fed_back(
         self, task: RefinementTask, attempt: Attempt, phase: float, depth: float, extra: Array | None

@@ -21,9 +21,6 @@ Array = NDArray[np.float64]
 class MeasuredParameters:
     """Parameters of the sample of a world; ``set`` replaces them.
 
-    Args:
-        robot: The robot.
-
     Attributes:
         model: Pinocchio's model with the load of the sample, a copy of the robot's if loads differ.
         values: Parameters of the sample, by name.

@@ -23,10 +23,6 @@ MAX_TIP_HEIGHT_ERROR_M = 0.01
 class StateCheck:
     """Check of states: limits of joints and torques, the manifold, the obstacles.
 
-    Args:
-        problem: The problem.
-        robot: Its robot.
-
     Raises:
         UsageError: There is neither a table nor a held object, or an obstacle is not an upright box.
     """

@@ -211,9 +211,6 @@ def table_velocity(robot: Robot) -> Any:
 
     The direction, in units of the limits, is projected onto the manifold in the metric of the limits. It is scaled
     until the first joint meets its limit, and multiplied by the length in [0, 1).
-
-    Args:
-        robot: The robot.
     """
     import casadi as ca
 
@@ -234,9 +231,6 @@ def table_acceleration(robot: Robot) -> Any:
     ``ddq = particular + t * projected direction`` with the particular solution of minimum weighted maximum norm. Torque
     is affine in t (two inverse dynamics), so every limit is an interval of t, and t is uniform in their intersection.
     ``interval_length`` is the length of the intersection, negative if the particular solution violates a limit.
-
-    Args:
-        robot: The robot.
     """
     import casadi as ca
 
