@@ -55,8 +55,18 @@ def add(commands: "Commands[Parser]") -> None:
     option("--workers", metavar="W", type=values.positive, help="processes; default one per available core")
     option("--list", action="store_true", help="also list the plans, one per line")
     option("--plan", metavar="I", type=values.natural, default=0, help="plan to draw (default: 0)")
-    option("--image", metavar="PICTURE", type=_picture, help="draw the world at the end of one plan: .png")
-    option("--video", metavar="FILM", type=_film, help="film one plan: .mp4 or .gif")
+    option(
+        "--image",
+        metavar="PICTURE",
+        type=lambda text: values.picture_file(text, ".png"),
+        help="draw the world at the end of one plan: .png",
+    )
+    option(
+        "--video",
+        metavar="FILM",
+        type=lambda text: values.picture_file(text, ".mp4", ".gif"),
+        help="film one plan: .mp4 or .gif",
+    )
     add_json(parser)
 
 
@@ -128,11 +138,3 @@ def _draw(arguments: argparse.Namespace, plan: "Plans", plant: "Plant") -> None:
     if arguments.video:
         save_film(Path(arguments.video), scene, execution, reference.ticks)
         print(f"filmed: plan {arguments.plan} in {arguments.video}", file=sys.stderr)
-
-
-def _picture(text: str) -> str:
-    return values.picture_file(text, ".png")
-
-
-def _film(text: str) -> str:
-    return values.picture_file(text, ".mp4", ".gif")

@@ -48,13 +48,15 @@ def add(commands: "Commands[Parser]") -> None:
     text = "the problem of plans or rows, whose URDF leads to its visual meshes"
     option("--problem", metavar="NAME|FILE", help=text)
     where = parser.add_mutually_exclusive_group()
-    where.add_argument("-o", "--out", metavar="OUT", type=_page, help="output file (default: NAME.html)")
+    where.add_argument(
+        "-o",
+        "--out",
+        metavar="OUT",
+        type=lambda text: values.picture_file(text, ".html"),
+        help="output file (default: NAME.html)",
+    )
     text = "serve the page on this machine, and show every change of its files (default port: 8000)"
     where.add_argument("--serve", metavar="PORT", type=values.port, nargs="?", const=8000, help=text)
-
-
-def _page(text: str) -> str:
-    return values.picture_file(text, ".html")
 
 
 def run(arguments: argparse.Namespace) -> int:

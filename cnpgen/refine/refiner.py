@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import cached_property
 from threading import get_ident
 
 import numpy as np
@@ -311,12 +310,12 @@ class Refiner:
 
     def other_guesses(self, task: RefinementTask) -> list[Array]:
         """Return the variables of the other initial guesses."""
-        arguments = self._guess_arguments(task)
+        arguments, center = self._guess_arguments(task), (self.robot.position_lower + self.robot.position_upper) / 2
         guesses = [
             initial_guesses.straight_line(*arguments),
             initial_guesses.line_through(*arguments, configuration=self.robot.base),
             initial_guesses.quintic(*arguments),
-            initial_guesses.line_through(*arguments, configuration=self._range_center),
+            initial_guesses.line_through(*arguments, configuration=center),
         ]
         return [*self.tip_path_guesses(task), *(self.slow_guess(task, guess) for guess in guesses)]
 
@@ -346,10 +345,6 @@ class Refiner:
         if thread not in self._hulls:
             self._hulls[thread] = Hulls(self.problem, self.robot, self._library)
         return self._hulls[thread]
-
-    @cached_property
-    def _range_center(self) -> Array:
-        return (self.robot.position_lower + self.robot.position_upper) / 2
 
     def _guess_arguments(self, task: RefinementTask) -> tuple[Boundary, Array, TrajectorySpec]:
         return task.boundary, self.robot.velocity_limit, self.spec

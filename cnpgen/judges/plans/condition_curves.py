@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from cnpgen.judges.plans.joint_limits import is_proven
 from cnpgen.judges.plans.measure import MeasuredCondition, measure, name_part
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
-from cnpgen.problems.constraints.constraint import Condition, Constraint
+from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.constraints.joint import JointTorque
 from cnpgen.problems.constraints.self_clearance import SelfClearance
 from cnpgen.problems.problem import Problem
@@ -133,7 +133,7 @@ def _distance_curves(
     """Measure the smallest distance of a constraint on distances at every state, with the closest points."""
     kind: Kind = "object" if isinstance(constraint, ObjectContact) else "robot"
     kind = "self" if isinstance(constraint, SelfClearance) else kind
-    stated = _stated(constraint, world)
+    (stated,) = constraint.judged(cast(World, world))
     if not stated.g:
         return
     radius = (problem.arm_radius or 0.0) if kind == "robot" and world.robot.shape is None else 0.0
@@ -153,9 +153,3 @@ def _distance_curves(
         closest.points,
         tuple(names[pair] for pair in closest.pair),
     )
-
-
-def _stated(constraint: Constraint, world: PathWorld) -> Condition:
-    """Return the condition of a constraint on distances."""
-    (condition,) = constraint.judged(cast(World, world))
-    return condition

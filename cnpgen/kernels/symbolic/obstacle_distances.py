@@ -289,23 +289,16 @@ def _solid(obstacle: Obstacle, values: Vec) -> SymbolicSolid:
     """Return the shape of an obstacle with these values of its pose and size."""
     if obstacle.upright:
         return _upright(obstacle, values[0])
-    return _BUILDERS[obstacle.kind](obstacle, values[:3], values[3:])
-
-
-def _box(obstacle: Obstacle, position: Vec, sizes: Vec) -> SymbolicBox:
-    return SymbolicBox([0.0] * 3, sizes[:3], position, _three_rows(sizes[3:]) if obstacle.is_turned else None)
-
-
-def _sphere(_: Obstacle, position: Vec, sizes: Vec) -> SymbolicCapsule:
-    return SymbolicCapsule(position, position, sizes[0])
-
-
-def _capsule(_: Obstacle, position: Vec, sizes: Vec) -> SymbolicCapsule:
-    return SymbolicCapsule(subtract(position, sizes[:3]), add(position, sizes[:3]), sizes[3])
-
-
-def _cylinder(_: Obstacle, position: Vec, sizes: Vec) -> SymbolicCylinder:
-    return SymbolicCylinder(position, sizes[:3], sizes[3])
+    position, rest = values[:3], values[3:]
+    if obstacle.kind == "box":
+        return SymbolicBox([0.0] * 3, rest[:3], position, _three_rows(rest[3:]) if obstacle.is_turned else None)
+    if obstacle.kind == "sphere":
+        return SymbolicCapsule(position, position, rest[0])
+    if obstacle.kind == "capsule":
+        return SymbolicCapsule(subtract(position, rest[:3]), add(position, rest[:3]), rest[3])
+    if obstacle.kind == "cylinder":
+        return SymbolicCylinder(position, rest[:3], rest[3])
+    return _mesh(obstacle, position, rest)
 
 
 def _mesh(obstacle: Obstacle, position: Vec, rotation: Vec) -> SymbolicHull:
@@ -313,15 +306,6 @@ def _mesh(obstacle: Obstacle, position: Vec, rotation: Vec) -> SymbolicHull:
     low, high = corners.min(axis=0), corners.max(axis=0)
     center, half = ((low + high) / 2).tolist(), ((high - low) / 2).tolist()
     return SymbolicHull(center, half, position, _three_rows(rotation), supporting_planes(corners).tolist())
-
-
-_BUILDERS: dict[str, Callable[[Obstacle, Vec, Vec], SymbolicSolid]] = {
-    "box": _box,
-    "sphere": _sphere,
-    "capsule": _capsule,
-    "cylinder": _cylinder,
-    "mesh": _mesh,
-}
 
 
 def _upright(obstacle: Obstacle, top: Scalar) -> SymbolicUprightBox:

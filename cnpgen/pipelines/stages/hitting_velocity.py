@@ -161,7 +161,7 @@ def maximise(a: Vec, b: list[Vec], limit: list[float]) -> tuple[Vec, Scalar]:
     best: Scalar = ca.SX(np.inf)
     y: Vec = [ca.SX(0), ca.SX(0)]
     for i, j in combinations(range(n), 2):
-        det = _det(b[i], b[j])
+        det = b[i][0] * b[j][1] - b[i][1] * b[j][0]
         size = ca.fabs(b[i][0] * b[j][1]) + ca.fabs(b[i][1] * b[j][0])
         usable = ca.fabs(det) > PARALLEL_TOLERANCE * size
         inverse = 1.0 / ca.if_else(usable, det, 1.0)
@@ -221,7 +221,3 @@ def _smallest_ratio(b: list[Vec], limit: list[float], target: Vec) -> Vec:
         for same, bound, x in zip(parallel, limit, b, strict=True)
     ]
     return [x + w for x, w in zip(v, along, strict=True)]
-
-
-def _det(a: Vec, b: Vec) -> Scalar:
-    return a[0] * b[1] - a[1] * b[0]
