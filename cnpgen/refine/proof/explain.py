@@ -11,7 +11,6 @@ from enum import StrEnum
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.problems.problem import Problem
@@ -28,7 +27,6 @@ from cnpgen.trajectory.boundary import Boundary
 if TYPE_CHECKING:
     from cnpgen.plans.plans import Plans
 
-Array = NDArray[np.float64]
 POSITION_MARGIN_RAD = 1e-4  # for motion between the times of the verdict, and its tolerance of boundary conditions
 
 
