@@ -153,16 +153,9 @@ def run_benchmark(
     where = Engine(engine, address, workers)
     with concerning("suite"):
         loaded = suite if isinstance(suite, Suite) else load_suite(suite)
-    _check_planners(planners)
     given = dict(parameters or {})
-    if unused := sorted(given.keys() - set(planners)):
-        raise UsageError(f"must be of planners of this run, got those of {', '.join(unused)}", argument="parameters")
-    settings = {name: _checked_parameters(name, given.get(name, {})) for name in planners}
-    robots = tuple(as_plant(plant, argument="plants") for plant in plants)
-    if environment is not None:
-        robots += (challenge_plant(environment),)
-    if robots:
-        load_mujoco()
+    settings = _checked_settings(planners, given)
+    robots = _loaded_plants(plants, environment)
     limit = number("time_limit", time_limit)
     if limit <= 0:
         raise UsageError(f"must be above 0 s, got {time_limit:g} s", argument="time_limit")
@@ -173,10 +166,7 @@ def run_benchmark(
     if environment is not None:
         check_challenge(*open_problem(problems.problem))
     setting = Setting(problems.problem, loaded.model, limit, seed)
-    place = Path(folder)
-    if place.exists() and not place.is_dir():
-        raise UsageError(f"must be a folder, {place} is a file", argument="folder")
-    place.mkdir(parents=True, exist_ok=True)
+    place = _made_folder(Path(folder))
     shared = _shared_identity(loaded, setting)
     names = {*_names_in(place, shared, delete_others=force), *planners}
     if reference is not None and reference not in names:
@@ -203,6 +193,31 @@ def run_benchmark(
     if count > len(problems):
         problems, prefix = loaded.problems(count)
     return Benchmark(loaded, problems, prefix, rows, robots, runs, reference, plane_tolerance)
+
+
+def _checked_settings(planners: Sequence[str], given: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Check names and parameters of planners; return the values of all fields of each."""
+    _check_planners(planners)
+    if unused := sorted(given.keys() - set(planners)):
+        raise UsageError(f"must be of planners of this run, got those of {', '.join(unused)}", argument="parameters")
+    return {name: _checked_parameters(name, given.get(name, {})) for name in planners}
+
+
+def _loaded_plants(plants: Sequence[str | Plant], environment: str | Path | None) -> tuple[Plant, ...]:
+    """Return the plants that execute plans, after loading MuJoCo for them."""
+    robots = tuple(as_plant(plant, argument="plants") for plant in plants)
+    if environment is not None:
+        robots += (challenge_plant(environment),)
+    if robots:
+        load_mujoco()
+    return robots
+
+
+def _made_folder(folder: Path) -> Path:
+    if folder.exists() and not folder.is_dir():
+        raise UsageError(f"must be a folder, {folder} is a file", argument="folder")
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
 
 
 def _place_of(folder: Path, planner: str, repetition: int) -> Path:

@@ -3,6 +3,8 @@
 import argparse
 import json
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from cnpgen.cli import values
 from cnpgen.cli.parser import Commands, Parser, add_command, add_engine, add_json
 from cnpgen.cli.progress import Meter
+from cnpgen.errors import CnpgenError, UsageError
 
 if TYPE_CHECKING:
     from cnpgen.benchmark.run_suite import Benchmark
@@ -96,7 +99,6 @@ def run(arguments: argparse.Namespace) -> int:
     from cnpgen.benchmark.html_report import save_benchmark_report
     from cnpgen.benchmark.paper_figures import save_benchmark_figures
     from cnpgen.benchmark.result_tables import save_benchmark_tables
-    from cnpgen.errors import UsageError
 
     if arguments.list:
         print(_listing(as_json=arguments.json))
@@ -123,34 +125,15 @@ def run(arguments: argparse.Namespace) -> int:
 def _search(arguments: argparse.Namespace) -> int:
     """Search for parameters of one planner and print the trials, the best one first."""
     from cnpgen.benchmark.parameter_search import SEARCH_FILE, csv_of, search_parameters
-    from cnpgen.errors import UsageError
 
     (planner, *others), ranges = {name for name, _, _ in arguments.search}, {k: ends for _, k, ends in arguments.search}
     if others or arguments.planners not in (None, [planner]) or arguments.set or arguments.repeat != 1:
         raise UsageError("--search has fields of one planner, without --planners, --set and --repeat")
     folder = arguments.out or Path(f"{Path(arguments.suite).stem}-search")
-    try:
+    with _kept(folder):
         trials = search_parameters(
-            arguments.suite,
-            folder,
-            planner,
-            ranges,
-            trials=arguments.trials,
-            seed=arguments.seed,
-            n=arguments.n,
-            plants=(arguments.plant or ("nominal",)) if arguments.simulate else (),
-            environment=arguments.environment,
-            time_limit=arguments.time_limit,
-            plane_tolerance=arguments.plane_tolerance,
-            workers=arguments.workers,
-            engine=arguments.engine,
-            address=arguments.address,
-            replan=arguments.replan,
-            force=arguments.force,
+            arguments.suite, folder, planner, ranges, trials=arguments.trials, **_options(arguments)
         )
-    except KeyboardInterrupt as interruption:
-        kept = f"{folder} keeps all finished problems; run the same command again to resume"
-        raise type(interruption)(kept) from interruption
     documents = json.dumps([asdict(trial) for trial in trials], indent=2) + "\n"
     sys.stdout.write(documents if arguments.json else csv_of(trials, list(ranges)))
     print(f"trials: {folder / SEARCH_FILE}", file=sys.stderr)
@@ -168,32 +151,34 @@ def _run(arguments: argparse.Namespace, folder: Path) -> "Benchmark":
             meter.begin(what, total, done - 1)
         meter(1)
 
-    try:
+    with meter, _kept(folder):
         return run_benchmark(
             arguments.suite,
             folder,
             planners=arguments.planners or FASTEST,
-            n=arguments.n,
-            plants=(arguments.plant or ("nominal",)) if arguments.simulate else (),
-            environment=arguments.environment,
-            time_limit=arguments.time_limit,
-            workers=arguments.workers,
-            engine=arguments.engine,
-            address=arguments.address,
-            seed=arguments.seed,
             repeat=arguments.repeat,
-            plane_tolerance=arguments.plane_tolerance,
             reference=arguments.reference,
             parameters=_parameters(arguments.set),
-            replan=arguments.replan,
-            force=arguments.force,
             progress=progress,
+            **_options(arguments),
         )
+
+
+def _options(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return the options of a run and of the runs of a search."""
+    names = ("n", "environment", "time_limit", "seed", "plane_tolerance", "workers", "engine", "address")
+    plants = (arguments.plant or ("nominal",)) if arguments.simulate else ()
+    return {"plants": plants, **{name: getattr(arguments, name) for name in (*names, "replan", "force")}}
+
+
+@contextmanager
+def _kept(folder: Path) -> Iterator[None]:
+    """Name the folder of the results in the message of an interruption."""
+    try:
+        yield
     except KeyboardInterrupt as interruption:
         kept = f"{folder} keeps all finished problems; run the same command again to resume"
         raise type(interruption)(kept) from interruption
-    finally:
-        meter.close()
 
 
 def _parameters(fields: list[tuple[str, str, Any]]) -> dict[str, dict[str, Any]]:
@@ -255,7 +240,6 @@ def _listing(*, as_json: bool) -> str:
 def _summary(planner: str) -> str:
     """Describe a planner in one line, or report why it cannot be used."""
     from cnpgen.cli.describe_keys import kind_summary
-    from cnpgen.errors import CnpgenError
     from cnpgen.schema import registry
 
     try:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from cnpgen.cli.parser import Commands, Parser, add_command, add_json
 from cnpgen.cli.plan_files import check_suffix
+from cnpgen.errors import counted
 
 if TYPE_CHECKING:
     from cnpgen.make.complete import Completed
@@ -73,8 +74,6 @@ def _facts(found: "Completed", out: Path) -> dict[str, object]:
 
 def _summary(found: "Completed") -> list[str]:
     """Summarize how many tasks have an answer, and the reasons of the others."""
-    from cnpgen.errors import counted
-
     lines = [f"{len(found):,} of {counted(len(found.reasons), 'task')} completed"]
     for reason, count in found.rejections.items():
         indices = [task for task, why in enumerate(found.reasons) if why == reason][:MAX_LISTED_TASKS]

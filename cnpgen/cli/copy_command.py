@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cnpgen.cli.parser import Commands, Parser, add_command
+from cnpgen.errors import UsageError
 
 if TYPE_CHECKING:
     from cnpgen.cli.describe import Recipe
@@ -37,7 +38,6 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     from cnpgen.cli.recipe_names import check_recipe
     from cnpgen.cli.show_command import load_any
-    from cnpgen.errors import UsageError
     from cnpgen.store.files.atomic import write_file
 
     check_recipe(arguments.recipe)
@@ -59,7 +59,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _name(folder: Path) -> str:
     """Return the name of recipes in a folder."""
-    from cnpgen.errors import UsageError
     from cnpgen.schema.keys import NAME
 
     name = folder.resolve().name

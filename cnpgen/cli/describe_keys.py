@@ -138,12 +138,9 @@ def _default(key: Key) -> str:
 def _expected(key: Key) -> str:
     """Describe the accepted values: ``"a length [m], at least 0"``."""
     bounds = {"at least": key.low, "at most": key.high}
-    said = [f"{which} {_exactly(bound)}" for which, bound in bounds.items() if bound is not None]
+    given = ((which, bound) for which, bound in bounds.items() if bound is not None)
+    said = [f"{which} {bound}" if isinstance(bound, int) else f"{which} {bound:g}" for which, bound in given]
     return ", ".join([key.expected, *said])
-
-
-def _exactly(bound: float) -> str:
-    return str(bound) if isinstance(bound, int) else f"{bound:g}"
 
 
 def _table_to_dict(cls: type) -> dict[str, Any]:
@@ -160,8 +157,6 @@ def _key_to_dict(key: Key) -> dict[str, Any]:
         return content | {"kinds": [kind_to_dict(group, use) for use in registry.names(group)]}
     if part is not None:
         return content | {"table": _table_to_dict(part)}
-    return content if key.required else content | {"default": _plain_default(key.default)}
-
-
-def _plain_default(value: Any) -> Any:
-    return [value.low, value.high] if isinstance(value, Range) else value
+    if key.required:
+        return content
+    return content | {"default": [key.default.low, key.default.high] if isinstance(key.default, Range) else key.default}

@@ -1,10 +1,11 @@
 """Output of ``make-dataset --dry-run``: the specification of a dataset and the state of its folder."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from cnpgen.cli.describe import table
 from cnpgen.errors import DatasetError, UsageError
+from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.make.recipe_file import load_notes
 from cnpgen.make.resolve_spec import dataset_folder, draw_up
 from cnpgen.store.dataset_spec import DatasetSpec, shards
@@ -13,14 +14,11 @@ from cnpgen.store.shard import storage_dtype
 from cnpgen.store.shard_record import pending
 from cnpgen.store.workspace import Workspace, check_clearable, find_workspace, started_spec
 
-if TYPE_CHECKING:
-    from cnpgen.make.recipe import DatasetRecipe
-
 SHARD_OVERHEAD = 41_000  # bytes: what the HDF5 file and the sidecar of a shard take beside the rows
 DOCUMENTS = 90_000  # bytes: specification.json, manifest, card and statistics
 
 
-def spec_text(recipe: "DatasetRecipe", out: str | None, *, force: bool, **settings: Any) -> str:
+def spec_text(recipe: DatasetRecipe, out: str | None, *, force: bool, **settings: Any) -> str:
     """Resolve the specification of a dataset without making anything, and describe it.
 
     Args:

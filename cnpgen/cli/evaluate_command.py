@@ -10,7 +10,16 @@ from cnpgen.cli import values
 from cnpgen.cli.parser import Commands, Parser, add_command, add_json
 from cnpgen.cli.plan_files import read_plans
 from cnpgen.cli.progress import Meter
-from cnpgen.cli.trajectory_options import TRAJECTORY_OPTIONS, add_trajectory_options
+from cnpgen.cli.trajectory_options import (
+    TRAJECTORY_OPTIONS,
+    add_trajectory_options,
+    listing_text,
+    load_file,
+    problem_of,
+    summary_text,
+    write_json,
+)
+from cnpgen.errors import DatasetError, UsageError
 
 if TYPE_CHECKING:
     from cnpgen.plans.evaluate import Evaluation
@@ -80,8 +89,6 @@ def add(commands: "Commands[Parser]") -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
-    from cnpgen.errors import UsageError
-
     if arguments.plan is not None and not arguments.plot:
         raise UsageError("--plan needs --plot")
     if _holds_trajectories(arguments.file):
@@ -110,8 +117,6 @@ def _holds_trajectories(file: Path) -> bool:
 
 def _refuse_trajectory_options(arguments: argparse.Namespace) -> None:
     """Refuse options of sampled trajectories for a plan file."""
-    from cnpgen.errors import UsageError
-
     for name in (*TRAJECTORY_OPTIONS, "payload", "interpolation", "max_jerk", "noise"):
         if getattr(arguments, name) is not None:
             raise UsageError(f"--{name.replace('_', '-')} is for sampled trajectories, {arguments.file} holds plans")
@@ -119,8 +124,6 @@ def _refuse_trajectory_options(arguments: argparse.Namespace) -> None:
 
 def _run_trajectories(arguments: argparse.Namespace) -> int:
     """Judge sampled trajectories."""
-    from cnpgen.cli.trajectory_options import listing_text, load_file, problem_of, summary_text, write_json
-    from cnpgen.errors import UsageError
     from cnpgen.plans.evaluate_trajectories import evaluate_trajectories
 
     if arguments.tracking_error is not None:
@@ -130,10 +133,9 @@ def _run_trajectories(arguments: argparse.Namespace) -> int:
     if arguments.plan is not None and arguments.plan >= len(loaded.trajectories):
         count = len(loaded.trajectories)
         raise UsageError(f"{arguments.file} has no trajectory {arguments.plan}: {count} are numbered from 0")
-    meter = Meter(quiet=not sys.stderr.isatty(), noun="trajectory")
-    meter.begin(f"judging {arguments.file}", len(loaded.trajectories))
     noise, jerk = arguments.noise or (0.0,), arguments.max_jerk
-    try:
+    with Meter(quiet=not sys.stderr.isatty(), noun="trajectory") as meter:
+        meter.begin(f"judging {arguments.file}", len(loaded.trajectories))
         found = evaluate_trajectories(
             problem,
             loaded.trajectories,
@@ -144,8 +146,6 @@ def _run_trajectories(arguments: argparse.Namespace) -> int:
             workers=arguments.workers or 1,
             progress=meter,
         )
-    finally:
-        meter.close()
     if arguments.json:
         write_json(arguments.file, found, loaded.labels)
     else:
@@ -158,16 +158,14 @@ def _run_trajectories(arguments: argparse.Namespace) -> int:
 
 
 def _evaluate(arguments: argparse.Namespace) -> "Evaluation":
-    from cnpgen.errors import UsageError
     from cnpgen.plans.evaluate import evaluate_plans
 
     plans = read_plans(arguments.file, problem=arguments.problem)
     if arguments.plan is not None and arguments.plan >= len(plans):
         raise UsageError(f"{arguments.file} has no plan {arguments.plan}: {len(plans)} plans are numbered from 0")
-    meter = Meter(quiet=not sys.stderr.isatty(), noun="plan")
-    meter.begin(f"judging {arguments.file}", len(plans))
-    try:
-        error = arguments.tracking_error
+    error = arguments.tracking_error
+    with Meter(quiet=not sys.stderr.isatty(), noun="plan") as meter:
+        meter.begin(f"judging {arguments.file}", len(plans))
         return evaluate_plans(
             plans,
             step=arguments.step,
@@ -175,8 +173,6 @@ def _evaluate(arguments: argparse.Namespace) -> "Evaluation":
             workers=arguments.workers,
             progress=meter,
         )
-    finally:
-        meter.close()
 
 
 def _write_json(file: Path, found: "Evaluation") -> None:
@@ -220,8 +216,6 @@ def _draw_trajectory(found: "TrajectoryEvaluation", picture: str, index: int | N
 
 def _chosen(found: "Evaluation") -> int:
     """Choose the plan to draw: the first invalid one that can be drawn, else the first that can be drawn."""
-    from cnpgen.errors import DatasetError
-
     able = [index for index, verdict in enumerate(found.verdicts) if verdict.margins]
     if not able:
         raise DatasetError("none of the plans can be drawn: none can be evaluated")

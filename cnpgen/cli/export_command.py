@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from cnpgen.cli import values
 from cnpgen.cli.parser import Commands, Parser, add_command
 from cnpgen.cli.plan_files import read_plans
+from cnpgen.errors import UsageError, counted
 
 if TYPE_CHECKING:
     from cnpgen.plans import Plans
@@ -85,7 +86,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _plans(arguments: argparse.Namespace) -> "Plans | JoinedPlans":
     """Read the plans, and join them with the following ones."""
-    from cnpgen.errors import UsageError, counted
     from cnpgen.plans.join import join_plans
 
     plans: Plans | JoinedPlans = read_plans(arguments.file)
@@ -99,8 +99,6 @@ def _plans(arguments: argparse.Namespace) -> "Plans | JoinedPlans":
 
 
 def _counted(exported: "Exported") -> str:
-    from cnpgen.errors import counted
-
     all_plans = exported.count + len(exported.refused)
     return counted(exported.count, "plan") + (f" of {all_plans:,}" if exported.refused else "")
 
@@ -114,8 +112,6 @@ def _invalid(exported: "Exported") -> str:
 
 def _place(arguments: argparse.Namespace, exporter: "Exporter") -> Path:
     """Return the output path, which must not exist without ``--force``."""
-    from cnpgen.errors import UsageError
-
     file: Path = arguments.file
     name = f"{file.stem}{exporter.suffix}" if exporter.single_file else f"{file.stem}-{arguments.to}"
     out: Path = arguments.out or Path(name)
@@ -131,8 +127,6 @@ def _place(arguments: argparse.Namespace, exporter: "Exporter") -> Path:
 def _chosen(plans: "Plans | JoinedPlans", arguments: argparse.Namespace) -> list[int] | None:
     """Return the indices of the selected plans, or None for all of them."""
     import numpy as np
-
-    from cnpgen.errors import UsageError
 
     if arguments.plan is None and arguments.sample is None:
         return None

@@ -9,6 +9,7 @@ from cnpgen.cli import values
 from cnpgen.cli.parser import Commands, Parser, add_command
 from cnpgen.cli.plan_files import check_suffix
 from cnpgen.cli.trajectory_options import add_trajectory_options, load_file, problem_of
+from cnpgen.errors import UsageError, counted
 
 if TYPE_CHECKING:
     from cnpgen.plans import Plans
@@ -40,7 +41,6 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     import numpy as np
 
-    from cnpgen.errors import UsageError, counted
     from cnpgen.plans.import_trajectories import import_trajectories
     from cnpgen.plans.save import check_replaceable, save_plans
 

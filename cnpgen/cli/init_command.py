@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from cnpgen.cli.parser import Commands, Parser, add_command
+from cnpgen.errors import UsageError
 
 _TEXT = """\
 The command writes NAME/problem.toml, NAME/pipeline.toml and NAME/dataset.toml: motions from rest to rest between two
@@ -86,7 +87,6 @@ def _folder(name: str) -> Path:
     """Return the folder of recipes of a name, which may be a path."""
     import re
 
-    from cnpgen.errors import UsageError
     from cnpgen.schema.keys import NAME
 
     folder = Path(name)
@@ -96,8 +96,6 @@ def _folder(name: str) -> Path:
 
 
 def _refuse(there: list[str]) -> None:
-    from cnpgen.errors import UsageError
-
     if there:
         raise UsageError(f"{', '.join(there)} exists already: --force writes over it")
 

@@ -4,6 +4,7 @@ import argparse
 from typing import Any
 
 from cnpgen.cli.parser import Commands, Parser, add_command, add_json
+from cnpgen.errors import RecipeError
 
 WHAT = ("datasets", "models", "pipelines", "problems", "stages", "constraints", "objectives", "exporters")
 
@@ -107,7 +108,6 @@ def _problems() -> list[dict[str, Any]]:
 def _summary(group: str, name: str) -> str:
     """Return one line about a kind; a broken plug-in must not hide the others."""
     from cnpgen.cli.describe_keys import kind_summary
-    from cnpgen.errors import RecipeError
     from cnpgen.schema import registry
 
     try:

@@ -9,7 +9,7 @@ from cnpgen.cli import values
 from cnpgen.cli.interruption import raise_if_interrupted
 from cnpgen.cli.parser import Commands, Parser, add_command, add_engine
 from cnpgen.cli.progress import Meter
-from cnpgen.errors import counted
+from cnpgen.errors import UsageError, counted
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -67,7 +67,6 @@ def add(commands: "Commands[Parser]") -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     from cnpgen.cli.recipe_names import check_recipe
-    from cnpgen.errors import UsageError
     from cnpgen.make.recipe_file import load_dataset_recipe
 
     check_recipe(arguments.recipe, of_dataset="'cnpgen make-dataset NAME --out {0}' resumes it")

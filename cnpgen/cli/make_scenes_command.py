@@ -9,6 +9,7 @@ from typing import Any
 from cnpgen.cli import values
 from cnpgen.cli.parser import Commands, Parser, add_command, add_json
 from cnpgen.cli.progress import Meter
+from cnpgen.errors import UsageError
 
 _TEXT = """\
 A family draws furniture and objects around the robot. Goals are grasp-like poses, for which inverse kinematics finds
@@ -52,7 +53,6 @@ def family_parameter(text: str) -> tuple[str, Any]:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
-    from cnpgen.errors import UsageError
     from cnpgen.pipelines.families.scene_generator import make_scenes
     from cnpgen.problems.scenes.scene_files import save_scenes
 
@@ -65,9 +65,8 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError(f"{' and '.join(missing)} must be given; 'cnpgen make-scenes --list' lists families")
     out = arguments.out or Path(f"{arguments.family}-scenes.h5")
     _check_place(out, force=arguments.force)
-    meter = Meter(quiet=arguments.quiet, noun="problem")
-    meter.begin(f"making {arguments.family}", arguments.n)
-    try:
+    with Meter(quiet=arguments.quiet, noun="problem") as meter:
+        meter.begin(f"making {arguments.family}", arguments.n)
         scenes = make_scenes(
             arguments.family,
             arguments.robot,
@@ -77,8 +76,6 @@ def run(arguments: argparse.Namespace) -> int:
             parameters=dict(arguments.set),
             progress=meter,
         )
-    finally:
-        meter.close()
     save_scenes(out, scenes)
     obstacles = [len(scene.obstacles) for scene in scenes]
     facts = {"file": str(out), "problems": len(scenes), "scenes": len({id(scene.obstacles) for scene in scenes})}
@@ -90,8 +87,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _check_place(out: Path, *, force: bool) -> None:
-    from cnpgen.errors import UsageError
-
     if out.suffix not in {"", ".h5", ".hdf5"}:
         raise UsageError(f"{out} must end in .h5 or .hdf5, or be a folder for YAML files")
     if not out.parent.is_dir():

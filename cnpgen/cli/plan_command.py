@@ -10,7 +10,7 @@ from cnpgen.cli.parser import Commands, Parser, add_command, add_engine, add_jso
 from cnpgen.cli.plan_files import check_suffix
 from cnpgen.cli.recipe_names import is_recipe
 from cnpgen.cli.refine_options import LARGE_ANGLES, REFINING, WORKERS, add_refining, check_place, refine_and_save
-from cnpgen.errors import counted
+from cnpgen.errors import UsageError, counted
 
 if TYPE_CHECKING:
     from cnpgen.planner.model import Model
@@ -92,7 +92,6 @@ def _complete(arguments: argparse.Namespace) -> None:
     Raises:
         UsageError: One of them is missing, and there is no default.
     """
-    from cnpgen.errors import UsageError
     from cnpgen.planner.model_file import shipped_models
 
     name, recipe = arguments.problems, is_recipe(arguments.problems)
@@ -107,8 +106,6 @@ def _complete(arguments: argparse.Namespace) -> None:
 
 def _check(arguments: argparse.Namespace) -> None:
     """Refuse contradictory arguments and existing output before any work."""
-    from cnpgen.errors import UsageError
-
     default = arguments.parser.get_default
     lost = [
         name
@@ -134,7 +131,6 @@ def _save(arguments: argparse.Namespace, plans: "Plans", seconds: float) -> int:
 
 
 def _requests(arguments: argparse.Namespace, model: "Model") -> "Requests":
-    from cnpgen.errors import UsageError
     from cnpgen.planner.plan_requests import read_file, read_rows
     from cnpgen.problems.scenes.scene_files import holds_scenes
 
@@ -161,7 +157,6 @@ def _requests(arguments: argparse.Namespace, model: "Model") -> "Requests":
 
 def _scenes(arguments: argparse.Namespace, model: "Model") -> "Requests":
     """Read the problems of scenes."""
-    from cnpgen.errors import UsageError
     from cnpgen.planner.scene_requests import scene_requests
     from cnpgen.problems.scenes.scene_files import load_scenes
 
@@ -172,7 +167,6 @@ def _scenes(arguments: argparse.Namespace, model: "Model") -> "Requests":
 
 def _draws(arguments: argparse.Namespace, model: "Model") -> "Requests":
     """Draw fresh problems of a recipe."""
-    from cnpgen.errors import UsageError
     from cnpgen.make.draw_boundary_problems import draw_boundary_problems
     from cnpgen.make.recipe_file import load_dataset_recipe
     from cnpgen.planner.plan_requests import Requests, check_stages, checked_boundary, context_columns

@@ -3,6 +3,8 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from cnpgen.errors import DatasetError, UsageError
+
 if TYPE_CHECKING:
     from cnpgen.plans import Plans
 
@@ -13,7 +15,6 @@ def read_plans(path: Path, *, problem: str | None = None) -> "Plans":
     Raises:
         DatasetError: The file has no plans, or as ``load_plans``.
     """
-    from cnpgen.errors import DatasetError
     from cnpgen.plans import load_plans
 
     plans = load_plans(path, problem=problem)
@@ -29,7 +30,5 @@ def checksum_text(plans: "Plans") -> str:
 
 def check_suffix(out: Path) -> None:
     """Refuse an output file that does not end in .h5."""
-    from cnpgen.errors import UsageError
-
     if out.suffix != ".h5":
         raise UsageError(f"{out} must be a file that ends in .h5, in a folder that exists")

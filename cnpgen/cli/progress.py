@@ -84,6 +84,12 @@ class Meter:
         if self._bar is not None:
             self._bar.set_postfix_str(text, refresh=False)
 
+    def __enter__(self) -> "Meter":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
     def close(self) -> None:
         """Remove the bar."""
         if self._bar is not None:

@@ -3,6 +3,8 @@
 from contextlib import suppress
 from pathlib import Path
 
+from cnpgen.errors import UsageError, either, nearest
+
 DATASET = "'cnpgen inspect {0}' describes it, 'cnpgen validate {0}' checks it"
 _HINTS = {  # what a file is -> what to do with it
     "a file of plans": "'cnpgen evaluate {0}' judges them",
@@ -22,7 +24,6 @@ def check_recipe(recipe: str, *, of_dataset: str = DATASET) -> None:
     Raises:
         UsageError: It is one of these.
     """
-    from cnpgen.errors import UsageError
     from cnpgen.store.paths import file_kind
     from cnpgen.store.workspace import is_dataset
 
@@ -58,8 +59,6 @@ def check_there(what: str, *kinds: str) -> None:
     Raises:
         UsageError: There is nothing of the kind.
     """
-    from cnpgen.errors import UsageError, either, nearest
-
     kinds = kinds or ("dataset", "pipeline")
     names = _shipped(*kinds)
     if Path(what).exists() or what in names:

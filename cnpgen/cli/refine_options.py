@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from cnpgen.cli import values
 from cnpgen.cli.parser import Options, Parser, add_engine, add_json
 from cnpgen.cli.progress import Meter
-from cnpgen.errors import counted
+from cnpgen.errors import UsageError, counted
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -143,7 +143,6 @@ def refine_and_save(
 
 def check_place(out: Path, *, force: bool) -> None:
     """Refuse an output path before any work if it cannot be written or exists."""
-    from cnpgen.errors import UsageError
     from cnpgen.plans.save import check_replaceable
 
     if out.is_dir() or not out.parent.is_dir():
@@ -174,14 +173,14 @@ def _explain(facts: dict[str, Any], found: "Refinement | SolvedScenes", meter: M
 
 def _summary(facts: dict[str, Any], times: "Times", *, listed: int) -> list[str]:
     """Summarize the refined plans."""
-    from cnpgen.refine.refine_plans import outcome_text
+    from cnpgen.refine.task import Outcome
 
     mean = facts["mean_duration_s"]
     lines = [
         f"{facts['valid']:,} of {counted(facts['plans'], 'plan')} valid in {times}"
         + ("" if mean is None else f"; mean motion time {mean:.4f} s")
     ]
-    lines += [f"  {count:,} {outcome_text(name)}" for name, count in facts["outcomes"].items()]
+    lines += [f"  {count:,} {Outcome[name.upper()].text}" for name, count in facts["outcomes"].items()]
     for failure in facts["not_valid"][:listed]:
         lines += textwrap.wrap(_failure_text(failure), 110, subsequent_indent="  ")
     if len(facts["not_valid"]) > listed:

@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING
 from cnpgen.cli.parser import Commands, Parser, add_command, add_json
 from cnpgen.cli.recipe_names import check_recipe
 from cnpgen.errors import RecipeError, UsageError, nearest
-from cnpgen.schema.toml import MARKS
+from cnpgen.schema.toml import MARKS, Kind, kind_of_file
 
 if TYPE_CHECKING:
     from cnpgen.cli.describe import Recipe
-    from cnpgen.schema.toml import Kind
 
-KINDS: tuple["Kind", ...] = ("dataset", "pipeline", "problem")  # a dataset includes the other two
+KINDS: tuple[Kind, ...] = ("dataset", "pipeline", "problem")  # a dataset includes the other two
 
 
 _TEXT = """\
@@ -74,7 +73,7 @@ def _about_kinds(arguments: argparse.Namespace) -> str:
     return render(plain(found)) if arguments.json else str(found)
 
 
-def load_any(name_or_path: str, kind: "Kind | None" = None) -> "Recipe":
+def load_any(name_or_path: str, kind: Kind | None = None) -> "Recipe":
     """Load a recipe of any kind; of several with the same name the one that includes the others.
 
     Raises:
@@ -90,10 +89,9 @@ def load_any(name_or_path: str, kind: "Kind | None" = None) -> "Recipe":
     return load_pipeline(name_or_path) if kind == "pipeline" else load_problem(name_or_path)
 
 
-def _kind(name_or_path: str) -> "Kind":
+def _kind(name_or_path: str) -> Kind:
     """Determine the kind of a recipe."""
     from cnpgen.schema.catalogue import list_recipes
-    from cnpgen.schema.toml import kind_of_file
 
     path = Path(name_or_path)
     if path.is_file():

@@ -10,6 +10,7 @@ from cnpgen.cli import values
 from cnpgen.cli.parser import Commands, Parser, add_command, add_json
 from cnpgen.cli.plan_files import read_plans
 from cnpgen.cli.progress import Meter
+from cnpgen.errors import UsageError, counted
 
 if TYPE_CHECKING:
     from cnpgen.benchmark.simulator.plant import Plant
@@ -54,27 +55,33 @@ def add(commands: "Commands[Parser]") -> None:
     option("--workers", metavar="W", type=values.positive, help="processes; default one per available core")
     option("--list", action="store_true", help="also list the plans, one per line")
     option("--plan", metavar="I", type=values.natural, default=0, help="plan to draw (default: 0)")
-    option("--image", metavar="PICTURE", type=_picture, help="draw the world at the end of one plan: .png")
-    option("--video", metavar="FILM", type=_film, help="film one plan: .mp4 or .gif")
+    option(
+        "--image",
+        metavar="PICTURE",
+        type=lambda text: values.picture_file(text, ".png"),
+        help="draw the world at the end of one plan: .png",
+    )
+    option(
+        "--video",
+        metavar="FILM",
+        type=lambda text: values.picture_file(text, ".mp4", ".gif"),
+        help="film one plan: .mp4 or .gif",
+    )
     add_json(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     from cnpgen.benchmark.simulator.simulate import simulate_plans
-    from cnpgen.errors import UsageError
 
     plans = read_plans(arguments.file, problem=arguments.problem)
     if arguments.plan >= len(plans):
         raise UsageError(f"{arguments.file} has no plan {arguments.plan}: {len(plans)} plans are numbered from 0")
-    meter = Meter(quiet=not sys.stderr.isatty(), noun="plan")
-    meter.begin(f"executing {arguments.file}", len(plans))
-    try:
+    with Meter(quiet=not sys.stderr.isatty(), noun="plan") as meter:
+        meter.begin(f"executing {arguments.file}", len(plans))
         found = simulate_plans(
             plans, plant=arguments.plant, environment=arguments.environment, workers=arguments.workers, progress=meter
         )
-    finally:
-        meter.close()
     if arguments.json:
         rows = [{"plan": index, **each.to_dict()} for index, each in enumerate(found.executed)]
         print(json.dumps({"file": str(arguments.file), **found.summary(), "executed": rows}, indent=2))
@@ -89,7 +96,6 @@ def run(arguments: argparse.Namespace) -> int:
 def _text(file: Path, found: "Simulation") -> str:
     """Lay out what came of all plans together."""
     from cnpgen.cli.describe import table
-    from cnpgen.errors import counted
 
     summary, count = found.summary(), len(found.executed)
     head = f"{file}: {counted(count, 'plan')} of {found.plans.problem.name}, executed by the {found.plant.name} plant"
@@ -132,11 +138,3 @@ def _draw(arguments: argparse.Namespace, plan: "Plans", plant: "Plant") -> None:
     if arguments.video:
         save_film(Path(arguments.video), scene, execution, reference.ticks)
         print(f"filmed: plan {arguments.plan} in {arguments.video}", file=sys.stderr)
-
-
-def _picture(text: str) -> str:
-    return values.picture_file(text, ".png")
-
-
-def _film(text: str) -> str:
-    return values.picture_file(text, ".mp4", ".gif")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from cnpgen.cli import values
 from cnpgen.cli.parser import Commands, Parser, add_command
 from cnpgen.cli.refine_options import LARGE_ANGLES, TEXT, add_options, refine_and_save
+from cnpgen.errors import DatasetError, UsageError
 
 if TYPE_CHECKING:
     from cnpgen.make.solve_scenes import SolvedScenes
@@ -90,7 +91,6 @@ def _name(what: Path) -> str:
 
 def _problems(arguments: argparse.Namespace) -> "Plans":
     """Read or draw the boundary problems, by what it is that was given."""
-    from cnpgen.errors import UsageError
     from cnpgen.problems.scenes.scene_files import holds_scenes
     from cnpgen.store.paths import file_kind
 
@@ -115,7 +115,6 @@ def _rows(arguments: argparse.Namespace) -> "Plans":
 
 
 def _conditions(arguments: argparse.Namespace) -> "Plans":
-    from cnpgen.errors import DatasetError
     from cnpgen.plans.boundary_problems import load_boundary_problems
 
     _refuse(arguments, ["split", "first", "n"], "--split, --first and --n need the folder of a dataset, got a file")
@@ -130,7 +129,6 @@ def _conditions(arguments: argparse.Namespace) -> "Plans":
 
 def _draws(arguments: argparse.Namespace) -> "Plans":
     from cnpgen.cli.recipe_names import check_recipe, check_there
-    from cnpgen.errors import UsageError
     from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 
     check_there(arguments.what)
@@ -145,7 +143,5 @@ def _draws(arguments: argparse.Namespace) -> "Plans":
 
 def _refuse(arguments: argparse.Namespace, options: Sequence[str], why: str) -> None:
     """Refuse options that mean nothing here."""
-    from cnpgen.errors import UsageError
-
     if any(getattr(arguments, name) is not None for name in options):
         raise UsageError(why)

@@ -10,6 +10,7 @@ from cnpgen.cli import values
 from cnpgen.cli.parser import Commands, Parser, add_command
 from cnpgen.cli.train_options import add_settings, changed_settings, passed_settings
 from cnpgen.cli.train_text import Watch, summary
+from cnpgen.errors import MachineError
 
 if TYPE_CHECKING:
     from cnpgen.training.settings import TrainingSettings
@@ -140,7 +141,6 @@ def _command(arguments: argparse.Namespace) -> str:
 
 def _draw(trained: "Trained") -> None:
     """Draw the learning curve where that is possible."""
-    from cnpgen.errors import MachineError
     from cnpgen.training.curve import plot_curve
 
     try:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from cnpgen.cli import values
 from cnpgen.cli.parser import Parser
+from cnpgen.errors import UsageError
 
 if TYPE_CHECKING:
     from cnpgen.training.settings import TrainingSettings
@@ -139,7 +140,6 @@ def changed_settings(settings: "TrainingSettings", arguments: argparse.Namespace
     Raises:
         UsageError: A value is invalid, or an option has no effect on the metric.
     """
-    from cnpgen.errors import UsageError
     from cnpgen.training.settings import METRICS
 
     changes = {name: getattr(arguments, name) for name in _OPTIONS if getattr(arguments, name) is not None}

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from cnpgen.cli import values
 from cnpgen.cli.parser import Options
+from cnpgen.errors import UsageError
 
 if TYPE_CHECKING:
     from cnpgen.plans.evaluate_trajectories import TrajectoryEvaluation
@@ -33,7 +34,6 @@ def add_trajectory_options(option: Options) -> None:
 
 def problem_of(arguments: argparse.Namespace) -> "str | Problem":
     """Return the problem of a command, with the payload of its options."""
-    from cnpgen.errors import UsageError
     from cnpgen.problems.problem_record import as_problem
     from cnpgen.robots.robot_spec import Payload
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from cnpgen.cli import values
 from cnpgen.cli.parser import Commands, Parser, add_command, add_engine, add_json
 from cnpgen.cli.progress import Meter
+from cnpgen.errors import DatasetError
 
 if TYPE_CHECKING:
     from cnpgen.validate.validate_dataset import ValidationReport
@@ -70,17 +71,13 @@ def _validate(arguments: argparse.Namespace) -> "ValidationReport":
     rows = _rows(arguments.folder) if arguments.deep else 0
     if not rows:
         return validate_dataset(arguments.folder, **options)
-    meter = Meter(quiet=arguments.quiet)
-    meter.begin(f"validating {arguments.folder}", rows)
-    try:
+    with Meter(quiet=arguments.quiet) as meter:
+        meter.begin(f"validating {arguments.folder}", rows)
         return validate_dataset(arguments.folder, **options, progress=meter)
-    finally:
-        meter.close()
 
 
 def _rows(folder: Path) -> int:
     """Return the number of samples to check; 0 if the specification is damaged, which validation reports."""
-    from cnpgen.errors import DatasetError
     from cnpgen.store.dataset_spec import load_dataset_spec, shards
     from cnpgen.store.shard_record import is_committed
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from cnpgen.cli import values
 from cnpgen.cli.parser import Commands, Parser, add_command
+from cnpgen.errors import DatasetError, UsageError
 
 if TYPE_CHECKING:
     from cnpgen.cli.view.view_scene import ViewScene
@@ -47,13 +48,15 @@ def add(commands: "Commands[Parser]") -> None:
     text = "the problem of plans or rows, whose URDF leads to its visual meshes"
     option("--problem", metavar="NAME|FILE", help=text)
     where = parser.add_mutually_exclusive_group()
-    where.add_argument("-o", "--out", metavar="OUT", type=_page, help="output file (default: NAME.html)")
+    where.add_argument(
+        "-o",
+        "--out",
+        metavar="OUT",
+        type=lambda text: values.picture_file(text, ".html"),
+        help="output file (default: NAME.html)",
+    )
     text = "serve the page on this machine, and show every change of its files (default port: 8000)"
     where.add_argument("--serve", metavar="PORT", type=values.port, nargs="?", const=8000, help=text)
-
-
-def _page(text: str) -> str:
-    return values.picture_file(text, ".html")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -122,8 +125,6 @@ def _scene(arguments: argparse.Namespace) -> "ViewScene":
 
 def _check_rows(rows: Sequence[int]) -> None:
     """Refuse more rows than a page may have."""
-    from cnpgen.errors import UsageError
-
     if len(rows) > MAX_ROWS_OF_PAGE:
         raise UsageError(f"--rows: expected at most {MAX_ROWS_OF_PAGE} rows on one page, got {len(rows)}")
 
@@ -139,8 +140,6 @@ def _verdicts(plans: "Plans", *, of_samples: bool) -> "list[Verdict | None]":
 
 def _refuse_for_problem(arguments: argparse.Namespace) -> None:
     """Refuse options that do not apply to a problem."""
-    from cnpgen.errors import UsageError
-
     extra = [name for name in ("row", "rows", "split", "problem") if getattr(arguments, name) is not None]
     if extra:
         raise UsageError(f"--{extra[0]} needs plans or the folder of a dataset, got {arguments.what}")
@@ -148,7 +147,6 @@ def _refuse_for_problem(arguments: argparse.Namespace) -> None:
 
 def _samples(arguments: argparse.Namespace, rows: Sequence[int]) -> "tuple[Plans, int]":
     """Read rows of a dataset, and count those of the split."""
-    from cnpgen.errors import DatasetError
     from cnpgen.plans.boundary_problems import load_boundary_problems
     from cnpgen.plans.concatenate import concatenate
     from cnpgen.problems.problem_file import load_problem_behind
@@ -168,7 +166,6 @@ def _samples(arguments: argparse.Namespace, rows: Sequence[int]) -> "tuple[Plans
 def _plans(arguments: argparse.Namespace, rows: Sequence[int]) -> "tuple[Plans, int]":
     """Read plans, and count those of the file."""
     from cnpgen.cli.plan_files import read_plans
-    from cnpgen.errors import UsageError
 
     if arguments.split:
         raise UsageError(f"--split is for the folder of a dataset, got {arguments.what}")

@@ -17,13 +17,10 @@ def _if_else_zero(condition: Any, value: Any, out: Array) -> None:
     out[...] = np.where(np.not_equal(condition, 0.0), value, 0.0)  # a product would turn 0 * inf into nan
 
 
-def _twice(x: Any, out: Array) -> None:
-    np.add(x, x, out=out)
-
-
 _APPLY: dict[str, Callable[..., Any]] = {
     "ADD": np.add, "SUB": np.subtract, "MUL": np.multiply, "DIV": np.divide, "NEG": np.negative, "SQ": np.square,
-    "TWICE": _twice, "INV": np.reciprocal, "SQRT": np.sqrt, "FABS": np.abs, "SIGN": np.sign, "SIN": np.sin,
+    "TWICE": lambda x, out: np.add(x, x, out=out),
+    "INV": np.reciprocal, "SQRT": np.sqrt, "FABS": np.abs, "SIGN": np.sign, "SIN": np.sin,
     "COS": np.cos,
     "EXP": np.exp, "FMIN": np.fmin, "FMAX": np.fmax, "LT": np.less, "LE": np.less_equal, "EQ": np.equal,
     "NE": np.not_equal, "NOT": np.logical_not, "AND": np.logical_and, "OR": np.logical_or,

@@ -17,10 +17,6 @@ class InMemoryRows:
 
     Two threads may load at the same time, since both write the same values.
 
-    Args:
-        source: Shards of the split.
-        row_format: Format of the rows.
-
     Attributes:
         packed: Memory for all rows, in their stored order.
     """

@@ -77,7 +77,8 @@ class Normalization:
         Raises:
             DatasetError: A field has no statistics here.
         """
-        missing = [field.name for field in fields if field.name not in self.mean and not _is_of_scene(field)]
+        of_scenes = {OBSTACLE_POSES, *(item.name for item in SCENE_ARRAYS)}  # never normalized
+        missing = [field.name for field in fields if field.name not in {*self.mean, *of_scenes}]
         if missing:
             raise DatasetError(
                 f"there are no statistics to normalize {', '.join(missing)} with, only those of {', '.join(self.mean)}"
@@ -86,11 +87,6 @@ class Normalization:
         mean = [self.mean.get(name, np.zeros(count)) for name, count in width.items()]
         scale = [self.scale.get(name, np.ones(count)) for name, count in width.items()]
         return np.concatenate([empty, *mean]), np.concatenate([empty, *scale])
-
-
-def _is_of_scene(field: Field) -> bool:
-    """Return whether a field is one of scenes, which is never normalized."""
-    return field.name == OBSTACLE_POSES or field.name in {item.name for item in SCENE_ARRAYS}
 
 
 def _as_type_of(values: Any, numbers: Floats) -> Any:

@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
+from cnpgen.kernels.collision.clearance_loss import ClearanceLoss
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.losses.plan_batch import PlanBatch
 from cnpgen.losses.quadrature import BasisTable
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.observation.scene_primitives import scene_primitives
+from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene import Scene
-
-if TYPE_CHECKING:
-    from cnpgen.kernels.collision.clearance_loss import ClearanceLoss
-    from cnpgen.robots.robot import Robot
 
 Array = NDArray[Any]
 
@@ -86,8 +84,6 @@ def make_hull_loss(problem: Problem, robot: Robot, kernels: KernelLibrary, tight
         UsageError: The problem has no constraint ``robot-clearance``, or its robot no link geometry.
         MachineError: Kernels are not compiled on this machine.
     """
-    from cnpgen.kernels.collision.clearance_loss import ClearanceLoss
-
     constraint = problem.first(RobotClearance)
     if constraint is None:
         raise UsageError(f"the problem {problem.name!r} has no constraint robot-clearance", concerns="problem")

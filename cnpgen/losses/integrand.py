@@ -6,7 +6,7 @@ functions) and the quadrature weight of the node.
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from cnpgen.kernels.symbolic.symbolic_state import FrozenState, SymbolicState, time_derivatives
 from cnpgen.kernels.tape import Axes, GridSpec
@@ -14,9 +14,7 @@ from cnpgen.losses.published_conditions import published_conditions
 from cnpgen.losses.terms import Term, constraint_term, task_term
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.problem import Problem
-
-if TYPE_CHECKING:
-    from cnpgen.robots.robot import Robot
+from cnpgen.robots.robot import Robot
 
 
 def grid_specs(problem: Problem) -> tuple[GridSpec, GridSpec]:
@@ -60,7 +58,7 @@ class Inputs:
         return [*self.path, *(column for name, column in vars(self).items() if name != "path")]
 
 
-def loss_values(robot: "Robot", problem: Problem, *, form: str) -> Any:
+def loss_values(robot: Robot, problem: Problem, *, form: str) -> Any:
     """Build ``inputs -> terms``: the summands of the quadrature, without the weights of constraints."""
     import casadi as ca
 
@@ -68,7 +66,7 @@ def loss_values(robot: "Robot", problem: Problem, *, form: str) -> Any:
     return ca.Function("loss_values", inputs.columns, ca.cse(state.unfrozen([_stacked(inputs, terms)])))
 
 
-def loss_gradient(robot: "Robot", problem: Problem, *, form: str) -> Any:
+def loss_gradient(robot: Robot, problem: Problem, *, form: str) -> Any:
     """Build ``inputs -> (terms, d/dp, d/dp', ..., d/d(r, r', ...))`` of the weighted sum by reverse-mode AD."""
     import casadi as ca
 
@@ -99,7 +97,7 @@ def has_time_varying_bound(constraint: Constraint) -> bool:
     return type(constraint).bound_relaxation is not Constraint.bound_relaxation
 
 
-def _stage(robot: "Robot", problem: Problem, form: str) -> tuple[Inputs, FrozenState, list[Term]]:
+def _stage(robot: Robot, problem: Problem, form: str) -> tuple[Inputs, FrozenState, list[Term]]:
     """Return the inputs, the state as a function of them, and the terms of the task and the constraints."""
     import casadi as ca
 

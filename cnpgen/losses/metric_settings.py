@@ -15,9 +15,7 @@ from cnpgen.schema.argument_types import check_fields, checked_arguments
 from cnpgen.schema.arguments import numbers
 
 Kind = Literal["fixed", "ramped", "learned"]
-METRIC_KINDS: tuple[Kind, ...] = ("fixed", "ramped", "learned")
 Average = Literal["mean", "median", "trimmed"]
-AVERAGES: tuple[Average, ...] = ("mean", "median", "trimmed")
 
 WEIGHT_FACTOR = 100.0  # of the weight in the problem file, for constraint classes without ``training_weight``
 

@@ -1,7 +1,7 @@
 """Time-varying bounds at the nodes, for motions that may start outside a constraint."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +11,7 @@ from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
 from cnpgen.losses.integrand import has_time_varying_bound, penalized_conditions
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.problem import Problem
-
-if TYPE_CHECKING:
-    from cnpgen.robots.robot import Robot
+from cnpgen.robots.robot import Robot
 
 Array = NDArray[Any]
 
@@ -53,7 +51,7 @@ class TimeVaryingBound:
         return np.stack(rows) if rows else np.zeros((0, len(s), len(start_tip)))
 
 
-def make_time_varying_bound(problem: Problem, robot: "Robot", form: str) -> TimeVaryingBound:
+def make_time_varying_bound(problem: Problem, robot: Robot, form: str) -> TimeVaryingBound:
     """Collect the conditions of a problem with time-varying bounds."""
     import casadi as ca
 

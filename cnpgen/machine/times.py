@@ -1,5 +1,7 @@
 """Times of a run: preparation (including the compilation of kernels that are not cached), computation, waiting."""
 
+from __future__ import annotations
+
 import time
 from dataclasses import asdict, dataclass, field
 
@@ -22,6 +24,9 @@ class Times:
     def passed(self) -> float:
         """Total elapsed time [s]."""
         return self.preparing + self.computing + self.waiting
+
+    def __add__(self, other: Times) -> Times:
+        return Times(self.preparing + other.preparing, self.computing + other.computing, self.waiting + other.waiting)
 
     def __str__(self) -> str:
         return (

@@ -14,6 +14,7 @@ from cnpgen.make.stage_planner import SHA256, load_stage_planner, model_sha256, 
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.stage import CandidateBatch, Stage, StageFunction
 from cnpgen.plans.format import BOUNDARY
+from cnpgen.refine.refine_engine import load_solver
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
 
@@ -73,8 +74,6 @@ class CertifiedPlan(Stage):
         """Load the refiner."""
         if context.dtype != "float64":
             raise RecipeError([f"plans meet their boundary conditions in float64 only: needs it, got {context.dtype}"])
-        from cnpgen.refine.refine_engine import load_solver
-
         solver = load_solver(context.problem, context.robot, context.kernels)
         solver_of_scenes = SceneSolver(context)
         planner = load_stage_planner(self.model, self.sha256, context) if self.model else None

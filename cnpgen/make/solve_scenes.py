@@ -28,9 +28,10 @@ from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import as_problem
 from cnpgen.problems.scene_capacity import Capacity
 from cnpgen.problems.scenes.scene_problem import GoalPose, SceneError, SceneProblem, check_scenes, checked_scene
+from cnpgen.refine.goal_options import Progress
 from cnpgen.refine.options import DEFAULT_OPTIONS, RefineOptions
 from cnpgen.refine.proof.explain import explain_plans
-from cnpgen.refine.refine_plans import Progress, solve_plans
+from cnpgen.refine.refine_plans import solve_plans
 from cnpgen.refine.refinement import Refinement
 from cnpgen.refine.task import Attempt
 from cnpgen.robots.robot import Robot
@@ -96,17 +97,8 @@ def solve_scenes(
     several goal states, the ``MAX_GOAL_STATES`` collision-free ones with the fastest straight lines are tried, and the
     result is the best valid motion to any of them. A goal pose without goal states gets some by inverse kinematics.
 
-    Args:
-        problem: The robot's problem, such as "panda"; obstacles of the scenes are added to its own.
-        scenes: The scenes.
-        options: See ``refine_plans``.
-        workers: See ``refine_plans``.
-        engine: See ``refine_plans``.
-        address: See ``refine_plans``.
-        journal: File for finished plans; further files beside it have its name and a number.
-        discard: See ``refine_plans``.
-        begin: See ``refine_plans``.
-        progress: See ``refine_plans``.
+    ``problem`` is the robot's problem, such as "panda"; obstacles of the scenes are added to its own. The other
+    arguments are those of ``refine_plans``. The names of the journals are that of ``journal`` with a number.
 
     Raises:
         SceneError: A scene does not fit the robot.
@@ -176,7 +168,7 @@ class _SceneRun:
             begin=lambda _, finished: self._report(finished, finished),
             progress=self._report,
         )
-        self._times = _sum(self._times, refinement.times)
+        self._times += refinement.times
         columns = {name: values for name, values in refinement.plans.columns.items() if name != GOAL_OPTION}
         chosen = replace(refinement.plans, columns=columns)
         wide = with_wider_capacity(chosen, self.problem, own, self._capacity)
@@ -191,10 +183,6 @@ class _SceneRun:
         """Return all plans, those of all capacities in one set."""
         plans, results = zip(*(self._found[index] for index in range(len(self.scenes))), strict=True)
         return SolvedScenes(tuple(self.scenes), concatenate(plans), results, self._times)
-
-
-def _sum(first: Times, second: Times) -> Times:
-    return Times(**{name: value + getattr(second, name) for name, value in vars(first).items()})
 
 
 def _goals(problem: Problem, robot: Robot, scene: SceneProblem, index: int) -> Array:

@@ -10,6 +10,8 @@ from cnpgen.errors import RecipeError
 from cnpgen.pipelines.context import Context
 from cnpgen.plans.format import CONDITIONS
 from cnpgen.problems.problem_record import record_problem
+from cnpgen.store.files.atomic import file_sha256
+from cnpgen.store.paths import require_file
 from cnpgen.trajectory.boundary import Boundary
 
 if TYPE_CHECKING:
@@ -27,8 +29,6 @@ def model_sha256(model: str) -> str:
         UsageError: There is no such model.
     """
     from cnpgen.planner.model_file import find_model
-    from cnpgen.store.files.atomic import file_sha256
-    from cnpgen.store.paths import require_file
 
     path = find_model(model)
     require_file(path, "a model")

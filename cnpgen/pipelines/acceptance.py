@@ -4,7 +4,7 @@ The check is independent of the stages: it makes no assumption about their conve
 """
 
 from collections.abc import Collection
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -17,12 +17,10 @@ from cnpgen.pipelines.stages.stage import CandidateBatch, StageFunction
 from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES, End
 from cnpgen.problems.constraints.needs import symbolic_needs
 from cnpgen.problems.problem import Problem
+from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene_arrays import scene_capacity
 from cnpgen.store.field import Field
 from cnpgen.store.scene_table import SCENE_ID
-
-if TYPE_CHECKING:
-    from cnpgen.robots.robot import Robot
 
 ZERO_VELOCITY_ROUNDING_M_S = 1e-14  # rounding error of a velocity that is zero in exact arithmetic
 
@@ -83,7 +81,7 @@ def acceptance(context: Context, written: set[str], *, given: Collection[End] = 
 
 
 def boundary_unmet(
-    robot: "Robot", problem: Problem, *, end: End, needs: int, dtype: str, exact: bool = True, hitting: bool = False
+    robot: Robot, problem: Problem, *, end: End, needs: int, dtype: str, exact: bool = True, hitting: bool = False
 ) -> Any:
     """Build ``(q, dq, ddq, obstacle_poses, position) -> unmet``, positive for violations above tolerance and for nan.
 

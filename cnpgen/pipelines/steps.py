@@ -119,10 +119,6 @@ def prepare_steps(
 ) -> list[tuple[str, StageFunction]]:
     """Prepare and label every stage.
 
-    Args:
-        steps: Stages of the pipeline.
-        prepare: Function that prepares one stage.
-
     Raises:
         RecipeError: Stages cannot be prepared; the error lists all mistakes with file and stage.
     """

@@ -115,7 +115,7 @@ class BoundaryLayer:
                 line_projection_steps=self._line_projection_steps,
                 expected_time=self._expected_time,
                 fixed_at_goal=self._fixed_at_goal,
-                placed=self.problem.obstacle if self.problem.has_sample_obstacles else (),
+                placed=self.problem.sample_obstacles,
             )
             return prepare, make_projection(
                 problem, kernels, steps=self.projection_steps, fixed_at_goal=self._fixed_at_goal

@@ -7,20 +7,18 @@ uses ``control_points``, in float32 and with gradients, followed by ``path_chang
 start_q, start_dq, start_ddq, goal_q, goal_dq, and goal_ddq if the goal fixes three control points.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from cnpgen.kernels.symbolic.kinematics import forward_kinematics, tip_velocity
 from cnpgen.kernels.symbolic.linalg import Vec, symbols
 from cnpgen.planner.gauss_newton import projection_change
 from cnpgen.problems.problem import Problem
+from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.spline import end_derivatives
-
-if TYPE_CHECKING:
-    from cnpgen.robots.robot import Robot
-    from cnpgen.trajectory.trajectory_spec import TrajectorySpec
+from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
 
-def tips_at_ends(robot: "Robot", problem: Problem, *, fixed_at_goal: int) -> Any:
+def tips_at_ends(robot: Robot, problem: Problem, *, fixed_at_goal: int) -> Any:
     """Build ``ends -> (start position, goal position)`` of the tip [m], and its velocity at the goal if it is used."""
     import casadi as ca
 
@@ -34,7 +32,7 @@ def tips_at_ends(robot: "Robot", problem: Problem, *, fixed_at_goal: int) -> Any
 
 
 def line_change(
-    robot: "Robot", problem: Problem, *, steps: int, fixed_at_goal: int, within_limits: bool, with_offsets: bool
+    robot: Robot, problem: Problem, *, steps: int, fixed_at_goal: int, within_limits: bool, with_offsets: bool
 ) -> Any:
     """Build ``(ends, rate, obstacle_poses) -> change`` of the line's interior points at a constant rate [1/s].
 
@@ -58,7 +56,7 @@ def line_change(
     return ca.Function("line_change", columns, [ca.cse(_column(change))])
 
 
-def projected_path(robot: "Robot", problem: Problem, *, steps: int, fixed_at_goal: int, within_limits: bool) -> Any:
+def projected_path(robot: Robot, problem: Problem, *, steps: int, fixed_at_goal: int, within_limits: bool) -> Any:
     """Build ``(ends, offsets, rates, obstacle_poses) -> path``: line plus offsets [rad], projected."""
     import casadi as ca
 
@@ -85,7 +83,7 @@ def projected_path(robot: "Robot", problem: Problem, *, steps: int, fixed_at_goa
     return ca.Function("projected_path", [ends_sx, offsets_sx, rates_sx, poses_sx], [ca.cse(_column(points))])
 
 
-def path_change(robot: "Robot", problem: Problem, *, steps: int, fixed_at_goal: int, within_limits: bool) -> Any:
+def path_change(robot: Robot, problem: Problem, *, steps: int, fixed_at_goal: int, within_limits: bool) -> Any:
     """Build ``(path, obstacle_poses) -> change`` of the interior control points."""
     import casadi as ca
 
@@ -93,9 +91,7 @@ def path_change(robot: "Robot", problem: Problem, *, steps: int, fixed_at_goal: 
     return ca.Function("path_change", [path, obstacle_poses], [ca.cse(change)])
 
 
-def path_change_adjoint(
-    robot: "Robot", problem: Problem, *, steps: int, fixed_at_goal: int, within_limits: bool
-) -> Any:
+def path_change_adjoint(robot: Robot, problem: Problem, *, steps: int, fixed_at_goal: int, within_limits: bool) -> Any:
     """Build ``(path, obstacle_poses, seed) -> gradient`` of ``seed . change`` by the path, in reverse mode."""
     import casadi as ca
 
@@ -106,7 +102,7 @@ def path_change_adjoint(
 
 
 def _path_change(
-    robot: "Robot", problem: Problem, steps: int, fixed_at_goal: int, within_limits: bool
+    robot: Robot, problem: Problem, steps: int, fixed_at_goal: int, within_limits: bool
 ) -> tuple[Any, Any, Any]:
     points = problem.trajectory.path_control_points
     (path_sx, path), (poses_sx, obstacle_poses) = (
@@ -125,7 +121,7 @@ def _path_change(
     return path_sx, poses_sx, _column(change)
 
 
-def _points(ends: list[Vec], rates: Vec, spec: "TrajectorySpec") -> list[Vec]:
+def _points(ends: list[Vec], rates: Vec, spec: TrajectorySpec) -> list[Vec]:
     """Return all control points of the line (paper, Appendix A; ``trajectory.boundary``)."""
     q, dq, ddq, goal_q, goal_dq, *goal_ddq = ends
     first = _end_points(q, dq, ddq, rates[:2], spec)
@@ -137,7 +133,7 @@ def _points(ends: list[Vec], rates: Vec, spec: "TrajectorySpec") -> list[Vec]:
     return [*first, *line, *last]
 
 
-def _end_points(q: Vec, dq: Vec, ddq: Vec | None, rates: Vec, spec: "TrajectorySpec") -> list[Vec]:
+def _end_points(q: Vec, dq: Vec, ddq: Vec | None, rates: Vec, spec: TrajectorySpec) -> list[Vec]:
     """Return the control points that an end fixes, from the outermost one: two if its acceleration is free."""
     path = end_derivatives(spec.path_control_points, spec.degree)
     gradient = end_derivatives(spec.rate_control_points, spec.degree).eta * (rates[1] - rates[0])

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import reduce
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,14 +13,12 @@ from cnpgen.kernels.symbolic.symbolic_state import SymbolicState, time_derivativ
 from cnpgen.problems.constraints.constraint import MIN_TOLERANCE, Condition
 from cnpgen.problems.constraints.needs import symbolic_needs
 from cnpgen.problems.problem import Problem
-
-if TYPE_CHECKING:
-    from cnpgen.robots.robot import Robot
+from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
 
 
-def equality_residuals(robot: "Robot", problem: Problem) -> Any:
+def equality_residuals(robot: Robot, problem: Problem) -> Any:
     """Build ``(q, obstacle_poses) -> (r, dr/dq)``: residuals of the equalities, Jacobian column by column."""
     import casadi as ca
 
@@ -39,7 +37,7 @@ def equality_residuals(robot: "Robot", problem: Problem) -> Any:
     return ca.Function("equality_residuals", [q_sx, poses_sx], ca.cse([residual, ca.vec(jacobian)]))
 
 
-def speed_residuals(robot: "Robot", problem: Problem) -> Any:
+def speed_residuals(robot: Robot, problem: Problem) -> Any:
     """Build ``(q, dq, ddq, obstacle_poses) -> g``: all bounded values of the problem that depend on velocity.
 
     With jerk constraints it is ``(q, dq, ddq, jerk, obstacle_poses) -> g``.
@@ -61,7 +59,7 @@ def speed_residuals(robot: "Robot", problem: Problem) -> Any:
     return ca.Function("speed_residuals", [q_sx, *state.moving, poses_sx], [g])
 
 
-def speed_violation(robot: "Robot", problem: Problem) -> Any:
+def speed_violation(robot: Robot, problem: Problem) -> Any:
     """Build ``(p, p', p'', r, r', obstacle_poses, in one column) -> e``, the largest violation.
 
     The violation is that of ``speed_residuals``. With jerk constraints the column has p''' after p'' and r'' after r'.
@@ -83,7 +81,7 @@ def speed_violation(robot: "Robot", problem: Problem) -> Any:
     return ca.Function("speed_violation", [ca.vertcat(*columns)], [worst])
 
 
-def speed_coefficients(robot: "Robot", problem: Problem) -> Any:
+def speed_coefficients(robot: Robot, problem: Problem) -> Any:
     """Build ``(the column of speed_violation) -> constant, square, mixed``: coefficients of the rate's bounds.
 
     Values of ``speed_residuals`` that are quadratic in dq, without a linear part, and linear in ddq are ``constant +
@@ -113,7 +111,7 @@ def coefficient_bounds(bounds: "SpeedBounds") -> tuple[Array, Array]:
     return np.append(bounds.lower[others], [-np.inf] * count), np.append(bounds.upper[others], [1.0] * count)
 
 
-def static_violation(robot: "Robot", problem: Problem) -> Any:
+def static_violation(robot: Robot, problem: Problem) -> Any:
     """Build ``(q, obstacle_poses) -> e``: the largest violation of a condition by the robot at rest, in tolerances."""
     import casadi as ca
 
@@ -162,7 +160,7 @@ class SpeedBounds:
     proportional: NDArray[np.bool_]
 
 
-def speed_bounds(robot: "Robot", problem: Problem) -> SpeedBounds:
+def speed_bounds(robot: Robot, problem: Problem) -> SpeedBounds:
     """Return the bounds of the rows of ``speed_residuals``."""
     state, obstacle_poses = (
         _moving(problem, symbols("q", robot.n)[1]),
@@ -185,7 +183,7 @@ def _is_proportional(value: Any, dq: Any, low: float, high: float) -> bool:
     return bool(linear and low < 0 < high and np.isfinite([low, high]).any())
 
 
-def _on_path(robot: "Robot", problem: Problem) -> tuple[list[Any], list[Vec]]:
+def _on_path(robot: Robot, problem: Problem) -> tuple[list[Any], list[Vec]]:
     """Return p, p', p'', ..., r, r', ... and obstacle poses, as SX columns and as lists of their scalars."""
     orders = problem.path_orders
     names = (*(f"p{order}" for order in range(orders)), "rates", "obstacle_poses")
@@ -211,7 +209,7 @@ def _moving(problem: Problem, q: Vec) -> _State:
     return _State(q, dq, ddq, third[0] if third else None, columns)
 
 
-def _conditions(robot: "Robot", problem: Problem, state: _State, obstacle_poses: Vec) -> list[tuple[Condition, int]]:
+def _conditions(robot: Robot, problem: Problem, state: _State, obstacle_poses: Vec) -> list[tuple[Condition, int]]:
     """Return all constraints at a state, each with the highest derivative of q that it depends on."""
     size = problem.object_size
     symbolic = SymbolicState(robot, state.q, state.dq, state.ddq, obstacle_poses, problem.obstacle, size, state.jerk)

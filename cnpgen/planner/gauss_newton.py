@@ -5,7 +5,7 @@ one more phase before the goal, where fast arrivals leave the manifold most. Amo
 to first order, the one with the smallest second differences is taken, so that motions stay smooth.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +13,8 @@ from numpy.typing import NDArray
 from cnpgen.kernels.symbolic.linalg import Vec, add, dot, solve
 from cnpgen.planner.expressions import equality_residuals
 from cnpgen.problems.problem import Problem
+from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.spline import basis, clamped_knots
-
-if TYPE_CHECKING:
-    from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
 
@@ -26,7 +24,7 @@ MAX_STEP_RAD = 0.6  # per control point and joint
 
 
 def projection_change(
-    robot: "Robot",
+    robot: Robot,
     problem: Problem,
     control: list[Vec],
     obstacle_poses: Vec,
@@ -59,7 +57,7 @@ def projection_change(
     return total
 
 
-def _clipped_to_limits(robot: "Robot", point: Vec, step: Vec) -> Vec:
+def _clipped_to_limits(robot: Robot, point: Vec, step: Vec) -> Vec:
     """Change a step so that its end is within the joint limits; then the whole path is, too."""
     import casadi as ca
 

@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,11 +23,9 @@ from cnpgen.plans.plans import Plans
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import ProblemRecord
+from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.spline_motion import Motion
-
-if TYPE_CHECKING:
-    from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
 
@@ -46,7 +43,7 @@ class LoadedProblem:
 
     record: ProblemRecord
     problem: Problem
-    robot: "Robot"
+    robot: Robot
     kernels: KernelLibrary
 
 
@@ -199,7 +196,7 @@ def make_inference_pipeline(
             fixed_at_goal=fixed_at_goal,
             within_limits=config.within_limits,
             via_lines=bool(config.via_points),
-            placed=loaded.problem.obstacle if loaded.problem.has_sample_obstacles else (),
+            placed=loaded.problem.sample_obstacles,
             observed=observed,
         )
         path = kernels.load(

@@ -17,8 +17,6 @@ from cnpgen.planner.tasks import Tasks
 from cnpgen.problems.problem_record import ProblemRecord
 from cnpgen.schema.argument_types import checked_arguments
 
-Array = NDArray[Any]
-
 
 @dataclass(frozen=True, kw_only=True)
 class ModelConfig:

@@ -18,6 +18,7 @@ from cnpgen.problems.problem_record import ProblemRecord, as_record, open_proble
 from cnpgen.store.dataset_spec import DatasetSpec
 from cnpgen.store.files.documents import canonical_sha256
 from cnpgen.store.reader import open_dataset
+from cnpgen.store.scene_table import SCENE_ID
 from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]
@@ -61,9 +62,9 @@ def read_rows(
     check_drawing(str(folder), dataset.spec, model, other=other)
     rows = chosen_rows(folder, dataset.spec, split=split, start=first, n=n)
     stored = {column.name for column in dataset.spec.fields}
-    names = [name for name in ASKED if name in stored]
+    names = [name for name in (*ASKED, SCENE_ID) if name in stored]
     arrays = dataset.read(split, fields=names, start=rows.start, stop=rows.stop)
-    columns = context_columns(arrays | scene_columns(dataset, split, rows))
+    columns = context_columns(arrays | scene_columns(dataset, split, rows, arrays))
     boundary = checked_boundary(str(folder), arrays, model)
     return Requests(boundary, arrays.get("sample_id", np.array(rows)), columns)
 

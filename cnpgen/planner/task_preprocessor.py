@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,12 +19,10 @@ from cnpgen.planner.tasks import MIN_EXPECTED_TIME_S, MIN_TRAVEL_TIME_S, Tasks, 
 from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.obstacle import Obstacle
+from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene import Scene
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.trajectory.boundary import Boundary
-
-if TYPE_CHECKING:
-    from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
 
@@ -150,7 +148,7 @@ class TaskPreprocessor:
 
 def make_task_preprocessor(
     problem: Problem,
-    robot: "Robot",
+    robot: Robot,
     kernels: KernelLibrary,
     *,
     line_projection_steps: int,

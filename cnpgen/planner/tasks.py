@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import reduce
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene import Scene
 from cnpgen.trajectory.boundary import Boundary
-
-if TYPE_CHECKING:
-    from cnpgen.robots.robot import Robot
 
 Array = NDArray[Any]
 
@@ -60,30 +59,15 @@ class Tasks:
 
     def take(self, rows: slice | NDArray[Any]) -> Tasks:
         """Return a subset of the tasks."""
-        return Tasks(
-            self.boundary[rows],
-            self.start_xyz[rows],
-            self.goal_xyz[rows],
-            self.expected_time[rows],
-            self.scene[rows],
-            None if self.correction is None else self.correction[rows],
-            None if self.placed is None else self.placed[rows],
-            None if self.observation is None else self.observation[rows],
-        )
+        return self._converted(lambda part: part[rows])
 
     def astype(self, dtype: str) -> Tasks:
         """Return the tasks in another float type."""
-        parts = {name: None if part is None else np.asarray(part, dtype) for name, part in vars(self.boundary).items()}
-        return Tasks(
-            Boundary(**parts),  # type: ignore[arg-type]
-            self.start_xyz.astype(dtype),
-            self.goal_xyz.astype(dtype),
-            self.expected_time.astype(dtype),
-            self.scene.astype(dtype),
-            None if self.correction is None else self.correction.astype(dtype),
-            None if self.placed is None else self.placed.astype(dtype),
-            None if self.observation is None else self.observation.astype(dtype),
-        )
+        return self._converted(lambda part: part.astype(dtype))
+
+    def _converted(self, convert: Callable[[Any], Any]) -> Tasks:
+        parts: dict[str, Any] = {name: None if part is None else convert(part) for name, part in vars(self).items()}
+        return Tasks(**parts)
 
 
 def expected_time(boundary: Boundary, velocity_limit: Array, *, least: float = MIN_EXPECTED_TIME_S) -> Array:

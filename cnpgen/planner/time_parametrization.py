@@ -13,7 +13,7 @@ from ctypes import c_double, c_long, c_void_p
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,10 +25,8 @@ from cnpgen.kernels.library import KernelLibrary
 from cnpgen.planner.expressions import coefficient_bounds, speed_bounds, speed_coefficients
 from cnpgen.planner.phase_grid import PhaseGrid, blocks_of_motions, make_phase_grid
 from cnpgen.problems.problem import Problem
+from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.spline_motion import Motion
-
-if TYPE_CHECKING:
-    from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
 
@@ -135,13 +133,8 @@ class TimeParametrization(PhaseGrid):
         self.library.parametrize_rates(ctypes.byref(self._c_arguments[0]), len(rate), *addresses)
 
 
-def make_time_parametrization(problem: Problem, robot: "Robot", kernels: KernelLibrary) -> TimeParametrization:
+def make_time_parametrization(problem: Problem, robot: Robot, kernels: KernelLibrary) -> TimeParametrization:
     """Load the time parametrization of one problem.
-
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        kernels: Library of kernels.
 
     Raises:
         UsageError: The problem bounds the jerk, which is no quadratic of the rate.

@@ -7,7 +7,6 @@ depend on the jerk are ``g0 + d / k^3``.
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +16,8 @@ from cnpgen.kernels.library import KernelLibrary
 from cnpgen.planner.expressions import SpeedBounds, speed_bounds, speed_residuals
 from cnpgen.planner.phase_grid import PhaseGrid, blocks_of_motions, make_phase_grid
 from cnpgen.problems.problem import Problem
+from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.spline_motion import Motion, time_derivatives
-
-if TYPE_CHECKING:
-    from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
 
@@ -85,14 +82,8 @@ class TimeScaling(PhaseGrid):
         return np.asarray(needed.max(axis=0, initial=1.0))
 
 
-def make_time_scaling(problem: Problem, robot: "Robot", kernels: KernelLibrary) -> TimeScaling:
-    """Load the time scaling of one problem.
-
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        kernels: Library of kernels.
-    """
+def make_time_scaling(problem: Problem, robot: Robot, kernels: KernelLibrary) -> TimeScaling:
+    """Load the time scaling of one problem."""
     speeds, residuals = make_phase_grid(problem, kernels, SCALING_INTERVALS), kernels.load(speed_residuals)
     return TimeScaling(speeds.violation, speeds.path, speeds.rate, residuals, speed_bounds(robot, problem))
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,16 +20,11 @@ from cnpgen.problems.problem_record import ProblemRecord, as_record, open_proble
 from cnpgen.robots.scene_arrays import scene_poses
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
-from cnpgen.store.dataset_spec import StoredProblem
+from cnpgen.store.dataset_spec import DatasetSpec, StoredProblem
 from cnpgen.store.paths import require_folder
 from cnpgen.store.reader import StoredDataset, open_dataset
 from cnpgen.store.scene_table import SCENE_ID
 from cnpgen.trajectory.boundary import Boundary
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from cnpgen.store.dataset_spec import DatasetSpec
 
 
 @checked_arguments
@@ -83,18 +79,23 @@ def _of_folder(folder: Path, split: str, start: int, n: int | None) -> Plans:
     dataset = open_dataset(folder)
     rows = chosen_rows(folder, dataset.spec, split=split, start=start, n=n)
     source = f"dataset {dataset.spec.name}, seed {dataset.spec.seed}, split {split}"
-    columns = dataset.read(split, start=rows.start, stop=rows.stop) | scene_columns(dataset, split, rows)
+    columns = dataset.read(split, start=rows.start, stop=rows.stop)
+    columns |= scene_columns(dataset, split, rows, columns)
     return plans_of_rows(as_record(dataset.spec.problem), columns, source=source)
 
 
-def scene_columns(dataset: StoredDataset, split: str, rows: range) -> dict[str, NDArray[Any]]:
-    """Return the column with the obstacles of rows of a dataset; none if its samples have no scenes."""
+def scene_columns(
+    dataset: StoredDataset, split: str, rows: range, columns: Mapping[str, NDArray[Any]]
+) -> dict[str, NDArray[Any]]:
+    """Return the column with the obstacles of rows of a dataset; none if its samples have no scenes.
+
+    The columns of the rows contain ``scene_id``.
+    """
     if not dataset.spec.scene_obstacles:
         return {}
     scenes = dataset.read_scenes(split, start=rows.start, stop=rows.stop)
-    ids = dataset.read(split, fields=[SCENE_ID], start=rows.start, stop=rows.stop)[SCENE_ID]
     obstacles = open_problem(as_record(dataset.spec.problem))[0].obstacle
-    return {OBSTACLE_POSES: scene_poses(obstacles, scenes[scenes.rows_of(ids)])}
+    return {OBSTACLE_POSES: scene_poses(obstacles, scenes[scenes.rows_of(columns[SCENE_ID])])}
 
 
 def chosen_rows(folder: Path, spec: DatasetSpec, *, split: str, start: int, n: int | None) -> range:

@@ -37,8 +37,6 @@ from cnpgen.store.files.hdf5 import Column, Hdf5, opened_hdf5
 from cnpgen.store.paths import file_kind, require_file
 from cnpgen.trajectory.boundary import Boundary
 
-Array = NDArray[np.float64]
-
 
 @checked_arguments
 def load_plans(path: str | Path, *, problem: Problem | StoredProblem | str | Path | None = None) -> Plans:

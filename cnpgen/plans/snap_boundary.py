@@ -24,10 +24,6 @@ class StateSnapper:
     """Moves boundary states onto the constraints of a problem by Gauss-Newton steps of minimum norm.
 
     Distances between bodies are not considered.
-
-    Args:
-        problem: The problem.
-        robot: Its robot.
     """
 
     def __init__(self, problem: Problem, robot: Robot) -> None:

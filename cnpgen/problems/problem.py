@@ -102,6 +102,11 @@ class Problem:
         return any(obstacle.position == PARKED_POSITION_M for obstacle in self.obstacle)
 
     @property
+    def sample_obstacles(self) -> tuple[Obstacle, ...]:
+        """The obstacles, with those that stay in place, if samples place some of them; otherwise none."""
+        return self.obstacle if self.has_sample_obstacles else ()
+
+    @property
     def for_planning(self) -> "Problem":
         """The problem without obstacles if samples place them: kernels of planners and losses do not depend on them."""
         return self.with_obstacles(()) if self.has_sample_obstacles else self

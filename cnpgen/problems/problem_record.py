@@ -26,6 +26,7 @@ from cnpgen.schema.arguments import numbers
 from cnpgen.schema.keys import RecipeLocation
 from cnpgen.schema.parsing import parse
 from cnpgen.store.dataset_spec import StoredProblem
+from cnpgen.store.files.cache_folder import temporary_folder
 from cnpgen.store.files.document_structure import ANY_KEY, NUMBER, TEXT, WHOLE, check_structure
 from cnpgen.store.files.documents import canonical_sha256, differences, parse_json, plain
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
@@ -265,8 +266,6 @@ def as_record(problem: object) -> ProblemRecord:
 @lru_cache(maxsize=8)
 def _rebuilt(record: ProblemRecord) -> Problem:
     """Rebuild a problem in a folder that exists until this process ends, since its URDF is read lazily."""
-    from cnpgen.store.files.cache_folder import temporary_folder
-
     return restore_problem(record.content, record.urdf, temporary_folder())
 
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +11,7 @@ from cnpgen.refine.solver.bounds import NO_TIGHTENING, BoundsTemplate
 from cnpgen.refine.solver.grid import make_grid
 from cnpgen.refine.solver.transcription import ResidualKernels, Transcription, cache_last
 from cnpgen.refine.task import RefinementTask
-
-if TYPE_CHECKING:
-    from cnpgen.world.world import World
+from cnpgen.world.world import World
 
 Array = NDArray[np.float64]
 FINE_POINTS = 600
@@ -76,7 +73,7 @@ class FineCheck:
     def __init__(
         self,
         problem: Problem,
-        world: "World",
+        world: World,
         kernels: ResidualKernels,
         *,
         poses: Callable[[RefinementTask], Array],
@@ -181,7 +178,7 @@ class FineCheck:
         return x, cost, violation
 
 
-def _powers_of_rate(problem: Problem, world: "World", kernels: ResidualKernels) -> Array:
+def _powers_of_rate(problem: Problem, world: World, kernels: ResidualKernels) -> Array:
     """Return the power of the rate with which every residual of velocities grows, at least 1, shape (m,)."""
     n, orders, random = world.robot.n, problem.path_orders, np.random.default_rng(0)
     w = np.zeros((orders * n + orders - 1, 2))

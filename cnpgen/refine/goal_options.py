@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
-from cnpgen.machine.times import Times
+from cnpgen.machine.times import NO_TIME
 from cnpgen.plans.concatenate import concatenate
 from cnpgen.plans.format import GOAL_OPTION
 from cnpgen.plans.plans import Plans
@@ -24,7 +24,7 @@ from cnpgen.problems.problem_record import open_problem
 from cnpgen.refine.refinement import Refinement
 
 Array = NDArray[np.float64]
-Progress = Callable[[int, int], None]
+Progress = Callable[[int, int], None]  # called with plans finished and valid since the last call
 
 
 def refine_goal_options(
@@ -113,11 +113,10 @@ def _of_rows(chosen: list[tuple[Refinement, int]]) -> Refinement:
     starts = np.cumsum([0, *(len(part.results) for part in parts)])
     position = {id(part): int(start) for part, start in zip(parts, starts, strict=False)}
     rows = np.array([position[id(refinement)] + row for refinement, row in chosen])
-    times = [vars(part.times) for part in parts]
     return replace(
         parts[0],
         input_plans=concatenate([part.input_plans for part in parts])[rows],
         plans=concatenate([part.plans for part in parts])[rows],
         results=tuple(refinement.results[row] for refinement, row in chosen),
-        times=Times(**{name: sum(part[name] for part in times) for name in times[0]}),
+        times=sum((part.times for part in parts), NO_TIME),
     )

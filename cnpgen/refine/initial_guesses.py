@@ -1,7 +1,5 @@
 """Initial guesses without a plan: lines, a quintic polynomial, and fits to joint-space paths."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,9 +7,7 @@ from cnpgen.robots.solid import place_obstacles
 from cnpgen.trajectory.boundary import Boundary, anchor_line, assemble
 from cnpgen.trajectory.spline import basis
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
-
-if TYPE_CHECKING:
-    from cnpgen.world.world import World
+from cnpgen.world.world import World
 
 Array = NDArray[np.float64]
 RISING_FRACTION, RISING_PHASE = 0.3, 0.3  # first value of a rising rate; fraction of its rising control points
@@ -105,7 +101,7 @@ def fit_to_path(states: Array, boundary: Boundary, velocity_limit: Array, spec: 
     return np.linalg.lstsq(table[:, inner], q - table @ fixed, rcond=None)[0], rate
 
 
-def along_tip_path(world: "World", start_q: Array, goal_q: Array, tip_path: Array) -> Array:
+def along_tip_path(world: World, start_q: Array, goal_q: Array, tip_path: Array) -> Array:
     """Return joint positions along a tip path: Gauss-Newton steps from the joint-space line, of minimum norm.
 
     Args:

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
 from threading import get_ident
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from cnpgen.kernels.library import KernelLibrary, choose_backend, problem_kernel
 from cnpgen.plans.format import OBSTACLE_POSES
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.obstacles import goal_velocities, scene_of
+from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import ProblemRecord, open_problem
 from cnpgen.refine.grid_levels import GridLevels
 from cnpgen.refine.options import DEFAULT_OPTIONS, RefineOptions
@@ -21,15 +22,13 @@ from cnpgen.refine.solver.cost_term import choose_cost_term
 from cnpgen.refine.solver.sqp import Settings
 from cnpgen.refine.strategy import PlanChecker, refine_task, refine_task_until
 from cnpgen.refine.task import Attempt, RefinementTask
+from cnpgen.robots.robot import Robot
+from cnpgen.robots.scene import Scene
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.remaining_trajectory import is_finer
 from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
-
-if TYPE_CHECKING:
-    from cnpgen.problems.problem import Problem
-    from cnpgen.robots.robot import Robot
-    from cnpgen.robots.scene import Scene
+from cnpgen.world.world import World
 
 Array = NDArray[np.float64]
 
@@ -75,7 +74,7 @@ def tasks_of(plans: Plans) -> list[RefinementTask]:
     return [replace(task, path=path, rate=rate) for task, (path, rate) in zip(tasks, control_points, strict=True)]
 
 
-def load_solver(problem: "Problem", robot: "Robot", kernels: KernelLibrary) -> Solver:
+def load_solver(problem: Problem, robot: Robot, kernels: KernelLibrary) -> Solver:
     """Load a function that plans rows of a dataset with the problem's own objective, in one thread.
 
     Args:
@@ -115,7 +114,7 @@ def load_solver(problem: "Problem", robot: "Robot", kernels: KernelLibrary) -> S
     return solve
 
 
-def _tasks(boundary: Boundary, scene: "Scene", start_xyz: Array, goal_xyz: Array) -> list[RefinementTask]:
+def _tasks(boundary: Boundary, scene: Scene, start_xyz: Array, goal_xyz: Array) -> list[RefinementTask]:
     return [RefinementTask(boundary[i : i + 1], scene[i], start_xyz[i], goal_xyz[i]) for i in range(len(boundary))]
 
 
@@ -133,8 +132,8 @@ def _refiner(record: ProblemRecord, spec: TrajectorySpec, options: RefineOptions
 
 
 def load_refiner(
-    problem: "Problem",
-    robot: "Robot",
+    problem: Problem,
+    robot: Robot,
     *,
     spec: TrajectorySpec | None = None,
     options: RefineOptions = DEFAULT_OPTIONS,
@@ -153,8 +152,6 @@ def load_refiner(
         levels: Grid levels, see ``Refiner``.
         coarser: Refiner with the problem's own control points, see ``Refiner``.
     """
-    from cnpgen.world.world import World
-
     if kernels is None:
         kernels = problem_kernels(problem, robot, *choose_backend(None))
     settings = Settings(cost_tolerance=options.tolerance, max_iterations=options.max_iterations)

@@ -22,19 +22,18 @@ from cnpgen.plans.format import GOAL_OPTION, OBSTACLE_POSES
 from cnpgen.plans.plans import Plans, screen
 from cnpgen.plans.status import PlanStatus
 from cnpgen.plans.tips import correct_tips
-from cnpgen.refine.goal_options import refine_goal_options
+from cnpgen.refine.goal_options import Progress, refine_goal_options
 from cnpgen.refine.options import DEFAULT_OPTIONS, RefineOptions
 from cnpgen.refine.refine_engine import prepare, refine_serially
 from cnpgen.refine.refinement import Refinement
 from cnpgen.refine.refinement_journal import Journal, open_journal
-from cnpgen.refine.task import Attempt, Outcome
+from cnpgen.refine.task import Attempt
 from cnpgen.schema.argument_types import checked_arguments
 
 MAX_SERIAL_PLANS = 60  # up to which the start of a second process takes longer than the plans
 PLANS_PER_TASK = 4  # of one of several processes: the transfer of a task takes a twentieth of a plan's time
 
 Array = NDArray[np.float64]
-Progress = Callable[[int, int], None]  # called with plans finished and valid since the last call
 
 
 @checked_arguments
@@ -55,21 +54,8 @@ def solve_plans(
     Problems with the column ``goal_option`` are goal states of tasks: rows with the same ``sample_id`` belong to one
     task, and the result has the best valid motion to any of its goal states, one row for each task.
 
-    Args:
-        problems: Boundary problems of ``draw_boundary_problems`` or ``load_boundary_problems``.
-        options: See ``refine_plans``.
-        workers: See ``refine_plans``.
-        engine: See ``refine_plans``.
-        address: See ``refine_plans``.
-        journal: See ``refine_plans``.
-        discard: See ``refine_plans``.
-        begin: See ``refine_plans``.
-        progress: See ``refine_plans``.
-
-    Raises:
-        UsageError: See ``refine_plans``.
-        RecipeError: See ``refine_plans``.
-        MachineError: See ``refine_plans``.
+    ``problems`` come from ``draw_boundary_problems`` or ``load_boundary_problems``. The other arguments, and the
+    errors, are those of ``refine_plans``.
     """
     without_plans = replace(
         problems,
@@ -217,8 +203,3 @@ def _identity(plans: Plans, options: RefineOptions) -> str:
     return json.dumps(
         {"version": __version__, "options": options.document(), "degree": plans.degree, "plans": digest.hexdigest()}
     )
-
-
-def outcome_text(name: str) -> str:
-    """Return the description of an outcome by its lower-case name."""
-    return Outcome[name.upper()].text

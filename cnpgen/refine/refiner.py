@@ -2,9 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import cached_property
 from threading import get_ident
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,18 +26,17 @@ from cnpgen.refine.solver.residuals import stage_jacobian, stage_values
 from cnpgen.refine.solver.sqp import DEFAULT_SETTINGS, Result, Settings, minimize
 from cnpgen.refine.solver.transcription import ResidualKernels, Transcription
 from cnpgen.refine.task import Attempt, Outcome, RefinementTask
+from cnpgen.robots.robot import Robot
 from cnpgen.robots.solid import pose_width
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
-
-if TYPE_CHECKING:
-    from cnpgen.robots.robot import Robot
-    from cnpgen.world.world import World
+from cnpgen.world.world import World
 
 Array = NDArray[np.float64]
 MAX_INPUT_DURATION_S = 60.0  # of an input plan that is used as initial guess; slower ones hardly change in a step
 MIN_RATE_FRACTION = 1e-3  # of a plan's largest rate control point
 MAX_END_VIOLATION = 10.0  # of boundary states, in scaled units; DAQP may take hours for larger ones
+MAX_CONTINUATIONS = 4  # of a motion that was scaled in time; most need one
 MAX_FEEDBACKS = 5  # of collisions between grid points to the solver
 SLOWNESS = 1.6  # times slower than the bounds of speeds require: the solver changes such guesses more easily
 
@@ -66,10 +63,10 @@ class Refiner:
     def __init__(
         self,
         problem: Problem,
-        robot: "Robot",
+        robot: Robot,
         *,
         kernels: KernelLibrary,
-        world: "World",
+        world: World,
         spec: TrajectorySpec | None = None,
         cost_term: CostTerm | None = None,
         settings: Settings = DEFAULT_SETTINGS,
@@ -200,6 +197,20 @@ class Refiner:
             result = self._separated(task, level, result)
         return self.measured(task, result.x, outcome, result.iterations)
 
+    def continue_scaled(self, task: RefinementTask, best: Attempt) -> Attempt:
+        """Optimize a motion that was scaled in time again, while it becomes cheaper.
+
+        Uniform time scaling makes the whole motion slower for the violation at a single phase.
+        """
+        for _ in range(MAX_CONTINUATIONS):
+            if best.outcome is not Outcome.TIME_SCALED:
+                break
+            again = self.solve(task, self.levels.warm, best.variables, Outcome.SOLVED)
+            if not (again.violation <= 1 and again.cost < best.cost):
+                break
+            best = replace(again, iterations=best.iterations + again.iterations)
+        return best
+
     def fed_back(
         self, task: RefinementTask, attempt: Attempt, phase: float, depth: float, extra: Array | None
     ) -> tuple[Attempt, Array] | None:
@@ -299,12 +310,12 @@ class Refiner:
 
     def other_guesses(self, task: RefinementTask) -> list[Array]:
         """Return the variables of the other initial guesses."""
-        arguments = self._guess_arguments(task)
+        arguments, center = self._guess_arguments(task), (self.robot.position_lower + self.robot.position_upper) / 2
         guesses = [
             initial_guesses.straight_line(*arguments),
             initial_guesses.line_through(*arguments, configuration=self.robot.base),
             initial_guesses.quintic(*arguments),
-            initial_guesses.line_through(*arguments, configuration=self._range_center),
+            initial_guesses.line_through(*arguments, configuration=center),
         ]
         return [*self.tip_path_guesses(task), *(self.slow_guess(task, guess) for guess in guesses)]
 
@@ -334,10 +345,6 @@ class Refiner:
         if thread not in self._hulls:
             self._hulls[thread] = Hulls(self.problem, self.robot, self._library)
         return self._hulls[thread]
-
-    @cached_property
-    def _range_center(self) -> Array:
-        return (self.robot.position_lower + self.robot.position_upper) / 2
 
     def _guess_arguments(self, task: RefinementTask) -> tuple[Boundary, Array, TrajectorySpec]:
         return task.boundary, self.robot.velocity_limit, self.spec

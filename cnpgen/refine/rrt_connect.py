@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +18,7 @@ from numpy.typing import NDArray
 from cnpgen.refine.fine_check import RestBounds
 from cnpgen.refine.solver.hulls import Hulls
 from cnpgen.refine.solver.transcription import ResidualKernels
-
-if TYPE_CHECKING:
-    from cnpgen.robots.robot import Robot
+from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
 Follow = Callable[[Array], Array]  # states (n, K) of an edge -> the leading valid ones, projected, (n, k)
@@ -54,7 +51,7 @@ class RestSpace:
     """
 
     kernels: ResidualKernels
-    robot: "Robot"
+    robot: Robot
     bounds: RestBounds
     obstacle_poses: Array
     hulls: Hulls | None = None
@@ -188,7 +185,7 @@ def follow_line(begin: Array, end: Array, follow: Follow) -> tuple[Array, bool]:
     return states[:, 1:].T, states.shape[1] == 1 + count
 
 
-def find_paths(start: Array, goal: Array, robot: "Robot", follow: Follow) -> Iterator[Array]:
+def find_paths(start: Array, goal: Array, robot: Robot, follow: Follow) -> Iterator[Array]:
     """Yield valid paths between two configurations: the line, if it is valid, or several paths of the trees.
 
     Args:
@@ -211,7 +208,7 @@ def find_paths(start: Array, goal: Array, robot: "Robot", follow: Follow) -> Ite
         yield path
 
 
-def find_path(start: Array, goal: Array, robot: "Robot", follow: Follow, *, seed: int) -> Array | None:
+def find_path(start: Array, goal: Array, robot: Robot, follow: Follow, *, seed: int) -> Array | None:
     """Search for one path by RRT-Connect.
 
     Args:

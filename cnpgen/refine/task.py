@@ -15,6 +15,7 @@ from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.spline import basis
 
 Array = NDArray[np.float64]
+MAX_JUDGED_VIOLATION = 3.0  # tolerances on the fine grid; attempts with larger ones are judged only without better ones
 DISTANCE_PHASES = 512  # at which motions are compared with their input path
 
 

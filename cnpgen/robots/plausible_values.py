@@ -11,8 +11,6 @@ from cnpgen.errors import UsageError
 from cnpgen.robots.robot import Robot
 from cnpgen.store.joint_units import unit_of
 
-Array = NDArray[np.float64]
-
 MAX_RANGE_RATIO = 2.0  # distance from the center of a joint's range, in half ranges
 MAX_LIMIT_RATIO = (
     10.0  # of velocities, accelerations and positions of the tip; deg/s is 57 times rad/s, mm 1,000 times m

@@ -173,7 +173,12 @@ def _check_of_type(hint: Any, *, strict: bool) -> Check | None:
     kind = get_origin(hint) or hint
     if kind is Literal:
         return functools.partial(_choice, get_args(hint))
-    known: dict[Any, Check] = {int: _whole, bool: flag, str: _text, float: _real if strict else number}
+    known: dict[Any, Check] = {
+        int: functools.partial(integer, least=None),
+        bool: flag,
+        str: _text,
+        float: _real if strict else number,
+    }
     known |= {collections.abc.Callable: _callable, np.ndarray: _array if strict else _masked}
     if kind in known:
         return known[kind]
@@ -194,10 +199,6 @@ def _array(name: str, value: Any) -> Any:
     if not isinstance(value, np.ndarray):
         raise UsageError(f"must be an array of NumPy, got {type(value).__name__}", argument=name)
     return value
-
-
-def _whole(name: str, value: Any) -> int:
-    return integer(name, value, least=None)
 
 
 def _real(name: str, value: Any) -> float:

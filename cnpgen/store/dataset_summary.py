@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -62,6 +61,20 @@ class DatasetSummary:
         """Sampling statistics of the whole dataset."""
         return merge_sampling(list(self.sampling_by_split.values()))
 
+    @property
+    def seconds(self) -> float:
+        """Computing time of all processes together [s]."""
+        return sum(record.seconds for _, record in self.records)
+
+    @cached_property
+    def environments(self) -> list[dict[str, str]]:
+        """Different combinations of versions of cnpgen, Python and libraries that made the shards."""
+        environments: list[dict[str, str]] = []
+        for _, record in self.records:
+            if (versions := dict(record.versions)) not in environments:
+                environments.append(versions)
+        return environments
+
     @cached_property
     def statistics(self) -> dict[str, dict[str, FieldStatistics]]:
         """Statistics of every split with finished shards: split -> field -> statistics."""
@@ -105,14 +118,10 @@ def _load_record_with_fields(folder: Path, spec: DatasetSpec, task: ShardTask) -
 
 def unfinished(summary: DatasetSummary) -> str:
     """Describe the progress of an unfinished dataset, with a hint."""
-    return f"unfinished: {progress_text(summary)}; {RERUN_HINT}"
-
-
-def progress_text(summary: DatasetSummary) -> str:
-    """Describe how many shards of an unfinished dataset are finished."""
+    progress = "all shards are finished, but the manifest is missing"
     if summary.problems:
-        return f"{len(summary.records)} of {summary.n_shards} shards are finished"
-    return "all shards are finished, but the manifest is missing"
+        progress = f"{len(summary.records)} of {summary.n_shards} shards are finished"
+    return f"unfinished: {progress}; {RERUN_HINT}"
 
 
 def stats_document(summary: DatasetSummary) -> dict[str, Any]:
@@ -121,10 +130,9 @@ def stats_document(summary: DatasetSummary) -> dict[str, Any]:
         "format": STATS_FORMAT,
         "format_version": STATS_VERSION,
         "specification_fingerprint": summary.spec.fingerprint,
-        "splits": {split: _fields_json(fields) for split, fields in summary.statistics.items()},
+        "splits": {
+            split: {name: item.to_json() for name, item in fields.items()}
+            for split, fields in summary.statistics.items()
+        },
         "densities": {split: densities_to_json(item.densities) for split, item in summary.sampling_by_split.items()},
     }
-
-
-def _fields_json(fields: Mapping[str, FieldStatistics]) -> dict[str, Any]:
-    return {name: item.to_json() for name, item in fields.items()}

@@ -84,16 +84,12 @@ class Inspection:
     @property
     def seconds(self) -> float:
         """Computing time of all processes together [s]."""
-        return sum(record.seconds for _, record in self.summary.records)
+        return self.summary.seconds
 
-    @cached_property
+    @property
     def environments(self) -> list[dict[str, str]]:
         """Different combinations of versions of cnpgen, Python and libraries that made the shards."""
-        environments: list[dict[str, str]] = []
-        for _, record in self.summary.records:
-            if (versions := dict(record.versions)) not in environments:
-                environments.append(versions)
-        return environments
+        return self.summary.environments
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything for JSON."""

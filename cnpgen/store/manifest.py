@@ -172,10 +172,6 @@ def data_fingerprint(files: Iterable[tuple[str, str]]) -> str:
 def _origin(summary: DatasetSummary) -> dict[str, Any]:
     """Describe the origin of the samples; "environments" are all combinations of versions that made shards."""
     spec = summary.spec
-    environments: list[dict[str, str]] = []
-    for _, record in summary.records:
-        if (versions := dict(record.versions)) not in environments:
-            environments.append(versions)
     pipeline = spec.recipe.get("pipeline")
     return {
         "pipeline": pipeline.get("name", "") if isinstance(pipeline, dict) else pipeline,
@@ -189,8 +185,8 @@ def _origin(summary: DatasetSummary) -> dict[str, Any]:
         "shard_size": spec.shard_size,
         "robot": spec.robot,
         "versions": spec.versions,
-        "environments": environments,
-        "seconds": sum(record.seconds for _, record in summary.records),
+        "environments": summary.environments,
+        "seconds": summary.seconds,
     }
 
 

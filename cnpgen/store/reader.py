@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, lacks
-from cnpgen.store.checked_shard import Shard, read_checked, read_scenes, recorded_shard
+from cnpgen.store.checked_shard import Shard, read_rows, read_scenes, recorded_shard
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, load_dataset_spec, shards
 from cnpgen.store.dataset_summary import summarize_dataset, unfinished
 from cnpgen.store.intact import require_intact
@@ -68,7 +68,7 @@ class StoredDataset:
         """
         names = self._names(fields)
         for task in self.tasks(split):
-            yield task, self._read(task, names)
+            yield task, read_rows(self._checked(task), names)
 
     def read(
         self, split: str, *, fields: Sequence[str] | None = None, start: int = 0, stop: int | None = None
@@ -97,7 +97,7 @@ class StoredDataset:
         for task in tasks:
             low, high = max(start - task.first_row, 0), min(stop - task.first_row, task.rows)
             if low < high:
-                columns = self._read(task, names)
+                columns = read_rows(self._checked(task), names)
                 for name in names:
                     parts[name].append(columns[name][low:high])
         return {name: np.concatenate(items) for name, items in parts.items()}
@@ -129,15 +129,13 @@ class StoredDataset:
 
     def _checked(self, task: ShardTask) -> Shard:
         """Verify a shard and return it."""
-        size, sha256 = self._recorded.get(task.file) or _size_and_sha256(self.folder, task)
+        if (recorded := self._recorded.get(task.file)) is None:
+            record = load_record(self.folder, task)
+            recorded = record.bytes, record.sha256
+        size, sha256 = recorded
         shard = recorded_shard(self.folder, self.spec, task, size=size, sha256=sha256)
         require_intact(shard.path, size=shard.size, sha256=shard.sha256)
         return shard
-
-    def _read(self, task: ShardTask, names: Sequence[str]) -> dict[str, NDArray[Any]]:
-        """Verify a shard and read fields of it."""
-        size, sha256 = self._recorded.get(task.file) or _size_and_sha256(self.folder, task)
-        return read_checked(recorded_shard(self.folder, self.spec, task, size=size, sha256=sha256), names)
 
     @cached_property
     def _recorded(self) -> dict[str, tuple[int, str]]:
@@ -153,12 +151,6 @@ class StoredDataset:
     def _no_rows(self, name: str) -> NDArray[Any]:
         field = self.spec.field_named(name)
         return np.empty((0, field.width) if field.width else (0,), storage_dtype(field, self.spec.dtype))
-
-
-def _size_and_sha256(folder: Path, task: ShardTask) -> tuple[int, str]:
-    """Return the size [bytes] and sha256 of a shard in its sidecar."""
-    record = load_record(folder, task)
-    return record.bytes, record.sha256
 
 
 def open_dataset(folder: str | Path, *, allow_incomplete: bool = False) -> StoredDataset:

@@ -134,11 +134,6 @@ SAMPLING_STRUCTURE = {
 }
 
 
-def densities_from_json(content: Mapping[str, Any]) -> dict[str, DensityMap]:
-    """Rebuild density maps from the result of :func:`densities_to_json`."""
-    return {name: _density(item) for name, item in content.items()}
-
-
 def _density(content: Mapping[str, Any]) -> DensityMap:
     (x_low, x_high), (y_low, y_high) = content["x"], content["y"]
     candidates, accepted = (np.array(content[key], np.int64) for key in ("candidates", "accepted"))
@@ -155,7 +150,7 @@ def sampling_from_json(content: Mapping[str, Any]) -> SamplingStatistics:
         accepted=int(content["accepted"]),
         rejections={name: int(count) for name, count in content["rejections"].items()},
         stages={name: str(stage) for name, stage in content["stages"].items()},
-        densities=densities_from_json(content["densities"]),
+        densities={name: _density(item) for name, item in content["densities"].items()},
         verification={name: float(value) for name, value in content["verification"].items()},
     )
 

@@ -92,13 +92,9 @@ def check_place(workspace: Workspace) -> None:
     if (workspace.folder / MANIFEST).is_file():
         return
     if not os.access(workspace.existing, os.W_OK | os.X_OK):
-        number = errno.EROFS if _is_read_only(workspace.existing) else errno.EACCES
+        is_read_only = hasattr(os, "statvfs") and os.statvfs(workspace.existing).f_flag & os.ST_RDONLY
+        number = errno.EROFS if is_read_only else errno.EACCES
         raise machine_error("write to", workspace.folder, OSError(number, os.strerror(number)))
-
-
-def _is_read_only(path: Path) -> bool:
-    """Return whether a path is on a read-only file system."""
-    return hasattr(os, "statvfs") and bool(os.statvfs(path).f_flag & os.ST_RDONLY)
 
 
 def started_spec(workspace: Workspace, wanted: DatasetSpec) -> DatasetSpec | None:

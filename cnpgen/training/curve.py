@@ -35,7 +35,9 @@ def plot_curve(log: str, path: str | Path) -> None:
     _draw_terms(axes[1], steps)
     checks = [record for record in records if "validation" in record]
     _draw_validity(axes[2], checks)
-    _draw_times(axes[3], checks)
+    durations = [record["validation"]["duration_s"] for record in checks]
+    axes[3].plot(_column(checks, "seconds"), durations, marker=".")
+    axes[3].set_ylabel("mean motion time [s]")
     for axis in axes[2:]:
         axis.set_xlabel("CPU time of training [s]")
     for axis in axes:
@@ -77,11 +79,6 @@ def _draw_validity(axis: "Axes", checks: list[dict[str, Any]]) -> None:
 def _name_lines(axis: "Axes") -> None:
     """Draw a legend above the axes, so that it covers no curve."""
     axis.legend(fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, frameon=False)
-
-
-def _draw_times(axis: "Axes", checks: list[dict[str, Any]]) -> None:
-    axis.plot(_column(checks, "seconds"), [record["validation"]["duration_s"] for record in checks], marker=".")
-    axis.set_ylabel("mean motion time [s]")
 
 
 def _column(records: list[dict[str, Any]], name: str) -> list[float]:

@@ -120,19 +120,16 @@ class Boundary:
         """Return the boundary conditions and the parameters that are not None: name -> values."""
         return {name: values for name, values in vars(self).items() if values is not None}
 
+    def astype(self, dtype: str) -> Boundary:
+        """Return the boundary conditions in another float type."""
+        return Boundary(**{name: np.asarray(values, dtype) for name, values in self.arrays().items()})
+
     def __len__(self) -> int:
         return len(self.start_q)
 
     def __getitem__(self, index: slice | NDArray[Any]) -> Boundary:
         try:
-            return Boundary(
-                self.start_q[index],
-                self.start_dq[index],
-                self.start_ddq[index],
-                self.goal_q[index],
-                self.goal_dq[index],
-                *(None if part is None else part[index] for part in (self.goal_ddq, self.parameters)),
-            )
+            return Boundary(**{name: values[index] for name, values in self.arrays().items()})
         except (IndexError, TypeError, ValueError) as error:
             raise MotionIndexError(
                 f"motions are selected by a slice, numbers or a mask: {error}", concerns="index"

@@ -15,6 +15,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from cnpgen.errors import PluginError
 from cnpgen.machine.threads import users_environment
 
 REQUIRED_PROJECTS = {  # module -> project on PyPI
@@ -284,7 +285,6 @@ def _check_cache(findings: _Findings, cache: str) -> bool:
 def _check_recipes(findings: _Findings) -> str:
     """Load every shipped dataset recipe with its robot."""
     try:
-        from cnpgen.errors import PluginError
         from cnpgen.make.recipe_file import load_dataset_recipe
         from cnpgen.problems.load_robot import load_robot
         from cnpgen.schema.catalogue import list_recipes, recipes_root

@@ -10,21 +10,17 @@ from numpy.typing import NDArray
 
 from cnpgen.robots.chain import frame_of
 from cnpgen.robots.parameter_ranges import PAYLOAD_CENTRE
-from cnpgen.robots.robot import reduced_model
+from cnpgen.robots.robot import Robot, reduced_model
 
 if TYPE_CHECKING:
     import pinocchio as pin
 
-    from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
 
 
 class MeasuredParameters:
     """Parameters of the sample of a world; ``set`` replaces them.
-
-    Args:
-        robot: The robot.
 
     Attributes:
         model: Pinocchio's model with the load of the sample, a copy of the robot's if loads differ.

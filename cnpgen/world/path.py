@@ -2,12 +2,13 @@
 
 from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
+from cnpgen.robots.obstacle import Obstacle
+from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.hull import CUBE
 from cnpgen.robots.solid import place_obstacles, pose_width, solids_of
 from cnpgen.world.collision_world import CollisionWorld
@@ -16,10 +17,6 @@ from cnpgen.world.measured_parameters import MeasuredParameters
 from cnpgen.world.pair_distances import PairDistances
 from cnpgen.world.rigid_bodies import NO_HELD_SHAPE, NO_SHAPE, RigidBodies
 from cnpgen.world.separation import cuboid_gaps, cuboid_separation, gaps, separation
-
-if TYPE_CHECKING:
-    from cnpgen.robots.obstacle import Obstacle
-    from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
 States = slice | NDArray[np.intp]
@@ -51,8 +48,8 @@ class PathWorld:
 
     def __init__(
         self,
-        robot: "Robot",
-        obstacles: "Sequence[Obstacle]" = (),
+        robot: Robot,
+        obstacles: Sequence[Obstacle] = (),
         object_size: tuple[float, float, float] | None = None,
     ) -> None:
         import pinocchio as pin

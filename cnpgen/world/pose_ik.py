@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.robots.robot import Robot
 from cnpgen.world.forward_kinematics import ForwardKinematics
 
 if TYPE_CHECKING:
     import pinocchio as pin
 
-    from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
 
@@ -74,7 +74,7 @@ class PoseKinematics:
         frame: Index of the frame in Pinocchio's model; the tip by default.
     """
 
-    def __init__(self, robot: "Robot", frame: int | None = None) -> None:
+    def __init__(self, robot: Robot, frame: int | None = None) -> None:
         model = robot.model
         placed = model.frames[robot.tip_frame if frame is None else frame]
         self.robot, self._carrier = robot, placed.parentJoint

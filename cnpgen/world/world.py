@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
+from cnpgen.robots.obstacle import Obstacle
+from cnpgen.robots.robot import Robot
 from cnpgen.robots.solid import place_obstacles, pose_width, solids_of
 from cnpgen.world.collision_world import CollisionWorld
 from cnpgen.world.measured_parameters import MeasuredParameters
 from cnpgen.world.rigid_bodies import NO_HELD_SHAPE, NO_SHAPE, RigidBodies
-
-if TYPE_CHECKING:
-    from cnpgen.robots.obstacle import Obstacle
-    from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
 

@@ -9,8 +9,8 @@ from cnpgen.kernels.collision.collision_checker import load_collision_library
 from cnpgen.kernels.library import KernelLibrary, choose_backend
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
+from cnpgen.refine import obstacle_attempts, strategy, tree_paths
 from cnpgen.refine import refiner as refiner_module
-from cnpgen.refine import strategy, tree_paths
 from cnpgen.refine.refine_engine import load_refiner
 from cnpgen.refine.solver.hull_feedback import HullFeedback
 from cnpgen.refine.solver.hulls import MEASURED_RANGE_M, Hulls, has_clearance_constraints
@@ -168,7 +168,7 @@ def test_deeper_trees_follow_where_few_connect(monkeypatch):
 def test_a_problem_without_a_path_reports_it(tmp_path, monkeypatch):
     problem = narrow(tmp_path, WALL)
     tool, task = refiner(problem), between(problem, BESIDE_WALL)
-    monkeypatch.setattr(strategy, "_path_guesses", lambda *_: iter(()))
+    monkeypatch.setattr(obstacle_attempts, "path_guesses", lambda *_: iter(()))
     monkeypatch.setattr(strategy, "_from_other_guesses", lambda *_: iter(()))
     found = refine_task(tool, PlanChecker(problem, load_robot(problem), degree=tool.spec.degree), task)
     assert not found.valid
@@ -181,7 +181,7 @@ def test_no_attempt_is_made_if_an_end_is_inside_an_obstacle(tmp_path):
     problem = narrow(tmp_path, SLOT)
     tool, inside = refiner(problem), between(problem, np.add(IN_SLOT, [0.0, 0.0, 0.1, 0.0]))
     best = tool.attempt(inside, tool.line_guess(inside), 1.0, Outcome.SOLVED, iterations=0, violation=0.0)
-    assert list(strategy._around_obstacles(tool, inside, best, tool.hulls)) == []
+    assert list(obstacle_attempts.around_obstacles(tool, inside, best, tool.hulls)) == []
 
 
 def test_robots_without_a_shape_have_no_hulls(tmp_path):

@@ -116,5 +116,5 @@ def test_an_arm_moves_over_a_wall_that_no_other_guess_avoids(wall, monkeypatch):
     meshes = Meshes(wall, robot, wall.path.parent)
     states = Motion(found.path[None], found.rate[None], tool.spec.degree).at(np.linspace(0, 1, 300)).q[0]
     assert min(min(meshes.distances(q)) for q in states) > -1e-4  # what the problem allows
-    monkeypatch.setattr(strategy, "_around_obstacles", lambda refiner, task, best, hulls: iter(()))
+    monkeypatch.setattr(strategy, "around_obstacles", lambda refiner, task, best, hulls: iter(()))
     assert not refine_task(tool, checker, task).valid

@@ -81,6 +81,6 @@ def test_a_transport_that_no_other_guess_solves_is_solved_along_a_path(
     (found,) = cnpgen.solve_plans(transport(label), workers=1).results
     assert found.valid
     assert found.outcome is Outcome.RESTARTED
-    monkeypatch.setattr(strategy, "_path_guesses", lambda refiner, task, hulls=None: iter(()))
+    monkeypatch.setattr(strategy, "path_guesses", lambda refiner, task, hulls=None: iter(()))
     (before,) = cnpgen.solve_plans(transport(label), workers=1).results
     assert not before.valid

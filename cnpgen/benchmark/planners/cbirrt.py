@@ -75,6 +75,31 @@ def seed_ompl(ompl: Any, setting: Setting, task: Plans) -> None:
     ompl.util.RNG.setSeed(int(setting.random(task).integers(1, SEEDS)))
 
 
+def joint_bounds(base: Any, robot: Robot) -> Any:
+    """Return the position limits of a robot as bounds of OMPL."""
+    bounds = base.RealVectorBounds(robot.n)
+    for index, (low, high) in enumerate(zip(robot.position_lower.tolist(), robot.position_upper.tolist(), strict=True)):
+        bounds.setLow(index, low)
+        bounds.setHigh(index, high)
+    return bounds
+
+
+def found_path(setup: Any, n: int, time_limit: float, simplify_time: float) -> Array | None:
+    """Search with OMPL's ``SimpleSetup`` and simplify the path; return joint positions [rad], (K, n), or None.
+
+    Times are in s; a simplification of 0 s keeps the path as it was found.
+    """
+    setup.setup()
+    setup.solve(time_limit)
+    if not setup.haveExactSolutionPath():
+        return None
+    if simplify_time > 0:
+        setup.simplifySolution(simplify_time)
+    path = setup.getSolutionPath()
+    path.interpolate()
+    return np.array([[state[index] for index in range(n)] for state in path.getStates()])
+
+
 def timed(path: Array, velocity_limit: Array) -> Trajectory:
     """Time a path so that one joint is at its velocity limit in every step.
 
@@ -87,13 +112,7 @@ def timed(path: Array, velocity_limit: Array) -> Trajectory:
 
 
 class Search:
-    """Search for a path of one boundary problem.
-
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        task: The boundary problem.
-    """
+    """Search for a path of one boundary problem."""
 
     def __init__(self, problem: Problem, robot: Robot, task: Plans) -> None:
         self._robot, self._tip = robot, Tip(robot)
@@ -139,41 +158,22 @@ class Search:
         Returns:
             Joint positions [rad], shape (K, n), or None.
         """
-        base = ompl.base
-        space = base.RealVectorStateSpace(self._robot.n)
-        space.setBounds(_bounds(base, self._robot))
-        constraint = _constraint(base, self._robot.n, self.residual)
+        base, n = ompl.base, self._robot.n
+        space = base.RealVectorStateSpace(n)
+        space.setBounds(joint_bounds(base, self._robot))
+        constraint = _constraint(base, n, self.residual)
         manifold = base.ProjectedStateSpace(space, constraint)
         manifold.setDelta(DELTA)
         manifold.setLambda(LAMBDA)
         information = base.ConstrainedSpaceInformation(manifold)
         setup = ompl.geometric.SimpleSetup(information)
-        setup.setStateValidityChecker(lambda state: self.is_valid(self._positions(state)))
+        setup.setStateValidityChecker(lambda state: self.is_valid(np.array([state[index] for index in range(n)])))
         ends = [manifold.allocState() for _ in self._ends]
         for state, q in zip(ends, self._ends, strict=True):
             state.copy(q.tolist())
         setup.setStartAndGoalStates(*ends, MAX_GOAL_ERROR_RAD)
         setup.setPlanner(ompl.geometric.RRTConnect(information))
-        setup.setup()
-        setup.solve(time_limit)
-        if not setup.haveExactSolutionPath():
-            return None
-        if simplify_time > 0:
-            setup.simplifySolution(simplify_time)
-        path = setup.getSolutionPath()
-        path.interpolate()
-        return np.array([self._positions(state) for state in path.getStates()])
-
-    def _positions(self, state: Any) -> Array:
-        return np.array([state[index] for index in range(self._robot.n)])
-
-
-def _bounds(base: Any, robot: Robot) -> Any:
-    bounds = base.RealVectorBounds(robot.n)
-    for index, (low, high) in enumerate(zip(robot.position_lower.tolist(), robot.position_upper.tolist(), strict=True)):
-        bounds.setLow(index, low)
-        bounds.setHigh(index, high)
-    return bounds
+        return found_path(setup, n, time_limit, simplify_time)
 
 
 def _constraint(base: Any, n: int, residual: Callable[[Array], tuple[float, Array]]) -> Any:

@@ -56,13 +56,7 @@ def load_crocoddyl() -> Any:
 
 
 class ShootingCosts:
-    """Costs of one boundary problem on a table, or of a transport among upright boxes.
-
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        task: The boundary problem.
-    """
+    """Costs of one boundary problem on a table, or of a transport among upright boxes."""
 
     def __init__(self, problem: Problem, robot: Robot, task: Plans) -> None:
         self._package, self._robot, self._boundary = load_crocoddyl(), robot, task.boundary

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.benchmark.benchmark_planner import Answer, BenchmarkPlanner, Plan, Setting
 from cnpgen.benchmark.planners.drake_arm import DrakeArm, check_robot, load_drake
@@ -20,8 +19,6 @@ from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import field
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.sampled_trajectory import Trajectory
-
-Array = NDArray[np.float64]
 
 SPLINE_ORDER = 4  # cubic, the default of Drake
 MIN_KNOT_DISTANCE_S = 1e-9  # closer knots are one

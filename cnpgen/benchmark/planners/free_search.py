@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.benchmark.planners.cbirrt import found_path, joint_bounds
 from cnpgen.pipelines.families.resting_states import RestingStates
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem import Problem
@@ -62,11 +63,7 @@ class FreeSearch:
         base, n = ompl.base, self._robot.n
         self.place_obstacles(task)
         space = base.RealVectorStateSpace(n)
-        bounds = base.RealVectorBounds(n)
-        for index, (low, high) in enumerate(zip(self._robot.position_lower, self._robot.position_upper, strict=True)):
-            bounds.setLow(index, float(low))
-            bounds.setHigh(index, float(high))
-        space.setBounds(bounds)
+        space.setBounds(joint_bounds(base, self._robot))
         information = base.SpaceInformation(space)
         information.setStateValidityCheckingResolution(STATE_DISTANCE_RAD / space.getMaximumExtent())
         setup = ompl.geometric.SimpleSetup(information)
@@ -77,12 +74,4 @@ class FreeSearch:
                 state[index] = float(q[index])
         setup.setStartAndGoalStates(*ends)
         setup.setPlanner(ompl.geometric.RRTConnect(information))
-        setup.setup()
-        setup.solve(time_limit)
-        if not setup.haveExactSolutionPath():
-            return None
-        if simplify_time > 0:
-            setup.simplifySolution(simplify_time)
-        path = setup.getSolutionPath()
-        path.interpolate()
-        return np.array([[state[index] for index in range(n)] for state in path.getStates()])
+        return found_path(setup, n, time_limit, simplify_time)

@@ -1,6 +1,6 @@
 """Validity of states and positions of the tip for tree planners, by a kernel over many states."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,10 +11,8 @@ from cnpgen.kernels.symbolic.linalg import Scalar, Vec, dot, symbols
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem
+from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.hull import CUBE
-
-if TYPE_CHECKING:
-    from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
 
@@ -25,15 +23,11 @@ MAX_TIP_HEIGHT_ERROR_M = 0.01
 class StateCheck:
     """Check of states: limits of joints and torques, the manifold, the obstacles.
 
-    Args:
-        problem: The problem.
-        robot: Its robot.
-
     Raises:
         UsageError: There is neither a table nor a held object, or an obstacle is not an upright box.
     """
 
-    def __init__(self, problem: Problem, robot: "Robot") -> None:
+    def __init__(self, problem: Problem, robot: Robot) -> None:
         if problem.first(Table) is None:
             require_transport(problem)
         self._robot = robot
@@ -64,7 +58,7 @@ class StateCheck:
         return np.asarray(self(q, still, still, obstacle_poses)[0][0])
 
 
-def tip_and_violation(robot: "Robot", problem: Problem) -> Any:
+def tip_and_violation(robot: Robot, problem: Problem) -> Any:
     """Build ``(q, dq, ddq, obstacle_poses) -> (tip, violation)`` with the largest violation, in its own unit."""
     import casadi as ca
 

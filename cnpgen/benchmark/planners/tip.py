@@ -9,11 +9,7 @@ Array = NDArray[np.float64]
 
 
 class Tip:
-    """Kinematics of the tip; not thread-safe, because Pinocchio's data are reused.
-
-    Args:
-        robot: The robot.
-    """
+    """Kinematics of the tip; not thread-safe, because Pinocchio's data are reused."""
 
     def __init__(self, robot: Robot) -> None:
         self._model, self._data = robot.model, robot.model.createData()

@@ -87,7 +87,8 @@ class Executed:
             "penalty_points": self.penalty,
             "failure": self.failure or None,
         }
-        return {name: value for name, value in values.items() if value is not None and not _is_nan(value)}
+        known = ((name, value) for name, value in values.items() if value is not None)
+        return {name: value for name, value in known if not (isinstance(value, float) and math.isnan(value))}
 
 
 def succeeded(executed: Mapping[str, Any], plane_tolerance: float = PLANE_TOLERANCE_M) -> bool:
@@ -107,7 +108,3 @@ def succeeded(executed: Mapping[str, Any], plane_tolerance: float = PLANE_TOLERA
         return bool(executed["finished"]) and not executed.get("collided")
     errors = [executed.get(name, math.inf) for name in ("plane_error_mm", "commanded_plane_error_mm")]
     return bool(executed["scored"]) and not executed.get("touched_early") and max(errors) <= 1e3 * plane_tolerance
-
-
-def _is_nan(value: object) -> bool:
-    return isinstance(value, float) and math.isnan(value)

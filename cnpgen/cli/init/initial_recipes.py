@@ -80,7 +80,7 @@ def problem_of(arm: Arm, name: str, folder: Path, packages: tuple[Path, ...], sr
     arm, overloaded = _with_torque_limits(arm, robot)
     limits = replace(problem.limits, **_replaced_limits(arm))
     problem = _with_jerk_limits(replace(problem, limits=limits), robot)
-    if _has_masses(robot):
+    if robot.chain.joints[-1].mass > 0:  # torques of links without masses are meaningless
         limit = JointTorque(tolerance=5e-3, budget=6e-2)
         problem = replace(problem, constraint=(*problem.constraint[:4], limit, *problem.constraint[4:]))
     base, base_notes = comfortable_base(problem, load_robot(problem))
@@ -189,11 +189,6 @@ def _with_jerk_limits(problem: Problem, robot: Robot) -> Problem:
     *others, acceleration = problem.constraint[:3]
     constraints = (*others, acceleration, JointJerk(tolerance=5e-3, budget=6e-2), *problem.constraint[3:])
     return replace(problem, limits=limits, constraint=constraints)
-
-
-def _has_masses(robot: Robot) -> bool:
-    """Return whether every joint moves a mass; otherwise torques are meaningless."""
-    return robot.chain.joints[-1].mass > 0
 
 
 def _torques(robot: Robot) -> tuple[Array, Array]:

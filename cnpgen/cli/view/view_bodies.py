@@ -90,7 +90,8 @@ def wrapped(name: str, joint: int, corners: Array, radius: float) -> Body:
     points = (corners[:, None] + radius * _ball()).reshape(-1, 3) if radius else corners
     hull = ConvexHull(points)
     triangles = hull.simplices.copy()
-    inwards = np.einsum("fi,fi->f", _normals(points, triangles), hull.equations[:, :3]) < 0
+    a, b, c = (points[triangles[:, i]] for i in range(3))
+    inwards = np.einsum("fi,fi->f", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
     triangles[inwards] = triangles[inwards][:, ::-1]
     used, numbers = np.unique(triangles, return_inverse=True)
     return Body(name, joint, points[used], numbers.reshape(-1, 3))
@@ -108,11 +109,6 @@ def tube(name: str, points: Array, radius: float) -> Body:
     first = [(6 * k + i, 6 * k + (i + 1) % 6, 6 * k + 6 + i) for k, i in product(range(len(points) - 1), range(6))]
     second = [(b, b + 6, a + 6) for a, b, _ in first]
     return Body(name, 0, (points[:, None] + radius * ring).reshape(-1, 3), np.array(first + second).reshape(-1, 3))
-
-
-def _normals(points: Array, triangles: NDArray[np.integer[Any]]) -> Array:
-    a, b, c = (points[triangles[:, i]] for i in range(3))
-    return np.asarray(np.cross(b - a, c - a))
 
 
 def _ball() -> Array:

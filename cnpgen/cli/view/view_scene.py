@@ -235,10 +235,6 @@ def _world(problem: Problem, scene: Scene) -> Iterator[Body]:
             yield wrapped("puck", 0, _on_table(problem, scene, corners), 0.0)
 
 
-def _mallet(contact: PuckContact, tip: int) -> Body:
-    return wrapped("mallet", tip, _disc_corners(np.zeros(3), contact.mallet_radius, MALLET_HEIGHT_M), 0.0)
-
-
 def _on_table(problem: Problem, scene: Scene, corners: Array) -> Array:
     """Return corners in the frame of the table in the world frame [m], shape (V, 3)."""
     parameters = np.repeat(scene.poses[:1, problem.scene_width - len(problem.parameters) :], len(corners), axis=0)

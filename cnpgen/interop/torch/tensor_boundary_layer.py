@@ -1,7 +1,5 @@
 """The boundary layer in torch operations, on the device of its arguments, differentiable any number of times."""
 
-from typing import TYPE_CHECKING, Any
-
 import torch
 
 from cnpgen.interop.torch.tensor_splines import start_points
@@ -12,11 +10,9 @@ from cnpgen.planner.boundary_layer import BoundaryLayer
 from cnpgen.planner.control_points import along_line
 from cnpgen.planner.expressions import effective_steps, equality_residuals
 from cnpgen.planner.gauss_newton import MAX_STEP_RAD, PROJECTION_DAMPING, collocation
+from cnpgen.planner.tasks import Tasks
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.schema.argument_types import checked_arguments
-
-if TYPE_CHECKING:
-    from cnpgen.planner.tasks import Tasks
 
 
 class TensorBoundaryLayer:
@@ -40,7 +36,7 @@ class TensorBoundaryLayer:
     def __repr__(self) -> str:
         return f"<TensorBoundaryLayer of {self.layer.problem.name!r}>"
 
-    def __call__(self, tasks: "Tasks", phi: torch.Tensor, log_rate: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def __call__(self, tasks: Tasks, phi: torch.Tensor, log_rate: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Compute control points that meet the boundary conditions from network outputs.
 
         Args:
@@ -57,7 +53,8 @@ class TensorBoundaryLayer:
         phi, log_rate = real_tensor("phi", phi), real_tensor("log_rate", log_rate)
         self.layer.check_shapes(tasks, tuple(phi.shape), tuple(log_rate.shape))
         kind = {"device": phi.device, "dtype": torch.promote_types(phi.dtype, torch.float32)}
-        spec, state = self.layer.problem.trajectory, _tensors(tasks.boundary.conditions(), kind)
+        spec, conditions = self.layer.problem.trajectory, tasks.boundary.conditions()
+        state = {name: torch.tensor(values, **kind) for name, values in conditions.items()}
         rate = log_rate.to(**kind).exp() / torch.tensor(tasks.expected_time, **kind)[:, None]
         first = start_points(state["start_q"], state["start_dq"], state["start_ddq"], rate, spec)
         # In reversed phase r' and p' change sign: the goal is a start with the velocity -dq.
@@ -89,7 +86,3 @@ class TensorBoundaryLayer:
             before, inner, after = path.tensor_split((self._interior.start, self._interior.stop), dim=1)
             path = torch.cat([before, inner + step.clamp(-MAX_STEP_RAD, MAX_STEP_RAD), after], dim=1)
         return path
-
-
-def _tensors(arrays: dict[str, Any], kind: dict[str, Any]) -> dict[str, torch.Tensor]:
-    return {name: torch.tensor(values, **kind) for name, values in arrays.items()}

@@ -1,26 +1,24 @@
 """Differentiable plans in torch: control points from network outputs, and their loss."""
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.interop.host_evaluation import evaluate
+from cnpgen.losses.plan_loss import PlanLoss
+from cnpgen.planner.boundary_layer import BoundaryLayer
+from cnpgen.planner.tasks import Tasks
 from cnpgen.schema.arguments import numbers
-
-if TYPE_CHECKING:
-    from cnpgen.losses.plan_loss import PlanLoss
-    from cnpgen.planner.boundary_layer import BoundaryLayer
-    from cnpgen.planner.tasks import Tasks
 
 Array = NDArray[Any]
 Function = Callable[..., tuple[Array, ...]]
 
 
 def control_points(
-    layer: "BoundaryLayer", tasks: "Tasks", phi: torch.Tensor, log_rate: torch.Tensor
+    layer: BoundaryLayer, tasks: Tasks, phi: torch.Tensor, log_rate: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Compute control points that meet the boundary conditions from network outputs; differentiable once.
 
@@ -54,7 +52,7 @@ def control_points(
 
 
 def plan_loss(
-    loss: "PlanLoss",
+    loss: PlanLoss,
     path: torch.Tensor,
     rate: torch.Tensor,
     *,
@@ -102,7 +100,7 @@ class _PlanLoss(torch.autograd.Function):  # type: ignore[misc]
     """The loss with its gradient, which forward computes and backward only scales."""
 
     @staticmethod
-    def forward(loss: "PlanLoss", options: dict[str, Any], *arguments: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    def forward(loss: PlanLoss, options: dict[str, Any], *arguments: torch.Tensor) -> tuple[torch.Tensor, ...]:
         results = evaluate(loss, *(tensor.detach().numpy() for tensor in arguments), **options)
         return tuple(torch.from_numpy(result) for result in results)
 

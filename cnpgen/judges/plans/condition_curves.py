@@ -1,8 +1,8 @@
 """Values of a problem's conditions over time, for plots and pages: tilt, clearances, distances from the manifold."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,18 +10,14 @@ from numpy.typing import NDArray
 from cnpgen.judges.plans.joint_limits import is_proven
 from cnpgen.judges.plans.measure import MeasuredCondition, measure, name_part
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
-from cnpgen.problems.constraints.constraint import Condition, Constraint
+from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.constraints.joint import JointTorque
 from cnpgen.problems.constraints.self_clearance import SelfClearance
+from cnpgen.problems.problem import Problem
+from cnpgen.robots.solid import Solid
 from cnpgen.world.closest_points import ClosestPoints, Kind, closest_points
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from cnpgen.problems.problem import Problem
-    from cnpgen.robots.solid import Solid
-    from cnpgen.world.path import PathWorld
-    from cnpgen.world.world import World
+from cnpgen.world.path import PathWorld
+from cnpgen.world.world import World
 
 Array = NDArray[np.float64]
 
@@ -70,9 +66,7 @@ def plot_unit(unit: str) -> tuple[float, str]:
     return _SCALES.get(unit, (1.0, unit))
 
 
-def condition_curves(
-    problem: "Problem", world: "PathWorld", s: Array, solids: "Sequence[Solid]"
-) -> list[ConditionCurve]:
+def condition_curves(problem: Problem, world: PathWorld, s: Array, solids: Sequence[Solid]) -> list[ConditionCurve]:
     """Measure all conditions that are no limits of joints, at every state.
 
     Args:
@@ -93,7 +87,7 @@ def condition_curves(
     return curves
 
 
-def _value_curves(problem: "Problem", measured: list[MeasuredCondition]) -> Iterator[ConditionCurve]:
+def _value_curves(problem: Problem, measured: list[MeasuredCondition]) -> Iterator[ConditionCurve]:
     """Convert measured conditions: one value with its bounds, several values as distances from their bounds."""
     for condition in measured:
         stated = condition.condition
@@ -134,12 +128,12 @@ def _tilt_curve(condition: MeasuredCondition) -> ConditionCurve:
 
 
 def _distance_curves(
-    problem: "Problem", constraint: Constraint, world: "PathWorld", solids: "Sequence[Solid]"
+    problem: Problem, constraint: Constraint, world: PathWorld, solids: Sequence[Solid]
 ) -> Iterator[ConditionCurve]:
     """Measure the smallest distance of a constraint on distances at every state, with the closest points."""
     kind: Kind = "object" if isinstance(constraint, ObjectContact) else "robot"
     kind = "self" if isinstance(constraint, SelfClearance) else kind
-    stated = _stated(constraint, world)
+    (stated,) = constraint.judged(cast(World, world))
     if not stated.g:
         return
     radius = (problem.arm_radius or 0.0) if kind == "robot" and world.robot.shape is None else 0.0
@@ -159,9 +153,3 @@ def _distance_curves(
         closest.points,
         tuple(names[pair] for pair in closest.pair),
     )
-
-
-def _stated(constraint: Constraint, world: "PathWorld") -> Condition:
-    """Return the condition of a constraint on distances."""
-    (condition,) = constraint.judged(cast("World", world))
-    return condition

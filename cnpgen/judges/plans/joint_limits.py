@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +16,7 @@ from cnpgen.problems.constraints.joint import JointAcceleration, JointJerk, Join
 from cnpgen.problems.problem import Problem
 from cnpgen.store.joint_units import unit_of
 from cnpgen.world.path import PathWorld
-
-if TYPE_CHECKING:
-    from cnpgen.world.world import World
+from cnpgen.world.world import World
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -156,7 +154,7 @@ def joint_limits(problem: Problem, world: PathWorld) -> ProvenJointLimits:
         world: Its robot at any state with a jerk; the bounds do not depend on the state.
     """
     constraints = tuple(constraint for constraint in problem.constraint if is_proven(constraint))
-    conditions = tuple(constraint.measured(cast("World", world))[0] for constraint in constraints)
+    conditions = tuple(constraint.measured(cast(World, world))[0] for constraint in constraints)
     shape = len(constraints), world.robot.n
     lower, upper = (
         np.array([getattr(condition, end) for condition in conditions]).reshape(shape) for end in ("lower", "upper")

@@ -7,7 +7,7 @@ obstacle.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,13 +21,11 @@ from cnpgen.problems.constraints.clearance import ObjectContact
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.constraints.joint import JointAcceleration, JointJerk, JointPosition, JointTorque, JointVelocity
 from cnpgen.problems.problem import Problem
+from cnpgen.robots.robot import Robot
 from cnpgen.store.joint_units import unit_of
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.world.path import PathWorld
-
-if TYPE_CHECKING:
-    from cnpgen.robots.robot import Robot
-    from cnpgen.world.world import World
+from cnpgen.world.world import World
 
 Array = NDArray[np.float64]
 
@@ -41,7 +39,7 @@ BOUNDARY_TOLERANCES = {
 _PER_JOINT = JointPosition | JointVelocity | JointAcceleration | JointJerk | JointTorque
 
 
-def boundary_margins(states: EvaluatedTrajectory, boundary: Boundary, samples: Samples, robot: "Robot") -> list[Margin]:
+def boundary_margins(states: EvaluatedTrajectory, boundary: Boundary, samples: Samples, robot: Robot) -> list[Margin]:
     """Compare the ends of a motion with its boundary conditions.
 
     Args:
@@ -134,7 +132,7 @@ def measure(constraint: Constraint, world: PathWorld, s: Array, start_tip: Array
         start_tip: Tip position at the start of the motion [m], shape (3,).
     """
     measured = []
-    for condition in constraint.judged(cast("World", world)):  # PathWorld has the interface of World for K states
+    for condition in constraint.judged(cast(World, world)):  # PathWorld has the interface of World for K states
         if condition.g:
             g = np.empty((len(condition.g), len(s)))
             for row, value in zip(g, condition.g, strict=True):

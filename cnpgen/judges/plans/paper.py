@@ -14,7 +14,6 @@ Joint positions, the robot's clearance and constraints of plug-ins are not check
 """
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,11 +25,9 @@ from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.constraints.joint import JointAcceleration, JointTorque, JointVelocity
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.constraints.vertical import Vertical
+from cnpgen.problems.problem import Problem
 from cnpgen.robots.solid import solids_of
-
-if TYPE_CHECKING:
-    from cnpgen.problems.problem import Problem
-    from cnpgen.world.path import PathWorld
+from cnpgen.world.path import PathWorld
 
 Array = NDArray[np.float64]
 
@@ -40,7 +37,7 @@ MAX_TILT = 0.05  # of 1 - R_22
 MAX_OBJECT_DEPTH_M = 0.02
 
 
-def paper_rule(problem: "Problem", world: "PathWorld", obstacle_poses: Array, goal_xyz: Array) -> PaperRule:
+def paper_rule(problem: Problem, world: PathWorld, obstacle_poses: Array, goal_xyz: Array) -> PaperRule:
     """Judge one motion by the paper's rules.
 
     Args:
@@ -54,7 +51,7 @@ def paper_rule(problem: "Problem", world: "PathWorld", obstacle_poses: Array, go
     return PaperRule(finished, finished and not broken, broken)
 
 
-def _checks(problem: "Problem", world: "PathWorld", obstacle_poses: Array) -> Iterator[tuple[str, bool]]:
+def _checks(problem: Problem, world: PathWorld, obstacle_poses: Array) -> Iterator[tuple[str, bool]]:
     """Yield pairs of a reason and whether its rule is met; nan values violate a rule."""
     on_table = any(isinstance(constraint, Table) for constraint in problem.constraint)
     for constraint in problem.constraint:
@@ -70,7 +67,7 @@ def _checks(problem: "Problem", world: "PathWorld", obstacle_poses: Array) -> It
             yield constraint.reason, _is_clear(problem, world, obstacle_poses)
 
 
-def _is_nominal(constraint: Constraint, problem: "Problem", world: "PathWorld") -> bool:
+def _is_nominal(constraint: Constraint, problem: Problem, world: PathWorld) -> bool:
     robot, limits = world.robot, problem.limits
     if isinstance(constraint, JointTorque):
         values, limit = world.torque, robot.torque_limit / limits.torque_scale
@@ -89,7 +86,7 @@ def _is_on_table(table: Table, tip: Array) -> bool:
     return bool(np.all((low[:, None] < tip) & (tip < high[:, None])))
 
 
-def _is_clear(problem: "Problem", world: "PathWorld", obstacle_poses: Array) -> bool:
+def _is_clear(problem: Problem, world: PathWorld, obstacle_poses: Array) -> bool:
     size = np.array(problem.object_size or (0.0, 0.0, 0.0))
     center, reach = world.tip_position, np.linalg.norm(size) / 2
     measured = world.object_distances() if any(not obstacle.upright for obstacle in problem.obstacle) else []
@@ -112,7 +109,7 @@ def _is_clear(problem: "Problem", world: "PathWorld", obstacle_poses: Array) -> 
     return True
 
 
-def metrics_of(problem: "Problem", world: "PathWorld", samples: Samples, jerk: Array) -> Metrics:
+def metrics_of(problem: Problem, world: PathWorld, samples: Samples, jerk: Array) -> Metrics:
     """Compute the metrics of one motion.
 
     Args:

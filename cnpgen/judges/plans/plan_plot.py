@@ -20,12 +20,12 @@ from cnpgen.store.files.figure_file import new_figure, save_figure
 from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.world.forward_kinematics import ForwardKinematics
 from cnpgen.world.path import PathWorld
+from cnpgen.world.world import World
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import SubFigure
 
-    from cnpgen.world.world import World
 
 Array = NDArray[np.float64]
 
@@ -252,7 +252,7 @@ def _draw_over_table(figure: "SubFigure", table: Table, world: PathWorld, s: Arr
     above.set(xlabel="x [m]", ylabel="y [m]", title="tip over the table, one dot per 20 ms")
     ticks = np.arange(0.0, t[-1], 0.02)
     above.plot(np.interp(ticks, t, x), np.interp(ticks, t, y), ".", color="black", markersize=4)
-    height = table.measured(cast("World", world))[1]
+    height = table.measured(cast(World, world))[1]
     band = 1e3 * (table.allowed(height) + table.bound_relaxation(height, s, world.tip_position[:, 0]))
     beside.fill_between(t, -band, band, color="tab:green", alpha=0.12, linewidth=0, label="valid")
     beside.plot(t, 1e3 * (z - table.z), color="black", linewidth=1.2)

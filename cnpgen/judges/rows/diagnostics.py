@@ -2,15 +2,12 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from cnpgen.judges.rows.row_report import ENDS, Array, Check, Index, compare
+from cnpgen.problems.problem import Problem
 from cnpgen.world.world import World
-
-if TYPE_CHECKING:
-    from cnpgen.problems.problem import Problem
 
 # Tolerances of stored diagnostics, in their units. Coal's distances have errors of 4e-11 m. In float32 the rounding of
 # joint positions moves the arm by 1e-7 m and changes its highest speed by 2e-6 m/s in 40,000 rows.
@@ -55,7 +52,7 @@ class Diagnostic:
         )
 
 
-def stored_diagnostics(problem: "Problem", columns: Mapping[str, Array]) -> list[Diagnostic]:
+def stored_diagnostics(problem: Problem, columns: Mapping[str, Array]) -> list[Diagnostic]:
     """List the diagnostics in rows that can be recomputed.
 
     Args:
@@ -80,7 +77,7 @@ def _torque_ratio(world: World) -> float:
     return float(np.max(np.abs(world.holding_torque) / world.robot.torque_limit))
 
 
-def _clearance(problem: "Problem") -> Iterator[tuple[str, str, str, Callable[[World], float]]]:
+def _clearance(problem: Problem) -> Iterator[tuple[str, str, str, Callable[[World], float]]]:
     """Yield the clearance: the distance from the closest obstacle minus the arm radius of the problem."""
     radius = problem.arm_radius
     if radius is not None and problem.obstacle:

@@ -16,16 +16,14 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import combinations
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from cnpgen.judges.rows.row_report import Array, Check, Index, compare
 from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES
+from cnpgen.robots.robot import Robot
 from cnpgen.world.measured_parameters import MeasuredParameters
-
-if TYPE_CHECKING:
-    from cnpgen.robots.robot import Robot
 
 # Tolerance of the projected gradient of f [m^2/rad]. In float32 the joints have errors of 1e-7 rad.
 STATIONARITY_TOLERANCES = {"float64": 1e-8, "float32": 1e-5}
@@ -56,7 +54,7 @@ def hit_rule(stages: Iterable[Mapping[str, Any]]) -> HitRule:
 
 
 def judge_goals(
-    robot: "Robot", rule: HitRule, columns: Mapping[str, Array], finite: Index, dtype: str
+    robot: Robot, rule: HitRule, columns: Mapping[str, Array], finite: Index, dtype: str
 ) -> list[tuple[Check, Index]]:
     """Check the goals of finite rows against the rule of the stages.
 
@@ -118,7 +116,7 @@ def _compared(name: str, unit: str, error: Array, tolerance: float, rows: Index)
     return compare(name, unit, violation=error, tolerance=np.full(len(rows), tolerance), row=rows, end=ones)
 
 
-def velocity_factors(robot: "Robot", columns: Mapping[str, Array]) -> Array:
+def velocity_factors(robot: Robot, columns: Mapping[str, Array]) -> Array:
     """Return the factor of the velocity limits of every row, shape (rows,)."""
     names = robot.parameters.names
     if "velocity_factor" not in names:
@@ -126,7 +124,7 @@ def velocity_factors(robot: "Robot", columns: Mapping[str, Array]) -> Array:
     return columns["parameters"][:, names.index("velocity_factor")]
 
 
-def _directions(robot: "Robot", columns: Mapping[str, Array], finite: Index) -> Array:
+def _directions(robot: Robot, columns: Mapping[str, Array], finite: Index) -> Array:
     """Return the unit directions of hits on the tables of finite rows, in the world frame, shape (rows, 3)."""
     angle = columns["hit_angle"][finite, 0]
     direction = np.stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))], axis=1)
@@ -138,7 +136,7 @@ def _directions(robot: "Robot", columns: Mapping[str, Array], finite: Index) -> 
     return direction
 
 
-def _projected_gradients(robot: "Robot", q: Array, home: Array, direction: Array, at_limit: float) -> Array:
+def _projected_gradients(robot: Robot, q: Array, home: Array, direction: Array, at_limit: float) -> Array:
     """Compute the gradient of f in the directions that the constraints leave free [m^2/rad], shape (rows,)."""
     jacobian, gradient = _gradients(robot, q, home, direction)
     low, high = q - robot.position_lower < at_limit, robot.position_upper - q < at_limit
@@ -150,7 +148,7 @@ def _projected_gradients(robot: "Robot", q: Array, home: Array, direction: Array
     return np.asarray(ascent.max(axis=1, initial=0.0))
 
 
-def _gradients(robot: "Robot", q: Array, home: Array, direction: Array) -> tuple[Array, Array]:
+def _gradients(robot: Robot, q: Array, home: Array, direction: Array) -> tuple[Array, Array]:
     """Return J and the gradient of f, by Pinocchio's derivatives of the tip's velocity.
 
     Pinocchio differentiates the velocity of the tip's frame as if its axes turned with it. That adds a combination of

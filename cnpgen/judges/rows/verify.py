@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,11 +17,9 @@ from cnpgen.judges.rows.row_report import ENDS, Array, Check, Index, RowReport, 
 from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES, Condition
 from cnpgen.problems.constraints.needs import measured_needs
 from cnpgen.problems.obstacles import goal_velocities, scene_of
+from cnpgen.problems.problem import Problem
+from cnpgen.robots.robot import Robot
 from cnpgen.world.world import World
-
-if TYPE_CHECKING:
-    from cnpgen.problems.problem import Problem
-    from cnpgen.robots.robot import Robot
 
 NO_RULE = HitRule()
 OBSTACLE_POSES = "obstacle_poses"
@@ -34,8 +32,8 @@ Key = tuple[str, str, str]  # name, unit and tolerance of a condition
 
 
 def verify_rows(
-    problem: "Problem",
-    robot: "Robot",
+    problem: Problem,
+    robot: Robot,
     columns: Mapping[str, ArrayLike],
     dtype: str = "float64",
     rule: HitRule = NO_RULE,
@@ -135,7 +133,7 @@ class _Measurements:
     conditions: dict[Key, _ConditionValues] = field(default_factory=dict)
 
 
-def _verify_block(problem: "Problem", world: World, columns: dict[str, Array], dtype: str, rule: HitRule) -> RowReport:
+def _verify_block(problem: Problem, world: World, columns: dict[str, Array], dtype: str, rule: HitRule) -> RowReport:
     rows = len(columns["start_q"])
     n_invalid = np.sum([np.sum(~np.isfinite(column), axis=1) for column in columns.values()], axis=0)
     finite = np.flatnonzero(n_invalid == 0)
@@ -153,7 +151,7 @@ def _verify_block(problem: "Problem", world: World, columns: dict[str, Array], d
     return RowReport(rows, tuple(check for check, _ in judged), failed)
 
 
-def _measure(problem: "Problem", world: World, columns: dict[str, Array], finite: Index) -> _Measurements:
+def _measure(problem: Problem, world: World, columns: dict[str, Array], finite: Index) -> _Measurements:
     """Move the world to both ends of every finite row and record the measurements."""
     rows = len(columns["start_q"])
     velocity = goal_velocities(problem, world.robot, columns["goal_q"], columns["goal_dq"])
@@ -234,7 +232,7 @@ def _judge_hit(
 
 
 def _judge_highest(
-    robot: "Robot", block: _Measurements, columns: dict[str, Array], finite: Index, dtype: str
+    robot: Robot, block: _Measurements, columns: dict[str, Array], finite: Index, dtype: str
 ) -> Iterator[tuple[Check, Index]]:
     """Check the stored highest possible speed of a hit."""
     if "hit_angle" in columns and "hit_speed_max" in columns:

@@ -3,7 +3,6 @@
 import ctypes
 from ctypes import c_double, c_long, c_void_p
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +12,7 @@ from cnpgen.kernels.collision.collision_checker import MAX_JOINTS, CollisionChec
 from cnpgen.kernels.compiled_kernel import address_of
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.robots.observation.primitives import Primitives
-
-if TYPE_CHECKING:
-    from cnpgen.robots.robot import Robot
+from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
 
@@ -40,7 +37,7 @@ class ClearanceLoss:
         UsageError: The robot has no link geometry, or too many joints.
     """
 
-    def __init__(self, kernels: KernelLibrary, robot: "Robot") -> None:
+    def __init__(self, kernels: KernelLibrary, robot: Robot) -> None:
         library = load_collision_library(kernels, SOURCES)
         if library is None:
             raise MachineError("losses of the distances of hulls need a C compiler ('cnpgen docs troubleshooting')")

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from ctypes import c_double, c_int, c_long, c_void_p
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +17,7 @@ from cnpgen.kernels.collision.body_arrays import BODY, hull_vertices, obstacle_b
 from cnpgen.kernels.compiled_kernel import address_of
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.robots.obstacle import Obstacle
-
-if TYPE_CHECKING:
-    from cnpgen.robots.robot import Robot
+from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -87,7 +85,7 @@ class CollisionChecker:
         link_pairs: Pairs of convex parts of links that must not touch, the one nearer to the base first, shape (M, 2).
     """
 
-    def __init__(self, library: ctypes.CDLL, robot: "Robot") -> None:
+    def __init__(self, library: ctypes.CDLL, robot: Robot) -> None:
         assert robot.shape is not None
         self.library, self._n, self._arrays = library, robot.n, dict[str, Any]()
         self._scene = _RobotScene()

@@ -4,7 +4,7 @@ Structural zeros of the URDF cause no operations.
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -23,9 +23,7 @@ from cnpgen.kernels.symbolic.linalg import (
     times,
 )
 from cnpgen.robots.chain import Chain, Joint
-
-if TYPE_CHECKING:
-    from cnpgen.robots.robot import Robot
+from cnpgen.robots.robot import Robot
 
 
 @dataclass(frozen=True)
@@ -102,7 +100,7 @@ def bias_acceleration(kin: Kinematics, dq: Vec) -> Vec:
     return bias
 
 
-def tip_position(robot: "Robot") -> Any:
+def tip_position(robot: Robot) -> Any:
     """Build ``q -> p``, the position of the tip [m], as an SX function."""
     import casadi as ca
 

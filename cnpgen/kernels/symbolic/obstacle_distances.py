@@ -8,7 +8,6 @@ an obstacle is that of one point: the deepest in a cylinder, the midpoint of the
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from cnpgen.kernels.symbolic.box_distances import (
     UNBOUNDED_EXTENT_M,
@@ -22,12 +21,10 @@ from cnpgen.kernels.symbolic.box_distances import (
 from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, dot, scale, subtract, transposed_times
 from cnpgen.kernels.symbolic.segment_distance import SMOOTHING_M2, segment_distance
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
+from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.hull import supporting_planes
 from cnpgen.robots.shape.inline import corners_of
 from cnpgen.robots.solid import number_slices
-
-if TYPE_CHECKING:
-    from cnpgen.robots.obstacle import Obstacle
 
 Size = tuple[float, float, float]
 Freeze = Callable[[Scalar], Scalar]
@@ -288,46 +285,30 @@ def symbolic_solids(state: SymbolicState) -> list[SymbolicSolid]:
     ]
 
 
-def _solid(obstacle: "Obstacle", values: Vec) -> SymbolicSolid:
+def _solid(obstacle: Obstacle, values: Vec) -> SymbolicSolid:
     """Return the shape of an obstacle with these values of its pose and size."""
     if obstacle.upright:
         return _upright(obstacle, values[0])
-    return _BUILDERS[obstacle.kind](obstacle, values[:3], values[3:])
+    position, rest = values[:3], values[3:]
+    if obstacle.kind == "box":
+        return SymbolicBox([0.0] * 3, rest[:3], position, _three_rows(rest[3:]) if obstacle.is_turned else None)
+    if obstacle.kind == "sphere":
+        return SymbolicCapsule(position, position, rest[0])
+    if obstacle.kind == "capsule":
+        return SymbolicCapsule(subtract(position, rest[:3]), add(position, rest[:3]), rest[3])
+    if obstacle.kind == "cylinder":
+        return SymbolicCylinder(position, rest[:3], rest[3])
+    return _mesh(obstacle, position, rest)
 
 
-def _box(obstacle: "Obstacle", position: Vec, sizes: Vec) -> SymbolicBox:
-    return SymbolicBox([0.0] * 3, sizes[:3], position, _three_rows(sizes[3:]) if obstacle.is_turned else None)
-
-
-def _sphere(_: "Obstacle", position: Vec, sizes: Vec) -> SymbolicCapsule:
-    return SymbolicCapsule(position, position, sizes[0])
-
-
-def _capsule(_: "Obstacle", position: Vec, sizes: Vec) -> SymbolicCapsule:
-    return SymbolicCapsule(subtract(position, sizes[:3]), add(position, sizes[:3]), sizes[3])
-
-
-def _cylinder(_: "Obstacle", position: Vec, sizes: Vec) -> SymbolicCylinder:
-    return SymbolicCylinder(position, sizes[:3], sizes[3])
-
-
-def _mesh(obstacle: "Obstacle", position: Vec, rotation: Vec) -> SymbolicHull:
+def _mesh(obstacle: Obstacle, position: Vec, rotation: Vec) -> SymbolicHull:
     corners = corners_of(obstacle.mesh)
     low, high = corners.min(axis=0), corners.max(axis=0)
     center, half = ((low + high) / 2).tolist(), ((high - low) / 2).tolist()
     return SymbolicHull(center, half, position, _three_rows(rotation), supporting_planes(corners).tolist())
 
 
-_BUILDERS: dict[str, Callable[["Obstacle", Vec, Vec], SymbolicSolid]] = {
-    "box": _box,
-    "sphere": _sphere,
-    "capsule": _capsule,
-    "cylinder": _cylinder,
-    "mesh": _mesh,
-}
-
-
-def _upright(obstacle: "Obstacle", top: Scalar) -> SymbolicUprightBox:
+def _upright(obstacle: Obstacle, top: Scalar) -> SymbolicUprightBox:
     height, ranges = obstacle.height, [bounds for bounds in (obstacle.x, obstacle.y) if bounds is not None]
     sides: Bounds = [(bounds.low, bounds.high) for bounds in ranges]
     return SymbolicUprightBox([*sides, (None if height is None else top - height, top)])

@@ -3,20 +3,18 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from cnpgen.kernels.symbolic.dynamics import Load, acceleration_at, body_motions, inverse_dynamics
 from cnpgen.kernels.symbolic.kinematics import Kinematics, bias_acceleration, forward_kinematics, tip_velocity
 from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, constants, cross, dot, scale, subtract, times
+from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.parameter_ranges import PAYLOAD_CENTRE, PAYLOAD_PARAMETERS
+from cnpgen.robots.robot import Robot
+from cnpgen.robots.shape.capsule import Capsule
+from cnpgen.robots.shape.shape import Shape
 from cnpgen.robots.solid import pose_width
 from cnpgen.robots.table_frame import table_axes
-
-if TYPE_CHECKING:
-    from cnpgen.robots.obstacle import Obstacle
-    from cnpgen.robots.robot import Robot
-    from cnpgen.robots.shape.capsule import Capsule
-    from cnpgen.robots.shape.shape import Shape
 
 
 @dataclass(frozen=True)
@@ -35,12 +33,12 @@ class SymbolicState:
         jerk: Joint jerks [rad/s^3], or None.
     """
 
-    robot: "Robot"
+    robot: Robot
     q: Vec
     dq: Vec
     ddq: Vec
     obstacle_poses: Vec
-    obstacles: "tuple[Obstacle, ...]"
+    obstacles: tuple[Obstacle, ...]
     object_size: tuple[float, float, float] | None
     jerk: Vec | None = None
 
@@ -163,12 +161,12 @@ class SymbolicState:
         """Link -> ends [m] and radius [m] of its capsule, for links that may not touch the held object."""
         return self._placed_capsules(self.robot.held_shape)
 
-    def _placed_capsules(self, shape: "Shape | None") -> dict[str, tuple[Vec, Vec, float]]:
+    def _placed_capsules(self, shape: Shape | None) -> dict[str, tuple[Vec, Vec, float]]:
         if shape is None:
             return {}
         return {capsule.link: self._placed(capsule, shape.joints[capsule.link]) for capsule in shape.capsules}
 
-    def _placed(self, capsule: "Capsule", joint: int) -> tuple[Vec, Vec, float]:
+    def _placed(self, capsule: Capsule, joint: int) -> tuple[Vec, Vec, float]:
         first, second = constants(capsule.first), constants(capsule.second)
         if joint == 0:
             return first, second, capsule.radius

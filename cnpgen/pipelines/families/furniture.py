@@ -6,13 +6,11 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.pipelines.families.family import Grasp, Layout, SceneFamily, uniform, whole
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.schema.keys import Range
 
-Array = NDArray[np.float64]
 Point = tuple[float, float, float]
 
 MAX_PLACEMENTS = 60  # attempts to place an object

@@ -20,6 +20,7 @@ from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import as_problem
 from cnpgen.problems.scenes.scene_problem import MAX_SCENES, SceneError, SceneProblem, checked_scene
 from cnpgen.robots.robot import Robot
+from cnpgen.robots.shape.hull import frame_along
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
 from cnpgen.store.dataset_spec import StoredProblem
@@ -181,6 +182,4 @@ def grasp_rotations(grasp: Grasp, count: int, random: np.random.Generator) -> Ar
 
 def _frame(axis: Array) -> Array:
     """Return a rotation matrix whose third column is a unit vector."""
-    from cnpgen.robots.shape.hull import frame_along
-
     return frame_along(axis.tolist(), 1.0)

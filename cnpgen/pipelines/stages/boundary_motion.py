@@ -2,7 +2,7 @@
 
 from collections.abc import Collection
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -12,11 +12,9 @@ from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, dot, scale, subtrac
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.stage import CandidateBatch, Stage, StageFunction
 from cnpgen.problems.constraints.table import Table
+from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
-
-if TYPE_CHECKING:
-    from cnpgen.robots.robot import Robot
 
 PROJECTION_STEPS = 3  # Newton steps from a millimetre to rounding error
 MAX_VELOCITY_RATIO = 1.005  # largest ratio of a plan's velocity to its limit
@@ -173,7 +171,7 @@ class TableAcceleration(Stage):
         return work
 
 
-def velocity_of_tip(robot: "Robot") -> Any:
+def velocity_of_tip(robot: Robot) -> Any:
     """Build ``(q, dq) -> velocity of the tip`` [m/s]."""
     import casadi as ca
 
@@ -182,7 +180,7 @@ def velocity_of_tip(robot: "Robot") -> Any:
     return ca.Function("velocity_of_tip", [q_sx, dq_sx], [ca.vertcat(*velocity)])
 
 
-def onto_table(robot: "Robot", *, height: float) -> Any:
+def onto_table(robot: Robot, *, height: float) -> Any:
     """Build the projection ``(q, dq, ddq) -> (q, dq, ddq)`` onto states whose tip moves and accelerates on the table.
 
     Use it for deviations as small as those of plans: three Newton steps for q, then two projections. Velocities
@@ -208,14 +206,11 @@ def onto_table(robot: "Robot", *, height: float) -> Any:
     return ca.Function("onto_table", [q_sx, dq_sx, ddq_sx], [ca.vertcat(*values) for values in (q, dq, ddq)])
 
 
-def table_velocity(robot: "Robot") -> Any:
+def table_velocity(robot: Robot) -> Any:
     """Build ``(q, direction, length) -> (dq, tip velocity)`` with ``J_z dq = 0``.
 
     The direction, in units of the limits, is projected onto the manifold in the metric of the limits. It is scaled
     until the first joint meets its limit, and multiplied by the length in [0, 1).
-
-    Args:
-        robot: The robot.
     """
     import casadi as ca
 
@@ -230,15 +225,12 @@ def table_velocity(robot: "Robot") -> Any:
     return ca.Function("table_velocity", [q_sx, u_sx, s_sx], [ca.vertcat(*dq), ca.vertcat(*tip_velocity(kin, dq))])
 
 
-def table_acceleration(robot: "Robot") -> Any:
+def table_acceleration(robot: Robot) -> Any:
     """Build ``(q, dq, direction, length) -> (ddq, interval_length)`` with ``J_z ddq + dJ_z dq = 0``.
 
     ``ddq = particular + t * projected direction`` with the particular solution of minimum weighted maximum norm. Torque
     is affine in t (two inverse dynamics), so every limit is an interval of t, and t is uniform in their intersection.
     ``interval_length`` is the length of the intersection, negative if the particular solution violates a limit.
-
-    Args:
-        robot: The robot.
     """
     import casadi as ca
 

@@ -5,7 +5,7 @@ the acceleration and velocity limits and the manifold: a linear program with one
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +17,9 @@ from cnpgen.kernels.tape import Loop
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Stage, StageFunction
 from cnpgen.problems.constraints.table import Table
+from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
-
-if TYPE_CHECKING:
-    from cnpgen.robots.robot import Robot
 
 BRAKING_STEP_S = 0.01
 MAX_BRAKING_STEPS = 60
@@ -101,7 +99,7 @@ def overshoot(
     return worst
 
 
-def tip_state(robot: "Robot") -> Any:
+def tip_state(robot: Robot) -> Any:
     """Build ``(q, dq) -> (tip position, tip velocity)``."""
     import casadi as ca
 
@@ -110,7 +108,7 @@ def tip_state(robot: "Robot") -> Any:
     return ca.Function("tip_state", [q_sx, dq_sx], [ca.vertcat(*kin.tip), ca.vertcat(*tip_velocity(kin, dq))])
 
 
-def braking_step(robot: "Robot", *, height: float) -> Any:
+def braking_step(robot: Robot, *, height: float) -> Any:
     """Build one step of braking: ``((q, dq, overshoot), (nx, ny, edge)) -> (next state, still running)``.
 
     ``still running`` is 1 until the tip stops along the normal within the step. ``overshoot`` is then its distance
@@ -142,7 +140,7 @@ def braking_step(robot: "Robot", *, height: float) -> Any:
     return ca.Function("braking", [state_sx, edge_sx], [ca.vertcat(*following), ca.if_else(stops, 0.0, 1.0)])
 
 
-def _acceleration_box(robot: "Robot", dq: Vec) -> tuple[Vec, Vec]:
+def _acceleration_box(robot: Robot, dq: Vec) -> tuple[Vec, Vec]:
     """Return bounds of the accelerations that keep the velocity within its limits over the step."""
     import casadi as ca
 

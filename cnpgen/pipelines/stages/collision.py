@@ -9,7 +9,7 @@ parts of the links.
 """
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,14 +23,12 @@ from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Stage, StageFun
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.obstacles import scene_of, table_frame_of
 from cnpgen.problems.problem import Problem
+from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.hull import coal_hull
 from cnpgen.robots.shape.shape import Shape
 from cnpgen.robots.solid import Box, Solid, height_places, place_obstacles, solids_of
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
-
-if TYPE_CHECKING:
-    from cnpgen.robots.robot import Robot
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,7 +135,7 @@ def candidate_poses(problem: Problem, candidates: CandidateBatch) -> Array:
     return scene_of(problem, candidates["start_xyz"].T, goal, direction, parameters, obstacle_poses=poses).lanes
 
 
-def capsule_axes_distance(robot: "Robot", problem: Problem) -> Any:
+def capsule_axes_distance(robot: Robot, problem: Problem) -> Any:
     """Build ``(q, obstacle_poses) -> minimum distance of a capsule axis from an obstacle`` [m]."""
     import casadi as ca
 
@@ -154,7 +152,7 @@ def capsule_axes_distance(robot: "Robot", problem: Problem) -> Any:
     return ca.Function("capsule_axes_distance", [q_sx, poses_sx], [nearest])
 
 
-def capsule_clearance(robot: "Robot", problem: Problem) -> Any:
+def capsule_clearance(robot: Robot, problem: Problem) -> Any:
     """Build ``(q, obstacle_poses) -> minimum distance of link capsules from obstacles`` [m], at least -radius."""
     import casadi as ca
 
@@ -172,7 +170,7 @@ def capsule_clearance(robot: "Robot", problem: Problem) -> Any:
     return ca.Function("capsule_clearance", [q_sx, poses_sx], [nearest])
 
 
-def coal_judge(problem: Problem, robot: "Robot", radius: float, depth: float) -> Any:
+def coal_judge(problem: Problem, robot: Robot, radius: float, depth: float) -> Any:
     """Return a collision check with Coal, ``(q (n, N), obstacle_poses (width, N)) -> collides (N,)``.
 
     The arm consists of capsules of the radius, or of its convex parts, inflated by the radius. The held object is
@@ -232,7 +230,7 @@ def _add_convex_parts(geometry: Any, shape: Shape, distance: float) -> list[int]
     return added
 
 
-def _add_capsules(geometry: Any, robot: "Robot", radius: float) -> list[int]:
+def _add_capsules(geometry: Any, robot: Robot, radius: float) -> list[int]:
     """Add one capsule per capsule axis, attached to the joint that moves it."""
     import coal
     import pinocchio as pin

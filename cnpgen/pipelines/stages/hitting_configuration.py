@@ -5,7 +5,7 @@
 
 from dataclasses import dataclass
 from functools import reduce
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,11 +25,9 @@ from cnpgen.pipelines.stages.hitting_newton import (
 )
 from cnpgen.pipelines.stages.ik import IK_TOLERANCE, MAX_IK_STEPS, ik_step
 from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Stage, StageFunction
+from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
-
-if TYPE_CHECKING:
-    from cnpgen.robots.robot import Robot
 
 REASONS = "no hitting configuration", "joint position limit at the goal"
 
@@ -122,7 +120,7 @@ class _Search:
         q[:, some[better]], value[some[better]] = held[:, better], reached[0, better]
 
 
-def better_optimum(robot: "Robot") -> Any:
+def better_optimum(robot: Robot) -> Any:
     """Build ``(q1, step1, value1, q2, step2, value2) -> (q, value, outside_q, outside_value, solved)`` of two searches.
 
     A search has converged if its last step is below the tolerance. ``q`` is the better optimum within the joint limits
@@ -144,7 +142,7 @@ def better_optimum(robot: "Robot") -> Any:
     return ca.Function("better_optimum", columns, [*found, ca.logic_or(*solved)])
 
 
-def _within(robot: "Robot", q: Vec) -> Scalar:
+def _within(robot: Robot, q: Vec) -> Scalar:
     """Build a flag that is 1 for configurations within the joint limits."""
     import casadi as ca
 

@@ -7,7 +7,7 @@ joints, maximize ``g . s + s^T H s / 2`` subject to ``J_F s = p - FK(q)``. Addin
 suffice.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,14 +35,12 @@ from cnpgen.pipelines.stages.hitting_newton import (
     shortened,
 )
 from cnpgen.pipelines.stages.stage import Array
-
-if TYPE_CHECKING:
-    from cnpgen.robots.robot import Robot
+from cnpgen.robots.robot import Robot
 
 CONSTRAINT_WEIGHT = 1e3  # weight of J_F^T J_F relative to -H: both are in m^2/rad^2, and of order 1
 
 
-def within_limits(robot: "Robot", kernel: Kernel, q: Array, *parameters: Array) -> tuple[Array, NDArray[np.bool_]]:
+def within_limits(robot: Robot, kernel: Kernel, q: Array, *parameters: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Move optima outside joint limits to nearby optima within, by an active-set method.
 
     Joints outside their limits are set to the limit and held. Joints that leave their limits after a solve for the
@@ -84,7 +82,7 @@ def _change(held: Array, outside: Array, pull: Array) -> Array:
     return np.where(released, -held, np.where(held == 0, outside, 0.0))
 
 
-def held_step(robot: "Robot") -> Any:
+def held_step(robot: Robot) -> Any:
     """Build one Newton step in the joints that are not held: ``((q, pull), p, d, q0, held) -> (next, |step|)``.
 
     ``held`` is 1 for joints that stay constant. ``pull`` is the gradient of the Lagrangian, an output that the step

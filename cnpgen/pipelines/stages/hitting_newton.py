@@ -11,7 +11,7 @@ only a (n - 3) x (n - 3) matrix.
 
 from dataclasses import dataclass
 from itertools import combinations
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -29,9 +29,7 @@ from cnpgen.kernels.symbolic.linalg import (
     subtract,
     symbols,
 )
-
-if TYPE_CHECKING:
-    from cnpgen.robots.robot import Robot
+from cnpgen.robots.robot import Robot
 
 MAX_NEWTON_STEP_RAD = 0.6  # Euclidean norm of one Newton step
 MIN_PIVOT = 1e-3  # minimum |pivot| of the reduced Hessian: every step is an ascent direction
@@ -39,7 +37,7 @@ NEWTON_TOLERANCE_RAD = 1e-6  # length of the last step; convergence is quadratic
 MAX_NEWTON_STEPS = 40
 
 
-def objective(robot: "Robot") -> Any:
+def objective(robot: Robot) -> Any:
     """Build ``(q, d, q0) -> f``: the squared manipulability along d minus the penalty on the distance from q0."""
     import casadi as ca
 
@@ -50,7 +48,7 @@ def objective(robot: "Robot") -> Any:
     return ca.Function("objective", [q_sx, d_sx, home_sx], [dot(gain, gain) - dot(away, away)])
 
 
-def direction_symbols(robot: "Robot") -> tuple[Any, Vec]:
+def direction_symbols(robot: Robot) -> tuple[Any, Vec]:
     """Return the symbols of a hitting direction: x and y, and z if samples tilt the table."""
     return symbols("d", 3 if robot.parameters.tilts_table else 2)
 
@@ -103,7 +101,7 @@ class Expansion:
         return hessian
 
 
-def expand(robot: "Robot", q: Vec, d: Vec, home: Vec) -> Expansion:
+def expand(robot: Robot, q: Vec, d: Vec, home: Vec) -> Expansion:
     """Expand objective and constraint at q.
 
     Args:
@@ -147,7 +145,7 @@ def _rates(kin: Kinematics, rate: Vec) -> tuple[list[Vec], list[Vec]]:
     return axis_rates, column_rates
 
 
-def newton_step(robot: "Robot") -> Any:
+def newton_step(robot: Robot) -> Any:
     """Build one Newton step as an SX function ``(q, p, d, q0) -> (next q, |step|)``.
 
     Args:
@@ -218,7 +216,7 @@ def _null_space(jacobian: list[Vec], inverse: list[Vec], basic: tuple[int, int, 
     return columns
 
 
-def basic_joints(robot: "Robot") -> tuple[int, int, int]:
+def basic_joints(robot: Robot) -> tuple[int, int, int]:
     """Choose the three joints that eliminate the tip position.
 
     They maximize the median of ``|det J_B| / sqrt(det J J^T)`` over configurations near the base. (A few unusual

@@ -13,7 +13,7 @@ equations. This is again a linear program, and its dual has its optimum at a ``z
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from itertools import combinations
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -24,11 +24,9 @@ from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.candidate_table import hit_direction, table_normal, velocity_factor
 from cnpgen.pipelines.stages.hitting_newton import along, direction_symbols
 from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Stage, StageFunction
+from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
-
-if TYPE_CHECKING:
-    from cnpgen.robots.robot import Robot
 
 ZERO_RESIDUAL_M = 1e-11  # residuals below this are treated as zero
 SPEED_SHARE_COLUMN = "hit_speed_share"  # task column: hit speed as a fraction of the maximum speed
@@ -121,7 +119,7 @@ class HittingVelocity(Stage):
         return work
 
 
-def hitting_velocity(robot: "Robot", *, min_speed: float) -> Any:
+def hitting_velocity(robot: Robot, *, min_speed: float) -> Any:
     """Build the linear program as an SX function ``(q, d) -> (dq, speed, found)``, or of (q, d, normal).
 
     Args:
@@ -163,7 +161,7 @@ def maximise(a: Vec, b: list[Vec], limit: list[float]) -> tuple[Vec, Scalar]:
     best: Scalar = ca.SX(np.inf)
     y: Vec = [ca.SX(0), ca.SX(0)]
     for i, j in combinations(range(n), 2):
-        det = _det(b[i], b[j])
+        det = b[i][0] * b[j][1] - b[i][1] * b[j][0]
         size = ca.fabs(b[i][0] * b[j][1]) + ca.fabs(b[i][1] * b[j][0])
         usable = ca.fabs(det) > PARALLEL_TOLERANCE * size
         inverse = 1.0 / ca.if_else(usable, det, 1.0)
@@ -223,7 +221,3 @@ def _smallest_ratio(b: list[Vec], limit: list[float], target: Vec) -> Vec:
         for same, bound, x in zip(parallel, limit, b, strict=True)
     ]
     return [x + w for x, w in zip(v, along, strict=True)]
-
-
-def _det(a: Vec, b: Vec) -> Scalar:
-    return a[0] * b[1] - a[1] * b[0]

@@ -2,7 +2,7 @@
 
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -13,11 +13,9 @@ from cnpgen.kernels.tape import Loop
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.draw import uniform
 from cnpgen.pipelines.stages.stage import CandidateBatch, Stage, StageFunction
+from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import Range, field
 from cnpgen.store.field import Field
-
-if TYPE_CHECKING:
-    from cnpgen.robots.robot import Robot
 
 IK_TOLERANCE = 1e-9  # m and rad, before the last step (quadratic convergence, except with joints on their limits)
 MAX_IK_STEPS = 24
@@ -100,7 +98,7 @@ class GuessedIK(_IK):
 
         return work
 
-    def _put_on_limits(self, candidates: CandidateBatch, random: np.random.Generator, robot: "Robot") -> None:
+    def _put_on_limits(self, candidates: CandidateBatch, random: np.random.Generator, robot: Robot) -> None:
         choice, joint, side = candidates.draw(random, 3)
         which = np.minimum((joint * robot.n).astype(int), robot.n - 1)
         held = (np.arange(robot.n)[:, None] == which) & (choice < self.at_limit)
@@ -205,7 +203,7 @@ class GoalIK(GuessedIK):
         return super().complete(context, given)
 
 
-def ik_step(robot: "Robot", *, vertical: bool, max_step: float, hold: bool = False) -> Any:
+def ik_step(robot: Robot, *, vertical: bool, max_step: float, hold: bool = False) -> Any:
     """Build one step of inverse kinematics as an SX function ``(q, p) -> (next q, |error|)``.
 
     A joint that would leave its limits is set to the limit. The rest of the step is redistributed once over the other
@@ -275,7 +273,7 @@ def _clipped(rows: list[Vec], error: Vec, max_step: float, damping: Scalar) -> t
     return scale(step, factor), factor
 
 
-def _clip(x: Scalar, robot: "Robot", i: int) -> Scalar:
+def _clip(x: Scalar, robot: Robot, i: int) -> Scalar:
     import casadi as ca
 
     return ca.fmin(ca.fmax(x, float(robot.position_lower[i])), float(robot.position_upper[i]))

@@ -5,7 +5,7 @@ checked.
 """
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,11 +19,9 @@ from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES, Condition, Constraint, End
 from cnpgen.problems.constraints.self_clearance import SelfClearance
 from cnpgen.problems.problem import Problem
+from cnpgen.robots.robot import Robot
 from cnpgen.world.path import PathWorld
 from cnpgen.world.world import World
-
-if TYPE_CHECKING:
-    from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
 States = tuple[Array, Array, Array]
@@ -161,7 +159,7 @@ def _violates(constraint: Constraint, world: World, end: End, dtype: str, *, exa
     return False
 
 
-def narrow_phase(robot: "Robot", problem: Problem, *, end: End, dtype: str) -> Any:
+def narrow_phase(robot: Robot, problem: Problem, *, end: End, dtype: str) -> Any:
     """Build ``(q, dq, ddq, obstacle_poses) -> unmet``: number of unmet conservative values of every constraint."""
     import casadi as ca
 

@@ -1,12 +1,10 @@
 """Inverse kinematics of tip poses as a kernel: damped Gauss-Newton steps from given joint positions."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from cnpgen.kernels.symbolic.kinematics import forward_kinematics
 from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, dot, gram, scale, solve, subtract, symbols
-
-if TYPE_CHECKING:
-    from cnpgen.robots.robot import Robot
+from cnpgen.robots.robot import Robot
 
 METERS_PER_RADIAN = 0.3  # weight of an angle against a distance
 POSE_TOLERANCE = 1e-9  # m and weighted rad, before the last step
@@ -16,7 +14,7 @@ POSE_DAMPING = 1e-3  # relative to the squared error (Sugihara 2011)
 MIN_DAMPING = 1e-12
 
 
-def pose_ik_step(robot: "Robot") -> Any:
+def pose_ik_step(robot: Robot) -> Any:
     """Build ``(q, position, rotation by rows) -> (next q, |error|)``; steps end at the joint limits.
 
     The error is the distance from the position, and the rotation vector to the rotation times ``METERS_PER_RADIAN``,

@@ -1,7 +1,7 @@
 """Stage: the torque that holds the arm and its payload still, by inverse dynamics."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -9,11 +9,9 @@ from cnpgen.kernels.symbolic.linalg import symbols
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.stage import CandidateBatch, Stage, StageFunction
+from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
-
-if TYPE_CHECKING:
-    from cnpgen.robots.robot import Robot
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +50,7 @@ class GravityTorque(Stage):
         return work
 
 
-def torque_ratio(robot: "Robot") -> Any:
+def torque_ratio(robot: Robot) -> Any:
     """Build ``q -> max_i |gravity torque_i| / limit_i``, with the problem's parameters ``(q, parameters) -> ...``."""
     import casadi as ca
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,11 +16,9 @@ from cnpgen.robots.observation.observations import BasisPoints
 from cnpgen.robots.observation.primitives import Primitives
 from cnpgen.robots.observation.reference import ObservationBackend
 from cnpgen.robots.observation.scene_primitives import scene_primitives
+from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene import Scene
 from cnpgen.trajectory.boundary import Boundary
-
-if TYPE_CHECKING:
-    from cnpgen.robots.robot import Robot
 
 Array = NDArray[Any]
 

@@ -20,8 +20,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class _RelativeLimit(Constraint):
-    """Base class: symmetric limit with a relative tolerance."""
+    """Base class: symmetric limit with a relative tolerance.
 
+    States have a property ``rates``, which is None for jerks of boundary states, and robots one ``limit``.
+    """
+
+    condition_name: ClassVar[str]
+    unit: ClassVar[str]
+    rates: ClassVar[str]
+    limit: ClassVar[str]
     factor_name: ClassVar[str] = ""  # parameter by which samples scale the limit
 
     tolerance: float = field("violation that a valid motion may have, as a fraction of the limit", low=0.0)
@@ -30,14 +37,21 @@ class _RelativeLimit(Constraint):
         """Return the fraction of the limit, shape (m,)."""
         return self.tolerance * condition.upper
 
+    def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
+        """State the limits on the rates in SI units."""
+        return self._within(state, state.parameters.get(self.factor_name))
 
-def _within(name: str, unit: str, g: list[Any], limit: NDArray[np.float64]) -> tuple[Condition, ...]:
-    return (Condition(name, unit, g, -limit, limit, "limit"),)
+    def measured(self, world: "World") -> tuple[Condition, ...]:
+        """Compare the rates in SI units with the limits; torques are Pinocchio's inverse dynamics."""
+        return self._within(world, world.parameters.values.get(self.factor_name))
 
-
-def _per_factor(rates: list[Any], factor: Any) -> list[Any]:
-    """Return rates divided by the factor of their limits, so that the bounds are the same for all samples."""
-    return rates if factor is None else [rate / factor for rate in rates]
+    def _within(self, state: "SymbolicState | World", factor: Any) -> tuple[Condition, ...]:
+        """Divide rates by the factor of their limits, so that the bounds are the same for all samples."""
+        if (rates := getattr(state, self.rates)) is None:
+            return ()
+        g = list(rates) if factor is None else [rate / factor for rate in rates]
+        limit, unit = getattr(state.robot, self.limit), state.robot.units(self.unit)
+        return (Condition(self.condition_name, unit, g, -limit, limit, "limit"),)
 
 
 def _between(robot: "Robot", q: list[Any]) -> tuple[Condition, ...]:
@@ -68,17 +82,8 @@ class JointVelocity(_RelativeLimit):
 
     reason = "joint velocity limit"
     training_weight, training_factor = 100.0, 0.99
+    condition_name, unit, rates, limit = "joint velocity", "rad/s", "dq", "velocity_limit"
     factor_name = "velocity_factor"
-
-    def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
-        """State the limits on dq [rad/s]."""
-        rates = _per_factor(state.dq, state.parameters.get(self.factor_name))
-        return _within("joint velocity", state.robot.units("rad/s"), rates, state.robot.velocity_limit)
-
-    def measured(self, world: "World") -> tuple[Condition, ...]:
-        """Compare dq [rad/s] with the limits."""
-        rates = _per_factor(list(world.dq), world.parameters.values.get(self.factor_name))
-        return _within("joint velocity", world.robot.units("rad/s"), rates, world.robot.velocity_limit)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,17 +92,8 @@ class JointAcceleration(_RelativeLimit):
 
     reason = "joint acceleration limit"
     training_weight, training_factor = 5.0, 0.985
+    condition_name, unit, rates, limit = "joint acceleration", "rad/s^2", "ddq", "acceleration_limit"
     factor_name = "acceleration_factor"
-
-    def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
-        """State the limits on ddq [rad/s^2]."""
-        rates = _per_factor(state.ddq, state.parameters.get(self.factor_name))
-        return _within("joint acceleration", state.robot.units("rad/s^2"), rates, state.robot.acceleration_limit)
-
-    def measured(self, world: "World") -> tuple[Condition, ...]:
-        """Compare ddq [rad/s^2] with the limits."""
-        rates = _per_factor(list(world.ddq), world.parameters.values.get(self.factor_name))
-        return _within("joint acceleration", world.robot.units("rad/s^2"), rates, world.robot.acceleration_limit)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,19 +105,8 @@ class JointJerk(_RelativeLimit):
 
     reason = "joint jerk limit"
     training_weight, training_factor = 0.01, 0.97
+    condition_name, unit, rates, limit = "joint jerk", "rad/s^3", "jerk", "jerk_limit"
     uses_jerk: ClassVar[bool] = True
-
-    def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
-        """State the limits on the jerk [rad/s^3], if the state has a jerk."""
-        if state.jerk is None:
-            return ()
-        return _within("joint jerk", state.robot.units("rad/s^3"), state.jerk, state.robot.jerk_limit)
-
-    def measured(self, world: "World") -> tuple[Condition, ...]:
-        """Compare the jerk [rad/s^3] with the limits, if the state has a jerk."""
-        if world.jerk is None:
-            return ()
-        return _within("joint jerk", world.robot.units("rad/s^3"), list(world.jerk), world.robot.jerk_limit)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,11 +115,4 @@ class JointTorque(_RelativeLimit):
 
     reason = "joint torque limit"
     training_weight, training_factor = 1.5, 0.97
-
-    def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
-        """State the limits on the inverse dynamics [N m]."""
-        return _within("joint torque", state.robot.units("N m"), state.torque, state.robot.torque_limit)
-
-    def measured(self, world: "World") -> tuple[Condition, ...]:
-        """Compare Pinocchio's inverse dynamics [N m] with the limits."""
-        return _within("joint torque", world.robot.units("N m"), list(world.torque), world.robot.torque_limit)
+    condition_name, unit, rates, limit = "joint torque", "N m", "torque", "torque_limit"

@@ -43,10 +43,6 @@ def is_mpinets(path: Path) -> bool:
 def read_mpinets(path: Path, rows: slice) -> Iterator[SceneProblem]:
     """Yield the problems of a file.
 
-    Args:
-        path: The file.
-        rows: Rows that are read.
-
     Raises:
         DatasetError: The file is damaged or no HDF5 file.
         SceneError: A dataset is missing or has a wrong shape, or a number of an obstacle is invalid.

@@ -11,12 +11,14 @@ from enum import StrEnum
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
+from cnpgen.problems.problem import Problem
 from cnpgen.refine.proof.end_violations import end_violations
 from cnpgen.refine.proof.reachable_positions import end_states, joint_limits, sample_times
 from cnpgen.refine.proof.table_proof import find_table_exit
+from cnpgen.robots.robot import Robot
+from cnpgen.robots.scene import Scene
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
 from cnpgen.store.joint_units import unit_of
@@ -24,11 +26,7 @@ from cnpgen.trajectory.boundary import Boundary
 
 if TYPE_CHECKING:
     from cnpgen.plans.plans import Plans
-    from cnpgen.problems.problem import Problem
-    from cnpgen.robots.robot import Robot
-    from cnpgen.robots.scene import Scene
 
-Array = NDArray[np.float64]
 POSITION_MARGIN_RAD = 1e-4  # for motion between the times of the verdict, and its tolerance of boundary conditions
 
 
@@ -57,7 +55,7 @@ class Explanation:
         return f"{self.kind}: {self.text}"
 
 
-def explain_failure(problem: "Problem", robot: "Robot", boundary: Boundary, scene: "Scene") -> Explanation:
+def explain_failure(problem: Problem, robot: Robot, boundary: Boundary, scene: Scene) -> Explanation:
     """Explain why no valid plan of a boundary problem was found.
 
     Args:
@@ -110,7 +108,7 @@ def explain_plans(plans: "Plans", indices: Sequence[int] | None = None) -> dict[
     }
 
 
-def _cannot_brake(problem: "Problem", robot: "Robot", boundary: Boundary) -> Iterator[str]:
+def _cannot_brake(problem: Problem, robot: Robot, boundary: Boundary) -> Iterator[str]:
     """Describe the joints that leave their range for any acceleration."""
     limits = joint_limits(problem, robot, tolerances=1.0)
     times = sample_times(boundary, limits)
@@ -124,7 +122,7 @@ def _cannot_brake(problem: "Problem", robot: "Robot", boundary: Boundary) -> Ite
                 yield f"{instant} {name} is {violation:.2g} {unit} or more outside its range, for any acceleration"
 
 
-def _off_table(problem: "Problem", robot: "Robot", boundary: Boundary) -> Explanation | None:
+def _off_table(problem: Problem, robot: Robot, boundary: Boundary) -> Explanation | None:
     """Explain whether the tip must leave a table."""
     table_exit = find_table_exit(problem, robot, boundary)
     if table_exit is None:

@@ -40,9 +40,6 @@ class TipKinematics:
 class ArmKinematics:
     """Positions of the tip by Pinocchio.
 
-    Args:
-        robot: The robot.
-
     Attributes:
         reach: Upper bounds of the derivatives of the tip's position by each joint, of any order, shape (n,).
     """

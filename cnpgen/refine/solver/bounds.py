@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +15,7 @@ from cnpgen.problems.constraints.self_clearance import SelfClearance
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.solver.residuals import DISTANCE_SCALE_M, residual_scale
 from cnpgen.robots.solid import place_obstacles
-
-if TYPE_CHECKING:
-    from cnpgen.world.world import World
+from cnpgen.world.world import World
 
 Array = NDArray[np.float64]
 END_POINTS = (0, 1, 2, 4, 7, 11)  # from either end, whose accelerations depend on the last rate control points
@@ -115,7 +112,7 @@ class Bounds:
         return Bounds(lower, upper, self.nonsmooth, self.interval_tolerance)
 
 
-def condition_orders(problem: Problem, world: "World") -> list[int]:
+def condition_orders(problem: Problem, world: World) -> list[int]:
     """Return the highest derivative of q on which each condition depends; the world is left at rest.
 
     Problems that differ only in poses and sizes of obstacles share the result.
@@ -150,7 +147,7 @@ class BoundsTemplate:
         held_clearances: Mask of clearances of the held object from the links, shape (m,).
     """
 
-    def __init__(self, problem: Problem, world: "World", s: Array, tightening: Tightening) -> None:
+    def __init__(self, problem: Problem, world: World, s: Array, tightening: Tightening) -> None:
         orders = condition_orders(problem, world)
         pairs = [(constraint, condition) for constraint in problem.constraint for condition in constraint.solved(world)]
         tables, untightened = (

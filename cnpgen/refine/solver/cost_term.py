@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,12 +11,10 @@ from cnpgen.kernels.symbolic.linalg import symbols
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState, time_derivatives
 from cnpgen.problems.objectives import Centrifugal, ObjectiveTerm, read_objective
 from cnpgen.problems.problem import Problem, resolved
+from cnpgen.robots.robot import Robot
 from cnpgen.schema import registry
 from cnpgen.schema.catalogue import read_kind
 from cnpgen.schema.keys import RecipeLocation
-
-if TYPE_CHECKING:
-    from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
 
@@ -82,7 +80,7 @@ def choose_cost_term(problem: Problem, objective: str = "time", weight: float | 
     return CostTerm(terms) if terms else None
 
 
-def cost_term_residuals(robot: "Robot", terms: list[dict[str, Any]]) -> Any:
+def cost_term_residuals(robot: Robot, terms: list[dict[str, Any]]) -> Any:
     """Build ``w -> (e, de/dw)`` with ``w = (p, p', p'', p''', r, r', r'')``, the Jacobian column by column.
 
     Args:
@@ -97,13 +95,13 @@ def cost_term_residuals(robot: "Robot", terms: list[dict[str, Any]]) -> Any:
     return ca.Function("cost_term", [w_sx], ca.cse([residuals, ca.vec(jacobian)]))
 
 
-def residual_counts(robot: "Robot", cost_term: CostTerm) -> tuple[int, ...]:
+def residual_counts(robot: Robot, cost_term: CostTerm) -> tuple[int, ...]:
     """Return the number of residuals of every term."""
     _, state = _state(robot)
     return tuple(len(term.residuals(state)) for term in cost_term.terms)
 
 
-def _state(robot: "Robot") -> tuple[Any, SymbolicState]:
+def _state(robot: Robot) -> tuple[Any, SymbolicState]:
     n = robot.n
     w_sx, w = symbols("w", 4 * n + 3)
     p, *path = (w[order * n : (order + 1) * n] for order in range(4))

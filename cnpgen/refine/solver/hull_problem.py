@@ -4,25 +4,22 @@ The kernels of such a problem are those of the problem without clearances, so th
 """
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from cnpgen.kernels.collision.collision_checker import MAX_JOINTS
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.constraints.self_clearance import SelfClearance
+from cnpgen.problems.problem import Problem
 from cnpgen.refine.solver.bounds import NO_TIGHTENING, BoundsTemplate
 from cnpgen.refine.solver.hulls import has_clearance_constraints
-
-if TYPE_CHECKING:
-    from cnpgen.problems.problem import Problem
-    from cnpgen.robots.robot import Robot
-    from cnpgen.world.world import World
+from cnpgen.robots.robot import Robot
+from cnpgen.world.world import World
 
 TEMPLATE_POINTS = 32  # of a grid that is only used to find equalities
 
 
-def can_measure_hulls(problem: "Problem", robot: "Robot", world: "World") -> bool:
+def can_measure_hulls(problem: Problem, robot: Robot, world: World) -> bool:
     """Return whether hulls replace capsules: clearances of link geometry, and no equalities of states."""
     if robot.n > MAX_JOINTS or not has_clearance_constraints(problem, robot):
         return False
@@ -32,7 +29,7 @@ def can_measure_hulls(problem: "Problem", robot: "Robot", world: "World") -> boo
     return not BoundsTemplate(others, world, np.linspace(0, 1, TEMPLATE_POINTS), NO_TIGHTENING).equal.any()
 
 
-def without_distances(problem: "Problem") -> "Problem":
+def without_distances(problem: Problem) -> Problem:
     """Return a problem without clearances of links, and without obstacles unless another constraint may use them."""
     others = tuple(item for item in problem.constraint if not isinstance(item, RobotClearance | SelfClearance))
     uses_obstacles = problem.structure is None or any(isinstance(item, ObjectContact) for item in others)

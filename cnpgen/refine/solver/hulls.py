@@ -6,9 +6,10 @@ The derivative of the distance treats the closest points and the direction as co
 velocity of the points along the direction.
 """
 
+from ctypes import CDLL
 from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,25 +19,21 @@ from cnpgen.kernels.collision.row_kernels import DistanceColumns, RowKernels
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.constraints.self_clearance import SelfClearance
+from cnpgen.problems.problem import Problem
 from cnpgen.refine.solver.grid import Grid
 from cnpgen.refine.solver.residuals import DISTANCE_SCALE_M
 from cnpgen.refine.solver.transcription import Linearization, ResidualKernels, Transcription, cache_last
+from cnpgen.robots.robot import Robot
 from cnpgen.robots.solid import solids_of
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.world.forward_kinematics import ForwardKinematics
 from cnpgen.world.rigid_bodies import Contacts, RigidBodies
 
-if TYPE_CHECKING:
-    from ctypes import CDLL
-
-    from cnpgen.problems.problem import Problem
-    from cnpgen.robots.robot import Robot
-
 Array = NDArray[np.float64]
 MEASURED_RANGE_M = 0.04  # above the required distance; larger distances are not measured
 
 
-def has_clearance_constraints(problem: "Problem", robot: "Robot") -> bool:
+def has_clearance_constraints(problem: Problem, robot: Robot) -> bool:
     """Return whether a problem constrains clearances of a robot with link geometry."""
     constraints = any(isinstance(item, RobotClearance | SelfClearance) for item in problem.constraint)
     return constraints and robot.shape is not None
@@ -58,7 +55,7 @@ class Hulls:
         tolerance: Accepted violation of them in a valid motion [m].
     """
 
-    def __init__(self, problem: "Problem", robot: "Robot", library: "CDLL | None" = None) -> None:
+    def __init__(self, problem: Problem, robot: Robot, library: CDLL | None = None) -> None:
         assert robot.shape is not None
         usable = library is not None and robot.n <= MAX_JOINTS
         self.checker = CollisionChecker(library, robot) if library is not None and usable else None

@@ -1,6 +1,6 @@
 """Residuals of a problem at one phase of a motion, as SX functions of the splines."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,16 +9,14 @@ from cnpgen.kernels.symbolic.linalg import symbols
 from cnpgen.kernels.symbolic.symbolic_state import FrozenState, time_derivatives
 from cnpgen.problems.constraints.constraint import MIN_TOLERANCE
 from cnpgen.problems.problem import Problem
-
-if TYPE_CHECKING:
-    from cnpgen.robots.robot import Robot
+from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
 DISTANCE_SCALE_M = 0.1  # size of a residual of 1
 EQUALITY_SCALE = 20  # tolerances; with fewer the merit function rejects steps for equalities that are met well enough
 
 
-def stage_values(robot: "Robot", problem: Problem) -> Any:
+def stage_values(robot: Robot, problem: Problem) -> Any:
     """Build the function ``(w, obstacle_poses) -> g`` of all residuals at one phase, with ``w = (p, p', p'', r, r')``.
 
     With constraints of the jerk, ``w = (p, p', p'', p''', r, r', r'')``.
@@ -29,7 +27,7 @@ def stage_values(robot: "Robot", problem: Problem) -> Any:
     return ca.Function("stage_values", columns, state.unfrozen([ca.vertcat(*g)]))
 
 
-def stage_jacobian(robot: "Robot", problem: Problem) -> Any:
+def stage_jacobian(robot: Robot, problem: Problem) -> Any:
     """Build the function ``(w, obstacle_poses) -> (g, dg/dw)``, the Jacobian column by column."""
     import casadi as ca
 
@@ -40,7 +38,7 @@ def stage_jacobian(robot: "Robot", problem: Problem) -> Any:
     return ca.Function("stage_jacobian", columns, outputs)
 
 
-def _stage(robot: "Robot", problem: Problem) -> tuple[list[Any], FrozenState, list[Any]]:
+def _stage(robot: Robot, problem: Problem) -> tuple[list[Any], FrozenState, list[Any]]:
     n, orders = robot.n, problem.path_orders
     (w_sx, w), (poses_sx, obstacle_poses) = (
         symbols("w", orders * n + orders - 1),

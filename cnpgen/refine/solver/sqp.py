@@ -130,13 +130,10 @@ def minimize(
         deadline.note(begun)
         feasible = None if iterate.tightened else feasible  # earlier iterates met the wider bounds only
         if iterate.violation < settings.violation_tolerance:
-            feasible = _cheaper(feasible, iterate.result(iteration))
+            found = iterate.result(iteration)
+            feasible = found if feasible is None or found.cost < feasible.cost else feasible
     last = iterate.result(iteration)
     return last if iterate.converged or feasible is None else replace(feasible, iterations=iteration)
-
-
-def _cheaper(best: Result | None, other: Result) -> Result:
-    return other if best is None or other.cost < best.cost else best
 
 
 def make_backend(motion: Transcription, bounds: Bounds, thinning: int) -> Backend:

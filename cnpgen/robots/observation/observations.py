@@ -24,7 +24,6 @@ Corner = tuple[float, float, float]
 MAX_OBSERVED_POINTS = 10_000_000  # of one observation of one scene
 MIN_GRID_EXTENT_M = 1e-6
 WORKSPACE = (-0.9, -0.9, -0.1), (0.9, 0.9, 1.1)  # corners of the default grids, around an arm like the Panda [m]
-TOKEN_NUMBERS = len(KINDS) + 3 + 6 + 3  # kind, center, two columns of the rotation matrix, sizes
 
 
 @dataclass(frozen=True, eq=False)

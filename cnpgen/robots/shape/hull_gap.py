@@ -101,8 +101,9 @@ def measure_hull_gap(urdf: str, path: Path, packages: Sequence[Path], *, model: 
     free, accepted = np.ones(GAP_STATES, bool), np.ones(GAP_STATES, bool)
     for of_parts, of_meshes in checked:
         free, accepted = free & ~of_meshes, accepted & ~of_parts
+    rejected = {pair: float(part[free].mean()) if free.any() else 0.0 for pair, (part, _) in overlaps.items()}
     gaps = [
-        (pair, PairGap(pair.first, pair.second, float(part.mean()), float(mesh.mean()), _fraction(part, free)))
+        (pair, PairGap(pair.first, pair.second, float(part.mean()), float(mesh.mean()), rejected[pair]))
         for pair, (part, mesh) in overlaps.items()
     ]
     return HullGap(
@@ -112,10 +113,6 @@ def measure_hull_gap(urdf: str, path: Path, packages: Sequence[Path], *, model: 
         pairs=tuple(sorted((gap for pair, gap in gaps if not pair.left_out), key=lambda gap: -gap.rejected)),
         hidden=tuple(gap for pair, gap in gaps if pair.left_out and gap.meshes <= ALWAYS_FRACTION),
     )
-
-
-def _fraction(mask: NDArray[np.bool_], among: NDArray[np.bool_]) -> float:
-    return float(mask[among].mean()) if among.any() else 0.0
 
 
 def _reference_bodies(
