@@ -68,9 +68,6 @@ def check_dataset(folder: Path) -> list[Finding]:
 
     Returns:
         The findings; empty if there is no problem. Of a dataset without manifest, the existing shards are checked.
-
-    Raises:
-        MachineError: A file cannot be read.
     """
     links = [Finding(name, OUTSIDE, hint=COPY_HINT) for name in outside_links(folder)]
     try:
@@ -93,9 +90,6 @@ def check_documents(folder: Path, spec: DatasetSpec) -> list[Finding]:
     Args:
         folder: Folder of the dataset.
         spec: Specification of the dataset.
-
-    Raises:
-        MachineError: A file cannot be read.
     """
     findings, manifest = _check_manifest(folder, spec)
     for entry in _shard_entries(manifest).values():
@@ -154,9 +148,6 @@ def check_shard(folder: Path, spec: DatasetSpec, task: ShardTask, entry: dict[st
 
     Returns:
         The findings.
-
-    Raises:
-        MachineError: A file cannot be read.
     """
     path = folder / task.file
     findings, expected = _check_sidecar(folder, spec, task, entry)

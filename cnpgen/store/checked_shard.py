@@ -87,7 +87,6 @@ def read_checked(shard: Shard, names: Iterable[str] | None = None) -> dict[str, 
 
     Raises:
         DatasetError: The shard is missing or damaged, or differs from its record or the specification.
-        MachineError: The shard cannot be read.
     """
     require_intact(shard.path, size=shard.size, sha256=shard.sha256)
     return read_rows(shard, names)
@@ -112,7 +111,6 @@ def read_scenes(shard: Shard, placements: Mapping[str, Placement] | None = None)
 
     Raises:
         DatasetError: The scenes are missing or invalid.
-        MachineError: The shard cannot be read.
     """
     placements = check_header(shard) if placements is None else placements
     names = [item.name for item in SCENE_ARRAYS]
@@ -134,7 +132,6 @@ def check_header(shard: Shard) -> dict[str, Placement]:
 
     Raises:
         DatasetError: They differ, or the file is damaged.
-        MachineError: The shard cannot be read.
     """
     placements, identity = read_placements(shard.path)
     if identity != {"specification_key": shard.key, "first_sample_id": shard.first_row, "rows": shard.rows}:
@@ -163,7 +160,6 @@ def read_columns(shard: Shard, placements: Mapping[str, Placement], names: Itera
 
     Raises:
         DatasetError: The file is cut off.
-        MachineError: The file cannot be read.
     """
     selected = {name: placements[name] for name in names}
     if any(place.offset is None for place in selected.values()):

@@ -99,11 +99,7 @@ def record_from_json(content: Mapping[str, Any]) -> ShardRecord:
 
 
 def save_record(folder: Path, task: ShardTask, record: ShardRecord) -> None:
-    """Write a shard's sidecar; from now on the shard counts as made.
-
-    Raises:
-        MachineError: A file cannot be written.
-    """
+    """Write a shard's sidecar; from now on the shard counts as made."""
     document = {"format": SHARD_RECORD_FORMAT, "format_version": SHARD_RECORD_VERSION, **record_to_json(record)}
     save_document(folder / task.sidecar, document, work=folder / WORK)
 
@@ -113,7 +109,6 @@ def load_record(folder: Path, task: ShardTask) -> ShardRecord:
 
     Raises:
         DatasetError: It is missing, damaged, of another format version or of another shard.
-        MachineError: A file cannot be read.
     """
     path = folder / task.sidecar
     record = record_from_json(load_document(path, SHARD_RECORD_FORMAT, version=SHARD_RECORD_VERSION, structure={}))
@@ -153,7 +148,6 @@ def commit_shard(
 
     Raises:
         DatasetError: The columns do not fit the specification, or are not finite.
-        MachineError: A file cannot be written.
     """
     if is_committed(folder, spec, task):  # another process made the same shard
         return load_record(folder, task)
@@ -216,7 +210,6 @@ def load_committed(folder: Path, spec: DatasetSpec, task: ShardTask) -> ShardRec
     Raises:
         DatasetError: The sidecar is missing, damaged or of another specification, or the shard is missing or has
             another size.
-        MachineError: A file cannot be read.
     """
     record = load_record(folder, task)
     if record.specification_fingerprint != spec.version_with(task).fingerprint:
@@ -241,7 +234,6 @@ def check_committed(folder: Path, spec: DatasetSpec, task: ShardTask) -> None:
 
     Raises:
         DatasetError: As for :func:`load_committed`, or the shard was changed.
-        MachineError: A file cannot be read.
     """
     record = load_committed(folder, spec, task)
     if file_sha256(folder / task.file) != record.sha256:

@@ -48,9 +48,6 @@ def write_with_checksum(path: Path, content: Content, *, kind: str, version: int
         content: The content.
         kind: Kind of the file: ``cnpgen-`` and one word.
         version: Version of the format.
-
-    Raises:
-        MachineError: The file cannot be written.
     """
     write_file(path, encode_with_checksum(content, kind=kind, version=version))
 
@@ -93,7 +90,6 @@ def verify_checksum(path: Path, *, kind: str, version: int) -> bool:
 
     Raises:
         DatasetError: The file is cut off, damaged or too large, or has another format version.
-        MachineError: The file cannot be read.
     """
     try:
         with path.open("rb") as file:
@@ -136,7 +132,6 @@ def read_with_checksum(path: Path, *, kind: str, version: int) -> Content:
 
     Raises:
         DatasetError: The file is missing, too large, cut off or damaged, or of another kind or format version.
-        MachineError: The file cannot be read.
     """
     data = read_file(path, max_bytes=MAX_CHECKSUM_FILE_BYTES)
     _check_checksum(
