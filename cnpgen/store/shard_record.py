@@ -202,11 +202,6 @@ def _write(
 def load_committed(folder: Path, spec: DatasetSpec, task: ShardTask) -> ShardRecord:
     """Read the sidecar of a shard and check that it belongs to this specification; the shard itself is not read.
 
-    Args:
-        folder: Folder of the dataset.
-        spec: Specification of the dataset.
-        task: The shard.
-
     Raises:
         DatasetError: The sidecar is missing, damaged or of another specification, or the shard is missing or has
             another size.
@@ -226,11 +221,6 @@ def load_committed(folder: Path, spec: DatasetSpec, task: ShardTask) -> ShardRec
 
 def check_committed(folder: Path, spec: DatasetSpec, task: ShardTask) -> None:
     """Check that a shard is the recorded one, by its sha256.
-
-    Args:
-        folder: Folder of the dataset.
-        spec: Specification of the dataset.
-        task: The shard.
 
     Raises:
         DatasetError: As for :func:`load_committed`, or the shard was changed.

@@ -83,11 +83,6 @@ def verify_checksum(path: Path, *, kind: str, version: int) -> bool:
 
     A damaged checksum is an error, and not taken for a missing one.
 
-    Args:
-        path: The file.
-        kind: Expected kind of the file.
-        version: Expected version of the format.
-
     Raises:
         DatasetError: The file is cut off, damaged or too large, or has another format version.
     """
@@ -124,11 +119,6 @@ def _check_checksum(path: Path, block: bytes, digest: str, *, kind: str, version
 
 def read_with_checksum(path: Path, *, kind: str, version: int) -> Content:
     """Read a file with a checksum and verify it.
-
-    Args:
-        path: The file.
-        kind: Expected kind of the file.
-        version: Expected version of the format.
 
     Raises:
         DatasetError: The file is missing, too large, cut off or damaged, or of another kind or format version.
