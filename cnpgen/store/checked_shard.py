@@ -75,8 +75,14 @@ def shard_of_record(folder: Path, spec: DatasetSpec, task: ShardTask, record: Sh
     return recorded_shard(folder, spec, task, size=record.bytes, sha256=record.sha256)
 
 
-def read_checked(shard: Shard, names: Iterable[str] | None = None) -> dict[str, NDArray[Any]]:
-    """Verify a shard and read fields of it.
+def read_checked(shard: Shard) -> dict[str, NDArray[Any]]:
+    """Verify a shard and read its fields; see ``read_rows``."""
+    require_intact(shard.path, size=shard.size, sha256=shard.sha256)
+    return read_rows(shard)
+
+
+def read_rows(shard: Shard, names: Iterable[str] | None = None) -> dict[str, NDArray[Any]]:
+    """Read and check fields of a shard whose sha256 was compared before.
 
     Args:
         shard: The shard.
@@ -88,12 +94,6 @@ def read_checked(shard: Shard, names: Iterable[str] | None = None) -> dict[str, 
     Raises:
         DatasetError: The shard is missing or damaged, or differs from its record or the specification.
     """
-    require_intact(shard.path, size=shard.size, sha256=shard.sha256)
-    return read_rows(shard, names)
-
-
-def read_rows(shard: Shard, names: Iterable[str] | None = None) -> dict[str, NDArray[Any]]:
-    """Read and check fields of a shard whose sha256 was compared before; see ``read_checked``."""
     placements = check_header(shard)
     columns = read_columns(shard, placements, [item.name for item in shard.fields] if names is None else names)
     check_values(shard, columns)
