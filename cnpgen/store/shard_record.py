@@ -1,7 +1,7 @@
 """The sidecar of a shard: its commit record, written after the shard has been flushed to the disk."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -61,17 +61,7 @@ _RECORD_STRUCTURE = {
     "sampling": SAMPLING_STRUCTURE,
     "statistics": {ANY_KEY: STATISTICS_STRUCTURE},
 }
-_PLAIN = (
-    "file",
-    "bytes",
-    "sha256",
-    "rows",
-    "first_sample_id",
-    "specification_fingerprint",
-    "started",
-    "seconds",
-    "versions",
-)
+_PLAIN = tuple(item.name for item in fields(ShardRecord) if item.name not in {"statistics", "sampling"})
 
 
 def record_to_json(record: ShardRecord) -> dict[str, Any]:
