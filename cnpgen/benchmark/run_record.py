@@ -18,17 +18,8 @@ from cnpgen.store.files.documents import parse_json
 
 RUNS_FILE = "runs.json"
 MAX_RUNS_BYTES = 10_000_000
-LIBRARIES = (
-    "scipy",
-    "daqp",
-    "mujoco",
-    "ompl",
-    "toppra",
-    "ruckig",
-    "sscbirrt",
-    "drake",
-    "crocoddyl",
-)  # beside those of ``versions``
+# Beside those of ``versions``.
+LIBRARIES = ("scipy", "daqp", "mujoco", "ompl", "toppra", "ruckig", "sscbirrt", "drake", "crocoddyl")
 _STRUCTURE = {
     "date": TEXT,
     "processor": TEXT,

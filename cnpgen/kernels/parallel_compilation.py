@@ -40,11 +40,7 @@ class PendingKernel(Kernel):
 
 
 class CompilerPool:
-    """Threads that compile tapes, equal ones once; all are compiled at the end of the ``with`` block.
-
-    Args:
-        cache_folder: Folder of cached libraries.
-    """
+    """Threads that compile tapes, equal ones once; all are compiled at the end of the ``with`` block."""
 
     def __init__(self, cache_folder: Path) -> None:
         self._folder = cache_folder

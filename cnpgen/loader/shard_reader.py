@@ -48,10 +48,6 @@ class ShardReader:
     def read(self, shard: Shard, fields: Sequence[Field]) -> Rows:
         """Read whole fields of a shard into memory.
 
-        Args:
-            shard: The shard.
-            fields: The fields.
-
         Returns:
             Field name -> values as stored, shape (rows, width) or (rows,).
 
@@ -73,10 +69,6 @@ class ShardReader:
         """Map fields of a shard into memory, to use some of their rows; they are read the first time.
 
         The system ends a process that uses a part of a map after the file was cut off there.
-
-        Args:
-            shard: The shard.
-            fields: The fields.
 
         Returns:
             As ``read`` does, but read-only if mapped; fields of scenes are computed for the rows that are used.

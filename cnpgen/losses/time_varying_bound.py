@@ -53,12 +53,7 @@ class TimeVaryingBound:
 
 def make_time_varying_bound(problem: Problem, robot: Robot, form: str) -> TimeVaryingBound:
     """Collect the conditions of a problem with time-varying bounds."""
-    import casadi as ca
-
-    q, dq, ddq = (ca.vertsplit(ca.SX.sym(name, robot.n)) for name in ("q", "dq", "ddq"))
-    obstacle_poses = ca.vertsplit(ca.SX.sym("obstacle_poses", problem.scene_width))
-    size = problem.object_size
-    state = SymbolicState(robot, q, dq, ddq, obstacle_poses, problem.obstacle, size)
+    _, state = SymbolicState.of_symbols(robot, problem.obstacle, problem.object_size, problem.scene_width)
     pairs = penalized_conditions(filter(has_time_varying_bound, problem.constraint), state, form)
     flat = ((constraint, condition) for constraint, conditions in pairs for condition in conditions)
     return TimeVaryingBound(tuple(flat))

@@ -127,11 +127,6 @@ class GoalOfPlan(Stage):
         """Describe the stage in one sentence."""
         return f"in {100 * self.share:.4g} % of the cases take the goal of the motion that the start is on"
 
-    def outputs(self, context: Context) -> tuple[Field, ...]:
-        """Return no new fields."""
-        del context
-        return ()
-
     def prepare(self, context: Context) -> StageFunction:
         """Return the stage function."""
         del context

@@ -105,18 +105,8 @@ def boundary_unmet(
     """
     import casadi as ca
 
-    names = (
-        ("q", robot.n),
-        ("dq", robot.n),
-        ("ddq", robot.n),
-        ("obstacle_poses", problem.scene_width),
-        ("p", 3),
-    )
-    (q_sx, q), (dq_sx, dq), (ddq_sx, ddq), (poses_sx, obstacle_poses), (p_sx, p) = (
-        symbols(name, width) for name, width in names
-    )
-    size = problem.object_size
-    state = SymbolicState(robot, q, dq, ddq, obstacle_poses, problem.obstacle, size)
+    columns, state = SymbolicState.of_symbols(robot, problem.obstacle, problem.object_size, problem.scene_width)
+    p_sx, p = symbols("p", 3)
     rows: list[Scalar] = []
     for constraint in problem.constraint:
         count: Scalar = ca.SX(0)
@@ -124,7 +114,7 @@ def boundary_unmet(
         for condition in constraint.symbolic_at(state, end):
             if condition.sufficient:
                 continue
-            if symbolic_needs(condition, dq_sx, ddq_sx) <= needs and (exact or condition.name in along):
+            if symbolic_needs(condition, *columns[1:3]) <= needs and (exact or condition.name in along):
                 tolerance = (
                     condition.tolerance(dtype)
                     if exact
@@ -136,7 +126,7 @@ def boundary_unmet(
     rows.append(ca.logic_not(ca.sqrt(dot(miss, miss)) <= BOUNDARY_TOLERANCES[dtype]["position"]))
     hit = [ca.SX.sym("angle"), ca.SX.sym("speed")] if hitting else []
     rows += [_direction_unmet(state.along_table(state.tip_velocity), *hit, dtype=dtype)] if hit else []
-    return ca.Function(f"boundary_{end}", [q_sx, dq_sx, ddq_sx, poses_sx, p_sx, *hit], [ca.vertcat(*rows)])
+    return ca.Function(f"boundary_{end}", [*columns, p_sx, *hit], [ca.vertcat(*rows)])
 
 
 def _direction_unmet(velocity: Vec, angle: Scalar, speed: Scalar, *, dtype: str) -> Scalar:

@@ -1,6 +1,7 @@
 """Build the CasADi functions of a planner: equality residuals, and residuals that depend on velocity."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import reduce
 from typing import Any
 
@@ -22,19 +23,16 @@ def equality_residuals(robot: Robot, problem: Problem) -> Any:
     """Build ``(q, obstacle_poses) -> (r, dr/dq)``: residuals of the equalities, Jacobian column by column."""
     import casadi as ca
 
-    (q_sx, q), (poses_sx, obstacle_poses) = (
-        symbols("q", robot.n),
-        symbols("obstacle_poses", problem.scene_width),
-    )
+    columns, state = _state(robot, problem)
     rows = [
         value - float(target)
-        for condition, needs in _conditions(robot, problem, _moving(problem, q), obstacle_poses)
+        for condition, needs in _conditions(problem, state, columns[1:-1])
         if needs == 0 and condition.is_equality
         for value, target in zip(condition.g, condition.lower, strict=True)
     ]
     residual = ca.vertcat(*rows) if rows else ca.SX(0, 1)
-    jacobian = ca.densify(ca.jacobian(residual, q_sx))
-    return ca.Function("equality_residuals", [q_sx, poses_sx], ca.cse([residual, ca.vec(jacobian)]))
+    jacobian = ca.densify(ca.jacobian(residual, columns[0]))
+    return ca.Function("equality_residuals", [columns[0], columns[-1]], ca.cse([residual, ca.vec(jacobian)]))
 
 
 def speed_residuals(robot: Robot, problem: Problem) -> Any:
@@ -44,19 +42,11 @@ def speed_residuals(robot: Robot, problem: Problem) -> Any:
     """
     import casadi as ca
 
-    (q_sx, q), (poses_sx, obstacle_poses) = (
-        symbols("q", robot.n),
-        symbols("obstacle_poses", problem.scene_width),
-    )
-    state = _moving(problem, q)
-    rows = [
-        value
-        for condition, needs in _conditions(robot, problem, state, obstacle_poses)
-        if needs
-        for value in condition.g
-    ]
+    columns, state = _state(robot, problem)
+    conditions = _conditions(problem, state, columns[1:-1])
+    rows = [value for condition, needs in conditions if needs for value in condition.g]
     g = ca.vertcat(*rows) if rows else ca.SX(0, 1)
-    return ca.Function("speed_residuals", [q_sx, *state.moving, poses_sx], [g])
+    return ca.Function("speed_residuals", columns, [g])
 
 
 def speed_violation(robot: Robot, problem: Problem) -> Any:
@@ -71,10 +61,11 @@ def speed_violation(robot: Robot, problem: Problem) -> Any:
 
     columns, (p, *path, rate, obstacle_poses) = _on_path(robot, problem)
     orders = problem.path_orders
-    moving = tuple(ca.vertcat(columns[order], columns[orders][order - 1]) for order in range(1, orders))
-    state = _State(p, *time_derivatives(path, rate), moving)
+    moving = [ca.vertcat(columns[order], columns[orders][order - 1]) for order in range(1, orders)]
+    dq, ddq, jerk = time_derivatives(path, rate)
+    state = SymbolicState(robot, p, dq, ddq, obstacle_poses, problem.obstacle, problem.object_size, jerk)
     violations: list[Any] = []
-    for condition, needs in _conditions(robot, problem, state, obstacle_poses):
+    for condition, needs in _conditions(problem, state, moving):
         if needs:
             violations += _violations(condition, np.ones(len(condition.g)))
     worst = reduce(ca.fmax, violations) if violations else ca.SX(-1)
@@ -115,18 +106,14 @@ def static_violation(robot: Robot, problem: Problem) -> Any:
     """Build ``(q, obstacle_poses) -> e``: the largest violation of a condition by the robot at rest, in tolerances."""
     import casadi as ca
 
-    (q_sx, q), (poses_sx, obstacle_poses) = (
-        symbols("q", robot.n),
-        symbols("obstacle_poses", problem.scene_width),
-    )
+    columns, state = _state(robot, problem)
     zero = [0.0] * robot.n
-    jerk = zero if problem.uses_jerk else None
-    state = SymbolicState(robot, q, zero, zero, obstacle_poses, problem.obstacle, problem.object_size, jerk)
+    rest = replace(state, dq=zero, ddq=zero, jerk=zero if problem.uses_jerk else None)
     violations: list[Any] = []
     for constraint in problem.constraint:
-        for condition in constraint.symbolic(state):
+        for condition in constraint.symbolic(rest):
             violations += _violations(condition, np.maximum(constraint.allowed(condition), MIN_TOLERANCE))
-    return ca.Function("static_violation", [q_sx, poses_sx], [reduce(ca.fmax, violations, ca.SX(-1))])
+    return ca.Function("static_violation", [columns[0], columns[-1]], [reduce(ca.fmax, violations, ca.SX(-1))])
 
 
 def _violations(condition: Condition, units: Array) -> list[Any]:
@@ -162,13 +149,10 @@ class SpeedBounds:
 
 def speed_bounds(robot: Robot, problem: Problem) -> SpeedBounds:
     """Return the bounds of the rows of ``speed_residuals``."""
-    state, obstacle_poses = (
-        _moving(problem, symbols("q", robot.n)[1]),
-        symbols("obstacle_poses", problem.scene_width)[1],
-    )
+    columns, state = _state(robot, problem)
     rows = [
-        (low, high, needs == 3, needs == 1 and _is_proportional(value, state.moving[0], low, high))
-        for condition, needs in _conditions(robot, problem, state, obstacle_poses)
+        (low, high, needs == 3, needs == 1 and _is_proportional(value, columns[1], low, high))
+        for condition, needs in _conditions(problem, state, columns[1:-1])
         if needs
         for value, low, high in zip(condition.g, condition.lower, condition.upper, strict=True)
     ]
@@ -192,26 +176,13 @@ def _on_path(robot: Robot, problem: Problem) -> tuple[list[Any], list[Vec]]:
     return list(columns), list(scalars)
 
 
-@dataclass(frozen=True)
-class _State:
-    """A symbolic state, its jerk if that is constrained, and the symbols of each derivative of q."""
-
-    q: Vec
-    dq: Vec
-    ddq: Vec
-    jerk: Vec | None
-    moving: tuple[Any, ...]
+def _state(robot: Robot, problem: Problem) -> tuple[list[Any], SymbolicState]:
+    """Return the columns q, dq, ddq, the jerk if it is constrained, and obstacle poses, and their state."""
+    scene = problem.obstacle, problem.object_size, problem.scene_width
+    return SymbolicState.of_symbols(robot, *scene, uses_jerk=problem.uses_jerk)
 
 
-def _moving(problem: Problem, q: Vec) -> _State:
-    names = ("dq", "ddq", "jerk")[: problem.path_orders - 1]
-    columns, (dq, ddq, *third) = zip(*(symbols(name, len(q)) for name in names), strict=True)
-    return _State(q, dq, ddq, third[0] if third else None, columns)
-
-
-def _conditions(robot: Robot, problem: Problem, state: _State, obstacle_poses: Vec) -> list[tuple[Condition, int]]:
-    """Return all constraints at a state, each with the highest derivative of q that it depends on."""
-    size = problem.object_size
-    symbolic = SymbolicState(robot, state.q, state.dq, state.ddq, obstacle_poses, problem.obstacle, size, state.jerk)
-    conditions = [condition for constraint in problem.constraint for condition in constraint.symbolic(symbolic)]
-    return [(condition, symbolic_needs(condition, *state.moving)) for condition in conditions]
+def _conditions(problem: Problem, state: SymbolicState, moving: Sequence[Any]) -> list[tuple[Condition, int]]:
+    """Return all constraints at a state, each with the highest derivative of q, of ``moving``, that it depends on."""
+    conditions = [condition for constraint in problem.constraint for condition in constraint.symbolic(state)]
+    return [(condition, symbolic_needs(condition, *moving)) for condition in conditions]

@@ -1,4 +1,7 @@
-"""Choice of the robot geometry of a problem, and checks of the raw tables against it."""
+"""Choice of the robot geometry of a problem, and checks of the raw tables against it.
+
+Arguments ``table`` and ``folder`` are the table of a problem file and the folder of this file.
+"""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,12 +21,7 @@ _NAME_IT = 'name geometry = "paper-capsules" in [robot] for a robot that is a li
 
 
 def chosen_geometry(table: dict[str, Any], folder: Path) -> str:
-    """Return the geometry of a problem's robot: the named one, or the URDF's if there is an obstacle.
-
-    Args:
-        table: Table of the problem file.
-        folder: Folder of the problem file.
-    """
+    """Return the geometry of a problem's robot: the named one, or the URDF's if there is an obstacle."""
     named = _robot(table).get("geometry")
     if isinstance(named, str):
         return named
@@ -32,13 +30,7 @@ def chosen_geometry(table: dict[str, Any], folder: Path) -> str:
 
 
 def with_object_clearance(problem: Problem, table: dict[str, Any], folder: Path) -> tuple[Constraint, ...]:
-    """Return the constraints of a problem; a held object stays clear of the links by default if they have geometry.
-
-    Args:
-        problem: Problem of the file.
-        table: Table of the problem file.
-        folder: Folder of the problem file.
-    """
+    """Return the constraints of a problem; a held object stays clear of the links by default if they have geometry."""
     if problem.object is None or problem.first(ObjectClearance) or not _collision_elements(table, folder):
         return problem.constraint
     return (*problem.constraint, ObjectClearance())

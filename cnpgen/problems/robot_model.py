@@ -353,12 +353,9 @@ def constraint_values_of(robot: Robot, problem: Problem) -> Any:
 
 
 def _symbolic_conditions(robot: Robot, problem: Problem) -> tuple[FrozenState, list[tuple[Constraint, Condition]]]:
-    from cnpgen.kernels.symbolic.linalg import symbols
     from cnpgen.kernels.symbolic.symbolic_state import FrozenState
 
-    widths = {"q": robot.n, "dq": robot.n, "ddq": robot.n, "poses": problem.scene_width}
-    q, dq, ddq, poses = (symbols(name, width)[1] for name, width in widths.items())
-    state = FrozenState(robot, q, dq, ddq, poses, problem.obstacle, problem.object_size)
+    _, state = FrozenState.of_symbols(robot, problem.obstacle, problem.object_size, problem.scene_width)
     pairs = [
         (constraint, condition)
         for constraint in problem.constraint

@@ -77,11 +77,6 @@ def tasks_of(plans: Plans) -> list[RefinementTask]:
 def load_solver(problem: Problem, robot: Robot, kernels: KernelLibrary) -> Solver:
     """Load a function that plans rows of a dataset with the problem's own objective, in one thread.
 
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        kernels: Library of kernels.
-
     Returns:
         A function of the columns of N rows, shape (N, width) each, among them ``obstacle_poses`` of scenes, and of N
         motions as initial guesses, or None. It

@@ -67,13 +67,7 @@ VERDICT_TIME_S = 5e-3  # of a verdict, before one was timed
 
 @np.errstate(all="ignore")  # squares of huge boundary conditions overflow
 def refine_task(refiner: Refiner, checker: PlanChecker, task: RefinementTask) -> Attempt:
-    """Refine the input plan of a task, or plan without one.
-
-    Args:
-        refiner: Refiner of the problem.
-        checker: Independent check.
-        task: The task.
-    """
+    """Refine the input plan of a task, or plan without one."""
     if not task.is_finite:
         return _invalid_input(refiner, task)
     search, x = RefinementSearch(refiner, checker, task), refiner.input_variables(task)

@@ -99,9 +99,6 @@ class UrdfParameters:
 def urdf_parameters(tree: Element) -> UrdfParameters:
     """Read the numbers of all links and joints.
 
-    Args:
-        tree: Parsed URDF.
-
     Raises:
         RecipeError: A number is missing, is not finite or is not a plain decimal; the error lists all of them.
     """

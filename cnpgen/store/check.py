@@ -68,9 +68,6 @@ def check_dataset(folder: Path) -> list[Finding]:
 
     Returns:
         The findings; empty if there is no problem. Of a dataset without manifest, the existing shards are checked.
-
-    Raises:
-        MachineError: A file cannot be read.
     """
     links = [Finding(name, OUTSIDE, hint=COPY_HINT) for name in outside_links(folder)]
     try:
@@ -88,15 +85,7 @@ def check_dataset(folder: Path) -> list[Finding]:
 
 
 def check_documents(folder: Path, spec: DatasetSpec) -> list[Finding]:
-    """Check the documents of a finished dataset: the manifest, the files it lists and the sidecars; no shard is read.
-
-    Args:
-        folder: Folder of the dataset.
-        spec: Specification of the dataset.
-
-    Raises:
-        MachineError: A file cannot be read.
-    """
+    """Check the documents of a finished dataset: the manifest, the files it lists and the sidecars, but no shard."""
     findings, manifest = _check_manifest(folder, spec)
     for entry in _shard_entries(manifest).values():
         findings += _check_digest(folder, entry["sidecar"]["file"], entry["sidecar"]["sha256"])
@@ -154,9 +143,6 @@ def check_shard(folder: Path, spec: DatasetSpec, task: ShardTask, entry: dict[st
 
     Returns:
         The findings.
-
-    Raises:
-        MachineError: A file cannot be read.
     """
     path = folder / task.file
     findings, expected = _check_sidecar(folder, spec, task, entry)
@@ -210,10 +196,7 @@ def _check_sidecar(
 def check_content(folder: Path, spec: DatasetSpec, task: ShardTask) -> list[Finding]:
     """Compare the attributes and fields of a shard with the specification.
 
-    Args:
-        folder: Folder of the dataset.
-        spec: Specification of the dataset.
-        task: The shard; verify its sha256 before, because HDF5 can hang on a damaged file.
+    Verify the sha256 of the shard before, because HDF5 can hang on a damaged file.
 
     Returns:
         The findings about attributes, fields, shapes, types, units, values that are not finite, and sample IDs.

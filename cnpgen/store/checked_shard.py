@@ -75,8 +75,14 @@ def shard_of_record(folder: Path, spec: DatasetSpec, task: ShardTask, record: Sh
     return recorded_shard(folder, spec, task, size=record.bytes, sha256=record.sha256)
 
 
-def read_checked(shard: Shard, names: Iterable[str] | None = None) -> dict[str, NDArray[Any]]:
-    """Verify a shard and read fields of it.
+def read_checked(shard: Shard) -> dict[str, NDArray[Any]]:
+    """Verify a shard and read its fields; see ``read_rows``."""
+    require_intact(shard.path, size=shard.size, sha256=shard.sha256)
+    return read_rows(shard)
+
+
+def read_rows(shard: Shard, names: Iterable[str] | None = None) -> dict[str, NDArray[Any]]:
+    """Read and check fields of a shard whose sha256 was compared before.
 
     Args:
         shard: The shard.
@@ -87,14 +93,7 @@ def read_checked(shard: Shard, names: Iterable[str] | None = None) -> dict[str, 
 
     Raises:
         DatasetError: The shard is missing or damaged, or differs from its record or the specification.
-        MachineError: The shard cannot be read.
     """
-    require_intact(shard.path, size=shard.size, sha256=shard.sha256)
-    return read_rows(shard, names)
-
-
-def read_rows(shard: Shard, names: Iterable[str] | None = None) -> dict[str, NDArray[Any]]:
-    """Read and check fields of a shard whose sha256 was compared before; see ``read_checked``."""
     placements = check_header(shard)
     columns = read_columns(shard, placements, [item.name for item in shard.fields] if names is None else names)
     check_values(shard, columns)
@@ -112,7 +111,6 @@ def read_scenes(shard: Shard, placements: Mapping[str, Placement] | None = None)
 
     Raises:
         DatasetError: The scenes are missing or invalid.
-        MachineError: The shard cannot be read.
     """
     placements = check_header(shard) if placements is None else placements
     names = [item.name for item in SCENE_ARRAYS]
@@ -134,7 +132,6 @@ def check_header(shard: Shard) -> dict[str, Placement]:
 
     Raises:
         DatasetError: They differ, or the file is damaged.
-        MachineError: The shard cannot be read.
     """
     placements, identity = read_placements(shard.path)
     if identity != {"specification_key": shard.key, "first_sample_id": shard.first_row, "rows": shard.rows}:
@@ -163,7 +160,6 @@ def read_columns(shard: Shard, placements: Mapping[str, Placement], names: Itera
 
     Raises:
         DatasetError: The file is cut off.
-        MachineError: The file cannot be read.
     """
     selected = {name: placements[name] for name in names}
     if any(place.offset is None for place in selected.values()):

@@ -367,11 +367,7 @@ def _field(content: Mapping[str, Any]) -> Field:
 
 
 def write_dataset_spec(folder: Path, spec: DatasetSpec) -> None:
-    """Write ``specification.json``; an existing file is replaced.
-
-    Raises:
-        MachineError: The folder cannot be written.
-    """
+    """Write ``specification.json``; an existing file is replaced."""
     document = {
         "format": SPECIFICATION_FORMAT,
         "format_version": SPECIFICATION_VERSION,
@@ -385,7 +381,6 @@ def load_dataset_spec(folder: Path) -> DatasetSpec:
 
     Raises:
         DatasetError: It is missing, damaged, or has another format version.
-        MachineError: It cannot be read.
     """
     path = folder / SPECIFICATION
     _refuse_old_format(folder)

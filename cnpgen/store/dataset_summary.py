@@ -92,7 +92,6 @@ def summarize_dataset(folder: Path, spec: DatasetSpec, *, allow_incomplete: bool
 
     Raises:
         DatasetError: A shard is missing, damaged or of another specification; the message names it.
-        MachineError: A file cannot be read.
     """
     records, problems = [], []
     for task in shards(spec):

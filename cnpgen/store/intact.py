@@ -61,7 +61,6 @@ def require_intact(path: Path, *, size: int, sha256: str) -> None:
 
     Raises:
         DatasetError: The shard is missing, cut off or changed.
-        MachineError: A file cannot be read.
     """
     if problem := size_problem(path, size):
         raise DatasetError(f"{problem}; {RERUN_HINT}")

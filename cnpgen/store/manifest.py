@@ -52,7 +52,6 @@ def finalize(folder: Path, spec: DatasetSpec, *, notes: str = "") -> dict[str, A
     Raises:
         DatasetError: Shards are missing, damaged or of another specification; the message names them.
         UsageError: SOURCE_DATE_EPOCH is not a time.
-        MachineError: A file cannot be written.
     """
     summary = summarize_dataset(folder, spec)
     created = _created(summary)
@@ -84,7 +83,6 @@ def load_manifest(folder: Path) -> dict[str, Any]:
 
     Raises:
         DatasetError: It is missing (the dataset is unfinished), damaged or of another format version.
-        MachineError: A file cannot be read.
     """
     return load_document(folder / MANIFEST, MANIFEST_FORMAT, version=MANIFEST_VERSION, structure=MANIFEST_STRUCTURE)
 

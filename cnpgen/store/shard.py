@@ -82,7 +82,6 @@ def write_shard(
 
     Raises:
         DatasetError: The columns do not fit the fields, or are not finite.
-        MachineError: A file cannot be written.
     """
     rows = int(attributes["rows"])
     _check_columns(columns, fields, rows, dtype)
@@ -154,7 +153,6 @@ def read_shard(path: Path, fields: Sequence[str] | None = None) -> dict[str, NDA
 
     Raises:
         DatasetError: The file is missing, damaged or cut off, or has no such field.
-        MachineError: A file cannot be read.
     """
     with opened_hdf5(path) as file:
         known = list(file)
@@ -176,7 +174,6 @@ def read_attributes(path: Path, names: Sequence[str] | None = None) -> dict[str,
 
     Raises:
         DatasetError: The file is missing, damaged or cut off, or has no such attribute.
-        MachineError: A file cannot be read.
     """
     with opened_hdf5(path) as file:
         values = {name: file.attributes[name] for name in (file.attributes if names is None else names)}
@@ -203,7 +200,6 @@ def read_schema(path: Path) -> dict[str, StoredField]:
 
     Raises:
         DatasetError: The file is missing, damaged or cut off.
-        MachineError: A file cannot be read.
     """
     with opened_hdf5(path) as file:
         columns = file.columns()
@@ -234,7 +230,6 @@ def read_placements(path: Path) -> tuple[dict[str, Placement], dict[str, int]]:
 
     Raises:
         DatasetError: The file is missing, damaged or cut off.
-        MachineError: A file cannot be read.
     """
     with opened_hdf5(path) as file:
         placements = {name: Placement(item.shape, item.dtype, item.offset) for name, item in file.columns().items()}

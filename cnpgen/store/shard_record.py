@@ -1,7 +1,7 @@
 """The sidecar of a shard: its commit record, written after the shard has been flushed to the disk."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -61,17 +61,7 @@ _RECORD_STRUCTURE = {
     "sampling": SAMPLING_STRUCTURE,
     "statistics": {ANY_KEY: STATISTICS_STRUCTURE},
 }
-_PLAIN = (
-    "file",
-    "bytes",
-    "sha256",
-    "rows",
-    "first_sample_id",
-    "specification_fingerprint",
-    "started",
-    "seconds",
-    "versions",
-)
+_PLAIN = tuple(item.name for item in fields(ShardRecord) if item.name not in {"statistics", "sampling"})
 
 
 def record_to_json(record: ShardRecord) -> dict[str, Any]:
@@ -99,11 +89,7 @@ def record_from_json(content: Mapping[str, Any]) -> ShardRecord:
 
 
 def save_record(folder: Path, task: ShardTask, record: ShardRecord) -> None:
-    """Write a shard's sidecar; from now on the shard counts as made.
-
-    Raises:
-        MachineError: A file cannot be written.
-    """
+    """Write a shard's sidecar; from now on the shard counts as made."""
     document = {"format": SHARD_RECORD_FORMAT, "format_version": SHARD_RECORD_VERSION, **record_to_json(record)}
     save_document(folder / task.sidecar, document, work=folder / WORK)
 
@@ -113,7 +99,6 @@ def load_record(folder: Path, task: ShardTask) -> ShardRecord:
 
     Raises:
         DatasetError: It is missing, damaged, of another format version or of another shard.
-        MachineError: A file cannot be read.
     """
     path = folder / task.sidecar
     record = record_from_json(load_document(path, SHARD_RECORD_FORMAT, version=SHARD_RECORD_VERSION, structure={}))
@@ -153,7 +138,6 @@ def commit_shard(
 
     Raises:
         DatasetError: The columns do not fit the specification, or are not finite.
-        MachineError: A file cannot be written.
     """
     if is_committed(folder, spec, task):  # another process made the same shard
         return load_record(folder, task)
@@ -208,15 +192,9 @@ def _write(
 def load_committed(folder: Path, spec: DatasetSpec, task: ShardTask) -> ShardRecord:
     """Read the sidecar of a shard and check that it belongs to this specification; the shard itself is not read.
 
-    Args:
-        folder: Folder of the dataset.
-        spec: Specification of the dataset.
-        task: The shard.
-
     Raises:
         DatasetError: The sidecar is missing, damaged or of another specification, or the shard is missing or has
             another size.
-        MachineError: A file cannot be read.
     """
     record = load_record(folder, task)
     if record.specification_fingerprint != spec.version_with(task).fingerprint:
@@ -234,14 +212,8 @@ def load_committed(folder: Path, spec: DatasetSpec, task: ShardTask) -> ShardRec
 def check_committed(folder: Path, spec: DatasetSpec, task: ShardTask) -> None:
     """Check that a shard is the recorded one, by its sha256.
 
-    Args:
-        folder: Folder of the dataset.
-        spec: Specification of the dataset.
-        task: The shard.
-
     Raises:
         DatasetError: As for :func:`load_committed`, or the shard was changed.
-        MachineError: A file cannot be read.
     """
     record = load_committed(folder, spec, task)
     if file_sha256(folder / task.file) != record.sha256:

@@ -45,11 +45,7 @@ class Workspace:
 
 
 def find_workspace(folder: Path) -> Workspace:
-    """Inspect the folder for a new dataset.
-
-    Raises:
-        MachineError: The folder cannot be read.
-    """
+    """Inspect the folder for a new dataset."""
     try:
         above = [folder.absolute(), *folder.absolute().parents]
         existing = next(path for path in above if path.exists())
@@ -75,7 +71,6 @@ def check_place(workspace: Workspace) -> None:
 
     Raises:
         UsageError: It is a file, contains files that are not a dataset of cnpgen, or a link out of it.
-        MachineError: It cannot be written.
     """
     if workspace.content == "a file":
         raise UsageError(
@@ -134,7 +129,6 @@ def open_workspace(folder: Path, spec: DatasetSpec, *, force: bool = False) -> D
 
     Raises:
         UsageError: The folder contains another dataset or other files.
-        MachineError: The folder cannot be written.
         DatasetError: The specification in the folder is damaged.
     """
     workspace = find_workspace(folder)
@@ -235,7 +229,6 @@ def _cleared(workspace: Workspace) -> Workspace:
 
     Raises:
         UsageError: The folder contains files that are not part of the dataset.
-        MachineError: A file cannot be deleted.
     """
     if workspace.content != "a dataset":
         return workspace

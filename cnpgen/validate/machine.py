@@ -18,20 +18,11 @@ from typing import Any
 from cnpgen.errors import PluginError
 from cnpgen.machine.threads import users_environment
 
-REQUIRED_PROJECTS = {  # module -> project on PyPI
-    "numpy": "numpy",
-    "scipy": "scipy",
-    "casadi": "casadi",
-    "pinocchio": "pin",
-    "coal": "coal",
-    "h5py": "h5py",
-    "joblib": "joblib",
-    "psutil": "psutil",
-    "tqdm": "tqdm",
-    "daqp": "daqp",
-    "threadpoolctl": "threadpoolctl",
-}
-OPTIONAL_PROJECTS = {"matplotlib": "matplotlib"}
+REQUIRED_MODULES = (
+    "numpy", "scipy", "casadi", "pinocchio", "coal", "h5py", "joblib", "psutil", "tqdm", "daqp", "threadpoolctl",
+)  # fmt: skip
+OPTIONAL_MODULES = ("matplotlib",)
+PROJECTS = {"pinocchio": "pin"}  # on PyPI, where it is not called like its module
 
 VARIABLES = (
     "OMP_NUM_THREADS",
@@ -173,11 +164,12 @@ def _version_of(project: str) -> str:
 
 def _check_libraries(findings: _Findings) -> dict[str, str]:
     versions = {}
-    for module, project in REQUIRED_PROJECTS.items():
+    for module in REQUIRED_MODULES:
+        project = PROJECTS.get(module, module)
         versions[project], problem = _try_library(module, project)
         findings.problems += [problem] if problem else []
-    for module, project in OPTIONAL_PROJECTS.items():
-        versions[project], problem = _try_library(module, project)
+    for module in OPTIONAL_MODULES:
+        versions[module], problem = _try_library(module, module)
         findings.notes += [f"{problem}, for 'cnpgen inspect --plot' only"] if problem else []
     return versions
 

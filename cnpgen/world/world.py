@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -114,26 +115,17 @@ class World:
     @property
     def tip_velocity(self) -> Array:
         """Linear velocity of the tip [m/s], shape (3,)."""
-        import pinocchio as pin
-
-        frame = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-        return np.array(pin.getFrameVelocity(self._model, self._data, self._tip, frame).linear)
+        return np.array(self._in_world_axes("getFrameVelocity").linear)
 
     @property
     def tip_angular_velocity(self) -> Array:
         """Angular velocity of the tip [rad/s], shape (3,)."""
-        import pinocchio as pin
-
-        frame = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-        return np.array(pin.getFrameVelocity(self._model, self._data, self._tip, frame).angular)
+        return np.array(self._in_world_axes("getFrameVelocity").angular)
 
     @property
     def tip_angular_acceleration(self) -> Array:
         """Angular acceleration of the tip [rad/s^2], shape (3,)."""
-        import pinocchio as pin
-
-        frame = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-        return np.array(pin.getFrameAcceleration(self._model, self._data, self._tip, frame).angular)
+        return np.array(self._in_world_axes("getFrameAcceleration").angular)
 
     @property
     def tip_jacobian(self) -> Array:
@@ -147,10 +139,14 @@ class World:
     @property
     def tip_acceleration(self) -> Array:
         """Linear acceleration of the tip [m/s^2], shape (3,)."""
+        return np.array(self._in_world_axes("getFrameClassicalAcceleration").linear)
+
+    def _in_world_axes(self, quantity: str) -> Any:
+        """Return the motion vector of the tip that a function of Pinocchio computes, in the axes of the world."""
         import pinocchio as pin
 
         frame = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-        return np.array(pin.getFrameClassicalAcceleration(self._model, self._data, self._tip, frame).linear)
+        return getattr(pin, quantity)(self._model, self._data, self._tip, frame)
 
     def segment_distances(self, sufficient: float = np.inf) -> list[float]:  # noqa: ARG002 - one state is always exact
         """Measure the signed distance of every segment of the robot from every obstacle, segment by segment [m]."""

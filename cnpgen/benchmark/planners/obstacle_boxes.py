@@ -18,10 +18,6 @@ MAX_CORNER_PENETRATION_M = 0.01  # of the object's corners, for samplers
 def boxes_of(problem: Problem, scene: Scene) -> tuple[Array, list[Box]]:
     """Return the edge lengths of the held object [m], shape (3,), and the obstacles.
 
-    Args:
-        problem: The problem.
-        scene: Obstacles of one boundary problem.
-
     Raises:
         UsageError: There is no held object, or an obstacle is not an upright box.
     """

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from cnpgen.benchmark.planners.obstacle_boxes import MAX_CORNER_PENETRATION_M, MIN_OBJECT_DISTANCE_M, require_transport
 from cnpgen.kernels.library import choose_backend, problem_kernels
-from cnpgen.kernels.symbolic.linalg import Scalar, Vec, dot, symbols
+from cnpgen.kernels.symbolic.linalg import Scalar, Vec, dot
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem
@@ -62,21 +62,19 @@ def tip_and_violation(robot: Robot, problem: Problem) -> Any:
     """Build ``(q, dq, ddq, obstacle_poses) -> (tip, violation)`` with the largest violation, in its own unit."""
     import casadi as ca
 
-    names = (("q", robot.n), ("dq", robot.n), ("ddq", robot.n), ("obstacle_poses", problem.scene_width))
-    (q_sx, q), (dq_sx, dq), (ddq_sx, ddq), (poses_sx, obstacle_poses) = (symbols(name, width) for name, width in names)
-    state = SymbolicState(robot, q, dq, ddq, obstacle_poses, problem.obstacle, problem.object_size)
+    columns, state = SymbolicState.of_symbols(robot, problem.obstacle, problem.object_size, problem.scene_width)
     tip, table = state.kinematics.tip, problem.first(Table)
-    violation = [ca.fabs(value) - limit for value, limit in zip(dq, robot.velocity_limit.tolist(), strict=True)]
+    violation = [ca.fabs(value) - limit for value, limit in zip(state.dq, robot.velocity_limit.tolist(), strict=True)]
     violation += [
         ca.fabs(value) - limit for value, limit in zip(state.torque, robot.torque_limit.tolist(), strict=True)
     ]
-    violation += [low - value for value, low in zip(q, robot.position_lower.tolist(), strict=True)]
-    violation += [value - high for value, high in zip(q, robot.position_upper.tolist(), strict=True)]
-    violation += _table_violations(table, tip) if table is not None else _obstacle_violations(state, obstacle_poses)
+    violation += [low - value for value, low in zip(state.q, robot.position_lower.tolist(), strict=True)]
+    violation += [value - high for value, high in zip(state.q, robot.position_upper.tolist(), strict=True)]
+    violation += _table_violations(table, tip) if table is not None else _obstacle_violations(state)
     worst: Scalar = violation[0]
     for value in violation[1:]:
         worst = ca.fmax(worst, value)
-    return ca.Function("tip_and_violation", [q_sx, dq_sx, ddq_sx, poses_sx], [ca.vertcat(*tip), worst])
+    return ca.Function("tip_and_violation", columns, [ca.vertcat(*tip), worst])
 
 
 def _table_violations(table: Table, tip: Vec) -> list[Scalar]:
@@ -86,7 +84,7 @@ def _table_violations(table: Table, tip: Vec) -> list[Scalar]:
     return [ca.fabs(tip[2] - table.z) - MAX_TIP_HEIGHT_ERROR_M, *sides]
 
 
-def _obstacle_violations(state: SymbolicState, obstacle_poses: Vec) -> list[Scalar]:
+def _obstacle_violations(state: SymbolicState) -> list[Scalar]:
     """Return violations of the tilt, of the distance to the obstacles, and of the penetration of corners."""
     import casadi as ca
 
@@ -96,7 +94,7 @@ def _obstacle_violations(state: SymbolicState, obstacle_poses: Vec) -> list[Scal
         for corner in (CUBE * np.array(state.object_size)).tolist()
     ]
     violation: list[Scalar] = [1.0 - rotation[2][2] - MAX_UPRIGHT_ERROR]
-    for box, top in zip(state.obstacles, obstacle_poses, strict=True):
+    for box, top in zip(state.obstacles, state.obstacle_poses, strict=True):
         spans = [(span.low, span.high) for span in (box.x, box.y) if span is not None]
         sides = (*spans, (-np.inf, top))
         outside = [ca.fmax(ca.fmax(low - x, x - high), 0) for x, (low, high) in zip(tip, sides, strict=True)]

@@ -28,10 +28,6 @@ class _SampleObstacles(ctypes.Structure):
 class ClearanceLoss:
     """Losses of states of one robot among obstacles that differ from sample to sample.
 
-    Args:
-        kernels: Library of kernels.
-        robot: The robot, with link geometry.
-
     Raises:
         MachineError: Kernels are not compiled on this machine.
         UsageError: The robot has no link geometry, or too many joints.

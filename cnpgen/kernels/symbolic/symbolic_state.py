@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 from cnpgen.kernels.symbolic.dynamics import Load, acceleration_at, body_motions, inverse_dynamics
 from cnpgen.kernels.symbolic.kinematics import Kinematics, bias_acceleration, forward_kinematics, tip_velocity
-from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, constants, cross, dot, scale, subtract, times
+from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, constants, cross, dot, scale, subtract, symbols, times
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.parameter_ranges import PAYLOAD_CENTRE, PAYLOAD_PARAMETERS
 from cnpgen.robots.robot import Robot
@@ -41,6 +41,21 @@ class SymbolicState:
     obstacles: tuple[Obstacle, ...]
     object_size: tuple[float, float, float] | None
     jerk: Vec | None = None
+
+    @classmethod
+    def of_symbols(
+        cls,
+        robot: Robot,
+        obstacles: tuple[Obstacle, ...],
+        object_size: tuple[float, float, float] | None,
+        width: int,
+        *,
+        uses_jerk: bool = False,
+    ) -> tuple[list[Any], Self]:
+        """Return the columns q, dq, ddq, the jerk if used, and ``width`` obstacle poses, and the state they define."""
+        widths = dict.fromkeys(("q", "dq", "ddq", "jerk")[: 3 + uses_jerk], robot.n) | {"obstacle_poses": width}
+        columns, (q, dq, ddq, *jerk, poses) = zip(*(symbols(*item) for item in widths.items()), strict=True)
+        return list(columns), cls(robot, q, dq, ddq, poses, obstacles, object_size, *jerk)
 
     @property
     def scene_values(self) -> Vec:

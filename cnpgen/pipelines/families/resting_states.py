@@ -15,7 +15,6 @@ from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.solid import Solid, place_obstacles, solids_of
 from cnpgen.world.forward_kinematics import ForwardKinematics
-from cnpgen.world.pose_ik import PoseKinematics, PoseTolerance, solve_pose_ik
 from cnpgen.world.rigid_bodies import RigidBodies
 
 Array = NDArray[np.float64]
@@ -90,33 +89,6 @@ class RestingStates:
         """Return whether the straight line between two joint positions is clear."""
         count = max(2, int(np.ceil(np.abs(goal - start).max() / LINE_SPACING_RAD)) + 1)
         return bool(self.are_clear(np.linspace(start, goal, count).T.copy()).all())
-
-
-def pose_states(
-    states: RestingStates,
-    kinematics: PoseKinematics,
-    positions: Array,
-    rotations: Array,
-    random: np.random.Generator,
-    *,
-    margin: float = 0.0,
-    tolerance: PoseTolerance | None = None,
-) -> Array:
-    """Return collision-free joint positions with given poses [rad], shape (G, n); G may be 0.
-
-    Args:
-        states: The scene.
-        kinematics: Kinematics of the frame that has the pose.
-        positions: Positions of the frame [m], one for each seed of the iteration, shape (K, 3).
-        rotations: Rotation matrices of the frame, shape (K, 3, 3).
-        random: Random numbers for the seeds.
-        margin: See ``RestingStates.are_ends``.
-        tolerance: Accepted differences from the poses; by default none.
-    """
-    seeds = seeds_of(kinematics.robot, len(positions), random)
-    q, met = solve_pose_ik(kinematics, positions, rotations, seeds, tolerance=tolerance)
-    found = q[:, met]
-    return found[:, states.are_ends(found, margin=margin)].T.copy()
 
 
 def seeds_of(robot: Robot, count: int, random: np.random.Generator) -> Array:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from cnpgen.errors import UsageError
 from cnpgen.pipelines.families.catalog import load_family
 from cnpgen.pipelines.families.family import Grasp, Layout, SceneFamily
-from cnpgen.pipelines.families.resting_states import RestingStates, pose_states, seeds_of
+from cnpgen.pipelines.families.resting_states import RestingStates, seeds_of
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import as_problem
@@ -24,7 +24,7 @@ from cnpgen.robots.shape.hull import frame_along
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
 from cnpgen.store.dataset_spec import StoredProblem
-from cnpgen.world.pose_ik import PoseKinematics
+from cnpgen.world.pose_ik import PoseKinematics, solve_pose_ik
 
 Array = NDArray[np.float64]
 
@@ -134,7 +134,8 @@ class _Generator:
             grasp = layout.grasps[index]
             rotations = grasp_rotations(grasp, POSES_PER_GRASP, random)
             positions = np.tile(grasp.position, (POSES_PER_GRASP, 1))
-            valid = pose_states(states, kinematics, positions, rotations, random, margin=END_MARGIN_M)
+            q, met = solve_pose_ik(kinematics, positions, rotations, seeds_of(self.robot, POSES_PER_GRASP, random))
+            valid = q[:, met][:, states.are_ends(q[:, met], margin=END_MARGIN_M)].T.copy()
             if len(valid):
                 found.append(valid)
         return found

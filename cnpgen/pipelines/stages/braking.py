@@ -19,7 +19,6 @@ from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Stage, StageFun
 from cnpgen.problems.constraints.table import Table
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import field
-from cnpgen.store.field import Field
 
 BRAKING_STEP_S = 0.01
 MAX_BRAKING_STEPS = 60
@@ -43,11 +42,6 @@ class BrakingReach(Stage):
             " the start forwards and from the goal backwards in time (loses about 0.15 % of the solvable problems,"
             " where the ballistic rule loses 13.7 %)"
         )
-
-    def outputs(self, context: Context) -> tuple[Field, ...]:
-        """Return no fields."""
-        del context
-        return ()
 
     def prepare(self, context: Context) -> StageFunction:
         """Load the kernels."""

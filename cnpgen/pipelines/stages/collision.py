@@ -139,35 +139,32 @@ def capsule_axes_distance(robot: Robot, problem: Problem) -> Any:
     """Build ``(q, obstacle_poses) -> minimum distance of a capsule axis from an obstacle`` [m]."""
     import casadi as ca
 
-    (q_sx, q), (poses_sx, obstacle_poses) = (
-        symbols("q", robot.n),
-        symbols("obstacle_poses", problem.scene_width),
-    )
-    zero = [0.0] * robot.n
-    state = SymbolicState(robot, q, zero, zero, obstacle_poses, problem.obstacle, None)
+    columns, state = _rest_state(robot, problem)
     nearest = ca.SX(np.inf)
     for first, second in state.segments:
         for solid in symbolic_solids(state):
             nearest = ca.fmin(nearest, solid.distance(first, second))
-    return ca.Function("capsule_axes_distance", [q_sx, poses_sx], [nearest])
+    return ca.Function("capsule_axes_distance", columns, [nearest])
 
 
 def capsule_clearance(robot: Robot, problem: Problem) -> Any:
     """Build ``(q, obstacle_poses) -> minimum distance of link capsules from obstacles`` [m], at least -radius."""
     import casadi as ca
 
-    (q_sx, q), (poses_sx, obstacle_poses) = (
-        symbols("q", robot.n),
-        symbols("obstacle_poses", problem.scene_width),
-    )
-    zero = [0.0] * robot.n
-    state = SymbolicState(robot, q, zero, zero, obstacle_poses, problem.obstacle, None)
+    columns, state = _rest_state(robot, problem)
     moving = robot.shape.moving_capsules if robot.shape else ()
     nearest = ca.SX(np.inf)
     for first, second, radius in (state.capsules[capsule.link] for capsule in moving):
         for solid in symbolic_solids(state):
             nearest = ca.fmin(nearest, solid.distance(first, second) - radius)
-    return ca.Function("capsule_clearance", [q_sx, poses_sx], [nearest])
+    return ca.Function("capsule_clearance", columns, [nearest])
+
+
+def _rest_state(robot: Robot, problem: Problem) -> tuple[list[Any], SymbolicState]:
+    """Return the columns of joint positions and obstacle poses, and the state of the robot at rest."""
+    (q_sx, q), (poses_sx, poses) = symbols("q", robot.n), symbols("obstacle_poses", problem.scene_width)
+    zero = [0.0] * robot.n
+    return [q_sx, poses_sx], SymbolicState(robot, q, zero, zero, poses, problem.obstacle, None)
 
 
 def coal_judge(problem: Problem, robot: Robot, radius: float, depth: float) -> Any:

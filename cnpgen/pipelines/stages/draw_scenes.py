@@ -19,7 +19,6 @@ from cnpgen.problems.scenes.scene_problem import MAX_BASE_DEPTH_M
 from cnpgen.robots.scene_arrays import rotations_of, sample_obstacles
 from cnpgen.schema import registry
 from cnpgen.schema.keys import field
-from cnpgen.store.field import Field
 from cnpgen.store.scene_table import OBSTACLE_KINDS, SceneTable
 
 TOO_MANY = "scene with more obstacles than the capacity"
@@ -50,11 +49,6 @@ class DrawScenes(Stage):
         shares = self._shares()
         each = (f"{name} {100 * share:.3g} %" for name, share in zip(self.family_names, shares, strict=True))
         return f"draw scenes for {self.per_scene} candidates each ({', '.join(each)})"
-
-    def outputs(self, context: Context) -> tuple[Field, ...]:
-        """Return no fields: scenes are stored beside the rows."""
-        del context
-        return ()
 
     def writes(self, context: Context) -> tuple[str, ...]:
         """List the index of the scene."""

@@ -228,7 +228,7 @@ def ik_step(robot: Robot, *, vertical: bool, max_step: float, hold: bool = False
     if hold:
         rows = [[x * (1 - stays) for x, stays in zip(row, held, strict=True)] for row in rows]
     square = dot(error, error)
-    step, factor = _clipped(rows, error, max_step, IK_DAMPING)
+    step, factor = clipped_step(rows, error, max_step, IK_DAMPING)
     target = add(q, step)
     free = [
         ca.logic_and(float(low) <= x, x <= float(high))
@@ -237,7 +237,7 @@ def ik_step(robot: Robot, *, vertical: bool, max_step: float, hold: bool = False
     moved = [ca.if_else(ok, 0.0, _clip(x, robot, i) - q[i]) for i, (ok, x) in enumerate(zip(free, target, strict=True))]
     rest = [factor * e - dot(row, moved) for e, row in zip(error, rows, strict=True)]
     left = [[x * ok for x, ok in zip(row, free, strict=True)] for row in rows]
-    again, _ = _clipped(left, rest, max_step, IK_DAMPING + ca.fmin(MAX_LIMIT_DAMPING, LIMIT_DAMPING_RATE * square))
+    again, _ = clipped_step(left, rest, max_step, IK_DAMPING + ca.fmin(MAX_LIMIT_DAMPING, LIMIT_DAMPING_RATE * square))
     following = [_clip(x, robot, i) for i, x in enumerate(add(add(q, moved), again))]
     given = [q_sx, p_sx, held_sx] if hold else [q_sx, p_sx]
     return ca.Function("ik", given, [ca.vertcat(*following), ca.sqrt(square)])
@@ -259,7 +259,7 @@ def _tilt(kin: Kinematics) -> tuple[Vec, list[Vec]]:
     return [up[1] * stretch, -up[0] * stretch], rows
 
 
-def _clipped(rows: list[Vec], error: Vec, max_step: float, damping: Scalar) -> tuple[Vec, Scalar]:
+def clipped_step(rows: list[Vec], error: Vec, max_step: float, damping: Scalar) -> tuple[Vec, Scalar]:
     """Return the least-norm step that corrects the error, shortened to ``max_step``, and the factor of shortening."""
     import casadi as ca
 

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.kernels.symbolic.linalg import Scalar, symbols
+from cnpgen.kernels.symbolic.linalg import Scalar
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.scene_clearance import SceneClearance
@@ -113,10 +113,7 @@ def narrow_phase_of_scenes(context: Context, end: End, *, exact: bool = True) ->
 def _conservative(context: Context, end: End) -> NDArray[np.bool_]:
     """Return which constraints have conservative conditions at an end, shape (constraints,)."""
     robot, problem = context.robot, context.problem
-    names = ("q", "dq", "ddq")
-    q, dq, ddq = (symbols(name, robot.n)[1] for name in names)
-    poses = symbols("obstacle_poses", problem.scene_width)[1]
-    state = SymbolicState(robot, q, dq, ddq, poses, problem.obstacle, problem.object_size)
+    _, state = SymbolicState.of_symbols(robot, problem.obstacle, problem.object_size, problem.scene_width)
     each = (
         () if isinstance(constraint, RobotClearance | SelfClearance) else constraint.symbolic_at(state, end)
         for constraint in problem.constraint
@@ -163,14 +160,12 @@ def narrow_phase(robot: Robot, problem: Problem, *, end: End, dtype: str) -> Any
     """Build ``(q, dq, ddq, obstacle_poses) -> unmet``: number of unmet conservative values of every constraint."""
     import casadi as ca
 
-    columns = [symbols(name, robot.n) for name in ("q", "dq", "ddq")] + [symbols("obstacle_poses", problem.scene_width)]
-    (q, dq, ddq, obstacle_poses), size = [scalars for _, scalars in columns], problem.object_size
-    state = SymbolicState(robot, q, dq, ddq, obstacle_poses, problem.obstacle, size)
+    columns, state = SymbolicState.of_symbols(robot, problem.obstacle, problem.object_size, problem.scene_width)
     rows: list[Scalar] = []
     for constraint in problem.constraint:
         conditions = [condition for condition in constraint.symbolic_at(state, end) if condition.sufficient]
         rows.append(sum((unmet(condition, condition.tolerance(dtype)) for condition in conditions), ca.SX(0)))
-    return ca.Function(f"narrow_phase_{end}", [column for column, _ in columns], [ca.vertcat(*rows)])
+    return ca.Function(f"narrow_phase_{end}", columns, [ca.vertcat(*rows)])
 
 
 def unmet(condition: Condition, tolerance: Array) -> Scalar:

@@ -3,7 +3,8 @@
 from typing import Any
 
 from cnpgen.kernels.symbolic.kinematics import forward_kinematics
-from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, dot, gram, scale, solve, subtract, symbols
+from cnpgen.kernels.symbolic.linalg import add, dot, scale, subtract, symbols
+from cnpgen.pipelines.stages.ik import clipped_step
 from cnpgen.robots.robot import Robot
 
 METERS_PER_RADIAN = 0.3  # weight of an angle against a distance
@@ -34,22 +35,10 @@ def pose_ik_step(robot: Robot) -> Any:
     rows = [[column[row] for column in kin.jacobian] for row in range(3)]
     rows += [[METERS_PER_RADIAN * axis[row] for axis in axes] for row in range(3)]
     square = dot(error, error)
-    step = _limited_step(rows, error, POSE_DAMPING * square + MIN_DAMPING)
+    step, _ = clipped_step(rows, error, MAX_POSE_IK_STEP_RAD, POSE_DAMPING * square + MIN_DAMPING)
     moved = add(q, step)
     following = [
         ca.fmin(ca.fmax(x, float(low)), float(high))
         for x, low, high in zip(moved, robot.position_lower, robot.position_upper, strict=True)
     ]
     return ca.Function("pose_ik", [q_sx, p_sx, r_sx], [ca.vertcat(*following), ca.sqrt(square)])
-
-
-def _limited_step(rows: list[Vec], error: Vec, damping: Scalar) -> Vec:
-    """Return the damped least-squares step, shortened to ``MAX_POSE_IK_STEP_RAD``."""
-    import casadi as ca
-
-    weights = solve(gram(rows, damping), error)
-    step = [dot([row[j] for row in rows], weights) for j in range(len(rows[0]))]
-    largest: Scalar = ca.fabs(step[0])
-    for x in step[1:]:
-        largest = ca.fmax(largest, ca.fabs(x))
-    return scale(step, ca.fmin(1.0, MAX_POSE_IK_STEP_RAD / ca.fmax(largest, 1e-9)))

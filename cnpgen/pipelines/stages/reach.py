@@ -12,7 +12,6 @@ from cnpgen.pipelines.stages.candidate_table import on_table
 from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Stage, StageFunction
 from cnpgen.problems.constraints.table import Table
 from cnpgen.schema.keys import field
-from cnpgen.store.field import Field
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,11 +35,6 @@ class BallisticReach(Stage):
         if self.goal_time:
             rules.append(f"the goal's position +- hit velocity x {1e3 * self.goal_time:g} ms")
         return "require over the table: " + " and ".join(rules) + " (cheap; braking-reach loses far fewer problems)"
-
-    def outputs(self, context: Context) -> tuple[Field, ...]:
-        """Return no fields."""
-        del context
-        return ()
 
     def prepare(self, context: Context) -> StageFunction:
         """Load the kernel."""

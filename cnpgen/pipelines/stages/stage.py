@@ -129,9 +129,10 @@ class Stage(ABC):
     def describe(self) -> str:
         """Describe the stage in one sentence, with its values and units."""
 
-    @abstractmethod
     def outputs(self, context: Context) -> tuple[Field, ...]:
-        """List the stored fields that this stage writes, in order."""
+        """List the stored fields that this stage writes, in order; by default none."""
+        del context
+        return ()
 
     def writes(self, context: Context) -> tuple[str, ...]:
         """List the columns that this stage writes, stored or not; by default its outputs."""

@@ -109,10 +109,6 @@ class SceneFeatures:
 def make_scene_features(robot: Robot, kernels: KernelLibrary) -> SceneFeatures:
     """Load the features of a robot's scenes.
 
-    Args:
-        robot: The robot, with link geometry.
-        kernels: Library of kernels.
-
     Raises:
         UsageError: The robot has no link geometry.
     """

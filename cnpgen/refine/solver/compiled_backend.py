@@ -92,13 +92,7 @@ def load_step_library(kernels: KernelLibrary) -> ctypes.CDLL | None:
 
 
 class CompiledBackend:
-    """Backend of step.c; see ``Backend``.
-
-    Args:
-        motion: The transcription.
-        bounds: Bounds of its residuals.
-        thinning: Interval of the thinned grid, see ``select_residuals``.
-    """
+    """Backend of step.c; see ``Backend``."""
 
     def __init__(self, motion: Transcription, bounds: Bounds, thinning: int) -> None:
         library = motion.kernels.step_library

@@ -46,9 +46,6 @@ def link_convex_parts(urdf: str) -> list[ConvexPart]:
 
     A cylinder becomes a prism of ``PRISM_SIDES`` sides that contains it; all other geometry is exact.
 
-    Args:
-        urdf: Text of the URDF.
-
     Returns:
         The convex parts in the frames of their links, in the order of the URDF.
 

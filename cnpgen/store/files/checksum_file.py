@@ -48,9 +48,6 @@ def write_with_checksum(path: Path, content: Content, *, kind: str, version: int
         content: The content.
         kind: Kind of the file: ``cnpgen-`` and one word.
         version: Version of the format.
-
-    Raises:
-        MachineError: The file cannot be written.
     """
     write_file(path, encode_with_checksum(content, kind=kind, version=version))
 
@@ -86,14 +83,8 @@ def verify_checksum(path: Path, *, kind: str, version: int) -> bool:
 
     A damaged checksum is an error, and not taken for a missing one.
 
-    Args:
-        path: The file.
-        kind: Expected kind of the file.
-        version: Expected version of the format.
-
     Raises:
         DatasetError: The file is cut off, damaged or too large, or has another format version.
-        MachineError: The file cannot be read.
     """
     try:
         with path.open("rb") as file:
@@ -129,14 +120,8 @@ def _check_checksum(path: Path, block: bytes, digest: str, *, kind: str, version
 def read_with_checksum(path: Path, *, kind: str, version: int) -> Content:
     """Read a file with a checksum and verify it.
 
-    Args:
-        path: The file.
-        kind: Expected kind of the file.
-        version: Expected version of the format.
-
     Raises:
         DatasetError: The file is missing, too large, cut off or damaged, or of another kind or format version.
-        MachineError: The file cannot be read.
     """
     data = read_file(path, max_bytes=MAX_CHECKSUM_FILE_BYTES)
     _check_checksum(

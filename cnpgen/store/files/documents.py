@@ -107,9 +107,6 @@ def save_document(path: Path, document: Mapping[str, Any], *, work: Path | None 
         path: The file.
         document: JSON-able content; the keys "format" and "format_version" come first.
         work: Folder of the temporary file.
-
-    Raises:
-        MachineError: The file cannot be written.
     """
     text = render(plain({**document, "self_sha256": _BLANK})) + "\n"
     digest = hashlib.sha256(text.encode()).hexdigest()
@@ -130,7 +127,6 @@ def load_document(path: Path, kind: str, *, version: int, structure: Structure) 
 
     Raises:
         DatasetError: The file is missing, too large, cut off or changed, or has another format, version or structure.
-        MachineError: The file cannot be read.
     """
     text, document = _parse(path)
     if document.get("format") != kind:

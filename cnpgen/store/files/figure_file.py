@@ -22,11 +22,7 @@ def new_figure(width: float, height: float, dpi: int = 110) -> "Figure":
 
 
 def save_figure(figure: "Figure", path: Path) -> None:
-    """Write a figure in the format of the suffix.
-
-    Raises:
-        MachineError: The file cannot be written.
-    """
+    """Write a figure in the format of the suffix."""
     try:
         figure.savefig(path)
     except OSError as error:

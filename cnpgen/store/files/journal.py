@@ -23,11 +23,7 @@ _MODE = os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0)  # the file is not t
 
 
 def append_line(path: Path, line: str) -> None:
-    """Append a line to a text file and flush it to the disk.
-
-    Raises:
-        MachineError: The file cannot be written.
-    """
+    """Append a line to a text file and flush it to the disk."""
     try:
         with path.open("a", encoding="utf-8") as file:
             file.write(f"{line}\n")
@@ -52,11 +48,7 @@ class JournalFile:
     _magic: bytes
 
     def append(self, record: bytes) -> None:
-        """Append a record and flush it to the disk.
-
-        Raises:
-            MachineError: The file cannot be written.
-        """
+        """Append a record and flush it to the disk."""
         length = len(record).to_bytes(_LENGTH_BYTES, "little")
         try:
             self._file.write(length + hashlib.sha256(record).digest() + record)
@@ -67,11 +59,7 @@ class JournalFile:
         self.records.append(record)
 
     def clear(self) -> None:
-        """Remove all records.
-
-        Raises:
-            MachineError: The file cannot be written.
-        """
+        """Remove all records."""
         try:
             self._file.seek(0)
             self._file.truncate()
@@ -97,7 +85,6 @@ def open_journal_file(path: Path, magic: bytes) -> JournalFile:
     Raises:
         DatasetError: The file does not start with ``magic``.
         UsageError: Another process has locked the file.
-        MachineError: The file cannot be opened.
     """
     try:
         file = os.fdopen(os.open(path, _MODE, 0o666), "r+b")
