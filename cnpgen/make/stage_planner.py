@@ -26,12 +26,12 @@ def model_sha256(model: str) -> str:
     Raises:
         UsageError: There is no such model.
     """
-    from cnpgen.planner.model_file import find_model
+    from cnpgen.planner.model_file import MODEL_NAME, find_model
     from cnpgen.store.files.atomic import file_sha256
     from cnpgen.store.paths import require_file
 
     path = find_model(model)
-    require_file(path, "a model")
+    require_file(path, MODEL_NAME, kinds=(MODEL_NAME,))
     return file_sha256(path)
 
 
@@ -56,7 +56,7 @@ def load_stage_planner(model: str, sha256: str, context: Context) -> "Planner":
     loaded, problem = load_model(model), record_problem(context.problem)
     if loaded.problem.comparable_sha256 != problem.comparable_sha256:
         differs = ", ".join(problem.differences(loaded.problem)[:4])
-        raise RecipeError([f"model: {model!r} plans for another problem, they differ in {differs}"])
+        raise RecipeError([f"model: {model!r} plans for another problem, they differ in {differs}; leave it out"])
     return Planner(loaded, backend=context.kernels.backend)
 
 

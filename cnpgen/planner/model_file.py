@@ -25,9 +25,10 @@ from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.store.files.checksum_file import Content, read_with_checksum, write_with_checksum
 from cnpgen.store.files.document_structure import ANY_KEY, ANYTHING, NUMBER, TEXT, WHOLE, check_structure
 from cnpgen.store.files.documents import parse_json
+from cnpgen.store.files.kind import kind_name
 from cnpgen.store.paths import require_file
 
-MODEL_KIND, MODEL_VERSION = "cnpgen-model", 2
+MODEL_KIND, MODEL_VERSION, MODEL_NAME = "cnpgen-model", 2, kind_name("model")
 MAX_PROJECTION_STEPS = 20  # Gauss-Newton steps; each makes a kernel larger
 _DEFAULTS = {
     "expected_time": "distance",
@@ -69,12 +70,12 @@ def load_model(name_or_path: str | Path) -> Model:
         name_or_path: Name of a shipped model, or path of a model file.
 
     Raises:
-        UsageError: There is no such file, or no shipped model of this name.
-        DatasetError: The file is damaged, of another format version, or no model.
+        UsageError: There is no such file, it is of another kind, or there is no shipped model of this name.
+        DatasetError: The file is damaged or of another format version.
         MachineError: The operating system denies reading it.
     """
     path = find_model(name_or_path)
-    require_file(path, "a model", argument="name_or_path")
+    require_file(path, MODEL_NAME, kinds=(MODEL_NAME,), argument="name_or_path")
     return model_from_content(path, read_with_checksum(path, kind=MODEL_KIND, version=MODEL_VERSION))
 
 

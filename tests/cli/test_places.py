@@ -78,7 +78,7 @@ def test_a_folder_is_not_a_file_of_plans(
 
 def test_a_folder_is_not_a_model(said: Said, tmp_path: Path) -> None:
     (tmp_path / "model.h5").mkdir()
-    assert said(MODELS["plan"], "model.h5") == (2, "model.h5 is a folder, expected a model")
+    assert said(MODELS["plan"], "model.h5") == (2, "model.h5 is a folder, expected a model of cnpgen")
 
 
 @pytest.mark.parametrize("words", [("show", "{}"), ("make-dataset", "{}")])
@@ -142,7 +142,7 @@ def test_what_cannot_be_solved_because_it_is_not_there_is_said_first(
 
 def test_a_model_is_not_a_file_of_plans(said: Said, tmp_path: Path) -> None:
     shutil.copy(shipped_models()["airhockey-hit"], tmp_path / "mine.h5")
-    assert said(FILES["evaluate"], "mine.h5") == (1, "mine.h5 is a model of cnpgen, not a file of plans")
+    assert said(FILES["evaluate"], "mine.h5") == (2, "mine.h5 is a model of cnpgen, expected a file of plans")
 
 
 def test_force_does_not_replace_a_model_by_plans(said: Said, tmp_path: Path, hit: Path) -> None:
