@@ -33,6 +33,7 @@ from cnpgen.problems.problem_record import open_problem
 from cnpgen.schema import registry
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import concerning, integer, number
+from cnpgen.store.files.atomic import check_writable
 from cnpgen.store.files.documents import canonical_sha256, plain
 from cnpgen.store.paths import require_file
 
@@ -169,13 +170,14 @@ def run_benchmark(
     if not 0 <= plane_tolerance < np.inf:
         raise UsageError(f"must not be negative, got {plane_tolerance:g} m", argument="plane_tolerance")
     seed, repeat = integer("seed", seed, least=0), integer("repeat", repeat, least=1, most=MAX_REPETITIONS)
+    place = Path(folder)
+    if place.exists() and not place.is_dir():
+        raise UsageError(f"must be a folder, {place} is a file", argument="folder")
+    check_writable(place)
     problems, prefix = loaded.problems(None if n is None else integer("n", n, least=1))
     if environment is not None:
         check_challenge(*open_problem(problems.problem))
     setting = Setting(problems.problem, loaded.model, limit, seed)
-    place = Path(folder)
-    if place.exists() and not place.is_dir():
-        raise UsageError(f"must be a folder, {place} is a file", argument="folder")
     place.mkdir(parents=True, exist_ok=True)
     shared = _shared_identity(loaded, setting)
     names = {*_names_in(place, shared, delete_others=force), *planners}

@@ -63,8 +63,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _validate(arguments: argparse.Namespace) -> "ValidationReport":
+    from cnpgen.store.paths import require_dataset
     from cnpgen.validate.validate_dataset import validate_dataset
 
+    require_dataset(arguments.folder)
     names = ("deep", "regenerate", "workers", "engine", "address")
     options = {name: getattr(arguments, name) for name in names}
     rows = _rows(arguments.folder) if arguments.deep else 0

@@ -92,11 +92,14 @@ def plot_file(text: str) -> str:
 
 
 def picture_file(text: str, *endings: str) -> str:
-    """Read the name of a file with one of some endings, in a folder that is there."""
+    """Read the name of a file with one of some endings, in a folder that is there and can be written."""
+    from cnpgen.store.files.atomic import check_writable
+
     if not text.lower().endswith(endings):
         raise ArgumentTypeError(f"expected a file that ends in {either(endings)}, got {text!r}")
     if not Path(text).absolute().parent.is_dir():
         raise ArgumentTypeError(f"expected a file in a folder that is there, got {text!r}")
+    check_writable(Path(text))
     return text
 
 

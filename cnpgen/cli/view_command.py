@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cnpgen.cli import values
+from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Commands, Parser, add_command
 
 if TYPE_CHECKING:
@@ -32,7 +32,10 @@ def add(commands: "Commands[Parser]") -> None:
     parser = add_command(commands, "view", run, title="show a robot, a plan or a sample in a browser", text=_TEXT)
     option = parser.add_argument
     option(
-        "what", metavar="PROBLEM|DIR|FILE", help="a problem by name or file, the folder of a dataset, or a plan file"
+        "what",
+        metavar="PROBLEM|DIR|FILE",
+        type=recipe_names.viewed,
+        help="a problem by name or file, the folder of a dataset, or a plan file",
     )
     rows = parser.add_mutually_exclusive_group()
     text = "plan of the file, or sample of the split (default: 0)"
@@ -45,7 +48,7 @@ def add(commands: "Commands[Parser]") -> None:
     )
     option("--split", metavar="NAME", help="split of the folder (default: validation)")
     text = "the problem of plans or rows, whose URDF leads to its visual meshes"
-    option("--problem", metavar="NAME|FILE", help=text)
+    option("--problem", metavar="NAME|FILE", type=recipe_names.problem, help=text)
     where = parser.add_mutually_exclusive_group()
     where.add_argument("-o", "--out", metavar="OUT", type=_page, help="output file (default: NAME.html)")
     text = "serve the page on this machine, and show every change of its files (default port: 8000)"
@@ -59,12 +62,13 @@ def _page(text: str) -> str:
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     from cnpgen.cli.view.page import page_of
-    from cnpgen.store.files.atomic import write_file
+    from cnpgen.store.files.atomic import check_writable, write_file
 
     what = Path(arguments.what)
     if arguments.serve is not None:
         return _serve(arguments)
     out = Path(arguments.out or f"{what.resolve().name if what.is_dir() else what.stem}.html")
+    check_writable(out)
     write_file(out, page_of(_scene(arguments)))
     print(out)
     return 0

@@ -18,7 +18,7 @@ from cnpgen.schema.arguments import integer
 from cnpgen.schema.texts import read_own, utf8_text
 from cnpgen.store.card import card_notes
 from cnpgen.store.dataset_spec import DatasetSpec, write_dataset_spec
-from cnpgen.store.files.atomic import machine_error
+from cnpgen.store.files.atomic import check_writable, machine_error
 from cnpgen.store.files.leftovers import remove_leftovers
 from cnpgen.store.intact import RERUN_HINT
 from cnpgen.store.layout import CARD, MANIFEST, SPECIFICATION, WORK
@@ -69,6 +69,7 @@ def extend_dataset(
         job = Job(folder, extended, recipe.pipeline, backend, cache_folder)
         notes = _notes(folder)
         if extended is not begun:
+            check_writable(folder)
             prepare(job)  # raises errors of this machine before anything is written
             _replace_spec(folder, extended)
         remove_leftovers(folder / WORK)

@@ -26,13 +26,10 @@ def model_sha256(model: str) -> str:
     Raises:
         UsageError: There is no such model.
     """
-    from cnpgen.planner.model_file import MODEL_NAME, find_model
+    from cnpgen.planner.model_file import find_model
     from cnpgen.store.files.atomic import file_sha256
-    from cnpgen.store.paths import require_file
 
-    path = find_model(model)
-    require_file(path, MODEL_NAME, kinds=(MODEL_NAME,))
-    return file_sha256(path)
+    return file_sha256(find_model(model))
 
 
 def load_stage_planner(model: str, sha256: str, context: Context) -> "Planner":

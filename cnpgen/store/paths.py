@@ -31,7 +31,7 @@ def require_folder(folder: str | Path, *, argument: str = "folder") -> Path:
     if not isinstance(folder, str | Path) or not str(folder) or "\0" in str(folder):
         raise UsageError(f"must name a folder, got {folder!r:.100}", argument=argument)
     folder = Path(folder)
-    _require_path(folder, "the folder of a dataset", argument)
+    require_path(folder, "the folder of a dataset", argument=argument)
     if not folder.is_dir():
         raise UsageError(f"{folder} is a file, expected the folder of a dataset", concerns=argument)
     return folder
@@ -47,7 +47,8 @@ def require_dataset(folder: str | Path, *, argument: str = "folder") -> Path:
     folder = require_folder(folder, argument=argument)
     if is_dataset(folder):
         return folder
-    hint = f"; 'cnpgen make-dataset {recipes[0]}' makes one" if (recipes := recipes_in(folder)) else ""
+    recipe = folder / "dataset.toml"  # as of 'cnpgen copy'
+    hint = f": 'cnpgen make-dataset {recipe}' makes one" if recipe.is_file() else ""
     raise UsageError(f"{folder} is not a dataset of cnpgen: it has no {SPECIFICATION}{hint}", concerns=argument)
 
 
@@ -67,7 +68,7 @@ def require_file(
         UsageError: The path does not exist, is a folder, a device or a pipe, or a file of another kind.
         MachineError: It cannot be read.
     """
-    _require_path(path, expected, argument)
+    require_path(path, expected, argument=argument)
     if path.is_dir():
         actual, hint = ("the folder of a dataset", of_dataset) if is_dataset(path) else ("a folder", "")
         raise UsageError(f"{path} is {actual}, expected {expected}{hint and f': {hint}'}", concerns=argument)
@@ -78,24 +79,29 @@ def require_file(
         raise UsageError(f"{path} is {kind}, expected {expected}", concerns=argument)
 
 
-def _require_path(path: Path, expected: str, argument: str) -> None:
-    """Raise an error if a path is missing or cannot be read."""
+def require_path(path: Path, expected: str, *, argument: str = "path") -> None:
+    """Raise an error if a path does not exist.
+
+    Args:
+        path: The path.
+        expected: Expected content.
+        argument: Name of the argument, for the error.
+
+    Raises:
+        UsageError: It does not exist.
+        MachineError: It cannot be read.
+    """
     check_readable(path)
     if not path.exists():
         raise UsageError(f"{path} is not there, expected {expected}{similar_path(path)}", concerns=argument)
 
 
 def similar_path(path: Path, names: Iterable[str] = ()) -> str:
-    """Return ``" (did you mean 'x'?)"`` for the most similar name or path in the same folder, or an empty text."""
+    """Return ``" (did you mean 'x'?)"`` for the most similar of names and of paths beside it, or an empty text."""
     with suppress(OSError):
         beside = itertools.islice(path.parent.iterdir(), MAX_SIMILAR_PATHS)
-        names = [*names, *(str(each) for each in beside if each.is_dir() or each.suffix == path.suffix)]
-    return nearest(str(path), names)
-
-
-def recipes_in(folder: Path) -> list[Path]:
-    """Return the recipes in a folder as ``cnpgen copy`` and ``cnpgen init`` write it, a dataset first."""
-    return [path for kind in ("dataset", "pipeline", "problem") if (path := folder / f"{kind}.toml").is_file()]
+        names = [*names, *(each.name for each in beside if path.suffix in ("", each.suffix) or each.is_dir())]
+    return nearest(path.name, names)
 
 
 def file_kind(path: Path) -> str:

@@ -562,7 +562,7 @@ def test_inspect_works_on_an_unfinished_dataset(run, hits, tmp_path):
 def test_inspect_of_something_else_is_one_line(run, tmp_path):
     assert run("inspect", tmp_path / "nothing")[0] == 2
     code, _, err = run("inspect", tmp_path)
-    assert code == 1
+    assert code == 2
     assert "not a dataset" in one_line(err)
 
 

@@ -26,7 +26,7 @@ FILES = {  # commands that take a file of plans
     "refine": ("refine", "{}", "-o", "out.h5"),
     "export": ("export", "{}", "--to", "npz"),
 }
-MODELS = {"plan": ("plan", "problems.h5", "--model", "{}", "-o", "out.h5")}
+MODELS = {"plan": ("plan", "airhockey-hit", "--model", "{}", "-o", "out.h5", "--n", "1")}
 RECIPES = {
     "make-dataset": ("make-dataset", "{}.toml"),
     "show": ("show", "{}.toml"),
