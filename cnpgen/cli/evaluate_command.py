@@ -23,7 +23,7 @@ time.
 
 With --problem, FILE may also hold sampled trajectories: CSV, JSON, YAML, NPZ, HDF5 or Parquet, messages of ROS and
 MoveIt, or a folder of such files ('cnpgen docs trajectories'). Each trajectory and condition is valid, invalid or
-undecided. The exit code is then 0 if all are valid, otherwise 1; 2 for files that cannot be read.
+undecided. The exit code is then 0 if all are valid, otherwise 1; 2 for damaged files and files of other kinds.
 """
 
 
