@@ -172,7 +172,7 @@ def run_benchmark(
     seed, repeat = integer("seed", seed, least=0), integer("repeat", repeat, least=1, most=MAX_REPETITIONS)
     place = Path(folder)
     if place.exists() and not place.is_dir():
-        raise UsageError(f"must be a folder, {place} is a file", argument="folder")
+        raise UsageError(f"{place} is a file, expected a folder for the results", concerns="folder")
     check_writable(place)
     problems, prefix = loaded.problems(None if n is None else integer("n", n, least=1))
     if environment is not None:

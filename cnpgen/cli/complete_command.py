@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names
 from cnpgen.cli.parser import Commands, Parser, add_command, add_json
-from cnpgen.cli.plan_files import check_suffix
 
 if TYPE_CHECKING:
     from cnpgen.make.complete import Completed
@@ -50,7 +49,6 @@ def run(arguments: argparse.Namespace) -> int:
     from cnpgen.make.complete import complete
     from cnpgen.plans import save_plans
 
-    check_suffix(arguments.out)
     check_place(arguments.out, force=arguments.force)
     found = complete(arguments.pipeline, arguments.tasks)
     if len(found.plans):

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Commands, Parser, add_command
-from cnpgen.cli.plan_files import check_suffix
 from cnpgen.cli.trajectory_options import add_trajectory_options, load_file, problem_of
 
 if TYPE_CHECKING:
@@ -47,12 +46,15 @@ def run(arguments: argparse.Namespace) -> int:
     import numpy as np
 
     from cnpgen.cli.refine_options import check_place
-    from cnpgen.errors import counted
+    from cnpgen.errors import UsageError, counted
     from cnpgen.plans.import_trajectories import import_trajectories
     from cnpgen.plans.save import save_plans
+    from cnpgen.store.files.kind import PLANS
+    from cnpgen.store.paths import file_kind
 
     out = arguments.out
-    check_suffix(out)
+    if file_kind(arguments.file) == PLANS:
+        raise UsageError(f"{arguments.file} is {PLANS} already: 'cnpgen refine' optimizes them")
     check_place(out, force=arguments.force)
     problem = problem_of(arguments)
     loaded = load_file(arguments, problem)

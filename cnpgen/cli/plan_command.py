@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Commands, Parser, add_command, add_engine, add_json
-from cnpgen.cli.plan_files import check_suffix
 from cnpgen.cli.refine_options import LARGE_ANGLES, REFINING, WORKERS, add_refining, check_place, refine_and_save
 from cnpgen.errors import counted
 
@@ -116,7 +115,6 @@ def _check(arguments: argparse.Namespace) -> None:
     ]
     if lost and not arguments.refine:
         raise UsageError(f"--{lost[0].replace('_', '-')} needs --refine")
-    check_suffix(arguments.out)
     check_place(arguments.out, force=arguments.force)
 
 

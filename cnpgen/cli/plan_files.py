@@ -25,11 +25,3 @@ def read_plans(path: Path, *, problem: str | None = None) -> "Plans":
 def checksum_text(plans: "Plans") -> str:
     """Return whether the source of the plans has a checksum, as text."""
     return "the file's checksum is right" if plans.has_checksum else "the file has no checksum"
-
-
-def check_suffix(out: Path) -> None:
-    """Refuse an output file that does not end in .h5."""
-    from cnpgen.errors import UsageError
-
-    if out.suffix != ".h5":
-        raise UsageError(f"{out} must be a file that ends in .h5, in a folder that exists")

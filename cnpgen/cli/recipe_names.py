@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from cnpgen.schema.toml import Kind
 
+_TEXTS = {".toml", ".yaml", ".yml"}  # suffixes of recipes, and of scenes
 DATASET = "'cnpgen inspect {0}' describes it, 'cnpgen validate {0}' checks it"
 _HINTS = {  # what a file is -> what to do with it
     "a file of plans": "'cnpgen evaluate {0}' judges them",
@@ -67,15 +68,20 @@ def check_there(what: str, *kinds: str) -> None:
     """
     from cnpgen.errors import UsageError, either
     from cnpgen.store.files.atomic import check_readable
+    from cnpgen.store.files.kind import kind_of_content
     from cnpgen.store.paths import similar_path
 
     kinds = kinds or ("dataset", "pipeline")
     names = _shipped(*kinds)
-    check_readable(Path(what))
-    if Path(what).exists() or what in names:
+    path = Path(what)
+    check_readable(path)
+    if path.suffix.lower() not in _TEXTS and path.is_file() and kind_of_content(path) == "a text file":
+        check_recipe(what)  # has a hint for tables
+        raise UsageError(f"{what} is a text file, expected a recipe (.toml) or an HDF5 file")
+    if path.exists() or what in names:
         return
-    hint = similar_path(Path(what), names)
-    if Path(what).suffix:
+    hint = similar_path(path, names)
+    if path.suffix:
         raise UsageError(f"no such file: {what}{hint}")
     raise UsageError(
         f"{what} is neither a folder nor a file, {either(kinds)}{hint}: 'cnpgen list' names those that ship"
@@ -135,6 +141,7 @@ def _recipe(text: str, *kinds: "Kind") -> str:
     from cnpgen.schema.catalogue import find_recipe
     from cnpgen.store.files.atomic import check_readable
 
+    check_recipe(text)
     check_readable(find_recipe(kinds, text))
     return text
 
@@ -159,6 +166,7 @@ def dataset(text: str) -> Path:
     """Read the folder of a dataset."""
     from cnpgen.store.paths import require_dataset
 
+    _refuse_shipped(text)
     return require_dataset(text)
 
 
@@ -166,5 +174,14 @@ def present(text: str) -> Path:
     """Read the path of a file or a folder."""
     from cnpgen.store.paths import require_path
 
+    _refuse_shipped(text)
     require_path(Path(text), "a file or a folder")
     return Path(text)
+
+
+def _refuse_shipped(text: str) -> None:
+    """Refuse the name of a shipped dataset where its folder is expected."""
+    from cnpgen.errors import UsageError
+
+    if not os.path.exists(text) and text in _shipped("dataset"):  # noqa: PTH110 - names may be too long
+        raise UsageError(f"{text} is a recipe, expected a path: 'cnpgen make-dataset {text}' makes the dataset")

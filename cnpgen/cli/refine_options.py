@@ -147,8 +147,8 @@ def check_place(out: Path, *, force: bool) -> None:
     from cnpgen.plans.save import check_replaceable
     from cnpgen.store.files.atomic import check_writable
 
-    if out.is_dir() or not out.parent.is_dir():
-        raise UsageError(f"{out} must be a file in a folder that exists")
+    if out.suffix != ".h5" or out.is_dir() or not out.parent.is_dir():
+        raise UsageError(f"{out} must be a file that ends in .h5, in a folder that exists")
     if out.exists() and not force:
         raise UsageError(f"{out} exists: --force replaces it, -o names another file")
     check_replaceable(out)

@@ -75,6 +75,8 @@ def publish_dataset(
     source, target = Path(folder), Path(out)
     if target.resolve().is_relative_to(source.resolve()):
         raise UsageError(f"must be a folder outside the dataset {source}, got {target}", argument="out")
+    if target.exists() and not target.is_dir():
+        raise UsageError(f"must be a folder, {target} is a file", argument="out")
     check_writable(target)
     spec = load_dataset(source).spec
     if not spec.license:

@@ -11,7 +11,7 @@ from cnpgen.store.files.kind import PLANS, is_hdf5, kind_of_content, own_kind
 from cnpgen.store.layout import SPECIFICATION
 from cnpgen.store.workspace import is_dataset
 
-MAX_SIMILAR_PATHS = 1000  # names of a folder that are compared
+MAX_SIMILAR_PATHS, MIN_SIMILARITY = 1000, 0.65  # names of a folder that are compared, and their share of equal letters
 ANY_HDF5 = "an HDF5 file"  # of other software
 _KIND_OF_FORMAT = {"cnpgen-plans": PLANS, "cnpgen-shard": "a shard of a dataset"}
 HDF5_KINDS = (ANY_HDF5, *_KIND_OF_FORMAT.values())
@@ -101,7 +101,7 @@ def similar_path(path: Path, names: Iterable[str] = ()) -> str:
     with suppress(OSError):
         beside = itertools.islice(path.parent.iterdir(), MAX_SIMILAR_PATHS)
         names = [*names, *(each.name for each in beside if path.suffix in ("", each.suffix) or each.is_dir())]
-    return nearest(path.name, names)
+    return nearest(path.name, names, similarity=MIN_SIMILARITY)
 
 
 def file_kind(path: Path) -> str:

@@ -170,7 +170,7 @@ def test_a_wrong_unit_is_named(run):
         (("generate", "x"), "'make-dataset'"),
         (("list", "stage"), "'stages'"),
         (("--hepl",), "'--help'"),
-        (("inspect", "x", "--jsn"), "'--json'"),
+        (("list", "--jsn"), "'--json'"),
     ],
 )
 def test_what_is_misspelt_is_met_with_the_nearest_known_name(run, words, hint):
@@ -655,23 +655,23 @@ def _fail_with(monkeypatch, error):
         (DatasetError("gone"), 1, "gone"),
     ],
 )
-def test_an_error_is_a_line_and_a_code_without_a_traceback(run, monkeypatch, error, code, text):
+def test_an_error_is_a_line_and_a_code_without_a_traceback(run, hits, monkeypatch, error, code, text):
     _fail_with(monkeypatch, error)
-    found, out, err = run("inspect", ".")
+    found, out, err = run("inspect", hits)
     assert (found, out) == (code, "")
     assert text in one_line(err)
 
 
-@pytest.mark.parametrize("words", [("--debug", "inspect", "."), ("inspect", ".", "--debug")])
-def test_debug_shows_the_traceback(run, monkeypatch, words):
+@pytest.mark.parametrize("words", [("--debug", "inspect", "{}"), ("inspect", "{}", "--debug")])
+def test_debug_shows_the_traceback(run, hits, monkeypatch, words):
     _fail_with(monkeypatch, ZeroDivisionError("division by zero"))
-    code, _, err = run(*words)
+    code, _, err = run(*(word.format(hits) for word in words))
     assert code == 3
     assert "Traceback (most recent call last)" in err
     assert err.splitlines()[-1].startswith("cnpgen: error: ")
 
 
-def test_a_warning_is_a_line(run, monkeypatch):
+def test_a_warning_is_a_line(run, hits, monkeypatch):
     def warn(*_, **__):
         warnings.warn("no compiler;\n  slower", RuntimeWarning, stacklevel=1)
         raise DatasetError("gone")
@@ -679,13 +679,13 @@ def test_a_warning_is_a_line(run, monkeypatch):
     monkeypatch.setattr("cnpgen.store.inspection.inspect_dataset", warn)
     with warnings.catch_warnings():
         warnings.simplefilter("always")
-        _, _, err = run("inspect", ".")
+        _, _, err = run("inspect", hits)
     assert err == "cnpgen: warning: no compiler; slower\ncnpgen: error: gone\n"
 
 
-def test_an_interruption_of_another_command_is_130(run, monkeypatch):
+def test_an_interruption_of_another_command_is_130(run, hits, monkeypatch):
     _fail_with(monkeypatch, KeyboardInterrupt())
-    assert run("inspect", ".") == (130, "", "cnpgen: interrupted\n")
+    assert run("inspect", hits) == (130, "", "cnpgen: interrupted\n")
 
 
 def test_a_reader_that_goes_away_is_left_quietly():
