@@ -3,6 +3,7 @@
 import argparse
 import io
 import os
+import re
 import sys
 import traceback
 import warnings
@@ -151,6 +152,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(words: list[str], given: argparse.Namespace) -> int:
     """Parse the words into ``given`` and run the command."""
     parser = build_parser()
+    for before, word in zip(["cnpgen", *words], words, strict=False):
+        if word == "" or re.fullmatch("--[a-z-]+=", word):
+            parser.error(f"the argument after {word or before!r} is empty: is it an unset variable of the shell?")
     try:
         arguments, extras = parser.parse_known_args(words, given)
     except SystemExit:  # --help and --version have printed their text

@@ -97,10 +97,11 @@ def _scene(arguments: argparse.Namespace) -> "ViewScene":
     from cnpgen.plans import open_problem
     from cnpgen.problems.load_robot import load_robot
     from cnpgen.problems.problem_file import load_problem_behind
+    from cnpgen.problems.scenes.scene_files import HDF5_SUFFIXES
     from cnpgen.store.paths import file_kind
 
     what, rows = Path(arguments.what), arguments.rows or (arguments.row or 0,)
-    if not what.is_dir() and not file_kind(what):
+    if not what.is_dir() and not file_kind(what) and what.suffix not in HDF5_SUFFIXES:
         _refuse_for_problem(arguments)
         problem = load_problem_behind(arguments.what)
         return scene_of_problem(problem, load_robot(problem))

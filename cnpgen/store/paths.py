@@ -101,7 +101,8 @@ def similar_path(path: Path, names: Iterable[str] = ()) -> str:
     with suppress(OSError):
         beside = itertools.islice(path.parent.iterdir(), MAX_SIMILAR_PATHS)
         names = [*names, *(each.name for each in beside if path.suffix in ("", each.suffix) or each.is_dir())]
-    return nearest(path.name, names, similarity=MIN_SIMILARITY)
+    others = [name for name in names if name != path.name]  # a link may lead nowhere
+    return nearest(path.name, others, similarity=MIN_SIMILARITY)
 
 
 def file_kind(path: Path) -> str:

@@ -104,7 +104,7 @@ def test_the_bounds_are_those_of_the_library():
     assert values.MAX_ROWS_ARGUMENT == MAX_ROWS
 
 
-@pytest.mark.parametrize("text", ["1e9x", "0", "-5", "2.5", ""])
+@pytest.mark.parametrize("text", ["1e9x", "0", "-5", "2.5"])
 def test_a_wrong_number_of_rows_is_one_line_that_says_what_to_write(run, text, tmp_path):
     code, out, err = run("make-dataset", "airhockey-hit", "--out", tmp_path / "x", "--n", text)
     assert (code, out) == (2, "")
@@ -194,6 +194,9 @@ def test_help_lists_the_commands_and_exit_codes(run):
     assert (code, err) == (0, "")
     for word in ("make-dataset", "list", "show", "inspect", "validate", "doctor", "  130  interrupted"):
         assert word in out
+    assert "  3    the machine: no permission to read or write a path" in out
+    codes = {error.exit_code for error in vars(cnpgen.errors).values() if hasattr(error, "exit_code")}
+    assert all(f"\n  {code}    " in out for code in {0, *codes})
 
 
 @pytest.mark.parametrize("command", ["make-dataset", "list", "show", "inspect", "validate", "doctor"])

@@ -339,6 +339,7 @@ def test_a_dataset_of_another_problem_is_refused_with_what_differs(trained, tiny
     assert "plans for 'airhockey'" in text
     assert "is of 'heavy-object'" in text
     assert "they differ in" in text
+    assert "train a model for it ('cnpgen train'), or plan without a model ('cnpgen solve')" in text
 
 
 def test_rows_that_are_drawn_in_another_way_are_refused_unless_they_are_meant(trained, tiny, tmp_path, capsys):

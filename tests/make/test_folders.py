@@ -240,7 +240,7 @@ def refused(capsys, out: str) -> tuple[int, str]:
 def test_a_place_where_no_folder_can_be_is_one_line_with_what_to_do(tmp_path, capsys):
     (tmp_path / "file").write_text("mine")
     expected = {
-        "": (2, "out must name a folder, got ''"),
+        "": (2, "the argument after '--out' is empty: is it an unset variable of the shell?"),
         str(tmp_path / "file"): (2, "file is a file, not a folder; choose another --out"),
         str(tmp_path / "file" / "below" / "it"): (2, "file is a file, not a folder; choose another --out"),
         str(tmp_path / ("x" * 300)): (3, "File name too long; choose a shorter name"),

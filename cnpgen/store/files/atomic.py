@@ -55,7 +55,7 @@ def check_readable(path: Path) -> None:
     try:
         mode = path.stat().st_mode
         if stat.S_ISDIR(mode):
-            os.scandir(path / ".").close()  # needs the permissions to list and to enter
+            os.scandir(f"{path}/.").close()  # needs the permissions to list and to enter
         elif stat.S_ISREG(mode):
             path.open("rb").close()
     except PermissionError as error:
@@ -74,9 +74,10 @@ def check_writable(path: Path) -> None:
         MachineError: An existing file is read-only, or no file can be created in its folder or in the next one above.
     """
     try:
+        places = [path.absolute(), *path.absolute().parents]
         if path.is_file():
-            path.open("ab").close()
-        folder = next(each for each in (path.absolute(), *path.absolute().parents) if each.is_dir())
+            places.pop(0).open("ab").close()
+        folder = next(place for place in places if place.exists())
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
