@@ -139,14 +139,20 @@ SYNONYMS = {  # words of other projects -> the word of a name here
 }
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
-    """Return ``" (did you mean 'x'?)"`` for a synonym or the most similar known name, or an empty string."""
+def nearest(name: str, known: Iterable[str], *, similarity: float = 0.5) -> str:
+    """Return ``" (did you mean 'x'?)"`` for a synonym or the most similar known name, or an empty string.
+
+    Args:
+        name: The unknown name.
+        known: Known names.
+        similarity: Minimum share of equal letters.
+    """
     names = list(known)
     meant = "-".join(SYNONYMS.get(word, word) for word in name.split("-"))
     if meant != name and meant in names:
         return f" (did you mean {meant!r}?)"
     completions = [candidate for candidate in names if len(name) > 2 and candidate.startswith(name)]
-    close = difflib.get_close_matches(name, names, n=1, cutoff=0.5) or completions
+    close = difflib.get_close_matches(name, names, n=1, cutoff=similarity) or completions
     return f" (did you mean {close[0]!r}?)" if close else ""
 
 

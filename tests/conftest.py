@@ -8,8 +8,10 @@ for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", 
 os.environ["LOKY_MAX_CPU_COUNT"] = "1"  # the tests run side by side already: workers only where a test requests them
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # hundreds of processes would compile the whole package each
 
+import ctypes
 import shutil
 import signal
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import cache
@@ -35,6 +37,7 @@ from cnpgen.store.layout import MANIFEST
 SHIPPED = ("airhockey-hit", "airhockey-replan", "heavy-object")
 TINY_ROWS = 660  # 600 + 60: three shards of training and one of validation
 TINY_SHARD = 250
+CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH, CAPABILITY_VERSION = 1, 2, 0x20080522  # of Linux: capabilities(7)
 HANGING = 1800  # [s] a longer run hangs on any machine
 
 
@@ -67,6 +70,25 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_xdist_auto_num_workers() -> int:
     """Choose one process more than there are processors: a quarter of the time is waiting for other processes."""
     return (os.cpu_count() or 1) + 1
+
+
+@pytest.fixture
+def file_permissions() -> Iterator[None]:
+    """Let the kernel check the permissions of files, also for root; the test may leave folders that are read-only."""
+    if os.geteuid() != 0:
+        yield
+        return
+    if not sys.platform.startswith("linux"):
+        pytest.skip("root may read and write everything here")
+    header, sets = (ctypes.c_uint32 * 2)(CAPABILITY_VERSION, 0), (ctypes.c_uint32 * 6)()
+    library = ctypes.CDLL(None, use_errno=True)
+    assert library.capget(header, sets) == 0
+    effective = sets[0]
+    sets[0] &= ~(1 << CAP_DAC_OVERRIDE | 1 << CAP_DAC_READ_SEARCH)
+    assert library.capset(header, sets) == 0
+    yield
+    sets[0] = effective
+    assert library.capset(header, sets) == 0
 
 
 @pytest.fixture(scope="session")

@@ -33,6 +33,7 @@ from cnpgen.problems.problem_record import open_problem
 from cnpgen.schema import registry
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import concerning, integer, number
+from cnpgen.store.files.atomic import check_writable
 from cnpgen.store.files.documents import canonical_sha256, plain
 from cnpgen.store.paths import require_file
 
@@ -162,11 +163,15 @@ def run_benchmark(
     if not 0 <= plane_tolerance < np.inf:
         raise UsageError(f"must not be negative, got {plane_tolerance:g} m", argument="plane_tolerance")
     seed, repeat = integer("seed", seed, least=0), integer("repeat", repeat, least=1, most=MAX_REPETITIONS)
+    place = Path(folder)
+    if place.exists() and not place.is_dir():
+        raise UsageError(f"{place} is a file, expected a folder for the results", concerns="folder")
+    check_writable(place)
     problems, prefix = loaded.problems(None if n is None else integer("n", n, least=1))
     if environment is not None:
         check_challenge(*open_problem(problems.problem))
     setting = Setting(problems.problem, loaded.model, limit, seed)
-    place = _made_folder(Path(folder))
+    place.mkdir(parents=True, exist_ok=True)
     shared = _shared_identity(loaded, setting)
     names = {*_names_in(place, shared, delete_others=force), *planners}
     if reference is not None and reference not in names:
@@ -211,13 +216,6 @@ def _loaded_plants(plants: Sequence[str | Plant], environment: str | Path | None
     if robots:
         load_mujoco()
     return robots
-
-
-def _made_folder(folder: Path) -> Path:
-    if folder.exists() and not folder.is_dir():
-        raise UsageError(f"must be a folder, {folder} is a file", argument="folder")
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
 
 
 def _place_of(folder: Path, planner: str, repetition: int) -> Path:

@@ -9,7 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cnpgen.cli import values
+from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Commands, Parser, add_command, add_engine, add_json
 from cnpgen.cli.progress import Meter
 from cnpgen.errors import CnpgenError, UsageError
@@ -31,7 +31,8 @@ def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
     parser = add_command(commands, "benchmark", run, title="compare planners on the problems of a suite", text=_TEXT)
     option = parser.add_argument
-    option("suite", metavar="SUITE", nargs="?", help="a suite (see --list), or a dataset for random problems")
+    text = "a suite (see --list), or a dataset for random problems"
+    option("suite", metavar="SUITE", nargs="?", type=recipe_names.suite, help=text)
     option("--list", action="store_true", help="list suites, planners and plants")
     option("-o", "--out", metavar="DIR", type=Path, help="folder of the results (default: SUITE-results)")
     option("--planners", metavar="NAME", nargs="+", help="planners to compare (default: cnpgen cnpgen+refine solve)")

@@ -7,8 +7,8 @@ import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from cnpgen.cli import recipe_names
 from cnpgen.cli.parser import Commands, Parser, add_command, add_json
-from cnpgen.cli.plan_files import check_suffix
 from cnpgen.errors import counted
 
 if TYPE_CHECKING:
@@ -35,8 +35,9 @@ def add(commands: "Commands[Parser]") -> None:
         commands, "complete", run, title="compute boundary problems for tasks in the workspace", text=_TEXT
     )
     option = parser.add_argument
-    option("pipeline", metavar="NAME|FILE", help="a pipeline, dataset or problem by name, or a recipe file")
-    option("tasks", metavar="TASKS", type=Path, help="a table of tasks: CSV, or HDF5")
+    text = "a pipeline, dataset or problem by name, or a recipe file"
+    option("pipeline", metavar="NAME|FILE", type=recipe_names.tasks_of, help=text)
+    option("tasks", metavar="TASKS", type=recipe_names.present, help="a table of tasks: CSV, or HDF5")
     option("-o", "--out", metavar="OUT", type=Path, required=True, help="file of boundary problems to write, .h5")
     option("--force", action="store_true", help="replace OUT")
     option("--quiet", action="store_true", help="no summary")
@@ -45,14 +46,10 @@ def add(commands: "Commands[Parser]") -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
-    from cnpgen.cli.recipe_names import check_recipe, check_there
     from cnpgen.cli.refine_options import check_place
     from cnpgen.make.complete import complete
     from cnpgen.plans import save_plans
 
-    check_there(arguments.pipeline, "dataset", "pipeline", "problem")
-    check_recipe(arguments.pipeline)
-    check_suffix(arguments.out)
     check_place(arguments.out, force=arguments.force)
     found = complete(arguments.pipeline, arguments.tasks)
     if len(found.plans):

@@ -1,12 +1,12 @@
 """``cnpgen copy``: copy a shipped recipe with all files that it refers to, for editing."""
 
 import argparse
-import os
 import re
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from cnpgen.cli import recipe_names
 from cnpgen.cli.parser import Commands, Parser, add_command
 from cnpgen.errors import UsageError
 
@@ -28,7 +28,8 @@ _NEXT = {
 def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
     parser = add_command(commands, "copy", run, title="copy a recipe for editing", text=_TEXT)
-    parser.add_argument("recipe", metavar="NAME", help="a shipped dataset, pipeline or problem (see 'cnpgen list')")
+    text = "a shipped dataset, pipeline or problem (see 'cnpgen list')"
+    parser.add_argument("recipe", metavar="NAME", type=recipe_names.shipped, help=text)
     parser.add_argument("folder", metavar="DIR", help="folder of the copies; its name becomes theirs")
     parser.add_argument("--kind", choices=("dataset", "pipeline", "problem"), help="kind, if several have this name")
     parser.add_argument("--force", action="store_true", help="replace existing files")
@@ -36,18 +37,15 @@ def add(commands: "Commands[Parser]") -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
-    from cnpgen.cli.recipe_names import check_recipe
     from cnpgen.cli.show_command import load_any
-    from cnpgen.store.files.atomic import write_file
+    from cnpgen.store.files.atomic import check_writable, write_file
 
-    check_recipe(arguments.recipe)
-    if os.path.exists(arguments.recipe) or arguments.recipe.endswith(".toml"):  # noqa: PTH110 - names may be too long
-        raise UsageError(f"expected the name of a shipped recipe, got the path {arguments.recipe}: copy your own files")
     folder = Path(arguments.folder)
     texts = copied_texts(load_any(arguments.recipe, arguments.kind), _name(folder))
     existing = [str(folder / name) for name in texts if (folder / name).exists()]
     if existing and not arguments.force:
         raise UsageError(f"{', '.join(existing)} exists already: --force writes over it")
+    check_writable(folder)
     for name, text in texts.items():
         folder.mkdir(parents=True, exist_ok=True)
         write_file(folder / name, text)

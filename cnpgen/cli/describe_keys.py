@@ -132,7 +132,9 @@ def _escaped(text: str) -> str:
 def _default(key: Key) -> str:
     if key.required:
         return "required"
-    return "those of its keys" if part_of(key) and key.default else quantity(key.default, key.unit)
+    if part_of(key) and key.default not in (None, ()):
+        return "those of its keys"
+    return quantity(key.default, key.unit)
 
 
 def _expected(key: Key) -> str:

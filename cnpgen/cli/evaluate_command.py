@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cnpgen.cli import values
+from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Commands, Parser, add_command, add_json
 from cnpgen.cli.plan_files import read_plans
 from cnpgen.cli.progress import Meter
@@ -32,7 +32,7 @@ time.
 
 With --problem, FILE may also hold sampled trajectories: CSV, JSON, YAML, NPZ, HDF5 or Parquet, messages of ROS and
 MoveIt, or a folder of such files ('cnpgen docs trajectories'). Each trajectory and condition is valid, invalid or
-undecided. The exit code is then 0 if all are valid, otherwise 1; 2 for files that cannot be read.
+undecided. The exit code is then 0 if all are valid, otherwise 1; 2 for damaged files and files of other kinds.
 """
 
 
@@ -41,7 +41,12 @@ def add(commands: "Commands[Parser]") -> None:
     parser = add_command(commands, "evaluate", run, title="judge plans or sampled trajectories", text=_TEXT)
     option = parser.add_argument
     option("file", metavar="FILE", type=Path, help="plan file, .h5, or sampled trajectories")
-    option("--problem", metavar="NAME|FILE", help="the problem of the plans; its tolerances are used")
+    option(
+        "--problem",
+        metavar="NAME|FILE",
+        type=recipe_names.problem,
+        help="the problem of the plans; its tolerances are used",
+    )
     option(
         "--step",
         metavar="S",
@@ -111,7 +116,9 @@ def run(arguments: argparse.Namespace) -> int:
 def _holds_trajectories(file: Path) -> bool:
     """Return whether a file, or a folder, holds sampled trajectories instead of plans."""
     from cnpgen.plans.trajectory_tables import holds_trajectories
+    from cnpgen.store.files.atomic import check_readable
 
+    check_readable(file)
     return holds_trajectories(file)
 
 

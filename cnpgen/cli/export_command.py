@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cnpgen.cli import values
+from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Commands, Parser, add_command
 from cnpgen.cli.plan_files import read_plans
 from cnpgen.errors import UsageError, counted
@@ -33,7 +33,7 @@ def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
     parser = add_command(commands, "export", run, title="write plans as sampled trajectories", text=_TEXT)
     option = parser.add_argument
-    option("file", metavar="FILE", type=Path, help="plan file, .h5")
+    option("file", metavar="FILE", type=recipe_names.present, help="plan file, .h5")
     option(
         "--to",
         metavar="FORMAT",
@@ -112,6 +112,8 @@ def _invalid(exported: "Exported") -> str:
 
 def _place(arguments: argparse.Namespace, exporter: "Exporter") -> Path:
     """Return the output path, which must not exist without ``--force``."""
+    from cnpgen.store.files.atomic import check_writable
+
     file: Path = arguments.file
     name = f"{file.stem}{exporter.suffix}" if exporter.single_file else f"{file.stem}-{arguments.to}"
     out: Path = arguments.out or Path(name)
@@ -121,6 +123,7 @@ def _place(arguments: argparse.Namespace, exporter: "Exporter") -> Path:
     target = out / f"plans{exporter.suffix}" if inside else out
     if target.exists() and not arguments.force and not (target.is_dir() and not any(target.iterdir())):
         raise UsageError(f"{target} exists; --force replaces files of the same name")
+    check_writable(out)
     return out
 
 

@@ -3,7 +3,7 @@
 import argparse
 from functools import partial
 
-from cnpgen.cli import values
+from cnpgen.cli import recipe_names, values
 from cnpgen.cli.make_command import make_metered
 from cnpgen.cli.parser import Commands, Parser, add_command, add_engine
 
@@ -18,7 +18,7 @@ def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
     parser = add_command(commands, "extend", run, title="add samples to a dataset", text=_TEXT)
     option = parser.add_argument
-    option("folder", metavar="DIR", help="the dataset")
+    option("folder", metavar="DIR", type=recipe_names.dataset, help="the dataset")
     option("--n", metavar="N", type=values.rows, required=True, help="total number of samples afterwards")
     option("--workers", metavar="W", type=values.positive, help="processes; default one per available core")
     add_engine(parser)

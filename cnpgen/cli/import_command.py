@@ -5,9 +5,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cnpgen.cli import values
+from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Commands, Parser, add_command
-from cnpgen.cli.plan_files import check_suffix
 from cnpgen.cli.trajectory_options import add_trajectory_options, load_file, problem_of
 from cnpgen.errors import UsageError, counted
 
@@ -25,8 +24,14 @@ def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
     parser = add_command(commands, "import", run, title="make plans of sampled trajectories", text=_TEXT)
     option = parser.add_argument
-    option("file", metavar="FILE", type=Path, help="file of trajectories, or a folder of them")
-    option("--problem", metavar="NAME|FILE", required=True, help="the problem of the trajectories")
+    option("file", metavar="FILE", type=recipe_names.present, help="file of trajectories, or a folder of them")
+    option(
+        "--problem",
+        metavar="NAME|FILE",
+        type=recipe_names.problem,
+        required=True,
+        help="the problem of the trajectories",
+    )
     option("-o", "--out", metavar="PLANS", type=Path, required=True, help="plan file to write, .h5")
     option("--force", action="store_true", help="replace PLANS")
     add_trajectory_options(parser)
@@ -41,16 +46,16 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     import numpy as np
 
+    from cnpgen.cli.refine_options import check_place
     from cnpgen.plans.import_trajectories import import_trajectories
-    from cnpgen.plans.save import check_replaceable, save_plans
+    from cnpgen.plans.save import save_plans
+    from cnpgen.store.files.kind import PLANS
+    from cnpgen.store.paths import file_kind
 
     out = arguments.out
-    check_suffix(out)
-    check_replaceable(out)
-    if not out.absolute().parent.is_dir():
-        raise UsageError(f"{out} must be in a folder that exists")
-    if out.exists() and not arguments.force:
-        raise UsageError(f"{out} exists", remedies={"force": True})
+    if file_kind(arguments.file) == PLANS:
+        raise UsageError(f"{arguments.file} is {PLANS} already: 'cnpgen refine' optimizes them")
+    check_place(out, force=arguments.force)
     problem = problem_of(arguments)
     loaded = load_file(arguments, problem)
     noise = arguments.noise or (0.0,)

@@ -23,7 +23,7 @@ def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
     parser = add_command(commands, "init", run, title="write recipes for your own arm, or a planner", text=_TEXT)
     option = parser.add_argument
-    option("name", metavar="NAME", help="name of the recipes and of their folder")
+    option("name", metavar="NAME", type=_folder, help="name of the recipes and of their folder")
     kind = parser.add_mutually_exclusive_group(required=True)
     kind.add_argument("--urdf", metavar="FILE", type=Path, help="URDF file; the recipes refer to its path")
     kind.add_argument("--planner", action="store_true", help="write a package with a planner for 'cnpgen benchmark'")
@@ -45,7 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
     from cnpgen.cli.init.write import FILES, problem_text, sampling_texts
     from cnpgen.robots.shape.mesh_files import packages_of_environment
 
-    folder = _folder(arguments.name)
+    folder = arguments.name
     if arguments.planner:
         return _write_planner(folder, force=arguments.force)
     there = [str(folder / name) for name in FILES if (folder / name).exists()]
@@ -88,10 +88,12 @@ def _folder(name: str) -> Path:
     import re
 
     from cnpgen.schema.keys import NAME
+    from cnpgen.store.files.atomic import check_writable
 
     folder = Path(name)
     if not re.match(NAME, folder.name):
         raise UsageError(f"NAME must be lower-case letters, digits and hyphens, such as my-arm; got {name!r}")
+    check_writable(folder)
     return folder
 
 

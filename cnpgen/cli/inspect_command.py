@@ -2,10 +2,9 @@
 
 import argparse
 import sys
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cnpgen.cli import values
+from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Commands, Parser, add_command, add_json
 
 if TYPE_CHECKING:
@@ -27,7 +26,7 @@ def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
     title = "summarize a dataset and its sampling"
     parser = add_command(commands, "inspect", run, title=title, text=_TEXT)
-    parser.add_argument("folder", metavar="DIR", type=Path, help="folder of a dataset, finished or not")
+    parser.add_argument("folder", metavar="DIR", type=recipe_names.dataset, help="folder of a dataset, finished or not")
     parser.add_argument("--plot", metavar="FILE", type=values.plot_file, help="also draw it: .png, .pdf or .svg")
     add_json(parser)
 

@@ -3,6 +3,7 @@
 import argparse
 import io
 import os
+import re
 import sys
 import traceback
 import warnings
@@ -97,10 +98,10 @@ examples:
 
 stdout is data, stderr everything else. Exit codes:
   0    done
-  1    the answer is no: a dataset or a file is damaged, unfinished or of another kind or problem; samples or plans
-       are invalid
-  2    a wrong argument, such as a missing path, or a mistake in a recipe
-  3    the machine: no compiler, a full disk, a broken library; also an internal error of cnpgen
+  1    the answer is no: a dataset or a file is damaged, unfinished or of another problem; samples or plans are invalid
+  2    a wrong argument, such as a missing path or one of another kind, or a mistake in a recipe
+  3    the machine: no permission to read or write a path, a full disk, no compiler, a broken library; also an internal
+       error of cnpgen
   130  interrupted (Ctrl-C); finished shards and plans are kept, the same command resumes
   141  the reader of stdout closed it
   143  terminated (SIGTERM, as SLURM and Docker send it); resumable
@@ -151,6 +152,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(words: list[str], given: argparse.Namespace) -> int:
     """Parse the words into ``given`` and run the command."""
     parser = build_parser()
+    for before, word in zip(["cnpgen", *words], words, strict=False):
+        if word == "" or re.fullmatch("--[a-z-]+=", word):
+            parser.error(f"the argument after {word or before!r} is empty: is it an unset variable of the shell?")
     try:
         arguments, extras = parser.parse_known_args(words, given)
     except SystemExit:  # --help and --version have printed their text

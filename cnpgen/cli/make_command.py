@@ -5,7 +5,7 @@ import sys
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from cnpgen.cli import values
+from cnpgen.cli import recipe_names, values
 from cnpgen.cli.interruption import raise_if_interrupted
 from cnpgen.cli.parser import Commands, Parser, add_command, add_engine
 from cnpgen.cli.progress import Meter
@@ -57,6 +57,7 @@ def add(commands: "Commands[Parser]") -> None:
     option(
         "--model",
         metavar="NAME|FILE",
+        type=recipe_names.model,
         help="with --certify: start from the plans of this planner, a shipped one or a file",
     )
     option("--force", action="store_true", help="overwrite another dataset in the folder")
@@ -66,10 +67,9 @@ def add(commands: "Commands[Parser]") -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
-    from cnpgen.cli.recipe_names import check_recipe
     from cnpgen.make.recipe_file import load_dataset_recipe
 
-    check_recipe(arguments.recipe, of_dataset="'cnpgen make-dataset NAME --out {0}' resumes it")
+    recipe_names.check_recipe(arguments.recipe, of_dataset="'cnpgen make-dataset NAME --out {0}' resumes it")
     recipe = load_dataset_recipe(arguments.recipe)
     if arguments.model is not None and not arguments.certify:
         raise UsageError("--model needs --certify")

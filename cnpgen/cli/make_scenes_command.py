@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from cnpgen.cli import values
+from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Commands, Parser, add_command, add_json
 from cnpgen.cli.progress import Meter
 from cnpgen.errors import UsageError
@@ -24,9 +24,11 @@ def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
     parser = add_command(commands, "make-scenes", run, title="make planning problems in random scenes", text=_TEXT)
     option = parser.add_argument
-    option("family", metavar="FAMILY", nargs="?", help="family of scenes, such as tabletop (see --list)")
+    text = "family of scenes, such as tabletop (see --list)"
+    option("family", metavar="FAMILY", nargs="?", type=recipe_names.family, help=text)
     option("--list", action="store_true", help="list families and their parameters")
-    option("--robot", metavar="NAME|FILE", help="problem of a robot with link geometry, such as panda")
+    text = "problem of a robot with link geometry, such as panda"
+    option("--robot", metavar="NAME|FILE", type=recipe_names.problem, help=text)
     option("--n", metavar="K", type=values.rows, help="number of problems")
     option("--seed", metavar="S", type=values.seed, default=0, help="seed (default: 0)")
     option("--per-scene", metavar="K", type=values.positive, default=4, help="largest number in one scene (default: 4)")
@@ -87,6 +89,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _check_place(out: Path, *, force: bool) -> None:
+    from cnpgen.store.files.atomic import check_writable
+
     if out.suffix not in {"", ".h5", ".hdf5"}:
         raise UsageError(f"{out} must end in .h5 or .hdf5, or be a folder for YAML files")
     if not out.parent.is_dir():
@@ -94,6 +98,7 @@ def _check_place(out: Path, *, force: bool) -> None:
     if out.exists() and (not force or out.is_dir()):
         hint = "-o names another folder" if out.is_dir() else "--force replaces it, -o names another file"
         raise UsageError(f"{out} exists: {hint}")
+    check_writable(out)
 
 
 def _listing(*, as_json: bool) -> str:

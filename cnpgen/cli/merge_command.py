@@ -3,6 +3,7 @@
 import argparse
 from functools import partial
 
+from cnpgen.cli import recipe_names
 from cnpgen.cli.make_command import make_metered
 from cnpgen.cli.parser import Commands, Parser, add_command
 
@@ -17,7 +18,7 @@ def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
     parser = add_command(commands, "merge", run, title="combine parts of a dataset", text=_TEXT)
     option = parser.add_argument
-    option("parts", metavar="PART", nargs="+", help="folders of parts")
+    option("parts", metavar="PART", nargs="+", type=recipe_names.dataset, help="folders of parts")
     option("-o", "--out", metavar="DIR", required=True, help="folder of the dataset; may be one of the parts")
     option("--quiet", action="store_true", help="no progress and no summary")
 

@@ -5,10 +5,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cnpgen.cli import values
+from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Commands, Parser, add_command, add_engine, add_json
-from cnpgen.cli.plan_files import check_suffix
-from cnpgen.cli.recipe_names import is_recipe
 from cnpgen.cli.refine_options import LARGE_ANGLES, REFINING, WORKERS, add_refining, check_place, refine_and_save
 from cnpgen.errors import UsageError, counted
 
@@ -33,9 +31,9 @@ def add(commands: "Commands[Parser]") -> None:
     parser = add_command(commands, "plan", run, title="plan with a trained model", text=_TEXT)
     option = parser.add_argument
     text = "a dataset's folder; a dataset or pipeline by name, or a recipe file; boundary conditions in HDF5; or scenes"
-    option("problems", metavar="DIR|NAME|FILE", help=text)
+    option("problems", metavar="DIR|NAME|FILE", type=recipe_names.problems, help=text)
     text = "a shipped model, or a model file (default for a shipped dataset by name: the model of this name)"
-    option("--model", metavar="NAME|FILE", help=text)
+    option("--model", metavar="NAME|FILE", type=recipe_names.model, help=text)
     option(
         "-o", "--out", metavar="PLANS", type=Path, help="plan file to write, .h5 (default for a recipe: NAME-plans.h5)"
     )
@@ -94,7 +92,7 @@ def _complete(arguments: argparse.Namespace) -> None:
     """
     from cnpgen.planner.model_file import shipped_models
 
-    name, recipe = arguments.problems, is_recipe(arguments.problems)
+    name, recipe = arguments.problems, recipe_names.is_recipe(arguments.problems)
     if recipe and arguments.model is None and name in shipped_models():
         arguments.model = name
     if recipe and arguments.out is None:
@@ -114,7 +112,6 @@ def _check(arguments: argparse.Namespace) -> None:
     ]
     if lost and not arguments.refine:
         raise UsageError(f"--{lost[0].replace('_', '-')} needs --refine")
-    check_suffix(arguments.out)
     check_place(arguments.out, force=arguments.force)
 
 
@@ -134,7 +131,7 @@ def _requests(arguments: argparse.Namespace, model: "Model") -> "Requests":
     from cnpgen.planner.plan_requests import read_file, read_rows
     from cnpgen.problems.scenes.scene_files import holds_scenes
 
-    if is_recipe(arguments.problems):
+    if recipe_names.is_recipe(arguments.problems):
         return _draws(arguments, model)
     if arguments.seed is not None:
         raise UsageError(f"--seed is for fresh draws of a recipe, got {arguments.problems}")

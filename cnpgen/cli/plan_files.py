@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cnpgen.errors import DatasetError, UsageError
+from cnpgen.errors import DatasetError
 
 if TYPE_CHECKING:
     from cnpgen.plans import Plans
@@ -26,9 +26,3 @@ def read_plans(path: Path, *, problem: str | None = None) -> "Plans":
 def checksum_text(plans: "Plans") -> str:
     """Return whether the source of the plans has a checksum, as text."""
     return "the file's checksum is right" if plans.has_checksum else "the file has no checksum"
-
-
-def check_suffix(out: Path) -> None:
-    """Refuse an output file that does not end in .h5."""
-    if out.suffix != ".h5":
-        raise UsageError(f"{out} must be a file that ends in .h5, in a folder that exists")

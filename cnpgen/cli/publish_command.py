@@ -4,6 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from cnpgen.cli import recipe_names
 from cnpgen.cli.parser import Commands, Parser, add_command
 
 _TEXT = """\
@@ -18,7 +19,7 @@ def add(commands: "Commands[Parser]") -> None:
     title = "publish a dataset on the Hugging Face Hub (extra: hub)"
     parser = add_command(commands, "publish", run, title=title, text=_TEXT)
     option = parser.add_argument
-    option("folder", metavar="DIR", type=Path, help="folder of a finished dataset")
+    option("folder", metavar="DIR", type=recipe_names.dataset, help="folder of a finished dataset")
     option("--to", metavar="USER/NAME", required=True, help="repository of the Hub; it is created if it does not exist")
     option("-o", "--out", metavar="FOLDER", type=Path, help="folder of the repository here (default: DIR-hub)")
     option("--private", action="store_true", help="a new repository is private")

@@ -1,10 +1,15 @@
-"""Arguments that name a recipe; an existing path of another kind is refused with its kind."""
+"""Arguments that name a recipe or a path; one that does not exist or is of another kind is refused."""
 
-from contextlib import suppress
+import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from cnpgen.errors import UsageError, either, nearest
+from cnpgen.errors import UsageError, either
 
+if TYPE_CHECKING:
+    from cnpgen.schema.toml import Kind
+
+_TEXTS = {".toml", ".yaml", ".yml"}  # suffixes of recipes, and of scenes
 DATASET = "'cnpgen inspect {0}' describes it, 'cnpgen validate {0}' checks it"
 _HINTS = {  # what a file is -> what to do with it
     "a file of plans": "'cnpgen evaluate {0}' judges them",
@@ -24,10 +29,12 @@ def check_recipe(recipe: str, *, of_dataset: str = DATASET) -> None:
     Raises:
         UsageError: It is one of these.
     """
+    from cnpgen.store.files.atomic import check_readable
     from cnpgen.store.paths import file_kind
     from cnpgen.store.workspace import is_dataset
 
     path = Path(recipe)
+    check_readable(path)
     if path.is_dir():
         if recipe not in _shipped() and is_dataset(path):
             raise UsageError(f"{recipe} is the folder of a dataset, expected a recipe: {of_dataset.format(recipe)}")
@@ -58,13 +65,23 @@ def check_there(what: str, *kinds: str) -> None:
 
     Raises:
         UsageError: There is nothing of the kind.
+        MachineError: The path cannot be read.
     """
+    from cnpgen.store.files.atomic import check_readable
+    from cnpgen.store.files.kind import kind_of_content
+    from cnpgen.store.paths import similar_path
+
     kinds = kinds or ("dataset", "pipeline")
     names = _shipped(*kinds)
-    if Path(what).exists() or what in names:
+    path = Path(what)
+    check_readable(path)
+    if path.suffix.lower() not in _TEXTS and path.is_file() and kind_of_content(path) == "a text file":
+        check_recipe(what)  # has a hint for tables
+        raise UsageError(f"{what} is a text file, expected a recipe (.toml) or an HDF5 file")
+    if path.exists() or what in names:
         return
-    hint = nearest(what, [*names, *_neighbours(Path(what))])
-    if what.endswith(".toml"):
+    hint = similar_path(path, names)
+    if path.suffix:
         raise UsageError(f"no such file: {what}{hint}")
     raise UsageError(
         f"{what} is neither a folder nor a file, {either(kinds)}{hint}: 'cnpgen list' names those that ship"
@@ -78,10 +95,93 @@ def _shipped(*kinds: str) -> set[str]:
     return {name for kind in MARKS if not kinds or kind in kinds for name in list_recipes(kind)}
 
 
-def _neighbours(path: Path) -> list[str]:
-    """List the datasets and recipe files beside a path."""
-    from cnpgen.store.workspace import is_dataset
+# Types of arguments, which argparse reads before it reports missing options.
 
-    with suppress(OSError):
-        return [str(each) for each in path.parent.iterdir() if each.suffix == ".toml" or is_dataset(each)]
-    return []
+
+def problems(text: str) -> str:
+    """Read the folder of a dataset, the name of a dataset or a pipeline, or a file."""
+    check_there(text)
+    return text
+
+
+def viewed(text: str) -> str:
+    """Read the name of a recipe of any kind with a problem, or a path."""
+    check_there(text, "problem", "pipeline", "dataset")
+    return text
+
+
+def shipped(text: str) -> str:
+    """Read the name of a shipped dataset, pipeline or problem."""
+    from cnpgen.errors import UsageError
+
+    check_recipe(text)
+    if os.path.exists(text) or text.endswith(".toml"):  # noqa: PTH110 - names may be too long
+        raise UsageError(f"expected the name of a shipped recipe, got the path {text}: copy your own files")
+    return viewed(text)
+
+
+def tasks_of(text: str) -> str:
+    """Read the name or the file of a dataset, a pipeline or a problem."""
+    check_recipe(viewed(text))
+    return text
+
+
+def problem(text: str) -> str:
+    """Read the name or the file of a problem, or of a pipeline or a dataset with it."""
+    return _recipe(text, "problem", "pipeline", "dataset")
+
+
+def suite(text: str) -> str:
+    """Read the name or the file of a suite, a dataset or a pipeline."""
+    return _recipe(text, "suite", "dataset", "pipeline")
+
+
+def _recipe(text: str, *kinds: "Kind") -> str:
+    """Read the name or the file of a recipe of one of several kinds."""
+    from cnpgen.schema.catalogue import find_recipe
+    from cnpgen.store.files.atomic import check_readable
+
+    check_recipe(text)
+    check_readable(find_recipe(kinds, text))
+    return text
+
+
+def family(text: str) -> str:
+    """Read the name of a family of scenes."""
+    from cnpgen.pipelines.families.catalog import load_family
+
+    load_family(text)
+    return text
+
+
+def model(text: str) -> str:
+    """Read the name of a shipped model, or its file."""
+    from cnpgen.planner.model_file import find_model
+
+    find_model(text)
+    return text
+
+
+def dataset(text: str) -> Path:
+    """Read the folder of a dataset."""
+    from cnpgen.store.paths import require_dataset
+
+    _refuse_shipped(text)
+    return require_dataset(text)
+
+
+def present(text: str) -> Path:
+    """Read the path of a file or a folder."""
+    from cnpgen.store.paths import require_path
+
+    _refuse_shipped(text)
+    require_path(Path(text), "a file or a folder")
+    return Path(text)
+
+
+def _refuse_shipped(text: str) -> None:
+    """Refuse the name of a shipped dataset where its folder is expected."""
+    from cnpgen.errors import UsageError
+
+    if not os.path.exists(text) and text in _shipped("dataset"):  # noqa: PTH110 - names may be too long
+        raise UsageError(f"{text} is a recipe, expected a path: 'cnpgen make-dataset {text}' makes the dataset")

@@ -4,6 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from cnpgen.cli import recipe_names
 from cnpgen.cli.parser import Commands, Parser, add_command
 from cnpgen.cli.plan_files import checksum_text, read_plans
 from cnpgen.cli.refine_options import TEXT, add_options, refine_and_save
@@ -25,7 +26,12 @@ def add(commands: "Commands[Parser]") -> None:
     parser.add_argument(
         "-o", "--out", metavar="OUT", type=Path, help="output file (default: FILE-refined.h5 beside it)"
     )
-    parser.add_argument("--problem", metavar="NAME|FILE", help="the problem of the plans; its tolerances are used")
+    parser.add_argument(
+        "--problem",
+        metavar="NAME|FILE",
+        type=recipe_names.problem,
+        help="the problem of the plans; its tolerances are used",
+    )
     add_options(parser)
 
 

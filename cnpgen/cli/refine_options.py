@@ -144,12 +144,14 @@ def refine_and_save(
 def check_place(out: Path, *, force: bool) -> None:
     """Refuse an output path before any work if it cannot be written or exists."""
     from cnpgen.plans.save import check_replaceable
+    from cnpgen.store.files.atomic import check_writable
 
-    if out.is_dir() or not out.parent.is_dir():
-        raise UsageError(f"{out} must be a file in a folder that exists")
+    if out.suffix != ".h5" or out.is_dir() or not out.parent.is_dir():
+        raise UsageError(f"{out} must be a file that ends in .h5, in a folder that exists")
     if out.exists() and not force:
         raise UsageError(f"{out} exists: --force replaces it, -o names another file")
     check_replaceable(out)
+    check_writable(out)
 
 
 def _tell(arguments: argparse.Namespace, facts: dict[str, Any], out: Path, times: "Times") -> None:

@@ -1,13 +1,11 @@
 """``cnpgen show``: a recipe, or a kind of stage or constraint, in words and numbers."""
 
 import argparse
-import os
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cnpgen.cli.parser import Commands, Parser, add_command, add_json
 from cnpgen.cli.recipe_names import check_recipe
-from cnpgen.errors import RecipeError, UsageError, nearest
+from cnpgen.errors import UsageError
 from cnpgen.schema.toml import MARKS, Kind, kind_of_file
 
 if TYPE_CHECKING:
@@ -91,15 +89,6 @@ def load_any(name_or_path: str, kind: Kind | None = None) -> "Recipe":
 
 def _kind(name_or_path: str) -> Kind:
     """Determine the kind of a recipe."""
-    from cnpgen.schema.catalogue import list_recipes
+    from cnpgen.schema.catalogue import find_recipe
 
-    path = Path(name_or_path)
-    if path.is_file():
-        return kind_of_file(path)
-    if path.suffix == ".toml" or "/" in name_or_path or os.sep in name_or_path:
-        return "dataset"  # the error is the same for every kind: no such file
-    for kind in KINDS:
-        if name_or_path in list_recipes(kind):
-            return kind
-    known = sorted({name for kind in KINDS for name in list_recipes(kind)})
-    raise RecipeError([f"unknown recipe {name_or_path!r}{nearest(name_or_path, known)}; known: {', '.join(known)}"])
+    return kind_of_file(find_recipe(KINDS, name_or_path))

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cnpgen.cli import values
+from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Commands, Parser, add_command, add_json
 from cnpgen.cli.plan_files import read_plans
 from cnpgen.cli.progress import Meter
@@ -48,7 +48,7 @@ def add(commands: "Commands[Parser]") -> None:
     parser = add_command(commands, "simulate", run, title="execute the plans of a file in MuJoCo", text=_TEXT)
     option = parser.add_argument
     option("file", metavar="FILE", type=Path, help="plan file, .h5")
-    option("--problem", metavar="NAME|FILE", help="the problem of the plans")
+    option("--problem", metavar="NAME|FILE", type=recipe_names.problem, help="the problem of the plans")
     where = parser.add_mutually_exclusive_group().add_argument
     where("--plant", choices=PLANTS, default="nominal", help=f"the robot: {', '.join(PLANTS)} (default: nominal)")
     where("--environment", metavar="PATH", type=Path, help="clone of the Air Hockey Challenge that executes them")

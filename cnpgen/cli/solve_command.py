@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cnpgen.cli import values
+from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Commands, Parser, add_command
-from cnpgen.cli.refine_options import LARGE_ANGLES, TEXT, add_options, refine_and_save
+from cnpgen.cli.refine_options import LARGE_ANGLES, TEXT, add_options, check_place, refine_and_save
 from cnpgen.errors import DatasetError, UsageError
 
 if TYPE_CHECKING:
@@ -38,6 +38,7 @@ def add(commands: "Commands[Parser]") -> None:
     option(
         "what",
         metavar="DIR|NAME|FILE",
+        type=recipe_names.problems,
         help="a dataset's folder; a dataset or pipeline by name, or a recipe file; boundary conditions in HDF5;"
         " or, with --robot, scenes",
     )
@@ -48,9 +49,11 @@ def add(commands: "Commands[Parser]") -> None:
     option(
         "--problem",
         metavar="NAME|FILE",
+        type=recipe_names.problem,
         help="the problem of boundary conditions in HDF5; its tolerances are used",
     )
-    option("--robot", metavar="NAME|FILE", help="solve scenes with this problem of a robot, such as panda")
+    text = "solve scenes with this problem of a robot, such as panda"
+    option("--robot", metavar="NAME|FILE", type=recipe_names.problem, help=text)
     option("-o", "--out", metavar="OUT", type=Path, help="output file (default: DIR-plans.h5 or NAME-plans.h5)")
     option("--allow-large-angles", action="store_true", help=LARGE_ANGLES)
     add_options(parser)
@@ -60,15 +63,16 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     from cnpgen.refine.refine_plans import refine_plans, solve_plans
 
-    if arguments.robot is not None:
-        return _solve_scenes(arguments)
-    problems = _problems(arguments)
     out = arguments.out or Path(f"{_name(Path(arguments.what))}-plans.h5")
+    check_place(out, force=arguments.force)
+    if arguments.robot is not None:
+        return _solve_scenes(arguments, out)
+    problems = _problems(arguments)
     make = refine_plans if math.isfinite(problems.duration[0]) else solve_plans  # rows of certified datasets have plans
     return refine_and_save(arguments, problems, out, title=f"solving {arguments.what}", make=make)
 
 
-def _solve_scenes(arguments: argparse.Namespace) -> int:
+def _solve_scenes(arguments: argparse.Namespace, out: Path) -> int:
     from cnpgen.make.solve_scenes import solve_scenes
     from cnpgen.problems.problem_record import as_problem
     from cnpgen.problems.scenes.scene_files import load_scenes
@@ -76,7 +80,6 @@ def _solve_scenes(arguments: argparse.Namespace) -> int:
     _refuse(arguments, ["split", "seed", "problem"], "--robot is for scenes, which have --first and --n")
     scenes = load_scenes(arguments.what, start=arguments.first or 0, n=arguments.n)
     problem = as_problem(arguments.robot)
-    out = arguments.out or Path(f"{_name(Path(arguments.what))}-plans.h5")
 
     def solve(_: "Plans", **options: Any) -> "SolvedScenes":
         return solve_scenes(problem, scenes, **options)
@@ -128,17 +131,17 @@ def _conditions(arguments: argparse.Namespace) -> "Plans":
 
 
 def _draws(arguments: argparse.Namespace) -> "Plans":
-    from cnpgen.cli.recipe_names import check_recipe, check_there
     from cnpgen.make.draw_boundary_problems import draw_boundary_problems
+    from cnpgen.make.recipe_file import load_dataset_recipe
 
-    check_there(arguments.what)
-    check_recipe(arguments.what)
+    recipe_names.check_recipe(arguments.what)
+    recipe = load_dataset_recipe(arguments.what)
     of_rows = "--split and --first need the folder of a dataset; samples drawn from a recipe have --seed"
     _refuse(arguments, ["split", "first"], of_rows)
     _refuse(arguments, ["problem"], "--problem is for boundary conditions in HDF5; a recipe contains its problem")
     if arguments.n is None:
         raise UsageError(f"--n is required: the number of fresh problems of the recipe {arguments.what}")
-    return draw_boundary_problems(arguments.what, arguments.n, seed=arguments.seed)
+    return draw_boundary_problems(recipe, arguments.n, seed=arguments.seed)
 
 
 def _refuse(arguments: argparse.Namespace, options: Sequence[str], why: str) -> None:

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cnpgen.cli import values
+from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Commands, Parser, add_command
 from cnpgen.cli.train_options import add_settings, changed_settings, passed_settings
 from cnpgen.cli.train_text import Watch, summary
@@ -37,12 +37,13 @@ def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
     parser = add_command(commands, "train", run, title="train a planner on a dataset", text=_TEXT)
     option = parser.add_argument
-    option("folder", metavar="DIR", type=Path, help="the dataset; or, with --robot, scenes")
+    option("folder", metavar="DIR", type=recipe_names.present, help="the dataset; or, with --robot, scenes")
     option("-o", "--out", metavar="MODEL", type=Path, required=True, help="model file to write, .h5")
     _add_length(parser)
     _add_how(parser)
     option("--check", metavar="N", type=values.positive, default=200, help=_CHECK)
-    option("--robot", metavar="NAME|FILE", help="train on scenes with this problem of a robot, such as panda")
+    text = "train on scenes with this problem of a robot, such as panda"
+    option("--robot", metavar="NAME|FILE", type=recipe_names.problem, help=text)
     option("--workers", metavar="W", type=values.positive, help="processes of the last validation, on up to 2,000 rows")
     option("--force", action="store_true", help="replace MODEL, its log and another run's checkpoint")
     option("--quiet", action="store_true", help="no progress and no summary")
@@ -63,6 +64,7 @@ def _add_how(parser: Parser) -> None:
         "--from",
         dest="start_from",
         metavar="MODEL",
+        type=recipe_names.model,
         help="start from the parameters of a model, by name or file; --hidden, --layers, --features and --expected-time"
         " must be those of the model",
     )

@@ -73,11 +73,15 @@ def write_json(file: Path, found: "TrajectoryEvaluation", labels: tuple[str, ...
 def summary_text(file: Path, found: "TrajectoryEvaluation") -> str:
     """Return the counts, and for every condition the decisions with the worst margin."""
     from cnpgen.cli.describe import table
+    from cnpgen.cli.verdict_text import margin_cells
 
     counts = ", ".join(f"{count:,} {decision}" for decision, count in found.counts.items())
     lines = [f"{file}: trajectories of {found.problem.name}: {counts}", ""]
-    rows: list[tuple[str, ...]] = [
-        ("condition", "valid", "invalid", "undecided", "time violated", "time undecided", "trajectory", "worst margin")
+    decided: list[tuple[str, ...]] = [
+        ("condition", "valid", "invalid", "undecided", "time violated", "time undecided", "")
+    ]
+    margins: list[tuple[str, ...]] = [
+        ("condition", "worst violation", "tolerance", "unit", "trajectory", "t [s]", "where")
     ]
     summary = found.summary()["conditions"]
     for name, decisions in summary.items():
@@ -85,8 +89,11 @@ def summary_text(file: Path, found: "TrajectoryEvaluation") -> str:
         worst, entry = max(entries, key=lambda item: item[1].margin.severity)
         shares = [max(getattr(e, share) for _, e in entries) for share in ("violated_share", "undecided_share")]
         counted = [f"{decisions[decision]:,}" for decision in ("valid", "invalid", "undecided")]
-        rows.append((name, *counted, *(f"{share:.1%}" for share in shares), str(worst), str(entry.margin)))
-    lines += table(rows, indent="  ", right=(1, 2, 3, 4, 5, 6)) if len(rows) > 1 else []
+        decided.append((name, *counted, *(f"{share:.1%}" for share in shares), ""))
+        margins.append((name, *margin_cells(entry.margin.to_dict(), worst)))
+    if summary:
+        lines += [*table(decided, indent="  ", right=(1, 2, 3, 4, 5)), ""]
+        lines += table(margins, indent="  ", right=(1, 2, 4, 5))
     lines += ["", *(f"  {count:,} because of: {reason}" for reason, count in found.summary()["reasons"].items())]
     return "\n".join(lines).rstrip()
 

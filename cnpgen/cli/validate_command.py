@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cnpgen.cli import values
+from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Commands, Parser, add_command, add_engine, add_json
 from cnpgen.cli.progress import Meter
 from cnpgen.errors import DatasetError
@@ -31,7 +31,7 @@ def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
     parser = add_command(commands, "validate", run, title="verify a dataset", text=_TEXT)
     option = parser.add_argument
-    option("folder", metavar="DIR", type=Path, help="folder of a dataset")
+    option("folder", metavar="DIR", type=recipe_names.dataset, help="folder of a dataset")
     option("--deep", action="store_true", help="check every row, its constraints with Pinocchio and Coal")
     option(
         "--regenerate",

@@ -1,6 +1,7 @@
 """Output of ``cnpgen evaluate``: counts, reasons, statistics, margins; and the plans one by one."""
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -96,11 +97,15 @@ def _margins(summary: dict[str, Any]) -> list[tuple[str, ...]]:
         ("condition", "violated by", "worst violation", "tolerance", "unit", "plan", "t [s]", "where")
     ]
     for name, worst in summary["conditions"].items():
-        violation = "-" if worst["violation"] is None else f"{worst['violation']:.2e}"
-        at = "-" if worst["time"] is None else f"{worst['time']:.4f}"
-        count, tolerance = f"{worst['violating_plans']:,}", f"{worst['tolerance']:.1e}"
-        rows.append((name, count, violation, tolerance, worst["unit"], str(worst["worst_plan"]), at, worst["part"]))
+        rows.append((name, f"{worst['violating_plans']:,}", *margin_cells(worst, worst["worst_plan"])))
     return rows
+
+
+def margin_cells(margin: Mapping[str, Any], index: int) -> tuple[str, ...]:
+    """Format the violation, tolerance, unit, plan or trajectory, time and place of a margin as cells of a table."""
+    violation = "-" if margin["violation"] is None else f"{margin['violation']:.2e}"
+    at = "-" if margin["time"] is None else f"{margin['time']:.4f}"
+    return violation, f"{margin['tolerance']:.1e}", margin["unit"], str(index), at, margin["part"]
 
 
 def listing_text(found: "Evaluation") -> str:

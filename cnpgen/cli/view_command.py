@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cnpgen.cli import values
+from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Commands, Parser, add_command
 from cnpgen.errors import DatasetError, UsageError
 
@@ -33,7 +33,10 @@ def add(commands: "Commands[Parser]") -> None:
     parser = add_command(commands, "view", run, title="show a robot, a plan or a sample in a browser", text=_TEXT)
     option = parser.add_argument
     option(
-        "what", metavar="PROBLEM|DIR|FILE", help="a problem by name or file, the folder of a dataset, or a plan file"
+        "what",
+        metavar="PROBLEM|DIR|FILE",
+        type=recipe_names.viewed,
+        help="a problem by name or file, the folder of a dataset, or a plan file",
     )
     rows = parser.add_mutually_exclusive_group()
     text = "plan of the file, or sample of the split (default: 0)"
@@ -46,7 +49,7 @@ def add(commands: "Commands[Parser]") -> None:
     )
     option("--split", metavar="NAME", help="split of the folder (default: validation)")
     text = "the problem of plans or rows, whose URDF leads to its visual meshes"
-    option("--problem", metavar="NAME|FILE", help=text)
+    option("--problem", metavar="NAME|FILE", type=recipe_names.problem, help=text)
     where = parser.add_mutually_exclusive_group()
     where.add_argument(
         "-o",
@@ -62,12 +65,13 @@ def add(commands: "Commands[Parser]") -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     from cnpgen.cli.view.page import page_of
-    from cnpgen.store.files.atomic import write_file
+    from cnpgen.store.files.atomic import check_writable, write_file
 
     what = Path(arguments.what)
     if arguments.serve is not None:
         return _serve(arguments)
     out = Path(arguments.out or f"{what.resolve().name if what.is_dir() else what.stem}.html")
+    check_writable(out)
     write_file(out, page_of(_scene(arguments)))
     print(out)
     return 0
@@ -96,10 +100,11 @@ def _scene(arguments: argparse.Namespace) -> "ViewScene":
     from cnpgen.plans import open_problem
     from cnpgen.problems.load_robot import load_robot
     from cnpgen.problems.problem_file import load_problem_behind
+    from cnpgen.problems.scenes.scene_files import HDF5_SUFFIXES
     from cnpgen.store.paths import file_kind
 
     what, rows = Path(arguments.what), arguments.rows or (arguments.row or 0,)
-    if not what.is_dir() and not file_kind(what):
+    if not what.is_dir() and not file_kind(what) and what.suffix not in HDF5_SUFFIXES:
         _refuse_for_problem(arguments)
         problem = load_problem_behind(arguments.what)
         return scene_of_problem(problem, load_robot(problem))

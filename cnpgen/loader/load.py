@@ -43,8 +43,8 @@ def load_dataset(folder: str | Path, *, allow_incomplete: bool = False, verify: 
         verify: Whether to verify the sha256 of every shard when it is read for the first time.
 
     Raises:
-        UsageError: The folder does not exist, or an option is not a bool.
-        DatasetError: The folder contains no dataset, the dataset is unfinished, or a part is missing or damaged.
+        UsageError: The folder does not exist or contains no dataset, or an option is not a bool.
+        DatasetError: The dataset is unfinished, or a part is missing or damaged.
         MachineError: A file cannot be read.
     """
     folder, verify = Path(folder), flag("verify", verify)

@@ -18,11 +18,11 @@ from cnpgen.schema.arguments import integer
 from cnpgen.schema.texts import read_own, utf8_text
 from cnpgen.store.card import card_notes
 from cnpgen.store.dataset_spec import DatasetSpec, write_dataset_spec
-from cnpgen.store.files.atomic import machine_error
+from cnpgen.store.files.atomic import check_writable, machine_error
 from cnpgen.store.files.leftovers import remove_leftovers
 from cnpgen.store.intact import RERUN_HINT
 from cnpgen.store.layout import CARD, MANIFEST, SPECIFICATION, WORK
-from cnpgen.store.paths import require_folder
+from cnpgen.store.paths import require_dataset
 from cnpgen.store.shard_record import pending
 from cnpgen.store.workspace import check_place, find_workspace
 
@@ -54,13 +54,14 @@ def extend_dataset(
         progress: Callback with the rows of every shard.
 
     Raises:
-        UsageError: The folder does not exist, the dataset has more rows or is unfinished, or this version of cnpgen or
-            of its plug-ins generates other rows.
-        DatasetError: The folder holds no dataset, or its specification.json is damaged.
+        UsageError: The folder does not exist or contains no dataset, the dataset has more rows or is unfinished, or
+            this version of cnpgen or of its plug-ins generates other rows.
+        DatasetError: The specification.json of the dataset is damaged.
         RecipeError: This version of cnpgen does not support the recipe in the specification.
         MachineError: The backend of the dataset does not work here, the disk is full, or a worker died.
     """
-    where, folder, n = Engine(engine, address, workers), require_folder(folder), integer("n", n, least=1, most=MAX_ROWS)
+    where, n = Engine(engine, address, workers), integer("n", n, least=1, most=MAX_ROWS)
+    folder = require_dataset(folder)
     begun = _begun(folder)
     with restored(begun) as recipe:
         extended = _extended(folder, begun, recipe, n)
@@ -68,6 +69,7 @@ def extend_dataset(
         job = Job(folder, extended, recipe.pipeline, backend, cache_folder)
         notes = _notes(folder)
         if extended is not begun:
+            check_writable(folder)
             prepare(job)  # raises errors of this machine before anything is written
             _replace_spec(folder, extended)
         remove_leftovers(folder / WORK)
@@ -76,11 +78,10 @@ def extend_dataset(
 
 def _begun(folder: Path) -> DatasetSpec:
     """Return the specification of the dataset in a writable folder."""
-    require_folder(folder)
     workspace = find_workspace(folder)
     check_place(workspace)
     if workspace.spec is None:
-        raise DatasetError(workspace.damage or f"{folder} holds no dataset")
+        raise DatasetError(workspace.damage)
     return workspace.spec
 
 

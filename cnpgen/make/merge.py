@@ -20,7 +20,7 @@ from cnpgen.store.files.atomic import committing, file_sha256, read_file, write_
 from cnpgen.store.intact import COPY_HINT, OUTSIDE, outside_links
 from cnpgen.store.layout import WORK
 from cnpgen.store.manifest import source_date
-from cnpgen.store.paths import require_folder
+from cnpgen.store.paths import require_dataset
 from cnpgen.store.shard_record import is_committed, load_committed
 from cnpgen.store.workspace import changed_settings, check_place, find_workspace, open_workspace
 
@@ -79,7 +79,7 @@ def _common_spec(folders: Sequence[Path]) -> DatasetSpec:
     if not folders:
         raise UsageError("must name at least one folder, got none", argument="parts")
     for folder in folders:
-        require_folder(folder, argument="parts")
+        require_dataset(folder, argument="parts")
         _require_inside(folder, outside_links(folder))
     first, *rest = folders
     spec = load_dataset_spec(first)

@@ -23,7 +23,7 @@ from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.store.card import PARQUET, card_notes, card_text
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, shards
 from cnpgen.store.dataset_summary import summarize_dataset
-from cnpgen.store.files.atomic import write_file
+from cnpgen.store.files.atomic import check_writable, write_file
 from cnpgen.store.layout import CARD, DOCUMENTS, SPLIT_NAME
 from cnpgen.store.shard import read_shard
 from cnpgen.store.shard_record import load_record
@@ -68,13 +68,16 @@ def publish_dataset(
         UsageError: The repository has no valid name or is inside the dataset, or the dataset has no license.
         DatasetError: The dataset is unfinished or damaged.
         MissingExtraError: pyarrow or huggingface_hub is not installed.
-        MachineError: The upload failed.
+        MachineError: The folder cannot be written, or the upload failed.
     """
     if not REPOSITORY.fullmatch(to):
         raise UsageError(f"must be the name of a repository, USER/NAME, got {to!r:.200}", argument="to")
     source, target = Path(folder), Path(out)
     if target.resolve().is_relative_to(source.resolve()):
         raise UsageError(f"must be a folder outside the dataset {source}, got {target}", argument="out")
+    if target.exists() and not target.is_dir():
+        raise UsageError(f"must be a folder, {target} is a file", argument="out")
+    check_writable(target)
     spec = load_dataset(source).spec
     if not spec.license:
         raise UsageError(

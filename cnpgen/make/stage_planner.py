@@ -11,7 +11,6 @@ from cnpgen.pipelines.context import Context
 from cnpgen.plans.format import CONDITIONS
 from cnpgen.problems.problem_record import record_problem
 from cnpgen.store.files.atomic import file_sha256
-from cnpgen.store.paths import require_file
 from cnpgen.trajectory.boundary import Boundary
 
 if TYPE_CHECKING:
@@ -30,9 +29,7 @@ def model_sha256(model: str) -> str:
     """
     from cnpgen.planner.model_file import find_model
 
-    path = find_model(model)
-    require_file(path, "a model")
-    return file_sha256(path)
+    return file_sha256(find_model(model))
 
 
 def load_stage_planner(model: str, sha256: str, context: Context) -> "Planner":
@@ -56,7 +53,7 @@ def load_stage_planner(model: str, sha256: str, context: Context) -> "Planner":
     loaded, problem = load_model(model), record_problem(context.problem)
     if loaded.problem.comparable_sha256 != problem.comparable_sha256:
         differs = ", ".join(problem.differences(loaded.problem)[:4])
-        raise RecipeError([f"model: {model!r} plans for another problem, they differ in {differs}"])
+        raise RecipeError([f"model: {model!r} plans for another problem, they differ in {differs}; leave it out"])
     return Planner(loaded, backend=context.kernels.backend)
 
 

@@ -13,7 +13,7 @@ from cnpgen.store.files.atomic import machine_error
 from cnpgen.store.files.csv_table import read_csv_table
 from cnpgen.store.files.hdf5 import opened_hdf5
 from cnpgen.store.files.kind import is_hdf5
-from cnpgen.store.paths import require_file
+from cnpgen.store.paths import HDF5_KINDS, require_file
 
 Array = NDArray[np.float64]
 
@@ -31,11 +31,11 @@ def read_tasks(path: Path, fields: Mapping[str, Field], *, flat: bool) -> dict[s
         Name -> values, shape (N,) or (N, width); (N, 2) for positions without z.
 
     Raises:
-        UsageError: The file does not exist.
+        UsageError: The file does not exist or is of another kind.
         DatasetError: The file is damaged, has no tasks, an unknown column, or a value that is not a finite number.
         MachineError: The file cannot be read.
     """
-    require_file(path, "a table of tasks, CSV or HDF5")
+    require_file(path, "a table of tasks, CSV or HDF5", kinds=("a text file", *HDF5_KINDS))
     try:
         columns = _hdf5_columns(path) if is_hdf5(path) else _csv_columns(path)
     except OSError as error:

@@ -25,7 +25,8 @@ from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.store.files.checksum_file import Content, read_with_checksum, write_with_checksum
 from cnpgen.store.files.document_structure import ANY_KEY, ANYTHING, NUMBER, TEXT, WHOLE, check_structure
 from cnpgen.store.files.documents import parse_json
-from cnpgen.store.paths import require_file
+from cnpgen.store.files.kind import kind_name
+from cnpgen.store.paths import ANY_HDF5, require_file
 
 MODEL_KIND, MODEL_VERSION = "cnpgen-model", 2
 MAX_PROJECTION_STEPS = 20  # Gauss-Newton steps; each makes a kernel larger
@@ -69,12 +70,11 @@ def load_model(name_or_path: str | Path) -> Model:
         name_or_path: Name of a shipped model, or path of a model file.
 
     Raises:
-        UsageError: There is no such file, or no shipped model of this name.
-        DatasetError: The file is damaged, of another format version, or no model.
+        UsageError: There is no such file, it is of another kind, or there is no shipped model of this name.
+        DatasetError: The file is damaged or of another format version.
         MachineError: The operating system denies reading it.
     """
     path = find_model(name_or_path)
-    require_file(path, "a model", argument="name_or_path")
     return model_from_content(path, read_with_checksum(path, kind=MODEL_KIND, version=MODEL_VERSION))
 
 
@@ -108,12 +108,15 @@ def find_model(name_or_path: str | Path) -> Path:
     """Return the file of a model: a path if it ends in ``.h5``, has a separator or is a file; else a shipped model.
 
     Raises:
-        UsageError: There is no shipped model of this name.
+        UsageError: There is no such file, it is of another kind, or there is no shipped model of this name.
+        MachineError: The operating system denies reading it.
     """
     if not isinstance(name_or_path, str | Path):
         raise UsageError(f"a model must be a name or a path, got {name_or_path!r}", concerns="name_or_path")
     text, known = os.fspath(name_or_path), shipped_models()
     if isinstance(name_or_path, Path) or text.endswith(".h5") or os.sep in text or Path(text).is_file():
+        expected = kind_name("model")
+        require_file(Path(text), expected, kinds=(expected, ANY_HDF5), argument="name_or_path")
         return Path(text)
     if text not in known:
         raise UsageError(

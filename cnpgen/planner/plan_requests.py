@@ -145,7 +145,8 @@ def check_problem(where: str, record: ProblemRecord, model: Model) -> None:
     if record.comparable_sha256 != model.problem.comparable_sha256:
         differs = ", ".join(record.differences(model.problem)[:4])
         raise DatasetError(
-            f"the model plans for {model.problem.name!r}, but {where} is of {record.name!r}: they differ in {differs}"
+            f"the model plans for {model.problem.name!r}, but {where} is of {record.name!r}: they differ in {differs};"
+            " train a model for it ('cnpgen train'), or plan without a model ('cnpgen solve')"
         )
 
 

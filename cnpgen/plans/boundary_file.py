@@ -20,7 +20,7 @@ from cnpgen.store.checked_shard import read_rows, recorded_shard
 from cnpgen.store.dataset_spec import DatasetSpec, load_dataset_spec, shards
 from cnpgen.store.files.checksum_file import verify_checksum
 from cnpgen.store.files.hdf5 import opened_hdf5
-from cnpgen.store.paths import file_kind, require_file
+from cnpgen.store.paths import HDF5_KINDS, require_file
 from cnpgen.store.shard import SHARD_FORMAT
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.boundary_arguments import boundary_of
@@ -149,13 +149,11 @@ def read_boundary_file(path: Path) -> BoundaryFile:
             and ``goal_dq`` unless they are zero.
 
     Raises:
-        UsageError: The file does not exist.
-        DatasetError: The file is damaged or of another kind, or a required name is missing or misspelled.
+        UsageError: The file does not exist or is of another kind.
+        DatasetError: The file is damaged, or a required name is missing or misspelled.
         MachineError: The file cannot be read.
     """
-    require_file(path, "a dataset or an HDF5 file of boundary conditions")
-    if (kind := file_kind(path)).endswith(" of cnpgen"):
-        raise DatasetError(f"{path} is {kind}, not an HDF5 file of boundary conditions")
+    require_file(path, "a dataset or an HDF5 file of boundary conditions", kinds=HDF5_KINDS)
     has_checksum = verify_checksum(path, kind=PLANS, version=PLANS_VERSION)
     with opened_hdf5(path) as file:
         attributes = file.attributes.some(SAID)

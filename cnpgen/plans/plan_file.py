@@ -34,7 +34,8 @@ from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.store.files.checksum_file import verify_checksum
 from cnpgen.store.files.hdf5 import Column, Hdf5, opened_hdf5
-from cnpgen.store.paths import file_kind, require_file
+from cnpgen.store.files.kind import PLANS
+from cnpgen.store.paths import ANY_HDF5, require_file
 from cnpgen.trajectory.boundary import Boundary
 
 
@@ -51,16 +52,15 @@ def load_plans(path: str | Path, *, problem: Problem | StoredProblem | str | Pat
             tolerances replace those in the file.
 
     Raises:
-        UsageError: The file does not exist.
-        DatasetError: The file is damaged, not a plan file, or of another problem.
+        UsageError: The file does not exist or is of another kind.
+        DatasetError: The file is damaged, incomplete, or of another problem.
         RecipeError: ``problem`` has mistakes, or a required plug-in is not installed.
         MachineError: The file cannot be read.
     """
     path = Path(path)
     wanted = None if problem is None else as_record(problem)
-    require_file(path, "a file of plans", of_dataset="'cnpgen solve' and 'cnpgen plan' make plans for its rows")
-    if (kind := file_kind(path)).endswith(" of cnpgen"):  # models are HDF5, too
-        raise DatasetError(f"{path} is {kind}, not a file of plans")
+    of_dataset = "'cnpgen solve' and 'cnpgen plan' make plans for its rows"
+    require_file(path, "a file of plans", kinds=(PLANS, ANY_HDF5), of_dataset=of_dataset)
     has_checksum = verify_checksum(path, kind=FORMAT, version=PLAN_FILE_VERSION)
     with opened_hdf5(path) as file:
         attributes = file.attributes.some((*ATTRIBUTES, *NOTES))

@@ -8,11 +8,16 @@ from typing import Any
 from xml.etree import ElementTree
 
 from cnpgen.errors import PluginError, RecipeError, nearest
+from cnpgen.problems.problem import Problem
+from cnpgen.robots.plausible_values import MAX_LIMIT_RATIO, MAX_RANGE_RATIO, ImplausibleValue
+from cnpgen.robots.robot_spec import LimitSpec
 from cnpgen.robots.shape.mesh_files import find_urdf
-from cnpgen.robots.urdf import read_urdf, urdf_tree
+from cnpgen.robots.urdf import number_in, read_urdf, urdf_tree
 from cnpgen.schema.keys import RecipeLocation
 from cnpgen.schema.units import show
+from cnpgen.store.joint_units import units_of_joints
 
+_LIMIT_UNITS = {"position": "rad", "velocity": "rad/s", "acceleration": "rad/s^2"}
 _XACRO = "{http://www.ros.org/wiki/xacro}"
 
 
@@ -58,6 +63,41 @@ def _robot_mistakes(robot: dict[str, Any], where: RecipeLocation, folder: Path) 
     for name, low, high in _locked_outside(tree.iter("joint"), joints if isinstance(joints, list) else []):
         text = f"{name!r} is not planned and stays at zero, which is outside of its limits [{low:g}, {high:g}]"
         yield (where / "joints").message(text)
+
+
+def limit_mistakes(problem: Problem, where: RecipeLocation) -> Iterator[str]:
+    """Check that no limit exceeds that of the URDF so far that it must be in another unit or in percent."""
+    spec, limits = problem.robot, problem.limits
+    per_joint = {"velocity": limits.velocity, "acceleration": limits.acceleration}  # effort is often a placeholder
+    given: dict[str, list[tuple[float, ...]]] = {}
+    given |= {key: [(value,) for value in limit.values] for key, limit in per_joint.items() if limit is not None}
+    given |= {"position": [(span.low, span.high) for span in limits.position]} if limits.position else {}
+    try:
+        urdf = urdf_tree(read_urdf(problem.urdf_path)).iter("joint") if given else ()
+        joints = {joint.get("name"): joint for joint in urdf}
+        plausible = {key: [_plausible_limit(joints[name], key) for name in spec.joints] for key in given}
+    except (PluginError, RecipeError, ValueError, KeyError):  # loading the robot raises the error
+        return
+    for key, rows in given.items():
+        per_row = rows * (len(spec.joints) if len(rows) == 1 else 1)
+        for name, values, (low, high, unit) in zip(spec.joints, per_row, plausible[key], strict=False):
+            wrong = next((value for value in values if low < high and not low <= value <= high), None)
+            if wrong is not None:
+                text = f"{name}: {ImplausibleValue(0, 0, wrong, low, high, unit)}"
+                hint = "" if key == "acceleration" else f" ('{key}_scale' is a fraction of the URDF's limit)"
+                yield (where / "limits" / key).message(text + hint)
+                break
+
+
+def _plausible_limit(joint: ElementTree.Element, key: str) -> tuple[float, float, str]:
+    """Return the ends of the plausible range of a limit, equal where the URDF limits nothing, and the unit."""
+    limit, unit = joint.find("limit"), units_of_joints(_LIMIT_UNITS[key], (joint.get("type") == "prismatic",))
+    if key == "position":
+        lower, upper = (number_in(limit, end, 0.0) for end in ("lower", "upper"))
+        center, half = (lower + upper) / 2, MAX_RANGE_RATIO * (upper - lower) / 2
+        return center - half, center + half, unit
+    rate = LimitSpec.acceleration_rate if key == "acceleration" else 1.0
+    return 0.0, MAX_LIMIT_RATIO * rate * number_in(limit, "velocity", 0.0), unit
 
 
 def named_packages(robot: dict[str, Any], folder: Path) -> list[Path]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from cnpgen.errors import PluginError, RecipeError
-from cnpgen.problems.checks import problem_mistakes, tables
+from cnpgen.problems.checks import limit_mistakes, problem_mistakes, tables
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.geometry import chosen_geometry, geometry_mistakes, with_object_clearance
 from cnpgen.problems.objectives import ObjectiveTerm
@@ -92,7 +92,9 @@ def read_problem(path: Path, mistakes: list[str]) -> Problem | None:
         return None
     spec = replace(problem.robot, geometry=chosen_geometry(table, path.parent))
     constraints = with_object_clearance(problem, table, path.parent)
-    return replace(problem, path=path.absolute(), robot=spec, obstacle=obstacles, constraint=constraints)
+    problem = replace(problem, path=path.absolute())
+    mistakes.extend(limit_mistakes(problem, where))
+    return replace(problem, robot=spec, obstacle=obstacles, constraint=constraints)
 
 
 def _with_meshes(problem: Problem, path: Path, where: RecipeLocation, mistakes: list[str]) -> tuple[Obstacle, ...]:

@@ -53,18 +53,32 @@ def find_file(kinds: tuple[Kind, ...], name_or_path: str | Path, folder: Path | 
     if is_path:
         hint = nearest(Path(shown).stem, known)
         if os.path.isdir(path):  # noqa: PTH112 - as above
-            raise ValueError(f"{path} is a folder, expected a .toml file")
+            raise ValueError(f"{path} is a folder, expected a .toml file{_hint_of_folder(path, kinds)}")
         raise ValueError(f"no such file: {(folder or Path()) / shown}{hint}")
     if text not in known:
-        hint = _hint(shown, kinds, known)
+        hint = _hint_of_folder(path, kinds) or _hint(shown, kinds, known)
         raise ValueError(f"unknown {either(kinds)} {shown!r}{hint}; known: {', '.join(known) or 'none'}")
     return known[text]
+
+
+def _hint_of_folder(folder: Path, kinds: tuple[Kind, ...]) -> str:
+    """Return a hint for a folder of recipes as 'cnpgen copy' writes it: its file of one of the kinds."""
+    files = [os.path.join(folder, f"{kind}.toml") for kind in kinds]  # noqa: PTH118 - names may be too long
+    return next((f" (did you mean {file!r}?)" for file in files if os.path.isfile(file)), "")  # noqa: PTH113
 
 
 def _hint(text: str, kinds: tuple[Kind, ...], known: Iterable[str]) -> str:
     """Return a hint: other kinds with a recipe of this name, or a similar known name."""
     others = " and ".join(f"a {kind}" for kind in _LAYOUT if kind not in kinds and text in list_recipes(kind))
     return f": it is the name of {others}" if others else nearest(text, known)
+
+
+def find_recipe(kinds: tuple[Kind, ...], name_or_path: str | Path, folder: Path | None = None) -> Path:
+    """Find the file of a recipe; raise RecipeError if there is none."""
+    try:
+        return find_file(kinds, name_or_path, folder)
+    except ValueError as error:
+        raise RecipeError([str(error)]) from error
 
 
 def load_recipe(
@@ -74,12 +88,8 @@ def load_recipe(
     build: Callable[[Path, list[str]], Recipe | None],
 ) -> Recipe:
     """Find, read and build a recipe, or raise all mistakes at once."""
-    try:
-        path = find_file(kinds, name_or_path, folder)
-    except ValueError as error:
-        raise RecipeError([str(error)]) from error
     mistakes: list[str] = []
-    recipe = build(path, mistakes)
+    recipe = build(find_recipe(kinds, name_or_path, folder), mistakes)
     if recipe is None or mistakes:
         raise RecipeError(mistakes)
     return recipe

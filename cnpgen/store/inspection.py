@@ -12,11 +12,10 @@ from cnpgen.store.dataset_spec import DatasetSpec, load_dataset_spec, shards
 from cnpgen.store.dataset_summary import DatasetSummary, summarize_dataset, unfinished
 from cnpgen.store.field import Field
 from cnpgen.store.files.documents import plain
-from cnpgen.store.layout import DOCUMENTS, MANIFEST, SPECIFICATION
-from cnpgen.store.paths import require_folder
+from cnpgen.store.layout import DOCUMENTS, MANIFEST
+from cnpgen.store.paths import require_dataset
 from cnpgen.store.sampling_statistics import SamplingStatistics, densities_to_json
 from cnpgen.store.statistics import FieldStatistics, merge_statistics
-from cnpgen.store.workspace import is_dataset
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,13 +143,11 @@ def inspect_dataset(folder: str | Path) -> Inspection:
         folder: Folder of the dataset.
 
     Raises:
-        UsageError: The folder does not exist.
-        DatasetError: It contains no dataset, or its specification is damaged.
+        UsageError: The folder does not exist, or contains no dataset.
+        DatasetError: Its specification is damaged.
         MachineError: A file cannot be read.
     """
-    folder = require_folder(folder)
-    if not is_dataset(folder):
-        raise DatasetError(f"{folder} is not a dataset of cnpgen: it has no {SPECIFICATION}")
+    folder = require_dataset(folder)
     try:
         spec = load_dataset_spec(folder)
     except DatasetError as error:

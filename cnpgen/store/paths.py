@@ -1,12 +1,20 @@
 """Checks of paths given by users: a missing file or folder is a usage error, not a damaged dataset."""
 
+import itertools
+from collections.abc import Collection, Iterable
+from contextlib import suppress
 from pathlib import Path
 
-from cnpgen.errors import DatasetError, MachineError, UsageError
-from cnpgen.store.files.kind import PLANS, is_hdf5, own_kind
+from cnpgen.errors import DatasetError, MachineError, UsageError, nearest
+from cnpgen.store.files.atomic import check_readable
+from cnpgen.store.files.kind import PLANS, is_hdf5, kind_of_content, own_kind
+from cnpgen.store.layout import SPECIFICATION
 from cnpgen.store.workspace import is_dataset
 
+MAX_SIMILAR_PATHS, MIN_SIMILARITY = 1000, 0.65  # names of a folder that are compared, and their share of equal letters
+ANY_HDF5 = "an HDF5 file"  # of other software
 _KIND_OF_FORMAT = {"cnpgen-plans": PLANS, "cnpgen-shard": "a shard of a dataset"}
+HDF5_KINDS = (ANY_HDF5, *_KIND_OF_FORMAT.values())
 
 
 def require_folder(folder: str | Path, *, argument: str = "folder") -> Path:
@@ -18,35 +26,83 @@ def require_folder(folder: str | Path, *, argument: str = "folder") -> Path:
 
     Raises:
         UsageError: It is no text or path, or the folder is missing or is a file.
+        MachineError: It cannot be read.
     """
     if not isinstance(folder, str | Path) or not str(folder) or "\0" in str(folder):
         raise UsageError(f"must name a folder, got {folder!r:.100}", argument=argument)
     folder = Path(folder)
+    require_path(folder, "the folder of a dataset", argument=argument)
     if not folder.is_dir():
-        actual = "a file" if folder.exists() else "not there"
-        raise UsageError(f"{folder} is {actual}, expected the folder of a dataset", concerns=argument)
+        raise UsageError(f"{folder} is a file, expected the folder of a dataset", concerns=argument)
     return folder
 
 
-def require_file(path: Path, expected: str, *, of_dataset: str = "", argument: str = "path") -> None:
+def require_dataset(folder: str | Path, *, argument: str = "folder") -> Path:
+    """Return the path of a folder that contains a dataset, possibly unfinished or damaged.
+
+    Raises:
+        UsageError: As ``require_folder``, or the folder contains no dataset.
+        MachineError: It cannot be read.
+    """
+    folder = require_folder(folder, argument=argument)
+    if is_dataset(folder):
+        return folder
+    recipe = folder / "dataset.toml"  # as of 'cnpgen copy'
+    hint = f": 'cnpgen make-dataset {recipe}' makes one" if recipe.is_file() else ""
+    raise UsageError(f"{folder} is not a dataset of cnpgen: it has no {SPECIFICATION}{hint}", concerns=argument)
+
+
+def require_file(
+    path: Path, expected: str, *, kinds: Collection[str] = (), of_dataset: str = "", argument: str = "path"
+) -> None:
     """Raise an error if a path is not a file.
 
     Args:
         path: The path.
         expected: Expected content: "a file of plans".
+        kinds: Kinds of files that may have this content, as ``file_kind`` returns them; any by default.
         of_dataset: Hint in the case of the folder of a dataset.
         argument: Name of the argument, for the error.
 
     Raises:
-        UsageError: The path does not exist, or is a folder, a device or a pipe.
+        UsageError: The path does not exist, is a folder, a device or a pipe, or a file of another kind.
+        MachineError: It cannot be read.
     """
+    require_path(path, expected, argument=argument)
     if path.is_dir():
         actual, hint = ("the folder of a dataset", of_dataset) if is_dataset(path) else ("a folder", "")
         raise UsageError(f"{path} is {actual}, expected {expected}{hint and f': {hint}'}", concerns=argument)
-    if not path.exists():
-        raise UsageError(f"{path} is not there, expected {expected}", concerns=argument)
     if not path.is_file():
         raise UsageError(f"{path} is a device or a pipe, expected {expected}", concerns=argument)
+    kind = file_kind(path) or kind_of_content(path) if kinds else ""
+    if kind and kind not in kinds:
+        raise UsageError(f"{path} is {kind}, expected {expected}", concerns=argument)
+
+
+def require_path(path: Path, expected: str, *, argument: str = "path") -> None:
+    """Raise an error if a path does not exist.
+
+    Args:
+        path: The path.
+        expected: Expected content.
+        argument: Name of the argument, for the error.
+
+    Raises:
+        UsageError: It does not exist.
+        MachineError: It cannot be read.
+    """
+    check_readable(path)
+    if not path.exists():
+        raise UsageError(f"{path} is not there, expected {expected}{similar_path(path)}", concerns=argument)
+
+
+def similar_path(path: Path, names: Iterable[str] = ()) -> str:
+    """Return ``" (did you mean 'x'?)"`` for the most similar of names and of paths beside it, or an empty text."""
+    with suppress(OSError):
+        beside = itertools.islice(path.parent.iterdir(), MAX_SIMILAR_PATHS)
+        names = [*names, *(each.name for each in beside if path.suffix in ("", each.suffix) or each.is_dir())]
+    others = [name for name in names if name != path.name]  # a link may lead nowhere
+    return nearest(path.name, others, similarity=MIN_SIMILARITY)
 
 
 def file_kind(path: Path) -> str:
@@ -68,11 +124,11 @@ def _hdf5_kind(path: Path) -> str:
         with opened_hdf5(path) as file:
             format_name, names = file.attributes.some(["format"]).get("format"), set(file)
     except (DatasetError, MachineError):
-        return "an HDF5 file"
+        return ANY_HDF5
     if isinstance(format_name, bytes):
         format_name = format_name.decode(errors="replace")
     if (
         format_name is None and {"path_control_points", "rate_control_points"} <= names
     ):  # files of other software may have no format
         return PLANS
-    return _KIND_OF_FORMAT.get(str(format_name), "an HDF5 file")
+    return _KIND_OF_FORMAT.get(str(format_name), ANY_HDF5)

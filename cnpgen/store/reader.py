@@ -16,7 +16,7 @@ from cnpgen.store.dataset_summary import summarize_dataset, unfinished
 from cnpgen.store.intact import require_intact
 from cnpgen.store.layout import MANIFEST, SPECIFICATION
 from cnpgen.store.manifest import lists_shards_of, load_manifest
-from cnpgen.store.paths import require_folder
+from cnpgen.store.paths import require_dataset
 from cnpgen.store.scene_table import SceneTable, distinct_scenes
 from cnpgen.store.shard import storage_dtype
 from cnpgen.store.shard_record import is_committed, load_record
@@ -161,12 +161,11 @@ def open_dataset(folder: str | Path, *, allow_incomplete: bool = False) -> Store
         allow_incomplete: Whether to open an unfinished dataset, too.
 
     Raises:
-        UsageError: The folder does not exist.
-        DatasetError: The folder contains no dataset, or the dataset is unfinished or its documents are damaged.
+        UsageError: The folder does not exist or contains no dataset.
+        DatasetError: The dataset is unfinished or its documents are damaged.
         MachineError: A file cannot be read.
     """
-    folder = Path(folder)
-    require_folder(folder)
+    folder = require_dataset(folder)
     spec = load_dataset_spec(folder)
     if (folder / MANIFEST).exists():
         manifest = load_manifest(folder)

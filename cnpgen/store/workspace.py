@@ -1,7 +1,5 @@
 """The folder in which a dataset is made: its current content, and whether it can be continued or replaced."""
 
-import errno
-import os
 import re
 import shutil
 from collections.abc import Iterator
@@ -11,7 +9,7 @@ from typing import Literal
 
 from cnpgen.errors import DatasetError, MachineError, UsageError
 from cnpgen.store.dataset_spec import INFORMATIONAL, DatasetSpec, load_dataset_spec, to_json, write_dataset_spec
-from cnpgen.store.files.atomic import machine_error, read_file
+from cnpgen.store.files.atomic import check_writable, machine_error, read_file
 from cnpgen.store.files.documents import Difference, differences
 from cnpgen.store.files.leftovers import remove_leftovers
 from cnpgen.store.intact import COPY_HINT, OUTSIDE, outside_links
@@ -86,10 +84,7 @@ def check_place(workspace: Workspace) -> None:
         raise UsageError(f"{workspace.folder / outside[0]} {OUTSIDE}; {COPY_HINT}")
     if (workspace.folder / MANIFEST).is_file():
         return
-    if not os.access(workspace.existing, os.W_OK | os.X_OK):
-        is_read_only = hasattr(os, "statvfs") and os.statvfs(workspace.existing).f_flag & os.ST_RDONLY
-        number = errno.EROFS if is_read_only else errno.EACCES
-        raise machine_error("write to", workspace.folder, OSError(number, os.strerror(number)))
+    check_writable(workspace.folder)
 
 
 def started_spec(workspace: Workspace, wanted: DatasetSpec) -> DatasetSpec | None:

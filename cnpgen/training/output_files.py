@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from cnpgen.errors import UsageError
+from cnpgen.store.files.atomic import check_writable
 from cnpgen.store.files.leftovers import remove_leftovers_of
 from cnpgen.training.log import is_log
 
@@ -10,9 +11,10 @@ CHECKPOINT, LOG, PICTURE, LOCK = ".checkpoint", ".jsonl", ".png", ".lock"  # in 
 
 
 def check_out(out: Path) -> None:
-    """Raise an error if the path is no possible model file."""
+    """Raise an error if the path is no possible model file, or cannot be written."""
     if out.suffix != ".h5" or out.is_dir() or not out.parent.is_dir():
         raise UsageError(f"{out} must be a file that ends in .h5, in a folder that exists", concerns="out")
+    check_writable(out)
 
 
 def check_beside(out: Path) -> None:

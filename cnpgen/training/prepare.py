@@ -144,7 +144,7 @@ def _check_initial_model(
     """Raise an error if the model's parameters cannot be used in this run."""
     if model.problem.comparable_sha256 != loaded.record.comparable_sha256:
         differs = ", ".join(loaded.record.differences(model.problem)[:4])
-        raise UsageError(f"the model to start from is for another problem, they differ in {differs}")
+        raise UsageError(f"the model to start from is for another problem, they differ in {differs}: train without it")
     theirs = _parameter_definition(model.architecture, model.config, model.zero_conditions)
     ours = _parameter_definition(architecture, settings.config, zero)
     changed = [

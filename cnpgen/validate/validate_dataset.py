@@ -13,10 +13,8 @@ from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
 from cnpgen.store.check import Finding, check_dataset
 from cnpgen.store.dataset_spec import DatasetSpec, load_dataset_spec, shards
-from cnpgen.store.layout import SPECIFICATION
-from cnpgen.store.paths import require_folder
+from cnpgen.store.paths import require_dataset
 from cnpgen.store.shard_record import is_committed
-from cnpgen.store.workspace import is_dataset
 from cnpgen.validate.blocks import Regeneration, backend_of, regenerate_blocks
 from cnpgen.validate.validate_documents import check_recipe, check_statistics
 from cnpgen.validate.validate_rows import DeepCheck, check_rows
@@ -122,18 +120,14 @@ def validate_dataset(
         progress: Called with the number of rows of every recomputed shard.
 
     Raises:
-        UsageError: The folder does not exist, or an argument is invalid.
-        DatasetError: The folder contains no dataset.
+        UsageError: The folder does not exist or contains no dataset, or an argument is invalid.
         RecipeError: The recipe in the specification does not fit this version of cnpgen.
         PluginError: The recipe needs packages that are not installed.
         MachineError: A file cannot be read, or blocks are to be regenerated and the backend of the dataset does not
             work on this machine.
     """
-    folder, regenerate = Path(folder), integer("regenerate", regenerate, least=0)
-    machine_engine = Engine(engine, address, workers)
-    require_folder(folder)
-    if not is_dataset(folder):
-        raise DatasetError(f"{folder} is not a dataset of cnpgen: it has no {SPECIFICATION}")
+    regenerate, machine_engine = integer("regenerate", regenerate, least=0), Engine(engine, address, workers)
+    folder = require_dataset(folder)
     findings = check_dataset(folder)
     try:
         spec = load_dataset_spec(folder)

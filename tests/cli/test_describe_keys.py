@@ -74,6 +74,12 @@ def test_every_key_of_every_table_is_on_the_page_with_a_sentence():
         assert f"### `{part}`" in page
 
 
+def test_no_default_is_a_python_object():
+    page = describe_keys(tuple(FILES))
+    assert "| `parameters` | a table | those of its keys |" in page
+    assert not re.search(r"\w\(\w+=", page)
+
+
 def test_every_row_of_every_table_has_four_cells():
     rows = [line for line in describe_keys(tuple(FILES)).splitlines() if line.startswith("|")]
     assert len(rows) > 150

@@ -252,15 +252,15 @@ def test_what_cannot_be_drawn_is_told_after_the_verdicts(
 def test_cut_off_and_foreign_files_are_one_line(run: Run, saved: Callable[[Plans], Path]) -> None:
     file = saved(plans_of(load("hit")))
     content = file.read_bytes()
-    for name, changed, message in (
-        ("cut.h5", content[: len(content) // 2], "cut.h5 is damaged or cut off"),
-        ("text.h5", b"hello", "text.h5 is not an HDF5 file, or its beginning is damaged: it seems to be a text file"),
-        ("empty.h5", b"", "empty.h5 is not an HDF5 file, or its beginning is damaged: it is empty"),
+    for name, changed, expected, message in (
+        ("cut.h5", content[: len(content) // 2], 1, "cut.h5 is damaged or cut off"),
+        ("text.h5", b"hello", 2, "text.h5 is a text file, expected a file of plans"),
+        ("empty.h5", b"", 1, "empty.h5 is not an HDF5 file, or its beginning is damaged: it is empty"),
     ):
         other = file.with_name(name)
         other.write_bytes(changed)
         code, out, err = run(other)
-        assert (code, out) == (1, "")
+        assert (code, out) == (expected, "")
         assert message in one_line(err)
 
 

@@ -104,7 +104,7 @@ def test_the_bounds_are_those_of_the_library():
     assert values.MAX_ROWS_ARGUMENT == MAX_ROWS
 
 
-@pytest.mark.parametrize("text", ["1e9x", "0", "-5", "2.5", ""])
+@pytest.mark.parametrize("text", ["1e9x", "0", "-5", "2.5"])
 def test_a_wrong_number_of_rows_is_one_line_that_says_what_to_write(run, text, tmp_path):
     code, out, err = run("make-dataset", "airhockey-hit", "--out", tmp_path / "x", "--n", text)
     assert (code, out) == (2, "")
@@ -170,7 +170,7 @@ def test_a_wrong_unit_is_named(run):
         (("generate", "x"), "'make-dataset'"),
         (("list", "stage"), "'stages'"),
         (("--hepl",), "'--help'"),
-        (("inspect", "x", "--jsn"), "'--json'"),
+        (("list", "--jsn"), "'--json'"),
     ],
 )
 def test_what_is_misspelt_is_met_with_the_nearest_known_name(run, words, hint):
@@ -194,6 +194,9 @@ def test_help_lists_the_commands_and_exit_codes(run):
     assert (code, err) == (0, "")
     for word in ("make-dataset", "list", "show", "inspect", "validate", "doctor", "  130  interrupted"):
         assert word in out
+    assert "  3    the machine: no permission to read or write a path" in out
+    codes = {error.exit_code for error in vars(cnpgen.errors).values() if hasattr(error, "exit_code")}
+    assert all(f"\n  {code}    " in out for code in {0, *codes})
 
 
 @pytest.mark.parametrize("command", ["make-dataset", "list", "show", "inspect", "validate", "doctor"])
@@ -562,7 +565,7 @@ def test_inspect_works_on_an_unfinished_dataset(run, hits, tmp_path):
 def test_inspect_of_something_else_is_one_line(run, tmp_path):
     assert run("inspect", tmp_path / "nothing")[0] == 2
     code, _, err = run("inspect", tmp_path)
-    assert code == 1
+    assert code == 2
     assert "not a dataset" in one_line(err)
 
 
@@ -655,23 +658,23 @@ def _fail_with(monkeypatch, error):
         (DatasetError("gone"), 1, "gone"),
     ],
 )
-def test_an_error_is_a_line_and_a_code_without_a_traceback(run, monkeypatch, error, code, text):
+def test_an_error_is_a_line_and_a_code_without_a_traceback(run, hits, monkeypatch, error, code, text):
     _fail_with(monkeypatch, error)
-    found, out, err = run("inspect", ".")
+    found, out, err = run("inspect", hits)
     assert (found, out) == (code, "")
     assert text in one_line(err)
 
 
-@pytest.mark.parametrize("words", [("--debug", "inspect", "."), ("inspect", ".", "--debug")])
-def test_debug_shows_the_traceback(run, monkeypatch, words):
+@pytest.mark.parametrize("words", [("--debug", "inspect", "{}"), ("inspect", "{}", "--debug")])
+def test_debug_shows_the_traceback(run, hits, monkeypatch, words):
     _fail_with(monkeypatch, ZeroDivisionError("division by zero"))
-    code, _, err = run(*words)
+    code, _, err = run(*(word.format(hits) for word in words))
     assert code == 3
     assert "Traceback (most recent call last)" in err
     assert err.splitlines()[-1].startswith("cnpgen: error: ")
 
 
-def test_a_warning_is_a_line(run, monkeypatch):
+def test_a_warning_is_a_line(run, hits, monkeypatch):
     def warn(*_, **__):
         warnings.warn("no compiler;\n  slower", RuntimeWarning, stacklevel=1)
         raise DatasetError("gone")
@@ -679,13 +682,13 @@ def test_a_warning_is_a_line(run, monkeypatch):
     monkeypatch.setattr("cnpgen.store.inspection.inspect_dataset", warn)
     with warnings.catch_warnings():
         warnings.simplefilter("always")
-        _, _, err = run("inspect", ".")
+        _, _, err = run("inspect", hits)
     assert err == "cnpgen: warning: no compiler; slower\ncnpgen: error: gone\n"
 
 
-def test_an_interruption_of_another_command_is_130(run, monkeypatch):
+def test_an_interruption_of_another_command_is_130(run, hits, monkeypatch):
     _fail_with(monkeypatch, KeyboardInterrupt())
-    assert run("inspect", ".") == (130, "", "cnpgen: interrupted\n")
+    assert run("inspect", hits) == (130, "", "cnpgen: interrupted\n")
 
 
 def test_a_reader_that_goes_away_is_left_quietly():

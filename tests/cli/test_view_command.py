@@ -222,7 +222,10 @@ def test_a_line_is_a_tube_round_its_points():
         (["airhockey", "-o", "page.png"], "expected a file that ends in .html, got 'page.png'"),
         (["airhockey", "--serve", "65536"], "expected a port, 0 to 65535, got '65536'"),
         (["airhockey", "--serve", "-o", "page.html"], "not allowed with"),
-        (["airhokey"], "unknown problem, pipeline or dataset 'airhokey' (did you mean 'airhockey'?)"),
+        (
+            ["airhokey"],
+            "airhokey is neither a folder nor a file, problem, pipeline or dataset (did you mean 'airhockey'?)",
+        ),
     ],
 )
 def test_what_cannot_be_meant_is_refused(words, said, capsys):

@@ -236,7 +236,7 @@ def test_options_must_be_bools(tmp_path: Path, option: str) -> None:
 
 
 def test_folders_without_a_dataset_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(DatasetError, match=r"specification\.json is missing"):
+    with pytest.raises(UsageError, match=r"is not a dataset of cnpgen: it has no specification\.json$"):
         load_dataset(tmp_path)
     with pytest.raises(UsageError, match="nowhere is not there, expected the folder of a dataset"):
         load_dataset(tmp_path / "nowhere")

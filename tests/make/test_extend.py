@@ -11,7 +11,7 @@ import pytest
 
 import cnpgen
 from cnpgen.cli.main import main
-from cnpgen.errors import DatasetError, UsageError
+from cnpgen.errors import UsageError
 from cnpgen.make import extend as extend_module
 from cnpgen.make import recipe_file as load_module
 from cnpgen.make.extend import extend_dataset
@@ -184,7 +184,7 @@ def test_what_cannot_be_extended_is_refused_and_left_as_it_is(damaged, tmp_path,
     with pytest.raises(UsageError, match="is not there, expected the folder of a dataset"):
         extend_dataset(tmp_path / "nothing", 1000)
     (tmp_path / "empty").mkdir()
-    with pytest.raises(DatasetError, match="holds no dataset"):
+    with pytest.raises(UsageError, match="is not a dataset of cnpgen"):
         extend_dataset(tmp_path / "empty", 1000)
     monkeypatch.setattr(load_module, "GENERATOR_REVISION", 3)
     with pytest.raises(UsageError, match="was made by another version of cnpgen or of its plug-ins"):

@@ -125,7 +125,7 @@ def test_a_part_of_another_dataset_is_refused_by_name(made, tmp_path, options, t
 
 def test_places_that_hold_no_dataset_or_another_one_are_refused(made, tmp_path):
     (tmp_path / "empty").mkdir()
-    with pytest.raises(DatasetError, match=r"specification\.json is missing"):
+    with pytest.raises(UsageError, match="empty is not a dataset of cnpgen"):
         merge_datasets([*made, tmp_path / "empty"], tmp_path / "out")
     with pytest.raises(UsageError, match="is not there, expected the folder of a dataset"):
         merge_datasets([tmp_path / "nothing"], tmp_path / "out")

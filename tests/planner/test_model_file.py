@@ -122,11 +122,11 @@ def test_missing_files_and_files_of_other_kinds_are_named(tmp_path, tiny):
     with pytest.raises(UsageError, match=r"none\.h5 is not there, expected a model"):
         load_model(tmp_path / "none.h5")
     shard = next(tiny("airhockey-hit").rglob("*.h5"))
-    with pytest.raises(DatasetError, match="not a model of cnpgen"):
+    with pytest.raises(UsageError, match="is a shard of a dataset, expected a model of cnpgen"):
         load_model(shard)
     other = tmp_path / "other.h5"
     other.write_bytes(encode_with_checksum(Content({}, {"a": "b"}), kind="cnpgen-checkpoint", version=1))
-    with pytest.raises(DatasetError, match="a checkpoint of cnpgen, not a model"):
+    with pytest.raises(UsageError, match="is a checkpoint of cnpgen, expected a model"):
         load_model(other)
 
 
@@ -229,8 +229,10 @@ def test_an_empty_text_and_a_scalar_are_restored(tmp_path):
 def test_shipped_models_are_found_by_name_and_others_by_path(tmp_path, monkeypatch):
     monkeypatch.setattr(model_file, "shipped_models", lambda: {"airhockey-hit": Path("/somewhere/airhockey-hit.h5")})
     assert find_model("airhockey-hit") == Path("/somewhere/airhockey-hit.h5")
-    assert find_model("mine.h5") == Path("mine.h5")
+    (tmp_path / "mine").touch()
     assert find_model(tmp_path / "mine") == tmp_path / "mine"
+    with pytest.raises(UsageError, match=r"mine\.h5 is not there, expected a model of cnpgen"):
+        find_model("mine.h5")
     with pytest.raises(UsageError, match=r"unknown model 'airhockey-hot' \(did you mean 'airhockey-hit'\?\)"):
         find_model("airhockey-hot")
 

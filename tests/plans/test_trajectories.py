@@ -1,6 +1,7 @@
 """Sampled trajectories: decisions agree with the verdict on plans, files are read, and bad files are located."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -271,7 +272,10 @@ def test_the_command_judges_exported_plans(plans: Plans, tmp_path: Path, capsys:
     assert document["verdicts"][0]["conditions"]["joint velocity"]["decision"] == "valid"
     words = ["evaluate", str(tmp_path / "out"), "--problem", "airhockey", "--interpolation", "linear", "--list"]
     assert main(words) == 1
-    assert "undecided: joint acceleration: the curve lacks a derivative" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "undecided: joint acceleration: the curve lacks a derivative" in out
+    cells = r" +joint velocity +-?\d\.\d\de[+-]\d\d +\d\.\de-\d\d +rad/s +0 +\d\.\d{4}  joint_\d"
+    assert any(re.fullmatch(cells, line) for line in out.splitlines())  # one line per condition, with its unit
     assert main(["evaluate", str(tmp_path / "out")]) == 2
     assert "--problem" in capsys.readouterr().err
 

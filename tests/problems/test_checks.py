@@ -62,3 +62,34 @@ def test_a_tip_that_is_not_there_is_refused_with_all_frames(tmp_path):
     file.write_text(file.read_text().replace('tip = "hand"', 'tip = "hnad"'))
     found = mistakes(file)
     assert "robot.tip: crane.urdf has no frame 'hnad' (did you mean 'hand'?); its frames: base, turret, arm" in found
+
+
+def limited(folder: Path, limit: str) -> Path:
+    """A problem with a limit, where the URDF allows 2 rad/s and positions of 2.5 rad to either side."""
+    file = write_problem(folder)
+    file.write_text(file.read_text(encoding="utf-8").replace("[limits]", f"[limits]\n{limit}"), encoding="utf-8")
+    return file
+
+
+@pytest.mark.parametrize(
+    ("limit", "text"),
+    [
+        ("velocity = 80", "limits.velocity: swing: must be from 0 to 20 rad/s, got 80 rad/s; 80 rad/s is 4584 deg/s;"),
+        ("velocity = [2, 2, 115, 2]", "limits.velocity: elbow: must be from 0 to 20 rad/s, got 115 rad/s;"),
+        ("acceleration = 573", "limits.acceleration: swing: must be from 0 to 200 rad/s^2, got 573 rad/s^2;"),
+        (
+            'position = ["[-2, 2]", "[-120, 120]", "[-2, 2]", "[-2, 2]"]',
+            "position: lift: must be from -5 to 5 rad, got",
+        ),
+    ],
+)
+def test_limits_far_above_those_of_the_urdf_are_in_another_unit(tmp_path, limit, text):
+    found = mistakes(limited(tmp_path, limit))
+    assert text in found
+    assert "did you mean" in found
+    assert ("'velocity_scale' is a fraction of the URDF's limit" in found) == limit.startswith("velocity")
+
+
+@pytest.mark.parametrize("limit", ["velocity = 19", 'velocity = "80 deg/s"', "acceleration = 190", "torque = 5000"])
+def test_limits_of_another_motor_are_accepted(tmp_path, limit):
+    load_robot(load_problem(limited(tmp_path, limit)))

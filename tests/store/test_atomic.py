@@ -11,7 +11,14 @@ from pathlib import Path
 import pytest
 
 from cnpgen.errors import DatasetError, MachineError
-from cnpgen.store.files.atomic import committing, file_sha256, read_file, write_file
+from cnpgen.store.files.atomic import (
+    check_readable,
+    check_writable,
+    committing,
+    file_sha256,
+    read_file,
+    write_file,
+)
 
 
 def failing(code: int) -> Callable[..., None]:
@@ -116,3 +123,31 @@ def test_a_missing_file_is_a_dataset_error_and_an_unreadable_one_a_machine_error
         read(tmp_path / "nothing")
     with pytest.raises(MachineError, match="cannot read"):
         read(tmp_path)
+
+
+@pytest.mark.usefixtures("file_permissions")
+def test_what_cannot_be_written_is_found_before_it_is_written(tmp_path: Path) -> None:
+    check_writable(tmp_path / "new" / "file.h5")
+    (tmp_path / "old").write_text("old")
+    check_writable(tmp_path / "old")
+    assert [path.name for path in tmp_path.iterdir()] == ["old"]
+    assert (tmp_path / "old").read_text() == "old"
+    (tmp_path / "old").chmod(0o444)
+    (tmp_path / "ro").mkdir(0o555)
+    for path in ("old", "ro", "ro/file.h5", "ro/new/file.h5"):
+        with pytest.raises(MachineError, match=rf"cannot write .*{path}: Permission denied; choose a folder"):
+            check_writable(tmp_path / path)
+    with pytest.raises(MachineError, match="Not a directory; a file is where a folder should be"):
+        check_writable(tmp_path / "old" / "file.h5")
+
+
+@pytest.mark.usefixtures("file_permissions")
+@pytest.mark.parametrize("mode", [0o000, 0o300, 0o600])
+def test_a_folder_that_cannot_be_listed_and_entered_cannot_be_read(tmp_path: Path, mode: int) -> None:
+    (tmp_path / "folder").mkdir()
+    check_readable(tmp_path / "folder")
+    check_readable(tmp_path / "nothing")
+    (tmp_path / "folder").chmod(mode)
+    with pytest.raises(MachineError, match=r"cannot read .*: Permission denied; its owner can permit reading it"):
+        check_readable(tmp_path / "folder")
+    (tmp_path / "folder").chmod(0o700)

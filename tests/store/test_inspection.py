@@ -139,7 +139,7 @@ def test_a_dataset_without_a_valid_specification_is_refused_with_a_hint(hits, tm
 def test_folders_without_a_dataset_are_refused(tmp_path):
     with pytest.raises(UsageError, match="not there"):
         inspect_dataset(tmp_path / "nothing")
-    with pytest.raises(DatasetError, match="not a dataset of cnpgen"):
+    with pytest.raises(UsageError, match="not a dataset of cnpgen"):
         inspect_dataset(tmp_path)
     (tmp_path / "file").write_text("")
     with pytest.raises(UsageError, match="a file"):

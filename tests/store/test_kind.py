@@ -62,14 +62,16 @@ def test_files_of_other_kinds_are_named_by_their_kind(tmp_path: Path, kind: str)
 def test_every_reader_names_the_apparent_kind(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "notes.h5"
     path.write_text("mine")
-    for read in (load_plans, read_shard):
-        with pytest.raises(DatasetError, match=r"notes\.h5 is not an HDF5 file.*: it seems to be a text file$"):
+    with pytest.raises(DatasetError, match=r"notes\.h5 is not an HDF5 file.*: it seems to be a text file$"):
+        read_shard(path)
+    for read in (load_plans, load_model, load_boundary_problems):
+        with pytest.raises(UsageError, match=r"notes\.h5 is a text file, expected "):
             read(path)
     with pytest.raises(DatasetError, match=r"is not a model of cnpgen, .*: it seems to be a text file$"):
         read_with_checksum(path, kind="cnpgen-model", version=1)
-    assert main(["evaluate", str(path)]) == 1
+    assert main(["evaluate", str(path)]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert "is not an HDF5 file" in line
+    assert line.endswith("notes.h5 is a text file, expected a file of plans")
 
 
 def test_a_cut_off_hdf5_file_is_reported_as_cut_off(tmp_path: Path) -> None:
@@ -90,10 +92,9 @@ def test_pipes_are_refused_without_blocking(tmp_path: Path, read: Callable[[Path
 
 def test_a_pipe_in_place_of_the_specification_is_refused_without_blocking(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "specification.json")
-    with pytest.raises(DatasetError, match="is not a dataset of cnpgen"):
-        validate_dataset(tmp_path)
-    with pytest.raises(DatasetError, match=r"specification\.json is not a file"):
-        load_dataset(tmp_path)
+    for read in (validate_dataset, load_dataset):
+        with pytest.raises(UsageError, match="is not a dataset of cnpgen"):
+            read(tmp_path)
 
 
 @pytest.mark.parametrize("block", [0, 512, 2048])

@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 import pytest
 
-from cnpgen.errors import DatasetError, MachineError, UsageError
+from cnpgen.errors import MachineError, UsageError
 from cnpgen.make.make_dataset import make_dataset
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
@@ -380,7 +380,7 @@ def test_missing_folders_and_negative_counts_are_refused(damaged: Path, tmp_path
 
 def test_a_folder_that_holds_something_else_is_refused(tmp_path):
     (tmp_path / "mine.txt").write_text("no dataset")
-    with pytest.raises(DatasetError, match=r"is not a dataset of cnpgen: it has no specification.json"):
+    with pytest.raises(UsageError, match=r"is not a dataset of cnpgen: it has no specification.json"):
         validate_dataset(tmp_path, deep=True, regenerate=3)
 
 

@@ -58,7 +58,10 @@ class PaperNetwork(BenchmarkPlanner):
         theirs = planner.model.problem
         if theirs.comparable_sha256 != setting.problem.comparable_sha256:
             differs = ", ".join(setting.problem.differences(theirs)[:4])
-            raise UsageError(f"the model {self.model} is for another problem, they differ in {differs}")
+            raise UsageError(
+                f"the model {self.model} is for another problem, they differ in {differs}: train one for"
+                f" {setting.problem.name!r} ('cnpgen train --preset paper')"
+            )
         return _batch_of_one(planner)
 
 

@@ -4,6 +4,7 @@ import errno
 import hashlib
 import os
 import stat
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -25,6 +26,7 @@ _HINTS = {
     errno.ELOOP: "choose another folder",
     errno.EMFILE: "too many open files (see ulimit -n)",
 }
+_DENIED = {errno.EACCES, errno.EPERM}
 
 
 def machine_error(verb: str, path: Path, error: OSError) -> MachineError:
@@ -39,7 +41,47 @@ def machine_error(verb: str, path: Path, error: OSError) -> MachineError:
         The error to raise from ``error``.
     """
     hint = _HINTS.get(error.errno or 0, "check the disk and try again")
+    if verb == "read" and error.errno in _DENIED:
+        hint = "its owner can permit reading it (chmod)"
     return MachineError(f"cannot {verb} {path}: {error.strerror or error}; {hint}")
+
+
+def check_readable(path: Path) -> None:
+    """Check that an existing file or folder can be read.
+
+    Raises:
+        MachineError: The operating system denies it.
+    """
+    try:
+        mode = path.stat().st_mode
+        if stat.S_ISDIR(mode):
+            os.scandir(f"{path}/.").close()  # needs the permissions to list and to enter
+        elif stat.S_ISREG(mode):
+            path.open("rb").close()
+    except PermissionError as error:
+        raise machine_error("read", path, error) from error
+    except (OSError, ValueError):  # there is no such path
+        return
+
+
+def check_writable(path: Path) -> None:
+    """Check that a file, or files in a folder, can be written before they are computed.
+
+    Args:
+        path: The file or the folder, which may be missing.
+
+    Raises:
+        MachineError: An existing file is read-only, or no file can be created in its folder or in the next one above.
+    """
+    try:
+        places = [path.absolute(), *path.absolute().parents]
+        if path.is_file():
+            places.pop(0).open("ab").close()
+        folder = next(place for place in places if place.exists())
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise machine_error("write", path, error) from error
 
 
 @contextmanager

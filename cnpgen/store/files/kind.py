@@ -42,15 +42,22 @@ def is_hdf5(path: Path) -> bool:
 def apparent_kind(path: Path) -> str:
     """Return the apparent kind of a file as the end of a message, ": it seems to be a text file"; otherwise empty."""
     try:
-        with path.open("rb") as file:
-            head = file.read(_HEAD_BYTES)
+        kind, size = kind_of_content(path), path.stat().st_size
     except OSError:
         return ""
-    if not head:
-        return ": it is empty"
+    return (f": it seems to be {kind}" if kind else "") if size else ": it is empty"
+
+
+def kind_of_content(path: Path) -> str:
+    """Return the kind of a file from its first bytes, "a zip archive" or "a model of cnpgen"; empty if unknown.
+
+    Raises:
+        OSError: The file cannot be read.
+    """
+    with path.open("rb") as file:
+        head = file.read(_HEAD_BYTES)
     known = (kind for signature, kind in _SIGNATURES.items() if head.startswith(signature))
-    kind = own_kind(head) or next(known, "a text file" if _is_text(head) else "")
-    return f": it seems to be {kind}" if kind else ""
+    return own_kind(head) or next(known, "a text file" if _is_text(head) else "")
 
 
 def _is_text(head: bytes) -> bool:
