@@ -10,7 +10,9 @@ import pytest
 
 from cnpgen.cli.docs_command import KINDS, list_pages
 from cnpgen.cli.main import build_parser
+from cnpgen.errors import CnpgenError
 from tests.docs.test_blocks import blocks
+from tests.test_public_names import MODULES
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -33,9 +35,9 @@ def generator() -> ModuleType:
     return script("generate")
 
 
-@pytest.mark.parametrize("name", ["keys.md", "cli.md", "api.md"])
+@pytest.mark.parametrize("name", ["reference/keys.md", "reference/cli.md", "reference/api.md", "index.md"])
 def test_a_generated_page_is_what_the_code_says(generator: ModuleType, name: str) -> None:
-    page = (DOCS / "reference" / name).read_text(encoding="utf-8")
+    page = (DOCS / name).read_text(encoding="utf-8")
     assert page == generator.PAGES[name]() + "\n", "run: python docs/generate.py"
 
 
@@ -53,6 +55,19 @@ def test_every_public_name_has_a_summary_of_one_sentence(generator: ModuleType) 
     rows = re.findall(r"^\| `(\w+)` \| (.*) \|$", generator.describe_names(), re.M)
     assert len(rows) > 120
     assert [name for name, summary in rows if not summary.endswith(".")] == []
+
+
+def test_the_page_of_names_has_all_public_modules(generator: ModuleType) -> None:
+    assert set(generator.MODULES) == set(MODULES)
+
+
+@pytest.mark.parametrize("framework", ["torch", "jax", "tensorflow"])
+def test_the_page_of_names_has_the_bridges_to_frameworks(generator: ModuleType, framework: str) -> None:
+    section = generator.describe_names().split(f"## `cnpgen.interop.{framework}`\n")[1].split("\n## ")[0]
+    names = re.findall(r"^\| `(\w+)` \| .*\. \|$", section, re.M)
+    assert {"torch": "TensorLoss", "jax": "plan_loss", "tensorflow": "to_tensorflow"}[framework] in names
+    module = pytest.importorskip(f"cnpgen.interop.{framework}", exc_type=CnpgenError)
+    assert names == sorted(getattr(module, "__all__", [f"to_{framework}"]))
 
 
 def test_every_page_is_of_one_kind_and_in_the_index() -> None:

@@ -1,5 +1,7 @@
 """Differentiable plans in JAX: control points from network outputs, and their loss; both may be jitted."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 from dataclasses import fields
 from functools import partial
@@ -28,7 +30,7 @@ jax.tree_util.register_dataclass(Scene, ["poses"], ["obstacles"])
 
 
 def control_points(
-    layer: "BoundaryLayer", tasks: Tasks, phi: jax.Array, log_rate: jax.Array
+    layer: BoundaryLayer, tasks: Tasks, phi: jax.Array, log_rate: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Compute control points that meet the boundary conditions from network outputs; differentiable once.
 
@@ -54,7 +56,7 @@ def control_points(
 
 
 def plan_loss(
-    loss: "PlanLoss",
+    loss: PlanLoss,
     path: jax.Array,
     rate: jax.Array,
     *,
@@ -100,7 +102,7 @@ def plan_loss(
     return total, jax.lax.stop_gradient(terms)
 
 
-def _evaluate(loss: "PlanLoss", *, gradient: bool, arguments: tuple[Any, ...]) -> tuple[jax.Array, ...]:
+def _evaluate(loss: PlanLoss, *, gradient: bool, arguments: tuple[Any, ...]) -> tuple[jax.Array, ...]:
     """Call the loss on the host; return totals and terms, and the gradients if requested."""
     path, rate, weights, _ = arguments
     n, m = len(path), len(weights)
@@ -116,16 +118,16 @@ def _evaluate(loss: "PlanLoss", *, gradient: bool, arguments: tuple[Any, ...]) -
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _plan_loss(loss: "PlanLoss", *arguments: Any) -> tuple[jax.Array, ...]:
+def _plan_loss(loss: PlanLoss, *arguments: Any) -> tuple[jax.Array, ...]:
     return _evaluate(loss, gradient=False, arguments=arguments)
 
 
-def _loss_forward(loss: "PlanLoss", *arguments: Any) -> tuple[tuple[jax.Array, ...], tuple[Any, ...]]:
+def _loss_forward(loss: PlanLoss, *arguments: Any) -> tuple[tuple[jax.Array, ...], tuple[Any, ...]]:
     total, terms, *gradients = _evaluate(loss, gradient=True, arguments=arguments)
     return (total, terms), (total, gradients, arguments[-1])
 
 
-def _loss_backward(_loss: "PlanLoss", residual: tuple[Any, ...], by_results: tuple[jax.Array, ...]) -> tuple[Any, ...]:
+def _loss_backward(_loss: PlanLoss, residual: tuple[Any, ...], by_results: tuple[jax.Array, ...]) -> tuple[Any, ...]:
     total, (by_path, by_rate, by_weights), options = residual
     by_total = jnp.where(jnp.isfinite(total), by_results[0], 0)
     return (
@@ -140,7 +142,7 @@ _plan_loss.defvjp(_loss_forward, _loss_backward)
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _control_points(layer: "BoundaryLayer", tasks: Tasks, phi: jax.Array, log_rate: jax.Array) -> tuple[jax.Array, ...]:
+def _control_points(layer: BoundaryLayer, tasks: Tasks, phi: jax.Array, log_rate: jax.Array) -> tuple[jax.Array, ...]:
     spec = layer.problem.trajectory
     shapes = (len(phi), spec.path_control_points, len(layer.problem.robot.joints)), (len(phi), spec.rate_control_points)
 
@@ -151,12 +153,12 @@ def _control_points(layer: "BoundaryLayer", tasks: Tasks, phi: jax.Array, log_ra
     return _on_host(call, [jax.ShapeDtypeStruct(shape, phi.dtype) for shape in shapes], tasks, phi, log_rate)
 
 
-def _points_forward(layer: "BoundaryLayer", *arguments: Any) -> tuple[tuple[jax.Array, ...], tuple[Any, ...]]:
+def _points_forward(layer: BoundaryLayer, *arguments: Any) -> tuple[tuple[jax.Array, ...], tuple[Any, ...]]:
     return _control_points(layer, *arguments), arguments
 
 
 def _points_backward(
-    layer: "BoundaryLayer", residual: tuple[Any, ...], by_results: tuple[jax.Array, ...]
+    layer: BoundaryLayer, residual: tuple[Any, ...], by_results: tuple[jax.Array, ...]
 ) -> tuple[Any, jax.Array, jax.Array]:
     tasks, *outputs = residual
 

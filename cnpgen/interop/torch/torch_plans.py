@@ -1,5 +1,7 @@
 """Differentiable plans in torch: control points from network outputs, and their loss."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +22,7 @@ Function = Callable[..., tuple[Array, ...]]
 
 
 def control_points(
-    layer: "BoundaryLayer", tasks: "Tasks", phi: torch.Tensor, log_rate: torch.Tensor
+    layer: BoundaryLayer, tasks: Tasks, phi: torch.Tensor, log_rate: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Compute control points that meet the boundary conditions from network outputs; differentiable once.
 
@@ -54,13 +56,13 @@ def control_points(
 
 
 def plan_loss(
-    loss: "PlanLoss",
+    loss: PlanLoss,
     path: torch.Tensor,
     rate: torch.Tensor,
     *,
-    weights: "torch.Tensor | ArrayLike | Mapping[str, float]",
-    obstacle_poses: "torch.Tensor | ArrayLike | None" = None,
-    start_tip: "torch.Tensor | ArrayLike | None" = None,
+    weights: torch.Tensor | ArrayLike | Mapping[str, float],
+    obstacle_poses: torch.Tensor | ArrayLike | None = None,
+    start_tip: torch.Tensor | ArrayLike | None = None,
     shift: float = 0.0,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Evaluate the loss of N plans on the CPU; differentiable once in control points and weights.
@@ -102,7 +104,7 @@ class _PlanLoss(torch.autograd.Function):  # type: ignore[misc]
     """The loss with its gradient, which forward computes and backward only scales."""
 
     @staticmethod
-    def forward(loss: "PlanLoss", options: dict[str, Any], *arguments: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    def forward(loss: PlanLoss, options: dict[str, Any], *arguments: torch.Tensor) -> tuple[torch.Tensor, ...]:
         results = evaluate(loss, *(tensor.detach().numpy() for tensor in arguments), **options)
         return tuple(torch.from_numpy(result) for result in results)
 
