@@ -40,7 +40,9 @@ highlight_language = "none"  # blocks without a language
 autodoc_typehints_format = "short"
 autodoc_mock_imports = list(BRIDGES)  # the pages of the bridges need no framework
 napoleon_use_ivar = True  # attributes in docstrings describe those that autodoc lists
-linkcheck_ignore = [re.escape(DOCUMENTATION_URL)]
+linkcheck_ignore = [re.escape(DOCUMENTATION_URL), r"https?://(localhost|[\w.]*\bexample\.(org|com))\b"]  # not published
+linkcheck_timeout = 20  # [s]
+linkcheck_retries = 2
 
 html_theme = "furo"
 html_title = f"cnpgen {__version__}"
