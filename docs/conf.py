@@ -21,7 +21,7 @@ DOCS = Path(__file__).resolve().parent
 sys.path[:0] = [str(DOCS.parent), str(DOCS)]  # the package of this checkout; the scripts beside this file
 
 from gallery import CARDS, available, write_gallery  # noqa: E402
-from generate import public_objects  # noqa: E402
+from generate import BRIDGES, bridge_names, public_objects  # noqa: E402
 from notebooks import write_notebooks  # noqa: E402
 
 from cnpgen.machine.versions import DOCUMENTATION_URL, __version__  # noqa: E402
@@ -38,8 +38,11 @@ myst_heading_anchors = 4  # the anchors of headings are GitHub's
 smartquotes = False  # they would change --n
 highlight_language = "none"  # blocks without a language
 autodoc_typehints_format = "short"
+autodoc_mock_imports = list(BRIDGES)  # the pages of the bridges need no framework
 napoleon_use_ivar = True  # attributes in docstrings describe those that autodoc lists
-linkcheck_ignore = [re.escape(DOCUMENTATION_URL)]
+linkcheck_ignore = [re.escape(DOCUMENTATION_URL), r"https?://(localhost|[\w.]*\bexample\.(org|com))\b"]  # not published
+linkcheck_timeout = 20  # [s]
+linkcheck_retries = 2
 
 html_theme = "furo"
 html_title = f"cnpgen {__version__}"
@@ -104,12 +107,22 @@ def write_api_pages(app: Sphinx) -> None:
     folder.mkdir(exist_ok=True)
     for old in folder.glob("*.rst"):
         old.unlink()
-    for name, value in public_objects().items():
-        kind = "class" if inspect.isclass(value) else "function" if inspect.isroutine(value) else "data"
-        kind = "exception" if inspect.isclass(value) and issubclass(value, BaseException) else kind
+    objects, once = public_objects(), set[int]()
+    kinds = {name: _kind(value) for name, value in objects.items()}
+    for name, kind in (kinds | {name: kind for name, (kind, _) in bridge_names().items()}).items():
         members = "\n   :members:\n   :inherited-members: Exception, tuple, int, str" if kind == "class" else ""
+        repeated = id(objects.get(name, name)) in once
+        once.add(id(objects.get(name, name)))
+        members += "\n   :no-index:" if repeated else ""  # a name of two modules
         text = f"{name}\n{'=' * len(name)}\n\n.. auto{kind}:: {name}{members}\n"
         (folder / f"{name}.rst").write_text(text, encoding="utf-8")
+
+
+def _kind(value: object) -> str:
+    """Return the kind of a public object for autodoc."""
+    if inspect.isclass(value):
+        return "exception" if issubclass(value, BaseException) else "class"
+    return "function" if inspect.isroutine(value) else "data"
 
 
 def escape_bars(_: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:  # noqa: ARG001

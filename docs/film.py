@@ -1,6 +1,6 @@
 """Render the film of the README: python docs/film.py (extra `benchmark`).
 
-MuJoCo executes a hit, a transport and a transport among obstacles; the film is four times slower than real time.
+MuJoCo executes a hit, a transport and a transport among obstacles; the film has half the speed of the motions.
 """
 
 import tempfile
@@ -17,7 +17,7 @@ from cnpgen.cli.main import main as run
 FILM = Path(__file__).parent / "images" / "film.gif"
 CLIPS = {"airhockey-pucks": 36, "heavy-object": 0, "clutter": 0}  # recipe or page of the gallery -> problem
 SIZE = (400, 300)  # [pixels]
-FRAMES_PER_S = 12.5  # every second frame of a film of `cnpgen simulate`
+FRAMES_PER_S = 25  # every second frame of a film of `cnpgen simulate`, which is four times slower
 COLORS = 64
 
 

@@ -1,4 +1,4 @@
-"""Write the pages of the reference that follow from the code: keys, command line and public names.
+"""Write the pages of the reference that follow from the code, and the part of the first page that the README has, too.
 
     python docs/generate.py
 
@@ -6,6 +6,7 @@
 """
 
 import argparse
+import ast
 import importlib
 import inspect
 import re
@@ -14,11 +15,13 @@ from pathlib import Path
 from typing import Any
 
 import cnpgen
+import cnpgen.interop
 from cnpgen.cli.describe_keys import FILES, describe_keys
 from cnpgen.cli.main import build_parser
 
-FOLDER = Path(__file__).parent / "reference"
-MODULES = ("recipes", "losses", "results", "benchmark", "plugins", "errors")
+FOLDER = Path(__file__).parent
+MODULES = ("recipes", "losses", "results", "benchmark", "scenes", "trajectories", "plugins", "errors")
+BRIDGES = ("torch", "jax", "tensorflow")  # their modules are read without an import of the framework
 
 COMMANDS_INTRODUCTION = """\
 # Command line
@@ -46,6 +49,27 @@ def public_objects() -> dict[str, Any]:
             if getattr(cnpgen, name, None) is not getattr(module, name):
                 objects[f"cnpgen.{part}.{name}"] = getattr(module, name)
     return objects
+
+
+def bridge_names() -> dict[str, tuple[str, str]]:
+    """Return the public names of the bridges to frameworks: name -> (class or function, docstring)."""
+    folder = Path(cnpgen.interop.__path__[0])
+    names = {}
+    for framework in BRIDGES:
+        single = folder / f"{framework}.py"
+        for file in [single] if single.is_file() else sorted((folder / framework).glob("*.py")):
+            public = _imported(folder / framework / "__init__.py") if file != single else None
+            for node in ast.parse(file.read_text("utf-8")).body:
+                if isinstance(node, ast.ClassDef | ast.FunctionDef) and (public is None or node.name in public):
+                    kind = "class" if isinstance(node, ast.ClassDef) else "function"
+                    names[f"cnpgen.interop.{framework}.{node.name}"] = kind, ast.get_docstring(node) or ""
+    return dict(sorted(names.items()))
+
+
+def _imported(file: Path) -> set[str]:
+    """Return the names that a module imports."""
+    nodes = ast.walk(ast.parse(file.read_text("utf-8")))
+    return {alias.name for node in nodes if isinstance(node, ast.ImportFrom) for alias in node.names}
 
 
 def describe_commands() -> str:
@@ -93,17 +117,27 @@ def _help(action: argparse.Action) -> str:
 def describe_names() -> str:
     """List all public names in Markdown."""
     groups: dict[str, list[tuple[str, str]]] = {}
-    for name, value in public_objects().items():
-        documented = inspect.isclass(value) or inspect.isroutine(value)
-        summary = (
-            re.split(r"(?<=\.)\s", (inspect.getdoc(value) or "").replace("``", "`"))[0] if documented else "Constant."
-        )
+    texts = {name: _documentation(value) for name, value in public_objects().items()}
+    for name, text in (texts | {name: text for name, (_, text) in bridge_names().items()}).items():
+        summary = re.split(r"(?<=\.)\s", re.sub(r":\w+:`|``", "`", text))[0]
         module, _, short = name.rpartition(".")
         groups.setdefault(module, []).append((f"`{short}`", " ".join(summary.split())))
     parts = [NAMES_INTRODUCTION]
     for module, rows in groups.items():
         parts += [f"## `{module}`", _table(("name", "purpose"), rows)]
     return "\n\n".join(parts)
+
+
+def _documentation(value: Any) -> str:
+    return inspect.getdoc(value) or "" if inspect.isclass(value) or inspect.isroutine(value) else "Constant."
+
+
+def describe_index() -> str:
+    """Return the first page, with the sections of the README that help to decide on cnpgen."""
+    shared = (FOLDER.parent / "README.md").read_text(encoding="utf-8")
+    shared = shared[shared.index("## Two commands") : shared.index("## How it works")].replace("](docs/", "](")
+    page = (FOLDER / "index.md").read_text(encoding="utf-8")
+    return page[: page.index("## Two commands")] + shared + page[page.index("## Tutorials") :].rstrip("\n")
 
 
 def _table(head: tuple[str, str], rows: list[tuple[str, str]]) -> str:
@@ -121,9 +155,10 @@ def _escaped(text: str | None) -> str:
 
 
 PAGES = {
-    "keys.md": lambda: describe_keys(tuple(FILES)),
-    "cli.md": describe_commands,
-    "api.md": describe_names,
+    "reference/keys.md": lambda: describe_keys(tuple(FILES)),
+    "reference/cli.md": describe_commands,
+    "reference/api.md": describe_names,
+    "index.md": describe_index,
 }
 
 

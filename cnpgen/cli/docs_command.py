@@ -1,11 +1,13 @@
 """``cnpgen docs``: the documentation of this version, without a network."""
 
 import argparse
+import re
+from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from cnpgen.cli.parser import Commands, Parser, add_command, add_json
-from cnpgen.errors import MachineError, UsageError, lacks
+from cnpgen.errors import CnpgenError, MachineError, UsageError, lacks
 
 KINDS = ("tutorials", "how-to", "concepts", "reference", "benchmarks")
 
@@ -94,6 +96,15 @@ def page_url(page: Path) -> str:
     from cnpgen.machine.versions import DOCUMENTATION_URL
 
     return f"{DOCUMENTATION_URL}docs/{page.relative_to(docs_folder()).with_suffix('.html').as_posix()}"
+
+
+def mentioned_addresses(text: str) -> list[str]:
+    """Return the addresses of the pages that a text names as ``'cnpgen docs PAGE'``; none without installed pages."""
+    names = re.findall(r"'cnpgen docs ([\w/-]+)'", " ".join(text.split()))
+    with suppress(CnpgenError):
+        pages = list_pages() if names else {}
+        return [page_url(pages[name]) for name in dict.fromkeys(names) if name in pages]
+    return []
 
 
 def _text(page: Path) -> str:

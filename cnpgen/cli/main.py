@@ -44,6 +44,7 @@ from cnpgen.cli.shell import shell_spelling
 from cnpgen.cli.terminal import printing_safely
 from cnpgen.errors import CnpgenError, MachineError, RecipeError
 from cnpgen.machine.threads import prefer_one_thread
+from cnpgen.machine.versions import DOCUMENTATION_URL
 
 _COMMANDS = (
     make_command,
@@ -74,7 +75,7 @@ _COMMANDS = (
 
 _DESCRIPTION = "Generate and verify datasets for kinodynamic motion planning, train planners and optimize plans."
 
-_EPILOG = """\
+_EPILOG = f"""\
 examples:
   cnpgen list                                        list recipes
   cnpgen init my-arm --urdf arm.urdf                 recipes for your own arm
@@ -96,6 +97,8 @@ examples:
   cnpgen export plans.h5 --to joint-trajectory       export plans for robots and simulators
   cnpgen docs hit-a-puck                             read a page of the documentation
 
+documentation: {DOCUMENTATION_URL}, or 'cnpgen docs' without a network
+
 stdout is data, stderr everything else. Exit codes:
   0    done
   1    the answer is no: a dataset or a file is damaged, unfinished or of another problem; samples or plans are invalid
@@ -108,6 +111,16 @@ stdout is data, stderr everything else. Exit codes:
 """
 
 BROKEN_PIPE = 141  # 128 + SIGPIPE, as shells have it
+
+
+class _LinkedParser(Parser):
+    """A parser whose help ends with the addresses of the pages that it names."""
+
+    def format_help(self) -> str:
+        """Return the help."""
+        text = super().format_help()
+        addresses = docs_command.mentioned_addresses(text)
+        return "\n  ".join([f"{text}\non the site:", *addresses]) + "\n" if addresses else text
 
 
 class _Version(argparse.Action):
@@ -174,10 +187,10 @@ def _run(words: list[str], given: argparse.Namespace) -> int:
 
 def build_parser() -> Parser:
     """Build the parser of all commands."""
-    parser = Parser(prog="cnpgen", description=_DESCRIPTION, epilog=_EPILOG)
+    parser = _LinkedParser(prog="cnpgen", description=_DESCRIPTION, epilog=_EPILOG)
     parser.add_argument("--version", action=_Version, nargs=0, help="show the version")
     add_debug(parser)
-    commands = parser.add_subparsers(title="commands", metavar="COMMAND", parser_class=Parser)
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", parser_class=_LinkedParser)
     for command in _COMMANDS:
         command.add(commands)
     return parser
@@ -191,7 +204,8 @@ def _report(error: BaseException, options: Container[str]) -> int:
         return exit_code(error)
     lines, code = _explain(error, options)
     for line in lines:
-        print(f"cnpgen: error: {line}", file=sys.stderr)
+        addresses = "".join(f" ({address})" for address in docs_command.mentioned_addresses(line))
+        print(f"cnpgen: error: {line}{addresses}", file=sys.stderr)
     return code
 
 

@@ -70,3 +70,29 @@ def test_an_installation_without_pages_is_an_error_of_the_machine(monkeypatch, t
     monkeypatch.setattr(docs_command, "docs_folder", lambda: tmp_path)
     assert main(["docs", "verdict"]) == 3
     assert "reinstall cnpgen" in capsys.readouterr().err
+
+
+def test_help_has_the_addresses_of_the_site_and_of_the_pages_that_it_names(capsys):
+    assert main(["--help"]) == 0
+    assert f"documentation: {DOCUMENTATION_URL}, or 'cnpgen docs' without a network" in capsys.readouterr().out
+    assert main(["train", "--help"]) == 0
+    printed = capsys.readouterr().out
+    assert "'cnpgen docs training'" in " ".join(printed.split())
+    assert printed.endswith(f"on the site:\n  {DOCUMENTATION_URL}docs/how-to/training.html\n")
+
+
+def test_an_error_that_names_a_page_has_its_address(monkeypatch, capsys):
+    def broken(_):
+        raise ImportError("libcoal.so: cannot open shared object file")
+
+    monkeypatch.setattr("cnpgen.cli.doctor_command.run", broken)
+    assert main(["doctor"]) == 3
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.endswith(f"({DOCUMENTATION_URL}docs/how-to/troubleshooting.html)")
+
+
+def test_texts_without_installed_pages_have_no_addresses(monkeypatch, tmp_path):
+    text = "'cnpgen docs scale' or 'cnpgen docs\n  no-such-page'"
+    assert docs_command.mentioned_addresses(text) == [f"{DOCUMENTATION_URL}docs/how-to/scale.html"]
+    monkeypatch.setattr(docs_command, "docs_folder", lambda: tmp_path)
+    assert docs_command.mentioned_addresses(text) == []

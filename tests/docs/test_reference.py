@@ -10,11 +10,14 @@ import pytest
 
 from cnpgen.cli.docs_command import KINDS, list_pages
 from cnpgen.cli.main import build_parser
+from cnpgen.errors import CnpgenError
 from tests.docs.test_blocks import blocks
+from tests.test_public_names import MODULES
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 MAX_BYTES = 500_000  # of all Markdown in the wheel
+MIN_PICTURE_TEXT = 20  # [characters] a description, not a name
 
 
 def script(name: str) -> ModuleType:
@@ -33,9 +36,9 @@ def generator() -> ModuleType:
     return script("generate")
 
 
-@pytest.mark.parametrize("name", ["keys.md", "cli.md", "api.md"])
+@pytest.mark.parametrize("name", ["reference/keys.md", "reference/cli.md", "reference/api.md", "index.md"])
 def test_a_generated_page_is_what_the_code_says(generator: ModuleType, name: str) -> None:
-    page = (DOCS / "reference" / name).read_text(encoding="utf-8")
+    page = (DOCS / name).read_text(encoding="utf-8")
     assert page == generator.PAGES[name]() + "\n", "run: python docs/generate.py"
 
 
@@ -55,6 +58,19 @@ def test_every_public_name_has_a_summary_of_one_sentence(generator: ModuleType) 
     assert [name for name, summary in rows if not summary.endswith(".")] == []
 
 
+def test_the_page_of_names_has_all_public_modules(generator: ModuleType) -> None:
+    assert set(generator.MODULES) == set(MODULES)
+
+
+@pytest.mark.parametrize("framework", ["torch", "jax", "tensorflow"])
+def test_the_page_of_names_has_the_bridges_to_frameworks(generator: ModuleType, framework: str) -> None:
+    section = generator.describe_names().split(f"## `cnpgen.interop.{framework}`\n")[1].split("\n## ")[0]
+    names = re.findall(r"^\| `(\w+)` \| .*\. \|$", section, re.M)
+    assert {"torch": "TensorLoss", "jax": "plan_loss", "tensorflow": "to_tensorflow"}[framework] in names
+    module = pytest.importorskip(f"cnpgen.interop.{framework}", exc_type=CnpgenError)
+    assert names == sorted(getattr(module, "__all__", [f"to_{framework}"]))
+
+
 def test_every_page_is_of_one_kind_and_in_the_index() -> None:
     index = (DOCS / "index.md").read_text(encoding="utf-8")
     pages = {path.relative_to(DOCS) for path in DOCS.rglob("*.md")} - {Path("index.md")}
@@ -66,13 +82,26 @@ def test_every_page_is_of_one_kind_and_in_the_index() -> None:
     assert len(names) == len(set(names)), "'cnpgen docs NAME' needs unique names"
 
 
-def test_concepts_have_a_picture_and_all_pictures_have_a_text() -> None:
+def test_concepts_have_a_picture() -> None:
     for name in ("splines", "constraint-manifold", "certification", "verdict", "scenes"):
-        assert re.search(
-            r"!\[[^\]]{20,}\]\(\.\./images/", (DOCS / "concepts" / f"{name}.md").read_text(encoding="utf-8")
-        )
-    for page in [ROOT / "README.md", *DOCS.rglob("*.md")]:
-        assert "![](" not in page.read_text(encoding="utf-8"), f"{page.name}: a picture without alternative text"
+        assert pictures(DOCS / "concepts" / f"{name}.md"), name
+
+
+def test_every_picture_has_an_alternative_text() -> None:
+    pages = [
+        *ROOT.glob("*.md"),
+        *(path for name in ("docs", "datasets", "problems", "pipelines") for path in (ROOT / name).rglob("*.md")),
+    ]
+    texts = {(page.name, file): text for page in pages for text, file in pictures(page)}
+    assert len(texts) > 15
+    assert {key: text for key, text in texts.items() if len(text) < MIN_PICTURE_TEXT} == {}
+
+
+def pictures(page: Path) -> list[tuple[str, str]]:
+    """Return the alternative text and the file of each picture of a page."""
+    text = page.read_text(encoding="utf-8")
+    assert "<img" not in text, f"{page.name}: write pictures in Markdown"
+    return re.findall(r"!\[([^\]]*)\]\(([^)\s]+)\)", text)
 
 
 def test_the_pages_are_small_enough_for_the_wheel() -> None:

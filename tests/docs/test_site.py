@@ -3,10 +3,12 @@
 import json
 import re
 import shutil
+import socket
 import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -87,6 +89,7 @@ def test_every_public_name_has_a_page_with_its_signature(site: Path) -> None:
     pages = {path.stem.rpartition(".")[2]: path for path in (site / "docs" / "reference" / "api").glob("*.html")}
     assert set(names) == set(pages)
     assert 'id="cnpgen.make_dataset"' in pages["make_dataset"].read_text(encoding="utf-8")
+    assert 'id="cnpgen.interop.torch.TensorLoss"' in pages["TensorLoss"].read_text(encoding="utf-8")
     assert "certify" in pages["make_dataset"].read_text(encoding="utf-8")
 
 
@@ -109,6 +112,39 @@ def test_a_broken_link_fails_the_build(mistake: str, tmp_path: Path) -> None:
     done = build(source, tmp_path / "site", builder="dummy")  # resolves links and writes nothing
     assert done.returncode != 0
     assert "scenes.md" in done.stderr
+
+
+@pytest.mark.extended
+def test_the_check_of_external_links_finds_a_broken_one(tmp_path: Path) -> None:
+    for library in ("sphinx", "myst_parser", "furo"):
+        pytest.importorskip(library)
+    (tmp_path / "pages").mkdir()
+    (tmp_path / "pages" / "there.html").write_text("<p>here</p>", encoding="utf-8")
+    source = copy_of_the_repository(tmp_path / "source")
+    with serve(tmp_path / "pages") as address:
+        links = [f"[a]({address}/there.html)", f"[b]({address}/gone.html)", "[c](https://cnpgen.example.org/gone)"]
+        with (source / "docs" / "concepts" / "scenes.md").open("a", encoding="utf-8") as page:
+            page.write("\n" + " ".join(links) + "\n")
+        done = build(source, tmp_path / "links", builder="linkcheck")
+    lines = [json.loads(line) for line in (tmp_path / "links" / "output.json").read_text(encoding="utf-8").splitlines()]
+    status = {line["uri"]: line["status"] for line in lines}
+    assert status[f"{address}/there.html"] == "working"
+    assert status[f"{address}/gone.html"] == "broken"
+    assert status["https://cnpgen.example.org/gone"] == "ignored"
+    assert done.returncode != 0
+    outside = {uri for uri in status if "127.0.0.1" not in uri and "example.org" not in uri}
+    assert len(outside) > 5
+    if has_network():
+        assert {uri for uri in outside if status[uri] == "broken"} == set()
+
+
+def has_network() -> bool:
+    """Return whether addresses outside of this machine can be reached."""
+    try:
+        socket.create_connection(("github.com", 443), timeout=5).close()
+    except OSError:
+        return False
+    return True
 
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -140,13 +176,20 @@ class _Quiet(SimpleHTTPRequestHandler):
         """Do not log requests."""
 
 
-@pytest.fixture(scope="module")
-def address(site: Path) -> Iterator[str]:
-    """Address at which the site is served."""
-    with ThreadingHTTPServer(("127.0.0.1", 0), partial(_Quiet, directory=str(site))) as server:
+@contextmanager
+def serve(folder: Path) -> Iterator[str]:
+    """Serve a folder; yield its address."""
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(_Quiet, directory=str(folder))) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         yield f"http://127.0.0.1:{server.server_port}"
         server.shutdown()
+
+
+@pytest.fixture(scope="module")
+def address(site: Path) -> Iterator[str]:
+    """Address at which the site is served."""
+    with serve(site) as url:
+        yield url
 
 
 def chromium(profile: Path, url: str, *options: str, budget: int = 8_000) -> subprocess.CompletedProcess[str]:

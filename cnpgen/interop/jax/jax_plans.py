@@ -1,5 +1,7 @@
 """Differentiable plans in JAX: control points from network outputs, and their loss; both may be jitted."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 from dataclasses import fields
 from functools import partial

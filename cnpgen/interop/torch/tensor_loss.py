@@ -1,5 +1,7 @@
 """The loss of plans in torch operations, on the device of its arguments, differentiable any number of times."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from typing import Any
 
@@ -61,9 +63,9 @@ class TensorLoss:
         path: torch.Tensor,
         rate: torch.Tensor,
         *,
-        weights: "torch.Tensor | ArrayLike | Mapping[str, float]",
-        obstacle_poses: "torch.Tensor | ArrayLike | None" = None,
-        start_tip: "torch.Tensor | ArrayLike | None" = None,
+        weights: torch.Tensor | ArrayLike | Mapping[str, float],
+        obstacle_poses: torch.Tensor | ArrayLike | None = None,
+        start_tip: torch.Tensor | ArrayLike | None = None,
         shift: float = 0.0,
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Evaluate the loss of N plans in the type of the path, at least float32.

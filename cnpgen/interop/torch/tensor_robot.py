@@ -1,5 +1,7 @@
 """The robot of a problem in torch: kinematics, dynamics and constraints, differentiable any number of times."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path

@@ -4,6 +4,8 @@ The tape is the one that becomes C code. Each operation runs on all points of a 
 motions are efficient; ``torch.compile`` fuses the operations.
 """
 
+from __future__ import annotations
+
 import operator
 from collections.abc import Callable, Sequence
 from typing import Any

@@ -1,5 +1,7 @@
 """Batches as tensors in NumPy's memory, with and without a ``DataLoader``."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -47,7 +49,7 @@ class TensorBatch(dict[str, torch.Tensor]):
         """Field name -> its columns of the table."""
         return self.layout.slices
 
-    def to(self, device: torch.device | str | int, *, non_blocking: bool = False) -> "TensorBatch":
+    def to(self, device: torch.device | str | int, *, non_blocking: bool = False) -> TensorBatch:
         """Copy a batch to a device, with one transfer of the table."""
         options = {"device": device, "non_blocking": non_blocking}
         integers = {field.name: self[field.name].to(**options) for field in self.layout.integers}

@@ -1,5 +1,7 @@
 """Differentiable plans in torch: control points from network outputs, and their loss."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -56,9 +58,9 @@ def plan_loss(
     path: torch.Tensor,
     rate: torch.Tensor,
     *,
-    weights: "torch.Tensor | ArrayLike | Mapping[str, float]",
-    obstacle_poses: "torch.Tensor | ArrayLike | None" = None,
-    start_tip: "torch.Tensor | ArrayLike | None" = None,
+    weights: torch.Tensor | ArrayLike | Mapping[str, float],
+    obstacle_poses: torch.Tensor | ArrayLike | None = None,
+    start_tip: torch.Tensor | ArrayLike | None = None,
     shift: float = 0.0,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Evaluate the loss of N plans on the CPU; differentiable once in control points and weights.

@@ -1,5 +1,7 @@
 """Single rows as tensors, for the samplers of torch."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -48,7 +50,7 @@ class RowDataset(data.Dataset[Tensors]):  # type: ignore[misc]
     def __getitem__(self, index: int) -> Tensors:
         return {name: values[0] for name, values in self.__getitems__([index]).fields.items()}
 
-    def __getitems__(self, indices: Sequence[int]) -> "ReadRows":
+    def __getitems__(self, indices: Sequence[int]) -> ReadRows:
         rows = self._dataset.rows(
             self._split, indices, fields=self._fields, normalize=self._normalize, dtype=self._dtype
         )

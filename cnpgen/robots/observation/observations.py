@@ -103,7 +103,7 @@ class CameraCloud(Observation):
 
 @dataclass(frozen=True, kw_only=True)
 class DistanceGrid(Observation):
-    """Signed distances at the points of a grid: ``distances``, shape (N, *shape), float32, m; inf without bodies.
+    """Signed distances at the points of a grid: ``distances`` [m], shape (N, X, Y, Z), float32; inf without bodies.
 
     Attributes:
         low: Lower corner of the grid in the world frame [m].
