@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from cnpgen.plans.load_trajectories import LoadedTrajectories
     from cnpgen.problems.problem import Problem
 
-TRAJECTORY_OPTIONS = ("joints", "unit", "rate", "separate_by", "unwrap")  # of load_trajectories
+TRAJECTORY_OPTIONS = ("joints", "unit", "rate", "separate_by", "unwrap", "parameters")  # of load_trajectories
 MAX_IGNORED = 8  # unused columns that are listed
 
 
@@ -27,6 +27,8 @@ def add_trajectory_options(option: Options) -> None:
     add("--separate-by", metavar="COLUMN", help="column whose value differs from trajectory to trajectory")
     add("--unwrap", action="store_true", default=None, help="continue angles that jump by more than half a turn")
 
+    text = "values of the problem's parameters that the file does not have, such as payload_mass=6kg"
+    add("--parameters", metavar="NAME=V,...", type=values.parameters, help=text)
     text = "body at the tip, in place of the problem's: mass [kg], or mass and centre of mass in the tip frame [m]"
     add("--payload", metavar="M[,X,Y,Z]", type=values.payload, help=text)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -11,10 +11,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import UsageError
+from cnpgen.errors import UsageError, either, nearest
 from cnpgen.plans.trajectory_tables import TrajectoryTable, read_trajectory_tables
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import ProblemRecord, as_record, open_problem
+from cnpgen.robots.parameter_ranges import PARAMETER_UNITS
 from cnpgen.robots.plausible_values import UnitError, find_implausible_value
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.argument_types import checked_arguments
@@ -62,6 +63,7 @@ class _Options:
     rate: float | None
     separate_by: str | None
     unwrap: bool
+    parameters: Mapping[str, float]
 
 
 @checked_arguments
@@ -74,6 +76,7 @@ def load_trajectories(
     rate: float | None = None,
     separate_by: str | None = None,
     unwrap: bool = False,
+    parameters: Mapping[str, float] | None = None,
 ) -> LoadedTrajectories:
     """Load sampled trajectories from a file or a folder; 'cnpgen docs trajectories' lists formats and columns.
 
@@ -86,6 +89,7 @@ def load_trajectories(
         rate: Samples per second [Hz] of a file without times.
         separate_by: Column whose value differs from trajectory to trajectory.
         unwrap: Whether revolute joints that jump by more than half a turn have passed the end of the range of angles.
+        parameters: Values of the problem's parameters that the file does not have, by name, in SI units.
 
     Raises:
         UsageError: A column is missing, a value is not finite, times do not increase, or the file is damaged.
@@ -99,7 +103,8 @@ def load_trajectories(
         raise UsageError(f"must have {len(record.joint_names)} names, {expected}, got {list(names)}", argument="joints")
     if rate is not None and not number("rate", rate) > 0:
         raise UsageError(f"must be above 0, got {rate}", argument="rate")
-    options = _Options(record, names, unit == "deg", rate, separate_by, unwrap)
+    _check_parameters(record, parameters or {})
+    options = _Options(record, names, unit == "deg", rate, separate_by, unwrap, parameters or {})
     try:
         found = [
             (part.place, *_trajectory(part, options))
@@ -138,7 +143,11 @@ def _separated(table: TrajectoryTable, separate_by: str | None) -> Iterator[Traj
             raise UsageError(f"{table.place}: columns must have one value per row each, got {sorted(lengths)} values")
         key = table.columns[separate_by]
         for value in dict.fromkeys(key.tolist()):
-            rows = {name: values[key == value] for name, values in table.columns.items() if name != separate_by}
+            rows = {
+                name: values[key == value] if values.ndim else values
+                for name, values in table.columns.items()
+                if name != separate_by
+            }
             lines = tuple(np.array(table.lines)[key == value].tolist()) if table.lines else ()
             yield TrajectoryTable(f"{table.place}: {separate_by} {value}", rows, table.joint_names, lines)
     elif stacked:
@@ -149,6 +158,8 @@ def _separated(table: TrajectoryTable, separate_by: str | None) -> Iterator[Traj
                 for name, values in table.columns.items()
                 if values.ndim == 3 or _plain(name) in TIME_NAMES
             }
+            of_all = {name: values for name, values in table.columns.items() if _plain(name) in PARAMETER_UNITS}
+            parts |= {name: values[index] if values.shape == (count,) else values for name, values in of_all.items()}
             yield TrajectoryTable(f"{table.place}: trajectory {index}", parts, table.joint_names)
     else:
         yield table
@@ -169,11 +180,43 @@ def _trajectory(table: TrajectoryTable, options: _Options) -> tuple[Trajectory, 
         turning = [not sliding for sliding in options.record.sliding_joints]
         q[:, turning] = np.unwrap(q[:, turning], axis=0)
     try:
-        trajectory = Trajectory(t - t[0], q, columns["dq"], columns["ddq"])
+        trajectory = Trajectory(t - t[0], q, columns["dq"], columns["ddq"], _parameters(table, options, used))
     except UsageError as error:
         raise UsageError(f"{table.place}: {error}") from error
     unused = [name for name in table.columns if name not in used and not _is_unused_kind(name)]
     return trajectory, unused
+
+
+def _check_parameters(record: ProblemRecord, parameters: Mapping[str, float]) -> None:
+    """Check the names of stated parameters."""
+    known = record.parameters.names
+    for name in parameters:
+        if name not in known:
+            expected = f"expected {either(known)}{nearest(name, known)}" if known else "the problem has no parameters"
+            raise UsageError(f"{name!r} is not a parameter of {record.name!r}: {expected}", argument="parameters")
+
+
+def _parameters(table: TrajectoryTable, options: _Options, used: set[str]) -> Array | None:
+    """Return the values of the problem's parameters, shape (p,); None if some are missing."""
+    ranges, plain = options.record.parameters, {_plain(name): name for name in table.columns}
+    found = dict(options.parameters)
+    units = dict(zip(ranges.names, ranges.value_units, strict=True))
+    for parameter, unit in units.items():
+        if (name := plain.get(parameter)) is None:
+            continue
+        used.add(name)
+        values = np.unique(_numbers(table, name, ndim=table.columns[name].ndim and 1))
+        if len(values) != 1:
+            raise UsageError(f"{table.place}: {name} must have one value, got {values[0]:g} and {values[-1]:g}")
+        found[parameter] = float(values[0]) * _factor(table, name, unit, 1.0)
+    if not units or found.keys() != units.keys():
+        return None
+    values = np.array([found[name] for name in units])
+    try:
+        ranges.checked(values)
+    except UsageError as error:
+        raise UsageError(f"{table.place}: {error}", argument=error.argument) from error
+    return values
 
 
 def _times(table: TrajectoryTable, options: _Options, count: int, used: set[str]) -> Array:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import CnpgenError, DatasetError, UsageError, either, requires_extra
 from cnpgen.problems.scenes.yaml_document import read_yaml
+from cnpgen.robots.parameter_ranges import PARAMETER_UNITS
 from cnpgen.store.files.atomic import machine_error, read_file
 from cnpgen.store.files.csv_table import read_csv_table
 from cnpgen.store.files.documents import parse_json
@@ -27,9 +28,11 @@ Values = NDArray[Any]
 MAX_ARCHIVE_BYTES = 1 << 32  # of the arrays of an archive
 HELD_JOINTS_FILE = "held_joints.yaml"  # beside exported plans; it holds no trajectory
 LEROBOT_INFO = "meta/info.json"  # in a folder of LeRobot
+LEROBOT_ENVIRONMENT = "observation.environment_state"
 JOINT_NAMES_KEY = b"cnpgen_joint_names"  # of the metadata of Parquet tables, as JSON
 PLAN_COLUMN = "plan"
-_PART_OF_ARCHIVE = re.compile(r"(.+)_(t|q|dq|ddq|jerk)")  # one array of a plan in an archive of cnpgen
+# of an array of one plan in an archive of cnpgen
+_PART_OF_ARCHIVE = re.compile(rf"(.+?)_(t|q|dq|ddq|jerk|{'|'.join(PARAMETER_UNITS)})")
 _POINT_FIELDS = {"positions": "q", "velocities": "dq", "accelerations": "ddq"}
 _NESTING = ("joint_trajectory", "trajectory", "trajectories", "solution")  # keys of messages that hold messages
 
@@ -200,17 +203,22 @@ def _read_lerobot(folder: Path) -> Iterator[TrajectoryTable]:
     if not version.startswith("v3"):
         raise UsageError(f"{folder} has LeRobot's format {version}, expected v3.0: convert it with LeRobot")
     names = _feature_names(features[key].get("names"), width)
+    described = features.get(LEROBOT_ENVIRONMENT, {}).get("names")
+    described = _feature_names(described, len(described) if isinstance(described, list) else 0)
+    parameters = {name: k for k, name in enumerate(described) if name in PARAMETER_UNITS}
     for path in sorted(folder.glob("data/*/*.parquet")):
         table = read_parquet(path)
-        missing = [name for name in ("timestamp", "episode_index", key) if name not in table.column_names]
+        needed = ("timestamp", "episode_index", key, *([LEROBOT_ENVIRONMENT] if parameters else []))
+        missing = [name for name in needed if name not in table.column_names]
         if missing:
             raise UsageError(f"{path}: there is no column {missing[0]!r}, only {', '.join(table.column_names)}")
-        times, episodes, values = (_parquet_column(table, name, path) for name in ("timestamp", "episode_index", key))
+        times, episodes, values, *environment = (_parquet_column(table, name, path) for name in needed)
         values = values.reshape(len(times), -1)
         for episode in dict.fromkeys(episodes.tolist()):
             rows = episodes == episode
             columns: dict[str, Values] = {"t": times[rows].astype(float)}
             columns |= {name: values[rows, k].astype(float) for k, name in enumerate(names)}
+            columns |= {name: environment[0][rows, k].astype(float) for name, k in parameters.items()}
             yield TrajectoryTable(f"{folder}: episode {episode}", columns)
 
 

@@ -27,6 +27,7 @@ class Trajectory:
         q: Joint positions [rad], shape (K, n).
         dq: Joint velocities [rad/s], shape (K, n), or None.
         ddq: Joint accelerations [rad/s^2], shape (K, n), or None.
+        parameters: Values of the problem's parameters in SI units, shape (p,); None without parameters.
 
     Raises:
         UsageError: A shape is wrong, the times do not increase from 0, or a value is not finite.
@@ -36,6 +37,7 @@ class Trajectory:
     q: Array
     dq: Array | None = None
     ddq: Array | None = None
+    parameters: Array | None = None
 
     def __post_init__(self) -> None:
         t, q, dq = checked_samples(self.t, self.q, self.dq)
@@ -44,7 +46,10 @@ class Trajectory:
             if dq is None:
                 raise UsageError("a trajectory with accelerations needs velocities, too", concerns="ddq")
             ddq = checked_samples(t, q, self.ddq)[2]
-        for name, values in (("t", t), ("q", q), ("dq", dq), ("ddq", ddq)):
+        parameters = None if self.parameters is None else numbers("parameters", self.parameters)
+        if parameters is not None and parameters.ndim != 1:
+            raise UsageError(f"must have shape (p,), got {parameters.shape}", argument="parameters")
+        for name, values in (("t", t), ("q", q), ("dq", dq), ("ddq", ddq), ("parameters", parameters)):
             object.__setattr__(self, name, values)  # lists become arrays
         if self.t[0] != 0:
             raise UsageError(f"a trajectory begins at t = 0, got {self.t[0]} s", concerns="t")

@@ -12,7 +12,6 @@ from itertools import chain, product
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import UsageError
 from cnpgen.judges.plans.bernstein import find_maximum
 from cnpgen.judges.plans.continuous_collision import check_continuous_collision, is_contact, pairs_of
 from cnpgen.judges.plans.evaluated_trajectory import EvaluatedTrajectory
@@ -28,6 +27,7 @@ from cnpgen.judges.trajectories.uncertainty import uncertainty_of
 from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
+from cnpgen.robots.solid import pose_width
 from cnpgen.world.path import PathWorld
 
 Array = NDArray[np.float64]
@@ -45,66 +45,79 @@ class FamilyJudge:
         step: Maximum time between checked times [s].
 
     Raises:
-        UsageError: The step is not positive, or too long, or the problem has parameters.
+        UsageError: The step is not positive, or too long.
     """
 
     def __init__(self, problem: Problem, robot: Robot, *, step: float = 1e-3) -> None:
         check_step(step)
-        if problem.parameters:
-            names = ", ".join(problem.parameters.names)
-            raise UsageError(f"sampled trajectories of {problem.name!r} are not judged: they have no values of {names}")
         self._problem, self._robot, self._step = problem, robot, step
         self._world, self._moved = (PathWorld(robot, problem.obstacle, problem.object_size) for _ in range(2))
         self._limits = joint_limits(problem, self._world)
 
-    @property
-    def limits(self) -> ProvenJointLimits:
-        """Joint limits of the problem."""
-        return self._limits
+    def limits(self, parameters: Array | None = None) -> ProvenJointLimits:
+        """Return the joint limits of the problem with parameters of shape (p,), nominal by default."""
+        names = self._problem.parameters.names
+        return self._limits if parameters is None else self._limits.scaled(dict(zip(names, parameters, strict=True)))
 
-    def __call__(self, family: CurveFamily) -> TrajectoryVerdict:
-        """Judge one family; values that cannot be evaluated give an undecided verdict."""
+    def __call__(
+        self, family: CurveFamily, parameters: Array | None = None, *, scene: Array | None = None
+    ) -> TrajectoryVerdict:
+        """Judge one family; values that cannot be evaluated give an undecided verdict.
+
+        Args:
+            family: The curves.
+            parameters: Values of the problem's parameters, shape (p,); nominal by default.
+            scene: Poses and sizes of the obstacles, then values for a constraint and parameters, shape (width,). By
+                default, they follow from the ends of the curves and the parameters.
+        """
         if not family.duration < MAX_DURATION_S or len(family.t) > MAX_TIME_SAMPLES:
             reason = f"{Reason.TOO_LONG}: at most {MAX_DURATION_S:g} s and {MAX_TIME_SAMPLES:,} samples are judged"
             return TrajectoryVerdict(Decision.UNDECIDED, reason, duration=family.duration)
         with np.errstate(all="ignore"):  # overflows give inf or nan, which are detected
-            return self._judge(family)
+            return self._judge(family, parameters, scene)
 
-    def _judge(self, family: CurveFamily) -> TrajectoryVerdict:
+    def _judge(self, family: CurveFamily, parameters: Array | None, scene: Array | None) -> TrajectoryVerdict:
         s = checked_phases(family, self._step)
         table = np.array([[0.0, 1.0], [0.0, family.duration]])
         samples = Samples(s, times(s, table))
         states = family.evaluate(s, jerk=self._problem.uses_jerk)
         if not states.is_finite():
             return TrajectoryVerdict(Decision.UNDECIDED, Reason.NOT_FINITE, duration=family.duration, samples=len(s))
-        poses = self._obstacle_poses(states.q, states.dq)
-        scenes = self._possible_scenes(family, states, poses)
+        if scene is None:
+            poses = self._obstacle_poses(states.q, states.dq, parameters)
+            scenes = self._possible_scenes(family, states, poses, parameters)
+        else:
+            poses, scenes = scene, []
         self._world.set_path(states.q, states.dq, states.ddq, poses, states.jerk)
         context = evaluation_context(self._problem, family, poses, self._world, samples, table)
         errors = uncertainty_of(self._problem, family, self._moved, [poses, *scenes], context.measured, s)
         measured = [errors.add(condition, s) for condition in context.measured]
         context = replace(context, measured=measured, with_uncertainty=errors.add)
-        entries = [*_limit_entries(self._limits, family, samples), *_measured_entries(context)]
+        limits = self._limits.scaled(self._world.parameters.values)
+        entries = [*_limit_entries(limits, family, samples), *_measured_entries(context)]
         names = list(by_name([entry.margin for entry in entries]))
         conditions = dict(zip(names, (entry.decided() for entry in entries), strict=True))
         return _verdict(conditions, family.duration, len(s))
 
-    def _obstacle_poses(self, q: Array, dq: Array) -> Array:
+    def _obstacle_poses(self, q: Array, dq: Array, parameters: Array | None) -> Array:
         """Place the obstacles, and the puck of a hit, by the tip at both ends."""
         (ends, speeds), still = (np.ascontiguousarray(x[:, [0, -1]]) for x in (q, dq)), np.zeros((len(q), 2))
         poses = scene_of(self._problem, *np.zeros((3, 1, 3))).poses[0]
         self._world.set_path(ends, speeds, still, poses, still)
         start, goal = self._world.tip_position.T[:, None].copy()
-        return np.asarray(scene_of(self._problem, start, goal, self._world.tip_velocity[:, 1:].T).poses[0])
+        rows = None if parameters is None else parameters[None]
+        return np.asarray(scene_of(self._problem, start, goal, self._world.tip_velocity[:, 1:].T, rows).poses[0])
 
-    def _possible_scenes(self, family: CurveFamily, states: EvaluatedTrajectory, poses: Array) -> list[Array]:
+    def _possible_scenes(
+        self, family: CurveFamily, states: EvaluatedTrajectory, poses: Array, parameters: Array | None
+    ) -> list[Array]:
         """Return scenes whose values of the motion, such as a puck, are those of other curves of the family."""
         if self._problem.scene_constraint is None:
             return []
         position, velocity, acceleration = (bound[-1] for bound in family.bounds[:3])
         if (acceleration >= UNDEFINED).all():  # velocities jump between spans
             velocity = velocity + np.abs(states.dq[:, -1] - family.polynomials.dq[-1, max(len(family.t) - 3, 0)])
-        scenes, known = [], self._problem.scene_width - self._problem.scene_constraint.scene_width
+        scenes, known = [], pose_width(self._problem.obstacle)
         for (order, bound), sign in product({"q": position, "dq": velocity}.items(), (-1.0, 1.0)):
             if not bound.any():
                 continue
@@ -112,7 +125,7 @@ class FamilyJudge:
                 ends = {name: getattr(states, name)[:, [0, -1]].copy() for name in ("q", "dq")}
                 moved = slice(None) if joint is None else joint
                 ends[order][moved, -1] += sign * bound[moved]
-                scene = self._obstacle_poses(ends["q"], ends["dq"])
+                scene = self._obstacle_poses(ends["q"], ends["dq"], parameters)
                 scenes.append(np.concatenate([poses[:known], scene[known:]]))
         return scenes
 

@@ -31,18 +31,19 @@ def judge_samples(judge: FamilyJudge, trajectory: Trajectory, noise: Array) -> T
         trajectory: The samples.
         noise: Largest errors of positions, velocities and accelerations [rad, rad/s, rad/s^2], shape (3,).
     """
-    limits = acceleration_limits(judge.limits)
+    parameters = trajectory.parameters
+    limits = acceleration_limits(judge.limits(parameters))
     if trajectory.dq is None and not noise.any() and np.diff(trajectory.t).max() <= MAX_LINEAR_SPAN_S:
-        return judge(interpolated(trajectory, "linear", noise))
+        return judge(interpolated(trajectory, "linear", noise), parameters)
     if not noise.any() and is_resolved(trajectory, limits.acceleration):
         curves = [smooth_curve(trajectory, limits)]
         if trajectory.ddq is not None:
             curves.insert(0, family_of_data(trajectory.t, data_of(trajectory)))
         for curve in curves:
-            verdict = None if curve is None else judge(curve)
+            verdict = None if curve is None else judge(curve, parameters)
             if verdict is not None and verdict.valid:
                 return verdict
-    return judge(resolved_curves(trajectory, noise, limits.acceleration))
+    return judge(resolved_curves(trajectory, noise, limits.acceleration), parameters)
 
 
 def acceleration_limits(limits: ProvenJointLimits) -> AccelerationLimits:

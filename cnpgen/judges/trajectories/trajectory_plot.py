@@ -41,6 +41,7 @@ def plot_trajectory(
     world = PathWorld(robot, problem.obstacle, problem.object_size)
     q, dq, ddq = (np.ascontiguousarray(values.T) for values in trajectory.states(t))
     jerk = np.ascontiguousarray(trajectory.jerks(t).T) if problem.uses_jerk else None
+    parameters = np.empty(0) if trajectory.parameters is None else trajectory.parameters
     with np.errstate(all="ignore"):
-        world.set_path(q, dq, ddq, place_obstacles(problem.obstacle), jerk)
+        world.set_path(q, dq, ddq, np.append(place_obstacles(problem.obstacle), parameters), jerk)
     draw_path(problem, world, t / trajectory.duration, t, Path(path), scene=None, title=title, margins=margins)
