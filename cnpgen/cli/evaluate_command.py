@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 _TEXT = """\
 Every plan is checked on a fine time grid and between its samples ('cnpgen docs verdict'). The exit code is 0 if every
-plan is valid, and 1 if a plan is invalid, if the file holds no plans, or if it is damaged. --workers changes only the
-time.
+plan is valid, and 1 if a plan is invalid, if the file holds no plans, or if it is damaged. It is 2 for files of
+another kind. --workers changes only the time.
 
 With --problem, FILE may also hold sampled trajectories: CSV, JSON, YAML, NPZ, HDF5 or Parquet, messages of ROS and
 MoveIt, or a folder of such files ('cnpgen docs trajectories'). Each trajectory and condition is valid, invalid or

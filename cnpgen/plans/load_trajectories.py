@@ -32,6 +32,8 @@ KIND_NAMES = {
     "dq": ("dq", "qd", "velocity", "velocities", "vel"),
     "ddq": ("ddq", "qdd", "acceleration", "accelerations", "acc"),
 }
+MIN_DOUBTFUL_STEP_S = 0.5  # of times without a unit
+MAX_DOUBTFUL_SPEED = 2e-3  # relative to the velocity limits; twice the limit if the times are milliseconds
 UNUSED_KINDS = ("jerk", "effort", "efforts")  # not reported as ignored
 _UNIT = re.compile(r"\s*\[([^\]]*)\]\s*$")
 _SEPARATORS = (" ", "_", ".", "/", ":", "")
@@ -64,6 +66,7 @@ class _Options:
     separate_by: str | None
     unwrap: bool
     parameters: Mapping[str, float]
+    velocity_limit: Array
 
 
 @checked_arguments
@@ -93,7 +96,7 @@ def load_trajectories(
 
     Raises:
         UsageError: A column is missing, a value is not finite, times do not increase, or the file is damaged.
-        UnitError: Positions without a unit are probably in degrees or millimetres.
+        UnitError: Positions without a unit are probably in degrees or millimetres, or times in milliseconds.
         MissingExtraError: The format needs a package that is not installed.
     """
     record = as_record(problem)
@@ -104,7 +107,8 @@ def load_trajectories(
     if rate is not None and not number("rate", rate) > 0:
         raise UsageError(f"must be above 0, got {rate}", argument="rate")
     _check_parameters(record, parameters or {})
-    options = _Options(record, names, unit == "deg", rate, separate_by, unwrap, parameters or {})
+    robot = open_problem(record)[1]
+    options = _Options(record, names, unit == "deg", rate, separate_by, unwrap, parameters or {}, robot.velocity_limit)
     try:
         found = [
             (part.place, *_trajectory(part, options))
@@ -115,7 +119,7 @@ def load_trajectories(
         error.argument = error.argument or "path"
         raise
     if unit == "rad":
-        _check_unit(path, open_problem(record)[1], [trajectory.q for _, trajectory, _ in found])
+        _check_unit(path, robot, [trajectory.q for _, trajectory, _ in found])
     ignored = dict.fromkeys(name for *_, unused in found for name in unused)
     return LoadedTrajectories(
         tuple(trajectory for _, trajectory, _ in found), tuple(place for place, *_ in found), tuple(ignored)
@@ -183,6 +187,7 @@ def _trajectory(table: TrajectoryTable, options: _Options) -> tuple[Trajectory, 
         trajectory = Trajectory(t - t[0], q, columns["dq"], columns["ddq"], _parameters(table, options, used))
     except UsageError as error:
         raise UsageError(f"{table.place}: {error}") from error
+    _check_times(table, trajectory, options)
     unused = [name for name in table.columns if name not in used and not _is_unused_kind(name)]
     return trajectory, unused
 
@@ -221,7 +226,7 @@ def _parameters(table: TrajectoryTable, options: _Options, used: set[str]) -> Ar
 
 def _times(table: TrajectoryTable, options: _Options, count: int, used: set[str]) -> Array:
     """Return the times of the samples [s]."""
-    name = next((name for name in table.columns if _plain(name).lower() in TIME_NAMES), None)
+    name = _time_column(table)
     if name is not None:
         used.add(name)
     if options.rate is not None:
@@ -231,6 +236,22 @@ def _times(table: TrajectoryTable, options: _Options, count: int, used: set[str]
             f"{table.place}: no column of times ({', '.join(TIME_NAMES)}): state {{rate}}", remedies={"rate": 100}
         )
     return _numbers(table, name, ndim=1) * _factor(table, name, "s", 1.0)
+
+
+def _time_column(table: TrajectoryTable) -> str | None:
+    return next((name for name in table.columns if _plain(name).lower() in TIME_NAMES), None)
+
+
+def _check_times(table: TrajectoryTable, trajectory: Trajectory, options: _Options) -> None:
+    """Check that times without a unit are in seconds: milliseconds make long steps and slow joints."""
+    name, step = _time_column(table), float(np.median(np.diff(trajectory.t)))
+    if name is None or options.rate is not None or _UNIT.search(name) or step < MIN_DOUBTFUL_STEP_S:
+        return
+    speeds = np.abs(np.diff(trajectory.q, axis=0)) / np.diff(trajectory.t)[:, None]
+    share = float((speeds / options.velocity_limit).max())
+    if 0 < share < MAX_DOUBTFUL_SPEED:
+        text = f"{name} has steps of {step:.3g} s, and all joints are slower than {share:.2g} of their velocity limits"
+        raise UnitError(f"{table.place}: {text}; name the column '{name} [ms]' or '{name} [s]'", concerns="path")
 
 
 def _kind(table: TrajectoryTable, kind: str, options: _Options, used: set[str]) -> Array | None:

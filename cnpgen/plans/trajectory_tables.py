@@ -31,8 +31,11 @@ LEROBOT_INFO = "meta/info.json"  # in a folder of LeRobot
 LEROBOT_ENVIRONMENT = "observation.environment_state"
 JOINT_NAMES_KEY = b"cnpgen_joint_names"  # of the metadata of Parquet tables, as JSON
 PLAN_COLUMN = "plan"
+HDF5_SUFFIXES = {".h5", ".hdf5"}
+HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 # of an array of one plan in an archive of cnpgen
 _PART_OF_ARCHIVE = re.compile(rf"(.+?)_(t|q|dq|ddq|jerk|{'|'.join(PARAMETER_UNITS)})")
+MESSAGE_TIME = "t [s]"  # of formats that define the unit
 _POINT_FIELDS = {"positions": "q", "velocities": "dq", "accelerations": "ddq"}
 _NESTING = ("joint_trajectory", "trajectory", "trajectories", "solution")  # keys of messages that hold messages
 
@@ -88,20 +91,38 @@ def is_trajectory_file(path: Path) -> bool:
 
 
 def holds_trajectories(path: Path) -> bool:
-    """Return whether a path holds sampled trajectories, not plans: by its suffix, HDF5 files by their content."""
+    """Return whether a path holds sampled trajectories, not plans: by its suffix, HDF5 files by their content.
+
+    Raises:
+        UsageError: The path does not exist, or is a file of neither.
+    """
+    if not path.exists():
+        raise UsageError(f"{path} is not there, expected a file of plans or sampled trajectories")
     if (path / LEROBOT_INFO).is_file():
         return True
     if path.is_dir():
         return not (path / SPECIFICATION).exists() and any(is_trajectory_file(file) for file in path.iterdir())
-    if not path.is_file() or path.suffix.lower() not in _READERS:
-        return False
-    if path.suffix.lower() not in {".h5", ".hdf5"}:
+    suffix = path.suffix.lower()
+    if suffix in _READERS.keys() - HDF5_SUFFIXES:
         return True
+    if suffix not in HDF5_SUFFIXES and path.is_file() and not _begins_as_hdf5(path):
+        formats = either(sorted(_READERS.keys() - HDF5_SUFFIXES))
+        raise UsageError(f"{path} has an unknown format, expected a plan file, .h5, or sampled trajectories, {formats}")
+    if suffix not in HDF5_SUFFIXES:
+        return False
     try:
         with opened_hdf5(path) as file:
             return "path_control_points" not in file and bool({"q", "positions"} & set(file))
     except CnpgenError:
         return False
+
+
+def _begins_as_hdf5(path: Path) -> bool:
+    try:
+        with path.open("rb") as file:
+            return file.read(len(HDF5_SIGNATURE)) == HDF5_SIGNATURE
+    except OSError as error:
+        raise machine_error("read", path, error) from error
 
 
 def _read_csv(path: Path) -> Iterator[TrajectoryTable]:
@@ -216,7 +237,7 @@ def _read_lerobot(folder: Path) -> Iterator[TrajectoryTable]:
         values = values.reshape(len(times), -1)
         for episode in dict.fromkeys(episodes.tolist()):
             rows = episodes == episode
-            columns: dict[str, Values] = {"t": times[rows].astype(float)}
+            columns: dict[str, Values] = {MESSAGE_TIME: times[rows].astype(float)}
             columns |= {name: values[rows, k].astype(float) for k, name in enumerate(names)}
             columns |= {name: environment[0][rows, k].astype(float) for name, k in parameters.items()}
             yield TrajectoryTable(f"{folder}: episode {episode}", columns)
@@ -298,12 +319,12 @@ def _from_message(message: Mapping[str, Any], place: str) -> TrajectoryTable:
         raise UsageError(f"{place}: joint_names must be a list of names, got {names!r:.60}")
     if not isinstance(points, list) or not points:
         raise UsageError(f"{place}: points must be a list of points, got {points!r:.60}")
-    columns: dict[str, list[Any]] = {"t": []}
+    columns: dict[str, list[Any]] = {MESSAGE_TIME: []}
     for index, point in enumerate(points):
         where = f"{place}: points[{index}]"
         if not isinstance(point, dict):
             raise UsageError(f"{where} must be an object, got {point!r:.60}")
-        columns["t"].append(_seconds(point.get("time_from_start"), where))
+        columns[MESSAGE_TIME].append(_seconds(point.get("time_from_start"), where))
         for key, name in _POINT_FIELDS.items():
             values = point.get(key) or []
             if not values and name != "q" and not columns.get(name):

@@ -201,6 +201,30 @@ def test_columns_are_found_by_their_usual_names(tmp_path: Path, pattern: str) ->
     assert np.allclose(trajectory.dq, 2 * Q)
 
 
+def test_times_in_milliseconds_need_their_unit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = write_csv(tmp_path / "a.csv", ["t", *JOINTS], [1e4 * T, *Q.T])
+    assert main(["evaluate", str(file), "--problem", "airhockey"]) == 2
+    assert "t has steps of 1e+03 s, and all joints are slower" in (text := capsys.readouterr().err)
+    assert "name the column 't [ms]' or 't [s]'" in text
+    for name, factor in (("t [ms]", 1e-3), ("t [s]", 1.0)):
+        file.write_text(file.read_text().replace(file.read_text().partition(",")[0], name, 1))
+        (trajectory,) = load_trajectories(file, "airhockey").trajectories
+        assert np.allclose(trajectory.t, factor * 1e4 * T)
+    slow = write_csv(tmp_path / "slow.csv", ["t", *JOINTS], [10 * T, *Q.T])
+    assert load_trajectories(slow, "airhockey").trajectories[0].duration == pytest.approx(3)
+
+
+def test_a_file_of_neither_plans_nor_trajectories_is_refused_with_exit_code_2(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "notes.md").write_text("# Notes")
+    for words in (["notes.md"], ["notes.md", "--problem", "airhockey"]):
+        assert main(["evaluate", str(tmp_path / words[0]), *words[1:]]) == 2
+        assert "notes.md has an unknown format, expected a plan file, .h5, or sampled" in capsys.readouterr().err
+    assert main(["evaluate", str(tmp_path / "nosuch.csv"), "--problem", "airhockey"]) == 2
+    assert "nosuch.csv is not there, expected a file of plans or sampled trajectories" in capsys.readouterr().err
+
+
 def test_a_column_separates_trajectories(tmp_path: Path) -> None:
     heads = ["episode", "t", *JOINTS]
     columns = [np.repeat([7, 3], 4), np.tile(T, 2) + 5, *np.concatenate([Q, -Q]).T]
