@@ -5,7 +5,8 @@ one limit by its tolerance and 1 %. With a bound of the jerk, the plan is one of
 contradicts the verdict on the plan is then wrong. Without one, the samples' resolution decides; such a decision must
 not contradict the verdict on the plan either.
 
-With ``--import``, sampled plans are imported and refined, and the valid ones are counted.
+With ``--import``, sampled plans are imported and refined, and the valid ones are counted. So are motions of Ruckig
+between the ends of the plans, and paths of the plans that TOPP-RA has timed (extra ``benchmark``).
 
     cnpgen solve airhockey-hit --n 210 --seed 30303 -o hits.h5
     python benchmarks/trajectories.py hits.h5
@@ -15,6 +16,7 @@ With ``--import``, sampled plans are imported and refined, and the valid ones ar
 """
 
 import argparse
+import tempfile
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -23,6 +25,8 @@ from pathlib import Path
 import numpy as np
 from common import arguments, progress, report, table
 
+from cnpgen.benchmark.planners.rrtconnect import timed_by_toppra
+from cnpgen.benchmark.planners.ruckig import load_ruckig, time_optimal_motion
 from cnpgen.judges.plans import Verdict
 from cnpgen.judges.trajectories.interpolate import bounded_jerk
 from cnpgen.judges.trajectories.judge_family import FamilyJudge
@@ -33,6 +37,7 @@ from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.exporter import SampledPlan, sample_plan
 from cnpgen.plans.format import OBSTACLE_POSES
 from cnpgen.plans.import_trajectories import import_trajectories
+from cnpgen.plans.load_trajectories import load_trajectories
 from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.refine_plans import refine_plans
 from cnpgen.trajectory.sampled_trajectory import Trajectory
@@ -40,6 +45,7 @@ from cnpgen.trajectory.spline_motion import Motion
 
 EXCESS = 0.01  # outside a limit with its tolerance, relative to the limit
 JERK_FACTOR = 1.01  # of the largest jerk of a plan: the stated bound
+PATH_POINTS = 100  # of the paths that TOPP-RA times
 JERK_SAMPLES = 20_000  # at which it is searched
 
 
@@ -54,6 +60,8 @@ class Case:
         decimals: Decimals of the values, or None for all.
         noise: Largest random error of the values in SI units.
         jerk: Whether every curve under a bound of the jerk is judged.
+        source: Planner of the trajectories; "plan" for the sampled plans.
+        degrees: Whether a file in degrees is read.
     """
 
     name: str
@@ -62,6 +70,8 @@ class Case:
     decimals: int | None = None
     noise: float = 0.0
     jerk: bool = False
+    source: str = "plan"
+    degrees: bool = False
 
     @property
     def error(self) -> float:
@@ -95,6 +105,10 @@ IMPORTS = (
     Case("q, 100 Hz, rounded to 1e-4", 100, 0, decimals=4),
     Case("q, 30 Hz, noise of 1e-3", 30, 0, noise=1e-3),
     Case("q, 100 Hz, noise of 1e-3", 100, 0, noise=1e-3),
+    Case("q dq, 100 Hz, CSV in degrees", 100, 1, decimals=6, degrees=True),
+    Case("Ruckig, q dq ddq at its knots", 0, 2, source="ruckig"),
+    Case("TOPP-RA, q dq, 100 Hz", 100, 1, source="toppra"),
+    Case("TOPP-RA, q dq ddq, 10 Hz, as of MoveIt", 10, 2, source="toppra"),
 )
 
 
@@ -175,6 +189,42 @@ def sampled_plan(plans: Plans, case: Case, index: int) -> SampledPlan:
     return sample_plan(plans.motion[[index]], case.rate, index, values)
 
 
+def trajectories_of(plans: Plans, case: Case) -> list[Trajectory]:
+    """Return the trajectories of a case; planners may fail for some plans."""
+    random, robot = np.random.default_rng(0), open_problem(plans.problem)[1]
+    found = []
+    for index in range(len(plans)):
+        if case.source == "ruckig":
+            found.append(time_optimal_motion(load_ruckig(), robot, plans.boundary[index : index + 1]))
+        elif case.source == "toppra":
+            path = plans.motion[[index]].at(np.linspace(0, 1, PATH_POINTS)[None]).q[0]
+            found.append(resampled(timed_by_toppra(path, robot, plans.boundary.goal_dq[index]), case))
+        else:
+            found.append(trajectory_of(sampled_plan(plans, case, index), case, random))
+    return [trajectory for trajectory in found if trajectory is not None]
+
+
+def resampled(trajectory: Trajectory | None, case: Case) -> Trajectory | None:
+    """Sample a trajectory at the rate of a case."""
+    if trajectory is None:
+        return None
+    t = np.linspace(0, trajectory.duration, int(np.ceil(trajectory.duration * case.rate)) + 1)
+    q, *derivatives = trajectory.states(t)
+    return Trajectory(t, q, *derivatives[: case.orders])
+
+
+def through_degrees(trajectory: Trajectory, plans: Plans) -> Trajectory:
+    """Write a trajectory as CSV in degrees and read it."""
+    names = plans.problem.joint_names
+    assert trajectory.dq is not None
+    columns = [trajectory.t, *np.rad2deg(trajectory.q).T, *np.rad2deg(trajectory.dq).T]
+    head = ",".join(["t", *names, *(f"{name}_velocity" for name in names)])
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "degrees.csv"
+        np.savetxt(path, np.stack(columns, axis=1), delimiter=",", header=head, comments="", fmt="%.6f")
+        return load_trajectories(path, plans.problem.name, unit="deg").trajectories[0]
+
+
 def chosen(cases: Sequence[Case], names: Sequence[str]) -> list[Case]:
     """Return the named cases, or all."""
     unknown = set(names) - {case.name for case in cases}
@@ -185,8 +235,9 @@ def chosen(cases: Sequence[Case], names: Sequence[str]) -> list[Case]:
 
 def refined(plans: Plans, case: Case, stay_within: float | None) -> tuple[str, ...]:
     """Import and refine sampled plans; return a row of the table."""
-    random = np.random.default_rng(0)
-    sampled = [trajectory_of(sampled_plan(plans, case, index), case, random) for index in range(len(plans))]
+    sampled = trajectories_of(plans, case)
+    if case.degrees:
+        sampled = [through_degrees(trajectory, plans) for trajectory in sampled]
     imported = import_trajectories(plans.problem, sampled, noise=case.error)
     valid = evaluate_plans(imported.plans, workers=1).valid
     options = RefineOptions(stay_within=None if stay_within is None else np.deg2rad(stay_within))
@@ -194,9 +245,9 @@ def refined(plans: Plans, case: Case, stay_within: float | None) -> tuple[str, .
     after = evaluate_plans(refinement.plans, workers=1)
     reasons = Counter(str(verdict.reason) for verdict in after.verdicts if not verdict.valid)
     text = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common())
-    counts = str(len(plans)), f"{int(valid.sum())}", f"{int(after.valid.sum())}", f"{after.valid.mean():.1%}"
+    counts = str(len(sampled)), f"{int(valid.sum())}", f"{int(after.valid.sum())}", f"{after.valid.mean():.1%}"
     moved = float(np.nanmax(imported.snapped, initial=0.0))
-    progress(f"{plans.problem.name}, {case.name}: {int(after.valid.sum())} of {len(plans)} valid; {text}")
+    progress(f"{plans.problem.name}, {case.name}: {int(after.valid.sum())} of {len(sampled)} valid; {text}")
     lengths = [f"{length:.1e}" for length in (imported.deviation.max(), moved, refinement.deviation.max())]
     return plans.problem.name, case.name, *counts, *lengths, text
 
