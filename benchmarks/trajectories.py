@@ -146,7 +146,8 @@ def trajectory_of(plan: SampledPlan, case: Case, random: np.random.Generator) ->
         noisy = array + case.noise * random.uniform(-1, 1, array.shape)
         values.append(noisy if case.decimals is None else noisy.round(case.decimals))
     trajectory = Trajectory(plan.t, *values)
-    return replace(trajectory, parameters=np.array(plan.parameters)) if plan.parameters else trajectory
+    parameters = np.array(plan.parameters) if plan.parameters else None
+    return replace(trajectory, phase=plan.phase, parameters=parameters)
 
 
 def too_fast(motion: Motion, verdict: Verdict, name: str) -> Motion:
@@ -178,7 +179,7 @@ def measure(plans: Plans, case: Case, truths: tuple[Verdict, ...]) -> Counts:
             counts.decisions["contradiction"] += 1
             counts.wrong += 1  # the plan itself passes through the samples
         else:
-            counts.add(judge(family, sampled.parameters, scene=scene), truth)
+            counts.add(judge(family, sampled, scene=scene), truth)
     return counts
 
 

@@ -45,7 +45,7 @@ def judge_answer(problem: Plans, answer: Plans | Trajectory) -> Verdict:
     loaded, robot = open_problem(problem.problem)
     judge, world = _judge_and_world(problem.problem)
     scene = problem.scene.poses[0]
-    verdict = judge(interpolated(answer, None, np.zeros(3)), scene=scene)
+    verdict = judge(interpolated(answer, None, np.zeros(3)), answer, scene=scene)
     if not verdict.conditions:
         return Verdict(verdict.reason)
     t = np.linspace(0, answer.duration, int(np.ceil(answer.duration / JUDGING_STEP_S)) + 1)

@@ -198,5 +198,5 @@ def _judge(  # noqa: PLR0917 - the arguments of evaluate_trajectories
                 verdicts.append(TrajectoryVerdict(Decision.UNDECIDED, CONTRADICTION, duration=trajectory.duration))
                 continue
             family = bounded
-        verdicts.append(judge(family, trajectory.parameters))
+        verdicts.append(judge(family, trajectory))
     return verdicts

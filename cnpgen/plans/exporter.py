@@ -33,6 +33,7 @@ class SampledPlan:
         ddq: Joint accelerations [rad/s^2], shape (K, n).
         jerk: Joint jerks [rad/s^3], shape (K, n).
         parameters: Values of the problem's parameters in SI units.
+        phase: Phases at the samples, shape (K,); None for joined plans.
     """
 
     index: int
@@ -42,6 +43,7 @@ class SampledPlan:
     ddq: Array
     jerk: Array
     parameters: tuple[float, ...] = ()
+    phase: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -115,7 +117,9 @@ def sample_plan(
     count = max(math.ceil(duration * rate - MIN_LAST_STEP_FRACTION), 1)
     t = np.append(np.arange(count) / rate, duration)
     states = motion.at_times(t[None])
-    return SampledPlan(index, t, states.q[0], states.dq[0], states.ddq[0], states.jerk[0], parameters)
+    phase = motion.phase_at(t[None])[0] if isinstance(motion, Motion) else None
+    values = states.q[0], states.dq[0], states.ddq[0], states.jerk[0]
+    return SampledPlan(index, t, *values, parameters=parameters, phase=phase)
 
 
 def parameter_columns(names: Iterable[str]) -> list[str]:

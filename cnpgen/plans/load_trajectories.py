@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError, either, nearest
-from cnpgen.plans.trajectory_tables import TrajectoryTable, read_trajectory_tables
+from cnpgen.plans.trajectory_tables import PHASE_COLUMN, TrajectoryTable, read_trajectory_tables
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import ProblemRecord, as_record, open_problem
 from cnpgen.robots.parameter_ranges import PARAMETER_UNITS
@@ -184,7 +184,8 @@ def _trajectory(table: TrajectoryTable, options: _Options) -> tuple[Trajectory, 
         turning = [not sliding for sliding in options.record.sliding_joints]
         q[:, turning] = np.unwrap(q[:, turning], axis=0)
     try:
-        trajectory = Trajectory(t - t[0], q, columns["dq"], columns["ddq"], _parameters(table, options, used))
+        constants = _parameters(table, options, used), _phase(table, used)
+        trajectory = Trajectory(t - t[0], q, columns["dq"], columns["ddq"], *constants)
     except UsageError as error:
         raise UsageError(f"{table.place}: {error}") from error
     _check_times(table, trajectory, options)
@@ -222,6 +223,14 @@ def _parameters(table: TrajectoryTable, options: _Options, used: set[str]) -> Ar
     except UsageError as error:
         raise UsageError(f"{table.place}: {error}", argument=error.argument) from error
     return values
+
+
+def _phase(table: TrajectoryTable, used: set[str]) -> Array | None:
+    """Return the phases of an exported plan, shape (K,), or None."""
+    if PHASE_COLUMN not in table.columns:
+        return None
+    used.add(PHASE_COLUMN)
+    return _numbers(table, PHASE_COLUMN, ndim=1)
 
 
 def _times(table: TrajectoryTable, options: _Options, count: int, used: set[str]) -> Array:

@@ -31,10 +31,11 @@ LEROBOT_INFO = "meta/info.json"  # in a folder of LeRobot
 LEROBOT_ENVIRONMENT = "observation.environment_state"
 JOINT_NAMES_KEY = b"cnpgen_joint_names"  # of the metadata of Parquet tables, as JSON
 PLAN_COLUMN = "plan"
+PHASE_COLUMN = "path_phase"
 HDF5_SUFFIXES = {".h5", ".hdf5"}
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 # of an array of one plan in an archive of cnpgen
-_PART_OF_ARCHIVE = re.compile(rf"(.+?)_(t|q|dq|ddq|jerk|{'|'.join(PARAMETER_UNITS)})")
+_PART_OF_ARCHIVE = re.compile(rf"(.+?)_(t|{PHASE_COLUMN}|q|dq|ddq|jerk|{'|'.join(PARAMETER_UNITS)})")
 MESSAGE_TIME = "t [s]"  # of formats that define the unit
 _POINT_FIELDS = {"positions": "q", "velocities": "dq", "accelerations": "ddq"}
 _NESTING = ("joint_trajectory", "trajectory", "trajectories", "solution")  # keys of messages that hold messages

@@ -1,6 +1,7 @@
 """Sampled trajectories: decisions agree with the verdict on plans, files are read, and bad files are located."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -128,6 +129,23 @@ def test_the_share_of_time_with_a_violation_is_reported() -> None:
     assert tilt.violated_share == pytest.approx(1 - 2 * np.arcsin(tilt.margin.tolerance / 1.2) / np.pi, abs=0.01)
 
 
+@pytest.mark.parametrize(("exponent", "expected"), [(0.2, "invalid"), (1.0, "valid"), (None, "valid")])
+def test_phases_of_the_samples_decide_a_bound_that_narrows(exponent: float | None, expected: str) -> None:
+    plans = plans_of(load("hit"))  # starts off the table; with the exponent 0.2, it should have reached it at once
+    (trajectory,) = sampled(plans, 500, 2)
+    share = trajectory.t / trajectory.duration
+    trajectory = replace(trajectory, phase=None if exponent is None else share**exponent)
+    (verdict,) = cnpgen.evaluate_trajectories(plans.problem, [trajectory]).verdicts
+    assert verdict.conditions["table height"].decision == expected
+
+
+def test_phases_increase_from_0_to_1() -> None:
+    (trajectory,) = sampled(plans_of(load("hit")), 100, 0)
+    for phase, message in ((trajectory.t, "must increase from 0 to 1, got 0 to"), (np.ones(3), "must have shape")):
+        with pytest.raises(UsageError, match=message):
+            replace(trajectory, phase=phase)
+
+
 # Files
 
 
@@ -145,6 +163,8 @@ def test_exported_plans_are_read_as_they_are(plans: Plans, tmp_path: Path, to: s
         assert np.allclose(trajectory.t, expected.t, atol=1e-9, rtol=0)
         for name in ("q", "dq", "ddq"):
             assert np.array_equal(getattr(trajectory, name), getattr(expected, name))
+        if to != "joint-trajectory":
+            np.testing.assert_array_equal(trajectory.phase, plans.motion[[0]].phase_at(expected.t[None])[0])
     assert loaded.ignored == ()
     assert cnpgen.evaluate_trajectories("airhockey", loaded.trajectories).valid.all()
 

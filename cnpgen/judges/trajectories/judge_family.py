@@ -2,7 +2,7 @@
 
 It is the verdict on plans (``cnpgen.judges.plans``) with a bound of the error of every value. Joint limits are proven
 from Bernstein coefficients, distances by interval subdivision, and smooth conditions at samples and local maxima. A
-sampled trajectory has no phase of its own: the phase is the share of its duration.
+sampled trajectory without phases has the share of its duration as phase.
 """
 
 from collections.abc import Sequence
@@ -28,6 +28,7 @@ from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.solid import pose_width
+from cnpgen.trajectory.sampled_trajectory import Trajectory
 from cnpgen.world.path import PathWorld
 
 Array = NDArray[np.float64]
@@ -59,14 +60,13 @@ class FamilyJudge:
         names = self._problem.parameters.names
         return self._limits if parameters is None else self._limits.scaled(dict(zip(names, parameters, strict=True)))
 
-    def __call__(
-        self, family: CurveFamily, parameters: Array | None = None, *, scene: Array | None = None
-    ) -> TrajectoryVerdict:
+    def __call__(self, family: CurveFamily, trajectory: Trajectory, *, scene: Array | None = None) -> TrajectoryVerdict:
         """Judge one family; values that cannot be evaluated give an undecided verdict.
 
         Args:
             family: The curves.
-            parameters: Values of the problem's parameters, shape (p,); nominal by default.
+            trajectory: The samples, with phases and parameters; without them, phases are shares of the duration, and
+                parameters nominal.
             scene: Poses and sizes of the obstacles, then values for a constraint and parameters, shape (width,). By
                 default, they follow from the ends of the curves and the parameters.
         """
@@ -74,9 +74,9 @@ class FamilyJudge:
             reason = f"{Reason.TOO_LONG}: at most {MAX_DURATION_S:g} s and {MAX_TIME_SAMPLES:,} samples are judged"
             return TrajectoryVerdict(Decision.UNDECIDED, reason, duration=family.duration)
         with np.errstate(all="ignore"):  # overflows give inf or nan, which are detected
-            return self._judge(family, parameters, scene)
+            return self._judge(family, trajectory, scene)
 
-    def _judge(self, family: CurveFamily, parameters: Array | None, scene: Array | None) -> TrajectoryVerdict:
+    def _judge(self, family: CurveFamily, trajectory: Trajectory, scene: Array | None) -> TrajectoryVerdict:
         s = checked_phases(family, self._step)
         table = np.array([[0.0, 1.0], [0.0, family.duration]])
         samples = Samples(s, times(s, table))
@@ -84,12 +84,13 @@ class FamilyJudge:
         if not states.is_finite():
             return TrajectoryVerdict(Decision.UNDECIDED, Reason.NOT_FINITE, duration=family.duration, samples=len(s))
         if scene is None:
-            poses = self._obstacle_poses(states.q, states.dq, parameters)
-            scenes = self._possible_scenes(family, states, poses, parameters)
+            poses = self._obstacle_poses(states.q, states.dq, trajectory.parameters)
+            scenes = self._possible_scenes(family, states, poses, trajectory.parameters)
         else:
             poses, scenes = scene, []
         self._world.set_path(states.q, states.dq, states.ddq, poses, states.jerk)
-        context = evaluation_context(self._problem, family, poses, self._world, samples, table)
+        phase_of = trajectory.phase_of()
+        context = evaluation_context(self._problem, family, poses, self._world, samples, table, phase_of)
         errors = uncertainty_of(self._problem, family, self._moved, [poses, *scenes], context.measured, s)
         measured = [errors.add(condition, s) for condition in context.measured]
         context = replace(context, measured=measured, with_uncertainty=errors.add)
@@ -175,7 +176,7 @@ class _Entry:
         if self.error >= DECIDING_ERROR:
             return f"{name}: the curve lacks a derivative at its samples"
         if self.error == 0:
-            return f"{name}: the bound depends on the phase, which samples do not have"
+            return f"{name}: the bound depends on the phase, which the samples do not have"
         return f"{name}: known up to {self.error:.2g} {unit}, which some curves need to be valid"
 
 
@@ -217,13 +218,13 @@ def _measured_entries(context: EvaluationContext) -> list[_Entry]:
     for condition in context.measured:
         violated, possible = _violation_masks(context, condition)
         masks[id(condition)] = _share(violated, t), _share(possible & ~violated, t)
-        certain[id(condition)] = float(_certain(condition).max())
+        certain[id(condition)] = float(_certain(context, condition).max())
     between = chain(check_continuous_collision(context, early_exit=False), check_local_maxima(context))
     for condition, margin in between:
         key = id(condition)
         error = float(np.max(condition.uncertainty))  # that of the margin is at most as large
         worst[key] = max(worst[key], margin, key=lambda candidate: candidate.severity)
-        if not condition.relaxation.any():
+        if context.phase_of is not None or not condition.relaxation.any():
             certain[key] = max(certain[key], (margin.violation - 2 * error) / max(margin.tolerance, ZERO_TOLERANCE))
     entries = []
     for condition in context.measured:
@@ -233,9 +234,11 @@ def _measured_entries(context: EvaluationContext) -> list[_Entry]:
     return entries
 
 
-def _certain(condition: MeasuredCondition) -> Array:
-    """Return the relative violations that every curve has, at every phase of the motion, shape (m, K)."""
-    excess = condition.relaxation.max() - condition.relaxation  # bounds are widest at some phase
+def _certain(context: EvaluationContext, condition: MeasuredCondition) -> Array:
+    """Return the relative violations that every curve has, whatever its phases are if unknown, shape (m, K)."""
+    excess: Array | float = 0.0
+    if context.phase_of is None:
+        excess = condition.relaxation.max() - condition.relaxation  # bounds are widest at some phase
     certain = condition.violation - 2 * condition.uncertainty - excess
     return np.asarray(certain / np.maximum(condition.tolerance, ZERO_TOLERANCE)[:, None])
 
@@ -250,7 +253,7 @@ def _violation_masks(
         high = float(np.max(required + condition.uncertainty, initial=-np.inf))
         return ~pairs.clear_states(low), ~pairs.clear_states(high)
     possible = condition.relative_violation > 1
-    return np.asarray((_certain(condition) > 1).any(axis=0)), np.asarray(possible.any(axis=0))
+    return np.asarray((_certain(context, condition) > 1).any(axis=0)), np.asarray(possible.any(axis=0))
 
 
 def _error_at(context: EvaluationContext, condition: MeasuredCondition, margin: Margin) -> float:

@@ -34,19 +34,18 @@ def judge_samples(
         noise: Largest errors of positions, velocities and accelerations [rad, rad/s, rad/s^2], shape (3,).
         scene: Obstacles, see ``FamilyJudge``.
     """
-    parameters = trajectory.parameters
-    limits = acceleration_limits(judge.limits(parameters))
+    limits = acceleration_limits(judge.limits(trajectory.parameters))
     if trajectory.dq is None and not noise.any() and np.diff(trajectory.t).max() <= MAX_LINEAR_SPAN_S:
-        return judge(interpolated(trajectory, "linear", noise), parameters, scene=scene)
+        return judge(interpolated(trajectory, "linear", noise), trajectory, scene=scene)
     if not noise.any() and is_resolved(trajectory, limits.acceleration):
         curves = [smooth_curve(trajectory, limits)]
         if trajectory.ddq is not None:
             curves.insert(0, family_of_data(trajectory.t, data_of(trajectory)))
         for curve in curves:
-            verdict = None if curve is None else judge(curve, parameters, scene=scene)
+            verdict = None if curve is None else judge(curve, trajectory, scene=scene)
             if verdict is not None and verdict.valid:
                 return verdict
-    return judge(resolved_curves(trajectory, noise, limits.acceleration), parameters, scene=scene)
+    return judge(resolved_curves(trajectory, noise, limits.acceleration), trajectory, scene=scene)
 
 
 def acceleration_limits(limits: ProvenJointLimits) -> AccelerationLimits:
