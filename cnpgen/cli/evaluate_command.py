@@ -10,7 +10,7 @@ from cnpgen.cli import values
 from cnpgen.cli.parser import Commands, Parser, add_command, add_json
 from cnpgen.cli.plan_files import read_plans
 from cnpgen.cli.progress import Meter
-from cnpgen.cli.trajectory_options import TRAJECTORY_OPTIONS, add_trajectory_options
+from cnpgen.cli.trajectory_options import add_trajectory_options, refuse_trajectory_options
 
 if TYPE_CHECKING:
     from cnpgen.plans.evaluate import Evaluation
@@ -86,7 +86,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError("--plan needs --plot")
     if _holds_trajectories(arguments.file):
         return _run_trajectories(arguments)
-    _refuse_trajectory_options(arguments)
+    refuse_trajectory_options(arguments, arguments.file, "interpolation", "max_jerk", "noise")
     found = _evaluate(arguments)
     if arguments.json:
         _write_json(arguments.file, found)
@@ -106,15 +106,6 @@ def _holds_trajectories(file: Path) -> bool:
     from cnpgen.plans.trajectory_tables import holds_trajectories
 
     return holds_trajectories(file)
-
-
-def _refuse_trajectory_options(arguments: argparse.Namespace) -> None:
-    """Refuse options of sampled trajectories for a plan file."""
-    from cnpgen.errors import UsageError
-
-    for name in (*TRAJECTORY_OPTIONS, "payload", "interpolation", "max_jerk", "noise"):
-        if getattr(arguments, name) is not None:
-            raise UsageError(f"--{name.replace('_', '-')} is for sampled trajectories, {arguments.file} holds plans")
 
 
 def _run_trajectories(arguments: argparse.Namespace) -> int:

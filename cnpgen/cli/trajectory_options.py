@@ -33,6 +33,15 @@ def add_trajectory_options(option: Options) -> None:
     add("--payload", metavar="M[,X,Y,Z]", type=values.payload, help=text)
 
 
+def refuse_trajectory_options(arguments: argparse.Namespace, file: Path, *others: str) -> None:
+    """Refuse options of sampled trajectories for a plan file or a dataset."""
+    from cnpgen.errors import UsageError
+
+    for name in (*TRAJECTORY_OPTIONS, "payload", *others):
+        if getattr(arguments, name) is not None:
+            raise UsageError(f"--{name.replace('_', '-')} is for sampled trajectories, {file} holds plans")
+
+
 def problem_of(arguments: argparse.Namespace) -> "str | Problem":
     """Return the problem of a command, with the payload of its options."""
     from cnpgen.errors import UsageError
