@@ -5,22 +5,28 @@ one limit by its tolerance and 1 %. With a bound of the jerk, the plan is one of
 contradicts the verdict on the plan is then wrong. Without one, the samples' resolution decides; such a decision must
 not contradict the verdict on the plan either.
 
-With ``--import``, sampled plans are imported and refined, and the valid ones are counted.
+With ``--import``, sampled plans are imported and refined, and the valid ones are counted. So are motions of Ruckig
+between the ends of the plans, and paths of the plans that TOPP-RA has timed (extra ``benchmark``).
 
-    cnpgen solve airhockey-hit --n 200 -o hits.h5
+    cnpgen solve airhockey-hit --n 210 --seed 30303 -o hits.h5
     python benchmarks/trajectories.py hits.h5
+    python benchmarks/trajectories.py hits.h5 --case "q dq ddq, 500 Hz" --case "q dq, 100 Hz"
     python benchmarks/trajectories.py hits.h5 --import
     python benchmarks/trajectories.py hits.h5 --import --stay-within 2
 """
 
 import argparse
+import tempfile
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from common import arguments, progress, report, table
 
+from cnpgen.benchmark.planners.rrtconnect import timed_by_toppra
+from cnpgen.benchmark.planners.ruckig import load_ruckig, time_optimal_motion
 from cnpgen.judges.plans import Verdict
 from cnpgen.judges.trajectories.interpolate import bounded_jerk
 from cnpgen.judges.trajectories.judge_family import FamilyJudge
@@ -29,7 +35,9 @@ from cnpgen.judges.trajectories.trajectory_verdict import Decision, TrajectoryVe
 from cnpgen.plans import Plans, load_plans, open_problem
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.exporter import SampledPlan, sample_plan
+from cnpgen.plans.format import OBSTACLE_POSES
 from cnpgen.plans.import_trajectories import import_trajectories
+from cnpgen.plans.load_trajectories import load_trajectories
 from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.refine_plans import refine_plans
 from cnpgen.trajectory.sampled_trajectory import Trajectory
@@ -37,6 +45,7 @@ from cnpgen.trajectory.spline_motion import Motion
 
 EXCESS = 0.01  # outside a limit with its tolerance, relative to the limit
 JERK_FACTOR = 1.01  # of the largest jerk of a plan: the stated bound
+PATH_POINTS = 100  # of the paths that TOPP-RA times
 JERK_SAMPLES = 20_000  # at which it is searched
 
 
@@ -51,6 +60,8 @@ class Case:
         decimals: Decimals of the values, or None for all.
         noise: Largest random error of the values in SI units.
         jerk: Whether every curve under a bound of the jerk is judged.
+        source: Planner of the trajectories; "plan" for the sampled plans.
+        degrees: Whether a file in degrees is read.
     """
 
     name: str
@@ -59,6 +70,8 @@ class Case:
     decimals: int | None = None
     noise: float = 0.0
     jerk: bool = False
+    source: str = "plan"
+    degrees: bool = False
 
     @property
     def error(self) -> float:
@@ -92,6 +105,10 @@ IMPORTS = (
     Case("q, 100 Hz, rounded to 1e-4", 100, 0, decimals=4),
     Case("q, 30 Hz, noise of 1e-3", 30, 0, noise=1e-3),
     Case("q, 100 Hz, noise of 1e-3", 100, 0, noise=1e-3),
+    Case("q dq, 100 Hz, CSV in degrees", 100, 1, decimals=6, degrees=True),
+    Case("Ruckig, q dq ddq at its knots", 0, 2, source="ruckig"),
+    Case("TOPP-RA, q dq, 100 Hz", 100, 1, source="toppra"),
+    Case("TOPP-RA, q dq ddq, 10 Hz, as of MoveIt", 10, 2, source="toppra"),
 )
 
 
@@ -117,10 +134,9 @@ class Counts:
             ok = truth.margins[name].ok
             self.wrong += entry.decision == (Decision.INVALID if ok else Decision.VALID)
 
-    def decided(self) -> str:
-        """Return the decided share of every condition that is not always decided."""
-        shares = {name: 1 - c[str(Decision.UNDECIDED)] / c.total() for name, c in self.conditions.items()}
-        return ", ".join(f"{name} {share:.0%}" for name, share in shares.items() if share < 1) or "all"
+    def shares(self) -> dict[str, float]:
+        """Return the decided share of every condition."""
+        return {name: 1 - c[str(Decision.UNDECIDED)] / c.total() for name, c in self.conditions.items()}
 
 
 def trajectory_of(plan: SampledPlan, case: Case, random: np.random.Generator) -> Trajectory:
@@ -129,7 +145,9 @@ def trajectory_of(plan: SampledPlan, case: Case, random: np.random.Generator) ->
     for array in (plan.q, plan.dq, plan.ddq)[: case.orders + 1]:
         noisy = array + case.noise * random.uniform(-1, 1, array.shape)
         values.append(noisy if case.decimals is None else noisy.round(case.decimals))
-    return Trajectory(plan.t, *values)
+    trajectory = Trajectory(plan.t, *values)
+    parameters = np.array(plan.parameters) if plan.parameters else None
+    return replace(trajectory, phase=plan.phase, parameters=parameters)
 
 
 def too_fast(motion: Motion, verdict: Verdict, name: str) -> Motion:
@@ -148,28 +166,79 @@ def measure(plans: Plans, case: Case, truths: tuple[Verdict, ...]) -> Counts:
     error = np.full(3, case.error)
     for index, truth in enumerate(truths):
         motion = plans.motion[[index]]
-        sampled = trajectory_of(sample_plan(motion, case.rate, index), case, random)
+        sampled = trajectory_of(sampled_plan(plans, case, index), case, random)
+        scene = plans.scene.poses[index] if OBSTACLE_POSES in plans.columns else None
         if case.jerk:
             t = np.linspace(0, float(motion.duration()[0]), JERK_SAMPLES)
             bound = JERK_FACTOR * np.abs(motion.at_times(t[None]).jerk[0]).max(axis=0)
             family = bounded_jerk(sampled, bound, error)
         else:
-            counts.add(judge_samples(judge, sampled, error), truth)
+            counts.add(judge_samples(judge, sampled, error, scene=scene), truth)
             continue
         if family is None:
             counts.decisions["contradiction"] += 1
             counts.wrong += 1  # the plan itself passes through the samples
         else:
-            counts.add(judge(family), truth)
+            counts.add(judge(family, sampled, scene=scene), truth)
     return counts
+
+
+def sampled_plan(plans: Plans, case: Case, index: int) -> SampledPlan:
+    """Return a plan at the rate of a case."""
+    parameters = plans.boundary.parameters
+    values = () if parameters is None else tuple(parameters[index].tolist())
+    return sample_plan(plans.motion[[index]], case.rate, index, values)
+
+
+def trajectories_of(plans: Plans, case: Case) -> list[Trajectory]:
+    """Return the trajectories of a case; planners may fail for some plans."""
+    random, robot = np.random.default_rng(0), open_problem(plans.problem)[1]
+    found = []
+    for index in range(len(plans)):
+        if case.source == "ruckig":
+            found.append(time_optimal_motion(load_ruckig(), robot, plans.boundary[index : index + 1]))
+        elif case.source == "toppra":
+            path = plans.motion[[index]].at(np.linspace(0, 1, PATH_POINTS)[None]).q[0]
+            found.append(resampled(timed_by_toppra(path, robot, plans.boundary.goal_dq[index]), case))
+        else:
+            found.append(trajectory_of(sampled_plan(plans, case, index), case, random))
+    return [trajectory for trajectory in found if trajectory is not None]
+
+
+def resampled(trajectory: Trajectory | None, case: Case) -> Trajectory | None:
+    """Sample a trajectory at the rate of a case."""
+    if trajectory is None:
+        return None
+    t = np.linspace(0, trajectory.duration, int(np.ceil(trajectory.duration * case.rate)) + 1)
+    q, *derivatives = trajectory.states(t)
+    return Trajectory(t, q, *derivatives[: case.orders])
+
+
+def through_degrees(trajectory: Trajectory, plans: Plans) -> Trajectory:
+    """Write a trajectory as CSV in degrees and read it."""
+    names = plans.problem.joint_names
+    assert trajectory.dq is not None
+    columns = [trajectory.t, *np.rad2deg(trajectory.q).T, *np.rad2deg(trajectory.dq).T]
+    head = ",".join(["t", *names, *(f"{name}_velocity" for name in names)])
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "degrees.csv"
+        np.savetxt(path, np.stack(columns, axis=1), delimiter=",", header=head, comments="", fmt="%.6f")
+        return load_trajectories(path, plans.problem.name, unit="deg").trajectories[0]
+
+
+def chosen(cases: Sequence[Case], names: Sequence[str]) -> list[Case]:
+    """Return the named cases, or all."""
+    unknown = set(names) - {case.name for case in cases}
+    if unknown:
+        raise SystemExit(f"no case {', '.join(unknown)}; expected {'; '.join(case.name for case in cases)}")
+    return [case for case in cases if case.name in names or not names]
 
 
 def refined(plans: Plans, case: Case, stay_within: float | None) -> tuple[str, ...]:
     """Import and refine sampled plans; return a row of the table."""
-    random = np.random.default_rng(0)
-    sampled = [
-        trajectory_of(sample_plan(plans.motion[[index]], case.rate, index), case, random) for index in range(len(plans))
-    ]
+    sampled = trajectories_of(plans, case)
+    if case.degrees:
+        sampled = [through_degrees(trajectory, plans) for trajectory in sampled]
     imported = import_trajectories(plans.problem, sampled, noise=case.error)
     valid = evaluate_plans(imported.plans, workers=1).valid
     options = RefineOptions(stay_within=None if stay_within is None else np.deg2rad(stay_within))
@@ -177,9 +246,9 @@ def refined(plans: Plans, case: Case, stay_within: float | None) -> tuple[str, .
     after = evaluate_plans(refinement.plans, workers=1)
     reasons = Counter(str(verdict.reason) for verdict in after.verdicts if not verdict.valid)
     text = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common())
-    counts = str(len(plans)), f"{int(valid.sum())}", f"{int(after.valid.sum())}", f"{after.valid.mean():.1%}"
+    counts = str(len(sampled)), f"{int(valid.sum())}", f"{int(after.valid.sum())}", f"{after.valid.mean():.1%}"
     moved = float(np.nanmax(imported.snapped, initial=0.0))
-    progress(f"{plans.problem.name}, {case.name}: {int(after.valid.sum())} of {len(plans)} valid; {text}")
+    progress(f"{plans.problem.name}, {case.name}: {int(after.valid.sum())} of {len(sampled)} valid; {text}")
     lengths = [f"{length:.1e}" for length in (imported.deviation.max(), moved, refinement.deviation.max())]
     return plans.problem.name, case.name, *counts, *lengths, text
 
@@ -202,7 +271,7 @@ def import_all(given: argparse.Namespace) -> None:
     for file in given.files:
         plans = load_plans(file)
         plans = plans[np.flatnonzero(evaluate_plans(plans, workers=1).valid)[: given.n]]
-        rows += [refined(plans, case, given.stay_within) for case in IMPORTS if given.case in case.name]
+        rows += [refined(plans, case, given.stay_within) for case in chosen(IMPORTS, given.case)]
         progress(f"{file}: done")
     results = {"rows": [dict(zip(head, row, strict=True)) for row in rows]}
     report(results, [table("imported plans", head, rows, left=2)], as_json=given.json)
@@ -214,7 +283,7 @@ def main() -> None:
     def add(parser: argparse.ArgumentParser) -> None:
         parser.add_argument("files", nargs="+", type=Path, help="files of plans")
         parser.add_argument("--n", type=int, default=200, help="valid plans of each file (default: 200)")
-        parser.add_argument("--case", default="", help="only samples whose name contains this text")
+        parser.add_argument("--case", action="append", default=[], help="only the samples of this name")
         parser.add_argument("--import", dest="imports", action="store_true", help="import and refine instead")
 
         parser.add_argument("--stay-within", metavar="DEG", type=float, help="largest distance from the imported path")
@@ -223,21 +292,26 @@ def main() -> None:
     import_all(given) if given.imports else judge_all(given)
 
 
+def shares_text(shares: dict[str, float]) -> str:
+    """Return the shares below 1, by condition."""
+    return ", ".join(f"{name} {share:.1%}" for name, share in shares.items() if share < 1) or "all"
+
+
 def judge_all(given: argparse.Namespace) -> None:
     """Judge the plans of all files in all cases."""
     rows = []
     for file in given.files:
         plans = load_plans(file)
         evaluation = evaluate_plans(plans, workers=1)
-        chosen = np.flatnonzero(evaluation.valid)[: given.n]
-        plans, truths = plans[chosen], tuple(evaluation.verdicts[index] for index in chosen.tolist())
+        valid = np.flatnonzero(evaluation.valid)[: given.n]
+        plans, truths = plans[valid], tuple(evaluation.verdicts[index] for index in valid.tolist())
         names = ("joint velocity", "joint acceleration")
         fast = [too_fast(plans.motion[[k]], truth, names[k % 2]) for k, truth in enumerate(truths)]
         rates = np.concatenate([motion.rate for motion in fast])
         faster = replace(plans, rate_control_points=rates)
         sets = {"valid": (plans, truths), "too fast": (faster, evaluate_plans(faster, workers=1).verdicts)}
         for label, (members, verdicts) in sets.items():
-            for case in (case for case in CASES if given.case in case.name):
+            for case in chosen(CASES, given.case):
                 counts = measure(members, case, verdicts)
                 found = {str(decision): counts.decisions[str(decision)] for decision in Decision}
                 rows.append(
@@ -247,12 +321,12 @@ def judge_all(given: argparse.Namespace) -> None:
                         "samples": case.name,
                         **found,
                         "wrong": counts.wrong,
-                        "decided": counts.decided(),
+                        "decided": counts.shares(),
                     }
                 )
-            progress(f"{file}: {label}: done")
+                progress(f"{file}: {label}, {case.name}: {rows[-1]}")
     head = ("problem", "plans", "samples", *map(str, Decision), "wrong", "decided conditions")
-    cells = [["" if value is None else str(value) for value in row.values()] for row in rows]
+    cells = [[shares_text(value) if isinstance(value, dict) else str(value) for value in row.values()] for row in rows]
     report({"rows": rows}, [table("sampled plans", head, cells, left=3)], as_json=given.json)
 
 

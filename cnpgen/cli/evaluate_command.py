@@ -11,11 +11,11 @@ from cnpgen.cli.parser import Commands, Parser, add_command, add_json
 from cnpgen.cli.plan_files import read_plans
 from cnpgen.cli.progress import Meter
 from cnpgen.cli.trajectory_options import (
-    TRAJECTORY_OPTIONS,
     add_trajectory_options,
     listing_text,
     load_file,
     problem_of,
+    refuse_trajectory_options,
     summary_text,
     write_json,
 )
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
 _TEXT = """\
 Every plan is checked on a fine time grid and between its samples ('cnpgen docs verdict'). The exit code is 0 if every
-plan is valid, and 1 if a plan is invalid, if the file holds no plans, or if it is damaged. --workers changes only the
-time.
+plan is valid, and 1 if a plan is invalid, if the file holds no plans, or if it is damaged. It is 2 for files of
+another kind. --workers changes only the time.
 
 With --problem, FILE may also hold sampled trajectories: CSV, JSON, YAML, NPZ, HDF5 or Parquet, messages of ROS and
 MoveIt, or a folder of such files ('cnpgen docs trajectories'). Each trajectory and condition is valid, invalid or
@@ -98,7 +98,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError("--plan needs --plot")
     if _holds_trajectories(arguments.file):
         return _run_trajectories(arguments)
-    _refuse_trajectory_options(arguments)
+    refuse_trajectory_options(arguments, arguments.file, "interpolation", "max_jerk", "noise")
     found = _evaluate(arguments)
     if arguments.json:
         _write_json(arguments.file, found)
@@ -120,13 +120,6 @@ def _holds_trajectories(file: Path) -> bool:
 
     check_readable(file)
     return holds_trajectories(file)
-
-
-def _refuse_trajectory_options(arguments: argparse.Namespace) -> None:
-    """Refuse options of sampled trajectories for a plan file."""
-    for name in (*TRAJECTORY_OPTIONS, "payload", "interpolation", "max_jerk", "noise"):
-        if getattr(arguments, name) is not None:
-            raise UsageError(f"--{name.replace('_', '-')} is for sampled trajectories, {arguments.file} holds plans")
 
 
 def _run_trajectories(arguments: argparse.Namespace) -> int:

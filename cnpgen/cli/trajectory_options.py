@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from cnpgen.plans.load_trajectories import LoadedTrajectories
     from cnpgen.problems.problem import Problem
 
-TRAJECTORY_OPTIONS = ("joints", "unit", "rate", "separate_by", "unwrap")  # of load_trajectories
+TRAJECTORY_OPTIONS = ("joints", "unit", "rate", "separate_by", "unwrap", "parameters")  # of load_trajectories
 MAX_IGNORED = 8  # unused columns that are listed
 
 
@@ -28,8 +28,19 @@ def add_trajectory_options(option: Options) -> None:
     add("--separate-by", metavar="COLUMN", help="column whose value differs from trajectory to trajectory")
     add("--unwrap", action="store_true", default=None, help="continue angles that jump by more than half a turn")
 
+    text = "values of the problem's parameters that the file does not have, such as payload_mass=6kg"
+    add("--parameters", metavar="NAME=V,...", type=values.parameters, help=text)
     text = "body at the tip, in place of the problem's: mass [kg], or mass and centre of mass in the tip frame [m]"
     add("--payload", metavar="M[,X,Y,Z]", type=values.payload, help=text)
+
+
+def refuse_trajectory_options(arguments: argparse.Namespace, file: Path, *others: str) -> None:
+    """Refuse options of sampled trajectories for a plan file or a dataset."""
+    from cnpgen.errors import UsageError
+
+    for name in (*TRAJECTORY_OPTIONS, "payload", *others):
+        if getattr(arguments, name) is not None:
+            raise UsageError(f"--{name.replace('_', '-')} is for sampled trajectories, {file} holds plans")
 
 
 def problem_of(arguments: argparse.Namespace) -> "str | Problem":

@@ -198,6 +198,23 @@ def tracking_errors(text: str) -> tuple[float, ...]:
     return tuple(found)
 
 
+def parameters(text: str) -> dict[str, float]:
+    """Read parameters of a problem, separated by commas: ``payload_mass=6kg`` or ``table_height=2cm,table_roll=0``."""
+    from cnpgen.robots.parameter_ranges import PARAMETER_UNITS
+    from cnpgen.schema.units import parse_number
+
+    found = {}
+    for part in text.split(","):
+        name, _, value = (word.strip() for word in part.partition("="))
+        if name not in PARAMETER_UNITS:
+            raise ArgumentTypeError(f"expected NAME=VALUE with one of {', '.join(PARAMETER_UNITS)}; got {part[:60]!r}")
+        try:
+            found[name] = parse_number(value, PARAMETER_UNITS[name])
+        except ValueError as error:
+            raise ArgumentTypeError(f"{name}: {error}") from error
+    return found
+
+
 def payload(text: str) -> tuple[float, ...]:
     """Read a mass [kg], or a mass and the centre of mass in the tip frame [m]: ``2`` or ``2,0,0,0.1``."""
     found = _numbers(text)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Commands, Parser, add_command
+from cnpgen.cli.trajectory_options import add_trajectory_options, load_file, problem_of, refuse_trajectory_options
 from cnpgen.errors import DatasetError, UsageError
 
 if TYPE_CHECKING:
@@ -22,9 +23,9 @@ The page is one file that needs no network: the arm, obstacles, puck, path and f
 slider for every joint. Curves show the joints relative to their limits and the other conditions with their bounds. The
 verdict lists the smallest margin of every condition; for a rejected plan, a click shows the place and time of a
 violation. A sample without a plan is shown at its start and goal, a problem in its base configuration. --rows puts
-several plans on one page. Plans and datasets contain collision geometry only; --problem locates the visual meshes.
---serve serves the page locally until Ctrl-C and reloads it when a file changes; ?row=I shows another sample. Needs
-MeshCat's viewer: pip install 'cnpgen[view]'.
+several plans on one page. Sampled trajectories need --problem ('cnpgen docs trajectories'). Plans and datasets contain
+collision geometry only; --problem locates the visual meshes. --serve serves the page locally until Ctrl-C and reloads
+it when a file changes; ?row=I shows another sample. Needs MeshCat's viewer: pip install 'cnpgen[view]'.
 """
 
 
@@ -32,12 +33,8 @@ def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
     parser = add_command(commands, "view", run, title="show a robot, a plan or a sample in a browser", text=_TEXT)
     option = parser.add_argument
-    option(
-        "what",
-        metavar="PROBLEM|DIR|FILE",
-        type=recipe_names.viewed,
-        help="a problem by name or file, the folder of a dataset, or a plan file",
-    )
+    text = "a problem by name or file, the folder of a dataset, a plan file, or sampled trajectories"
+    option("what", metavar="PROBLEM|DIR|FILE", type=recipe_names.viewed, help=text)
     rows = parser.add_mutually_exclusive_group()
     text = "plan of the file, or sample of the split (default: 0)"
     rows.add_argument("--row", metavar="I", type=values.natural, help=text)
@@ -48,7 +45,7 @@ def add(commands: "Commands[Parser]") -> None:
         help=f"several of them, such as 0,3,10-12; at most {MAX_ROWS_OF_PAGE}",
     )
     option("--split", metavar="NAME", help="split of the folder (default: validation)")
-    text = "the problem of plans or rows, whose URDF leads to its visual meshes"
+    text = "the problem of plans, rows or trajectories, whose URDF leads to its visual meshes"
     option("--problem", metavar="NAME|FILE", type=recipe_names.problem, help=text)
     where = parser.add_mutually_exclusive_group()
     where.add_argument(
@@ -60,6 +57,7 @@ def add(commands: "Commands[Parser]") -> None:
     )
     text = "serve the page on this machine, and show every change of its files (default port: 8000)"
     where.add_argument("--serve", metavar="PORT", type=values.port, nargs="?", const=8000, help=text)
+    add_trajectory_options(parser.add_argument_group("sampled trajectories"))
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -98,12 +96,16 @@ def _scene(arguments: argparse.Namespace) -> "ViewScene":
     """Build the scene of a problem, of samples or of plans."""
     from cnpgen.cli.view.view_scene import scene_of_plans, scene_of_problem
     from cnpgen.plans import open_problem
+    from cnpgen.plans.trajectory_tables import holds_trajectories, is_trajectory_file
     from cnpgen.problems.load_robot import load_robot
     from cnpgen.problems.problem_file import load_problem_behind
     from cnpgen.problems.scenes.scene_files import HDF5_SUFFIXES
     from cnpgen.store.paths import file_kind
 
     what, rows = Path(arguments.what), arguments.rows or (arguments.row or 0,)
+    if what.exists() and (what.is_dir() or is_trajectory_file(what)) and holds_trajectories(what):
+        return _scene_of_trajectories(arguments, rows)
+    refuse_trajectory_options(arguments, what)
     if not what.is_dir() and not file_kind(what) and what.suffix not in HDF5_SUFFIXES:
         _refuse_for_problem(arguments)
         problem = load_problem_behind(arguments.what)
@@ -125,6 +127,29 @@ def _scene(arguments: argparse.Namespace) -> "ViewScene":
         with_meshes=bool(arguments.problem),
         first_row=rows[0],
         n_rows=count,
+    )
+
+
+def _scene_of_trajectories(arguments: argparse.Namespace, rows: Sequence[int]) -> "ViewScene":
+    """Build the scene of sampled trajectories with their verdicts."""
+    _check_rows(rows)
+    from cnpgen.cli.view.view_scene import scene_of_trajectories
+    from cnpgen.plans.evaluate_trajectories import evaluate_trajectories
+    from cnpgen.problems.load_robot import load_robot
+    from cnpgen.problems.problem_record import as_problem
+
+    if arguments.split:
+        raise UsageError(f"--split is for the folder of a dataset, got {arguments.what}")
+    problem = as_problem(problem_of(arguments))
+    loaded = load_file(argparse.Namespace(**vars(arguments) | {"file": Path(arguments.what)}), problem)
+    count = len(loaded.trajectories)
+    if (row := max(rows)) >= count:
+        raise UsageError(f"{arguments.what} has no trajectory {row}: {count} are numbered from 0")
+    chosen = [loaded.trajectories[row] for row in rows]
+    titles = [f"{problem.name}: {loaded.labels[row]}" for row in rows]
+    verdicts = evaluate_trajectories(problem, chosen).verdicts
+    return scene_of_trajectories(
+        problem, load_robot(problem), chosen, titles, verdicts, first_row=rows[0], n_rows=count
     )
 
 

@@ -2,8 +2,9 @@
 
 ```
 README.md                        the card
+croissant.json                   the Parquet view for ML catalogues, with a record set for each split
 parquet/train/00000.parquet      a table per shard, for the viewer, polars and DuckDB
-hdf5/                            the dataset, unchanged: cnpgen validate hdf5
+hdf5/                            the dataset without its croissant.json: cnpgen validate hdf5
 ```
 """
 
@@ -21,14 +22,18 @@ from cnpgen.loader.load import load_dataset
 from cnpgen.plans.parquet_table import fixed_lists, write_parquet
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.store.card import PARQUET, card_notes, card_text
+from cnpgen.store.croissant import ParquetFile, croissant_of_tables
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, shards
 from cnpgen.store.dataset_summary import summarize_dataset
-from cnpgen.store.files.atomic import check_writable, write_file
-from cnpgen.store.layout import CARD, DOCUMENTS, SPLIT_NAME
+from cnpgen.store.files.atomic import check_writable, file_sha256, write_file
+from cnpgen.store.files.documents import render
+from cnpgen.store.layout import CARD, CROISSANT, DOCUMENTS, SPLIT_NAME
+from cnpgen.store.manifest import load_manifest
 from cnpgen.store.shard import read_shard
 from cnpgen.store.shard_record import load_record
 
 HDF5 = "hdf5"  # folder of the dataset in the repository
+HUB = "https://huggingface.co"
 REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]{0,95}/[A-Za-z0-9][\w.-]{0,95}")
 WRITTEN = re.compile(  # paths of tables and shards in the repository
     rf"{PARQUET}/{SPLIT_NAME.pattern}/\d{{5,}}\.parquet|{HDF5}/{SPLIT_NAME.pattern}/shard-\d{{5,}}\.(h5|json)"
@@ -55,7 +60,7 @@ def publish_dataset(
 ) -> Published:
     """Write the repository of a dataset and upload it; a second call continues an interrupted one.
 
-    Tables and shards of an earlier state of the dataset are removed from the folder of the repository.
+    Tables and shards of an earlier state of the dataset are removed, from the folder and from the hub.
 
     Args:
         folder: Folder of a finished dataset.
@@ -96,11 +101,19 @@ def write_repository(source: Path, spec: DatasetSpec, target: Path, *, repositor
     _remove_others(target, {*tables, *(target / HDF5 / name for name in copies)})
     for task, path in zip(tasks, tables, strict=True):
         _write_table(source, spec, task, path)
+    (target / HDF5 / CROISSANT).unlink(missing_ok=True)
     for name in (*DOCUMENTS, *copies):
-        _copy(source / name, target / HDF5 / name)
+        if name != CROISSANT:  # which has no record sets
+            _copy(source / name, target / HDF5 / name)
     notes = card_notes((source / CARD).read_text(encoding="utf-8"))
-    card = card_text(summarize_dataset(source, spec), folder=repository, notes=notes, shards=f"{HDF5}/")
-    write_file(target / CARD, card)
+    summary = summarize_dataset(source, spec)
+    write_file(target / CARD, card_text(summary, folder=repository, notes=notes, shards=f"{HDF5}/"))
+    files: dict[str, list[ParquetFile]] = {}
+    for task, path in zip(tasks, tables, strict=True):
+        name = path.relative_to(target).as_posix()
+        files.setdefault(task.split, []).append(ParquetFile(name, path.stat().st_size, file_sha256(path)))
+    created, url = load_manifest(source)["created"], f"{HUB}/datasets/{repository}"
+    write_file(target / CROISSANT, render(croissant_of_tables(summary, files, created=created, url=url)) + "\n")
 
 
 def _remove_others(target: Path, present: set[Path]) -> None:
@@ -154,14 +167,22 @@ def _copy(source: Path, target: Path) -> None:
 
 
 def upload_folder(folder: Path, repository: str, *, private: bool) -> str:
-    """Upload the folder of a repository and return its address; a second call continues an interrupted one."""
+    """Upload the folder of a repository and return its address; a second call continues an interrupted one.
+
+    Other tables and files of the dataset are removed from the repository.
+    """
     with requires_extra("hub", "huggingface_hub"):
         import huggingface_hub
 
     api = huggingface_hub.HfApi(library_name="cnpgen")
     try:
         url = str(api.create_repo(repository, repo_type="dataset", private=private, exist_ok=True))
-        api.upload_large_folder(repo_id=repository, folder_path=folder, repo_type="dataset")
+        api.upload_folder(
+            repo_id=repository,
+            folder_path=folder,
+            repo_type="dataset",
+            delete_patterns=[f"{part}/*" for part in (PARQUET, HDF5)],  # those that the folder does not contain
+        )
     except (OSError, ValueError, RuntimeError) as error:  # the errors of huggingface_hub are OSError or ValueError
         hint = "'hf auth login' stores a token; the same command continues an interrupted upload"
         raise MachineError(f"{repository} was not uploaded: {error!s:.300}; {hint}") from error

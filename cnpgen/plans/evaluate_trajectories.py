@@ -120,13 +120,13 @@ def evaluate_trajectories(
         progress: Called with the number of trajectories that were judged since the last call.
 
     Raises:
-        UsageError: An argument is invalid, or a trajectory has another number of joints.
+        UsageError: An argument is invalid, or a trajectory has another number of joints or of parameters.
         RecipeError: A required plug-in is not installed.
     """
     check_step(step := number("step", step))
     record = as_record(problem)
     n = len(record.joint_names)
-    check_trajectories(trajectories, n)
+    check_trajectories(trajectories, record)
     if interpolation is not None and max_jerk is not None:
         raise UsageError("interpolation and max_jerk exclude each other", concerns="interpolation")
     errors = non_negative("noise", noise, 3)
@@ -145,8 +145,9 @@ def evaluate_trajectories(
     return TrajectoryEvaluation(record, tuple(trajectories), tuple(verdicts), step)
 
 
-def check_trajectories(trajectories: Sequence[Trajectory], n: int) -> None:
-    """Check that there are trajectories of n joints."""
+def check_trajectories(trajectories: Sequence[Trajectory], record: ProblemRecord) -> None:
+    """Check that there are trajectories with the joints and the parameters of a problem."""
+    n, names = len(record.joint_names), ", ".join(record.parameters.names)
     if not len(trajectories):
         raise UsageError("there are no trajectories", concerns="trajectories")
     for index, trajectory in enumerate(trajectories):
@@ -157,6 +158,13 @@ def check_trajectories(trajectories: Sequence[Trajectory], n: int) -> None:
                 f"trajectory {index} has {trajectory.q.shape[1]} joints, the problem plans {n}",
                 concerns="trajectories",
             )
+        if trajectory.parameters is not None:
+            record.parameters.checked(trajectory.parameters)
+        elif names:
+            text = (
+                f"trajectory {index} has no values of {names}: its file needs columns of these names, or {{parameters}}"
+            )
+            raise UsageError(text, concerns="trajectories", remedies={"parameters": None})
 
 
 def non_negative(name: str, value: ArrayLike, size: int) -> Array:
@@ -190,5 +198,5 @@ def _judge(  # noqa: PLR0917 - the arguments of evaluate_trajectories
                 verdicts.append(TrajectoryVerdict(Decision.UNDECIDED, CONTRADICTION, duration=trajectory.duration))
                 continue
             family = bounded
-        verdicts.append(judge(family))
+        verdicts.append(judge(family, trajectory))
     return verdicts

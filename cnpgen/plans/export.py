@@ -106,6 +106,7 @@ def export_plans(
         problem=problem.name,
         environment=_environment(plans, kept) if exporter.uses_environment else {},
         motion=plans.motion[kept] if isinstance(plans, Plans) else None,
+        parameters=problem.parameters.names,
     )
     held = None
     if exporter.single_file:
@@ -122,8 +123,10 @@ def export_plans(
 
 def _environment(plans: Plans | JoinedPlans, kept: list[int]) -> dict[str, NDArray[np.float64]]:
     """Return goals, columns of the tasks and scenes of chosen plans, shape (N, w) each; of the last if joined."""
-    last = plans if isinstance(plans, Plans) else plans.parts[-1]
+    last = _last(plans)
     columns = {"goal_q": last.boundary.goal_q, "goal_dq": last.boundary.goal_dq, **last.columns}
+    if last.boundary.parameters is not None:
+        columns |= zip(plans.problem.parameters.names, last.boundary.parameters.T, strict=True)
     scene = last.scene.poses
     if scene.shape[1]:
         columns["scene"] = scene
@@ -165,9 +168,15 @@ def _why_not(plans: Plans | JoinedPlans, index: int, status: PlanStatus, rate: f
 
 
 def _sampled(plans: Plans | JoinedPlans, rate: float, kept: list[int]) -> Iterator[SampledPlan]:
-    motion = plans.motion
+    motion, parameters = plans.motion, _last(plans).boundary.parameters
     for index in kept:
-        yield sample_plan(motion[[index]], rate, index)
+        values = () if parameters is None else tuple(parameters[index].tolist())
+        yield sample_plan(motion[[index]], rate, index, values)
+
+
+def _last(plans: Plans | JoinedPlans) -> Plans:
+    """Return the plans themselves, or the last ones of joined plans, which have the same problem."""
+    return plans if isinstance(plans, Plans) else plans.parts[-1]
 
 
 def _write_held_joints(folder: Path, held: dict[str, float]) -> Path | None:

@@ -12,6 +12,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.robots.parameter_ranges import PARAMETER_UNITS
 from cnpgen.trajectory.joined import JoinedMotion
 from cnpgen.trajectory.spline_motion import Motion
 
@@ -31,6 +32,8 @@ class SampledPlan:
         dq: Joint velocities [rad/s], shape (K, n).
         ddq: Joint accelerations [rad/s^2], shape (K, n).
         jerk: Joint jerks [rad/s^3], shape (K, n).
+        parameters: Values of the problem's parameters in SI units.
+        phase: Phases at the samples, shape (K,); None for joined plans.
     """
 
     index: int
@@ -39,6 +42,8 @@ class SampledPlan:
     dq: Array
     ddq: Array
     jerk: Array
+    parameters: tuple[float, ...] = ()
+    phase: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -56,6 +61,7 @@ class ExportedSet:
         environment: Goals, columns of the tasks and scenes: name -> values in SI units, shape (N, w); empty for
             formats that do not use them.
         motion: The N motions as splines; None for joined plans.
+        parameters: Names of the problem's parameters.
     """
 
     index: NDArray[np.int64]
@@ -67,6 +73,7 @@ class ExportedSet:
     problem: str = ""
     environment: Mapping[str, Array] = field(default_factory=dict)
     motion: Motion | None = None
+    parameters: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -102,10 +109,20 @@ class Exporter(ABC):
         """
 
 
-def sample_plan(motion: Motion | JoinedMotion, rate: float, index: int = 0) -> SampledPlan:
+def sample_plan(
+    motion: Motion | JoinedMotion, rate: float, index: int = 0, parameters: tuple[float, ...] = ()
+) -> SampledPlan:
     """Sample one motion at ``rate`` [Hz], and at its last instant."""
     duration = float(motion.duration()[0])
     count = max(math.ceil(duration * rate - MIN_LAST_STEP_FRACTION), 1)
     t = np.append(np.arange(count) / rate, duration)
     states = motion.at_times(t[None])
-    return SampledPlan(index, t, states.q[0], states.dq[0], states.ddq[0], states.jerk[0])
+    phase = motion.phase_at(t[None])[0] if isinstance(motion, Motion) else None
+    values = states.q[0], states.dq[0], states.ddq[0], states.jerk[0]
+    return SampledPlan(index, t, *values, parameters=parameters, phase=phase)
+
+
+def parameter_columns(names: Iterable[str]) -> list[str]:
+    """Return names of parameters with their units, such as ``"payload_mass [kg]"``."""
+    units = {name: PARAMETER_UNITS[name] for name in names}
+    return [name if unit == "1" else f"{name} [{unit}]" for name, unit in units.items()]

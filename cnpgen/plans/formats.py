@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.plans.exporter import ExportedSet, Exporter, SampledPlan
+from cnpgen.plans.exporter import ExportedSet, Exporter, SampledPlan, parameter_columns
 from cnpgen.plans.format import UNITS
+from cnpgen.plans.trajectory_tables import PHASE_COLUMN
 from cnpgen.store.files.atomic import committing, write_file
 from cnpgen.store.joint_units import unit_of, units_of_joints
 
@@ -26,9 +27,9 @@ _WITHOUT_POINT = re.compile(r"(?<![\d.])(\d+)(?=e[+-])")
 class NumpyArchive(Exporter):
     """One NumPy archive with all plans.
 
-    The arrays of a plan are ``plan_00000_t`` (K,) and ``plan_00000_q``, ``_dq``, ``_ddq``, ``_jerk`` (K, n), numbered
-    by its index. Further arrays are ``plan``, ``sample_id``, ``joint_names``, ``held_joint_names`` and
-    ``held_joint_positions``.
+    The arrays of a plan are ``plan_00000_t`` and ``_path_phase`` (K,), and ``plan_00000_q``, ``_dq``, ``_ddq``,
+    ``_jerk`` (K, n), numbered by its index, and one number per parameter, such as ``plan_00000_payload_mass``.
+    Further arrays are ``plan``, ``sample_id``, ``joint_names``, ``held_joint_names`` and ``held_joint_positions``.
     """
 
     suffix = ".npz"
@@ -50,11 +51,19 @@ class NumpyArchive(Exporter):
             for plan in plans:
                 for name in ("t", *UNITS):
                     _add(archive, f"plan_{plan.index:05d}_{name}", getattr(plan, name))
+                if plan.phase is not None:
+                    _add(archive, f"plan_{plan.index:05d}_{PHASE_COLUMN}", plan.phase)
+                for name, value in zip(exported.parameters, plan.parameters, strict=True):
+                    _add(archive, f"plan_{plan.index:05d}_{name}", np.array(value))
 
 
 @dataclass(frozen=True)
 class CsvTables(Exporter):
-    """A folder with one CSV table per plan; numbers read back as the same float64."""
+    """A folder with one CSV table per plan; numbers read back as the same float64.
+
+    ``path_phase`` is the phase of the plan. Parameters of the problem are columns of equal values, such as
+    ``payload_mass [kg]``.
+    """
 
     suffix = ".csv"
 
@@ -65,10 +74,12 @@ class CsvTables(Exporter):
         units = {name: units_of_joints(unit, exported.prismatic) for name, unit in UNITS.items()}
         joints = list(enumerate(exported.joint_names))
         heads = [f"{name} {joint} [{unit_of(units[name], i)}]" for name in UNITS for i, joint in joints]
-        writer.writerow(["t [s]", *heads])
-        for plan in plans:
-            columns = [getattr(plan, name) for name in UNITS]
-            writer.writerows(np.column_stack([plan.t, *columns]).tolist())
+        (plan,) = plans
+        phase = [] if plan.phase is None else [plan.phase]
+        writer.writerow(["t [s]", *heads, *[PHASE_COLUMN] * len(phase), *parameter_columns(exported.parameters)])
+        columns = [getattr(plan, name) for name in UNITS]
+        columns += [*phase, *(np.full(len(plan.t), value) for value in plan.parameters)]
+        writer.writerows(np.column_stack([plan.t, *columns]).tolist())
         write_file(path, text.getvalue())
 
 

@@ -80,7 +80,7 @@ def import_trajectories(
         UsageError: An argument is invalid, or a trajectory has another number of joints.
     """
     record = as_record(problem)
-    check_trajectories(trajectories, len(record.joint_names))
+    check_trajectories(trajectories, record)
     errors = non_negative("noise", noise, 3)
     snapper = StateSnapper(*open_problem(record))
     ends = [_boundary(trajectory, errors, snapper, at_rest=at_rest) for trajectory in trajectories]
@@ -88,9 +88,7 @@ def import_trajectories(
     motions, deviation = _fitted(trajectories, boundaries, record.trajectory, MAX_FIT_ERROR_RAD + float(errors[0]))
     plans = make_plans(
         record,
-        Boundary(
-            *(np.concatenate(parts) for parts in zip(*(_parts(boundary) for boundary in boundaries), strict=True))
-        ),
+        _joined(boundaries),
         path_control_points=np.concatenate([motion.path for motion in motions]),
         rate_control_points=np.concatenate([motion.rate for motion in motions]),
         source=source,
@@ -98,8 +96,10 @@ def import_trajectories(
     return ImportedTrajectories(plans, deviation, snapped)
 
 
-def _parts(boundary: Boundary) -> list[Array]:
-    return [part for part in vars(boundary).values() if part is not None]
+def _joined(boundaries: Sequence[Boundary]) -> Boundary:
+    """Return the boundary conditions of all trajectories."""
+    arrays = [boundary.arrays() for boundary in boundaries]
+    return Boundary(**{name: np.concatenate([parts[name] for parts in arrays]) for name in arrays[0]})
 
 
 def _boundary(trajectory: Trajectory, noise: Array, snapper: StateSnapper, *, at_rest: bool) -> tuple[Boundary, float]:
@@ -117,10 +117,13 @@ def _boundary(trajectory: Trajectory, noise: Array, snapper: StateSnapper, *, at
         moving = [(state[0], still, still) for state in (start, goal)]
     allowed = max(MIN_SNAP_RAD, SNAP_FACTOR * float(noise[0]))
     given = [trajectory.dq is not None, trajectory.ddq is not None]
+    snapper.set_parameters(trajectory.parameters)
     first, moved_first = _snapped(snapper, moving[0], "start", given, allowed)
     last, moved_last = _snapped(snapper, moving[1], "goal", given, allowed)
     change = float(np.maximum(moved_first, moved_last))  # nan if one of them is
-    return Boundary(*(part[None] for part in (*first, *last[:2]))), change
+    parameters = None if trajectory.parameters is None else trajectory.parameters[None]
+    start_q, start_dq, start_ddq, goal_q, goal_dq = (part[None] for part in (*first, *last[:2]))
+    return Boundary(start_q, start_dq, start_ddq, goal_q, goal_dq, parameters=parameters), change
 
 
 def _snapped(

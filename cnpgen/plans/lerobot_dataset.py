@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from cnpgen.errors import UsageError, requires_extra
 from cnpgen.plans.exporter import ExportedSet, Exporter, SampledPlan
 from cnpgen.plans.parquet_table import fixed_lists, write_parquet
-from cnpgen.plans.trajectory_tables import LEROBOT_INFO
+from cnpgen.plans.trajectory_tables import LEROBOT_ENVIRONMENT, LEROBOT_INFO
 from cnpgen.store.files.atomic import write_file
 
 Values = NDArray[Any]
@@ -29,7 +29,7 @@ MAX_DATA_FILE_MB = 100
 MAX_VIDEO_FILE_MB = 200  # there are none, but readers expect the number
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 EPISODES_PATH = "meta/episodes/chunk-000/file-000.parquet"
-STATE, ENVIRONMENT, ACTION = "observation.state", "observation.environment_state", "action"
+STATE, ENVIRONMENT, ACTION = "observation.state", LEROBOT_ENVIRONMENT, "action"
 QUANTILES = (0.01, 0.1, 0.5, 0.9, 0.99)
 _INDICES = {"timestamp": "float32", "frame_index": "int64", "episode_index": "int64", "index": "int64"}
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -11,10 +11,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import UsageError
-from cnpgen.plans.trajectory_tables import TrajectoryTable, read_trajectory_tables
+from cnpgen.errors import UsageError, either, nearest
+from cnpgen.plans.trajectory_tables import PHASE_COLUMN, TrajectoryTable, read_trajectory_tables
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import ProblemRecord, as_record, open_problem
+from cnpgen.robots.parameter_ranges import PARAMETER_UNITS
 from cnpgen.robots.plausible_values import UnitError, find_implausible_value
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.argument_types import checked_arguments
@@ -31,6 +32,8 @@ KIND_NAMES = {
     "dq": ("dq", "qd", "velocity", "velocities", "vel"),
     "ddq": ("ddq", "qdd", "acceleration", "accelerations", "acc"),
 }
+MIN_DOUBTFUL_STEP_S = 0.5  # of times without a unit
+MAX_DOUBTFUL_SPEED = 2e-3  # relative to the velocity limits; twice the limit if the times are milliseconds
 UNUSED_KINDS = ("jerk", "effort", "efforts")  # not reported as ignored
 _UNIT = re.compile(r"\s*\[([^\]]*)\]\s*$")
 _SEPARATORS = (" ", "_", ".", "/", ":", "")
@@ -62,6 +65,8 @@ class _Options:
     rate: float | None
     separate_by: str | None
     unwrap: bool
+    parameters: Mapping[str, float]
+    velocity_limit: Array
 
 
 @checked_arguments
@@ -74,6 +79,7 @@ def load_trajectories(
     rate: float | None = None,
     separate_by: str | None = None,
     unwrap: bool = False,
+    parameters: Mapping[str, float] | None = None,
 ) -> LoadedTrajectories:
     """Load sampled trajectories from a file or a folder; 'cnpgen docs trajectories' lists formats and columns.
 
@@ -86,10 +92,11 @@ def load_trajectories(
         rate: Samples per second [Hz] of a file without times.
         separate_by: Column whose value differs from trajectory to trajectory.
         unwrap: Whether revolute joints that jump by more than half a turn have passed the end of the range of angles.
+        parameters: Values of the problem's parameters that the file does not have, by name, in SI units.
 
     Raises:
         UsageError: A column is missing, a value is not finite, times do not increase, or the file is damaged.
-        UnitError: Positions without a unit are probably in degrees or millimetres.
+        UnitError: Positions without a unit are probably in degrees or millimetres, or times in milliseconds.
         MissingExtraError: The format needs a package that is not installed.
     """
     record = as_record(problem)
@@ -99,7 +106,9 @@ def load_trajectories(
         raise UsageError(f"must have {len(record.joint_names)} names, {expected}, got {list(names)}", argument="joints")
     if rate is not None and not number("rate", rate) > 0:
         raise UsageError(f"must be above 0, got {rate}", argument="rate")
-    options = _Options(record, names, unit == "deg", rate, separate_by, unwrap)
+    _check_parameters(record, parameters or {})
+    robot = open_problem(record)[1]
+    options = _Options(record, names, unit == "deg", rate, separate_by, unwrap, parameters or {}, robot.velocity_limit)
     try:
         found = [
             (part.place, *_trajectory(part, options))
@@ -110,7 +119,7 @@ def load_trajectories(
         error.argument = error.argument or "path"
         raise
     if unit == "rad":
-        _check_unit(path, open_problem(record)[1], [trajectory.q for _, trajectory, _ in found])
+        _check_unit(path, robot, [trajectory.q for _, trajectory, _ in found])
     ignored = dict.fromkeys(name for *_, unused in found for name in unused)
     return LoadedTrajectories(
         tuple(trajectory for _, trajectory, _ in found), tuple(place for place, *_ in found), tuple(ignored)
@@ -138,7 +147,11 @@ def _separated(table: TrajectoryTable, separate_by: str | None) -> Iterator[Traj
             raise UsageError(f"{table.place}: columns must have one value per row each, got {sorted(lengths)} values")
         key = table.columns[separate_by]
         for value in dict.fromkeys(key.tolist()):
-            rows = {name: values[key == value] for name, values in table.columns.items() if name != separate_by}
+            rows = {
+                name: values[key == value] if values.ndim else values
+                for name, values in table.columns.items()
+                if name != separate_by
+            }
             lines = tuple(np.array(table.lines)[key == value].tolist()) if table.lines else ()
             yield TrajectoryTable(f"{table.place}: {separate_by} {value}", rows, table.joint_names, lines)
     elif stacked:
@@ -149,6 +162,8 @@ def _separated(table: TrajectoryTable, separate_by: str | None) -> Iterator[Traj
                 for name, values in table.columns.items()
                 if values.ndim == 3 or _plain(name) in TIME_NAMES
             }
+            of_all = {name: values for name, values in table.columns.items() if _plain(name) in PARAMETER_UNITS}
+            parts |= {name: values[index] if values.shape == (count,) else values for name, values in of_all.items()}
             yield TrajectoryTable(f"{table.place}: trajectory {index}", parts, table.joint_names)
     else:
         yield table
@@ -169,16 +184,58 @@ def _trajectory(table: TrajectoryTable, options: _Options) -> tuple[Trajectory, 
         turning = [not sliding for sliding in options.record.sliding_joints]
         q[:, turning] = np.unwrap(q[:, turning], axis=0)
     try:
-        trajectory = Trajectory(t - t[0], q, columns["dq"], columns["ddq"])
+        constants = _parameters(table, options, used), _phase(table, used)
+        trajectory = Trajectory(t - t[0], q, columns["dq"], columns["ddq"], *constants)
     except UsageError as error:
         raise UsageError(f"{table.place}: {error}") from error
+    _check_times(table, trajectory, options)
     unused = [name for name in table.columns if name not in used and not _is_unused_kind(name)]
     return trajectory, unused
 
 
+def _check_parameters(record: ProblemRecord, parameters: Mapping[str, float]) -> None:
+    """Check the names of stated parameters."""
+    known = record.parameters.names
+    for name in parameters:
+        if name not in known:
+            expected = f"expected {either(known)}{nearest(name, known)}" if known else "the problem has no parameters"
+            raise UsageError(f"{name!r} is not a parameter of {record.name!r}: {expected}", argument="parameters")
+
+
+def _parameters(table: TrajectoryTable, options: _Options, used: set[str]) -> Array | None:
+    """Return the values of the problem's parameters, shape (p,); None if some are missing."""
+    ranges, plain = options.record.parameters, {_plain(name): name for name in table.columns}
+    found = dict(options.parameters)
+    units = dict(zip(ranges.names, ranges.value_units, strict=True))
+    for parameter, unit in units.items():
+        if (name := plain.get(parameter)) is None:
+            continue
+        used.add(name)
+        values = np.unique(_numbers(table, name, ndim=table.columns[name].ndim and 1))
+        if len(values) != 1:
+            raise UsageError(f"{table.place}: {name} must have one value, got {values[0]:g} and {values[-1]:g}")
+        found[parameter] = float(values[0]) * _factor(table, name, unit, 1.0)
+    if not units or found.keys() != units.keys():
+        return None
+    values = np.array([found[name] for name in units])
+    try:
+        ranges.checked(values)
+    except UsageError as error:
+        raise UsageError(f"{table.place}: {error}", argument=error.argument) from error
+    return values
+
+
+def _phase(table: TrajectoryTable, used: set[str]) -> Array | None:
+    """Return the phases of an exported plan, shape (K,), or None."""
+    if PHASE_COLUMN not in table.columns:
+        return None
+    used.add(PHASE_COLUMN)
+    return _numbers(table, PHASE_COLUMN, ndim=1)
+
+
 def _times(table: TrajectoryTable, options: _Options, count: int, used: set[str]) -> Array:
     """Return the times of the samples [s]."""
-    name = next((name for name in table.columns if _plain(name).lower() in TIME_NAMES), None)
+    name = _time_column(table)
     if name is not None:
         used.add(name)
     if options.rate is not None:
@@ -188,6 +245,22 @@ def _times(table: TrajectoryTable, options: _Options, count: int, used: set[str]
             f"{table.place}: no column of times ({', '.join(TIME_NAMES)}): state {{rate}}", remedies={"rate": 100}
         )
     return _numbers(table, name, ndim=1) * _factor(table, name, "s", 1.0)
+
+
+def _time_column(table: TrajectoryTable) -> str | None:
+    return next((name for name in table.columns if _plain(name).lower() in TIME_NAMES), None)
+
+
+def _check_times(table: TrajectoryTable, trajectory: Trajectory, options: _Options) -> None:
+    """Check that times without a unit are in seconds: milliseconds make long steps and slow joints."""
+    name, step = _time_column(table), float(np.median(np.diff(trajectory.t)))
+    if name is None or options.rate is not None or _UNIT.search(name) or step < MIN_DOUBTFUL_STEP_S:
+        return
+    speeds = np.abs(np.diff(trajectory.q, axis=0)) / np.diff(trajectory.t)[:, None]
+    share = float((speeds / options.velocity_limit).max())
+    if 0 < share < MAX_DOUBTFUL_SPEED:
+        text = f"{name} has steps of {step:.3g} s, and all joints are slower than {share:.2g} of their velocity limits"
+        raise UnitError(f"{table.place}: {text}; name the column '{name} [ms]' or '{name} [s]'", concerns="path")
 
 
 def _kind(table: TrajectoryTable, kind: str, options: _Options, used: set[str]) -> Array | None:

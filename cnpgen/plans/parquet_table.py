@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import requires_extra
-from cnpgen.plans.exporter import ExportedSet, Exporter, SampledPlan
+from cnpgen.plans.exporter import ExportedSet, Exporter, SampledPlan, parameter_columns
 from cnpgen.plans.format import UNITS
-from cnpgen.plans.trajectory_tables import JOINT_NAMES_KEY, PLAN_COLUMN
+from cnpgen.plans.trajectory_tables import JOINT_NAMES_KEY, PHASE_COLUMN, PLAN_COLUMN
 from cnpgen.store.files.atomic import committing, write_file
 from cnpgen.store.joint_units import units_of_joints
 
@@ -22,8 +22,9 @@ from cnpgen.store.joint_units import units_of_joints
 class ParquetTable(Exporter):
     """One Parquet file with all plans, one row per sample.
 
-    Columns are ``plan``, ``sample_id``, ``t`` [s], and ``q``, ``dq``, ``ddq`` and ``jerk`` as lists of n values. The
-    metadata have the names of the joints and the units. Every plan is a row group.
+    Columns are ``plan``, ``sample_id``, ``t`` [s], ``q``, ``dq``, ``ddq`` and ``jerk`` as lists of n values,
+    ``path_phase`` and the parameters of the problem, such as ``payload_mass [kg]``. The metadata have the names of the
+    joints and the units. Every plan is a row group.
     """
 
     suffix = ".parquet"
@@ -40,7 +41,9 @@ class ParquetTable(Exporter):
         metadata = {JOINT_NAMES_KEY: json.dumps(exported.joint_names), "units": json.dumps(units), "held_joints": held}
         lists = {name: pyarrow.list_(pyarrow.float64(), len(exported.joint_names)) for name in UNITS}
         whole = {PLAN_COLUMN: pyarrow.int64(), "sample_id": pyarrow.int64()}
-        schema = pyarrow.schema({**whole, "t": pyarrow.float64(), **lists}, metadata=metadata)
+        parameters = dict.fromkeys(parameter_columns(exported.parameters), pyarrow.float64())
+        phase = {} if exported.motion is None else {PHASE_COLUMN: pyarrow.float64()}
+        schema = pyarrow.schema({**whole, "t": pyarrow.float64(), **lists, **phase, **parameters}, metadata=metadata)
         samples = dict(zip(exported.index.tolist(), exported.sample_id.tolist(), strict=True))
         with committing(path) as temporary, pyarrow.parquet.ParquetWriter(temporary, schema) as writer:
             for plan in plans:
@@ -48,6 +51,8 @@ class ParquetTable(Exporter):
                 whole_values = [np.full(count, plan.index), np.full(count, samples[plan.index]), plan.t]
                 columns = [pyarrow.array(values) for values in whole_values]
                 columns += [fixed_lists(getattr(plan, name)) for name in UNITS]
+                columns += [pyarrow.array(plan.phase)] if phase else []
+                columns += [pyarrow.array(np.full(count, value)) for value in plan.parameters]
                 writer.write_table(pyarrow.table(columns, schema=schema))
 
 

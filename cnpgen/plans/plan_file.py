@@ -146,12 +146,13 @@ def agreed_problem(
         command: Command with the option ``--problem``, for messages.
 
     Raises:
-        DatasetError: The file is of another problem, or there is no problem.
+        DatasetError: The file is of another problem.
+        UsageError: There is no problem.
     """
     found = stored or wanted
     if found is None:
         help_ = f"set its attribute 'problem' to a name or a file, or pass {{problem}} ('cnpgen {command}' takes it)"
-        raise DatasetError(f"{path} does not name its problem: {help_}", remedies={"problem": None})
+        raise UsageError(f"{path} does not name its problem: {help_}", remedies={"problem": None})
     if wanted is not None and found.comparable_sha256 != wanted.comparable_sha256:
         where = ", ".join(found.differences(wanted)[:4])
         raise DatasetError(

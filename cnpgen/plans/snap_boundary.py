@@ -29,8 +29,15 @@ class StateSnapper:
     def __init__(self, problem: Problem, robot: Robot) -> None:
         self._constraints = [constraint for constraint in problem.constraint if not is_contact(constraint)]
         self._world = World(robot, problem.obstacle, problem.object_size)
-        self._poses = scene_of(problem, *np.zeros((3, 1, 3))).poses[0]
+        self._problem = problem
+        self.set_parameters(None)
         self._scale = np.repeat(SCALES, robot.n)
+
+    def set_parameters(self, parameters: Array | None) -> None:
+        """Set the values of the problem's parameters, shape (p,); nominal for None."""
+        rows = None if parameters is None else parameters[None]
+        nowhere = np.zeros((1, 3))
+        self._poses = scene_of(self._problem, nowhere, nowhere, nowhere, rows).poses[0]
 
     def __call__(self, state: State, end: End) -> State:
         """Move a state, or return the last one that was reached if the constraints cannot be met.

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import CnpgenError, DatasetError, UsageError, either, requires_extra
 from cnpgen.problems.scenes.yaml_document import read_yaml
+from cnpgen.robots.parameter_ranges import PARAMETER_UNITS
 from cnpgen.store.files.atomic import machine_error, read_file
 from cnpgen.store.files.csv_table import read_csv_table
 from cnpgen.store.files.documents import parse_json
@@ -27,9 +28,15 @@ Values = NDArray[Any]
 MAX_ARCHIVE_BYTES = 1 << 32  # of the arrays of an archive
 HELD_JOINTS_FILE = "held_joints.yaml"  # beside exported plans; it holds no trajectory
 LEROBOT_INFO = "meta/info.json"  # in a folder of LeRobot
+LEROBOT_ENVIRONMENT = "observation.environment_state"
 JOINT_NAMES_KEY = b"cnpgen_joint_names"  # of the metadata of Parquet tables, as JSON
 PLAN_COLUMN = "plan"
-_PART_OF_ARCHIVE = re.compile(r"(.+)_(t|q|dq|ddq|jerk)")  # one array of a plan in an archive of cnpgen
+PHASE_COLUMN = "path_phase"
+HDF5_SUFFIXES = {".h5", ".hdf5"}
+HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
+# of an array of one plan in an archive of cnpgen
+_PART_OF_ARCHIVE = re.compile(rf"(.+?)_(t|{PHASE_COLUMN}|q|dq|ddq|jerk|{'|'.join(PARAMETER_UNITS)})")
+MESSAGE_TIME = "t [s]"  # of formats that define the unit
 _POINT_FIELDS = {"positions": "q", "velocities": "dq", "accelerations": "ddq"}
 _NESTING = ("joint_trajectory", "trajectory", "trajectories", "solution")  # keys of messages that hold messages
 
@@ -85,20 +92,38 @@ def is_trajectory_file(path: Path) -> bool:
 
 
 def holds_trajectories(path: Path) -> bool:
-    """Return whether a path holds sampled trajectories, not plans: by its suffix, HDF5 files by their content."""
+    """Return whether a path holds sampled trajectories, not plans: by its suffix, HDF5 files by their content.
+
+    Raises:
+        UsageError: The path does not exist, or is a file of neither.
+    """
+    if not path.exists():
+        raise UsageError(f"{path} is not there, expected a file of plans or sampled trajectories")
     if (path / LEROBOT_INFO).is_file():
         return True
     if path.is_dir():
         return not (path / SPECIFICATION).exists() and any(is_trajectory_file(file) for file in path.iterdir())
-    if not path.is_file() or path.suffix.lower() not in _READERS:
-        return False
-    if path.suffix.lower() not in {".h5", ".hdf5"}:
+    suffix = path.suffix.lower()
+    if suffix in _READERS.keys() - HDF5_SUFFIXES:
         return True
+    if suffix not in HDF5_SUFFIXES and path.is_file() and not _begins_as_hdf5(path):
+        formats = either(sorted(_READERS.keys() - HDF5_SUFFIXES))
+        raise UsageError(f"{path} has an unknown format, expected a plan file, .h5, or sampled trajectories, {formats}")
+    if suffix not in HDF5_SUFFIXES:
+        return False
     try:
         with opened_hdf5(path) as file:
             return "path_control_points" not in file and bool({"q", "positions"} & set(file))
     except CnpgenError:
         return False
+
+
+def _begins_as_hdf5(path: Path) -> bool:
+    try:
+        with path.open("rb") as file:
+            return file.read(len(HDF5_SIGNATURE)) == HDF5_SIGNATURE
+    except OSError as error:
+        raise machine_error("read", path, error) from error
 
 
 def _read_csv(path: Path) -> Iterator[TrajectoryTable]:
@@ -200,17 +225,22 @@ def _read_lerobot(folder: Path) -> Iterator[TrajectoryTable]:
     if not version.startswith("v3"):
         raise UsageError(f"{folder} has LeRobot's format {version}, expected v3.0: convert it with LeRobot")
     names = _feature_names(features[key].get("names"), width)
+    described = features.get(LEROBOT_ENVIRONMENT, {}).get("names")
+    described = _feature_names(described, len(described) if isinstance(described, list) else 0)
+    parameters = {name: k for k, name in enumerate(described) if name in PARAMETER_UNITS}
     for path in sorted(folder.glob("data/*/*.parquet")):
         table = read_parquet(path)
-        missing = [name for name in ("timestamp", "episode_index", key) if name not in table.column_names]
+        needed = ("timestamp", "episode_index", key, *([LEROBOT_ENVIRONMENT] if parameters else []))
+        missing = [name for name in needed if name not in table.column_names]
         if missing:
             raise UsageError(f"{path}: there is no column {missing[0]!r}, only {', '.join(table.column_names)}")
-        times, episodes, values = (_parquet_column(table, name, path) for name in ("timestamp", "episode_index", key))
+        times, episodes, values, *environment = (_parquet_column(table, name, path) for name in needed)
         values = values.reshape(len(times), -1)
         for episode in dict.fromkeys(episodes.tolist()):
             rows = episodes == episode
-            columns: dict[str, Values] = {"t": times[rows].astype(float)}
+            columns: dict[str, Values] = {MESSAGE_TIME: times[rows].astype(float)}
             columns |= {name: values[rows, k].astype(float) for k, name in enumerate(names)}
+            columns |= {name: environment[0][rows, k].astype(float) for name, k in parameters.items()}
             yield TrajectoryTable(f"{folder}: episode {episode}", columns)
 
 
@@ -290,12 +320,12 @@ def _from_message(message: Mapping[str, Any], place: str) -> TrajectoryTable:
         raise UsageError(f"{place}: joint_names must be a list of names, got {names!r:.60}")
     if not isinstance(points, list) or not points:
         raise UsageError(f"{place}: points must be a list of points, got {points!r:.60}")
-    columns: dict[str, list[Any]] = {"t": []}
+    columns: dict[str, list[Any]] = {MESSAGE_TIME: []}
     for index, point in enumerate(points):
         where = f"{place}: points[{index}]"
         if not isinstance(point, dict):
             raise UsageError(f"{where} must be an object, got {point!r:.60}")
-        columns["t"].append(_seconds(point.get("time_from_start"), where))
+        columns[MESSAGE_TIME].append(_seconds(point.get("time_from_start"), where))
         for key, name in _POINT_FIELDS.items():
             values = point.get(key) or []
             if not values and name != "q" and not columns.get(name):

@@ -73,8 +73,13 @@ class ParameterRanges:
     @property
     def units(self) -> str:
         """Unit of all values, or one per value, separated by commas, if they differ."""
-        units = [key.unit for key in keys(type(self)) if key.name in self.names]
+        units = self.value_units
         return units[0] if len(set(units)) == 1 else ", ".join(units)
+
+    @property
+    def value_units(self) -> tuple[str, ...]:
+        """Unit of every value."""
+        return tuple(key.unit for key in keys(type(self)) if key.name in self.names)
 
     @property
     def ranges(self) -> tuple[Range, ...]:
@@ -151,3 +156,4 @@ class ParameterRanges:
 
 
 NO_PARAMETERS = ParameterRanges()
+PARAMETER_UNITS = {key.name: key.unit for key in keys(ParameterRanges)}

@@ -1,10 +1,12 @@
 """The Croissant description of a dataset: metadata, files and measured variables with units.
 
-It has no record sets, because no Croissant reader opens HDF5 (mlcommons/croissant issue 697). Fields of Croissant are
-parts of record sets and have no unit. The fields are therefore listed as ``variableMeasured`` of schema.org, which
-Croissant documents may contain.
+Files of HDF5 have no record sets, because no Croissant reader opens them (mlcommons/croissant issue 697); Parquet
+tables have. Fields of Croissant have no unit. They are therefore also listed as ``variableMeasured`` of schema.org,
+which Croissant documents may contain.
 """
 
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from cnpgen.store.dataset_summary import DatasetSummary
@@ -14,6 +16,7 @@ from cnpgen.store.scene_table import SCENE_ARRAYS
 _CONTEXT: dict[str, Any] = {
     "@language": "en",
     "@vocab": "https://schema.org/",
+    "arrayShape": "cr:arrayShape",
     "citeAs": "cr:citeAs",
     "column": "cr:column",
     "conformsTo": "dct:conformsTo",
@@ -30,6 +33,7 @@ _CONTEXT: dict[str, Any] = {
     "fileSet": "cr:fileSet",
     "format": "cr:format",
     "includes": "cr:includes",
+    "isArray": "cr:isArray",
     "isLiveDataset": "cr:isLiveDataset",
     "jsonPath": "cr:jsonPath",
     "key": "cr:key",
@@ -49,18 +53,77 @@ _CONTEXT: dict[str, Any] = {
 }
 
 
+@dataclass(frozen=True)
+class ParquetFile:
+    """A Parquet table of a split.
+
+    Attributes:
+        path: Path in the repository.
+        bytes: Size [B].
+        sha256: Checksum.
+    """
+
+    path: str
+    bytes: int
+    sha256: str
+
+
 def croissant_document(summary: DatasetSummary, *, created: str) -> dict[str, Any]:
-    """Return the content of ``croissant.json``.
+    """Return the content of ``croissant.json`` of a dataset.
 
     Args:
         summary: The finished shards.
         created: Creation time of the dataset, ISO 8601.
     """
+    files = [_file(item.file, item.bytes, item.sha256, "x-hdf5") for _, item in summary.records]
+    return _document(summary, created) | {"distribution": files}
+
+
+def croissant_of_tables(
+    summary: DatasetSummary, tables: Mapping[str, Iterable[ParquetFile]], *, created: str, url: str
+) -> dict[str, Any]:
+    """Return the content of ``croissant.json`` of a repository of Parquet tables, with a record set for each split.
+
+    Args:
+        summary: The finished shards.
+        tables: Split -> its tables.
+        created: Creation time of the dataset, ISO 8601.
+        url: Address of the repository.
+    """
+    distribution, records = [], []
+    for split, files in tables.items():
+        objects = [_file(item.path, item.bytes, item.sha256, "x-parquet") for item in files]
+        name = f"{split}-tables"
+        chosen = {"containedIn": [{"@id": item["@id"]} for item in objects], "includes": f"*/{split}/*.parquet"}
+        kind = {"@type": "cr:FileSet", "@id": name, "name": name, "encodingFormat": "application/x-parquet"}
+        distribution += [*objects, kind | chosen]
+        fields = [_field(field, split, name) for field in summary.spec.fields]
+        records.append({"@type": "cr:RecordSet", "@id": split, "name": split, "field": fields})
+    return _document(summary, created) | {"url": url, "distribution": distribution, "recordSet": records}
+
+
+def _field(field: Field, split: str, files: str) -> dict[str, Any]:
+    """Describe a column of a split's tables."""
+    source = {"fileSet": {"@id": files}, "extract": {"column": field.name}}
+    shape = {"isArray": True, "arrayShape": str(field.width)} if field.width else {}
+    return {
+        "@type": "cr:Field",
+        "@id": f"{split}/{field.name}",
+        "name": field.name,
+        "description": f"{field.long_name} [{field.unit}]",
+        "dataType": "sc:Integer" if field.dtype == "int64" else "sc:Float",
+        "source": source,
+        **shape,
+    }
+
+
+def _document(summary: DatasetSummary, created: str) -> dict[str, Any]:
+    """Return the metadata and the variables of a dataset."""
     spec = summary.spec
     document: dict[str, Any] = {
         "@context": _CONTEXT,
         "@type": "sc:Dataset",
-        "conformsTo": "http://mlcommons.org/croissant/1.0",
+        "conformsTo": "http://mlcommons.org/croissant/1.1",
         "name": spec.name,
         "description": _description(summary),
         "version": spec.version,
@@ -68,10 +131,7 @@ def croissant_document(summary: DatasetSummary, *, created: str) -> dict[str, An
     }
     if spec.license:
         document["license"] = f"https://spdx.org/licenses/{spec.license}"
-    return document | {
-        "variableMeasured": [_variable(field) for field in spec.fields],
-        "distribution": [_file(item.file, item.bytes, item.sha256) for _, item in summary.records],
-    }
+    return document | {"variableMeasured": [_variable(field) for field in spec.fields]}
 
 
 def _variable(field: Field) -> dict[str, Any]:
@@ -96,13 +156,13 @@ def _description(summary: DatasetSummary) -> str:
     return f"{text} One entry per scene: {arrays}."
 
 
-def _file(name: str, size: int, sha256: str) -> dict[str, str]:
+def _file(name: str, size: int, sha256: str, encoding: str) -> dict[str, str]:
     return {
         "@type": "cr:FileObject",
         "@id": name,
         "name": name,
         "contentUrl": name,
         "contentSize": f"{size} B",
-        "encodingFormat": "application/x-hdf5",
+        "encodingFormat": f"application/{encoding}",
         "sha256": sha256,
     }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -27,6 +28,8 @@ class Trajectory:
         q: Joint positions [rad], shape (K, n).
         dq: Joint velocities [rad/s], shape (K, n), or None.
         ddq: Joint accelerations [rad/s^2], shape (K, n), or None.
+        parameters: Values of the problem's parameters in SI units, shape (p,); None without parameters.
+        phase: Phases at the samples, increasing from 0 to 1, for bounds that depend on the phase, shape (K,), or None.
 
     Raises:
         UsageError: A shape is wrong, the times do not increase from 0, or a value is not finite.
@@ -36,6 +39,8 @@ class Trajectory:
     q: Array
     dq: Array | None = None
     ddq: Array | None = None
+    parameters: Array | None = None
+    phase: Array | None = None
 
     def __post_init__(self) -> None:
         t, q, dq = checked_samples(self.t, self.q, self.dq)
@@ -44,7 +49,14 @@ class Trajectory:
             if dq is None:
                 raise UsageError("a trajectory with accelerations needs velocities, too", concerns="ddq")
             ddq = checked_samples(t, q, self.ddq)[2]
-        for name, values in (("t", t), ("q", q), ("dq", dq), ("ddq", ddq)):
+        parameters = None if self.parameters is None else numbers("parameters", self.parameters)
+        if parameters is not None and parameters.ndim != 1:
+            raise UsageError(f"must have shape (p,), got {parameters.shape}", argument="parameters")
+        phase = None if self.phase is None else numbers("phase", self.phase)
+        if phase is not None:
+            _check_phase(phase, len(t))
+        arrays = {"t": t, "q": q, "dq": dq, "ddq": ddq, "parameters": parameters, "phase": phase}
+        for name, values in arrays.items():
             object.__setattr__(self, name, values)  # lists become arrays
         if self.t[0] != 0:
             raise UsageError(f"a trajectory begins at t = 0, got {self.t[0]} s", concerns="t")
@@ -53,6 +65,15 @@ class Trajectory:
     def duration(self) -> float:
         """Motion time [s]."""
         return float(self.t[-1])
+
+    def phase_of(self) -> Callable[[Array], Array] | None:
+        """Return the function from shares of the duration, shape (M,), to phases; None without phases."""
+        if self.phase is None:
+            return None
+        from scipy.interpolate import PchipInterpolator
+
+        interpolator = PchipInterpolator(self.t / self.duration, self.phase)
+        return lambda share: np.asarray(interpolator(share))
 
     def states(self, t: Array) -> tuple[Array, Array, Array]:
         """Evaluate the trajectory.
@@ -90,3 +111,11 @@ class Trajectory:
 
         parts = [part for part in (self.q, self.dq, self.ddq) if part is not None]
         return BPoly.from_derivatives(self.t, np.stack(parts, axis=1))
+
+
+def _check_phase(phase: Array, count: int) -> None:
+    """Check that phases increase from 0 to 1."""
+    if phase.shape != (count,):
+        raise UsageError(f"must have shape ({count},), one for each sample, got {phase.shape}", argument="phase")
+    if not (np.diff(phase) >= 0).all() or phase[0] != 0 or phase[-1] != 1:
+        raise UsageError(f"must increase from 0 to 1, got {phase[0]:g} to {phase[-1]:g}", argument="phase")

@@ -6,9 +6,11 @@ import pytest
 from cnpgen.benchmark.execution import execute_answer
 from cnpgen.benchmark.judging import judge_answer
 from cnpgen.benchmark.results_file import answer_to_dict
+from cnpgen.benchmark.run_suite import verdict_to_dict
 from cnpgen.benchmark.simulator.plant import PLANTS
 from cnpgen.errors import UsageError
 from cnpgen.plans import Plans, make_plans
+from cnpgen.plans.evaluate_trajectories import evaluate_trajectories
 from cnpgen.trajectory.sampled_trajectory import Trajectory
 from tests.examples.jerk_limits import jerk_limited_plan
 from tests.examples.plans import load
@@ -75,12 +77,29 @@ def test_a_faster_trajectory_exceeds_the_acceleration_limit() -> None:
     assert verdict.margins["joint acceleration"].severity > 1
 
 
-def test_velocity_jumps_of_linear_interpolation_count_as_accelerations() -> None:
+def test_positions_alone_have_no_accelerations_that_could_be_valid() -> None:
     plan = stored("transport")
-    samples = sampled(plan, 12)
+    samples = sampled(plan, 400)
     verdict = judge_answer(plan, Trajectory(samples.t, samples.q))
-    margin = verdict.margins["joint acceleration"]
-    assert abs(margin.value) > 5 * abs(margin.bound)
+    broken = {name for name, margin in verdict.margins.items() if not margin.ok}
+    assert {"joint acceleration", "joint torque"} < broken
+    assert verdict.margins["joint acceleration"].violation == np.inf
+    assert verdict.margins["joint position"].ok
+    assert "joint acceleration" not in verdict_to_dict(verdict)["value_over_bound"]
+
+
+@pytest.mark.parametrize(("label", "count"), [("hit", 300), ("transport", 300)])
+@pytest.mark.parametrize("speed", [1.0, 1.1])
+def test_the_verdict_is_that_of_the_evaluation_of_the_same_curve(label: str, count: int, speed: float) -> None:
+    plan = stored(label)
+    exact = sampled(plan, count)
+    samples = Trajectory(exact.t / speed, exact.q, exact.dq * speed, exact.ddq * speed**2)
+    verdict = judge_answer(plan, samples)
+    (expected,) = evaluate_trajectories(plan.problem, [samples], interpolation="quintic").verdicts
+    assert {name: margin.ok for name, margin in verdict.margins.items() if name in expected.conditions} == {
+        name: entry.decision == "valid" for name, entry in expected.conditions.items()
+    }
+    assert verdict.margins["joint velocity"] == expected.conditions["joint velocity"].margin
 
 
 @pytest.mark.parametrize("known", ["positions", "velocities", "accelerations"])

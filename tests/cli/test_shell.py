@@ -85,7 +85,7 @@ def test_the_command_line_names_its_option_for_a_file_without_a_problem(
         for name in ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq", "path_control_points"):
             file[name] = [[0.0]]
         file["rate_control_points"] = [[1.0]]
-    assert main(["evaluate", str(tmp_path / "a.h5")]) == 1
+    assert main(["evaluate", str(tmp_path / "a.h5")]) == 2
     assert "does not name its problem: set its attribute 'problem' to a name or a file, or pass --problem" in (
         capsys.readouterr().err
     )

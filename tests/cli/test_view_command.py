@@ -24,8 +24,10 @@ import cnpgen
 from cnpgen.cli.main import main
 from cnpgen.cli.view.serve import stamp
 from cnpgen.cli.view.view_bodies import robot_bodies, tube, wrapped
+from cnpgen.plans.export import export_plans
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
+from cnpgen.trajectories import load_trajectories
 from tests.conftest import HANGING, some
 from tests.examples.plan_files import plans_of
 from tests.examples.plans import load, perturbed
@@ -476,3 +478,28 @@ def test_a_browser_shows_the_verdict_without_an_error(rejected, width):
     assert np.ptp(scene, axis=(0, 1)).min() > 0.3  # the arm and its obstacles are drawn
     reddish = (image[..., 0] > 0.6) & (image[..., 1] < 0.3) & (image[..., 2] < 0.3)
     assert reddish.mean() > 0.003  # the badge and the violated conditions
+
+
+@needs_meshcat
+def test_sampled_trajectories_are_shown_with_their_verdicts(tmp_path, capsys):
+    hit = load("hit")
+    export_plans(plans_of(hit, perturbed(hit, 0.1)), tmp_path / "csv", to="csv", rate=500)
+    words = ["view", str(tmp_path / "csv"), "--problem", "airhockey", "--rows", "0,1", "-o", str(tmp_path / "a.html")]
+    assert main(words) == 0
+    text = (tmp_path / "a.html").read_text(encoding="utf-8")
+    valid, invalid = in_page(text, 0), in_page(text, 1)
+    assert (valid["verdict"]["valid"], valid["verdict"]["reason"]) == (True, "ok")
+    assert "puck" in {body["name"] for body in valid["world"]}
+    expected = cnpgen.evaluate_trajectories("airhockey", load_trajectories(tmp_path / "csv", "airhockey").trajectories)
+    verdict = expected.verdicts[1]
+    assert invalid["verdict"]["reason"] == str(verdict)
+    causes = {cause["name"]: cause for cause in invalid["verdict"]["causes"]}
+    for entry in verdict.conditions.values():
+        margin = entry.margin
+        cause = causes[f"{margin.name} {margin.part}".strip()]
+        assert cause["ok"] == margin.ok
+        assert margin.ok or invalid["times"][cause["frame"]] == pytest.approx(margin.time, abs=1e-9)
+    assert main([*words[:-4], "--row", "2"]) == 2
+    assert "has no trajectory 2: 2 are numbered from 0" in capsys.readouterr().err
+    assert main(["view", "airhockey", "--unit", "deg"]) == 2
+    assert "--unit is for sampled trajectories" in capsys.readouterr().err

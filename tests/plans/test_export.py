@@ -46,7 +46,8 @@ def read_csv(path: Path) -> dict[str, np.ndarray]:
     with path.open(newline="", encoding="utf-8") as file:
         header, *rows = csv.reader(file)
     units = {"q": "rad", "dq": "rad/s", "ddq": "rad/s^2", "jerk": "rad/s^3"}
-    assert header == ["t [s]", *(f"{name} {joint} [{unit}]" for name, unit in units.items() for joint in JOINTS)]
+    columns = [f"{name} {joint} [{unit}]" for name, unit in units.items() for joint in JOINTS]
+    assert header == ["t [s]", *columns, "path_phase"]
     values = np.array(rows, float)
     return {"t": values[:, 0]} | {name: values[:, 1 + 6 * i : 7 + 6 * i] for i, name in enumerate(FIELDS)}
 
@@ -99,7 +100,7 @@ def test_npz_says_which_plans_and_samples_there_are(tmp_path: Path) -> None:
     with np.load(exported.files[0]) as data:
         assert data["plan"].tolist() == [0, 9]
         assert data["sample_id"].tolist() == [0, 99]
-        assert len(data.files) == 5 + 2 * 5
+        assert len(data.files) == 5 + 2 * 6
 
 
 @pytest.mark.parametrize(

@@ -221,7 +221,7 @@ def test_a_problem_beside_the_file_or_in_the_call(tmp_path: Path) -> None:
         load_plans(beside, problem="heavy-object").problem.comparable_sha256 == record_problem(HEAVY).comparable_sha256
     )
     assert load_plans(missing, problem=HEAVY).problem == record_problem(HEAVY)
-    with pytest.raises(DatasetError, match=r"b\.h5 does not name its problem: set its attribute 'problem'"):
+    with pytest.raises(UsageError, match=r"b\.h5 does not name its problem: set its attribute 'problem'"):
         load_plans(missing)
 
 

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -129,6 +130,23 @@ def test_the_share_of_time_with_a_violation_is_reported() -> None:
     assert tilt.violated_share == pytest.approx(1 - 2 * np.arcsin(tilt.margin.tolerance / 1.2) / np.pi, abs=0.01)
 
 
+@pytest.mark.parametrize(("exponent", "expected"), [(0.2, "invalid"), (1.0, "valid"), (None, "valid")])
+def test_phases_of_the_samples_decide_a_bound_that_narrows(exponent: float | None, expected: str) -> None:
+    plans = plans_of(load("hit"))  # starts off the table; with the exponent 0.2, it should have reached it at once
+    (trajectory,) = sampled(plans, 500, 2)
+    share = trajectory.t / trajectory.duration
+    trajectory = replace(trajectory, phase=None if exponent is None else share**exponent)
+    (verdict,) = cnpgen.evaluate_trajectories(plans.problem, [trajectory]).verdicts
+    assert verdict.conditions["table height"].decision == expected
+
+
+def test_phases_increase_from_0_to_1() -> None:
+    (trajectory,) = sampled(plans_of(load("hit")), 100, 0)
+    for phase, message in ((trajectory.t, "must increase from 0 to 1, got 0 to"), (np.ones(3), "must have shape")):
+        with pytest.raises(UsageError, match=message):
+            replace(trajectory, phase=phase)
+
+
 # Files
 
 
@@ -146,6 +164,8 @@ def test_exported_plans_are_read_as_they_are(plans: Plans, tmp_path: Path, to: s
         assert np.allclose(trajectory.t, expected.t, atol=1e-9, rtol=0)
         for name in ("q", "dq", "ddq"):
             assert np.array_equal(getattr(trajectory, name), getattr(expected, name))
+        if to != "joint-trajectory":
+            np.testing.assert_array_equal(trajectory.phase, plans.motion[[0]].phase_at(expected.t[None])[0])
     assert loaded.ignored == ()
     assert cnpgen.evaluate_trajectories("airhockey", loaded.trajectories).valid.all()
 
@@ -200,6 +220,30 @@ def test_columns_are_found_by_their_usual_names(tmp_path: Path, pattern: str) ->
     assert np.allclose(trajectory.t, T)
     assert trajectory.dq is not None
     assert np.allclose(trajectory.dq, 2 * Q)
+
+
+def test_times_in_milliseconds_need_their_unit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = write_csv(tmp_path / "a.csv", ["t", *JOINTS], [1e4 * T, *Q.T])
+    assert main(["evaluate", str(file), "--problem", "airhockey"]) == 2
+    assert "t has steps of 1e+03 s, and all joints are slower" in (text := capsys.readouterr().err)
+    assert "name the column 't [ms]' or 't [s]'" in text
+    for name, factor in (("t [ms]", 1e-3), ("t [s]", 1.0)):
+        file.write_text(file.read_text().replace(file.read_text().partition(",")[0], name, 1))
+        (trajectory,) = load_trajectories(file, "airhockey").trajectories
+        assert np.allclose(trajectory.t, factor * 1e4 * T)
+    slow = write_csv(tmp_path / "slow.csv", ["t", *JOINTS], [10 * T, *Q.T])
+    assert load_trajectories(slow, "airhockey").trajectories[0].duration == pytest.approx(3)
+
+
+def test_a_file_of_neither_plans_nor_trajectories_is_refused_with_exit_code_2(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "notes.md").write_text("# Notes")
+    for words in (["notes.md"], ["notes.md", "--problem", "airhockey"]):
+        assert main(["evaluate", str(tmp_path / words[0]), *words[1:]]) == 2
+        assert "notes.md has an unknown format, expected a plan file, .h5, or sampled" in capsys.readouterr().err
+    assert main(["evaluate", str(tmp_path / "nosuch.csv"), "--problem", "airhockey"]) == 2
+    assert "nosuch.csv is not there, expected a file of plans or sampled trajectories" in capsys.readouterr().err
 
 
 def test_a_column_separates_trajectories(tmp_path: Path) -> None:

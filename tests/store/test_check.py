@@ -67,7 +67,14 @@ def test_empty_and_truncated_files_are_found_and_named(
     assert problems(dataset).keys() == {name}
 
 
-@pytest.mark.parametrize("name", FILES)
+def test_a_missing_description_for_catalogues_is_a_remark(dataset: Path) -> None:
+    (dataset / "croissant.json").unlink()
+    (finding,) = check_dataset(dataset)
+    assert (finding.file, finding.note) == ("croissant.json", True)
+    assert "missing" in finding.problem
+
+
+@pytest.mark.parametrize("name", [name for name in FILES if name != "croissant.json"])
 def test_missing_files_are_found_and_named(dataset: Path, name: str) -> None:
     (dataset / name).unlink()
     found = problems(dataset)

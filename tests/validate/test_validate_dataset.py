@@ -145,7 +145,7 @@ def test_a_flipped_byte_is_found_in_every_file(damaged: Path, file):
     assert validate_dataset(damaged).ok
 
 
-@pytest.mark.parametrize("file", KINDS)
+@pytest.mark.parametrize("file", [kind for kind in KINDS if kind != "croissant.json"])
 def test_a_missing_file_is_named(damaged: Path, file):
     (damaged / file).unlink()
     report = validate_dataset(damaged)

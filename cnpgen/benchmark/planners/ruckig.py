@@ -28,14 +28,24 @@ class Ruckig(BenchmarkPlanner):
 
     def prepare(self, setting: Setting) -> Plan:
         """Import Ruckig."""
-        with requires_extra("benchmark", "Ruckig"):
-            import ruckig
+        ruckig = load_ruckig()
         _, robot = open_problem(setting.problem)
 
         def plan(task: Plans) -> Answer:
             return time_optimal_motion(ruckig, robot, task.boundary)
 
         return plan
+
+
+def load_ruckig() -> Any:
+    """Import Ruckig.
+
+    Raises:
+        MissingExtraError: Ruckig is missing.
+    """
+    with requires_extra("benchmark", "Ruckig"):
+        import ruckig
+    return ruckig
 
 
 def time_optimal_motion(ruckig: Any, robot: Robot, boundary: Boundary) -> Trajectory | None:

@@ -10,7 +10,9 @@ from cnpgen.cli.view.view_bodies import Body, capsule_bodies, robot_bodies, tube
 from cnpgen.cli.view.view_verdict import ViewVerdict, view_verdict
 from cnpgen.judges.plans.condition_curves import ConditionCurve, condition_curves
 from cnpgen.judges.plans.plan_plot import along, shares_of_limits
-from cnpgen.judges.plans.verdict import Verdict
+from cnpgen.judges.plans.verdict import Reason, Verdict
+from cnpgen.judges.trajectories.trajectory_plot import along_trajectory
+from cnpgen.judges.trajectories.trajectory_verdict import TrajectoryVerdict
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.constraints.puck_contact import PUCK_OUT_OF_REACH_M, PuckContact
 from cnpgen.problems.constraints.table import Table
@@ -20,7 +22,9 @@ from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene import PARKED_POSITION_M, Scene
 from cnpgen.robots.shape.hull import CUBE
 from cnpgen.robots.solid import pose_width
+from cnpgen.trajectory.sampled_trajectory import Trajectory
 from cnpgen.world.forward_kinematics import ForwardKinematics
+from cnpgen.world.path import PathWorld
 
 Array = NDArray[np.float64]
 
@@ -130,6 +134,40 @@ def scene_of_plans(
     return _scene(problem, robot, views, with_meshes=with_meshes, first_row=first_row, n_rows=n_rows)
 
 
+def scene_of_trajectories(
+    problem: Problem,
+    robot: Robot,
+    trajectories: Sequence[Trajectory],
+    titles: Sequence[str],
+    verdicts: Sequence[TrajectoryVerdict],
+    *,
+    first_row: int = 0,
+    n_rows: int = 1,
+) -> ViewScene:
+    """Show sampled trajectories, by the interpolation that their derivatives determine.
+
+    Args:
+        problem: The problem.
+        robot: Its robot.
+        trajectories: The trajectories.
+        titles: Title of each.
+        verdicts: Verdict on each.
+        first_row: Index of the first trajectory in its source.
+        n_rows: Number of trajectories of the source.
+    """
+    views = []
+    for trajectory, title, verdict in zip(trajectories, titles, verdicts, strict=True):
+        margins = {name: entry.margin for name, entry in verdict.conditions.items()}
+        extra = [margin.time for margin in margins.values() if not margin.ok]
+        with np.errstate(all="ignore"):
+            world, s, times, scene = along_trajectory(
+                problem, robot, trajectory, samples=FRAMES_PER_MOTION, extra_times=extra
+            )
+            shown = Verdict(Reason.OK if verdict.valid else str(verdict), margins)
+            views.append(_moving(problem, robot, world, s, times, scene, title, shown))
+    return _scene(problem, robot, views, with_meshes=True, first_row=first_row, n_rows=n_rows)
+
+
 def _view(  # noqa: PLR0917 - all of them are shown
     problem: Problem, robot: Robot, plan: Plans, title: str, verdict: Verdict | None, scene: Scene
 ) -> View:
@@ -141,6 +179,20 @@ def _view(  # noqa: PLR0917 - all of them are shown
         return _still(problem, robot, title, q, ("start", "goal"), scene, rejected)
     extra = [margin.time for margin in verdict.margins.values() if not margin.ok]
     world, s, times = along(problem, robot, plan.motion, 0, samples=FRAMES_PER_MOTION, extra_times=extra, scene=scene)
+    return _moving(problem, robot, world, s, times, scene, title, verdict)
+
+
+def _moving(  # noqa: PLR0917 - all of them are shown
+    problem: Problem,
+    robot: Robot,
+    world: PathWorld,
+    s: Array,
+    times: Array,
+    scene: Scene,
+    title: str,
+    verdict: Verdict,
+) -> View:
+    """Show one motion at phases s and times [s], shape (K,)."""
     curves = condition_curves(problem, world, s, scene.bodies())
     poses = _poses(robot, world.q)
     return View(

@@ -1,7 +1,7 @@
 """Joint limits over a whole motion, including all times between samples: proven, because the motion is a polynomial."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import cast
 
@@ -65,6 +65,14 @@ class ProvenJointLimits:
     tolerance: Array
     bounds: Array
     scale: Array
+
+    def scaled(self, parameters: Mapping[str, float]) -> "ProvenJointLimits":
+        """Return the limits of a sample with these parameters, by name."""
+        factors = np.array([_factor_of(constraint, parameters) for constraint in self.constraints])[:, None]
+        if (factors == 1).all():
+            return self
+        tolerance, bounds, scale = (factors * values for values in (self.tolerance, self.bounds, self.scale))
+        return replace(self, tolerance=tolerance, bounds=bounds, scale=scale)
 
     @cached_property
     def tolerant(self) -> NDArray[np.bool_]:

@@ -185,6 +185,7 @@ class EvaluationContext:
         world: The robot; ``move`` moves it.
         measured: Conditions at the samples.
         with_uncertainty: Adds the errors of the values to conditions at phases, if the motion is not known exactly.
+        phase_of: Returns the phases of bounds for phases of the curve, if they differ.
     """
 
     problem: Problem
@@ -196,6 +197,7 @@ class EvaluationContext:
     world: PathWorld
     measured: Sequence[MeasuredCondition]
     with_uncertainty: Callable[[MeasuredCondition, Array], MeasuredCondition] | None = None
+    phase_of: Callable[[Array], Array] | None = None
 
     def move(self, s: Array) -> None:
         """Move the robot to phases s, shape (K,)."""
@@ -204,7 +206,8 @@ class EvaluationContext:
 
     def measure(self, constraint: Constraint, s: Array) -> list[MeasuredCondition]:
         """Measure a constraint at phases s, shape (K,), to which the robot was moved."""
-        measured = measure(constraint, self.world, s, self.start_tip)
+        phases = s if self.phase_of is None else self.phase_of(s)
+        measured = measure(constraint, self.world, phases, self.start_tip)
         add = self.with_uncertainty
         return measured if add is None else [add(condition, s) for condition in measured]
 
@@ -214,7 +217,13 @@ class EvaluationContext:
 
 
 def evaluation_context(  # noqa: PLR0917 - all of them are independent inputs
-    problem: Problem, curve: Curve, obstacle_poses: Array, world: PathWorld, samples: Samples, table: Array
+    problem: Problem,
+    curve: Curve,
+    obstacle_poses: Array,
+    world: PathWorld,
+    samples: Samples,
+    table: Array,
+    phase_of: Callable[[Array], Array] | None = None,
 ) -> EvaluationContext:
     """Measure all conditions of one motion that are not proven, at the samples where the robot is.
 
@@ -225,10 +234,12 @@ def evaluation_context(  # noqa: PLR0917 - all of them are independent inputs
         world: The robot at the samples.
         samples: Times and phases of the samples.
         table: Times of the motion (``time_table``).
+        phase_of: See ``EvaluationContext``.
     """
     start_tip = world.tip_position[:, 0].copy()
     constraints = [constraint for constraint in problem.constraint if not is_proven(constraint)]
-    measured = [
-        condition for constraint in constraints for condition in measure(constraint, world, samples.s, start_tip)
-    ]
-    return EvaluationContext(problem, curve, obstacle_poses, samples, table, start_tip, world, measured)
+    phases = samples.s if phase_of is None else phase_of(samples.s)
+    measured = [condition for constraint in constraints for condition in measure(constraint, world, phases, start_tip)]
+    return EvaluationContext(
+        problem, curve, obstacle_poses, samples, table, start_tip, world, measured, phase_of=phase_of
+    )

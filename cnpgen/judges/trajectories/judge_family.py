@@ -2,7 +2,7 @@
 
 It is the verdict on plans (``cnpgen.judges.plans``) with a bound of the error of every value. Joint limits are proven
 from Bernstein coefficients, distances by interval subdivision, and smooth conditions at samples and local maxima. A
-sampled trajectory has no phase of its own: the phase is the share of its duration.
+sampled trajectory without phases has the share of its duration as phase.
 """
 
 from collections.abc import Sequence
@@ -12,7 +12,6 @@ from itertools import chain, product
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import UsageError
 from cnpgen.judges.plans.bernstein import find_maximum
 from cnpgen.judges.plans.continuous_collision import check_continuous_collision, is_contact, pairs_of
 from cnpgen.judges.plans.evaluated_trajectory import EvaluatedTrajectory
@@ -28,6 +27,8 @@ from cnpgen.judges.trajectories.uncertainty import uncertainty_of
 from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
+from cnpgen.robots.solid import pose_width
+from cnpgen.trajectory.sampled_trajectory import Trajectory
 from cnpgen.world.path import PathWorld
 
 Array = NDArray[np.float64]
@@ -45,66 +46,79 @@ class FamilyJudge:
         step: Maximum time between checked times [s].
 
     Raises:
-        UsageError: The step is not positive, or too long, or the problem has parameters.
+        UsageError: The step is not positive, or too long.
     """
 
     def __init__(self, problem: Problem, robot: Robot, *, step: float = 1e-3) -> None:
         check_step(step)
-        if problem.parameters:
-            names = ", ".join(problem.parameters.names)
-            raise UsageError(f"sampled trajectories of {problem.name!r} are not judged: they have no values of {names}")
         self._problem, self._robot, self._step = problem, robot, step
         self._world, self._moved = (PathWorld(robot, problem.obstacle, problem.object_size) for _ in range(2))
         self._limits = joint_limits(problem, self._world)
 
-    @property
-    def limits(self) -> ProvenJointLimits:
-        """Joint limits of the problem."""
-        return self._limits
+    def limits(self, parameters: Array | None = None) -> ProvenJointLimits:
+        """Return the joint limits of the problem with parameters of shape (p,), nominal by default."""
+        names = self._problem.parameters.names
+        return self._limits if parameters is None else self._limits.scaled(dict(zip(names, parameters, strict=True)))
 
-    def __call__(self, family: CurveFamily) -> TrajectoryVerdict:
-        """Judge one family; values that cannot be evaluated give an undecided verdict."""
+    def __call__(self, family: CurveFamily, trajectory: Trajectory, *, scene: Array | None = None) -> TrajectoryVerdict:
+        """Judge one family; values that cannot be evaluated give an undecided verdict.
+
+        Args:
+            family: The curves.
+            trajectory: The samples, with phases and parameters; without them, phases are shares of the duration, and
+                parameters nominal.
+            scene: Poses and sizes of the obstacles, then values for a constraint and parameters, shape (width,). By
+                default, they follow from the ends of the curves and the parameters.
+        """
         if not family.duration < MAX_DURATION_S or len(family.t) > MAX_TIME_SAMPLES:
             reason = f"{Reason.TOO_LONG}: at most {MAX_DURATION_S:g} s and {MAX_TIME_SAMPLES:,} samples are judged"
             return TrajectoryVerdict(Decision.UNDECIDED, reason, duration=family.duration)
         with np.errstate(all="ignore"):  # overflows give inf or nan, which are detected
-            return self._judge(family)
+            return self._judge(family, trajectory, scene)
 
-    def _judge(self, family: CurveFamily) -> TrajectoryVerdict:
+    def _judge(self, family: CurveFamily, trajectory: Trajectory, scene: Array | None) -> TrajectoryVerdict:
         s = checked_phases(family, self._step)
         table = np.array([[0.0, 1.0], [0.0, family.duration]])
         samples = Samples(s, times(s, table))
         states = family.evaluate(s, jerk=self._problem.uses_jerk)
         if not states.is_finite():
             return TrajectoryVerdict(Decision.UNDECIDED, Reason.NOT_FINITE, duration=family.duration, samples=len(s))
-        poses = self._obstacle_poses(states.q, states.dq)
-        scenes = self._possible_scenes(family, states, poses)
+        if scene is None:
+            poses = self._obstacle_poses(states.q, states.dq, trajectory.parameters)
+            scenes = self._possible_scenes(family, states, poses, trajectory.parameters)
+        else:
+            poses, scenes = scene, []
         self._world.set_path(states.q, states.dq, states.ddq, poses, states.jerk)
-        context = evaluation_context(self._problem, family, poses, self._world, samples, table)
+        phase_of = trajectory.phase_of()
+        context = evaluation_context(self._problem, family, poses, self._world, samples, table, phase_of)
         errors = uncertainty_of(self._problem, family, self._moved, [poses, *scenes], context.measured, s)
         measured = [errors.add(condition, s) for condition in context.measured]
         context = replace(context, measured=measured, with_uncertainty=errors.add)
-        entries = [*_limit_entries(self._limits, family, samples), *_measured_entries(context)]
+        limits = self._limits.scaled(self._world.parameters.values)
+        entries = [*_limit_entries(limits, family, samples), *_measured_entries(context)]
         names = list(by_name([entry.margin for entry in entries]))
         conditions = dict(zip(names, (entry.decided() for entry in entries), strict=True))
         return _verdict(conditions, family.duration, len(s))
 
-    def _obstacle_poses(self, q: Array, dq: Array) -> Array:
+    def _obstacle_poses(self, q: Array, dq: Array, parameters: Array | None) -> Array:
         """Place the obstacles, and the puck of a hit, by the tip at both ends."""
         (ends, speeds), still = (np.ascontiguousarray(x[:, [0, -1]]) for x in (q, dq)), np.zeros((len(q), 2))
         poses = scene_of(self._problem, *np.zeros((3, 1, 3))).poses[0]
         self._world.set_path(ends, speeds, still, poses, still)
         start, goal = self._world.tip_position.T[:, None].copy()
-        return np.asarray(scene_of(self._problem, start, goal, self._world.tip_velocity[:, 1:].T).poses[0])
+        rows = None if parameters is None else parameters[None]
+        return np.asarray(scene_of(self._problem, start, goal, self._world.tip_velocity[:, 1:].T, rows).poses[0])
 
-    def _possible_scenes(self, family: CurveFamily, states: EvaluatedTrajectory, poses: Array) -> list[Array]:
+    def _possible_scenes(
+        self, family: CurveFamily, states: EvaluatedTrajectory, poses: Array, parameters: Array | None
+    ) -> list[Array]:
         """Return scenes whose values of the motion, such as a puck, are those of other curves of the family."""
         if self._problem.scene_constraint is None:
             return []
         position, velocity, acceleration = (bound[-1] for bound in family.bounds[:3])
         if (acceleration >= UNDEFINED).all():  # velocities jump between spans
             velocity = velocity + np.abs(states.dq[:, -1] - family.polynomials.dq[-1, max(len(family.t) - 3, 0)])
-        scenes, known = [], self._problem.scene_width - self._problem.scene_constraint.scene_width
+        scenes, known = [], pose_width(self._problem.obstacle)
         for (order, bound), sign in product({"q": position, "dq": velocity}.items(), (-1.0, 1.0)):
             if not bound.any():
                 continue
@@ -112,7 +126,7 @@ class FamilyJudge:
                 ends = {name: getattr(states, name)[:, [0, -1]].copy() for name in ("q", "dq")}
                 moved = slice(None) if joint is None else joint
                 ends[order][moved, -1] += sign * bound[moved]
-                scene = self._obstacle_poses(ends["q"], ends["dq"])
+                scene = self._obstacle_poses(ends["q"], ends["dq"], parameters)
                 scenes.append(np.concatenate([poses[:known], scene[known:]]))
         return scenes
 
@@ -162,7 +176,7 @@ class _Entry:
         if self.error >= DECIDING_ERROR:
             return f"{name}: the curve lacks a derivative at its samples"
         if self.error == 0:
-            return f"{name}: the bound depends on the phase, which samples do not have"
+            return f"{name}: the bound depends on the phase, which the samples do not have"
         return f"{name}: known up to {self.error:.2g} {unit}, which some curves need to be valid"
 
 
@@ -204,13 +218,13 @@ def _measured_entries(context: EvaluationContext) -> list[_Entry]:
     for condition in context.measured:
         violated, possible = _violation_masks(context, condition)
         masks[id(condition)] = _share(violated, t), _share(possible & ~violated, t)
-        certain[id(condition)] = float(_certain(condition).max())
+        certain[id(condition)] = float(_certain(context, condition).max())
     between = chain(check_continuous_collision(context, early_exit=False), check_local_maxima(context))
     for condition, margin in between:
         key = id(condition)
         error = float(np.max(condition.uncertainty))  # that of the margin is at most as large
         worst[key] = max(worst[key], margin, key=lambda candidate: candidate.severity)
-        if not condition.relaxation.any():
+        if context.phase_of is not None or not condition.relaxation.any():
             certain[key] = max(certain[key], (margin.violation - 2 * error) / max(margin.tolerance, ZERO_TOLERANCE))
     entries = []
     for condition in context.measured:
@@ -220,9 +234,11 @@ def _measured_entries(context: EvaluationContext) -> list[_Entry]:
     return entries
 
 
-def _certain(condition: MeasuredCondition) -> Array:
-    """Return the relative violations that every curve has, at every phase of the motion, shape (m, K)."""
-    excess = condition.relaxation.max() - condition.relaxation  # bounds are widest at some phase
+def _certain(context: EvaluationContext, condition: MeasuredCondition) -> Array:
+    """Return the relative violations that every curve has, whatever its phases are if unknown, shape (m, K)."""
+    excess: Array | float = 0.0
+    if context.phase_of is None:
+        excess = condition.relaxation.max() - condition.relaxation  # bounds are widest at some phase
     certain = condition.violation - 2 * condition.uncertainty - excess
     return np.asarray(certain / np.maximum(condition.tolerance, ZERO_TOLERANCE)[:, None])
 
@@ -237,7 +253,7 @@ def _violation_masks(
         high = float(np.max(required + condition.uncertainty, initial=-np.inf))
         return ~pairs.clear_states(low), ~pairs.clear_states(high)
     possible = condition.relative_violation > 1
-    return np.asarray((_certain(condition) > 1).any(axis=0)), np.asarray(possible.any(axis=0))
+    return np.asarray((_certain(context, condition) > 1).any(axis=0)), np.asarray(possible.any(axis=0))
 
 
 def _error_at(context: EvaluationContext, condition: MeasuredCondition, margin: Margin) -> float:

@@ -23,26 +23,29 @@ MAX_LINEAR_SPAN_S = 0.0101  # between exact positions that a controller connects
 TOLERANCE_SHARE = 0.9  # of the tolerance of accelerations and jerks that the smooth curve uses
 
 
-def judge_samples(judge: FamilyJudge, trajectory: Trajectory, noise: Array) -> TrajectoryVerdict:
+def judge_samples(
+    judge: FamilyJudge, trajectory: Trajectory, noise: Array, *, scene: Array | None = None
+) -> TrajectoryVerdict:
     """Judge the motion that samples resolve.
 
     Args:
         judge: The judge of the problem.
         trajectory: The samples.
         noise: Largest errors of positions, velocities and accelerations [rad, rad/s, rad/s^2], shape (3,).
+        scene: Obstacles, see ``FamilyJudge``.
     """
-    limits = acceleration_limits(judge.limits)
+    limits = acceleration_limits(judge.limits(trajectory.parameters))
     if trajectory.dq is None and not noise.any() and np.diff(trajectory.t).max() <= MAX_LINEAR_SPAN_S:
-        return judge(interpolated(trajectory, "linear", noise))
+        return judge(interpolated(trajectory, "linear", noise), trajectory, scene=scene)
     if not noise.any() and is_resolved(trajectory, limits.acceleration):
         curves = [smooth_curve(trajectory, limits)]
         if trajectory.ddq is not None:
             curves.insert(0, family_of_data(trajectory.t, data_of(trajectory)))
         for curve in curves:
-            verdict = None if curve is None else judge(curve)
+            verdict = None if curve is None else judge(curve, trajectory, scene=scene)
             if verdict is not None and verdict.valid:
                 return verdict
-    return judge(resolved_curves(trajectory, noise, limits.acceleration))
+    return judge(resolved_curves(trajectory, noise, limits.acceleration), trajectory, scene=scene)
 
 
 def acceleration_limits(limits: ProvenJointLimits) -> AccelerationLimits:

@@ -4,14 +4,19 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cnpgen.judges.plans.plan_plot import PLOT_SAMPLES, draw_path
 from cnpgen.judges.plans.verdict import Margin
+from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
+from cnpgen.robots.scene import Scene
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.trajectory.sampled_trajectory import Trajectory
 from cnpgen.world.path import PathWorld
+
+Array = NDArray[np.float64]
 
 
 def plot_trajectory(
@@ -36,11 +41,37 @@ def plot_trajectory(
     Raises:
         MachineError: matplotlib is missing, or the file cannot be written.
     """
-    times = np.clip([margin.time for margin in margins], 0, trajectory.duration)
-    t = np.union1d(np.linspace(0, trajectory.duration, PLOT_SAMPLES), times)
-    world = PathWorld(robot, problem.obstacle, problem.object_size)
+    with np.errstate(all="ignore"):
+        world, s, t, scene = along_trajectory(
+            problem, robot, trajectory, samples=PLOT_SAMPLES, extra_times=[margin.time for margin in margins]
+        )
+    draw_path(problem, world, s, t, Path(path), scene=scene, title=title, margins=margins)
+
+
+def along_trajectory(
+    problem: Problem, robot: Robot, trajectory: Trajectory, *, samples: int, extra_times: Sequence[float] = ()
+) -> tuple[PathWorld, Array, Array, Scene]:
+    """Place the robot at K times of a trajectory, uniformly spaced but for extra ones, among obstacles by its ends.
+
+    Args:
+        problem: The problem.
+        robot: Its robot.
+        trajectory: The trajectory.
+        samples: Number of uniformly spaced times.
+        extra_times: Further times [s].
+
+    Returns:
+        The world, phases, times [s], shape (K,) each, and the obstacles.
+    """
+    times = np.clip(np.array(extra_times, float), 0, trajectory.duration)
+    t = np.union1d(np.linspace(0, trajectory.duration, samples), times)
+    share, phase_of = t / trajectory.duration, trajectory.phase_of()
     q, dq, ddq = (np.ascontiguousarray(values.T) for values in trajectory.states(t))
     jerk = np.ascontiguousarray(trajectory.jerks(t).T) if problem.uses_jerk else None
-    with np.errstate(all="ignore"):
-        world.set_path(q, dq, ddq, place_obstacles(problem.obstacle), jerk)
-    draw_path(problem, world, t / trajectory.duration, t, Path(path), scene=None, title=title, margins=margins)
+    world = PathWorld(robot, problem.obstacle, problem.object_size)
+    world.set_path(q, dq, ddq, place_obstacles(problem.obstacle), jerk)
+    tip, velocity = world.tip_position.T, world.tip_velocity.T
+    parameters = None if trajectory.parameters is None else trajectory.parameters[None]
+    scene = scene_of(problem, tip[:1], tip[-1:], velocity[-1:], parameters)
+    world.set_path(q, dq, ddq, scene.poses[0], jerk)
+    return world, share if phase_of is None else phase_of(share), t, scene
