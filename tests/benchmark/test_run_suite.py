@@ -5,6 +5,7 @@ import json
 import os
 import re
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +22,9 @@ from cnpgen.benchmark.paper_figures import (
     success_over_time,
 )
 from cnpgen.benchmark.process import Ending, PlannerProcess, PlanningOutcome
-from cnpgen.benchmark.result_tables import failure_summaries, save_benchmark_tables, table_rows
+from cnpgen.benchmark.result_tables import failure_summaries, notes, save_benchmark_tables, table_rows
 from cnpgen.benchmark.results_file import answer_from_dict, answer_to_dict, open_results
-from cnpgen.benchmark.run_suite import run_benchmark
+from cnpgen.benchmark.run_suite import Benchmark, run_benchmark
 from cnpgen.benchmark.suite import load_suite
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.trajectory.sampled_trajectory import Trajectory
@@ -444,3 +445,11 @@ def test_a_damaged_record_of_runs_is_named(tmp_path: Path) -> None:
     (tmp_path / "runs.json").write_text('[{"date": 5}]')
     with pytest.raises(DatasetError, match=r"runs.json is damaged: .*; delete it"):
         run_benchmark("hits-81", tmp_path, planners=["cnpgen"], n=1)
+
+
+def test_tables_name_the_planners_whose_inner_loops_are_in_python() -> None:
+    suite = load_suite("hits-81")
+    benchmark = Benchmark(suite, suite.problems(1)[0], None, {"aqp": [], "cnpgen": [], "cbirrt": []})
+    (note,) = (note for note in notes(benchmark) if "Python" in note and "C++" in note)
+    assert note.startswith("aqp, cbirrt: inner loops in Python")
+    assert not any("C++" in note for note in notes(replace(benchmark, results={"cnpgen": []})))
