@@ -21,7 +21,7 @@ from cnpgen.benchmark.paper_figures import (
     success_figure,
     success_over_time,
 )
-from cnpgen.benchmark.process import Ending, PlannerProcess, PlanningOutcome
+from cnpgen.benchmark.process import Ending, PlannerProcess, PlanningOutcome, cpu_time_of
 from cnpgen.benchmark.result_tables import failure_summaries, notes, save_benchmark_tables, table_rows
 from cnpgen.benchmark.results_file import answer_from_dict, answer_to_dict, open_results
 from cnpgen.benchmark.run_suite import Benchmark, run_benchmark
@@ -385,6 +385,20 @@ def test_an_answer_after_the_time_limit_does_not_count() -> None:
     assert process._in_time(late).answer is None
     in_time = PlanningOutcome(Ending.PLANNED, {"t": []}, seconds=0.999)
     assert process._in_time(in_time) is in_time
+
+
+def test_a_stopped_planner_has_the_cpu_time_that_it_used(
+    unreliable: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cnpgen.benchmark.process.STOP_MARGIN_S", 0.2)
+    module = tmp_path / "unreliable.py"
+    module.write_text(module.read_text().replace("time.sleep(1000)", "sum(1 for _ in iter(int, 1))"))
+    problems, _ = load_suite("hits-81").problems(6)
+    process = PlannerProcess(unreliable, Setting(problems.problem, "airhockey-hit", time_limit=2.0))
+    outcome = process.plan(problems[5])
+    assert outcome.ending is Ending.OUT_OF_TIME
+    assert 0 < outcome.cpu_seconds < 1.1 * outcome.seconds
+    assert cpu_time_of(os.getpid()) >= time.process_time()
 
 
 def test_a_report_covers_the_folder_and_nothing_else(random: str, tmp_path: Path) -> None:
