@@ -5,7 +5,7 @@
 The output of each command becomes one text file in OUT. Commands whose file exists are skipped, so that an interrupted
 run resumes. FOLDER in a command is a folder in OUT, and ``air_hockey_challenge`` is the clone of --environment, without
 which those commands are skipped, like those that need files which the reader has trained. --list also prints the
-longest planning time of comparisons of planners: every planner uses its time limit for every problem.
+maximum planning time of comparisons of planners: every planner uses its time limit for every problem.
 """
 
 import argparse
@@ -60,7 +60,7 @@ class QuotedCommand:
         return [sys.executable, *words]
 
     def planning_bound(self) -> float | None:
-        """Return the longest planning time [h] of a comparison with a time limit, including the margin of its stops."""
+        """Return the maximum planning time [h] of a comparison with a time limit, including the margin of its stops."""
         from cnpgen.benchmark.process import STOP_MARGIN_S
         from cnpgen.benchmark.suite import load_suite
         from cnpgen.schema.units import parse_number
@@ -122,7 +122,7 @@ def run(command: QuotedCommand, out: Path, environment: Path | None, time_limit:
 
 
 def print_list(commands: list[QuotedCommand]) -> None:
-    """Print the commands, and the longest planning time of comparisons of planners with its sum."""
+    """Print the commands, and the maximum planning time of comparisons of planners with its sum."""
     total = 0.0
     for command in commands:
         print(f"{command.page}: {command.text}")

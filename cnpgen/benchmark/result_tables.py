@@ -2,6 +2,7 @@
 
 import csv
 import io
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -131,7 +132,7 @@ def _printed_note(benchmark: Benchmark) -> list[str]:
 
 
 def failure_summaries(benchmark: Benchmark) -> list[str]:
-    """Report the outcomes and the first error of every planner without a plan for some problems."""
+    """Report problems without a plan, with the first error, and the violated conditions of plans that are not valid."""
     texts = []
     for name, rows in benchmark.results.items():
         unplanned = [row for row in rows if row["answer"] is None]
@@ -139,6 +140,11 @@ def failure_summaries(benchmark: Benchmark) -> list[str]:
             failed = [row for row in unplanned if row["ending"] == ending]
             detail = f", problem {failed[0]['problem']}: {failed[0]['error']}" if failed[0]["error"] else ""
             texts.append(f"{name}: {len(failed)} of {len(rows)} {ending}{detail}")
+        verdicts = [row["verdict"] for row in rows if row["answer"] is not None]
+        reasons = Counter(str(verdict.get("reason", "no reason")) for verdict in verdicts if not verdict["valid"])
+        if reasons:
+            counts = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common())
+            texts.append(f"{name}: {reasons.total()} of {len(verdicts)} plans not valid by the verdict: {counts}")
     return texts
 
 

@@ -93,6 +93,9 @@ def test_a_failure_of_a_planner_affects_only_its_own_problem(
     assert "garbage" in rows[2]["error"]
     assert "ZeroDivisionError" in rows[3]["error"]
     assert [row["answer"] is not None for row in rows[:7]] == [False, True, False, False, False, False, True]
+    assert failure_summaries(benchmark)[-1] == (
+        "unreliable: 5 of 7 plans not valid by the verdict: boundary conditions 3, not finite 1, too long 1"
+    )
 
 
 @pytest.mark.parametrize("failure", some(["os._exit(1)", "1 / 0"], 1, "slow"))
