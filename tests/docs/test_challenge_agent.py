@@ -56,7 +56,7 @@ print(json.dumps(edges))
 
 
 @needs_challenge
-def test_the_agent_refines_hits_that_start_beyond_the_edge_of_the_table():
+def test_the_agent_refines_hits_that_leave_the_table():
     python, clone = os.environ["CNPGEN_CHALLENGE_PYTHON"], os.environ["CNPGEN_CHALLENGE"]
     command = [python, "-W", "ignore", "-c", EDGE, clone, str(RUN.parent)]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
