@@ -4,7 +4,8 @@
 
 The output of each command becomes one text file in OUT. Commands whose file exists are skipped, so that an interrupted
 run resumes. FOLDER in a command is a folder in OUT, and ``air_hockey_challenge`` is the clone of --environment, without
-which those commands are skipped, like those that need files which the reader has trained.
+which those commands are skipped, like those that need files which the reader has trained. --list also prints the
+maximum planning time of comparisons of planners: every planner uses its time limit for every problem.
 """
 
 import argparse
@@ -14,6 +15,7 @@ import subprocess
 import sys
 import time
 from dataclasses import dataclass
+from itertools import takewhile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -24,6 +26,7 @@ OTHER_PAGES = tuple(ROOT / "docs" / "how-to" / name for name in ("benchmark.md",
 CLONE, FOLDER = "air_hockey_challenge", "FOLDER"
 PATTERN_CHARACTERS = "*?"  # of files that the reader trains first
 DEFAULT_TIME_LIMIT_S = 12 * 3600.0
+HOUR_S = 3600.0
 
 
 @dataclass(frozen=True)
@@ -55,6 +58,20 @@ class QuotedCommand:
         if words[0] == "cnpgen":
             return [sys.executable, "-m", *words, "-o", str(out / "work" / words[2])]
         return [sys.executable, *words]
+
+    def planning_bound(self) -> float | None:
+        """Return the maximum planning time [h] of a comparison with a time limit, including the margin of its stops."""
+        from cnpgen.benchmark.process import STOP_MARGIN_S
+        from cnpgen.benchmark.suite import load_suite
+        from cnpgen.schema.units import parse_number
+
+        words = shlex.split(self.text)
+        if words[0] != "cnpgen" or "--time-limit" not in words:
+            return None
+        limit = parse_number(words[words.index("--time-limit") + 1], "s")
+        planners = list(takewhile(lambda word: not word.startswith("--"), words[words.index("--planners") + 1 :]))
+        problems, _ = load_suite(words[2]).problems()
+        return len(planners) * len(problems) * (limit + STOP_MARGIN_S) / HOUR_S
 
 
 def quoted_commands(pages: list[str] | None = None) -> list[QuotedCommand]:
@@ -104,6 +121,18 @@ def run(command: QuotedCommand, out: Path, environment: Path | None, time_limit:
     return f"done in {time.monotonic() - begun:.0f} s"
 
 
+def print_list(commands: list[QuotedCommand]) -> None:
+    """Print the commands, and the maximum planning time of comparisons of planners with its sum."""
+    total = 0.0
+    for command in commands:
+        print(f"{command.page}: {command.text}")
+        if (bound := command.planning_bound()) is not None:
+            total += bound
+            print(f"    plans for at most {bound:.2f} h")
+    if total:
+        print(f"all comparisons of planners: at most {total:.2f} h of planning")
+
+
 def main() -> int:
     """Run the command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -113,11 +142,12 @@ def main() -> int:
     parser.add_argument("--environment", type=Path, help="clone of the Air Hockey Challenge")
     parser.add_argument("--time-limit", type=float, default=DEFAULT_TIME_LIMIT_S, help="of one command [s]")
     options = parser.parse_args()
+    commands = quoted_commands(options.pages)
+    if options.list:
+        print_list(commands)
+        return 0
     failed = False
-    for command in quoted_commands(options.pages):
-        if options.list:
-            print(f"{command.page}: {command.text}")
-            continue
+    for command in commands:
         outcome = run(command, options.out.resolve(), options.environment, options.time_limit)
         failed |= outcome.startswith("failed")
         print(f"{command.page}: {command.text}: {outcome}", flush=True)

@@ -51,7 +51,7 @@ FIGURES = {
 TAILS = {"p99": 0.99, "p999": 0.999, "max": 1.0}
 REFERENCE_PLANNER = "cnpgen+refine"  # default reference of the comparison, if present
 NORMAL_QUANTILE_95 = 1.959963984540054  # two-sided
-NOT_APPLICABLE = "not applicable"
+NOT_APPLICABLE, CRASHED = "not applicable", "crashed"  # endings of rows
 
 Values = dict[str, bool | float]
 """Flags and figures of one problem, by the names of ``FLAGS`` and ``FIGURES``."""
@@ -70,7 +70,8 @@ def values_of(row: Mapping[str, Any], plant: str = "", plane_tolerance: float = 
     if row.get("ending") == NOT_APPLICABLE or (plant and has_answer and executed is None):
         return {}
     values: Values = {"planned": has_answer}
-    values |= {"planning_ms": 1e3 * row["planning_s"], "planning_cpu_ms": 1e3 * row["planning_cpu_s"]}
+    if row.get("ending") != CRASHED:  # the CPU time of a crashed process is unknown
+        values |= {"planning_ms": 1e3 * row["planning_s"], "planning_cpu_ms": 1e3 * row["planning_cpu_s"]}
     if plant:
         executed = executed or {}
         values |= {name: value for name, value in executed.items() if name in FLAGS or name in FIGURES}

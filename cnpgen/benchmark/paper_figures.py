@@ -82,7 +82,8 @@ def success_figure(values: dict[str, list[Values]], plant: str) -> "Figure":
     """
     figure = new_figure(4.5, 3.2)
     axes, flag = figure.add_subplot(), "success" if plant else "valid"
-    max_time = max((float(known["planning_cpu_ms"]) for rows in values.values() for known in rows), default=1.0)
+    times_ms = [float(known.get("planning_cpu_ms", 0.0)) for rows in values.values() for known in rows]
+    max_time = max(times_ms, default=1.0)
     for index, (name, rows) in enumerate(values.items()):
         times, ratios = success_over_time(rows, flag)
         end = ratios[-1] if len(ratios) else 0.0

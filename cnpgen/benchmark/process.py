@@ -44,7 +44,8 @@ class PlanningOutcome:
         ending: Outcome.
         answer: The plan or the trajectory in its stored form, if there is one.
         seconds: Wall time of planning [s].
-        cpu_seconds: CPU time of planning, with that of ended child processes [s].
+        cpu_seconds: CPU time of planning, with that of ended child processes [s]; of a stopped planner, also with that
+            of its running child processes.
         error: Error message of the planner, or empty.
     """
 
@@ -79,17 +80,19 @@ class PlannerProcess:
             self._unprepared = self._start()
         if self._unprepared is not None:
             return self._unprepared
-        start = time.perf_counter()
+        assert self._pipe is not None
+        assert self._process is not None
+        start, used = time.perf_counter(), cpu_time_of(self._process.pid)
         try:
-            assert self._pipe is not None
             self._pipe.send(problem)
             if self._pipe.poll(self._setting.time_limit + STOP_MARGIN_S):
                 return self._in_time(self._pipe.recv())
         except (EOFError, OSError):
             self.stop()
             return PlanningOutcome(Ending.CRASHED, seconds=time.perf_counter() - start, error="its process ended")
+        seconds, used = time.perf_counter() - start, cpu_time_of(self._process.pid) - used
         self.stop()
-        return PlanningOutcome(Ending.OUT_OF_TIME, seconds=time.perf_counter() - start, error="stopped: no answer")
+        return PlanningOutcome(Ending.OUT_OF_TIME, None, seconds, used, "stopped: no answer")
 
     def _in_time(self, outcome: PlanningOutcome) -> PlanningOutcome:
         """Return an outcome, without an answer that is late."""
@@ -151,6 +154,23 @@ def end_processes(root: int) -> None:
             with suppress(psutil.NoSuchProcess):
                 process.kill()
         psutil.wait_procs(descendants, timeout=STOP_MARGIN_S)
+
+
+def cpu_time_of(root: int) -> float:
+    """Return the CPU time of a process and all of its child processes [s]; 0 if it has ended.
+
+    Args:
+        root: Its number.
+    """
+    import psutil
+
+    seconds = 0.0
+    with suppress(psutil.NoSuchProcess):
+        process = psutil.Process(root)
+        for part in (process, *process.children(recursive=True)):
+            with suppress(psutil.NoSuchProcess):
+                seconds += sum(part.cpu_times()[:4])  # user, system, and those of ended child processes
+    return seconds
 
 
 def _cpu_time() -> float:

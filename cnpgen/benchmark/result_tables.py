@@ -2,6 +2,7 @@
 
 import csv
 import io
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ PAPER_PLANNER = "cnp-b-paper"  # the planner that the paper calls CNP-B
 PRINTED: dict[str, dict[str, dict[str, str]]] = {  # suite -> planner -> figure -> value in the paper's text
     "hits-81": {
         PAPER_PLANNER: {"scored": "100 %", "planning_ms": "33", "z_error_mm_s": "< 5"},
-        "aqp": {"scored": "92.59 %", "planning_ms": "42"},
+        "aqp": {"scored": "92.59 %", "planning_ms": "42 in C++"},
         "trajopt": {"scored": "91.35 %", "planning_ms": "about 10,000"},
     },
     "heavy-100": {
@@ -24,6 +25,7 @@ PRINTED: dict[str, dict[str, dict[str, str]]] = {  # suite -> planner -> figure 
     },
     "hits-110": {PAPER_PLANNER: {"scored": "78.2 % (real robot)"}, "aqp": {"scored": "52.7 % (real robot)"}},
 }
+PYTHON_LOOPS = ("aqp", "cbirrt", "rrtconnect", "sscbirrt")  # planners whose authors' inner loops are in C++
 TAIL_FIGURES = ("planning_ms", "planning_cpu_ms")  # printed with their tails
 MAX_PRINTED_P = 0.05
 TABLE_FILES = ("results.csv", "tables.md", "tables.tex")
@@ -107,9 +109,17 @@ def notes(benchmark: Benchmark) -> list[str]:
         f" corrected by Holm for all comparisons of a table, if below {MAX_PRINTED_P:g}.",
         f"A hit succeeds if it scores without early contact and its mallet stays within"
         f" {1e3 * benchmark.plane_tolerance:g} mm of the table plane.",
+        *_python_note(benchmark),
         *_printed_note(benchmark),
         *(f"Run {run}." for run in benchmark.runs),
     ]
+
+
+def _python_note(benchmark: Benchmark) -> list[str]:
+    """Return the planners whose times are not comparable with those of their authors."""
+    names = ", ".join(name for name in PYTHON_LOOPS if name in benchmark.results)
+    text = "inner loops in Python; their authors' are in C++, so planning times are not comparable with theirs"
+    return [f"{names}: {text}."] if names else []
 
 
 def _printed_note(benchmark: Benchmark) -> list[str]:
@@ -122,7 +132,7 @@ def _printed_note(benchmark: Benchmark) -> list[str]:
 
 
 def failure_summaries(benchmark: Benchmark) -> list[str]:
-    """Report the outcomes and the first error of every planner without a plan for some problems."""
+    """Report problems without a plan, with the first error, and the violated conditions of plans that are not valid."""
     texts = []
     for name, rows in benchmark.results.items():
         unplanned = [row for row in rows if row["answer"] is None]
@@ -130,6 +140,11 @@ def failure_summaries(benchmark: Benchmark) -> list[str]:
             failed = [row for row in unplanned if row["ending"] == ending]
             detail = f", problem {failed[0]['problem']}: {failed[0]['error']}" if failed[0]["error"] else ""
             texts.append(f"{name}: {len(failed)} of {len(rows)} {ending}{detail}")
+        verdicts = [row["verdict"] for row in rows if row["answer"] is not None]
+        reasons = Counter(str(verdict.get("reason", "no reason")) for verdict in verdicts if not verdict["valid"])
+        if reasons:
+            counts = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common())
+            texts.append(f"{name}: {reasons.total()} of {len(verdicts)} plans not valid by the verdict: {counts}")
     return texts
 
 

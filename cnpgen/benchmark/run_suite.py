@@ -16,7 +16,8 @@ from cnpgen.benchmark.hypothesis_tests import summarize_results
 from cnpgen.benchmark.judging import judge_answer
 from cnpgen.benchmark.process import PlannerProcess, PlanningOutcome
 from cnpgen.benchmark.replanning_scenario import ExecutedPrefix
-from cnpgen.benchmark.results_file import Results, answer_from_dict, holds_results, open_results, read_results
+from cnpgen.benchmark.results_file import Results, answer_from_dict
+from cnpgen.benchmark.results_folder import ResultsFolder
 from cnpgen.benchmark.run_record import RunRecord, describe_run, load_runs, save_runs
 from cnpgen.benchmark.simulator.challenge import challenge_plant, check_challenge
 from cnpgen.benchmark.simulator.execute import load_mujoco
@@ -26,16 +27,12 @@ from cnpgen.benchmark.suite import Suite, load_suite
 from cnpgen.errors import RecipeError, UsageError
 from cnpgen.judges.plans.verdict import Verdict
 from cnpgen.machine.engine import Engine, WorkerPool, assembled
-from cnpgen.machine.versions import __version__
 from cnpgen.plans.plans import Plans
-from cnpgen.problems.problem import resolved
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.schema import registry
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import concerning, integer, number
-from cnpgen.store.files.atomic import check_writable
-from cnpgen.store.files.documents import canonical_sha256, plain
-from cnpgen.store.paths import require_file
+from cnpgen.store.files.documents import plain
 
 MAX_REPETITIONS = 10_000
 PROBLEMS_PER_TASK = 4  # of a worker; starting a planner takes some seconds
@@ -155,34 +152,23 @@ def run_benchmark(
     with concerning("suite"):
         loaded = suite if isinstance(suite, Suite) else load_suite(suite)
     given = dict(parameters or {})
-    settings = _checked_settings(planners, given)
-    robots = _loaded_plants(plants, environment)
-    limit = number("time_limit", time_limit)
-    if limit <= 0:
-        raise UsageError(f"must be above 0 s, got {time_limit:g} s", argument="time_limit")
-    if not 0 <= plane_tolerance < np.inf:
-        raise UsageError(f"must not be negative, got {plane_tolerance:g} m", argument="plane_tolerance")
-    seed, repeat = integer("seed", seed, least=0), integer("repeat", repeat, least=1, most=MAX_REPETITIONS)
-    place = Path(folder)
-    if place.exists() and not place.is_dir():
-        raise UsageError(f"{place} is a file, expected a folder for the results", concerns="folder")
-    check_writable(place)
+    values = _checked_planners(planners, given)
+    limit, seed, repeat = _checked_numbers(time_limit, plane_tolerance, seed, repeat)
+    robots = _checked_plants(plants, environment)
     problems, prefix = loaded.problems(None if n is None else integer("n", n, least=1))
     if environment is not None:
         check_challenge(*open_problem(problems.problem))
     setting = Setting(problems.problem, loaded.model, limit, seed)
-    place.mkdir(parents=True, exist_ok=True)
-    shared = _shared_identity(loaded, setting)
-    names = {*_names_in(place, shared, delete_others=force), *planners}
+    place = ResultsFolder(Path(folder), loaded, setting)
+    names = {*place.planners(delete_others=force), *planners}
     if reference is not None and reference not in names:
         raise UsageError(f"must be one of {', '.join(sorted(names))}, got {reference!r}", argument="reference")
-    runs = (*load_runs(place), describe_run(seed, planners))
-    save_runs(place, runs)
+    runs = (*load_runs(place.path), describe_run(seed, planners))
+    save_runs(place.path, runs)
     report = progress or (lambda *_: None)
     with assembled(where, len(problems)) as pool:
         for name, repetition in product(planners, range(repeat)):
-            path, identity = _place_of(place, name, repetition), _identity(shared, name, repetition, settings[name])
-            results = open_results(path, identity, overwrite=force, discard=replan)
+            results = place.open(name, repetition, values[name], overwrite=force, discard=replan)
             planned = partial(
                 _plan_locally if engine is None else partial(_plan_in_pool, pool),
                 name,
@@ -193,23 +179,25 @@ def run_benchmark(
             for plant in robots:
                 activity = f"{label}, {plant.name} plant"
                 _execute_all(results, plant, problems, prefix, pool=pool, report=partial(report, activity))
-    rows = _read_folder(place, shared, planners)
+    rows = place.rows(planners)
     count = max((row["problem"] + 1 for part in rows.values() for row in part), default=0)
     if count > len(problems):
         problems, prefix = loaded.problems(count)
     return Benchmark(loaded, problems, prefix, rows, robots, runs, reference, plane_tolerance)
 
 
-def _checked_settings(planners: Sequence[str], given: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Check names and parameters of planners; return the values of all fields of each."""
-    _check_planners(planners)
-    if unused := sorted(given.keys() - set(planners)):
-        raise UsageError(f"must be of planners of this run, got those of {', '.join(unused)}", argument="parameters")
-    return {name: _checked_parameters(name, given.get(name, {})) for name in planners}
+def _checked_numbers(time_limit: float, plane_tolerance: float, seed: int, repeat: int) -> tuple[float, int, int]:
+    """Return the time limit, the seed and the number of repetitions after checking all numbers."""
+    limit = number("time_limit", time_limit)
+    if limit <= 0:
+        raise UsageError(f"must be above 0 s, got {time_limit:g} s", argument="time_limit")
+    if not 0 <= plane_tolerance < np.inf:
+        raise UsageError(f"must not be negative, got {plane_tolerance:g} m", argument="plane_tolerance")
+    return limit, integer("seed", seed, least=0), integer("repeat", repeat, least=1, most=MAX_REPETITIONS)
 
 
-def _loaded_plants(plants: Sequence[str | Plant], environment: str | Path | None) -> tuple[Plant, ...]:
-    """Return the plants that execute plans, after loading MuJoCo for them."""
+def _checked_plants(plants: Sequence[str | Plant], environment: str | Path | None) -> tuple[Plant, ...]:
+    """Return the plants, with that of the environment."""
     robots = tuple(as_plant(plant, argument="plants") for plant in plants)
     if environment is not None:
         robots += (challenge_plant(environment),)
@@ -218,57 +206,10 @@ def _loaded_plants(plants: Sequence[str | Plant], environment: str | Path | None
     return robots
 
 
-def _place_of(folder: Path, planner: str, repetition: int) -> Path:
-    """Return the results file of a planner and a repetition."""
-    return folder / (f"{planner}.jsonl" if repetition == 0 else f"{planner}.repetition-{repetition}.jsonl")
-
-
-def _names_in(folder: Path, shared: dict[str, Any], *, delete_others: bool) -> set[str]:
-    """Return the planners with results in a folder.
-
-    Raises:
-        UsageError: There are results of another run, and they are not to be deleted.
-    """
-    names = set()
-    for path in sorted(folder.glob("*.jsonl")):
-        require_file(path, "the results of a planner")
-        results = read_results(path, shared)
-        if results is not None:
-            names.add(str(results[0]["planner"]))
-        elif not holds_results(path):
-            continue
-        elif delete_others:
-            path.unlink()
-        else:
-            raise UsageError(
-                f"{path} holds results of another run (suite, version, time limit or seed differ);"
-                " {force} deletes them, another folder keeps them",
-                remedies={"force": True},
-            )
-    return names
-
-
-def _read_folder(folder: Path, shared: dict[str, Any], first: Sequence[str]) -> dict[str, list[dict[str, Any]]]:
-    """Return planner -> rows of all results in a folder, the given planners first."""
-    parts: dict[str, dict[int, Results]] = {name: {} for name in first}
-    for path in sorted(folder.glob("*.jsonl")):
-        loaded = read_results(path, shared)
-        if loaded is not None:
-            identity, results = loaded
-            parts.setdefault(identity["planner"], {})[identity["repetition"]] = results
-    return {
-        name: [
-            {**row, "repetition": repetition}
-            for repetition, results in sorted(repetitions.items())
-            for _, row in sorted(results.rows.items())
-            if "ending" in row
-        ]
-        for name, repetitions in parts.items()
-    }
-
-
-def _check_planners(planners: Sequence[str]) -> None:
-    """Check names before any work."""
+def _checked_planners(
+    planners: Sequence[str], parameters: Mapping[str, Mapping[str, Any]]
+) -> dict[str, dict[str, Any]]:
+    """Return planner -> the values of all its fields, after checking names before any work."""
     known = registry.names(registry.PLANNERS)
     if not planners:
         raise UsageError(f"no planners, expected some of {', '.join(known)}", concerns="planners")
@@ -280,19 +221,9 @@ def _check_planners(planners: Sequence[str]) -> None:
                 f"unknown planner {name!r}{registry.name_hint(registry.PLANNERS, name)}; known: {', '.join(known)}",
                 concerns="planners",
             )
-
-
-def _shared_identity(suite: Suite, setting: Setting) -> dict[str, Any]:
-    """Return the identity that all results of a folder share."""
-    digest = canonical_sha256(plain(resolved(suite)))
-    return {
-        "suite": suite.name,
-        "suite_version": suite.version,
-        "suite_sha256": digest,
-        "cnpgen": __version__,
-        "time_limit_s": setting.time_limit,
-        "seed": setting.seed,
-    }
+    if unused := sorted(parameters.keys() - set(planners)):
+        raise UsageError(f"must be of planners of this run, got those of {', '.join(unused)}", argument="parameters")
+    return {name: _checked_parameters(name, parameters.get(name, {})) for name in planners}
 
 
 def _checked_parameters(planner: str, parameters: Mapping[str, Any]) -> dict[str, Any]:
@@ -302,19 +233,6 @@ def _checked_parameters(planner: str, parameters: Mapping[str, Any]) -> dict[str
     except RecipeError:  # it cannot be imported; its own process reports the error
         return {}
     return dict(plain(asdict(loaded)))
-
-
-def _identity(shared: dict[str, Any], planner: str, repetition: int, parameters: dict[str, Any]) -> dict[str, Any]:
-    """Return the identity of the results of a planner: with its parameters and the version of its package."""
-    packages = [entry.dist for entry in registry.installed(registry.PLANNERS) if entry.name == planner]
-    version = next((package.version for package in packages if package is not None), __version__)
-    return {
-        **shared,
-        "planner": planner,
-        "planner_version": version,
-        "parameters": parameters,
-        "repetition": repetition,
-    }
 
 
 def _plan_all(

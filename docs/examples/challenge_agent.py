@@ -25,7 +25,8 @@ PUCK = PuckModel(restitution=0.46, friction=1.0, band_restitution=0.7, band_loss
 REACH_X_M, REACH_Y_M = (0.72, 1.32), 0.43  # of pucks that are hit
 MEETING_TIMES_S = np.arange(0.34, 2.6, 0.06)
 MIN_CONTACT_TIME_S = 0.05  # of a hit that is executed
-MIN_DELAY_S, MAX_DELAY_S = 0.08, 0.16  # before the start of a hit, for planning in several steps
+MIN_DELAY_S, MAX_DELAY_S = 0.1, 0.18  # before the start of a hit, for planning in several steps
+CHECKED_STATES, MIN_CLEARANCE = 30, 0.005  # of a plan; m, rad and rad/s, for the error of the controller
 KEEPER_RATE_RAD_S = 3.0  # of the opponent's motion
 KEEPER_X_M = np.linspace(2.28, 2.48, 6)
 KEEPER_RADIUS_M = 0.08
@@ -153,11 +154,14 @@ class HitAgent(AgentBase):
         observation[:2], observation[6:12], observation[20] = [1.0, 0.2], self.home, 2.4
         for _ in range(self.warm_up_steps):
             self.draw_action(observation)
+        still = np.zeros(6)
+        hits = cnpgen.plan_hits(self.planner, (self.home, still, still), observation[:2], GOAL)
+        cnpgen.refine_plans(hits.plans, workers=1)
         self.reset()
 
     def start(self, q, puck, velocity):
         """Begin with the motion to the home configuration, unless the puck would be lost meanwhile."""
-        self.runtime = PlanRuntime(self.planner, q, judge=False)
+        self.runtime = PlanRuntime(self.planner, q, judge=False)  # ``checked`` applies the Challenge's own rules
         later, _ = PUCK.predict(puck[None], velocity[None], np.array([FIRST_MOTION_S]))
         if later[0, 0] > SAFE_X_M or np.abs(q - self.home).max() < 1e-6:
             self.go_home(q, 0.0)
@@ -174,7 +178,7 @@ class HitAgent(AgentBase):
         return np.stack([q, dq, self.mallet.feedforward(q, dq, ddq)], axis=1)[:TICKS_PER_STEP]
 
     def think(self, now, puck, velocity, keeper):
-        """Take the next step of the decision: find a meeting, plan three times, switch."""
+        """Take the next step of the decision: find a meeting, plan three times, check the hit, add the way back."""
         rest = self.runtime.state_at(now).q
         if self.shot is None:
             self.shot, waits = self.find_shot(now, rest, puck, velocity, keeper)
@@ -182,13 +186,38 @@ class HitAgent(AgentBase):
                 self.go_home(rest, now)
         elif self.shot["plans"] < 3:
             self.aim(self.shot, now, rest, puck, velocity)
+        elif "hit" not in self.shot:
+            self.shot["hit"] = self.checked(self.shot["hits"].plans) if self.shot["planned"] else None
+            self.shot = None if self.shot["hit"] is None else self.shot
         else:
             shot, self.shot = self.shot, None
-            if shot["planned"]:
-                start = shot["time"] - float(shot["hits"].contact_time[0])
-                if start >= now:
-                    shot["switch"] = self.runtime.switch(shot["hits"].sequences, start)
-                    self.log.append(shot)
+            self.switch_to(shot, now)
+
+    def switch_to(self, shot, now):
+        """Switch to a hit and its way back, if both keep the constraints and there is time."""
+        hit = shot["hit"]
+        start = shot["time"] - float(hit.duration[0] - shot["hits"].overlap / hit.columns["hit_speed"][0])
+        if start < now:
+            return
+        q, dq, ddq = hit.states_at(hit.duration)
+        back = self.checked(self.planner.plan(q, self.home, start_dq=dq, start_ddq=ddq))
+        if back is not None:
+            shot["switch"] = self.runtime.switch(cnpgen.join_plans(hit, back), start)
+            self.log.append(shot)
+
+    def checked(self, plan):
+        """Return a plan that keeps the constraints, or else the refined one; None if that violates one, too."""
+        if self.keeps_constraints(plan):
+            return plan
+        refined = cnpgen.refine_plans(plan, workers=1).plans
+        return refined if self.keeps_constraints(refined) else None
+
+    def keeps_constraints(self, plan):
+        """Return whether a plan keeps the Challenge's constraints with a margin."""
+        states = plan.motion.at_times(np.linspace(0, 1, CHECKED_STATES)[None] * plan.duration[:, None])
+        q, dq = (np.pad(values[0], ((0, 0), (0, 1))) for values in (states.q, states.dq))
+        values = map(self.env_info["constraints"].fun, q, dq)
+        return max(value.max() for row in values for value in row.values()) < -MIN_CLEARANCE
 
     def find_shot(self, now, rest, puck, velocity, keeper):
         """Return a hit to the goal or else a push, and whether to wait if there is none."""
@@ -306,9 +335,7 @@ class HitAgent(AgentBase):
         tip = shot["speed"] * normal - shot["du"]
         tip = tip / np.linalg.norm(tip)
         goal = position[0] - shot["u"] + 0.07 * (tip - normal)
-        hits = cnpgen.plan_hits(
-            self.planner, (rest, still, still), goal, goal + tip, speed_share=shot["share"], home=self.home
-        )
+        hits = cnpgen.plan_hits(self.planner, (rest, still, still), goal, goal + tip, speed_share=shot["share"])
         shot["plans"] += 1
         shot["hits"], shot["normal"], shot["position"], shot["velocity"] = hits, normal, position[0], puck_velocity[0]
         contact = 0.0 if hits.reasons[0] else float(hits.contact_time[0])

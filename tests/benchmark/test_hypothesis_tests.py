@@ -36,6 +36,14 @@ def test_a_row_without_a_plan_counts_as_a_failure() -> None:
     assert "duration_s" not in values
 
 
+def test_a_crash_has_no_planning_time_and_a_stop_has_one() -> None:
+    failed = row(planned=False)
+    assert "planning_cpu_ms" in values_of({**failed, "ending": "out of time"})
+    crashed = values_of({**failed, "ending": "crashed"})
+    assert crashed["planned"] is False
+    assert not {"planning_ms", "planning_cpu_ms"} & set(crashed)
+
+
 def test_planned_and_executed_errors_are_distinguished() -> None:
     values = values_of(row(), "nominal")
     assert (values["planned_z_error_mm_s"], values["z_error_mm_s"]) == (0.2, 0.3)

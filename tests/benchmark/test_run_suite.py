@@ -5,6 +5,7 @@ import json
 import os
 import re
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +21,10 @@ from cnpgen.benchmark.paper_figures import (
     success_figure,
     success_over_time,
 )
-from cnpgen.benchmark.process import Ending, PlannerProcess, PlanningOutcome
-from cnpgen.benchmark.result_tables import failure_summaries, save_benchmark_tables, table_rows
+from cnpgen.benchmark.process import Ending, PlannerProcess, PlanningOutcome, cpu_time_of
+from cnpgen.benchmark.result_tables import failure_summaries, notes, save_benchmark_tables, table_rows
 from cnpgen.benchmark.results_file import answer_from_dict, answer_to_dict, open_results
-from cnpgen.benchmark.run_suite import run_benchmark
+from cnpgen.benchmark.run_suite import Benchmark, run_benchmark
 from cnpgen.benchmark.suite import load_suite
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.trajectory.sampled_trajectory import Trajectory
@@ -92,6 +93,9 @@ def test_a_failure_of_a_planner_affects_only_its_own_problem(
     assert "garbage" in rows[2]["error"]
     assert "ZeroDivisionError" in rows[3]["error"]
     assert [row["answer"] is not None for row in rows[:7]] == [False, True, False, False, False, False, True]
+    assert failure_summaries(benchmark)[-1] == (
+        "unreliable: 5 of 7 plans not valid by the verdict: boundary conditions 3, not finite 1, too long 1"
+    )
 
 
 @pytest.mark.parametrize("failure", some(["os._exit(1)", "1 / 0"], 1, "slow"))
@@ -386,6 +390,20 @@ def test_an_answer_after_the_time_limit_does_not_count() -> None:
     assert process._in_time(in_time) is in_time
 
 
+def test_a_stopped_planner_has_the_cpu_time_that_it_used(
+    unreliable: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cnpgen.benchmark.process.STOP_MARGIN_S", 0.2)
+    module = tmp_path / "unreliable.py"
+    module.write_text(module.read_text().replace("time.sleep(1000)", "sum(1 for _ in iter(int, 1))"))
+    problems, _ = load_suite("hits-81").problems(6)
+    process = PlannerProcess(unreliable, Setting(problems.problem, "airhockey-hit", time_limit=2.0))
+    outcome = process.plan(problems[5])
+    assert outcome.ending is Ending.OUT_OF_TIME
+    assert 0 < outcome.cpu_seconds < 1.1 * outcome.seconds
+    assert cpu_time_of(os.getpid()) >= time.process_time()
+
+
 def test_a_report_covers_the_folder_and_nothing_else(random: str, tmp_path: Path) -> None:
     folder = tmp_path / "results"
     run_benchmark("hits-81", folder, planners=["cnpgen"], n=3)
@@ -444,3 +462,11 @@ def test_a_damaged_record_of_runs_is_named(tmp_path: Path) -> None:
     (tmp_path / "runs.json").write_text('[{"date": 5}]')
     with pytest.raises(DatasetError, match=r"runs.json is damaged: .*; delete it"):
         run_benchmark("hits-81", tmp_path, planners=["cnpgen"], n=1)
+
+
+def test_tables_name_the_planners_whose_inner_loops_are_in_python() -> None:
+    suite = load_suite("hits-81")
+    benchmark = Benchmark(suite, suite.problems(1)[0], None, {"aqp": [], "cnpgen": [], "cbirrt": []})
+    (note,) = (note for note in notes(benchmark) if "Python" in note and "C++" in note)
+    assert note.startswith("aqp, cbirrt: inner loops in Python")
+    assert not any("C++" in note for note in notes(replace(benchmark, results={"cnpgen": []})))

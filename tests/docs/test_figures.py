@@ -4,7 +4,7 @@ import importlib.util
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import pytest
 
@@ -57,3 +57,19 @@ def test_the_script_lists_its_commands() -> None:
     command = [sys.executable, str(ROOT / "benchmarks" / "figures.py"), "--list", "--pages", "loss"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert "loss: benchmarks/loss.py" in done.stdout.splitlines()
+
+
+def test_the_comparison_of_planners_plans_for_at_most_nine_hours(
+    figures: ModuleType, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    limited = figures.QuotedCommand("a", "cnpgen benchmark hits-81 --simulate --time-limit 9s --planners a b --json")
+    assert limited.planning_bound() == pytest.approx(2 * 81 * 10 / 3600)
+    assert figures.QuotedCommand("a", "benchmarks/loss.py").planning_bound() is None
+    counts = {"hits-81": 81, "hits-110": 110, "heavy-100": 100, "replans-200": 200, "clutter": 200}
+    monkeypatch.setattr(
+        "cnpgen.benchmark.suite.load_suite",
+        lambda name: SimpleNamespace(problems=lambda: (range(counts[name]), None)),
+    )
+    figures.print_list(figures.quoted_commands(["planners"]))
+    *_, last = capsys.readouterr().out.splitlines()
+    assert 5 < float(last.split()[-4]) <= 9
