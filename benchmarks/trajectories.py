@@ -289,9 +289,8 @@ def main() -> None:
         parser.add_argument("--case", action="append", default=[], help="only the samples of this name")
         parser.add_argument("--import", dest="imports", action="store_true", help="import and refine instead")
 
-        parser.add_argument(
-            "--at-rest", choices=("start", "goal"), default=False, help="end of imported motions at rest"
-        )
+        text = "end of imported motions at rest; both without a value"
+        parser.add_argument("--at-rest", choices=("start", "goal"), nargs="?", const=True, default=False, help=text)
         parser.add_argument("--stay-within", metavar="DEG", type=float, help="largest distance from the imported path")
 
     given = arguments(__doc__, add)
