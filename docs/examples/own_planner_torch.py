@@ -17,10 +17,10 @@ from cnpgen.interop.torch import BatchDataset, control_points, plan_loss, to_tor
 from cnpgen.losses import Metric, MetricSettings, rotating_shift, suggested_margins, suggested_weights
 
 STATES = ["start_q", "start_dq", "start_ddq", "goal_q", "goal_dq"]
-WIDTH, LAYERS, BATCH, RATE, WARM_UP = 128, 5, 64, 1e-3, 200  # the last: steps until the full learning rate
+WIDTH, LAYERS, BATCH, RATE, WARM_UP = 192, 5, 128, 1e-3, 200  # the last: steps until the full learning rate
 NODES, SHIFTS = 32, 16  # quadrature nodes of the loss, which move from step to step
 SAMPLE_CLIP, BATCH_CLIP = 30.0, 2.0  # of gradients, in medians of the batch and in running norms
-GROWTH = 200.0  # of the weights of constraints during the run
+GROWTH = 3000.0  # of the weights of constraints during the run
 MEMORY = 0.999  # decay of the average of the parameters
 
 
