@@ -11,7 +11,7 @@ between the ends of the plans, and paths of the plans that TOPP-RA has timed (ex
     cnpgen solve airhockey-hit --n 210 --seed 30303 -o hits.h5
     python benchmarks/trajectories.py hits.h5
     python benchmarks/trajectories.py hits.h5 --case "q dq ddq, 500 Hz" --case "q dq, 100 Hz"
-    python benchmarks/trajectories.py hits.h5 --import
+    python benchmarks/trajectories.py hits.h5 --import --at-rest start
     python benchmarks/trajectories.py hits.h5 --import --stay-within 2
 """
 
@@ -21,6 +21,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from common import arguments, progress, report, table
@@ -234,12 +235,14 @@ def chosen(cases: Sequence[Case], names: Sequence[str]) -> list[Case]:
     return [case for case in cases if case.name in names or not names]
 
 
-def refined(plans: Plans, case: Case, stay_within: float | None) -> tuple[str, ...]:
+def refined(
+    plans: Plans, case: Case, stay_within: float | None, at_rest: bool | Literal["start", "goal"]
+) -> tuple[str, ...]:
     """Import and refine sampled plans; return a row of the table."""
     sampled = trajectories_of(plans, case)
     if case.degrees:
         sampled = [through_degrees(trajectory, plans) for trajectory in sampled]
-    imported = import_trajectories(plans.problem, sampled, noise=case.error)
+    imported = import_trajectories(plans.problem, sampled, noise=case.error, at_rest=at_rest)
     valid = evaluate_plans(imported.plans, workers=1).valid
     options = RefineOptions(stay_within=None if stay_within is None else np.deg2rad(stay_within))
     refinement = refine_plans(imported.plans, options=options, workers=1)
@@ -271,7 +274,7 @@ def import_all(given: argparse.Namespace) -> None:
     for file in given.files:
         plans = load_plans(file)
         plans = plans[np.flatnonzero(evaluate_plans(plans, workers=1).valid)[: given.n]]
-        rows += [refined(plans, case, given.stay_within) for case in chosen(IMPORTS, given.case)]
+        rows += [refined(plans, case, given.stay_within, given.at_rest) for case in chosen(IMPORTS, given.case)]
         progress(f"{file}: done")
     results = {"rows": [dict(zip(head, row, strict=True)) for row in rows]}
     report(results, [table("imported plans", head, rows, left=2)], as_json=given.json)
@@ -286,6 +289,8 @@ def main() -> None:
         parser.add_argument("--case", action="append", default=[], help="only the samples of this name")
         parser.add_argument("--import", dest="imports", action="store_true", help="import and refine instead")
 
+        text = "end of imported motions at rest; both without a value"
+        parser.add_argument("--at-rest", choices=("start", "goal"), nargs="?", const=True, default=False, help=text)
         parser.add_argument("--stay-within", metavar="DEG", type=float, help="largest distance from the imported path")
 
     given = arguments(__doc__, add)

@@ -37,7 +37,8 @@ def add(commands: "Commands[Parser]") -> None:
     add_trajectory_options(parser)
     text = "largest error of the samples in SI units: one number, or of positions, velocities and accelerations"
     option("--noise", metavar="E,...", type=values.errors, help=text)
-    option("--at-rest", action="store_true", help="all motions begin and end at rest")
+    text = "all motions are at rest at this end; without a value, at both"
+    option("--at-rest", metavar="END", choices=("start", "goal"), nargs="?", const=True, default=False, help=text)
     text = "also refine the plans, with at most this difference of every joint from the imported path, such as 2deg"
     option("--stay-within", metavar="E", type=values.angle, help=text)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -59,7 +60,7 @@ def import_trajectories(
     trajectories: Sequence[Trajectory],
     *,
     noise: ArrayLike = 0.0,
-    at_rest: bool = False,
+    at_rest: bool | Literal["start", "goal"] = False,
     source: str = "",
 ) -> ImportedTrajectories:
     """Fit plans to sampled trajectories.
@@ -73,7 +74,7 @@ def import_trajectories(
         trajectories: The trajectories, with the problem's joints in their order.
         noise: Largest error of the samples in SI units: one number for positions, velocities and accelerations, or
             three.
-        at_rest: Whether all motions begin and end at rest.
+        at_rest: Ends at which all motions are at rest: "start", "goal", or True for both.
         source: Source of the plans, a line of text.
 
     Raises:
@@ -102,7 +103,9 @@ def _joined(boundaries: Sequence[Boundary]) -> Boundary:
     return Boundary(**{name: np.concatenate([parts[name] for parts in arrays]) for name in arrays[0]})
 
 
-def _boundary(trajectory: Trajectory, noise: Array, snapper: StateSnapper, *, at_rest: bool) -> tuple[Boundary, float]:
+def _boundary(
+    trajectory: Trajectory, noise: Array, snapper: StateSnapper, *, at_rest: bool | str
+) -> tuple[Boundary, float]:
     """Return the boundary conditions of one trajectory and the change of their positions by snapping [rad]."""
     estimate = sampled_boundary(trajectory.t, trajectory.q, trajectory.dq)
     q, still = trajectory.q, np.zeros(trajectory.q.shape[1])
@@ -113,8 +116,10 @@ def _boundary(trajectory: Trajectory, noise: Array, snapper: StateSnapper, *, at
     speed_error = noise[1] if trajectory.dq is not None else 2 * noise[0] / REST_WINDOW_S
     acceleration_error = noise[2] if trajectory.ddq is not None else 4 * speed_error / REST_WINDOW_S
     moving = [_at_rest_within(state, speed_error, acceleration_error) for state in (start, goal)]
-    if at_rest:
-        moving = [(state[0], still, still) for state in (start, goal)]
+    moving = [
+        (state[0], still, still) if at_rest in {True, end} else state
+        for state, end in zip(moving, ("start", "goal"), strict=True)
+    ]
     allowed = max(MIN_SNAP_RAD, SNAP_FACTOR * float(noise[0]))
     given = [trajectory.dq is not None, trajectory.ddq is not None]
     snapper.set_parameters(trajectory.parameters)

@@ -16,12 +16,13 @@ import numpy as np
 
 import cnpgen
 from cnpgen.interop.jax import control_points, plan_loss
-from cnpgen.losses import Metric, rotating_shift, suggested_margins, suggested_weights
+from cnpgen.losses import Metric, MetricSettings, rotating_shift, suggested_margins, suggested_weights
 
 STATES = ["start_q", "start_dq", "start_ddq", "goal_q", "goal_dq"]
-WIDTH, LAYERS, BATCH, RATE, WARM_UP = 128, 5, 64, 1e-3, 200  # the last: steps until the full learning rate
+WIDTH, LAYERS, BATCH, RATE, WARM_UP = 192, 5, 128, 1e-3, 200  # the last: steps until the full learning rate
 NODES, SHIFTS = 32, 16  # quadrature nodes of the loss, which move from step to step
 SAMPLE_CLIP, BATCH_CLIP = 30.0, 2.0  # of gradients, in medians of the batch and in running norms
+GROWTH = 3000.0  # of the weights of constraints during the run
 MEMORY = 0.999  # decay of the average of the parameters
 
 
@@ -97,7 +98,7 @@ def make_step(layer, loss, mean, scale):
 def train(layer, dataset, *, seconds, steps):
     """Train for some CPU time or steps; return the outputs' function with the average of the last parameters."""
     loss = cnpgen.PlanLoss(dataset.problem, nodes=NODES, margins=suggested_margins(layer.problem))
-    metric = Metric(suggested_weights(loss.problem, loss.weights0), loss.budgets)  # its weights grow during the run
+    metric = Metric(suggested_weights(loss.problem, loss.weights0), loss.budgets, MetricSettings(growth=GROWTH))
     first = next(iter(dataset.batches(1000, fields=STATES)))
     inputs = features(first.table, layer.tasks(cnpgen.Boundary.from_batch(first)))
     outputs, update = make_step(layer, loss, inputs.mean(0), 1 / jnp.maximum(inputs.std(0), 1e-6))

@@ -14,12 +14,13 @@ import torch
 
 import cnpgen
 from cnpgen.interop.torch import BatchDataset, control_points, plan_loss, to_torch
-from cnpgen.losses import Metric, rotating_shift, suggested_margins, suggested_weights
+from cnpgen.losses import Metric, MetricSettings, rotating_shift, suggested_margins, suggested_weights
 
 STATES = ["start_q", "start_dq", "start_ddq", "goal_q", "goal_dq"]
-WIDTH, LAYERS, BATCH, RATE, WARM_UP = 128, 5, 64, 1e-3, 200  # the last: steps until the full learning rate
+WIDTH, LAYERS, BATCH, RATE, WARM_UP = 192, 5, 128, 1e-3, 200  # the last: steps until the full learning rate
 NODES, SHIFTS = 32, 16  # quadrature nodes of the loss, which move from step to step
 SAMPLE_CLIP, BATCH_CLIP = 30.0, 2.0  # of gradients, in medians of the batch and in running norms
+GROWTH = 3000.0  # of the weights of constraints during the run
 MEMORY = 0.999  # decay of the average of the parameters
 
 
@@ -66,9 +67,11 @@ def clip_samples(gradient):
 def train(planner, dataset, *, seconds, steps):
     """Train for some CPU time or steps; return the planner with the average of the last parameters."""
     loss = cnpgen.PlanLoss(dataset.problem, nodes=NODES, margins=suggested_margins(planner.layer.problem))
-    metric = Metric(suggested_weights(loss.problem, loss.weights0), loss.budgets)  # its weights grow during the run
+    metric = Metric(suggested_weights(loss.problem, loss.weights0), loss.budgets, MetricSettings(growth=GROWTH))
     batches, average = BatchDataset(dataset.batches(BATCH, fields=STATES)), copy.deepcopy(planner)
-    optimizer, step, typical, begin = torch.optim.Adam(planner.parameters()), 0, math.inf, time.process_time()
+    parameters, means = list(planner.parameters()), list(average.parameters())
+    optimizer = torch.optim.Adam(parameters, fused=True)
+    step, typical, begin = 0, math.inf, time.process_time()
     while True:
         for batch in batches:
             progress = step / steps if steps else (time.process_time() - begin) / seconds
@@ -82,14 +85,14 @@ def train(planner, dataset, *, seconds, steps):
             total, _ = plan_loss(loss, path, rate, weights=metric.weights(progress), **scene, shift=shift)
             optimizer.zero_grad()
             total.mean().backward()
-            norm = float(torch.nn.utils.clip_grad_norm_(planner.parameters(), BATCH_CLIP * typical))
+            norm = float(torch.nn.utils.clip_grad_norm_(parameters, BATCH_CLIP * typical))
             typical = norm if math.isinf(typical) else 0.99 * typical + 0.01 * min(norm, 3 * typical)
             cosine = 0.505 + 0.495 * math.cos(math.pi * progress)
             optimizer.param_groups[0]["lr"] = RATE * cosine * min(1, (step + 1) / WARM_UP)
             optimizer.step()
             step += 1
             with torch.no_grad():
-                for mean, value in zip(average.parameters(), planner.parameters(), strict=True):
+                for mean, value in zip(means, parameters, strict=True):
                     mean.lerp_(value, 1 - min(MEMORY, (1 + step) / (10 + step)))
 
 

@@ -1,6 +1,11 @@
 """Formats of other projects: what their readers find is the plan, and files of theirs are read."""
 
 import json
+import math
+import os
+import re
+import shutil
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +21,7 @@ from cnpgen.plans import Plans
 from cnpgen.plans.export import export_plans
 from cnpgen.plans.join import join_plans
 from cnpgen.trajectories import load_trajectories
+from tests.conftest import HANGING
 from tests.plans.test_plans import draw_plans
 
 AIRHOCKEY = "airhockey"
@@ -112,6 +118,27 @@ def test_a_dataset_of_lerobot_has_the_published_layout(plans: Plans, dataset: Pa
     assert np.allclose(stats["action"]["mean"], action.mean(axis=0))
     assert np.allclose(stats["observation.state"]["q50"], np.quantile(state, 0.5, axis=0))
     assert np.allclose(episodes[1]["stats/action/max"], action[episode == 1].max(axis=0))
+
+
+@pytest.mark.extended
+def test_act_of_lerobot_trains_on_an_exported_dataset(dataset: Path, tmp_path: Path) -> None:
+    program = shutil.which("lerobot-train")  # of lerobot>=0.4, in an environment of its own
+    if program is None:
+        pytest.skip("lerobot-train is not on the PATH")
+    options = {
+        "dataset.repo_id": "lab/hits", "dataset.root": dataset, "output_dir": tmp_path / "out", "policy.type": "act",
+        "policy.push_to_hub": "false", "policy.device": "cpu", "policy.chunk_size": 5, "policy.n_action_steps": 5,
+        "policy.dim_model": 32, "policy.n_heads": 2, "policy.dim_feedforward": 64, "steps": 2, "log_freq": 1,
+        "batch_size": 2, "num_workers": 0, "wandb.enable": "false", "eval_freq": 0, "save_checkpoint": "false",
+        "policy.pretrained_backbone_weights": "null",
+    }  # fmt: skip
+    arguments = [program, *(f"--{name}={value}" for name, value in options.items())]
+    environment = {**os.environ, "HF_HUB_OFFLINE": "1"}
+    result = subprocess.run(arguments, capture_output=True, text=True, env=environment, timeout=HANGING, check=False)
+    assert result.returncode == 0, result.stderr[-2000:]
+    losses = [float(text) for text in re.findall(r"loss:([\d.]+)", result.stdout + result.stderr)]
+    assert len(losses) == 2
+    assert all(map(math.isfinite, losses))
 
 
 def test_a_dataset_of_lerobot_is_read(plans: Plans, dataset: Path) -> None:

@@ -52,6 +52,12 @@ def test_a_motion_at_rest_at_its_ends() -> None:
     imported = import_trajectories(original.problem, [positions(original, 100)], at_rest=True)
     boundary = imported.plans.boundary
     assert not any(part.any() for part in (boundary.start_dq, boundary.start_ddq, boundary.goal_dq))
+    known = original.boundary.goal_dq
+    boundary = import_trajectories(original.problem, [positions(original, 100)], at_rest="start").plans.boundary
+    assert not any(part.any() for part in (boundary.start_dq, boundary.start_ddq))
+    assert np.abs(boundary.goal_dq - known).max() < 0.1 < np.abs(known).max()
+    boundary = import_trajectories(original.problem, [positions(original, 100)], at_rest="goal").plans.boundary
+    assert not boundary.goal_dq.any()
 
 
 def test_a_state_is_moved_onto_the_manifold_and_into_the_limits() -> None:

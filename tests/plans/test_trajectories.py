@@ -12,6 +12,7 @@ import pytest
 import cnpgen
 from cnpgen.cli.main import main
 from cnpgen.errors import UsageError
+from cnpgen.judges.trajectories.smooth_curve import AccelerationLimits, smooth_curve
 from cnpgen.plans import Plans
 from cnpgen.plans.export import export_plans
 from cnpgen.plans.exporter import sample_plan
@@ -128,6 +129,16 @@ def test_the_share_of_time_with_a_violation_is_reported() -> None:
     tilt = verdict.conditions["tilt"]
     assert (verdict.decision, tilt.decision) == (Decision.INVALID, Decision.INVALID)
     assert tilt.violated_share == pytest.approx(1 - 2 * np.arcsin(tilt.margin.tolerance / 1.2) / np.pi, abs=0.01)
+
+
+@pytest.mark.parametrize("last_step", [2e-4, 2e-3])
+def test_jerks_are_not_exceeded_by_rounding_in_a_short_last_step(last_step: float) -> None:
+    t = np.append(np.arange(100) * 2e-3, 99 * 2e-3 + last_step)
+    jerk = 1000.0
+    trajectory = Trajectory(t, 1 + jerk * t[:, None] ** 3 / 6, jerk * t[:, None] ** 2 / 2, jerk * t[:, None])
+    curve = smooth_curve(trajectory, AccelerationLimits(np.array([jerk]), np.array([jerk * 1.0001])))
+    assert curve is not None
+    assert np.abs(curve.polynomials.jerk - jerk).max() < 0.01 * jerk
 
 
 @pytest.mark.parametrize(("exponent", "expected"), [(0.2, "invalid"), (1.0, "valid"), (None, "valid")])

@@ -33,7 +33,8 @@ MIN_SMOOTHNESS = 0.1  # weight of a change of jerk at an end, relative to one af
 REGULARIZATION = 1e-10  # of the curvature of a quadratic program
 END_PROGRAM_TOLERANCE = 1e-10
 DAQP_EQUALITY = 5
-MIN_STEP_S = 1e-12  # between knots
+MIN_STEP_S = 1e-12  # between samples
+MIN_KNOT_STEP_S = 3e-5  # between knots in a span: rounding of positions changes jerks by eps / step^3
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +113,7 @@ def _end(
     t: Array, q: Array, dq: Array, ddq: Array, jerk: Array, *, limits: AccelerationLimits, given: bool
 ) -> tuple[Array, Array, Array, Array] | None:
     """Return times, positions, velocities and accelerations at the knots of the first spans, or None."""
-    knots = np.concatenate([*(t[k] + (t[k + 1] - t[k]) * np.array(_PARTS[k]) for k in range(END_SPANS)), t[-1:]])
+    knots = np.concatenate([*(_knots(t[k], t[k + 1], _PARTS[k]) for k in range(END_SPANS)), t[-1:]])
     program = _EndProgram.at(t, knots, given=given)
     columns = []
     for joint in range(q.shape[1]):
@@ -125,6 +126,16 @@ def _end(
     velocities = dq[0] + _sums(step * (accelerations[1:] + accelerations[:-1]) / 2)
     moves = velocities[:-1] * step + step**2 * (accelerations[:-1] / 3 + accelerations[1:] / 6)
     return knots, q[0] + _sums(moves), velocities, accelerations
+
+
+def _knots(start: float, end: float, parts: tuple[float, ...]) -> Array:
+    """Return knots at shares of a span, without those that are too close for the rounding of jerks."""
+    found = [start]
+    for part in parts[1:]:
+        knot = start + (end - start) * part
+        if knot - found[-1] >= MIN_KNOT_STEP_S and end - knot >= MIN_KNOT_STEP_S:
+            found.append(knot)
+    return np.array(found)
 
 
 def _sums(steps: Array) -> Array:
