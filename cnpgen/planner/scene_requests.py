@@ -14,7 +14,7 @@ from cnpgen.planner.plan_requests import Requests
 from cnpgen.planner.planner import Planner
 from cnpgen.plans.format import OBSTACLE_POSES
 from cnpgen.plans.plans import Plans
-from cnpgen.plans.scene_plans import scene_plans
+from cnpgen.plans.scene_plans import scene_plans, shape_of
 from cnpgen.problems.scenes.scene_problem import SceneProblem, checked_scene
 from cnpgen.robots.scene import PARKED_POSITION_M
 
@@ -56,7 +56,7 @@ def scene_requests(
                 concerns="model",
             )
         own = tuple(obstacle for obstacle in problem.obstacle if obstacle.position != PARKED_POSITION_M)
-        parked = Counter(obstacle.kind for obstacle in problem.obstacle if obstacle.position == PARKED_POSITION_M)
+        parked = Counter(shape_of(obstacle) for obstacle in problem.obstacle if obstacle.position == PARKED_POSITION_M)
         checked = [checked_scene(scene) for scene in scenes]
         plans = scene_plans(problem.with_obstacles(own), checked, goals=goals, capacity=parked)
     columns = {OBSTACLE_POSES: plans.columns[OBSTACLE_POSES]}
