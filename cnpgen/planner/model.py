@@ -34,6 +34,7 @@ class ModelConfig:
         within_limits: Whether control points are clipped to the joint limits after each of these steps.
         time_parametrized: Whether rates are fitted to the limits after the network (``time_parametrization``).
         via_points: Via points of alternative lines for plans with violations [rad], n numbers each (``via_points``).
+        iterations: Number of evaluations of the network; each one after the first corrects the path of the one before.
     """
 
     path_scale: float
@@ -43,6 +44,7 @@ class ModelConfig:
     within_limits: bool = False
     time_parametrized: bool = False
     via_points: tuple[tuple[float, ...], ...] = ()
+    iterations: int = 1
 
 
 @dataclass(frozen=True)

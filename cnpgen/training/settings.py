@@ -22,7 +22,7 @@ METRICS = {
     "bounded": BOUNDED,
 }
 MIN_INTEGERS = {
-    "hidden": 1, "layers": 1, "batch_size": 1, "nodes": 1, "shifts": 1,
+    "hidden": 1, "layers": 1, "batch_size": 1, "iterations": 1, "nodes": 1, "shifts": 1,
     "warm_up": 0, "seed": 0, "line_projection_steps": 0, "projection_steps": 0, "validations": 1,
 }  # fmt: skip
 VALID_INTERVALS = {
@@ -60,6 +60,7 @@ class TrainingSettings:
         line_projection_steps: Gauss-Newton steps that project the line onto the equalities.
         projection_steps: Gauss-Newton steps that project the path onto the equalities.
         within_limits: Whether both clip control points to the joint limits.
+        iterations: Number of evaluations of the network; see ``ModelConfig``.
         time_parametrized: Whether the planner fits rates to the limits after the network; training steps do not include
             it, validations do.
         nodes: Number of quadrature nodes of the loss.
@@ -99,6 +100,7 @@ class TrainingSettings:
     line_projection_steps: int = 1
     projection_steps: int = 1
     within_limits: bool = False
+    iterations: int = 1
     time_parametrized: bool = False
     nodes: int = 32
     shifts: int = 16
@@ -155,6 +157,7 @@ class TrainingSettings:
             projection_steps=self.projection_steps,
             expected_time=self.expected_time,
             within_limits=self.within_limits,
+            iterations=self.iterations,
             time_parametrized=self.time_parametrized,
         )
 
