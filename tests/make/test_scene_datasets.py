@@ -207,6 +207,13 @@ def test_training_rows_have_the_obstacles_of_their_scenes(dataset: Path) -> None
     np.testing.assert_array_equal(checked.obstacle_poses, loaded.scenes("validation", np.arange(5)).poses)
 
 
+def test_few_rows_of_scenes_are_judged_at_the_end(dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = open_training_data(dataset)
+    monkeypatch.setattr("cnpgen.training.data.MAX_VALIDATION_ROWS", 2)
+    assert len(rows.judged(2000, after=1).boundary) == 2
+    assert len(rows.judged(1, after=1).boundary) == 1
+
+
 def test_batches_observe_the_scenes_of_their_rows(dataset: Path) -> None:
     loaded = cnpgen.load_dataset(dataset)
     options = {"split": "validation", "fields": ["start_q"], "shuffle": False}
@@ -264,21 +271,24 @@ def test_mistakes_name_file_and_key(
     assert "scenes.toml" in error
 
 
-@pytest.mark.slow
-def test_certified_samples_have_valid_plans_in_their_scenes(pipeline: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "certified"
-    cnpgen.make_dataset(pipeline, folder, n=12, certify=True, workers=1)
-    assert main(["validate", str(folder), "--deep", "--workers", "1"]) == 0
-    plans = cnpgen.load_boundary_problems(folder)
-    assert cnpgen.evaluate_plans(plans).valid.all()
-
-
 @pytest.fixture(scope="module")
 def model(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("model") / "scenes.h5"
     settings = TrainingSettings(hidden=8, layers=1, batch_size=16, nodes=8, validations=1)
     cnpgen.train_model(dataset, path, steps=2, settings=settings, check_rows=4)
     return path
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("from_planner", [False, True])
+def test_certified_samples_have_valid_plans_in_their_scenes(
+    pipeline: Path, model: Path, tmp_path: Path, *, from_planner: bool
+) -> None:
+    folder = tmp_path / "certified"
+    cnpgen.make_dataset(pipeline, folder, n=12, certify=True, model=model if from_planner else None, workers=1)
+    assert main(["validate", str(folder), "--deep", "--workers", "1"]) == 0
+    plans = cnpgen.load_boundary_problems(folder)
+    assert cnpgen.evaluate_plans(plans).valid.all()
 
 
 @pytest.mark.slow

@@ -25,12 +25,12 @@ if TYPE_CHECKING:
 
 Array = NDArray[Any]
 
-PATH_PHASES = 8  # states of the path
+PATH_PHASES = 12  # states of the path
 STEP_RAD = 0.15  # rad or m: of every joint to both sides of the path
 RANGE_M = 0.12  # clearance below which points count
 MIN_DISTANCE_M, MAX_DISTANCE_M = -0.15, 0.3  # to which distances are clipped
 POINT_SPACING_M = 0.12  # of the points on the axis of a link's capsule
-BASIS = BasisPoints(points=256, low=(-0.75, -0.75, -0.05), high=(0.85, 0.75, 0.75))
+BASIS = BasisPoints(points=64, low=(-0.75, -0.75, -0.05), high=(0.85, 0.75, 0.75))
 TASKS_PER_BLOCK = 256
 
 
