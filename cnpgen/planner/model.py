@@ -19,6 +19,8 @@ from cnpgen.schema.argument_types import checked_arguments
 
 Array = NDArray[Any]
 
+MAX_NETWORK_ITERATIONS = 20
+
 
 @dataclass(frozen=True, kw_only=True)
 class ModelConfig:

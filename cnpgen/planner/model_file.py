@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, RecipeError, UsageError, nearest
-from cnpgen.planner.model import Model, ModelConfig
+from cnpgen.planner.model import MAX_NETWORK_ITERATIONS, Model, ModelConfig
 from cnpgen.planner.network.architecture import Architecture
 from cnpgen.planner.network.features import ARRIVAL, BLOCKS, LINE, Features, count_features
 from cnpgen.planner.tasks import EXPECTED_TIMES
@@ -29,7 +29,6 @@ from cnpgen.store.paths import require_file
 
 MODEL_KIND, MODEL_VERSION = "cnpgen-model", 2
 MAX_PROJECTION_STEPS = 20  # Gauss-Newton steps; each makes a kernel larger
-MAX_NETWORK_ITERATIONS = 20  # of the network
 _DEFAULTS = {
     "expected_time": "distance",
     "within_limits": False,

@@ -8,7 +8,7 @@ from typing import Any, Literal
 from cnpgen.errors import UsageError
 from cnpgen.losses.metric_settings import BOUNDED, PUBLISHED, MetricSettings
 from cnpgen.losses.plan_loss import FORMS
-from cnpgen.planner.model import ModelConfig
+from cnpgen.planner.model import MAX_NETWORK_ITERATIONS, ModelConfig
 from cnpgen.planner.network.features import FEATURE_SETS
 from cnpgen.planner.tasks import EXPECTED_TIMES
 from cnpgen.problems.objectives import read_objective
@@ -28,7 +28,7 @@ MIN_INTEGERS = {
 VALID_INTERVALS = {
     "learning_rate": "(0, inf)", "final_rate": "[0, 1]", "path_scale": "(0, inf)", "head_scale": "[0, inf)",
     "rate_bias": "(-inf, inf)", "sample_clip": "(0, inf]", "batch_clip": "(0, inf]", "memory": "[0, 1)",
-    "imitation": "[0, 1)",
+    "imitation": "[0, 1)", "iterations": f"[1, {MAX_NETWORK_ITERATIONS}]",
 }  # fmt: skip
 
 
@@ -137,6 +137,12 @@ class TrainingSettings:
             if getattr(self, name) not in choices:
                 known = ", ".join(filter(None, choices))
                 raise UsageError(f"must be one of {known}, got {getattr(self, name)!r}", argument=name)
+        if self.iterations > 1 and self.features in {"states", "paper"}:
+            raise UsageError(
+                f"{self.iterations} evaluations of the network need its path as an input: expected features"
+                f" 'full' or 'no-scene', got {self.features!r}",
+                concerns="features",
+            )
         for name in ("path_control_points", "rate_control_points"):
             if getattr(self, name) is not None:
                 integer(name, getattr(self, name), least=1)
