@@ -36,7 +36,7 @@ from cnpgen.problems.problem_file import load_problem
 from cnpgen.problems.problem_record import as_problem, record_problem
 from cnpgen.problems.scenes.scene_files import load_scenes
 from cnpgen.refine.options import DEFAULT_OPTIONS
-from cnpgen.refine.refine_engine import refine_serially
+from cnpgen.refine.refine_engine import prepare, refine_serially
 from cnpgen.refine.solver.hulls import Hulls
 from cnpgen.refine.task import Attempt
 from cnpgen.robots.obstacle import Obstacle
@@ -124,11 +124,15 @@ class GeneratedScene:
 
 @dataclass(frozen=True)
 class Solved:
-    """A boundary problem without a motion, the best attempt at it, its obstacles, and the CPU time [s]."""
+    """A boundary problem without a motion, the best attempt at it, its obstacles, and CPU times [s].
+
+    ``set_up`` is the part of ``cpu`` until the solver of the scene is ready.
+    """
 
     plans: Plans
     attempt: Attempt
     obstacles: tuple[Obstacle, ...]
+    set_up: float
     cpu: float
 
 
@@ -338,8 +342,10 @@ def solve_problem(set_up: Callable[[], Plans], obstacles: tuple[Obstacle, ...]) 
     """Set up one boundary problem and solve it; the CPU time includes both."""
     begun = time.process_time()
     plans = set_up()
+    prepare(plans, DEFAULT_OPTIONS)
+    ready = time.process_time()
     (attempt,) = refine_serially(plans, DEFAULT_OPTIONS)
-    return Solved(plans, attempt, obstacles, time.process_time() - begun)
+    return Solved(plans, attempt, obstacles, ready - begun, time.process_time() - begun)
 
 
 def with_jerk_limits(problem: Problem, limits: tuple[float, ...]) -> Problem:
@@ -465,6 +471,7 @@ def solve_family(base: Problem, sampler: EndSampler, family: str, count: int, se
 def summary(solved: list[Solved]) -> dict[str, Any]:
     """Summarize solved problems."""
     cpu, valid = np.array([each.cpu for each in solved]), [each.attempt.valid for each in solved]
+    set_up = [each.set_up for each in solved]
     return {
         "problems": len(solved),
         "valid": sum(valid),
@@ -472,6 +479,8 @@ def summary(solved: list[Solved]) -> dict[str, Any]:
         "p95 cpu [s]": float(np.percentile(cpu, 95)),
         "p99 cpu [s]": float(np.percentile(cpu, 99)),
         "cpu above 1 s": int((cpu > 1).sum()),
+        "median set-up [s]": float(np.median(set_up)),
+        "p95 set-up [s]": float(np.percentile(set_up, 95)),
         "mean motion time [s]": float(np.mean([each.attempt.cost for each in solved if each.attempt.valid])),
         "reasons": sorted({str(each.attempt.reason) for each in solved if not each.attempt.valid}),
     }
@@ -510,7 +519,7 @@ def main() -> None:
                 figures["meshes"] = check_meshes(problem, solved)
             if chosen.reference:
                 figures["reference"] = search_reference(problem, solved, chosen.reference)
-    head = ("robot", "family", "problems", "valid", "median", "p95", "p99", "> 1 s", "motion time")
+    head = ("robot", "family", "problems", "valid", "median", "p95", "p99", "> 1 s", "set-up", "p95", "motion time")
     tables = [
         table("collision checks", ("figure", "value"), [(key, f"{value:,.4g}") for key, value in checked.items()])
     ]

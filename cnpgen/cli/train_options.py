@@ -61,7 +61,9 @@ _OPTIONS: dict[str, _Setting] = {
         values.natural, "N", "Gauss-Newton steps that project the line onto the manifold (default: 1; 0 for none)"
     ),
     "projection_steps": _Setting(values.natural, "N", "the same for the network's path (default: 1; 0 for none)"),
-    "within_limits": _Setting(None, None, "keep control points within the joint limits in these steps"),
+    "within_limits": _Setting(
+        None, None, "keep control points within the joint limits in these steps; without equalities, in plans"
+    ),
     "iterations": _Setting(
         values.positive, "N", "evaluations of the network; each after the first corrects the path of the one before"
         " (default: 1)",

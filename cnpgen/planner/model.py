@@ -33,7 +33,8 @@ class ModelConfig:
         expected_time: Unit of durations: "distance", the time of the distance at the velocity limits, at least 0.2 s;
             "travel", the same without a lower bound, as in the authors' implementation; or "reach", the minimum time
             in which every joint could reach its goal state.
-        within_limits: Whether control points are clipped to the joint limits after each of these steps.
+        within_limits: Whether control points are clipped to the joint limits after each of these steps, and without any
+            of them once.
         time_parametrized: Whether rates are fitted to the limits after the network (``time_parametrization``).
         via_points: Via points of alternative lines for plans with violations [rad], n numbers each (``via_points``).
         iterations: Number of evaluations of the network; each one after the first corrects the path of the one before.

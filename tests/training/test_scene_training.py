@@ -24,6 +24,7 @@ from cnpgen.planner.network.scene_features import (
 )
 from cnpgen.planner.planner import Planner
 from cnpgen.planner.scene_requests import plan_scenes, scene_requests
+from cnpgen.planner.task_preprocessor import ends_of
 from cnpgen.plans.format import OBSTACLE_POSES
 from cnpgen.plans.plan_file import load_plans
 from cnpgen.problems.load_robot import load_robot
@@ -163,6 +164,19 @@ def test_the_next_iteration_starts_from_the_path_of_the_last_one(problem):
     features = inference.prepare.scene_features
     np.testing.assert_array_equal(following.observation, features(points.path, tasks.placed))
     assert not np.array_equal(following.observation, tasks.observation)
+
+
+def test_control_points_stay_within_the_limits(problem):
+    rows = make_scene_rows(problem, scenes(problem, 40), "here")._rows(0, 5)
+    with loaded_problem(make_scene_rows(problem, scenes(problem, 40), "here").problem, "numpy") as loaded:
+        config = replace(TINY, within_limits=True).config
+        inference, robot = make_inference_pipeline(loaded, config, scale_time=False), loaded.robot
+    offsets = np.random.default_rng(7).uniform(-9, 9, (40, 5))
+    (path,) = inference.path(ends_of(rows.boundary), offsets, np.ones((20, 5)), np.empty((0, 5)))
+    points = path.T.reshape(5, 15, 4)
+    assert (points >= robot.position_lower).all()
+    assert (points <= robot.position_upper).all()
+    np.testing.assert_allclose(points[:, :3], np.repeat(rows.boundary.start_q[:, None], 3, axis=1))
 
 
 @needs_compiler
