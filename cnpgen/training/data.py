@@ -13,7 +13,7 @@ from cnpgen.problems.problem_record import as_problem
 from cnpgen.problems.scenes.scene_files import holds_scenes, load_scenes
 from cnpgen.schema.arguments import concerning
 from cnpgen.store.dataset_spec import StoredProblem
-from cnpgen.training.scene_rows import MAX_VALIDATION_ROWS, make_scene_rows
+from cnpgen.training.scene_rows import make_scene_rows
 from cnpgen.training.training_rows import TrainingProblems, boundary_columns
 
 DEMONSTRATION = ("path_control_points", "rate_control_points")  # columns of a certified dataset
@@ -91,7 +91,6 @@ class DatasetRows:
     def judged(self, rows: int, *, after: int) -> TrainingProblems:
         """See ``TrainingData``."""
         first = self._checks(after)
-        rows = min(rows, MAX_VALIDATION_ROWS) if self.dataset.spec.scene_obstacles else rows
         return self._validation(first, first + rows)
 
     def _checks(self, rows: int) -> int:

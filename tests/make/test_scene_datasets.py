@@ -207,13 +207,6 @@ def test_training_rows_have_the_obstacles_of_their_scenes(dataset: Path) -> None
     np.testing.assert_array_equal(checked.obstacle_poses, loaded.scenes("validation", np.arange(5)).poses)
 
 
-def test_few_rows_of_scenes_are_judged_at_the_end(dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    rows = open_training_data(dataset)
-    monkeypatch.setattr("cnpgen.training.data.MAX_VALIDATION_ROWS", 2)
-    assert len(rows.judged(2000, after=1).boundary) == 2
-    assert len(rows.judged(1, after=1).boundary) == 1
-
-
 def test_batches_observe_the_scenes_of_their_rows(dataset: Path) -> None:
     loaded = cnpgen.load_dataset(dataset)
     options = {"split": "validation", "fields": ["start_q"], "shuffle": False}
