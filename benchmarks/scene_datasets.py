@@ -35,7 +35,7 @@ def main() -> None:
     """Measure the rate, or check the plans of a folder."""
     options = arguments(__doc__, add_options)
     if options.part == "rate":
-        results = measure_rate(options.blocks, options.seed, certify=options.certify)
+        results = measure_rate(options.blocks, options.seed, certify=options.certify, model=options.model)
     else:
         results = check_meshes(options.folder, options.plans, options.step)
     tables = [table("Result", list(results), [[str(value) for value in results.values()]])]
@@ -48,16 +48,17 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("folder", nargs="?", type=Path, help="certified dataset, for meshes")
     parser.add_argument("--blocks", type=int, default=4, help="blocks of the rate (default: 4)")
     parser.add_argument("--certify", action="store_true", help="measure the rate of certified samples")
+    parser.add_argument("--model", help="planner whose plans are initial guesses of certified samples")
     parser.add_argument("--seed", type=int, default=2, help="seed of the rate (default: 2)")
     parser.add_argument("--plans", type=int, default=10**9, help="number of checked plans (default: all)")
     parser.add_argument("--step", type=float, default=0.002, help="time between checked states [s] (default: 0.002)")
 
 
-def measure_rate(blocks: int, seed: int, *, certify: bool) -> dict[str, float]:
+def measure_rate(blocks: int, seed: int, *, certify: bool, model: str | None) -> dict[str, float]:
     """Return the CPU time of blocks of panda-scenes after the first one, which loads all kernels."""
     recipe = load_dataset_recipe("panda-scenes")
     backend, cache = choose_backend(None)
-    pipeline = certified(recipe).pipeline if certify else recipe.pipeline
+    pipeline = certified(recipe, model=model).pipeline if certify else recipe.pipeline
     prepared = PreparedPipeline(pipeline, backend=backend, cache_folder=cache)
     prepared.block(seed, BENCHMARK_SPLIT, 0)
     begun, tried, scenes = time.process_time(), 0, 0

@@ -2,22 +2,26 @@
 
 The scenes are generated: tables, shelves, cages, boxes and desks with a Panda (3 kg at the hand) or a UR5. Every scene
 is solved once, in one process and thread, from a new problem: the set-up of the scene is part of its time. Kernels of
-a robot are compiled before, since they do not depend on its obstacles.
+a robot are compiled before, since they do not depend on its obstacles. With ``--meshes`` Pinocchio and Coal check valid
+plans on the meshes of the URDF. With ``--reference`` RRT-Connect alone searches for paths of unsolved problems.
 """
 
 import argparse
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import coal
 import numpy as np
+import pinocchio as pin
 from common import arguments, median, progress, report, table
 from numpy.typing import NDArray
+from scene_datasets import Meshes, plan_states
 
 from cnpgen.kernels.collision.collision_checker import CollisionChecker, load_collision_library
 from cnpgen.kernels.collision.tree_search import TreeSettings, find_tree_path
@@ -25,18 +29,21 @@ from cnpgen.kernels.library import KernelLibrary, choose_backend
 from cnpgen.plans.boundary_problems import plans_of_rows
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.scene_plans import scene_plans
+from cnpgen.problems.constraints.joint import JointJerk
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.problems.problem_record import as_problem, record_problem
 from cnpgen.problems.scenes.scene_files import load_scenes
 from cnpgen.refine.options import DEFAULT_OPTIONS
-from cnpgen.refine.refine_engine import refine_serially
+from cnpgen.refine.refine_engine import prepare, refine_serially
 from cnpgen.refine.solver.hulls import Hulls
+from cnpgen.refine.task import Attempt
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.schema.catalogue import list_recipes
+from cnpgen.schema.keys import PerJoint
 
 Array = NDArray[np.float64]
 Random = np.random.Generator
@@ -45,6 +52,10 @@ Box = tuple[tuple[float, float, float], tuple[float, float, float]]  # lowest an
 SAMPLES, MAX_BATCHES = 20_000, 40  # random states per batch of the search of ends
 MIN_END_CLEARANCE_M = 1e-3
 TORQUE_FRACTION = 0.95  # of the limits, at rest at both ends
+JERK_LIMITS = {"panda": (7500.0, 3750.0, 5000.0, 6250.0, 7500.0, 10000.0, 10000.0)}  # data sheet [rad/s^3]
+JERK_TOLERANCE = 0.01  # of the limits
+MESH_STEP_S = 0.002  # between the states that are checked on meshes
+REFERENCE_EXTENSIONS = 100_000  # of the trees of one search
 PROBLEM = """
 name = "scenes"
 [robot]
@@ -109,6 +120,20 @@ class GeneratedScene:
 
     obstacles: tuple[Obstacle, ...]
     regions: tuple[Box, ...]
+
+
+@dataclass(frozen=True)
+class Solved:
+    """A boundary problem without a motion, the best attempt at it, its obstacles, and CPU times [s].
+
+    ``set_up`` is the part of ``cpu`` until the solver of the scene is ready.
+    """
+
+    plans: Plans
+    attempt: Attempt
+    obstacles: tuple[Obstacle, ...]
+    set_up: float
+    cpu: float
 
 
 def box(name: str, position: Any, size: Any, yaw: float = 0.0) -> Obstacle:
@@ -300,31 +325,81 @@ def boundary_columns(start: Array, goal: Array) -> dict[str, Array]:
     return columns | {"start_xyz": np.zeros((1, 3)), "goal_xyz": np.zeros((1, 3))}
 
 
-def solve_scene(problem: Problem, start: Array, goal: Array) -> dict[str, Any]:
-    """Solve a new scene; return CPU time [s], validity, motion time [s] and the outcome."""
-    return solve_problem(lambda: plans_of_rows(record_problem(problem), boundary_columns(start, goal)))
+def solve_scene(problem: Problem, start: Array, goal: Array) -> Solved:
+    """Solve a new scene."""
+    columns = boundary_columns(start, goal)
+    return solve_problem(lambda: plans_of_rows(record_problem(problem), columns), problem.obstacle)
 
 
-def solve_suite(count: int) -> dict[str, Any]:
+def solve_suite(problem: Problem, count: int) -> list[Solved]:
     """Solve the first problems of the suite clutter one by one; the first one, which may compile, is solved twice."""
-    problem, scenes = as_problem("panda-3kg"), load_scenes(list_recipes("suite")["clutter"].with_suffix(".h5"), n=count)
-    solved = [solve_problem(partial(scene_plans, problem, [scene])) for scene in (scenes[0], *scenes)]
-    return summary(solved[1:])
+    scenes = load_scenes(list_recipes("suite")["clutter"].with_suffix(".h5"), n=count)
+    set_ups = [(partial(scene_plans, problem, [scene]), scene.obstacles) for scene in (scenes[0], *scenes)]
+    return [solve_problem(*set_up) for set_up in set_ups][1:]
 
 
-def solve_problem(set_up: Callable[[], Plans]) -> dict[str, Any]:
-    """Set up one boundary problem and solve it; see ``solve_scene``."""
+def solve_problem(set_up: Callable[[], Plans], obstacles: tuple[Obstacle, ...]) -> Solved:
+    """Set up one boundary problem and solve it; the CPU time includes both."""
     begun = time.process_time()
-    (attempt,) = refine_serially(set_up(), DEFAULT_OPTIONS)
-    cpu = time.process_time() - begun
-    return {
-        "cpu": cpu,
-        "valid": attempt.valid,
-        "duration": attempt.cost,
-        "outcome": attempt.outcome.name,
-        "reason": str(attempt.reason),
-        "iterations": attempt.iterations,
-    }
+    plans = set_up()
+    prepare(plans, DEFAULT_OPTIONS)
+    ready = time.process_time()
+    (attempt,) = refine_serially(plans, DEFAULT_OPTIONS)
+    return Solved(plans, attempt, obstacles, ready - begun, time.process_time() - begun)
+
+
+def with_jerk_limits(problem: Problem, limits: tuple[float, ...]) -> Problem:
+    """Return the problem with limits on the jerk [rad/s^3], too."""
+    limited = replace(
+        problem,
+        limits=replace(problem.limits, jerk=PerJoint(limits)),
+        constraint=(*problem.constraint, JointJerk(tolerance=JERK_TOLERANCE)),
+    )
+    vars(limited)["urdf_text"] = problem.urdf_text  # a cached property, whose file may be temporary
+    return limited
+
+
+def check_meshes(problem: Problem, solved: list[Solved]) -> dict[str, Any]:
+    """Return the number of valid plans with contacts of the URDF's meshes, by SciPy, Pinocchio and Coal."""
+    robot, contacts, depth, states = load_robot(problem), 0, 0.0, 0
+    assert robot.shape is not None
+    left_out = {frozenset((pair.first, pair.second)) for pair in robot.shape.pairs if pair.left_out}
+    meshes = Meshes(problem.urdf_path.read_text(), robot.joint_names, left_out)
+    valid = [each for each in solved if each.attempt.valid]
+    for each in valid:
+        meshes.place([coal_obstacle(obstacle) for obstacle in each.obstacles])
+        q = plan_states(each.attempt.path, each.attempt.rate, each.plans.degree, MESH_STEP_S)
+        states += len(q)
+        if touching := [state for state in q if meshes.touch(state)]:
+            contacts, depth = contacts + 1, max(depth, *map(meshes.depth, touching))
+    return {"plans": len(valid), "states": states, "with contact": contacts, "depth [mm]": 1e3 * depth}
+
+
+def coal_obstacle(obstacle: Obstacle) -> tuple[Any, Any]:
+    """Return Coal's exact shape of a box or a cylinder, and its placement."""
+    if obstacle.kind not in {"box", "cylinder"} or obstacle.position is None:
+        raise ValueError(f"expected a box or a cylinder with a pose, got {obstacle}")
+    sizes = (obstacle.size or ()) if obstacle.kind == "box" else (obstacle.radius, obstacle.length)
+    rotation = pin.rpy.rpyToMatrix(*obstacle.rotation)
+    return getattr(coal, obstacle.kind.capitalize())(*sizes), pin.SE3(rotation, np.array(obstacle.position))
+
+
+def search_reference(problem: Problem, solved: list[Solved], seconds: float) -> dict[str, int]:
+    """Return the number of unsolved problems for which RRT-Connect finds a path in so much CPU time [s]."""
+    robot = load_robot(problem)
+    checker, found = make_checker(robot), 0
+    unsolved = [each for each in solved if not each.attempt.valid]
+    for each in unsolved:
+        checker.place(each.obstacles, place_obstacles(each.obstacles))
+        ends, box_of_joints = each.plans.boundary, (robot.position_lower, robot.position_upper)
+        settings = TreeSettings(0.0, 0.0, max_extensions=REFERENCE_EXTENSIONS, shortcuts=0)
+        begun, path, seed = time.process_time(), None, 0
+        while path is None and time.process_time() - begun < seconds:
+            end_states = ends.start_q[0], ends.goal_q[0]
+            path = find_tree_path(checker, end_states, box_of_joints, robot.velocity_limit, settings, seed=seed)
+            seed += 1
+        found += path is not None
+    return {"unsolved": len(unsolved), "with a path": found}
 
 
 def checks(states: int) -> dict[str, float]:
@@ -376,22 +451,27 @@ def loaded(name: str) -> tuple[Problem, Robot, CollisionChecker]:
         problem = load_problem(path)
         robot = load_robot(problem)
         problem = problem.with_obstacles(())  # with the text of the URDF
+    return problem, robot, make_checker(robot)
+
+
+def make_checker(robot: Robot) -> CollisionChecker:
+    """Return the compiled collision checks of a robot."""
     library = load_collision_library(KernelLibrary(*choose_backend("compiled"), "", {}))
     assert library is not None
-    return problem, robot, CollisionChecker(library, robot)
+    return CollisionChecker(library, robot)
 
 
-def solve_family(name: str, family: str, count: int, seed: int) -> dict[str, Any]:
+def solve_family(base: Problem, sampler: EndSampler, family: str, count: int, seed: int) -> list[Solved]:
     """Solve problems of a family, each from a new scene; the first one, which may compile kernels, is solved twice."""
-    base, robot, checker = loaded(name)
-    problems = list(generate(base, EndSampler(robot, checker), family, count, seed))
+    problems = list(generate(base, sampler, family, count, seed))
     solve_scene(*problems[0])
-    return summary([solve_scene(*problem) for problem in problems[1:]])
+    return [solve_scene(*problem) for problem in problems[1:]]
 
 
-def summary(solved: list[dict[str, Any]]) -> dict[str, Any]:
+def summary(solved: list[Solved]) -> dict[str, Any]:
     """Summarize solved problems."""
-    cpu, valid = np.array([each["cpu"] for each in solved]), [each["valid"] for each in solved]
+    cpu, valid = np.array([each.cpu for each in solved]), [each.attempt.valid for each in solved]
+    set_up = [each.set_up for each in solved]
     return {
         "problems": len(solved),
         "valid": sum(valid),
@@ -399,8 +479,10 @@ def summary(solved: list[dict[str, Any]]) -> dict[str, Any]:
         "p95 cpu [s]": float(np.percentile(cpu, 95)),
         "p99 cpu [s]": float(np.percentile(cpu, 99)),
         "cpu above 1 s": int((cpu > 1).sum()),
-        "mean motion time [s]": float(np.mean([each["duration"] for each in solved if each["valid"]])),
-        "reasons": sorted({each["reason"] for each in solved if not each["valid"]}),
+        "median set-up [s]": float(np.median(set_up)),
+        "p95 set-up [s]": float(np.percentile(set_up, 95)),
+        "mean motion time [s]": float(np.mean([each.attempt.cost for each in solved if each.attempt.valid])),
+        "reasons": sorted({str(each.attempt.reason) for each in solved if not each.attempt.valid}),
     }
 
 
@@ -411,6 +493,9 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--count", type=int, default=21, help="problems of every family; the first is not counted")
     parser.add_argument("--seed", type=int, default=29_110_301, help="seed of the scenes")
     parser.add_argument("--suite", type=int, default=0, help="problems of the suite clutter")
+    parser.add_argument("--jerk", action="store_true", help="limit the jerk, too (panda)")
+    parser.add_argument("--meshes", action="store_true", help="check valid plans on the meshes of the URDF")
+    parser.add_argument("--reference", type=float, default=0.0, metavar="S", help="CPU time of RRT-Connect [s]")
     parser.add_argument("--states", type=int, default=100_000, help="states of the collision checks")
 
 
@@ -419,20 +504,31 @@ def main() -> None:
     chosen = arguments(__doc__, options)
     with np.errstate(all="ignore"):
         checked, rows, results = checks(chosen.states), list[tuple[str, ...]](), dict[str, Any]()
-        jobs = [(name, family) for name in chosen.robots for family in chosen.families]
-        if chosen.suite:
-            jobs.insert(0, ("panda-3kg", "clutter"))
-        for name, family in jobs:
+        for name, family in [("panda", "clutter")] * bool(chosen.suite) + list(product(chosen.robots, chosen.families)):
             progress(f"{name}: {family}")
-            of_suite = family == "clutter"
-            figures = solve_suite(chosen.suite) if of_suite else solve_family(name, family, chosen.count, chosen.seed)
-            results[f"{name} {family}"] = figures
+            problem, robot, checker = loaded(name)
+            problem = as_problem("panda-3kg") if family == "clutter" else problem
+            problem = with_jerk_limits(problem, JERK_LIMITS[name]) if chosen.jerk else problem
+            if family == "clutter":
+                solved = solve_suite(problem, chosen.suite)
+            else:
+                solved = solve_family(problem, EndSampler(robot, checker), family, chosen.count, chosen.seed)
+            figures = results[f"{name} {family}"] = summary(solved)
             rows.append((name, family, *(f"{value:.4g}" for key, value in figures.items() if key != "reasons")))
-    head = ("robot", "family", "problems", "valid", "median", "p95", "p99", "> 1 s", "motion time")
+            if chosen.meshes:
+                figures["meshes"] = check_meshes(problem, solved)
+            if chosen.reference:
+                figures["reference"] = search_reference(problem, solved, chosen.reference)
+    head = ("robot", "family", "problems", "valid", "median", "p95", "p99", "> 1 s", "set-up", "p95", "motion time")
     tables = [
         table("collision checks", ("figure", "value"), [(key, f"{value:,.4g}") for key, value in checked.items()])
     ]
     tables.append(table("new scenes, CPU time in s with set-up", head, rows, left=2))
+    for part, title in (("meshes", "contacts of the meshes"), ("reference", "RRT-Connect on unsolved problems")):
+        parts = {key: figures[part] for key, figures in results.items() if part in figures}
+        if parts:
+            cells = [(key, *(f"{value:.6g}" for value in figures.values())) for key, figures in parts.items()]
+            tables.append(table(title, ("scenes", *next(iter(parts.values()))), cells))
     report({"checks": checked, "scenes": results}, tables, as_json=chosen.json)
 
 

@@ -62,7 +62,13 @@ _OPTIONS: dict[str, _Setting] = {
         values.natural, "N", "Gauss-Newton steps that project the line onto the manifold (default: 1; 0 for none)"
     ),
     "projection_steps": _Setting(values.natural, "N", "the same for the network's path (default: 1; 0 for none)"),
-    "within_limits": _Setting(None, None, "keep control points within the joint limits in these steps"),
+    "within_limits": _Setting(
+        None, None, "keep control points within the joint limits in these steps; without equalities, in plans"
+    ),
+    "iterations": _Setting(
+        values.positive, "N", "evaluations of the network; each after the first corrects the path of the one before"
+        " (default: 1)",
+    ),
     "time_parametrized": _Setting(None, None, "fit the rates to the limits after the network"),
     "path_control_points": _Setting(values.positive, "C", "control points of the path (default: those of the problem)"),
     "rate_control_points": _Setting(values.positive, "R", "control points of the rate (default: those of the problem)"),

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
 from cnpgen.machine.threads import one_thread
@@ -13,8 +14,8 @@ from cnpgen.make.scene_solver import SceneSolver
 from cnpgen.make.stage_planner import SHA256, load_stage_planner, model_sha256, planner_boundary
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.stage import CandidateBatch, Stage, StageFunction
-from cnpgen.plans.format import BOUNDARY
-from cnpgen.refine.refine_engine import load_solver
+from cnpgen.plans.format import BOUNDARY, OBSTACLE_POSES
+from cnpgen.robots.scene_arrays import scene_poses
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
 
@@ -80,12 +81,15 @@ class CertifiedPlan(Stage):
 
         def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
             columns = {name: np.ascontiguousarray(values.T) for name, values in candidates.columns.items()}
-            guess = None if planner is None else planner.plan_batch(planner_boundary(columns, planner)).motion
+            scenes, poses = None, dict[str, NDArray[np.float64]]()
+            if candidates.scenes is not None:
+                scenes = candidates.scenes.table[candidates.scene]
+                poses = {OBSTACLE_POSES: scene_poses(context.problem.obstacle, scenes)}
+            guess = None
+            if planner is not None:
+                guess = planner.plan_batch(planner_boundary(columns, planner), columns=poses).motion
             with one_thread():
-                if candidates.scenes is None:
-                    motion, valid = solver(columns, guess)
-                else:
-                    motion, valid = solver_of_scenes(columns, candidates.scenes.table[candidates.scene], guess)
+                motion, valid = solver(columns, guess) if scenes is None else solver_of_scenes(columns, scenes, guess)
             count, points, joints = motion.path.shape
             candidates["path_control_points"] = np.ascontiguousarray(motion.path.reshape(count, points * joints).T)
             candidates["rate_control_points"] = np.ascontiguousarray(motion.rate.T)

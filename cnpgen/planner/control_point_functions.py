@@ -11,7 +11,7 @@ from typing import Any
 
 from cnpgen.kernels.symbolic.kinematics import forward_kinematics, tip_velocity
 from cnpgen.kernels.symbolic.linalg import Vec, symbols
-from cnpgen.planner.gauss_newton import projection_change
+from cnpgen.planner.gauss_newton import clipped_to_limits, projection_change
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.spline import end_derivatives
@@ -56,8 +56,11 @@ def line_change(
     return ca.Function("line_change", columns, [ca.cse(_column(change))])
 
 
-def projected_path(robot: Robot, problem: Problem, *, steps: int, fixed_at_goal: int, within_limits: bool) -> Any:
-    """Build ``(ends, offsets, rates, obstacle_poses) -> path``: line plus offsets [rad], projected."""
+def projected_path(robot: "Robot", problem: Problem, *, steps: int, fixed_at_goal: int, within_limits: bool) -> Any:
+    """Build ``(ends, offsets, rates, obstacle_poses) -> path``: line plus offsets [rad], projected.
+
+    Without steps, control points are clipped once to the joint limits if they must be within them.
+    """
     import casadi as ca
 
     spec, n = problem.trajectory, robot.n
@@ -79,6 +82,9 @@ def projected_path(robot: Robot, problem: Problem, *, steps: int, fixed_at_goal:
             fixed_at_goal=fixed_at_goal,
             within_limits=within_limits,
         )
+        points[interior] = _sums(points[interior], change)
+    elif within_limits:
+        change = [clipped_to_limits(robot, point, [0.0] * n) for point in points[interior]]
         points[interior] = _sums(points[interior], change)
     return ca.Function("projected_path", [ends_sx, offsets_sx, rates_sx, poses_sx], [ca.cse(_column(points))])
 

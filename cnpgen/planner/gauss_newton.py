@@ -51,13 +51,13 @@ def projection_change(
         q = [_combined(row, control) for row in table]
         step = _gauss_newton(equality, q, obstacle_poses, table[:, interior], response)
         if within_limits:
-            step = [_clipped_to_limits(robot, *pair) for pair in zip(control[interior], step, strict=True)]
+            step = [clipped_to_limits(robot, *pair) for pair in zip(control[interior], step, strict=True)]
         control[interior] = [add(*pair) for pair in zip(control[interior], step, strict=True)]
         total = [add(*pair) for pair in zip(total, step, strict=True)]
     return total
 
 
-def _clipped_to_limits(robot: Robot, point: Vec, step: Vec) -> Vec:
+def clipped_to_limits(robot: "Robot", point: Vec, step: Vec) -> Vec:
     """Change a step so that its end is within the joint limits; then the whole path is, too."""
     import casadi as ca
 

@@ -11,7 +11,7 @@ from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary, choose_backend, problem_kernels
 from cnpgen.planner.control_point_functions import projected_path
 from cnpgen.planner.expressions import effective_steps
-from cnpgen.planner.model import Model, ModelConfig
+from cnpgen.planner.model import Model, ModelConfig, Outputs
 from cnpgen.planner.phase_grid import blocks_of_motions
 from cnpgen.planner.task_preprocessor import TaskPreprocessor, ends_of, lanes, make_task_preprocessor, rows
 from cnpgen.planner.tasks import Tasks
@@ -129,9 +129,16 @@ class InferencePipeline:
         return self._fitted(self._projected(model, tasks, ends_of(tasks.boundary)), tasks.scene.poses)
 
     def _projected(self, model: Model, tasks: Tasks, ends: Array) -> Motion:
+        outputs, path = self._outputs(model, tasks, ends)
+        for _ in range(1, model.config.iterations):
+            outputs, path = self._outputs(model, self.prepare.along(tasks, path), ends)
+        return Motion(path, outputs.rate, model.problem.trajectory.degree)
+
+    def _outputs(self, model: Model, tasks: Tasks, ends: Array) -> tuple[Outputs, Array]:
+        """Evaluate the network; return its outputs, and the projected path, shape (N, C, n)."""
         outputs = model.outputs(tasks)
         (path,) = self.path(ends, lanes(outputs.offsets), lanes(outputs.rate), tasks.scene.lanes)
-        return Motion(rows(path, tasks.boundary.start_q.shape[1]), outputs.rate, model.problem.trajectory.degree)
+        return outputs, rows(path, tasks.boundary.start_q.shape[1])
 
     def _fitted(self, motion: Motion, obstacle_poses: Array) -> Motion:
         if self.time_parametrization is not None:
@@ -198,6 +205,7 @@ def make_inference_pipeline(
             via_lines=bool(config.via_points),
             placed=loaded.problem.sample_obstacles,
             observed=observed,
+            iterated=config.iterations > 1,
         )
         path = kernels.load(
             projected_path,

@@ -17,6 +17,10 @@ from cnpgen.planner.tasks import Tasks
 from cnpgen.problems.problem_record import ProblemRecord
 from cnpgen.schema.argument_types import checked_arguments
 
+Array = NDArray[Any]
+
+MAX_NETWORK_ITERATIONS = 20
+
 
 @dataclass(frozen=True, kw_only=True)
 class ModelConfig:
@@ -29,9 +33,11 @@ class ModelConfig:
         expected_time: Unit of durations: "distance", the time of the distance at the velocity limits, at least 0.2 s;
             "travel", the same without a lower bound, as in the authors' implementation; or "reach", the minimum time
             in which every joint could reach its goal state.
-        within_limits: Whether control points are clipped to the joint limits after each of these steps.
+        within_limits: Whether control points are clipped to the joint limits after each of these steps, and without any
+            of them once.
         time_parametrized: Whether rates are fitted to the limits after the network (``time_parametrization``).
         via_points: Via points of alternative lines for plans with violations [rad], n numbers each (``via_points``).
+        iterations: Number of evaluations of the network; each one after the first corrects the path of the one before.
     """
 
     path_scale: float
@@ -41,6 +47,7 @@ class ModelConfig:
     within_limits: bool = False
     time_parametrized: bool = False
     via_points: tuple[tuple[float, ...], ...] = ()
+    iterations: int = 1
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, RecipeError, UsageError, nearest
-from cnpgen.planner.model import Model, ModelConfig
+from cnpgen.planner.model import MAX_NETWORK_ITERATIONS, Model, ModelConfig
 from cnpgen.planner.network.architecture import Architecture
-from cnpgen.planner.network.features import ARRIVAL, BLOCKS, Features, count_features
+from cnpgen.planner.network.features import ARRIVAL, BLOCKS, LINE, Features, count_features
 from cnpgen.planner.tasks import EXPECTED_TIMES
 from cnpgen.plans.format import CONDITIONS
 from cnpgen.problems.problem import Problem
@@ -35,6 +35,7 @@ _DEFAULTS = {
     "within_limits": False,
     "time_parametrized": False,
     "via_points": (),
+    "iterations": 1,
 }  # values that files omit
 _STRUCTURE = {
     "architecture": dict.fromkeys(("inputs", "hidden", "layers", "path_outputs", "rate_outputs"), WHOLE),
@@ -195,6 +196,10 @@ def _assembled(content: Content) -> Model:
         raise ValueError(
             f"{config} is invalid: there are at most {MAX_PROJECTION_STEPS} steps, and path_scale is finite"
         )
+    if not (type(config.iterations) is int and 1 <= config.iterations <= MAX_NETWORK_ITERATIONS):
+        raise ValueError(f"iterations must be an integer from 1 to {MAX_NETWORK_ITERATIONS}, got {config.iterations!r}")
+    if (config.iterations > 1) != (LINE in features.blocks):
+        raise ValueError(f"{config.iterations} iterations do not fit the features {', '.join(features.blocks)}")
     if config.expected_time not in EXPECTED_TIMES:
         raise ValueError(f"expected_time must be one of {', '.join(EXPECTED_TIMES)}, got {config.expected_time!r}")
     for name in ("within_limits", "time_parametrized"):
@@ -218,7 +223,8 @@ def _check_sizes(problem: ProblemRecord, architecture: Architecture, features: F
     if unknown:
         raise ValueError(f"unknown features {', '.join(sorted(unknown))}")
     joints, spec = len(problem.joint_names), problem.trajectory
-    inputs, rates = count_features(features.blocks, joints, len(problem.parameters)), spec.rate_control_points
+    inputs = count_features(features.blocks, joints, len(problem.parameters), line=architecture.path_outputs)
+    rates = spec.rate_control_points
     interior = [(spec.path_control_points - 3 - fixed) * joints for fixed in (2, 3)]
     widths = (architecture.inputs, architecture.path_outputs, architecture.rate_outputs)
     if widths not in [(inputs, outputs, rates) for outputs in interior]:

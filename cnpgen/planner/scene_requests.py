@@ -14,7 +14,8 @@ from cnpgen.planner.plan_requests import Requests
 from cnpgen.planner.planner import Planner
 from cnpgen.plans.format import OBSTACLE_POSES
 from cnpgen.plans.plans import Plans
-from cnpgen.plans.scene_plans import scene_plans
+from cnpgen.plans.scene_plans import scene_plans, shape_of
+from cnpgen.problems.problem_record import open_problem
 from cnpgen.problems.scenes.scene_problem import SceneProblem, checked_scene
 from cnpgen.robots.scene import PARKED_POSITION_M
 
@@ -48,16 +49,16 @@ def scene_requests(
     """Return the tasks of scenes; see ``plan_scenes``."""
     if len(scenes) == 0:
         raise UsageError("there are no scenes", concerns="scenes")
-    with model.problem.restored() as problem:
-        if not problem.has_sample_obstacles:
-            raise UsageError(
-                f"the model is for {problem.name!r}, whose obstacles do not differ from plan to plan: expected a model"
-                " that was trained on scenes",
-                concerns="model",
-            )
-        own = tuple(obstacle for obstacle in problem.obstacle if obstacle.position != PARKED_POSITION_M)
-        parked = Counter(obstacle.kind for obstacle in problem.obstacle if obstacle.position == PARKED_POSITION_M)
-        checked = [checked_scene(scene) for scene in scenes]
-        plans = scene_plans(problem.with_obstacles(own), checked, goals=goals, capacity=parked)
+    problem, _ = open_problem(model.problem)
+    if not problem.has_sample_obstacles:
+        raise UsageError(
+            f"the model is for {problem.name!r}, whose obstacles do not differ from plan to plan: expected a model"
+            " that was trained on scenes",
+            concerns="model",
+        )
+    own = tuple(obstacle for obstacle in problem.obstacle if obstacle.position != PARKED_POSITION_M)
+    parked = Counter(shape_of(obstacle) for obstacle in problem.obstacle if obstacle.position == PARKED_POSITION_M)
+    checked = [checked_scene(scene) for scene in scenes]
+    plans = scene_plans(problem.with_obstacles(own), checked, goals=goals, capacity=parked)
     columns = {OBSTACLE_POSES: plans.columns[OBSTACLE_POSES]}
     return Requests(plans.boundary, plans.sample_id, columns)

@@ -1,7 +1,7 @@
 """Prepare tasks from boundary conditions: tip positions, obstacles, expected time, projected line."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -56,6 +56,7 @@ class TaskPreprocessor:
         least_time: Lower bound of the expected time of the distance [s].
         placed: Obstacles that samples place.
         scene_features: Features of these obstacles; None if the model has none.
+        iterated: Whether the network corrects its own path.
     """
 
     problem: Problem
@@ -67,6 +68,7 @@ class TaskPreprocessor:
     least_time: float = MIN_EXPECTED_TIME_S
     placed: tuple[Obstacle, ...] = ()
     scene_features: SceneFeatures | None = None
+    iterated: bool = False
 
     def __call__(
         self,
@@ -104,10 +106,39 @@ class TaskPreprocessor:
             (change,) = kernel(ends, *offsets, 1 / time[None], scene.lanes)
             correction = rows(change, boundary.start_q.shape[1])
         placed = self._placed_scene(len(boundary), obstacle_poses)
-        observation = None
-        if placed is not None and self.scene_features is not None:
-            observation = self.scene_features(boundary, placed)
-        return Tasks(boundary, start_xyz, goal_xyz, time, scene, correction, placed, observation)
+        if correction is None and self.iterated:
+            correction = np.zeros((len(boundary), *self._interior(boundary), boundary.start_q.shape[1]))
+        tasks = Tasks(boundary, start_xyz, goal_xyz, time, scene, correction, placed)
+        return self._observed(tasks, self._line(boundary, correction))
+
+    def along(self, tasks: Tasks, path: Array) -> Tasks:
+        """Return tasks whose lines are the paths of other plans for them.
+
+        Args:
+            tasks: N tasks.
+            path: Control points of the plans [rad], shape (N, C, n).
+        """
+        fixed = tasks.boundary.fixed_at_goal
+        first, last, interior = path[:, 2:3], path[:, -fixed, None], path[:, 3:-fixed]
+        along = along_line(interior.shape[1], path.dtype.name)
+        return self._observed(replace(tasks, correction=interior - first - (last - first) * along), path)
+
+    def _line(self, boundary: Boundary, correction: Array | None) -> Array:
+        """Return control points of the lines between states at rest, shape (N, C, n)."""
+        start, goal, fixed = boundary.start_q[:, None], boundary.goal_q[:, None], boundary.fixed_at_goal
+        interior = start + (goal - start) * along_line(*self._interior(boundary))
+        interior = interior if correction is None else interior + correction
+        return np.concatenate([np.repeat(start, 3, axis=1), interior, np.repeat(goal, fixed, axis=1)], axis=1)
+
+    def _interior(self, boundary: Boundary) -> tuple[int]:
+        """Return the number of interior control points."""
+        return (self.problem.trajectory.path_control_points - 3 - boundary.fixed_at_goal,)
+
+    def _observed(self, tasks: Tasks, path: Array) -> Tasks:
+        """Return tasks with features of the placed obstacles along paths, if the model has such features."""
+        if tasks.placed is None or self.scene_features is None:
+            return tasks
+        return replace(tasks, observation=self.scene_features(path.astype(float), tasks.placed.astype("float64")))
 
     def _placed_scene(self, count: int, obstacle_poses: Array | None) -> Scene | None:
         if not self.placed:
@@ -158,6 +189,7 @@ def make_task_preprocessor(
     via_lines: bool = False,
     placed: tuple[Obstacle, ...] = (),
     observed: bool = False,
+    iterated: bool = False,
 ) -> TaskPreprocessor:
     """Load the preprocessor of a problem's tasks.
 
@@ -172,6 +204,7 @@ def make_task_preprocessor(
         via_lines: Whether to load the kernel of lines through via points.
         placed: Obstacles that samples place.
         observed: Whether to compute features of them.
+        iterated: Whether the network corrects its own path.
     """
     steps = effective_steps(kernels, line_projection_steps)
     load = partial(kernels.load, steps=steps, fixed_at_goal=fixed_at_goal, within_limits=within_limits)
@@ -180,5 +213,6 @@ def make_task_preprocessor(
     time = kernels.load(reaching_time, fixed_at_goal=fixed_at_goal) if expected_time == "reach" else None
     via_line = load(line_change, with_offsets=True) if steps and via_lines else None
     least_time = MIN_TRAVEL_TIME_S if expected_time == "travel" else MIN_EXPECTED_TIME_S
-    features = make_scene_features(robot, kernels) if placed and observed else None
-    return TaskPreprocessor(problem, robot.velocity_limit, tips, line, time, via_line, least_time, placed, features)
+    features = make_scene_features(robot, problem.trajectory, kernels) if placed and observed else None
+    parts = tips, line, time, via_line, least_time, placed, features, iterated
+    return TaskPreprocessor(problem, robot.velocity_limit, *parts)

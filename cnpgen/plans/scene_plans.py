@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from cnpgen.errors import UsageError
 from cnpgen.plans.format import OBSTACLE_POSES
 from cnpgen.plans.plans import Plans, make_plans
-from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.problem_record import record_problem
+from cnpgen.problems.problem_record import open_problem, record_problem
 from cnpgen.problems.scene_capacity import Capacity, with_capacity
 from cnpgen.problems.scenes.scene_problem import SceneError, SceneProblem, check_scenes
 from cnpgen.robots.observation.primitives import KINDS, primitives_of
@@ -36,14 +35,15 @@ def capacity_of(scenes: Sequence[SceneProblem]) -> dict[str, int]:
 
     The shape is a kind, or the corners of a mesh. Numbers of kinds are rounded up to ``OBSTACLES_PER_STEP``.
     """
-    counts = [Counter(map(_shape, scene.obstacles)) for scene in scenes]
+    counts = [Counter(map(shape_of, scene.obstacles)) for scene in scenes]
     meshes = sorted({shape for count in counts for shape in count} - set(KINDS))
     most = {shape: max((count[shape] for count in counts), default=0) for shape in (*KINDS, *meshes)}
     steps = {shape: OBSTACLES_PER_STEP if shape in KINDS else 1 for shape in most}
     return {shape: -(-count // steps[shape]) * steps[shape] for shape, count in most.items() if count}
 
 
-def _shape(obstacle: Obstacle) -> str:
+def shape_of(obstacle: Obstacle) -> str:
+    """Return the key of an obstacle in capacities."""
     return obstacle.mesh or obstacle.kind
 
 
@@ -70,9 +70,10 @@ def scene_plans(
         SceneError: A scene lacks a planned joint or a goal state, or a position is outside its limits.
     """
     check_scenes(scenes)
-    robot = load_robot(problem)
-    capacity = capacity_of(scenes) if capacity is None else capacity
-    full = with_capacity(problem, capacity)
+    problem.urdf_text  # noqa: B018 - read once for all capacities
+    full = with_capacity(problem, capacity_of(scenes) if capacity is None else capacity)
+    record = record_problem(full)
+    robot = open_problem(record)[1]
     start = np.array([joint_order(scene, robot, scene.start_q[None], "start")[0] for scene in scenes])
     if goals is None:
         goals = [goal_states(scene, robot)[0] for scene in scenes]
@@ -82,7 +83,7 @@ def scene_plans(
     zero, spec, count = np.zeros_like(start), problem.trajectory, len(scenes)
     poses = np.array([_obstacle_poses(full, len(problem.obstacle), scene) for scene in scenes])
     return make_plans(
-        record_problem(full),
+        record,
         Boundary(start, zero, zero, goal_q, zero, None),
         path_control_points=np.full((count, spec.path_control_points, robot.n), np.nan),
         rate_control_points=np.full((count, spec.rate_control_points), np.nan),
@@ -137,12 +138,12 @@ def _obstacle_poses(problem: Problem, fixed: int, scene: SceneProblem) -> Array:
     numbers, slices = place_obstacles(problem.obstacle), number_slices(problem.obstacle)
     free: dict[str, list[int]] = {}
     for index, obstacle in enumerate(problem.obstacle[fixed:], fixed):
-        free.setdefault(_shape(obstacle), []).append(index)
+        free.setdefault(shape_of(obstacle), []).append(index)
     for obstacle in scene.obstacles:
-        if not free.get(_shape(obstacle)):
+        if not free.get(shape_of(obstacle)):
             text = f"{scene.place} has more obstacles of the kind {obstacle.kind} than the capacity"
             raise UsageError(text, concerns="capacity")
-        own, part = place_obstacles([obstacle]), slices[free[_shape(obstacle)].pop(0)]
+        own, part = place_obstacles([obstacle]), slices[free[shape_of(obstacle)].pop(0)]
         if obstacle.kind == "box":
             box = primitives_of([obstacle], own)
             own = np.concatenate([box.centers[0], box.sizes[0], box.rotations[0].ravel()])

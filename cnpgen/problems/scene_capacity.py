@@ -39,7 +39,10 @@ def with_capacity(problem: Problem, capacity: Capacity) -> Problem:
         )
     shapes = [*KINDS, *sorted(capacity.keys() - set(KINDS))]
     parked = [_parked(shape, index) for shape in shapes for index in range(1, capacity.get(shape, 0) + 1)]
-    return replace(problem, obstacle=(*problem.obstacle, *parked))  # without reading the URDF
+    full = replace(problem, obstacle=(*problem.obstacle, *parked))
+    if "urdf_text" in vars(problem):  # a cached property, expensive to read again
+        vars(full)["urdf_text"] = problem.urdf_text
+    return full
 
 
 def _parked(kind: str, index: int) -> Obstacle:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.problems.problem import Problem
-from cnpgen.refine.solver.bounds import NO_TIGHTENING, BoundsTemplate
+from cnpgen.refine.solver.bounds import NO_TIGHTENING, bounds_template
 from cnpgen.refine.solver.grid import make_grid
 from cnpgen.refine.solver.transcription import ResidualKernels, Transcription, cache_last
 from cnpgen.refine.task import RefinementTask
@@ -84,7 +84,7 @@ class FineCheck:
         self._last = cache_last(
             lambda task: Transcription(kernels, self._grid, boundary=task.boundary, obstacle_poses=poses(task))
         )
-        self._bounds = BoundsTemplate(problem, world, self._grid.s, NO_TIGHTENING)
+        self._bounds = bounds_template(problem, world, self._grid.s, NO_TIGHTENING)
         conditions = self._bounds.conditions
         self.equalities = {condition.name for condition in conditions if condition.is_equality}
         limits = np.repeat(

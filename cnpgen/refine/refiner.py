@@ -15,7 +15,7 @@ from cnpgen.refine import initial_guesses
 from cnpgen.refine.fine_check import FineCheck
 from cnpgen.refine.grid_levels import GridLevel, GridLevels, default_grid_levels
 from cnpgen.refine.rrt_connect import RestSpace
-from cnpgen.refine.solver.bounds import Bounds, BoundsTemplate
+from cnpgen.refine.solver.bounds import Bounds, bounds_template
 from cnpgen.refine.solver.compiled_backend import load_step_library
 from cnpgen.refine.solver.cost_term import CostTerm, cost_term_residuals, residual_counts
 from cnpgen.refine.solver.grid import make_grid
@@ -106,7 +106,7 @@ class Refiner:
         self._grids = {points: make_grid(self.spec, points, orders) for points in {level.points for level in every}}
         self._feedbacks = dict[int, HullFeedback]()
         self._bounds = {
-            level: BoundsTemplate(solved, world, self._grids[level.points].s, level.tightening) for level in every
+            level: bounds_template(solved, world, self._grids[level.points].s, level.tightening) for level in every
         }
 
     def input_variables(self, task: RefinementTask) -> Array | None:

@@ -83,7 +83,7 @@ def prepare_run(
         within_limits=settings.within_limits,
     )
     run = Run(
-        learner=Learner(architecture, spec, loss, settings, projection),
+        learner=Learner(architecture, spec, loss, settings, projection, inference.prepare.along, features),
         names=loss.terms,
         budgets=dict(zip(loss.terms[1:], loss.budgets.tolist(), strict=True)),
         rows=rows,
@@ -110,7 +110,8 @@ def _rows(
     boundary, poses = problems.boundary, problems.obstacle_poses
     if initial_model is None:
         robot = loaded.robot
-        blocks = feature_blocks(boundary, settings.features, placed=loaded.problem.has_sample_obstacles)
+        placed = loaded.problem.has_sample_obstacles
+        blocks = feature_blocks(boundary, settings.features, placed=placed, iterated=settings.iterations > 1)
         features = None
         if settings.features == "paper":
             features = published_features(blocks, robot.velocity_limit, robot.acceleration_limit)
@@ -157,6 +158,7 @@ def _check_initial_model(
 def _parameter_definition(architecture: Architecture, config: ModelConfig, zero: tuple[str, ...]) -> dict[str, Any]:
     """Return the values that must agree for parameters to be interchangeable."""
     outputs = {"path_scale": config.path_scale, "zero conditions": zero, "expected_time": config.expected_time}
+    outputs["iterations"] = config.iterations
     return {**asdict(architecture), **outputs}
 
 
@@ -168,15 +170,16 @@ def _architecture(
     spec = loaded.problem.trajectory
     placed = loaded.problem.has_sample_obstacles
     blocks = (
-        feature_blocks(boundary, settings.features, placed=placed)
+        feature_blocks(boundary, settings.features, placed=placed, iterated=settings.iterations > 1)
         if initial_model is None
         else initial_model.features.blocks
     )
+    outputs = loaded.robot.n * (spec.path_control_points - 3 - boundary.fixed_at_goal)
     return Architecture(
-        inputs=count_features(blocks, loaded.robot.n, len(loaded.problem.parameters)),
+        inputs=count_features(blocks, loaded.robot.n, len(loaded.problem.parameters), line=outputs),
         hidden=settings.hidden,
         layers=settings.layers,
-        path_outputs=loaded.robot.n * (spec.path_control_points - 3 - boundary.fixed_at_goal),
+        path_outputs=outputs,
         rate_outputs=spec.rate_control_points,
     )
 

@@ -8,7 +8,7 @@ from typing import Any, Literal
 from cnpgen.errors import UsageError
 from cnpgen.losses.metric_settings import BOUNDED, PUBLISHED, MetricSettings
 from cnpgen.losses.plan_loss import FORMS
-from cnpgen.planner.model import ModelConfig
+from cnpgen.planner.model import MAX_NETWORK_ITERATIONS, ModelConfig
 from cnpgen.planner.network.features import FEATURE_SETS
 from cnpgen.planner.tasks import EXPECTED_TIMES
 from cnpgen.problems.objectives import read_objective
@@ -22,13 +22,13 @@ METRICS = {
     "bounded": BOUNDED,
 }
 MIN_INTEGERS = {
-    "hidden": 1, "layers": 1, "batch_size": 1, "nodes": 1, "shifts": 1,
+    "hidden": 1, "layers": 1, "batch_size": 1, "iterations": 1, "nodes": 1, "shifts": 1,
     "warm_up": 0, "seed": 0, "line_projection_steps": 0, "projection_steps": 0, "validations": 1,
 }  # fmt: skip
 VALID_INTERVALS = {
     "learning_rate": "(0, inf)", "final_rate": "[0, 1]", "path_scale": "(0, inf)", "head_scale": "[0, inf)",
     "rate_bias": "(-inf, inf)", "sample_clip": "(0, inf]", "batch_clip": "(0, inf]", "memory": "[0, 1)",
-    "imitation": "[0, 1)",
+    "imitation": "[0, 1)", "iterations": f"[1, {MAX_NETWORK_ITERATIONS}]",
 }  # fmt: skip
 
 
@@ -60,6 +60,7 @@ class TrainingSettings:
         line_projection_steps: Gauss-Newton steps that project the line onto the equalities.
         projection_steps: Gauss-Newton steps that project the path onto the equalities.
         within_limits: Whether both clip control points to the joint limits.
+        iterations: Number of evaluations of the network; see ``ModelConfig``.
         time_parametrized: Whether the planner fits rates to the limits after the network; training steps do not include
             it, validations do.
         nodes: Number of quadrature nodes of the loss.
@@ -99,6 +100,7 @@ class TrainingSettings:
     line_projection_steps: int = 1
     projection_steps: int = 1
     within_limits: bool = False
+    iterations: int = 1
     time_parametrized: bool = False
     nodes: int = 32
     shifts: int = 16
@@ -135,6 +137,12 @@ class TrainingSettings:
             if getattr(self, name) not in choices:
                 known = ", ".join(filter(None, choices))
                 raise UsageError(f"must be one of {known}, got {getattr(self, name)!r}", argument=name)
+        if self.iterations > 1 and self.features in {"states", "paper"}:
+            raise UsageError(
+                f"{self.iterations} evaluations of the network need its path as an input: expected features"
+                f" 'full' or 'no-scene', got {self.features!r}",
+                concerns="features",
+            )
         for name in ("path_control_points", "rate_control_points"):
             if getattr(self, name) is not None:
                 integer(name, getattr(self, name), least=1)
@@ -155,6 +163,7 @@ class TrainingSettings:
             projection_steps=self.projection_steps,
             expected_time=self.expected_time,
             within_limits=self.within_limits,
+            iterations=self.iterations,
             time_parametrized=self.time_parametrized,
         )
 

@@ -1,7 +1,7 @@
 """One training step: batch, network, loss, gradient, parameters."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 from cnpgen.losses.plan_loss import LossValue
 from cnpgen.planner.control_points import ControlPoints, control_points, vjp
 from cnpgen.planner.network.architecture import Architecture
+from cnpgen.planner.network.features import Features
 from cnpgen.planner.network.forward import backward, forward
 from cnpgen.planner.projection import Projection
+from cnpgen.planner.tasks import Tasks
 from cnpgen.training.adam import Adam
 from cnpgen.training.clipping import Clipping
 from cnpgen.training.settings import TrainingSettings
@@ -50,6 +52,8 @@ class Learner:
         loss: The loss.
         settings: The settings.
         projection: Projection of the network's paths onto the equalities; None if there is none.
+        along: Function of tasks and paths of plans for them that returns tasks along these paths.
+        features: Definition of the features of such tasks.
     """
 
     architecture: Architecture
@@ -57,6 +61,8 @@ class Learner:
     loss: Loss
     settings: TrainingSettings
     projection: Projection | None = None
+    along: Callable[[Tasks, Array], Tasks] | None = None
+    features: Features | None = None
 
     def gradient(
         self, parameters: Array, rows: Rows, weights: Array, *, shift: float, clipping: Clipping, out: Array
@@ -75,7 +81,7 @@ class Learner:
             The terms of every sample, shape (N, 1 + m).
         """
 
-        def cost(points: ControlPoints) -> LossValue:
+        def cost(rows: Rows, points: ControlPoints) -> LossValue:
             start_tip = rows.tasks.start_xyz if self.settings.time_varying_bounds else None
             return self.loss(
                 points.path,
@@ -96,27 +102,41 @@ class Learner:
         """
         target = rows.target
         assert target is not None
-        return self._gradient(parameters, rows, lambda points: imitation_loss(points, target), clipping, out)
+        return self._gradient(parameters, rows, lambda _, points: imitation_loss(points, target), clipping, out)
 
     def _gradient(
         self,
         parameters: Array,
         rows: Rows,
-        cost: Callable[[ControlPoints], LossValue],
+        cost: Callable[[Rows, ControlPoints], LossValue],
         clipping: Clipping,
         out: Array,
     ) -> Array:
-        network = self.architecture.split(parameters)
-        activations = forward(network, rows.features)
-        scale = self.settings.path_scale
-        points = control_points(rows.tasks, activations.path, activations.log_rate, scale=scale, spec=self.spec)
-        value = cost(self._projected(points, rows))
-        phi, log_rate = self._output_gradients(rows, points, value)
-        factors = self._factors(phi, log_rate, clipping)
-        phi *= factors
-        log_rate *= factors
-        backward(network, activations, path_gradient=phi, log_rate_gradient=log_rate, out=self.architecture.split(out))
+        network, scale, part = self.architecture.split(parameters), self.settings.path_scale, out
+        for iteration in range(self.settings.iterations):
+            activations = forward(network, rows.features)
+            points = control_points(rows.tasks, activations.path, activations.log_rate, scale=scale, spec=self.spec)
+            projected = self._projected(points, rows)
+            value = cost(rows, projected)
+            phi, log_rate = self._output_gradients(rows, points, value)
+            factors = self._factors(phi, log_rate, clipping)
+            phi *= factors
+            log_rate *= factors
+            gradients = self.architecture.split(part)
+            backward(network, activations, path_gradient=phi, log_rate_gradient=log_rate, out=gradients)
+            if iteration:
+                out += part
+            if iteration + 1 < self.settings.iterations:
+                part = np.empty_like(out) if iteration == 0 else part
+                rows = self._along(rows, projected.path)
         return value.terms
+
+    def _along(self, rows: Rows, path: Array) -> Rows:
+        """Return the rows of the next iteration, whose lines are the paths of this one."""
+        assert self.along is not None
+        assert self.features is not None
+        tasks = self.along(rows.tasks, path)
+        return replace(rows, tasks=replace(tasks, observation=None), features=self.features.of(tasks))
 
     def _output_gradients(self, rows: Rows, points: ControlPoints, value: LossValue) -> tuple[Array, Array]:
         """Return the loss's gradients with respect to both heads."""

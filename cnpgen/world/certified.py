@@ -5,7 +5,7 @@ signed distance. No failure of Coal can therefore overestimate a distance.
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -29,12 +29,17 @@ class ConvexBody:
     Attributes:
         corners: Corners of the hull [m], shape (V, 3).
         radius: Radius that is added to the hull [m].
-        shape: Coal shape of the hull.
+        equivalent: Coal shape that is measured in place of the hull; None for the hull itself.
     """
 
     corners: Array
     radius: float
-    shape: Any
+    equivalent: Any = None
+
+    @cached_property
+    def shape(self) -> Any:
+        """Coal shape of the hull, built when a distance is first measured."""
+        return coal_hull(self.corners) if self.equivalent is None else self.equivalent
 
     def support(self, pose: Pose, direction: Array) -> float:
         """Evaluate the support function along a unit vector of shape (3,), from the origin of the world [m]."""
@@ -50,7 +55,7 @@ def convex_body(corners: Array, radius: float = 0.0) -> ConvexBody:
 @lru_cache(maxsize=512)
 def _cached_body(corners: bytes, radius: float) -> ConvexBody:
     points = np.frombuffer(corners).reshape(-1, 3)
-    return ConvexBody(points, radius, coal_hull(points))
+    return ConvexBody(points, radius)
 
 
 class CertifiedDistance:

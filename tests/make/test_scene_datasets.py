@@ -264,21 +264,24 @@ def test_mistakes_name_file_and_key(
     assert "scenes.toml" in error
 
 
-@pytest.mark.slow
-def test_certified_samples_have_valid_plans_in_their_scenes(pipeline: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "certified"
-    cnpgen.make_dataset(pipeline, folder, n=12, certify=True, workers=1)
-    assert main(["validate", str(folder), "--deep", "--workers", "1"]) == 0
-    plans = cnpgen.load_boundary_problems(folder)
-    assert cnpgen.evaluate_plans(plans).valid.all()
-
-
 @pytest.fixture(scope="module")
 def model(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("model") / "scenes.h5"
     settings = TrainingSettings(hidden=8, layers=1, batch_size=16, nodes=8, validations=1)
     cnpgen.train_model(dataset, path, steps=2, settings=settings, check_rows=4)
     return path
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("from_planner", [False, True])
+def test_certified_samples_have_valid_plans_in_their_scenes(
+    pipeline: Path, model: Path, tmp_path: Path, *, from_planner: bool
+) -> None:
+    folder = tmp_path / "certified"
+    cnpgen.make_dataset(pipeline, folder, n=12, certify=True, model=model if from_planner else None, workers=1)
+    assert main(["validate", str(folder), "--deep", "--workers", "1"]) == 0
+    plans = cnpgen.load_boundary_problems(folder)
+    assert cnpgen.evaluate_plans(plans).valid.all()
 
 
 @pytest.mark.slow

@@ -61,6 +61,19 @@ def test_scenes_become_boundary_problems_of_one_problem(crane: Path) -> None:
     assert others.problem == scene_plans(problem, SCENES[:1]).problem  # kernels depend on the numbers of obstacles only
 
 
+def test_new_scenes_read_neither_the_urdf_nor_the_robot_again(crane: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = cnpgen.load_problem(crane)
+    first = scene_plans(problem, SCENES[:1])
+
+    def refused(*_: object, **__: object) -> None:
+        pytest.fail("the URDF is read again")
+
+    monkeypatch.setattr("cnpgen.problems.problem.read_urdf", refused)
+    monkeypatch.setattr("cnpgen.problems.load_robot.reduced_model", refused)
+    assert scene_plans(problem, SCENES[:1]).problem == first.problem
+    assert scene_plans(problem, SCENES).problem != first.problem  # more places for obstacles
+
+
 def test_joints_are_ordered_by_name_and_checked(crane: Path) -> None:
     problem = cnpgen.load_problem(crane)
     names = ("grip", "roll", "elbow", "lift", "swing")

@@ -13,8 +13,9 @@ from cnpgen.planner.planner import Planner
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.problems.problem_record import record_problem
-from tests.conftest import some
-from tests.examples.example_robots import SHIPPED, with_robots
+from cnpgen.scenes import make_scenes, plan_scenes
+from tests.conftest import needs_compiler, some
+from tests.examples.example_robots import SHIPPED, needs_robots, with_robots
 
 MAX_MODEL_BYTES = 3_000_000
 STRICT = {
@@ -26,6 +27,7 @@ STRICT = {
     "heavy-object-anywhere": 0.9,
     "heavy-object-loads": 0.85,
     "panda-cup": 0.9,
+    "panda-scenes": 0.6,
     "ur5-wipe": 0.9,
 }
 FOLDER = Path(__file__).parents[2] / "datasets" / "models"
@@ -55,7 +57,7 @@ def test_a_model_is_small_and_of_the_shipped_problem(name):
 
 
 # Those of the shipped robots: tests/problems/test_shipped_robots.py.
-@pytest.mark.parametrize("name", some([name for name in STRICT if name not in SHIPPED], 1, "slow"))
+@pytest.mark.parametrize("name", some([name for name in STRICT if name not in (*SHIPPED, "panda-scenes")], 1, "slow"))
 def test_a_model_reaches_its_recorded_score(name, tiny):
     planner = Planner(name)
     requests = read_rows(tiny(name), planner.model)  # raises an error if the recipe has changed
@@ -63,6 +65,15 @@ def test_a_model_reaches_its_recorded_score(name, tiny):
     score = planner.model.training["score"]
     assert score["valid"] >= STRICT[name]
     assert found.valid.mean() >= score["valid"] - 0.08  # 60 rows
+
+
+@needs_robots
+@needs_compiler
+@pytest.mark.slow
+def test_the_planner_of_scenes_plans_in_unseen_scenes():
+    scenes = make_scenes("tabletop", "panda-3kg", 25, seed=29_270_001)
+    plans = plan_scenes(Planner("panda-scenes"), scenes)
+    assert evaluate_plans(plans, workers=1).valid.mean() >= STRICT["panda-scenes"]
 
 
 @pytest.mark.parametrize("name", STRICT)

@@ -21,7 +21,7 @@ from cnpgen.refine.refine_plans import refine_plans, solve_plans
 from cnpgen.refine.refinement import Refinement
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.solver import compiled_backend, qp_subproblem, sqp
-from cnpgen.refine.solver.bounds import INTERVAL_FRACTION, Bounds
+from cnpgen.refine.solver.bounds import INTERVAL_FRACTION, NO_TIGHTENING, Bounds, bounds_template
 from cnpgen.refine.solver.compiled_backend import CompiledBackend
 from cnpgen.refine.solver.cost_term import CostTerm, choose_cost_term, cost_term_residuals, residual_counts
 from cnpgen.refine.solver.deadline import Deadline
@@ -655,3 +655,14 @@ def test_before_a_deadline_motions_of_hundredths_of_a_second_become_feasible_too
         found = [tool.run_level(each, tool.levels.warm, tool.input_variables(each)) for each in tasks]
         feasible.append(sum(each.violation < tool.settings.violation_tolerance for each in found))
     assert feasible[1] > feasible[0] + 2
+
+
+def test_equal_problems_share_their_bounds():
+    plan = load("transport")
+    world = World(plan.robot, plan.problem.obstacle, plan.problem.object_size)
+    tight, other = replace(NO_TIGHTENING, limit=0.01), replace(plan.problem, name="other")
+    s = chebyshev(24)[1:]
+    template = bounds_template(plan.problem, world, s, tight)
+    assert bounds_template(replace(plan.problem), world, s.copy(), tight) is template
+    others = [(plan.problem, s, NO_TIGHTENING), (plan.problem, s[:-1], tight), (other, s, tight)]
+    assert all(bounds_template(problem, world, phases, amount) is not template for problem, phases, amount in others)

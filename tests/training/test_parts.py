@@ -94,7 +94,7 @@ WRONG: list[tuple[str, Any]] = [
     ("hidden", 0), ("hidden", 2.5), ("batch_size", -1), ("seed", -1), ("line_projection_steps", -1), ("nodes", "32"),
     ("learning_rate", 0.0), ("learning_rate", math.inf), ("learning_rate", "1e-3"), ("final_rate", -5),
     ("memory", 2), ("memory", 1.0), ("imitation", 1.0), ("sample_clip", math.nan), ("head_scale", -0.1),
-    ("rate_bias", math.inf), ("warm_up", 1.5),
+    ("rate_bias", math.inf), ("warm_up", 1.5), ("iterations", 0), ("iterations", 21),
 ]  # fmt: skip
 
 
@@ -180,6 +180,10 @@ def test_margins_tighten_the_limits_that_they_name_and_no_others(monkeypatch: py
     [
         ({"margins": {"joint-velocity": 1.5}}, r"margins must be in \(0, 1\] for 'joint-velocity', got 1.5"),
         ({"expected_time": "soon"}, "expected_time must be one of distance, reach, travel, got 'soon'"),
+        (
+            {"iterations": 2, "features": "paper"},
+            "expected features 'full' or 'no-scene', got 'paper'",
+        ),
     ],
 )
 def test_invalid_margins_and_expected_times_raise_errors(changes: dict[str, Any], message: str):

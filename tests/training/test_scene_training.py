@@ -4,38 +4,50 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.interpolate import BSpline
 
 from cnpgen.cli.main import main
-from cnpgen.errors import UsageError
+from cnpgen.errors import DatasetError, UsageError
 from cnpgen.kernels.library import problem_kernels
-from cnpgen.planner.model_file import load_model
+from cnpgen.planner.control_points import control_points
+from cnpgen.planner.inference_pipeline import loaded_problem, make_inference_pipeline
+from cnpgen.planner.model_file import load_model, model_content, model_from_content
+from cnpgen.planner.network.architecture import initial_parameters
+from cnpgen.planner.network.forward import forward
 from cnpgen.planner.network.scene_features import (
     BASIS,
-    LINE_PHASES,
     MAX_DISTANCE_M,
     MIN_DISTANCE_M,
+    PATH_PHASES,
     count_scene_features,
     make_scene_features,
 )
 from cnpgen.planner.planner import Planner
-from cnpgen.planner.scene_requests import plan_scenes
+from cnpgen.planner.scene_requests import plan_scenes, scene_requests
+from cnpgen.planner.task_preprocessor import ends_of
 from cnpgen.plans.format import OBSTACLE_POSES
 from cnpgen.plans.plan_file import load_plans
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
+from cnpgen.problems.problem_record import record_problem
+from cnpgen.problems.scene_capacity import with_capacity
 from cnpgen.robots.observation.primitives import primitives_of
 from cnpgen.robots.observation.signed_distance import signed_distances
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.scene import Scene
+from cnpgen.robots.shape.hull import hull_corners
+from cnpgen.robots.shape.inline import address_of
 from cnpgen.robots.solid import number_slices, place_obstacles
 from cnpgen.scenes import SceneProblem, save_scenes
+from cnpgen.training.clipping import Clipping
+from cnpgen.training.prepare import prepare_run
 from cnpgen.training.scene_rows import make_scene_rows
 from cnpgen.training.settings import TrainingSettings
 from cnpgen.training.train import train_model
-from cnpgen.trajectory.boundary import Boundary
+from cnpgen.trajectory.spline import clamped_knots
 from cnpgen.world.forward_kinematics import ForwardKinematics
 from tests.conftest import needs_compiler
-from tests.examples.shaped_robot import write_problem
+from tests.examples.shaped_robot import WEDGE, write_problem
 
 TINY = TrainingSettings(hidden=8, layers=1, batch_size=16, nodes=8, validations=1)
 
@@ -75,11 +87,9 @@ def test_features_do_not_depend_on_the_order_of_obstacles(problem, tmp_path):
     items = [item for item in obstacles(random, 5) if item.kind == "box"]
     numbers, slices = place_obstacles(items), number_slices(items)
     turned = np.concatenate([numbers[slices[index]] for index in (2, 0, 3, 1)])
-    ends = random.uniform(robot.position_lower, robot.position_upper, (2, 3, robot.n))
-    zero = np.zeros((3, robot.n))
-    boundary = Boundary(ends[0], zero, zero, ends[1], zero)
-    features = make_scene_features(robot, problem_kernels(problem, robot, "numpy", tmp_path))
-    found, other = (features(boundary, Scene(tuple(items), np.tile(poses, (3, 1)))) for poses in (numbers, turned))
+    path = random.uniform(robot.position_lower, robot.position_upper, (3, 15, robot.n))
+    features = make_scene_features(robot, problem.trajectory, problem_kernels(problem, robot, "numpy", tmp_path))
+    found, other = (features(path, Scene(tuple(items), np.tile(poses, (3, 1)))) for poses in (numbers, turned))
     assert found.shape == (3, count_scene_features(robot.n))
     np.testing.assert_allclose(found, other, atol=1e-12)
     bodies = primitives_of(items, numbers)
@@ -87,18 +97,18 @@ def test_features_do_not_depend_on_the_order_of_obstacles(problem, tmp_path):
     np.testing.assert_allclose(found[0, -BASIS.points :], expected, atol=1e-6)
 
 
-def test_clearances_along_the_line_are_those_of_the_capsules(problem, tmp_path):
+def test_clearances_along_a_path_are_those_of_the_capsules(problem, tmp_path):
     robot, random = load_robot(problem), np.random.default_rng(3)
     items = obstacles(random, 4)
-    start, goal = random.uniform(robot.position_lower, robot.position_upper, (2, robot.n))
-    zero = np.zeros((1, robot.n))
-    features = make_scene_features(robot, problem_kernels(problem, robot, "numpy", tmp_path))
+    path, spec = random.uniform(robot.position_lower, robot.position_upper, (15, robot.n)), problem.trajectory
+    features = make_scene_features(robot, spec, problem_kernels(problem, robot, "numpy", tmp_path))
     scene = Scene(items, place_obstacles(items)[None])
-    found = features(Boundary(start[None], zero, zero, goal[None], zero), scene)[0]
-    phases = (np.arange(LINE_PHASES) + 1) / (LINE_PHASES + 1)
-    rotations, positions = ForwardKinematics(robot.model).poses((start + (goal - start) * phases[:, None]).T)
+    found = features(path[None], scene)[0]
+    phases = (np.arange(PATH_PHASES) + 1) / (PATH_PHASES + 1)
+    states = BSpline(clamped_knots(15, spec.degree), path, spec.degree)(phases)
+    rotations, positions = ForwardKinematics(robot.model).poses(states.T)
     bodies = primitives_of(items, scene.poses[0])
-    for phase in range(LINE_PHASES):
+    for phase in range(PATH_PHASES):
         smallest = MAX_DISTANCE_M
         for capsule in robot.shape.moving_capsules:
             joint = robot.shape.joints[capsule.link]
@@ -108,6 +118,19 @@ def test_clearances_along_the_line_are_those_of_the_capsules(problem, tmp_path):
         entry = found[phase * (robot.n + 2)]
         assert entry <= max(smallest, MIN_DISTANCE_M) + 1e-6  # ends of the axes, and points between them
         assert entry >= max(smallest - 0.12, MIN_DISTANCE_M) - 1e-6
+
+
+def test_obstacles_of_a_scene_fill_places_of_their_shape(problem):
+    wedge = Obstacle(name="wedge", kind="mesh", position=(0.5, 0.0, 0.2), mesh=address_of(hull_corners(0.001 * WEDGE)))
+    (scene,) = scenes(problem, 1)
+    mixed = replace(scene, obstacles=(*scene.obstacles, wedge))
+    full = with_capacity(problem, {"box": 2, "cylinder": 1, wedge.mesh: 1})
+    model = replace(load_model("heavy-object"), problem=record_problem(full))
+    (placed,) = scene_requests(model, [mixed]).columns[OBSTACLE_POSES]
+    part = number_slices(full.obstacle)[-1]
+    np.testing.assert_allclose(placed[part], place_obstacles([wedge]))
+    with pytest.raises(UsageError, match="more obstacles of the kind mesh"):
+        scene_requests(model, [replace(mixed, obstacles=(*mixed.obstacles, wedge))])
 
 
 def test_training_rows_are_problems_and_their_reverses(problem):
@@ -123,6 +146,66 @@ def test_training_rows_are_problems_and_their_reverses(problem):
         make_scene_rows(problem, items[:3], "here")
 
 
+def test_the_next_iteration_starts_from_the_path_of_the_last_one(problem):
+    items = scenes(problem, 5)
+    rows = make_scene_rows(problem, items * 8, "here")._rows(0, 5)
+    random, spec = np.random.default_rng(6), problem.trajectory
+    with loaded_problem(make_scene_rows(problem, items * 8, "here").problem, "numpy") as loaded:
+        config = replace(TINY, iterations=2).config
+        inference = make_inference_pipeline(loaded, config, scale_time=False)
+    tasks = inference.prepare(rows.boundary, obstacle_poses=rows.obstacle_poses)
+    assert tasks.correction.shape == (5, 10, 4)
+    assert not tasks.correction.any()
+    outputs = [random.uniform(-0.5, 0.5, (5, width)) for width in (40, 20)]
+    points = control_points(tasks, *outputs, scale=0.5, spec=spec)
+    following = inference.prepare.along(tasks, points.path)
+    again = control_points(following, np.zeros((5, 40)), outputs[1], scale=0.5, spec=spec)
+    np.testing.assert_allclose(again.path, points.path, atol=1e-12)
+    features = inference.prepare.scene_features
+    np.testing.assert_array_equal(following.observation, features(points.path, tasks.placed))
+    assert not np.array_equal(following.observation, tasks.observation)
+
+
+def test_control_points_stay_within_the_limits(problem):
+    rows = make_scene_rows(problem, scenes(problem, 40), "here")._rows(0, 5)
+    with loaded_problem(make_scene_rows(problem, scenes(problem, 40), "here").problem, "numpy") as loaded:
+        config = replace(TINY, within_limits=True).config
+        inference, robot = make_inference_pipeline(loaded, config, scale_time=False), loaded.robot
+    offsets = np.random.default_rng(7).uniform(-9, 9, (40, 5))
+    (path,) = inference.path(ends_of(rows.boundary), offsets, np.ones((20, 5)), np.empty((0, 5)))
+    points = path.T.reshape(5, 15, 4)
+    assert (points >= robot.position_lower).all()
+    assert (points <= robot.position_upper).all()
+    np.testing.assert_allclose(points[:, :3], np.repeat(rows.boundary.start_q[:, None], 3, axis=1))
+
+
+@needs_compiler
+def test_the_gradient_is_the_sum_of_those_of_all_iterations(problem):
+    rows = make_scene_rows(problem, scenes(problem, 60), "here")
+    settings = replace(TINY, iterations=3)
+    with loaded_problem(rows.problem) as loaded:
+        run, inference = prepare_run(rows, loaded, settings)
+    learner, batch = run.learner, run.rows.take(np.arange(4))
+    parameters = initial_parameters(learner.architecture, seed=1, head_scale=1.0, rate_bias=-0.5)
+    weights, clipping = np.ones(len(run.names) - 1), Clipping()
+
+    def gradient(learner, rows):
+        out = np.empty_like(parameters)
+        learner.gradient(parameters, rows, weights, shift=0.0, clipping=clipping, out=out)
+        return out.astype(float)
+
+    single, expected = replace(learner, settings=replace(settings, iterations=1, sample_clip=np.inf)), 0.0
+    learner = replace(learner, settings=replace(settings, sample_clip=np.inf))
+    found = gradient(learner, batch)
+    for _ in range(3):
+        expected = expected + gradient(single, batch)
+        activations = forward(learner.architecture.split(parameters), batch.features)
+        points = control_points(batch.tasks, activations.path, activations.log_rate, scale=0.5, spec=learner.spec)
+        tasks = inference.prepare.along(batch.tasks, points.path)
+        batch = replace(batch, tasks=tasks, features=run.features.of(tasks))
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5 * np.abs(expected).max())
+
+
 @needs_compiler
 @pytest.mark.slow
 def test_a_planner_is_trained_on_a_scene_file_and_plans_its_scenes(problem, tmp_path, capsys):
@@ -132,9 +215,18 @@ def test_a_planner_is_trained_on_a_scene_file_and_plans_its_scenes(problem, tmp_
     with pytest.raises(UsageError, match=r"holds scenes: robot='panda' trains on them"):
         train_model(file, tmp_path / "model.h5", steps=8)
     own = load_problem(path)
-    trained = train_model(file, tmp_path / "model.h5", steps=8, settings=TINY, check_rows=1, workers=1, robot=str(path))
+    settings = replace(TINY, iterations=2)
+    trained = train_model(
+        file, tmp_path / "model.h5", steps=8, settings=settings, check_rows=1, workers=1, robot=str(path)
+    )
     model = load_model(trained.path)
-    assert "scene" in model.features.blocks
+    assert model.features.blocks[-2:] == ("scene", "line")
+    assert model.config.iterations == 2
+    content = model_content(model)
+    for damage in ('"iterations": 1', '"iterations": 2.5', '"iterations": 1000'):
+        texts = {**content.texts, "description": content.texts["description"].replace('"iterations": 2', damage)}
+        with pytest.raises(DatasetError, match="iterations"):
+            model_from_content(trained.path, replace(content, texts=texts))
     assert robot.exists()
     planner = Planner(model)
     plans = plan_scenes(planner, items[:4])

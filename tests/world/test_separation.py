@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from cnpgen.robots.shape.hull import coal_hull
 from cnpgen.robots.solid import Box
+from cnpgen.world import certified
 from cnpgen.world.separation import cuboid_gaps, cuboid_separation, gaps, separation
 
 SIZE = np.array([0.2, 0.2, 0.3])
@@ -81,3 +83,15 @@ def test_gaps_along_several_axes_form_a_distance() -> None:
 def test_the_bound_of_overlapping_boxes_is_the_smallest_depth() -> None:
     low, high = np.array([[0.0], [0.0], [0.9]]), np.array([[1.0], [1.0], [1.5]])
     assert gaps(low, high, [box_between(np.zeros(3), np.ones(3))])[0, 0] == pytest.approx(-0.1)
+
+
+def test_the_hull_of_a_body_is_built_when_a_distance_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    built = list[np.ndarray]()
+    monkeypatch.setattr(certified, "coal_hull", lambda corners: built.append(corners) or coal_hull(corners))
+    corners = np.random.default_rng(8).uniform(-1, 1, (12, 3))
+    body, pose = certified.convex_body(corners, 0.1), (np.eye(3), np.array([5.0, 0.0, 0.0]))
+    assert built == []
+    for _ in range(2):
+        distance, _ = certified.CertifiedDistance().between(body, (np.eye(3), np.zeros(3)), body, pose)
+    assert distance > 0
+    assert len(built) == 1

@@ -20,7 +20,8 @@ USUAL = (*STATES, "sin_cos", "tips", "expected_time")
 ARRIVAL = "goal_ddq"  # only if goal accelerations are given
 SCENE = "scene"  # only if samples place obstacles
 PARAMETERS = "parameters"  # only for problems with parameters
-BLOCKS = (*USUAL, ARRIVAL, PARAMETERS, SCENE)
+LINE = "line"  # only if the network corrects its own path
+BLOCKS = (*USUAL, ARRIVAL, PARAMETERS, SCENE, LINE)
 FEATURE_SETS = ("full", "no-scene", "states", "paper")
 MIN_DEVIATION = 1e-7  # SI units; features with a smaller standard deviation are constant
 
@@ -47,7 +48,9 @@ class Features:
         return raw.astype(dtype)
 
 
-def feature_blocks(boundary: Boundary, features: str = "full", *, placed: bool = False) -> tuple[str, ...]:
+def feature_blocks(
+    boundary: Boundary, features: str = "full", *, placed: bool = False, iterated: bool = False
+) -> tuple[str, ...]:
     """Return the feature blocks of tasks with such boundary conditions.
 
     Args:
@@ -55,11 +58,13 @@ def feature_blocks(boundary: Boundary, features: str = "full", *, placed: bool =
         features: One of ``FEATURE_SETS``: all blocks ("full"), all but those of placed obstacles ("no-scene"), or the
             boundary states ("states", "paper").
         placed: Whether samples place obstacles.
+        iterated: Whether the network corrects its own path.
     """
     blocks = USUAL if features in {"full", "no-scene"} else STATES
     optional = {ARRIVAL: boundary.goal_ddq, PARAMETERS: boundary.parameters}
     blocks = (*blocks, *(name for name, values in optional.items() if values is not None))
-    return (*blocks, SCENE) if placed and features == "full" else blocks
+    blocks = (*blocks, SCENE) if placed and features == "full" else blocks
+    return (*blocks, LINE) if iterated else blocks
 
 
 def published_features(blocks: tuple[str, ...], velocity_limit: Array, acceleration_limit: Array) -> Features:
@@ -79,15 +84,19 @@ def published_features(blocks: tuple[str, ...], velocity_limit: Array, accelerat
 
 def fit_features(parts: Iterable[Tasks], blocks: tuple[str, ...] = USUAL) -> Features:
     """Compute mean and standard deviation of every feature over the training rows, given in parts."""
-    count, mean, squares = 0, np.zeros(1), np.zeros(1)
+    count, mean, squares, line = 0, np.zeros(1), np.zeros(1), 0
     for tasks in parts:
         raw = raw_features(tasks, blocks)
+        line = 0 if tasks.correction is None else tasks.correction[:1].size
         new, total = raw.mean(axis=0) - mean, count + len(raw)
         squares = squares + raw.var(axis=0) * len(raw) + new**2 * (count * len(raw) / total)  # Chan et al., 1983
         count, mean = total, mean + new * (len(raw) / total)
     deviation = np.sqrt(squares / count)
     constant = deviation < MIN_DEVIATION
-    return Features(blocks, mean, np.where(constant, 0.0, 1 / np.where(constant, 1.0, deviation)))
+    scale = np.where(constant, 0.0, 1 / np.where(constant, 1.0, deviation))
+    if LINE in blocks:  # the last one; zero along straight lines
+        mean[-line:], scale[-line:] = 0.0, 1.0
+    return Features(blocks, mean, scale)
 
 
 def raw_features(tasks: Tasks, blocks: tuple[str, ...]) -> Array:
@@ -97,8 +106,9 @@ def raw_features(tasks: Tasks, blocks: tuple[str, ...]) -> Array:
     * ``sin_cos``: sines and cosines of start and goal positions, whose products appear in the forward kinematics;
     * ``tips``: tip positions at start and goal [m];
     * ``expected_time``: its logarithm;
-    * ``scene``: features of the obstacles that samples place (``scene_features``).
-    * ``parameters``: the parameters of the problem, if it has any.
+    * ``parameters``: the parameters of the problem, if it has any;
+    * ``scene``: features of the obstacles that samples place (``scene_features``);
+    * ``line``: offsets of the interior control points of the path that the network corrects [rad], not standardized.
 
     Args:
         tasks: The tasks.
@@ -111,10 +121,17 @@ def raw_features(tasks: Tasks, blocks: tuple[str, ...]) -> Array:
     return np.concatenate(parts, axis=1, dtype=np.float64)
 
 
-def count_features(blocks: tuple[str, ...], joints: int, parameters: int = 0) -> int:
-    """Return the number of features of some of ``BLOCKS``, for a number of planned joints and of parameters."""
+def count_features(blocks: tuple[str, ...], joints: int, parameters: int = 0, line: int = 0) -> int:
+    """Return the number of features of some of ``BLOCKS``.
+
+    Args:
+        blocks: The blocks.
+        joints: Number of planned joints.
+        parameters: Number of parameters of the problem.
+        line: Number of coordinates of the interior control points.
+    """
     widths = {**dict.fromkeys((*STATES, ARRIVAL), joints), "sin_cos": 4 * joints, "tips": 6}
-    widths |= {"expected_time": 1, PARAMETERS: parameters, SCENE: count_scene_features(joints)}
+    widths |= {"expected_time": 1, PARAMETERS: parameters, SCENE: count_scene_features(joints), LINE: line}
     return sum(widths[name] for name in blocks)
 
 
@@ -131,4 +148,6 @@ def _block(tasks: Tasks, name: str) -> tuple[Array, ...]:
         return (np.log(tasks.expected_time)[:, None],)
     if name == SCENE and tasks.observation is not None:
         return (tasks.observation,)
+    if name == LINE and tasks.correction is not None:
+        return (tasks.correction.reshape(len(tasks), -1),)
     raise ValueError(f"unknown feature block {name!r}: expected one of {', '.join(BLOCKS)}")

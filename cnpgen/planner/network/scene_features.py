@@ -18,22 +18,23 @@ from cnpgen.robots.observation.reference import ObservationBackend
 from cnpgen.robots.observation.scene_primitives import scene_primitives
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene import Scene
-from cnpgen.trajectory.boundary import Boundary
+from cnpgen.trajectory.spline import basis
+from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
 Array = NDArray[Any]
 
-LINE_PHASES = 8  # states of the straight line
-LINE_STEP_RAD = 0.15  # rad or m: of every joint to both sides of the line
-LINE_RANGE_M = 0.12  # clearance below which points count
+PATH_PHASES = 12  # states of the path
+STEP_RAD = 0.15  # rad or m: of every joint to both sides of the path
+RANGE_M = 0.12  # clearance below which points count
 MIN_DISTANCE_M, MAX_DISTANCE_M = -0.15, 0.3  # to which distances are clipped
 POINT_SPACING_M = 0.12  # of the points on the axis of a link's capsule
-BASIS = BasisPoints(points=256, low=(-0.75, -0.75, -0.05), high=(0.85, 0.75, 0.75))
+BASIS = BasisPoints(points=64, low=(-0.75, -0.75, -0.05), high=(0.85, 0.75, 0.75))
 TASKS_PER_BLOCK = 256
 
 
 def count_scene_features(joints: int) -> int:
     """Return the number of features of a scene for a number of planned joints."""
-    return LINE_PHASES * (joints + 2) + BASIS.points
+    return PATH_PHASES * (joints + 2) + BASIS.points
 
 
 def link_points(robot: Robot) -> Any:
@@ -64,50 +65,62 @@ def _shares(axis: Array) -> list[float]:
 class SceneFeatures:
     """Features of the obstacles of tasks, made by ``make_scene_features``.
 
-    At some phases of the straight line they are the smallest clearance of points of the links, the sum of what their
-    clearances lack of ``LINE_RANGE_M``, and its differences if each joint moves by ``LINE_STEP_RAD`` to both sides. The
-    others are signed distances at the points of ``BASIS``.
+    At some phases of a path they are the smallest clearance of points of the links, the sum of what their clearances
+    lack of ``RANGE_M``, and its differences if each joint moves by ``STEP_RAD`` to both sides. The others are signed
+    distances at the points of ``BASIS``.
 
     Attributes:
         points: Kernel of ``link_points``.
         radii: Radii of the capsules at these points [m], shape (P,).
         backend: Signed distances.
+        path: Basis of the path at its phases, shape (PATH_PHASES, C).
     """
 
     points: Kernel
     radii: Array
     backend: ObservationBackend
+    path: Array
 
-    def __call__(self, boundary: Boundary, scene: Scene) -> Array:
-        """Compute the features of N tasks, shape (N, ``count_scene_features``)."""
-        joints = boundary.start_q.shape[1]
-        features = np.empty((len(boundary), count_scene_features(joints)))
-        for first in range(0, len(boundary), TASKS_PER_BLOCK):
+    def __call__(self, path: Array, scene: Scene) -> Array:
+        """Compute the features of N paths.
+
+        Args:
+            path: Control points [rad], shape (N, C, n).
+            scene: Obstacles of each path.
+
+        Returns:
+            Shape (N, ``count_scene_features``).
+        """
+        features = np.empty((len(path), count_scene_features(path.shape[2])))
+        for first in range(0, len(path), TASKS_PER_BLOCK):
             rows = slice(first, first + TASKS_PER_BLOCK)
             bodies = scene_primitives(scene[rows])
-            line = self._line(boundary.start_q[rows], boundary.goal_q[rows], bodies)
-            basis = self.backend.distances(bodies, BASIS.positions)
-            features[rows] = np.concatenate([line, np.clip(basis, MIN_DISTANCE_M, MAX_DISTANCE_M)], axis=1)
+            along = self._along(path[rows], bodies)
+            around = self.backend.distances(bodies, BASIS.positions)
+            features[rows] = np.concatenate([along, np.clip(around, MIN_DISTANCE_M, MAX_DISTANCE_M)], axis=1)
         return features
 
-    def _line(self, start: Array, goal: Array, bodies: Primitives) -> Array:
-        """Return the features along the straight lines, shape (N, LINE_PHASES * (n + 2))."""
-        count, n = start.shape
-        phases = (np.arange(LINE_PHASES) + 1) / (LINE_PHASES + 1)
-        line = start[:, None] + (goal - start)[:, None] * phases[:, None]
-        steps = LINE_STEP_RAD * np.concatenate([np.zeros((1, n)), np.eye(n), -np.eye(n)])
-        states = (line[:, :, None] + steps).reshape(-1, n)
+    def _along(self, path: Array, bodies: Primitives) -> Array:
+        """Return the features along paths, shape (N, PATH_PHASES * (n + 2))."""
+        count, _, n = path.shape
+        steps = STEP_RAD * np.concatenate([np.zeros((1, n)), np.eye(n), -np.eye(n)])
+        states = ((self.path @ path)[:, :, None] + steps).reshape(-1, n)
         (columns,) = self.points(np.ascontiguousarray(states.T))
         points = columns.T.reshape(count, -1, 3)
-        distances = self.backend.distances(bodies, points).reshape(count, LINE_PHASES, 2 * n + 1, -1) - self.radii
-        near = np.maximum(LINE_RANGE_M - distances, 0).sum(axis=-1)
+        distances = self.backend.distances(bodies, points).reshape(count, PATH_PHASES, 2 * n + 1, -1) - self.radii
+        near = np.maximum(RANGE_M - distances, 0).sum(axis=-1)
         smallest = np.clip(distances[:, :, 0].min(axis=-1), MIN_DISTANCE_M, MAX_DISTANCE_M)
         parts = smallest[..., None], near[:, :, :1], near[:, :, 1 : n + 1] - near[:, :, n + 1 :]
         return np.concatenate(parts, axis=2).reshape(count, -1)
 
 
-def make_scene_features(robot: Robot, kernels: KernelLibrary) -> SceneFeatures:
+def make_scene_features(robot: Robot, spec: TrajectorySpec, kernels: KernelLibrary) -> SceneFeatures:
     """Load the features of a robot's scenes.
+
+    Args:
+        robot: The robot, with link geometry.
+        spec: Degree and number of control points of paths.
+        kernels: Library of kernels.
 
     Raises:
         UsageError: The robot has no link geometry.
@@ -119,4 +132,6 @@ def make_scene_features(robot: Robot, kernels: KernelLibrary) -> SceneFeatures:
         for capsule in robot.shape.moving_capsules
         for _ in _shares(np.subtract(capsule.second, capsule.first))
     ]
-    return SceneFeatures(kernels.load(link_points), np.array(radii), observation_backend(kernels.backend))
+    phases = (np.arange(PATH_PHASES) + 1) / (PATH_PHASES + 1)
+    path = basis(phases, spec.path_control_points, spec.degree)
+    return SceneFeatures(kernels.load(link_points), np.array(radii), observation_backend(kernels.backend), path)

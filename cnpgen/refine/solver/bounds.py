@@ -29,6 +29,8 @@ INTERVAL_FRACTION = 0.9  # of the tolerance between grid points: the interpolati
 
 
 _ORDERS: dict[str, list[int]] = {}  # structure of a problem -> result of ``condition_orders``
+_TEMPLATES: dict[tuple[str, bytes, "Tightening"], "BoundsTemplate"] = {}
+MAX_TEMPLATES = 64
 
 
 @dataclass(frozen=True)
@@ -126,6 +128,17 @@ def condition_orders(problem: Problem, world: World) -> list[int]:
     if structure is not None:
         _ORDERS[structure] = orders
     return orders
+
+
+def bounds_template(problem: Problem, world: "World", s: Array, tightening: Tightening) -> "BoundsTemplate":
+    """Return the bounds of the motions of a problem on one grid; equal problems share them (``BoundsTemplate``)."""
+    key = problem.identity, s.tobytes(), tightening
+    template = _TEMPLATES.get(key)
+    if template is None:
+        if len(_TEMPLATES) >= MAX_TEMPLATES:
+            _TEMPLATES.clear()
+        template = _TEMPLATES[key] = BoundsTemplate(problem, world, s, tightening)
+    return template
 
 
 class BoundsTemplate:

@@ -1,7 +1,7 @@
 """Collocation grids: phases, spline bases and quadrature nodes, which do not depend on the motion."""
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import permutations
 
 import numpy as np
@@ -93,6 +93,7 @@ class Grid:
         return weights
 
 
+@lru_cache(maxsize=32)
 def make_grid(spec: TrajectorySpec, points: int, orders: int = 3) -> Grid:
     """Build the Chebyshev grid of ``points`` phases, with bases of so many orders of p."""
     s = np.concatenate([[FIRST_JERK_PHASE] * (orders > 3), chebyshev(points)[1:]])

@@ -10,8 +10,7 @@ import numpy as np
 from cnpgen.kernels.collision.collision_checker import MAX_JOINTS
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.constraints.self_clearance import SelfClearance
-from cnpgen.problems.problem import Problem
-from cnpgen.refine.solver.bounds import NO_TIGHTENING, BoundsTemplate
+from cnpgen.refine.solver.bounds import NO_TIGHTENING, bounds_template
 from cnpgen.refine.solver.hulls import has_clearance_constraints
 from cnpgen.robots.robot import Robot
 from cnpgen.world.world import World
@@ -26,7 +25,7 @@ def can_measure_hulls(problem: Problem, robot: Robot, world: World) -> bool:
     others = without_distances(problem)
     if not others.constraint:
         return False
-    return not BoundsTemplate(others, world, np.linspace(0, 1, TEMPLATE_POINTS), NO_TIGHTENING).equal.any()
+    return not bounds_template(others, world, np.linspace(0, 1, TEMPLATE_POINTS), NO_TIGHTENING).equal.any()
 
 
 def without_distances(problem: Problem) -> Problem:
