@@ -10,7 +10,8 @@ typedef struct {
   const long *order;                            /* control points of r in the order of their moves */
   const double *step_fractions;                 /* fractions of the steps up, (moves,) */
   kernel *coefficients, *violation;             /* of the column made by lay_out */
-  double max_increase, max_decrease, tolerance; /* of a control point, relative; tolerance of the violation */
+  double max_increase, max_decrease, margin;    /* of a control point, relative; the last decrease of all */
+  double tolerance;                             /* of the violation */
 } parametrization;
 
 /* Buffers of one motion; K is the number of phases. */
@@ -148,13 +149,13 @@ static void parametrize_motion(const parametrization *p, double *c, const worksp
     c[j] += x * c[j];
   }
   combine_rates(p, c, p->first, p->last, b, b1);
-  double x = advance(p, m, 0, p->phases);
-  EACH(j, p->first, p->last) c[j] += x * c[j];
+  double factor = (1 + advance(p, m, 0, p->phases)) * (1 - p->margin);
+  EACH(j, p->first, p->last) c[j] *= factor;
 }
 
-/* Fit the rates of motions, (count, points), in place. */
+/* Fit the rates of motions, (count, points), in place, and return their largest violations, (count,). */
 void parametrize_rates(const parametrization *p, long count, const double *path, const double *obstacle_poses,
-                       double *rate, double *memory) {
+                       double *rate, double *violation, double *memory) {
   long phases = p->phases, numbers = 3 * p->joints;
   memory += -((size_t)memory / sizeof(double)) % W;
   workspace m = {.column = memory, .r = memory + numbers * phases};
@@ -167,7 +168,10 @@ void parametrize_rates(const parametrization *p, long count, const double *path,
     lay_out(p, path + motion * p->path_points * p->joints, obstacle_poses + motion * p->pose_width, &m);
     parametrize_motion(p, c, &m);
     double worst = max_violation(p, &m, c);
-    if (!(worst <= p->tolerance) && !(worst <= max_violation(p, &m, m.before)))
-      memcpy(c, m.before, p->points * sizeof(double));
+    if (!(worst <= p->tolerance)) {
+      double before = max_violation(p, &m, m.before);
+      if (!(worst <= before)) memcpy(c, m.before, p->points * sizeof(double)), worst = before;
+    }
+    violation[motion] = worst;
   }
 }
