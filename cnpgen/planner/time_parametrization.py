@@ -6,7 +6,8 @@ r'`` with coefficients that depend on the phase alone: squares of velocities, ac
 time-optimal path parametrization (Bobrow, Dubowsky and Gibson, 1985). So it is a quadratic of each control point of the
 rate, or of a factor of them all, and the largest step up to the first bound follows in closed form. Every second
 control point takes a fraction of its step, one after the other, then those between them a larger fraction; finally all
-of them are scaled together. Motions from rest to rest keep a margin of the limits between the phases.
+of them are scaled together. From rest to rest the control points move twice if one of them has become much larger, and
+motions keep a margin of the limits between the phases.
 """
 
 import ctypes
@@ -40,6 +41,7 @@ RATE_MARGIN = 3e-3  # relative decrease of the rates from rest to rest, for exce
 STEP_FRACTIONS = 0.65, 0.9  # of the step to the first bound: of every second control point, then of those between
 MAX_RATE_INCREASE, MAX_RATE_DECREASE = 1.0, -0.3  # of a control point in one step, relative
 BOUND_ROUNDING = 1e-9  # fraction of a limit by which boundary conditions may exceed it
+MIN_INCREASE_TO_REPEAT = 0.4  # of a control point in a sweep from rest to rest, after which all move again
 MAX_VECTOR_WIDTH = 8  # float64 values
 
 
@@ -54,7 +56,7 @@ class _TimeParametrization(ctypes.Structure):
             for name in ("path", "rate", "lower", "upper", "path_span", "span", "order", "step_fractions")
         ),
         *((name, c_void_p) for name in ("coefficients", "violation")),
-        *((name, c_double) for name in ("max_increase", "max_decrease", "margin", "tolerance")),
+        *((name, c_double) for name in ("max_increase", "max_decrease", "margin", "min_increase", "tolerance")),
     )
 
 
@@ -89,7 +91,8 @@ class TimeParametrization(PhaseGrid):
             obstacle_poses: Poses and sizes of the obstacles, shape (N, width).
 
         Returns:
-            The motions, and a mask of those that meet the limits at the phases, shape (N,).
+            The motions, and a mask of those that meet the limits, shape (N,). False also for motions whose control
+            points moved twice: they exceed the limits more between the phases.
         """
         rate, violation = np.array(motion.rate, np.float64, order="C"), np.empty(len(motion))
         if self.library is not None:
@@ -100,17 +103,17 @@ class TimeParametrization(PhaseGrid):
         return Motion(motion.path, rate, motion.degree), violation <= self._tolerance
 
     def _parametrize_interpreted(self, motion: Motion, obstacle_poses: Array) -> tuple[Array, Array]:
-        """Return the rates and the largest violation of every motion."""
+        """Return the rates and the largest violations; inf for motions whose control points moved twice."""
         rate, column = motion.rate.copy(), self.column(motion, obstacle_poses)
-        parametrize_rates(
-            rate, self.coefficients(column), self._bounds, self.rate, fixed=self._fixed, margin=self._margin
-        )
+        rates = rate, self.coefficients(column), self._bounds, self.rate
+        twice = parametrize_rates(*rates, fixed=self._fixed, margin=self._margin, min_increase=self._min_increase)
         new_column = self.column(Motion(motion.path, rate, motion.degree), obstacle_poses)
         before, after = (
             self.violation(states)[0].reshape(len(motion), -1).max(axis=1) for states in (column, new_column)
         )
         better = after <= np.maximum(before, self._tolerance)
-        return np.where(better[:, None], rate, motion.rate), np.where(better, after, before)
+        violation = np.where(twice, np.inf, np.where(better, after, before))
+        return np.where(better[:, None], rate, motion.rate), violation
 
     @property
     def _fixed(self) -> int:
@@ -121,6 +124,11 @@ class TimeParametrization(PhaseGrid):
     def _margin(self) -> float:
         """Relative decrease of the rates after the last step."""
         return RATE_MARGIN if self.at_rest else 0.0
+
+    @property
+    def _min_increase(self) -> float:
+        """Largest increase of a control point in a sweep above which all control points move again."""
+        return MIN_INCREASE_TO_REPEAT if self.at_rest else np.inf
 
     @cached_property
     def _bounds(self) -> tuple[Array, Array]:
@@ -143,7 +151,7 @@ class TimeParametrization(PhaseGrid):
         counts = self.joints, self.coefficients.tape.inputs[0] - 3 * self.joints - 2, path_points, points
         moves = phases, len(lower), self._fixed, points - self._fixed, len(order)
         addresses = *map(address_of, arrays), self.coefficients.address, self.violation.address
-        bounds = MAX_RATE_INCREASE, MAX_RATE_DECREASE, self._margin, self._tolerance
+        bounds = MAX_RATE_INCREASE, MAX_RATE_DECREASE, self._margin, self._min_increase, self._tolerance
         return _TimeParametrization(*counts, *moves, *addresses, *bounds), arrays
 
     def _parametrize_compiled(self, path: Array, obstacle_poses: Array, rate: Array, violation: Array) -> None:
@@ -217,7 +225,8 @@ def parametrize_rates(
     *,
     fixed: int = FIXED_RATE_POINTS,
     margin: float = 0.0,
-) -> None:
+    min_increase: float = np.inf,
+) -> NDArray[np.bool_]:
     """Fit the rates of N motions as time_parametrization.c does.
 
     Args:
@@ -227,15 +236,33 @@ def parametrize_rates(
         table: Basis of r and r', shape (2, K, R).
         fixed: Number of control points at either end that stay.
         margin: Relative decrease of the others after the last step.
+        min_increase: Relative increase of a control point above which the others move again.
+
+    Returns:
+        Mask of the motions whose control points moved twice, shape (N,).
     """
     shaped = [coefficient.reshape(len(coefficient), len(rate), -1) for coefficient in coefficients]
     movable = slice(fixed, rate.shape[1] - fixed)
-    for point, fraction in zip(*moves_of(rate.shape[1], fixed), strict=True):
-        along = rate[:, point, None] * table[:, None, :, point]
-        x = advance(shaped, bounds, rate @ table.swapaxes(1, 2), along)
-        rate[:, point] *= 1 + np.where(x > 0, fraction * x, x)
+    increase = _sweep(rate, shaped, bounds, table, fixed)
+    again = increase > min_increase
+    some = rate[again]
+    _sweep(some, [coefficient[:, again] for coefficient in shaped], bounds, table, fixed)
+    rate[again] = some
     along = rate[:, movable] @ table[:, :, movable].swapaxes(1, 2)
     rate[:, movable] *= (1 + advance(shaped, bounds, rate @ table.swapaxes(1, 2), along)[:, None]) * (1 - margin)
+    return again
+
+
+def _sweep(rate: Array, coefficients: list[Array], bounds: tuple[Array, Array], table: Array, fixed: int) -> Array:
+    """Move the control points of N rates in their order, in place; return their largest relative increases."""
+    largest = np.zeros(len(rate))
+    for point, fraction in zip(*moves_of(rate.shape[1], fixed), strict=True):
+        along = rate[:, point, None] * table[:, None, :, point]
+        x = advance(coefficients, bounds, rate @ table.swapaxes(1, 2), along)
+        x = np.where(x > 0, fraction * x, x)
+        rate[:, point] *= 1 + x
+        largest = np.fmax(largest, x)
+    return largest
 
 
 def advance(coefficients: list[Array], bounds: tuple[Array, Array], rates: Array, along: Array) -> Array:

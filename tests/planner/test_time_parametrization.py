@@ -7,6 +7,7 @@ import pinocchio as pin
 import pytest
 
 from cnpgen.errors import UsageError
+from cnpgen.planner import time_parametrization as module
 from cnpgen.planner.expressions import coefficient_bounds, speed_bounds
 from cnpgen.planner.planner import Planner
 from cnpgen.planner.time_parametrization import (
@@ -144,7 +145,7 @@ def test_compiled_and_interpreted_time_parametrization_agree(motion, time_parame
 
 @needs_compiler
 @pytest.mark.slow
-def test_compiled_and_interpreted_time_parametrization_agree_from_rest_to_rest(tiny):
+def test_compiled_and_interpreted_time_parametrization_agree_from_rest_to_rest(tiny, monkeypatch):
     """Only with obstacles a state has more values than the motion; compiling its kernels takes some seconds."""
     given, boundary = loaded_problem_of("heavy-object"), boundary_of_columns(columns_of(tiny("heavy-object")), COUNT)
     plans = Planner("heavy-object", backend="numpy").plan_batch(boundary)
@@ -153,21 +154,28 @@ def test_compiled_and_interpreted_time_parametrization_agree_from_rest_to_rest(t
     kernels = interpreted(given).kernels
     interpreted_one = make_time_parametrization(given.problem, given.robot, kernels, at_rest=True)
     compiled = compiled_time_parametrization("heavy-object", at_rest=True)
-    (found, meets_limits), (expected, expected_mask) = (
-        each.parametrize(plans.motion, obstacle_poses) for each in (compiled, interpreted_one)
-    )
-    np.testing.assert_allclose(found.rate, expected.rate, rtol=1e-8)
-    np.testing.assert_array_equal(meets_limits, expected_mask)
-    assert meets_limits.any()
-    fixed, slow = make_time_parametrization(given.problem, given.robot, kernels), plans.motion.rate.copy()
+    slow = plans.motion.rate.copy()
     slow[:, [0, 1, -2, -1]] *= 0.5
-    one, other = (
-        each.parametrize(replace(plans.motion, rate=slow), obstacle_poses)[0].duration().mean()
-        for each in (interpreted_one, fixed)
-    )
-    assert one < 0.99 * other
+    results = []
+    for motion in (plans.motion, replace(plans.motion, rate=slow)):
+        (found, meets_limits), (expected, expected_mask) = (
+            each.parametrize(motion, obstacle_poses) for each in (compiled, interpreted_one)
+        )
+        agree = np.isclose(found.rate, expected.rate, rtol=1e-8).all(axis=1)
+        assert agree.sum() >= COUNT - 1  # after a step back, rounding decides whether a bound is violated
+        np.testing.assert_array_equal(meets_limits[agree], expected_mask[agree])
+        assert (found.rate[:, [0, 1, -2, -1]] != motion.rate[:, [0, 1, -2, -1]]).all()
+        results.append((found, meets_limits))
+    (found, meets_limits), (twice, checked_again) = results
+    assert meets_limits.any()
+    assert not checked_again.all()
     timed = replace(plans, rate_control_points=found.rate)
     assert evaluate_plans(timed, workers=1).valid[meets_limits].mean() >= evaluate_plans(plans, workers=1).valid.mean()
+    fixed = make_time_parametrization(given.problem, given.robot, kernels).parametrize(motion, obstacle_poses)[0]
+    assert twice.duration().mean() < 0.99 * fixed.duration().mean()
+    monkeypatch.setattr(module, "MIN_INCREASE_TO_REPEAT", np.inf)
+    once = interpreted_one.parametrize(motion, obstacle_poses)[0]
+    assert twice.duration().mean() < once.duration().mean()
 
 
 def test_coefficients_are_those_of_accelerations_torques_and_squared_velocity_fractions(given, time_parametrization):
