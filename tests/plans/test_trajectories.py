@@ -315,6 +315,13 @@ def test_a_damaged_header_of_a_parquet_file_in_a_dataset_of_lerobot_is_an_error(
         load_trajectories(tmp_path / "set", plans.problem)
 
 
+@pytest.mark.parametrize("unit", ["rad", "deg"])
+def test_a_file_with_a_stack_of_no_trajectories_is_an_error(tmp_path: Path, unit: str) -> None:
+    np.savez(tmp_path / "none.npz", t=np.zeros((0, 5)), q=np.zeros((0, 5, 6)))
+    with pytest.raises(UsageError, match="holds no trajectory"):
+        load_trajectories(tmp_path / "none.npz", "airhockey", unit=unit)
+
+
 def test_names_in_a_parquet_file_that_are_no_texts_are_an_error(tmp_path: Path) -> None:
     pyarrow = pytest.importorskip("pyarrow")
     parquet = pytest.importorskip("pyarrow.parquet")
