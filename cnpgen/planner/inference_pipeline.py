@@ -141,12 +141,15 @@ class InferencePipeline:
         return outputs, rows(path, tasks.boundary.start_q.shape[1])
 
     def _fitted(self, motion: Motion, obstacle_poses: Array) -> Motion:
+        violating = np.arange(len(motion))
         if self.time_parametrization is not None:
-            motion = self.time_parametrization.parametrize(motion, obstacle_poses)
-        if self.time_scaling is not None:
-            factor = self.time_scaling.factor(motion, obstacle_poses)
-            motion = motion if factor.max(initial=1.0) <= 1 else motion.time_scaled(factor)
-        return motion
+            motion, meets_limits = self.time_parametrization.parametrize(motion, obstacle_poses)
+            violating = np.flatnonzero(~meets_limits)
+        if self.time_scaling is None or not len(violating):
+            return motion
+        factor = np.ones(len(motion))
+        factor[violating] = self.time_scaling.factor(motion[violating], obstacle_poses[violating])
+        return motion if factor.max() <= 1 else motion.time_scaled(factor)
 
     def _with_via_points(
         self, via_points: ViaPoints, model: Model, tasks: Tasks, motion: Motion
@@ -168,7 +171,10 @@ class InferencePipeline:
             fitted, time = self._fitted(motions[candidates], poses[candidates]), np.full(len(motions), np.inf)
             time[candidates] = fitted.duration()
             fastest = time.reshape(len(some), -1).argmin(axis=1) + count * np.arange(len(some))
-            better = via_points.violation(motions[fastest], poses[fastest]) < before[some]
+            violation = after[fastest]
+            unclear = violation > 1  # lower bounds
+            violation[unclear] = via_points.violation(motions[fastest[unclear]], poses[fastest[unclear]])
+            better = violation < before[some]
             replaced, sources = some[better], np.searchsorted(candidates, fastest[better])
             path[replaced], rate[replaced] = fitted.path[sources], fitted.rate[sources]
             correction[replaced] = alternatives.correction[fastest[better]]
@@ -214,6 +220,8 @@ def make_inference_pipeline(
             within_limits=config.within_limits,
         )
         time_scaling = make_time_scaling(problem, robot, kernels) if scale_time else None
-        time_parametrization = make_time_parametrization(problem, robot, kernels) if config.time_parametrized else None
+        time_parametrization = (
+            make_time_parametrization(problem, robot, kernels, at_rest=scale_time) if config.time_parametrized else None
+        )
         via_points = make_via_points(problem, kernels, np.array(config.via_points)) if config.via_points else None
     return InferencePipeline(prepare, path, time_scaling, time_parametrization, via_points)

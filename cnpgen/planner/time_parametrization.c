@@ -10,7 +10,8 @@ typedef struct {
   const long *order;                            /* control points of r in the order of their moves */
   const double *step_fractions;                 /* fractions of the steps up, (moves,) */
   kernel *coefficients, *violation;             /* of the column made by lay_out */
-  double max_increase, max_decrease, tolerance; /* of a control point, relative; tolerance of the violation */
+  double max_increase, max_decrease, margin;    /* of a control point, relative; the last decrease of all */
+  double min_increase, tolerance;               /* of a control point, for a second sweep; of the violation */
 } parametrization;
 
 /* Buffers of one motion; K is the number of phases. */
@@ -132,11 +133,9 @@ static double max_violation(const parametrization *p, const workspace *m, const 
   return worst;
 }
 
-static void parametrize_motion(const parametrization *p, double *c, const workspace *m) {
-  double *r = m->r, *r1 = m->r1, *b = m->b, *b1 = m->b1, *a = m->coefficients;
-  long size = p->rows * p->phases;
-  run(p->coefficients, p, m, (double *const[]){a, a + size, a + 2 * size});
-  combine_rates(p, c, 0, p->points, r, r1);
+/* Move the control points of r in their order; return the largest relative change of one. */
+static double sweep(const parametrization *p, double *c, const workspace *m) {
+  double *r = m->r, *r1 = m->r1, *b = m->b, *b1 = m->b1, largest_change = 0;
   EACH(move, 0, p->moves) {
     long j = p->order[move];
     const double *basis = p->rate + j * p->phases, *derivative = basis + p->points * p->phases;
@@ -146,15 +145,28 @@ static void parametrize_motion(const parametrization *p, double *c, const worksp
     if (x > 0) x *= p->step_fractions[move];
     add(r + from, x, b + from, to - from), add(r1 + from, x, b1 + from, to - from);
     c[j] += x * c[j];
+    if (x > largest_change) largest_change = x;
   }
-  combine_rates(p, c, p->first, p->last, b, b1);
-  double x = advance(p, m, 0, p->phases);
-  EACH(j, p->first, p->last) c[j] += x * c[j];
+  return largest_change;
 }
 
-/* Fit the rates of motions, (count, points), in place. */
+/* Fit the rate of a motion; return whether its control points moved twice. */
+static int parametrize_motion(const parametrization *p, double *c, const workspace *m) {
+  double *a = m->coefficients;
+  long size = p->rows * p->phases;
+  run(p->coefficients, p, m, (double *const[]){a, a + size, a + 2 * size});
+  combine_rates(p, c, 0, p->points, m->r, m->r1);
+  int twice = sweep(p, c, m) > p->min_increase;
+  if (twice) sweep(p, c, m);
+  combine_rates(p, c, p->first, p->last, m->b, m->b1);
+  double factor = (1 + advance(p, m, 0, p->phases)) * (1 - p->margin);
+  EACH(j, p->first, p->last) c[j] *= factor;
+  return twice;
+}
+
+/* Fit the rates of motions, (count, points), in place, and return their largest violations, (count,). */
 void parametrize_rates(const parametrization *p, long count, const double *path, const double *obstacle_poses,
-                       double *rate, double *memory) {
+                       double *rate, double *violation, double *memory) {
   long phases = p->phases, numbers = 3 * p->joints;
   memory += -((size_t)memory / sizeof(double)) % W;
   workspace m = {.column = memory, .r = memory + numbers * phases};
@@ -165,9 +177,12 @@ void parametrize_rates(const parametrization *p, long count, const double *path,
     double *c = rate + motion * p->points;
     memcpy(m.before, c, p->points * sizeof(double));
     lay_out(p, path + motion * p->path_points * p->joints, obstacle_poses + motion * p->pose_width, &m);
-    parametrize_motion(p, c, &m);
+    int twice = parametrize_motion(p, c, &m);
     double worst = max_violation(p, &m, c);
-    if (!(worst <= p->tolerance) && !(worst <= max_violation(p, &m, m.before)))
-      memcpy(c, m.before, p->points * sizeof(double));
+    if (!(worst <= p->tolerance)) {
+      double before = max_violation(p, &m, m.before);
+      if (!(worst <= before)) memcpy(c, m.before, p->points * sizeof(double)), worst = before;
+    }
+    violation[motion] = twice ? INFINITY : worst; /* which has larger excesses between the phases */
   }
 }

@@ -1,11 +1,13 @@
 """Fit the rates after the network to the limits: as large as allowed, and smaller if limits are violated.
 
-The path stays, and so do the two control points of the rate at either end, which determine the boundary conditions. On
-a fixed path a bounded value is ``g = constant + square r^2 + mixed r r'`` with coefficients that depend on the phase
-alone: squares of velocities, accelerations and torques, as in time-optimal path parametrization (Bobrow, Dubowsky and
-Gibson, 1985). So it is a quadratic of each control point of the rate, or of a factor of them all, and the largest step
-up to the first bound follows in closed form. Every second control point takes a fraction of its step, one after the
-other, then those between them a larger fraction; finally all of them are scaled together.
+The path stays. So do the two control points of the rate at either end that determine velocities and accelerations
+there; at rest they have no effect, and move. On a fixed path a bounded value is ``g = constant + square r^2 + mixed r
+r'`` with coefficients that depend on the phase alone: squares of velocities, accelerations and torques, as in
+time-optimal path parametrization (Bobrow, Dubowsky and Gibson, 1985). So it is a quadratic of each control point of the
+rate, or of a factor of them all, and the largest step up to the first bound follows in closed form. Every second
+control point takes a fraction of its step, one after the other, then those between them a larger fraction; finally all
+of them are scaled together. From rest to rest the control points move twice if one of them has become much larger, and
+motions keep a margin of the limits between the phases.
 """
 
 import ctypes
@@ -32,10 +34,12 @@ Array = NDArray[np.float64]
 
 SOURCE = Path(__file__).with_name("time_parametrization.c")
 PARAMETRIZATION_INTERVALS = 79  # between phases; the 80 phases fill vectors of any width
-FIXED_RATE_POINTS = 2  # at either end
+FIXED_RATE_POINTS = 2  # at either end of motions that are not at rest there
+RATE_MARGIN = 3e-3  # relative decrease of the rates from rest to rest, for excesses between the phases
 STEP_FRACTIONS = 0.65, 0.9  # of the step to the first bound: of every second control point, then of those between
 MAX_RATE_INCREASE, MAX_RATE_DECREASE = 1.0, -0.3  # of a control point in one step, relative
 BOUND_ROUNDING = 1e-9  # fraction of a limit by which boundary conditions may exceed it
+MIN_INCREASE_TO_REPEAT = 0.4  # of a control point in a sweep from rest to rest, after which all move again
 MAX_VECTOR_WIDTH = 8  # float64 values
 
 
@@ -50,7 +54,7 @@ class _TimeParametrization(ctypes.Structure):
             for name in ("path", "rate", "lower", "upper", "path_span", "span", "order", "step_fractions")
         ),
         *((name, c_void_p) for name in ("coefficients", "violation")),
-        *((name, c_double) for name in ("max_increase", "max_decrease", "tolerance")),
+        *((name, c_double) for name in ("max_increase", "max_decrease", "margin", "min_increase", "tolerance")),
     )
 
 
@@ -63,6 +67,7 @@ class TimeParametrization(PhaseGrid):
         lower: Lower bounds of its rows, shape (m,).
         upper: Upper bounds of its rows, shape (m,).
         joints: Number of joints.
+        at_rest: Whether motions begin and end at rest, so that all control points of the rate may move.
         library: Library of time_parametrization.c; None if kernels are not compiled.
     """
 
@@ -70,10 +75,11 @@ class TimeParametrization(PhaseGrid):
     lower: Array
     upper: Array
     joints: int
+    at_rest: bool
     library: ctypes.CDLL | None
 
-    def parametrize(self, motion: Motion, obstacle_poses: Array) -> Motion:
-        """Return N motions along the same paths, between the same ends, whose rates meet the limits.
+    def parametrize(self, motion: Motion, obstacle_poses: Array) -> tuple[Motion, NDArray[np.bool_]]:
+        """Fit the rates of N motions to the limits; their paths and boundary conditions stay.
 
         A motion stays as it is if its largest violation would grow, because its bounded values are not such
         quadratics. For the same reason motions may be slower than necessary.
@@ -81,24 +87,46 @@ class TimeParametrization(PhaseGrid):
         Args:
             motion: N motions, with the problem's numbers of control points.
             obstacle_poses: Poses and sizes of the obstacles, shape (N, width).
+
+        Returns:
+            The motions, and a mask of those that meet the limits, shape (N,). False also for motions whose control
+            points moved twice: they exceed the limits more between the phases.
         """
-        rate = np.array(motion.rate, np.float64, order="C")
+        rate, violation = np.array(motion.rate, np.float64, order="C"), np.empty(len(motion))
         if self.library is not None:
-            self._parametrize_compiled(motion.path, obstacle_poses, rate)
+            self._parametrize_compiled(motion.path, obstacle_poses, rate, violation)
         else:
             for block in blocks_of_motions(len(motion)):
-                rate[block] = self._parametrize_interpreted(motion[block], obstacle_poses[block])
-        return Motion(motion.path, rate, motion.degree)
+                rate[block], violation[block] = self._parametrize_interpreted(motion[block], obstacle_poses[block])
+        return Motion(motion.path, rate, motion.degree), violation <= self._tolerance
 
-    def _parametrize_interpreted(self, motion: Motion, obstacle_poses: Array) -> Array:
+    def _parametrize_interpreted(self, motion: Motion, obstacle_poses: Array) -> tuple[Array, Array]:
+        """Return the rates and the largest violations; inf for motions whose control points moved twice."""
         rate, column = motion.rate.copy(), self.column(motion, obstacle_poses)
-        parametrize_rates(rate, self.coefficients(column), self._bounds, self.rate)
+        rates = rate, self.coefficients(column), self._bounds, self.rate
+        twice = parametrize_rates(*rates, fixed=self._fixed, margin=self._margin, min_increase=self._min_increase)
         new_column = self.column(Motion(motion.path, rate, motion.degree), obstacle_poses)
         before, after = (
             self.violation(states)[0].reshape(len(motion), -1).max(axis=1) for states in (column, new_column)
         )
         better = after <= np.maximum(before, self._tolerance)
-        return np.where(better[:, None], rate, motion.rate)
+        violation = np.where(twice, np.inf, np.where(better, after, before))
+        return np.where(better[:, None], rate, motion.rate), violation
+
+    @property
+    def _fixed(self) -> int:
+        """Number of control points of the rate at either end that stay."""
+        return 0 if self.at_rest else FIXED_RATE_POINTS
+
+    @property
+    def _margin(self) -> float:
+        """Relative decrease of the rates after the last step."""
+        return RATE_MARGIN if self.at_rest else 0.0
+
+    @property
+    def _min_increase(self) -> float:
+        """Largest increase of a control point in a sweep above which all control points move again."""
+        return MIN_INCREASE_TO_REPEAT if self.at_rest else np.inf
 
     @cached_property
     def _bounds(self) -> tuple[Array, Array]:
@@ -114,27 +142,35 @@ class TimeParametrization(PhaseGrid):
     @cached_property
     def _c_arguments(self) -> tuple[_TimeParametrization, list[NDArray[Any]]]:
         """Arguments of time_parametrization.c for the problem, and the arrays that they point to."""
-        lower, upper, order, fractions = *self._bounds, *moves_of(self.rate.shape[2])
+        lower, upper, order, fractions = *self._bounds, *moves_of(self.rate.shape[2], self._fixed)
         tables, spans = [[of(self.path), of(self.rate)] for of in (by_point, span_of)]
         arrays = [*tables, lower, upper, *spans, order, fractions]
         (phases, path_points), points = self.path.shape[1:], self.rate.shape[2]
         counts = self.joints, self.coefficients.tape.inputs[0] - 3 * self.joints - 2, path_points, points
-        moves = phases, len(lower), FIXED_RATE_POINTS, points - FIXED_RATE_POINTS, len(order)
+        moves = phases, len(lower), self._fixed, points - self._fixed, len(order)
         addresses = *map(address_of, arrays), self.coefficients.address, self.violation.address
-        bounds = MAX_RATE_INCREASE, MAX_RATE_DECREASE, self._tolerance
+        bounds = MAX_RATE_INCREASE, MAX_RATE_DECREASE, self._margin, self._min_increase, self._tolerance
         return _TimeParametrization(*counts, *moves, *addresses, *bounds), arrays
 
-    def _parametrize_compiled(self, path: Array, obstacle_poses: Array, rate: Array) -> None:
+    def _parametrize_compiled(self, path: Array, obstacle_poses: Array, rate: Array, violation: Array) -> None:
         assert self.library is not None
         rows, phases = self.coefficients.tape.inputs[0] + 3 * len(self.lower) + 3, self.path.shape[1]
         memory = np.empty(MAX_VECTOR_WIDTH * (1 + len(self.lower)) + rows * phases + rate.shape[1])
         inputs = [np.ascontiguousarray(array, np.float64) if array.size else None for array in (path, obstacle_poses)]
-        addresses = (None if array is None else address_of(array) for array in (*inputs, rate, memory))
+        addresses = (None if array is None else address_of(array) for array in (*inputs, rate, violation, memory))
         self.library.parametrize_rates(ctypes.byref(self._c_arguments[0]), len(rate), *addresses)
 
 
-def make_time_parametrization(problem: Problem, robot: Robot, kernels: KernelLibrary) -> TimeParametrization:
+def make_time_parametrization(
+    problem: Problem, robot: "Robot", kernels: KernelLibrary, *, at_rest: bool = False
+) -> TimeParametrization:
     """Load the time parametrization of one problem.
+
+    Args:
+        problem: The problem.
+        robot: Its robot.
+        kernels: Library of kernels.
+        at_rest: Whether motions begin and end at rest.
 
     Raises:
         UsageError: The problem bounds the jerk, which is no quadratic of the rate.
@@ -144,9 +180,11 @@ def make_time_parametrization(problem: Problem, robot: Robot, kernels: KernelLib
     library, speeds = kernels.load_source(SOURCE), make_phase_grid(problem, kernels, PARAMETRIZATION_INTERVALS)
     if library is not None:
         function = library.parametrize_rates
-        function.argtypes, function.restype = (c_void_p, c_long, *[c_void_p] * 4), None
+        function.argtypes, function.restype = (c_void_p, c_long, *[c_void_p] * 5), None
     rows = kernels.load(speed_coefficients), *coefficient_bounds(speed_bounds(robot, problem))
-    return TimeParametrization(speeds.violation, speeds.path, speeds.rate, *rows, joints=robot.n, library=library)
+    return TimeParametrization(
+        speeds.violation, speeds.path, speeds.rate, *rows, joints=robot.n, at_rest=at_rest, library=library
+    )
 
 
 def span_of(table: Array) -> NDArray[np.int64]:
@@ -170,14 +208,23 @@ def by_point(table: Array) -> Array:
     return aligned
 
 
-def moves_of(points: int) -> tuple[NDArray[np.int64], Array]:
+def moves_of(points: int, fixed: int) -> tuple[NDArray[np.int64], Array]:
     """Return the order in which control points of the rate move, and the fractions of their steps."""
-    movable = np.arange(FIXED_RATE_POINTS, points - FIXED_RATE_POINTS)
+    movable = np.arange(fixed, points - fixed)
     first, second = movable[1::2], movable[::2]
     return np.concatenate([first, second]), np.repeat(STEP_FRACTIONS, [len(first), len(second)])
 
 
-def parametrize_rates(rate: Array, coefficients: list[Array], bounds: tuple[Array, Array], table: Array) -> None:
+def parametrize_rates(
+    rate: Array,
+    coefficients: list[Array],
+    bounds: tuple[Array, Array],
+    table: Array,
+    *,
+    fixed: int = FIXED_RATE_POINTS,
+    margin: float = 0.0,
+    min_increase: float = np.inf,
+) -> NDArray[np.bool_]:
     """Fit the rates of N motions as time_parametrization.c does.
 
     Args:
@@ -185,15 +232,35 @@ def parametrize_rates(rate: Array, coefficients: list[Array], bounds: tuple[Arra
         coefficients: Constant, square and mixed, shape (m, N K) each.
         bounds: Lower and upper bounds, shape (m,) each.
         table: Basis of r and r', shape (2, K, R).
+        fixed: Number of control points at either end that stay.
+        margin: Relative decrease of the others after the last step.
+        min_increase: Relative increase of a control point above which the others move again.
+
+    Returns:
+        Mask of the motions whose control points moved twice, shape (N,).
     """
     shaped = [coefficient.reshape(len(coefficient), len(rate), -1) for coefficient in coefficients]
-    movable = slice(FIXED_RATE_POINTS, rate.shape[1] - FIXED_RATE_POINTS)
-    for point, fraction in zip(*moves_of(rate.shape[1]), strict=True):
-        along = rate[:, point, None] * table[:, None, :, point]
-        x = advance(shaped, bounds, rate @ table.swapaxes(1, 2), along)
-        rate[:, point] *= 1 + np.where(x > 0, fraction * x, x)
+    movable = slice(fixed, rate.shape[1] - fixed)
+    increase = _sweep(rate, shaped, bounds, table, fixed)
+    again = increase > min_increase
+    some = rate[again]
+    _sweep(some, [coefficient[:, again] for coefficient in shaped], bounds, table, fixed)
+    rate[again] = some
     along = rate[:, movable] @ table[:, :, movable].swapaxes(1, 2)
-    rate[:, movable] *= 1 + advance(shaped, bounds, rate @ table.swapaxes(1, 2), along)[:, None]
+    rate[:, movable] *= (1 + advance(shaped, bounds, rate @ table.swapaxes(1, 2), along)[:, None]) * (1 - margin)
+    return again
+
+
+def _sweep(rate: Array, coefficients: list[Array], bounds: tuple[Array, Array], table: Array, fixed: int) -> Array:
+    """Move the control points of N rates in their order, in place; return their largest relative increases."""
+    largest = np.zeros(len(rate))
+    for point, fraction in zip(*moves_of(rate.shape[1], fixed), strict=True):
+        along = rate[:, point, None] * table[:, None, :, point]
+        x = advance(coefficients, bounds, rate @ table.swapaxes(1, 2), along)
+        x = np.where(x > 0, fraction * x, x)
+        rate[:, point] *= 1 + x
+        largest = np.fmax(largest, x)
+    return largest
 
 
 def advance(coefficients: list[Array], bounds: tuple[Array, Array], rates: Array, along: Array) -> Array:

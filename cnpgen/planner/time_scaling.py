@@ -70,16 +70,17 @@ class TimeScaling(PhaseGrid):
             self.residuals(p, *(term / k**order for order, term in enumerate(moving, 1)), obstacle_poses)[0]
             for k in (1.0, 2.0, np.inf)
         )
-        quadratic = 2 * (fast - 2 * slow + static)  # c, from g(1) = static + b + c and g(2) = static + b / 2 + c / 4
-        linear = fast - static - quadratic
-        above, below = self.bounds.upper[:, None] - static, static - self.bounds.lower[:, None]
-        needed = np.maximum(_smallest_scale(above, linear, quadratic), _smallest_scale(below, -linear, -quadratic))
-        cubic = self.bounds.cubic
-        change = (fast - static)[cubic]
-        needed[cubic] = np.maximum(
-            _smallest_scale_cubic(above[cubic], change), _smallest_scale_cubic(below[cubic], -change)
-        )
-        return np.asarray(needed.max(axis=0, initial=1.0))
+        needed = np.ones(fast.shape[1])
+        for sign, bounds in ((1.0, self.bounds.upper), (-1.0, self.bounds.lower)):
+            row, phase = np.nonzero(sign * fast > sign * bounds[:, None])  # few
+            at_rest = static[row, phase]
+            margin, change, half = (sign * (x - at_rest) for x in (bounds[row], fast[row, phase], slow[row, phase]))
+            quadratic = 2 * (change - 2 * half)  # c, from g(1) = static + b + c and g(2) = static + b / 2 + c / 4
+            scale = _smallest_scale(margin, change - quadratic, quadratic)
+            cubic = self.bounds.cubic[row]
+            scale[cubic] = _smallest_scale_cubic(margin[cubic], change[cubic])
+            np.maximum.at(needed, phase, scale)
+        return needed
 
 
 def make_time_scaling(problem: Problem, robot: Robot, kernels: KernelLibrary) -> TimeScaling:

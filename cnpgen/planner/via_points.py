@@ -17,9 +17,9 @@ from cnpgen.trajectory.spline_motion import Motion
 
 Array = NDArray[np.float64]
 
-STATIC_INTERVALS = 64  # between phases
-COARSE_PHASES = slice(4, None, 8)  # that most violating motions fail at
-MAX_LINES = 8  # that motions are planned along
+STATIC_INTERVALS = 32  # between phases
+COARSE_PHASES = slice(2, None, 4)  # that most violating motions fail at
+MAX_LINES = 4  # that motions are planned along
 
 
 @dataclass(frozen=True)

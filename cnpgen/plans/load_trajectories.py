@@ -118,6 +118,8 @@ def load_trajectories(
     except UsageError as error:
         error.argument = error.argument or "path"
         raise
+    if not found:
+        raise UsageError(f"{path} holds no trajectory", argument="path")
     if unit == "rad":
         _check_unit(path, robot, [trajectory.q for _, trajectory, _ in found])
     ignored = dict.fromkeys(name for *_, unused in found for name in unused)

@@ -172,7 +172,10 @@ def _split(path: Path, arrays: dict[str, Values], names: tuple[str, ...]) -> Ite
 
 def _read_parquet(path: Path) -> Iterator[TrajectoryTable]:
     table = read_parquet(path)
-    names = tuple(json.loads((table.schema.metadata or {}).get(JOINT_NAMES_KEY, b"[]")))
+    try:
+        names = tuple(map(str, json.loads((table.schema.metadata or {}).get(JOINT_NAMES_KEY, b"[]"))))
+    except (ValueError, TypeError, RecursionError) as error:
+        raise UsageError(f"{path}: its names of joints are no list of texts, or are damaged: {error}") from error
     columns = {name: _parquet_column(table, name, path) for name in table.column_names}
     if names and PLAN_COLUMN in columns:  # a table of cnpgen
         index = columns.pop(PLAN_COLUMN)
@@ -200,7 +203,7 @@ def read_parquet(path: Path) -> Any:
         size = sum(file.metadata.row_group(index).total_byte_size for index in range(file.num_row_groups))
         if size <= MAX_ARCHIVE_BYTES:
             return file.read()
-    except (pyarrow.ArrowException, OSError) as error:  # OSError: damaged headers
+    except (pyarrow.ArrowException, OSError, ValueError) as error:  # damaged headers; texts that are not UTF-8
         raise UsageError(f"{path} is not a Parquet file, or is damaged: {error}") from error
     raise UsageError(f"{path} holds {size:,} bytes, expected at most {MAX_ARCHIVE_BYTES:,}")
 

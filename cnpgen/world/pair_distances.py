@@ -26,17 +26,18 @@ class SeparationBound(Protocol):
         """Return one lower bound per state."""
 
 
-def smallest_distances(bounds: Array, measure: Measure, separation: Callable[[int, Array], Array]) -> Array:
+def smallest_distances(bounds: Array, measure: Measure, separation: Callable[[int, Array, Indices], Array]) -> Array:
     """Find the smallest signed distance of M pairs of convex bodies along K states by best-first search.
 
     The state with the smallest bound is measured, and its separating direction raises the bounds of the same pair at
-    the other states. The search ends when no bound is below the smallest measured distance, so no state is missed.
+    the states that could be closer. The search ends when no bound is below the smallest measured distance, so no state
+    is missed.
 
     Args:
         bounds: Initial lower bounds of the distances [m], shape (M, K).
         measure: Returns the signed distance of a pair at a state [m] and the unit vector, shape (3,), along which the
             bodies have this distance, or a vector of nan. Distances are never below their bounds.
-        separation: Returns lower bounds of the distances of a pair [m], shape (K,), along a unit vector.
+        separation: Returns lower bounds of the distances of a pair [m] along a unit vector at J states, shape (J,).
 
     Returns:
         Distances [m], shape (M, K). The smallest one is exact up to ``RESOLUTION`` and stands where it was measured;
@@ -53,9 +54,10 @@ def smallest_distances(bounds: Array, measure: Measure, separation: Callable[[in
         measured[pair, k] = distance
         if math.isnan(distance):
             break
-        if np.isfinite(direction).all():
-            np.maximum(distances[pair], separation(pair, direction), out=distances[pair])
         distances[pair, k], best = distance, min(best, distance)
+        closer = np.flatnonzero(distances[pair] < best)
+        if len(closer) and np.isfinite(direction).all():
+            distances[pair, closer] = np.maximum(distances[pair, closer], separation(pair, direction, closer))
     np.maximum(distances, math.nextafter(best, math.inf), out=distances)
     for index, distance in measured.items():
         distances[index] = distance
@@ -120,9 +122,8 @@ class PairDistances:
         def measure(index: int, k: int) -> tuple[float, Array]:
             return self._measured(pairs[index], k)
 
-        def separation(index: int, direction: Array) -> Array:
-            pair = pairs[index]  # a single state has been measured when its direction is known
-            return self.bounds[pair] if self.bounds.shape[1] == 1 else self.separation(pair, direction)
+        def separation(index: int, direction: Array, states: Indices) -> Array:
+            return self.separation(pairs[index], direction, states)
 
         return list(smallest_distances(self.bounds[pairs], measure, separation))
 

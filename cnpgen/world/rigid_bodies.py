@@ -16,6 +16,8 @@ from cnpgen.world.pair_distances import PairDistances
 Array = NDArray[np.float64]
 Pairs = NDArray[np.intp]
 
+MAX_BLOCK_PRODUCTS = 65_536  # of corners and directions, per temporary array
+
 NO_SHAPE = 'a constraint needs the link geometry of the robot, which has none: set geometry = "urdf" in [robot]'
 NO_HELD_SHAPE = (
     "a constraint needs the geometry of the links and a held object: the problem needs [object], and <collision>"
@@ -180,7 +182,16 @@ class RigidBodies:
         in_b = np.einsum("ijk,ik->jk", self._rotations[other][..., states], along)
         between = self._positions[other][:, states] - self._positions[frame][:, states]
         reach = float((first.corners @ direction).max()) + first.radius + second.radius
-        return np.asarray((second.corners @ in_b).min(axis=0) + np.einsum("ik,ik->k", along, between) - reach)
+        return np.asarray(lowest_products(second.corners, in_b) + np.einsum("ik,ik->k", along, between) - reach)
+
+
+def lowest_products(corners: Array, directions: Array) -> Array:
+    """Return the smallest product of N corners with each of K directions, shape (K,), in blocks for the cache."""
+    size = max(MAX_BLOCK_PRODUCTS // max(directions.shape[1], 1), 1)
+    lowest = (corners[:size] @ directions).min(axis=0)
+    for first in range(size, len(corners), size):
+        np.minimum(lowest, (corners[first : first + size] @ directions).min(axis=0), out=lowest)
+    return np.asarray(lowest)
 
 
 def _pairs(pairs: Any) -> Pairs:

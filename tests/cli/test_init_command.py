@@ -146,6 +146,7 @@ ARMS = {  # URDF, tip
     "xarm7": ("xarm_description/urdf/xarm7.urdf", None),
     "z1": ("z1_description/urdf/z1.urdf", None),
     "baxter": ("baxter_description/urdf/baxter.urdf", "left_gripper"),
+    "iiwa": ("kuka_description/kuka_lbr_iiwa/urdf/lbr_iiwa_14_r820.urdf", "tool0"),  # of rtb-data, an optional package
 }
 
 
@@ -154,12 +155,17 @@ ARMS = {  # URDF, tip
 @pytest.mark.parametrize("name", ARMS)
 def test_convex_parts_reject_less_than_two_percent_of_the_free_states(name, tmp_path):
     file, tip = ARMS[name]
-    urdf = robots() / "example-robot-data" / "robots" / file
+    share = robots()
+    urdf = share / "example-robot-data" / "robots" / file
+    if name == "iiwa":
+        urdf = Path(pytest.importorskip("rtbdata").__file__).parent / "xacro" / file
+        (share := tmp_path / "packages").mkdir()
+        (share / "kuka_lbr_iiwa_support").symlink_to(urdf.parents[1])  # the name of the package, for Pinocchio
     initial = problem_of(read_arm(urdf, tip), name, tmp_path, (), None)
     problem = initial.problem
     assert problem.robot.hull_gap < 0.02
     robot, still = load_robot(problem), np.zeros(len(problem.robot.joints))
-    world, meshes, free, rejected = World(robot), Meshes(problem, robot, robots()), 0, 0
+    world, meshes, free, rejected = World(robot), Meshes(problem, robot, share), 0, 0
     count = 4000 if name == "baxter" else 1000  # of Baxter's states 9 % are free
     for q in np.random.default_rng(1).uniform(robot.position_lower, robot.position_upper, (count, robot.n)):
         if not meshes.touches(q):  # by Pinocchio's own reading of the URDF

@@ -15,7 +15,7 @@ from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.plans import screen
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
-from cnpgen.scenes import Grasp, SceneProblem, load_family, load_scenes, save_scenes
+from cnpgen.scenes import Grasp, SceneError, SceneProblem, load_family, load_scenes, save_scenes
 from cnpgen.store.dataset_spec import load_dataset_spec, shards
 from cnpgen.store.inspection import inspect_dataset
 from cnpgen.store.shard_record import load_record
@@ -23,7 +23,7 @@ from cnpgen.trajectories import largest_error, load_trajectories
 from tests.examples.documents import rewritten
 from tests.examples.plan_files import plans_of
 from tests.examples.plans import load as stored_plan
-from tests.examples.scene_files import ROBOMETRICS
+from tests.examples.scene_files import REQUEST, ROBOMETRICS, SCENE
 from tests.examples.store import dataset  # noqa: F401 - a fixture
 
 
@@ -98,3 +98,21 @@ def test_numbers_written_as_texts_in_a_trajectory(tmp_path: Path) -> None:
     (tmp_path / "rows.json").write_text(json.dumps(rows))
     with pytest.raises(UsageError, match="row 0: t must be a number, got '0'"):
         load_trajectories(tmp_path / "rows.json", "airhockey")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("[0.002]", "[]", r"dimensions of the goal region must be positive, got \[\]"),
+        ("[0.002]", "[nan]", "dimensions of the goal region must be positive"),
+        ("[0.002]", "[-1]", "dimensions of the goal region must be positive"),
+        ("orientation_constraints:", "orientation_constraints: [7]\n    other:", "must be a mapping, got"),
+    ],
+)
+def test_a_goal_region_without_a_size_and_an_orientation_that_is_a_number(
+    tmp_path: Path, old: str, new: str, message: str
+) -> None:
+    (tmp_path / "scene1.yaml").write_text(SCENE, encoding="utf-8")
+    (tmp_path / "request1.yaml").write_text(REQUEST.replace(old, new), encoding="utf-8")
+    with pytest.raises(SceneError, match=message):
+        load_scenes(tmp_path)

@@ -374,6 +374,27 @@ def test_a_damaged_header_of_a_parquet_file_in_a_dataset_of_lerobot_is_an_error(
         load_trajectories(tmp_path / "set", plans.problem)
 
 
+@pytest.mark.parametrize("unit", ["rad", "deg"])
+def test_a_file_with_a_stack_of_no_trajectories_is_an_error(tmp_path: Path, unit: str) -> None:
+    np.savez(tmp_path / "none.npz", t=np.zeros((0, 5)), q=np.zeros((0, 5, 6)))
+    with pytest.raises(UsageError, match="holds no trajectory"):
+        load_trajectories(tmp_path / "none.npz", "airhockey", unit=unit)
+
+
+def test_names_in_a_parquet_file_that_are_no_texts_are_an_error(tmp_path: Path) -> None:
+    pyarrow = pytest.importorskip("pyarrow")
+    parquet = pytest.importorskip("pyarrow.parquet")
+    table, path = pyarrow.table({"a_column": [1.0, 2.0]}), tmp_path / "table.parquet"
+    parquet.write_table(table, path)
+    path.write_bytes(path.read_bytes().replace(b"a_column", b"a\xf4column"))
+    with pytest.raises(UsageError, match="is not a Parquet file, or is damaged"):
+        load_trajectories(path, "airhockey")
+    for names in (b"7", b"[", b"\xf4"):
+        parquet.write_table(table.replace_schema_metadata({b"cnpgen_joint_names": names}), path)
+        with pytest.raises(UsageError, match="names of joints are no list of texts"):
+            load_trajectories(path, "airhockey")
+
+
 def test_a_payload_of_the_command_line_counts_in_the_torques(
     plans: Plans, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

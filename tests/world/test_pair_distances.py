@@ -23,8 +23,8 @@ def searched(
         calls.append((pair, k))
         return float(truth[pair, k]), np.array([1.0, 0.0, float(k)]) if directions else NO_DIRECTION
 
-    def separation(pair: int, direction: np.ndarray) -> np.ndarray:
-        return truth[pair] - 1e-3 * np.abs(np.arange(truth.shape[1]) - direction[2])
+    def separation(pair: int, direction: np.ndarray, states: np.ndarray) -> np.ndarray:
+        return truth[pair, states] - 1e-3 * np.abs(states - direction[2])
 
     return smallest_distances(bounds, measure, separation), calls
 
@@ -52,6 +52,20 @@ def test_directions_avoid_most_measurements() -> None:
     truth = 0.3 + 0.2 * np.cos(np.linspace(0, 9, 2000))[None]
     _, calls = searched(truth, np.full(truth.shape, -1.0))
     assert len(calls) < 200
+
+
+def test_directions_are_applied_only_where_the_distance_could_be_smaller() -> None:
+    truth, applied = 0.3 + 0.2 * np.cos(np.linspace(0, 9, 400))[None], list[np.ndarray]()
+    bounds = truth - 0.1
+
+    def separation(pair: int, direction: np.ndarray, states: np.ndarray) -> np.ndarray:
+        applied.append(states)
+        return bounds[pair, states]
+
+    smallest_distances(bounds, lambda pair, k: (float(truth[pair, k]), np.array([1.0, 0.0, 0.0])), separation)
+    for states in applied:
+        assert bounds[0, states].max() < truth[0, bounds[0].argmin()]
+    assert 0 < len(applied[0]) < 200
 
 
 def test_one_measurement_is_enough_if_all_distances_are_equal() -> None:

@@ -14,6 +14,7 @@ from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.robots.robot import Robot
 from cnpgen.world.path import PathWorld
+from cnpgen.world.rigid_bodies import lowest_products
 from cnpgen.world.world import World
 from tests.examples.meshes import Meshes
 from tests.examples.shaped_robot import LINKS, write_problem
@@ -148,3 +149,11 @@ def test_no_point_of_the_arm_moves_by_more_than_the_motion_bound(crane):
         pieces = [(data.oMi[robot.shape.joints[piece.link]], piece) for piece in robot.shape.convex_parts]
         found.append(np.concatenate([piece.vertices @ pose.rotation.T + pose.translation for pose, piece in pieces]))
     assert (np.linalg.norm(np.diff(found, axis=0), axis=2).max(axis=1) <= bounds + 1e-12).all()
+
+
+@pytest.mark.parametrize(("corners", "directions"), [(3, 5), (1000, 300), (70, 70_000), (1, 0)])
+def test_smallest_products_in_blocks_are_those_of_the_whole(corners: int, directions: int) -> None:
+    random = np.random.default_rng(3)
+    points, along = random.normal(size=(corners, 3)), random.normal(size=(3, directions))
+    expected = np.einsum("ni,ik->nk", points, along).min(axis=0)
+    np.testing.assert_allclose(lowest_products(points, along), expected, rtol=1e-12, atol=1e-14)

@@ -129,7 +129,10 @@ def _pose_goal(goal: Any, where: str) -> GoalPose | None:
     if offset is not None and np.abs(vector(offset, "xyz", where)).max() > 0:
         raise SceneError(f"{where}: target_point_offset must be zero, got {offset!r:.60}")
     dimensions = vector(part(primitives[0], "dimensions", list, where), "", f"{where}: dimensions of the goal region")
+    if not dimensions.size or not (np.isfinite(dimensions) & (dimensions > 0)).all():
+        raise SceneError(f"{where}: dimensions of the goal region must be positive, got {dimensions.tolist()!r:.60}")
     is_sphere = _kind(primitives[0]) == "sphere"
+    part(orientations[0], "link_name", str, where)  # which must be a mapping
     angles = [orientations[0].get(f"absolute_{axis}_axis_tolerance", 0.01) for axis in "xyz"]
     radius = float(dimensions[0] if is_sphere else dimensions.min() / 2)
     return GoalPose(

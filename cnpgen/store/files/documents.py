@@ -38,10 +38,9 @@ def plain(value: Any) -> Any:
     if isinstance(value, np.ndarray | np.generic):
         return plain(value.tolist())
     if isinstance(value, list | tuple):
-        kinds = set(map(type, value))
-        return (
-            list(value) if kinds <= _SCALARS else [plain(item) for item in value]
-        )  # fast path for long lists of counts
+        kinds = set(map(type, value))  # fast paths for long lists of numbers
+        is_plain = kinds <= _SCALARS or (kinds == {float} and all(map(math.isfinite, value)))
+        return list(value) if is_plain else [plain(item) for item in value]
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)
     if value is None or isinstance(value, bool | int | float | str):
@@ -95,7 +94,7 @@ def render(value: Any, indent: str = "") -> str:
     if isinstance(value, dict) and value:
         items = [f"{json.dumps(key, ensure_ascii=False)}: {render(item, inner)}" for key, item in value.items()]
         return "{\n" + ",\n".join(inner + item for item in items) + "\n" + indent + "}"
-    if isinstance(value, list) and any(isinstance(item, dict | list) for item in value):
+    if isinstance(value, list) and not _NESTED.isdisjoint(map(type, value)):
         return "[\n" + ",\n".join(inner + render(item, inner) for item in value) + "\n" + indent + "]"
     return json.dumps(value, ensure_ascii=False, allow_nan=False)
 
