@@ -203,7 +203,7 @@ def _finished(job: _Job) -> Trained:
     path, identity, hint = job.out, job.checkpoints.identity, "train another file, or replace it with {force}"
     try:
         model = load_model(path)
-    except DatasetError as error:
+    except (DatasetError, UsageError) as error:
         raise UsageError(f"{path} exists and is no model ({error}): {hint}", remedies={"force": True}) from error
     existing = {name: model.training.get(name) for name in identity}
     changed = list(map(str, differences(existing, identity)))
