@@ -75,6 +75,8 @@ class CertifiedPlan(Stage):
         """Load the refiner."""
         if context.dtype != "float64":
             raise RecipeError([f"plans meet their boundary conditions in float64 only: needs it, got {context.dtype}"])
+        from cnpgen.refine.refine_engine import load_solver
+
         solver = load_solver(context.problem, context.robot, context.kernels)
         solver_of_scenes = SceneSolver(context)
         planner = load_stage_planner(self.model, self.sha256, context) if self.model else None
