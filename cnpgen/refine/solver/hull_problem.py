@@ -10,9 +10,9 @@ import numpy as np
 from cnpgen.kernels.collision.collision_checker import MAX_JOINTS
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.constraints.self_clearance import SelfClearance
+from cnpgen.problems.problem import Problem
 from cnpgen.refine.solver.bounds import NO_TIGHTENING, bounds_template
 from cnpgen.refine.solver.hulls import has_clearance_constraints
-from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 from cnpgen.world.world import World
 
