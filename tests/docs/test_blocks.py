@@ -228,9 +228,4 @@ def test_every_page_can_be_reached_from_the_readme() -> None:
 def test_no_page_has_a_placeholder_left() -> None:
     for page in PAGES:
         for line in page.read_text(encoding="utf-8").splitlines():
-            assert not re.fullmatch(r"[A-Z]{4,}", line), f"{page.name}: {line}"
-
-
-def test_pages_have_no_placeholders() -> None:
-    found = [f"{page.name}: {mark}" for page in LINKED for mark in re.findall(r"@[A-Z]+@", page.read_text("utf-8"))]
-    assert not found, f"write the values: {found}"
+            assert not re.search(r"^[A-Z]{4,}$|@[A-Z]+@", line), f"{page.name}: {line}"

@@ -67,11 +67,11 @@ COMMANDS = {
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_that_shares_work_takes_the_options_and_says_them_in_errors(tiny, tmp_path, capsys, command):
     cnpgen.save_plans(tmp_path / "plans.h5", cnpgen.load_boundary_problems(tiny("airhockey-hit"), n=2))
-    places = {"out": tmp_path / "out", "tiny": tiny("airhockey-hit"), "plans": tmp_path / "plans.h5"}
+    places = {"out": tmp_path / "out.h5", "tiny": tiny("airhockey-hit"), "plans": tmp_path / "plans.h5"}
     words = [command, *(word.format(**places) for word in COMMANDS[command])]
     assert main([*words, "--address", "a:1"]) == 2
     assert capsys.readouterr().err.endswith("is that of a cluster: choose --engine dask or ray\n")
-    assert not (tmp_path / "out").exists()
+    assert not (tmp_path / "out.h5").exists()
     assert main([*words, "--engine", "dusk"]) == 2
     assert "--engine: expected one of loky, dask, ray, got 'dusk' (did you mean 'dask'?)" in capsys.readouterr().err
 

@@ -345,8 +345,11 @@ def test_invalid_plans_are_listed_and_the_exit_code_is_1(
         (["solve", "airhockey-hit", "--n", "2", "--split", "train"], "--split and --first need the folder"),
         (["solve", "airhokey-hit", "--n", "2"], "did you mean 'airhockey-hit'"),
         (["refine", "nowhere.h5"], "nowhere.h5"),
-        (["solve", "airhockey-hit", "--n", "2", "-o", "."], "must be a file in a folder that exists"),
-        (["solve", "airhockey-hit", "--n", "2", "-o", "no/where.h5"], "must be a file in a folder that exists"),
+        (["solve", "airhockey-hit", "--n", "2", "-o", "."], "must be a file that ends in .h5, in a folder that exists"),
+        (
+            ["solve", "airhockey-hit", "--n", "2", "-o", "no/where.h5"],
+            "must be a file that ends in .h5, in a folder that exists",
+        ),
         (["solve", "airhockey-hit", "--n", "2", "--tolerance", "2"], "--tolerance must be above 0 and below 1"),
         (["solve", "airhockey-hit", "--n", "2", "--weight", "-1"], "--weight must not be negative"),
     ],

@@ -95,7 +95,7 @@ def test_a_kind_of_the_other_group_is_unknown(register):
         (f"{__name__}:Missing", "AttributeError"),
         (f"{__name__}:THE_STRING", "is not a subclass of cnpgen.pipelines.stages.stage.Stage, got 'not a class'"),
         ("builtins:dict", "is not a subclass of cnpgen.pipelines.stages.stage.Stage"),
-        (f"{__name__}:Abstract", "Abstract is abstract, it does not define outputs, prepare"),
+        (f"{__name__}:Abstract", "Abstract is abstract, it does not define prepare"),
         (f"{__name__}:NotADataclass", "NotADataclass is not a dataclass"),
         (f"{__name__}:Undeclared", "the field 'loaded' is not declared with cnpgen.plugins.field"),
     ],
