@@ -94,9 +94,11 @@ def add(commands: "Commands[Parser]") -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
+    from cnpgen.plans.trajectory_tables import holds_trajectories
+
     if arguments.plan is not None and not arguments.plot:
         raise UsageError("--plan needs --plot")
-    if _holds_trajectories(arguments.file):
+    if holds_trajectories(arguments.file):
         return _run_trajectories(arguments)
     refuse_trajectory_options(arguments, arguments.file, "interpolation", "max_jerk", "noise")
     found = _evaluate(arguments)
@@ -111,15 +113,6 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.plot:
         _draw(found, arguments.plot, arguments.plan)
     return 0 if found.valid.all() else 1
-
-
-def _holds_trajectories(file: Path) -> bool:
-    """Return whether a file, or a folder, holds sampled trajectories instead of plans."""
-    from cnpgen.plans.trajectory_tables import holds_trajectories
-    from cnpgen.store.files.atomic import check_readable
-
-    check_readable(file)
-    return holds_trajectories(file)
 
 
 def _run_trajectories(arguments: argparse.Namespace) -> int:

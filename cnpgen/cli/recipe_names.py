@@ -112,8 +112,6 @@ def viewed(text: str) -> str:
 
 def shipped(text: str) -> str:
     """Read the name of a shipped dataset, pipeline or problem."""
-    from cnpgen.errors import UsageError
-
     check_recipe(text)
     if os.path.exists(text) or text.endswith(".toml"):  # noqa: PTH110 - names may be too long
         raise UsageError(f"expected the name of a shipped recipe, got the path {text}: copy your own files")
@@ -181,7 +179,5 @@ def present(text: str) -> Path:
 
 def _refuse_shipped(text: str) -> None:
     """Refuse the name of a shipped dataset where its folder is expected."""
-    from cnpgen.errors import UsageError
-
     if not os.path.exists(text) and text in _shipped("dataset"):  # noqa: PTH110 - names may be too long
         raise UsageError(f"{text} is a recipe, expected a path: 'cnpgen make-dataset {text}' makes the dataset")

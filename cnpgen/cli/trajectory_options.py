@@ -36,8 +36,6 @@ def add_trajectory_options(option: Options) -> None:
 
 def refuse_trajectory_options(arguments: argparse.Namespace, file: Path, *others: str) -> None:
     """Refuse options of sampled trajectories for a plan file or a dataset."""
-    from cnpgen.errors import UsageError
-
     for name in (*TRAJECTORY_OPTIONS, "payload", *others):
         if getattr(arguments, name) is not None:
             raise UsageError(f"--{name.replace('_', '-')} is for sampled trajectories, {file} holds plans")

@@ -99,7 +99,7 @@ def _scene(arguments: argparse.Namespace) -> "ViewScene":
     from cnpgen.plans.trajectory_tables import holds_trajectories, is_trajectory_file
     from cnpgen.problems.load_robot import load_robot
     from cnpgen.problems.problem_file import load_problem_behind
-    from cnpgen.problems.scenes.scene_files import HDF5_SUFFIXES
+    from cnpgen.store.files.kind import HDF5_SUFFIXES
     from cnpgen.store.paths import file_kind
 
     what, rows = Path(arguments.what), arguments.rows or (arguments.row or 0,)

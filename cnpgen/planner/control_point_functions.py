@@ -56,7 +56,7 @@ def line_change(
     return ca.Function("line_change", columns, [ca.cse(_column(change))])
 
 
-def projected_path(robot: "Robot", problem: Problem, *, steps: int, fixed_at_goal: int, within_limits: bool) -> Any:
+def projected_path(robot: Robot, problem: Problem, *, steps: int, fixed_at_goal: int, within_limits: bool) -> Any:
     """Build ``(ends, offsets, rates, obstacle_poses) -> path``: line plus offsets [rad], projected.
 
     Without steps, control points are clipped once to the joint limits if they must be within them.

@@ -57,7 +57,7 @@ def projection_change(
     return total
 
 
-def clipped_to_limits(robot: "Robot", point: Vec, step: Vec) -> Vec:
+def clipped_to_limits(robot: Robot, point: Vec, step: Vec) -> Vec:
     """Change a step so that its end is within the joint limits; then the whole path is, too."""
     import casadi as ca
 

@@ -162,7 +162,7 @@ class TimeParametrization(PhaseGrid):
 
 
 def make_time_parametrization(
-    problem: Problem, robot: "Robot", kernels: KernelLibrary, *, at_rest: bool = False
+    problem: Problem, robot: Robot, kernels: KernelLibrary, *, at_rest: bool = False
 ) -> TimeParametrization:
     """Load the time parametrization of one problem.
 

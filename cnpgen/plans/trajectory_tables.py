@@ -20,8 +20,10 @@ from cnpgen.store.files.atomic import machine_error, read_file
 from cnpgen.store.files.csv_table import read_csv_table
 from cnpgen.store.files.documents import parse_json
 from cnpgen.store.files.hdf5 import opened_hdf5
+from cnpgen.store.files.kind import HDF5_SUFFIXES, is_hdf5, kind_of_content
 from cnpgen.store.files.size_limits import MAX_TABLE_BYTES
 from cnpgen.store.layout import SPECIFICATION
+from cnpgen.store.paths import require_path
 
 Values = NDArray[Any]
 
@@ -32,8 +34,6 @@ LEROBOT_ENVIRONMENT = "observation.environment_state"
 JOINT_NAMES_KEY = b"cnpgen_joint_names"  # of the metadata of Parquet tables, as JSON
 PLAN_COLUMN = "plan"
 PHASE_COLUMN = "path_phase"
-HDF5_SUFFIXES = {".h5", ".hdf5"}
-HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 # of an array of one plan in an archive of cnpgen
 _PART_OF_ARCHIVE = re.compile(rf"(.+?)_(t|{PHASE_COLUMN}|q|dq|ddq|jerk|{'|'.join(PARAMETER_UNITS)})")
 MESSAGE_TIME = "t [s]"  # of formats that define the unit
@@ -96,34 +96,27 @@ def holds_trajectories(path: Path) -> bool:
 
     Raises:
         UsageError: The path does not exist, or is a file of neither.
+        MachineError: It cannot be read.
     """
-    if not path.exists():
-        raise UsageError(f"{path} is not there, expected a file of plans or sampled trajectories")
+    require_path(path, "a file of plans or sampled trajectories")
     if (path / LEROBOT_INFO).is_file():
         return True
     if path.is_dir():
         return not (path / SPECIFICATION).exists() and any(is_trajectory_file(file) for file in path.iterdir())
-    suffix = path.suffix.lower()
-    if suffix in _READERS.keys() - HDF5_SUFFIXES:
+    suffix, tables = path.suffix.lower(), sorted(_READERS.keys() - {*HDF5_SUFFIXES})
+    if suffix in tables:
         return True
-    if suffix not in HDF5_SUFFIXES and path.is_file() and not _begins_as_hdf5(path):
-        formats = either(sorted(_READERS.keys() - HDF5_SUFFIXES))
-        raise UsageError(f"{path} has an unknown format, expected a plan file, .h5, or sampled trajectories, {formats}")
     if suffix not in HDF5_SUFFIXES:
+        if path.is_file() and not is_hdf5(path):
+            kind = kind_of_content(path) or "of an unknown kind"
+            expected = f"a plan file, .h5, or sampled trajectories, {either(tables)}"
+            raise UsageError(f"{path} is {kind}, expected {expected}")
         return False
     try:
         with opened_hdf5(path) as file:
             return "path_control_points" not in file and bool({"q", "positions"} & set(file))
     except CnpgenError:
         return False
-
-
-def _begins_as_hdf5(path: Path) -> bool:
-    try:
-        with path.open("rb") as file:
-            return file.read(len(HDF5_SIGNATURE)) == HDF5_SIGNATURE
-    except OSError as error:
-        raise machine_error("read", path, error) from error
 
 
 def _read_csv(path: Path) -> Iterator[TrajectoryTable]:

@@ -215,6 +215,12 @@ def test_the_first_plan_that_is_not_valid_is_drawn(run: Run, saved: Callable[[Pl
     assert "sample 3: valid" in re.sub(r"<!-- | -->", "", (tmp_path / "plan.svg").read_text())
 
 
+def test_a_plan_file_may_have_any_suffix(run: Run, saved: Callable[[Plans], Path]) -> None:
+    file = saved(plans_of(load("hit")))
+    code, _, stderr = run(file.rename(file.with_suffix(".plans")))
+    assert (code, stderr) == (0, "")
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

@@ -1,7 +1,6 @@
 """Paths that are not there, or not what a command is about: one line that says what was expected, one exit code."""
 
 import argparse
-import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -241,7 +240,7 @@ def test_a_text_file_is_a_wrong_argument(said: Said, words: tuple[str, ...], tmp
     (tmp_path / "README.md").write_text("# Hits\n")
     code, line = said(words, "README.md")
     assert code == 2
-    assert re.match(r"README\.md (is a text file, expected |has an unknown format, expected a plan file)", line)
+    assert line.startswith("README.md is a text file, expected ")
 
 
 @pytest.mark.parametrize("words", DATASETS.values(), ids=DATASETS)

@@ -252,7 +252,7 @@ def test_a_file_of_neither_plans_nor_trajectories_is_refused_with_exit_code_2(
     (tmp_path / "notes.md").write_text("# Notes")
     for words in (["notes.md"], ["notes.md", "--problem", "airhockey"]):
         assert main(["evaluate", str(tmp_path / words[0]), *words[1:]]) == 2
-        assert "notes.md has an unknown format, expected a plan file, .h5, or sampled" in capsys.readouterr().err
+        assert "notes.md is a text file, expected a plan file, .h5, or sampled" in capsys.readouterr().err
     assert main(["evaluate", str(tmp_path / "nosuch.csv"), "--problem", "airhockey"]) == 2
     assert "nosuch.csv is not there, expected a file of plans or sampled trajectories" in capsys.readouterr().err
 

@@ -16,10 +16,9 @@ from cnpgen.problems.scenes.yaml_document import read_yaml
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
 from cnpgen.store.files.atomic import write_file
-from cnpgen.store.files.kind import is_hdf5
+from cnpgen.store.files.kind import HDF5_SUFFIXES, is_hdf5
 
 YAML_SUFFIXES = (".yaml", ".yml")
-HDF5_SUFFIXES = (".h5", ".hdf5")
 MAX_SCENE_FILES = 20_000  # of a folder
 
 

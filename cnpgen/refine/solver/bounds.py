@@ -130,7 +130,7 @@ def condition_orders(problem: Problem, world: World) -> list[int]:
     return orders
 
 
-def bounds_template(problem: Problem, world: "World", s: Array, tightening: Tightening) -> "BoundsTemplate":
+def bounds_template(problem: Problem, world: World, s: Array, tightening: Tightening) -> "BoundsTemplate":
     """Return the bounds of the motions of a problem on one grid; equal problems share them (``BoundsTemplate``)."""
     key = problem.identity, s.tobytes(), tightening
     template = _TEMPLATES.get(key)
