@@ -2,7 +2,7 @@
 
 from functools import cache
 
-__version__ = "0.1.0"
+__version__ = "1.0.0"
 
 DOCUMENTATION_URL = "https://cnpgen.example.org/"  # the publisher replaces this address, also in pyproject.toml
 
