@@ -33,7 +33,7 @@ def add(commands: "Commands[Parser]") -> None:
     option = parser.add_argument
     text = "a suite (see --list), or a dataset for random problems"
     option("suite", metavar="SUITE", nargs="?", type=recipe_names.suite, help=text)
-    option("--list", action="store_true", help="list suites, planners and plants")
+    option("--list", action="store_true", help="list suites, planners with their fields, and plants")
     option("-o", "--out", metavar="DIR", type=Path, help="folder of the results (default: SUITE-results)")
     option("--planners", metavar="NAME", nargs="+", help="planners to compare (default: cnpgen cnpgen+refine solve)")
     option("--n", metavar="N", type=values.positive, help="number of problems; a random suite has any number")
@@ -222,7 +222,7 @@ def _text(found: "Benchmark") -> str:
 
 
 def _listing(*, as_json: bool) -> str:
-    """List suites, planners and plants."""
+    """List suites, planners with their fields, and plants."""
     from cnpgen.benchmark.simulator.plant import PLANTS
     from cnpgen.benchmark.suite import list_suites, load_suite
     from cnpgen.cli.describe import table
@@ -231,6 +231,7 @@ def _listing(*, as_json: bool) -> str:
     found = {
         "suites": {name: load_suite(name).title for name in list_suites()},
         "planners": {name: _summary(name) for name in registry.names(registry.PLANNERS)},
+        "fields": {key: text for name in registry.names(registry.PLANNERS) for key, text in _fields(name).items()},
         "plants": {plant.name: plant.title for plant in PLANTS.values()},
     }
     if as_json:
@@ -247,3 +248,16 @@ def _summary(planner: str) -> str:
         return kind_summary(registry.load(registry.PLANNERS, planner))
     except CnpgenError as error:
         return f"cannot be used: {error}"
+
+
+def _fields(planner: str) -> dict[str, str]:
+    """Describe the fields of a planner, by their names for ``--set`` and ``--search``."""
+    from cnpgen.schema import registry
+    from cnpgen.schema.keys import keys
+
+    try:
+        known = keys(registry.load(registry.PLANNERS, planner))
+    except CnpgenError:
+        return {}
+    units = {key.name: "" if key.unit == "1" else f" {key.unit}" for key in known}
+    return {f"{planner}.{key.name}": f"{key.doc} (default {key.default!r}{units[key.name]})" for key in known}

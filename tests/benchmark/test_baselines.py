@@ -121,7 +121,7 @@ def length_of(path: PlanePath) -> float:
 def test_paths_in_the_plane_have_smooth_headings_correct_lengths_and_ends(hit: tuple[float, float]) -> None:
     start, end = np.array([0.65, 0.0]), np.array(hit)
     direction = np.array([2.478, 0.0]) - end
-    hit = striking_path(start, end, direction, 1.5)
+    hit = striking_path(start, end, direction, 1.5, 8.0)
     np.testing.assert_allclose(hit.at(0.0), start, atol=1e-12)
     np.testing.assert_allclose(hit.at(hit.length), end, atol=1e-12)
     assert length_of(hit) == pytest.approx(hit.length, abs=1e-4)
@@ -150,6 +150,20 @@ def test_aqp_hits_the_goal_in_the_required_direction() -> None:
     assert abs(np.arctan2(last[1], last[0]) - np.arctan2(direction[1], direction[0])) < 0.01
     robot = open_problem(task.problem)[1]
     assert np.all(np.abs(np.diff(trajectory.q, axis=0)) <= robot.velocity_limit * trajectory.t[1] * (1 + 1e-6))
+
+
+def test_the_fields_of_aqp_limit_the_acceleration_of_the_mallet_and_slow_the_anchor() -> None:
+    task = one_of("hits-81", 40)
+    slow, default, anchored = (
+        planner.prepare(Setting(task.problem))(task) for planner in (AQP(acceleration=2.0), AQP(), AQP(anchor_time=5.0))
+    )
+    for trajectory, limit in ((slow, 2.0), (default, 8.0)):
+        steps = np.diff(task.problem.tip_positions(trajectory.q)[:, :2], axis=0)
+        length = np.linalg.norm(steps, axis=1).sum()
+        assert 2 * length / trajectory.duration**2 <= 1.02 * limit  # of a constant acceleration from rest
+    assert slow.duration > 1.2 * default.duration
+    goal = task.boundary.goal_q[0]
+    assert np.linalg.norm(anchored.q[-1] - goal) > np.linalg.norm(default.q[-1] - goal)
 
 
 def test_aqp_refuses_transports() -> None:
@@ -271,4 +285,6 @@ def test_a_sampling_based_search_depends_on_its_own_problem_only(planner: Benchm
     np.testing.assert_array_equal(alone(problems[3]).q, after_others[3].q)
     np.testing.assert_array_equal(alone(problems[1]).q, after_others[1].q)
     changed = [other_seed(problem) for problem in problems]
+    shorter = replace(planner, step_size=0.2).prepare(Setting(problems.problem, time_limit=20.0))
+    assert any(not np.array_equal(shorter(a).q, b.q) for a, b in zip(problems, after_others, strict=True))
     assert any(a.q.shape != b.q.shape or (a.q != b.q).any() for a, b in zip(changed, after_others, strict=True))

@@ -7,6 +7,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import scipy  # imports scipy.stats on first access, which takes a second
+from numpy.typing import NDArray
 
 from cnpgen.benchmark.benchmark_planner import Setting
 from cnpgen.benchmark.planners.cbirrt import Search
@@ -20,10 +21,10 @@ from cnpgen.benchmark.planners.proposals import (
     shipped_proposals,
     train_proposals,
 )
-from cnpgen.benchmark.planners.sst import CONTROL_STEP_S, RandomExtension
+from cnpgen.benchmark.planners.sst import CONTROL_STEP_S, SST, RandomExtension
 from cnpgen.benchmark.planners.state_check import MAX_TIP_HEIGHT_ERROR_M, MAX_UPRIGHT_ERROR, StateCheck
 from cnpgen.benchmark.planners.steering import STEERING_STEP_S, Steering, spread_of
-from cnpgen.benchmark.planners.tree import HIT_RADII, Tree
+from cnpgen.benchmark.planners.tree import Radii, Tree, radii_of
 from cnpgen.benchmark.suite import load_suite
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.planner.network.architecture import Architecture, initial_parameters
@@ -33,6 +34,9 @@ from cnpgen.refine.refine_plans import solve_plans
 from cnpgen.trajectory.sampled_trajectory import Trajectory
 from tests.conftest import some
 
+Array = NDArray[np.float64]
+
+RADII = Radii(0.05, 0.02, 0.02)
 PROBLEM_OF = {"hits-81": "airhockey", "heavy-100": "heavy-object"}
 
 
@@ -86,10 +90,9 @@ def test_sst_stays_within_limits_and_approaches_the_goal() -> None:
     problem, robot = open_problem(task.problem)
     start_xyz, goal = task.columns["start_xyz"][0], task.columns["goal_xyz"][0]
     check = StateCheck(problem, robot)
-    tree = Tree(
-        np.concatenate([task.boundary.start_q[0], task.boundary.start_dq[0]]), start_xyz, HIT_RADII, CONTROL_STEP_S
-    )
-    extend = RandomExtension(tree, robot, check, task.scene.poses[0], goal, np.random.default_rng(0))
+    tree = Tree(np.concatenate([task.boundary.start_q[0], task.boundary.start_dq[0]]), start_xyz, RADII, CONTROL_STEP_S)
+    random = np.random.default_rng(0)
+    extend = RandomExtension(tree, robot, check, task.scene.poses[0], goal, random, SST())
     trajectory = tree.grow(extend, goal, time_limit=60, max_iterations=3000)
     assert trajectory is not None
     check_constant_accelerations(trajectory, CONTROL_STEP_S, robot.acceleration_limit)
@@ -100,8 +103,47 @@ def test_sst_stays_within_limits_and_approaches_the_goal() -> None:
     np.testing.assert_array_equal(trajectory.q[0], task.boundary.start_q[0])
 
 
+def test_fields_of_sst_change_the_length_of_controls_the_share_of_goals_and_the_witnesses() -> None:
+    task = one_of("hits-81", 40)
+    problem, robot = open_problem(task.problem)
+    lengths, check = [], StateCheck(problem, robot)
+
+    def recorded(q: Array, *others: Array) -> tuple[Array, NDArray[np.bool_]]:
+        lengths.append(len(q))
+        return check(q, *others)
+
+    start = np.concatenate([task.boundary.start_q[0], task.boundary.start_dq[0]])
+    tree = Tree(start, task.columns["start_xyz"][0], RADII, CONTROL_STEP_S)
+    always_goal = SST(max_steps=7, goal_bias=1.0)  # no random position is sampled
+    arguments = task.scene.poses[0], task.columns["goal_xyz"][0], np.random.default_rng(0), always_goal
+    extend = RandomExtension(tree, robot, recorded, *arguments)  # type: ignore[arg-type]
+    for _ in range(100):
+        extend()
+    assert set(lengths) == set(range(1, 8))
+    assert radii_of(problem, 0.05) == Radii(0.05, 0.05, 0.02)
+
+
+def test_fields_of_mpc_mpnet_are_the_counts_of_the_cross_entropy_method(monkeypatch: pytest.MonkeyPatch) -> None:
+    shapes = []
+    integrate = Steering.integrate
+
+    def recorded(self: Steering, state: Array, controls: Array) -> tuple[Array, Array, NDArray[np.int64]]:
+        shapes.append((len(controls), self.elites))
+        return integrate(self, state, controls)
+
+    monkeypatch.setattr(Steering, "integrate", recorded)
+    planner = MPCMPNet(samples=10, elites=3, iterations=2)
+    task = one_of("hits-81", 40)
+    planner.prepare(Setting(task.problem, time_limit=0.2))(task)
+    assert set(shapes) == {(10, 3)}
+    steer = replace(steering_of(task), samples=10, iterations=2)
+    shapes.clear()
+    steer(np.concatenate([task.boundary.start_q[0], task.boundary.start_dq[0]]), task.boundary.goal_q[0])
+    assert len(shapes) <= 2
+
+
 def test_a_tree_keeps_the_cheapest_node_of_every_witness_and_selects_the_cheapest_nearby() -> None:
-    tree = Tree(np.zeros(2), np.zeros(3), HIT_RADII, 0.1)
+    tree = Tree(np.zeros(2), np.zeros(3), RADII, 0.1)
     slow, quick = np.zeros((5, 2)), np.ones((2, 2))
     assert tree.add(0, slow, np.array([1.0, 0, 0])) == 1
     assert tree.add(0, quick, np.array([1.01, 0, 0])) == 2  # cheaper, of the same witness
@@ -242,9 +284,9 @@ def test_mpc_mpnet_continues_from_another_node_after_a_failure() -> None:
     task = one_of("hits-81", 40)
     steer = steering_of(task)
     start = np.concatenate([task.boundary.start_q[0], task.boundary.start_dq[0]])
-    tree = Tree(start, task.columns["start_xyz"][0], HIT_RADII, STEERING_STEP_S)
+    tree = Tree(start, task.columns["start_xyz"][0], RADII, STEERING_STEP_S)
     upwards = np.concatenate([start[:6], [0, -1.0, 0, 0, 0, 0]])  # the tip leaves the table at once
     stuck = tree.add(0, upwards[None], np.array([1.5, 0, 0.16]))
-    extend = ProposedExtension(tree, load_proposals(shipped_proposals("airhockey")), steer, start[:6], node=stuck)
+    extend = ProposedExtension(tree, load_proposals(shipped_proposals("airhockey")), steer, start[:6], 0.05, node=stuck)
     assert extend() == 0
     assert extend.node == 0

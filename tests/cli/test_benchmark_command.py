@@ -15,6 +15,8 @@ def test_the_list_names_suites_planners_and_plants(capsys: pytest.CaptureFixture
     assert {"hits-81", "hits-110", "heavy-100"} <= found["suites"].keys()
     assert {"cnpgen", "cnpgen+refine", "solve", "trajopt", "aqp"} <= found["planners"].keys()
     assert list(found["plants"]) == ["nominal", "heavier", "delayed"]
+    assert found["fields"]["aqp.acceleration"] == "largest acceleration of the mallet up to the hit (default 8.0 m/s^2)"
+    assert found["fields"]["trajopt.iterations"].endswith("(default 100)")
 
 
 def test_the_list_says_of_a_planner_that_cannot_be_imported_why(

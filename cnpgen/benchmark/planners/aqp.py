@@ -18,13 +18,13 @@ from cnpgen.plans.plans import Plans
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.robots.robot import Robot
+from cnpgen.schema.keys import field
 from cnpgen.trajectory.sampled_trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
 SAMPLE_PERIOD_S = 0.01  # reduced so that a sample is the hit
 JOINT_WEIGHTS = (1.0, 1.0, 5.0, 1.0, 10.0, 10.0, 0.01)
-ANCHOR_TIME_S = 0.5  # time constant of the motion towards the anchor
 JOINT_LIMIT_FRACTION = 0.95
 SPEED_REDUCTION, MAX_TRIES = 0.9, 10  # after a failure
 
@@ -32,6 +32,11 @@ SPEED_REDUCTION, MAX_TRIES = 0.9, 10  # after a failure
 @dataclass(frozen=True)
 class AQP(BenchmarkPlanner):
     """Anchored quadratic programming along a path in the plane (Liu et al., 2021)."""
+
+    acceleration: float = field("largest acceleration of the mallet up to the hit", unit="m/s^2", default=8.0, low=0.1)
+    anchor_time: float = field(
+        "time constant of the motion towards the hitting configuration", unit="s", default=0.5, low=1e-3
+    )
 
     def prepare(self, setting: Setting) -> Plan:
         """Check that there is a table to plan on."""
@@ -41,7 +46,7 @@ class AQP(BenchmarkPlanner):
             raise UsageError(f"aqp plans hits on a table with up to 7 joints, {problem.name!r} is another problem")
 
         def plan(task: Plans) -> Answer:
-            return _Follower(robot, task).plan(table.z)
+            return _Follower(robot, task, self).plan(table.z)
 
         return plan
 
@@ -49,8 +54,8 @@ class AQP(BenchmarkPlanner):
 class _Follower:
     """Joint motion that follows a path in the plane."""
 
-    def __init__(self, robot: Robot, task: Plans) -> None:
-        self._robot, self._boundary = robot, task.boundary
+    def __init__(self, robot: Robot, task: Plans, settings: AQP) -> None:
+        self._robot, self._boundary, self._settings = robot, task.boundary, settings
         self._tip = Tip(robot)
         self._goal = task.columns["goal_xyz"][0]
         self._weights = np.array(JOINT_WEIGHTS[: robot.n])
@@ -63,7 +68,7 @@ class _Follower:
         if speed == 0:
             raise UsageError("aqp plans hits, this motion ends at rest")
         for _ in range(MAX_TRIES):
-            hit = striking_path(start[:2], self._goal[:2], velocity[:2], speed)
+            hit = striking_path(start[:2], self._goal[:2], velocity[:2], speed, self._settings.acceleration)
             stop = stopping_path(hit)
             trajectory = self._follow(hit, stop, height)
             if trajectory is not None:
@@ -95,7 +100,7 @@ class _Follower:
 
     def _anchor_velocity(self, q: Array, t: float, hit: float, end: float) -> Array:
         """Return the velocity towards the anchor; it increases up to the hit and then decreases."""
-        velocity = (self._boundary.goal_q[0] - q) / ANCHOR_TIME_S
+        velocity = (self._boundary.goal_q[0] - q) / self._settings.anchor_time
         if t > hit:
             return np.asarray((end - t) / (end - hit) * velocity)
         share = t / hit

@@ -27,12 +27,13 @@ from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.hull import CUBE
+from cnpgen.schema.keys import field
 from cnpgen.trajectory.sampled_trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
 MANIFOLD_TOLERANCE = 0.01
-MAX_PROJECTIONS, DELTA, LAMBDA = 50, 0.05, 2.0  # defaults of OMPL
+MAX_PROJECTIONS, LAMBDA = 50, 2.0  # defaults of OMPL
 MAX_GOAL_ERROR_RAD = 0.01
 SEEDS = 2**31  # number of seeds of OMPL
 STEP_PAUSE_S = 1e-4  # added to the time of every step
@@ -42,6 +43,9 @@ STEP_PAUSE_S = 1e-4  # added to the time of every step
 class CBiRRT(BenchmarkPlanner):
     """Bidirectional trees on the constraint manifold (OMPL's RRTConnect on ProjectedStateSpace)."""
 
+    step_size: float = field("largest step of the trees; 0: OMPL's automatic value", unit="rad", default=0.0, low=0.0)
+    delta: float = field("distance of projected states along an edge", unit="rad", default=0.05, low=1e-3)
+
     def prepare(self, setting: Setting) -> Plan:
         """Import OMPL."""
         ompl = load_ompl()
@@ -50,7 +54,7 @@ class CBiRRT(BenchmarkPlanner):
         def plan(task: Plans) -> Answer:
             seed_ompl(ompl, setting, task)
             search = Search(problem, robot, task)
-            path = search.solve(ompl, setting.time_limit)
+            path = search.solve(ompl, setting.time_limit, step_size=self.step_size, delta=self.delta)
             return None if path is None else timed(path, robot.velocity_limit)
 
         return plan
@@ -147,13 +151,17 @@ class Search:
             for box in self._boxes
         )
 
-    def solve(self, ompl: Any, time_limit: float, simplify_time: float = 0.0) -> Array | None:
+    def solve(
+        self, ompl: Any, time_limit: float, *, simplify_time: float = 0.0, step_size: float = 0.0, delta: float = 0.05
+    ) -> Array | None:
         """Search for a path.
 
         Args:
             ompl: The modules of OMPL.
             time_limit: Time for the search [s].
             simplify_time: Time for simplifying the path [s]; 0 keeps it as it was found.
+            step_size: Largest step of the trees [rad]; 0 is the automatic value of OMPL.
+            delta: Distance of projected states along an edge [rad].
 
         Returns:
             Joint positions [rad], shape (K, n), or None.
@@ -163,7 +171,7 @@ class Search:
         space.setBounds(joint_bounds(base, self._robot))
         constraint = _constraint(base, n, self.residual)
         manifold = base.ProjectedStateSpace(space, constraint)
-        manifold.setDelta(DELTA)
+        manifold.setDelta(delta)
         manifold.setLambda(LAMBDA)
         information = base.ConstrainedSpaceInformation(manifold)
         setup = ompl.geometric.SimpleSetup(information)
@@ -172,7 +180,9 @@ class Search:
         for state, q in zip(ends, self._ends, strict=True):
             state.copy(q.tolist())
         setup.setStartAndGoalStates(*ends, MAX_GOAL_ERROR_RAD)
-        setup.setPlanner(ompl.geometric.RRTConnect(information))
+        planner = ompl.geometric.RRTConnect(information)
+        planner.setRange(step_size)
+        setup.setPlanner(planner)
         return found_path(setup, n, time_limit, simplify_time)
 
 

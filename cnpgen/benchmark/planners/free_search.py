@@ -48,7 +48,9 @@ class FreeSearch:
         """Return whether the robot can hold joint positions q [rad], shape (n,), without collision."""
         return bool(self._states.can_hold(q[:, None])[0] and self._states.are_clear(q[:, None])[0])
 
-    def solve(self, ompl: Any, task: Plans, time_limit: float, simplify_time: float) -> Array | None:
+    def solve(
+        self, ompl: Any, task: Plans, time_limit: float, simplify_time: float, step_size: float = 0.0
+    ) -> Array | None:
         """Search for a path and simplify it.
 
         Args:
@@ -56,6 +58,7 @@ class FreeSearch:
             task: The boundary problem.
             time_limit: Time for the search [s].
             simplify_time: Time for simplifying the path [s].
+            step_size: Largest step of the trees [rad]; 0 is the automatic value of OMPL.
 
         Returns:
             Joint positions [rad], shape (K, n), or None.
@@ -73,5 +76,7 @@ class FreeSearch:
             for index in range(n):
                 state[index] = float(q[index])
         setup.setStartAndGoalStates(*ends)
-        setup.setPlanner(ompl.geometric.RRTConnect(information))
+        planner = ompl.geometric.RRTConnect(information)
+        planner.setRange(step_size)
+        setup.setPlanner(planner)
         return found_path(setup, n, time_limit, simplify_time)

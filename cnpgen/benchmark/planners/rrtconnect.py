@@ -36,6 +36,7 @@ class RRTConnect(BenchmarkPlanner):
     """RRT-Connect on the constraint manifold with simplification (OMPL), timed by TOPP-RA."""
 
     simplify_time: float = field("time for simplifying the path", unit="s", default=1.0, low=0.0)
+    step_size: float = field("largest step of the trees; 0: OMPL's automatic value", unit="rad", default=0.0, low=0.0)
 
     def prepare(self, setting: Setting) -> Plan:
         """Import OMPL and TOPP-RA."""
@@ -49,7 +50,8 @@ class RRTConnect(BenchmarkPlanner):
             seed_ompl(ompl, setting, task)
             simplify_time = min(self.simplify_time, setting.time_limit / 2)
             search_time = setting.time_limit - simplify_time
-            path = Search(problem, robot, task).solve(ompl, search_time, simplify_time=simplify_time)
+            search = Search(problem, robot, task)
+            path = search.solve(ompl, search_time, simplify_time=simplify_time, step_size=self.step_size)
             return None if path is None else timed_by_toppra(path, robot, task.boundary.goal_dq[0])
 
         return plan
@@ -61,7 +63,7 @@ class RRTConnect(BenchmarkPlanner):
         def plan(task: Plans) -> Answer:
             seed_ompl(ompl, setting, task)
             simplify_time = min(self.simplify_time, setting.time_limit / 2)
-            path = search.solve(ompl, task, setting.time_limit - simplify_time, simplify_time)
+            path = search.solve(ompl, task, setting.time_limit - simplify_time, simplify_time, self.step_size)
             return None if path is None else timed_by_toppra(path, robot, np.zeros(robot.n), torque=torque_limited)
 
         return plan

@@ -11,7 +11,6 @@ from cnpgen.problems.problem import Problem
 Array = NDArray[np.float64]
 
 STEERING_STEP_S = 0.01
-CEM_SAMPLES, CEM_ELITES, MAX_CEM_ITERATIONS = 64, 4, 30
 TARGET_TOLERANCE_RAD = 0.02
 CEM_LEARNING_RATE = 0.1  # of mean and deviation towards the elites
 
@@ -52,6 +51,9 @@ class Steering:
         limit: Limits of the accelerations [rad/s^2], shape (n,).
         spread: Initial distribution of controls.
         random: Random generator.
+        samples: Controls per iteration of the cross-entropy method.
+        elites: Best controls, which determine the next distribution.
+        iterations: Largest number of iterations.
     """
 
     check: StateCheck
@@ -59,6 +61,9 @@ class Steering:
     limit: Array
     spread: Spread
     random: np.random.Generator
+    samples: int = 64
+    elites: int = 4
+    iterations: int = 30
 
     def __call__(self, state: Array, target: Array) -> tuple[Array, Array] | None:
         """Steer; a control is cut before its first invalid state.
@@ -74,12 +79,12 @@ class Steering:
         mean = np.append(np.zeros_like(self.limit), self.spread.mean_time)
         deviation = np.append(self.spread.acceleration * self.limit, self.spread.time)
         best, least = None, np.inf
-        for _ in range(MAX_CEM_ITERATIONS):
+        for _ in range(self.iterations):
             controls = self._sample_controls(mean, deviation)
             paths, tips, lengths = self.integrate(state, controls)
-            ends = paths[np.arange(CEM_SAMPLES), lengths - 1, : len(target)]
+            ends = paths[np.arange(self.samples), lengths - 1, : len(target)]
             distances = np.where(lengths > 0, np.linalg.norm(ends - target, axis=1), np.inf)
-            order = np.argsort(distances)[:CEM_ELITES]
+            order = np.argsort(distances)[: self.elites]
             first, length = int(order[0]), int(lengths[order[0]])
             if distances[first] < least:
                 best, least = (paths[first, :length], tips[first, length - 1]), float(distances[first])
@@ -91,8 +96,8 @@ class Steering:
         return best
 
     def _sample_controls(self, mean: Array, deviation: Array) -> Array:
-        """Sample controls within their limits: accelerations [rad/s^2] and a time [s], shape (CEM_SAMPLES, n + 1)."""
-        controls = self.random.normal(mean, deviation, (CEM_SAMPLES, len(mean)))
+        """Sample controls within their limits: accelerations [rad/s^2] and a time [s], shape (samples, n + 1)."""
+        controls = self.random.normal(mean, deviation, (self.samples, len(mean)))
         low, high = np.append(-self.limit, STEERING_STEP_S), np.append(self.limit, self.spread.max_duration)
         return np.clip(controls, low, high)
 

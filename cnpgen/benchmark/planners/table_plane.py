@@ -13,7 +13,6 @@ Array = NDArray[np.float64]
 BAND_MARGIN_M = 0.02  # between the mallet and a band
 MIN_MALLET_XY_M = np.array([HOME_M + MALLET_RADIUS_M + BAND_MARGIN_M, -WIDTH_M / 2 + MALLET_RADIUS_M + BAND_MARGIN_M])
 MAX_MALLET_XY_M = np.array([HOME_M + LENGTH_M / 2 - MALLET_RADIUS_M, WIDTH_M / 2 - MALLET_RADIUS_M - BAND_MARGIN_M])
-MAX_PLANE_ACCELERATION_M_S2 = 8.0
 STOP_OFFSET_M = np.array([0.1, 0.15])  # ahead of the hit and towards the centre
 MAX_STOP_XY_M = np.array([HOME_M + 0.9, 0.42085])
 MIN_BEND_RAD = 1e-6
@@ -85,14 +84,15 @@ class PlanePath:
         return cut, cut / np.tan(turn / 2), turn
 
 
-def striking_path(start: Array, hit: Array, velocity: Array, speed: float) -> PlanePath:
+def striking_path(start: Array, hit: Array, velocity: Array, speed: float, acceleration: float) -> PlanePath:
     """Plan a path from rest to a hit in a direction: it bends where the line of the hit leaves the box of both ends.
 
     Args:
         start: Position at rest [m], shape (2,).
         hit: Position of the hit [m], shape (2,).
         velocity: Direction of the hit, of any length, shape (2,).
-        speed: Speed of the hit [m/s], reduced if it needs more than ``MAX_PLANE_ACCELERATION_M_S2``.
+        speed: Speed of the hit [m/s], reduced if it needs more than ``acceleration``.
+        acceleration: Largest acceleration along the path [m/s^2].
     """
     start, hit = np.clip(start, MIN_MALLET_XY_M, MAX_MALLET_XY_M), np.clip(hit, MIN_MALLET_XY_M, MAX_MALLET_XY_M)
     low, high = (
@@ -100,7 +100,7 @@ def striking_path(start: Array, hit: Array, velocity: Array, speed: float) -> Pl
         np.array([max(start[0], hit[0]), MAX_MALLET_XY_M[1]]),
     )
     path = PlanePath(start, _exit_point(hit, -velocity, low, high), hit, speed)
-    duration = max(2 * path.length / speed, np.sqrt(2 * path.length / MAX_PLANE_ACCELERATION_M_S2))
+    duration = max(2 * path.length / speed, np.sqrt(2 * path.length / acceleration))
     return PlanePath(path.start, path.bend, hit, 2 * path.length / duration)
 
 

@@ -32,13 +32,18 @@ class Radii:
     goal: float
 
 
-HIT_RADII = Radii(0.05, 0.02, 0.02)
-TRANSPORT_RADII = Radii(0.2, 0.02, 0.2)  # the paper has 0.1 for witnesses, which a state from rest cannot leave
+HIT_SELECT_M, HIT_GOAL_M = 0.05, 0.02  # the paper's radii
+TRANSPORT_SELECT_M, TRANSPORT_GOAL_M = 0.2, 0.2
 
 
-def radii_of(problem: Problem) -> Radii:
-    """Return the radii for hits or for transports."""
-    return HIT_RADII if problem.object_size is None else TRANSPORT_RADII
+def radii_of(problem: Problem, witness: float) -> Radii:
+    """Return the radii for hits or for transports, with the radius of witnesses [m].
+
+    The paper has 0.1 m for the witnesses of transports, which a state from rest cannot leave.
+    """
+    if problem.object_size is None:
+        return Radii(HIT_SELECT_M, witness, HIT_GOAL_M)
+    return Radii(TRANSPORT_SELECT_M, witness, TRANSPORT_GOAL_M)
 
 
 class Tree:
