@@ -1,6 +1,7 @@
 """Folder of results: a file per planner and repetition, all of one suite, version, time limit and seed."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +39,7 @@ class ResultsFolder:
         self._shared = {
             "suite": suite.name,
             "suite_version": suite.version,
-            "suite_sha256": canonical_sha256(plain(resolved(suite))),
+            "suite_sha256": canonical_sha256(plain(resolved(replace(suite, planners=None)))),
             "cnpgen": __version__,
             "time_limit_s": setting.time_limit,
             "seed": setting.seed,

@@ -23,7 +23,7 @@ from cnpgen.benchmark.simulator.challenge import challenge_plant, check_challeng
 from cnpgen.benchmark.simulator.execute import load_mujoco
 from cnpgen.benchmark.simulator.executed import PLANE_TOLERANCE_M
 from cnpgen.benchmark.simulator.plant import Plant, as_plant
-from cnpgen.benchmark.suite import Suite, load_suite
+from cnpgen.benchmark.suite import PlannerFields, Suite, load_suite
 from cnpgen.errors import RecipeError, UsageError
 from cnpgen.judges.plans.verdict import Verdict
 from cnpgen.machine.engine import Engine, WorkerPool, assembled
@@ -134,7 +134,8 @@ def run_benchmark(
         repeat: Number of repetitions of every problem.
         plane_tolerance: Maximum distance of the mallet of a successful hit from the table plane [m].
         reference: Planner with which the others are compared; default ``cnpgen+refine``, or the first one without it.
-        parameters: Planner -> its field -> value, as in a recipe; the others have their defaults.
+        parameters: Planner -> its field -> value, as in a recipe; the others have the values of the suite, or their
+            defaults.
         workers: Processes that execute plans and, with an engine, plan; default one per available core.
         engine: Engine of the workers, see ``make_dataset``; by default planners run on this machine.
         address: Address of the engine, see ``make_dataset``.
@@ -151,8 +152,8 @@ def run_benchmark(
     where = Engine(engine, address, workers)
     with concerning("suite"):
         loaded = suite if isinstance(suite, Suite) else load_suite(suite)
-    given = dict(parameters or {})
-    values = _checked_planners(planners, given)
+    given = _checked_planners(planners, loaded.planners or {}, parameters or {})
+    values = {name: _checked_parameters(name, given[name]) for name in planners}
     limit, seed, repeat = _checked_numbers(time_limit, plane_tolerance, seed, repeat)
     robots = _checked_plants(plants, environment)
     problems, prefix = loaded.problems(None if n is None else integer("n", n, least=1))
@@ -172,7 +173,7 @@ def run_benchmark(
             planned = partial(
                 _plan_locally if engine is None else partial(_plan_in_pool, pool),
                 name,
-                replace(setting, repetition=repetition, parameters=given.get(name, {})),
+                replace(setting, repetition=repetition, parameters=given[name]),
             )
             label = name if repeat == 1 else f"{name}, repetition {repetition}"
             _plan_all(results, problems, planned, partial(report, f"{label} plans"))
@@ -207,9 +208,9 @@ def _checked_plants(plants: Sequence[str | Plant], environment: str | Path | Non
 
 
 def _checked_planners(
-    planners: Sequence[str], parameters: Mapping[str, Mapping[str, Any]]
-) -> dict[str, dict[str, Any]]:
-    """Return planner -> the values of all its fields, after checking names before any work."""
+    planners: Sequence[str], of_suite: PlannerFields, parameters: Mapping[str, Mapping[str, Any]]
+) -> PlannerFields:
+    """Return planner -> given values of its fields, after checking names before any work."""
     known = registry.names(registry.PLANNERS)
     if not planners:
         raise UsageError(f"no planners, expected some of {', '.join(known)}", concerns="planners")
@@ -223,7 +224,7 @@ def _checked_planners(
             )
     if unused := sorted(parameters.keys() - set(planners)):
         raise UsageError(f"must be of planners of this run, got those of {', '.join(unused)}", argument="parameters")
-    return {name: _checked_parameters(name, parameters.get(name, {})) for name in planners}
+    return {name: {**of_suite.get(name, {}), **parameters.get(name, {})} for name in planners}
 
 
 def _checked_parameters(planner: str, parameters: Mapping[str, Any]) -> dict[str, Any]:

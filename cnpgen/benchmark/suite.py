@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from cnpgen.benchmark.pucks import Pucks, hits_of
 from cnpgen.benchmark.replanning_scenario import ExecutedPrefix, ReplanningScenario, scenario_problems
+from cnpgen.errors import CnpgenError, nearest
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.make.recipe_file import load_dataset_recipe
 from cnpgen.pipelines.stages.given_positions import MAX_TASKS
@@ -16,14 +18,19 @@ from cnpgen.plans.scene_plans import scene_plans
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import load_problem, read_problem
 from cnpgen.problems.scenes.scene_files import load_scenes
+from cnpgen.schema import registry
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
 from cnpgen.schema.catalogue import list_recipes, load_recipe, reference
 from cnpgen.schema.keys import NAME, RecipeLocation, field
 from cnpgen.schema.parsing import Reader, parse
 from cnpgen.schema.toml import is_kind, read_table
+from cnpgen.schema.units import show
 
 DEFAULT_SAMPLES = 100
+
+PlannerFields = dict[str, dict[str, Any]]
+"""Planner -> its field -> value, as in a recipe."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,6 +62,9 @@ class Suite:
     replanning: ReplanningScenario | None = field("replanning scenarios: pucks to hit from moving states", default=None)
     samples: SampledProblems | None = field("random problems of a dataset", default=None)
     scenes: SceneFileProblems | None = field("problems of a scene file", default=None, since_version=2)
+    planners: PlannerFields | None = field(
+        "fields of planners, in a table per planner", default=None, form="a table of tables", since_version=2
+    )
 
     def find_mistakes(self) -> Iterator[tuple[str, str]]:
         """Yield (key, mistake) pairs."""
@@ -111,6 +121,26 @@ def _located(scenes: SceneFileProblems, folder: Path) -> SceneFileProblems:
     return replace(scenes, file=str(folder / scenes.file), robot=str(robot) if robot.is_file() else scenes.robot)
 
 
+def _read_planners(tables: Any, where: RecipeLocation, mistakes: list[str]) -> PlannerFields | None:
+    """Return the fields of planners after checking them."""
+    before, known = len(mistakes), registry.names(registry.PLANNERS)
+    if not isinstance(tables, dict):
+        mistakes.append(where.message(f"expected a table per planner, got {show(tables)}"))
+        return None
+    for name, fields in tables.items():
+        if name not in known:
+            hint = nearest(name, known) or f"; known: {', '.join(known)}"
+            mistakes.append((where / name).message(f"unknown planner{hint}"))
+            continue
+        try:
+            planner = registry.load(registry.PLANNERS, name)
+        except CnpgenError as error:
+            mistakes.append((where / name).message(str(error)))
+            continue
+        parse(planner, fields, where=where / name, mistakes=mistakes)
+    return tables if len(mistakes) == before else None
+
+
 def _read(path: Path, mistakes: list[str]) -> Suite | None:
     table = read_table(path, ("suite", "dataset", "pipeline"), mistakes)
     if table is None:
@@ -124,7 +154,10 @@ def _read(path: Path, mistakes: list[str]) -> Suite | None:
             model=recipe.name if recipe.name in list_recipes("dataset") else "",
             samples=SampledProblems(recipe=str(path)),
         )
-    readers: dict[type, Reader] = {Problem: reference("problem", read_problem, path.parent)}
+    readers: dict[Any, Reader] = {
+        Problem: reference("problem", read_problem, path.parent),
+        PlannerFields: _read_planners,
+    }
     suite = parse(Suite, table, where=RecipeLocation(str(path)), mistakes=mistakes, readers=readers)
     if suite is not None and suite.scenes is not None:
         return replace(suite, scenes=_located(suite.scenes, path.parent))

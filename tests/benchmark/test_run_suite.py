@@ -25,7 +25,7 @@ from cnpgen.benchmark.process import Ending, PlannerProcess, PlanningOutcome, cp
 from cnpgen.benchmark.result_tables import failure_summaries, notes, save_benchmark_tables, table_rows
 from cnpgen.benchmark.results_file import answer_from_dict, answer_to_dict, open_results
 from cnpgen.benchmark.run_suite import Benchmark, run_benchmark
-from cnpgen.benchmark.suite import load_suite
+from cnpgen.benchmark.suite import list_suites, load_suite
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.trajectory.sampled_trajectory import Trajectory
 from tests.conftest import some
@@ -38,7 +38,6 @@ import numpy as np
 from cnpgen.benchmark import Trajectory
 from cnpgen.benchmark.benchmark_planner import BenchmarkPlanner
 from cnpgen.benchmark.planners.learned import ShippedNetwork
-from cnpgen.benchmark.suite import load_suite
 
 @dataclass(frozen=True)
 class Unreliable(BenchmarkPlanner):
@@ -349,6 +348,17 @@ def test_earlier_answers_are_discarded_on_request(random: str, tmp_path: Path) -
     again = run_benchmark("hits-81", tmp_path / "results", planners=[random], n=1, replan=True).results[random]
     assert len(again) == 1
     assert again[0]["planning_s"] < 77.0
+
+
+def test_fields_of_planners_in_a_suite_are_those_of_its_runs_unless_the_command_sets_others(tmp_path: Path) -> None:
+    suite, text = tmp_path / "hits-81.toml", list_suites()["hits-81"].read_text(encoding="utf-8")
+    suite.write_text(f'{text}[planners.aqp]\nacceleration = "300 cm/s^2"\nanchor_time = "700 ms"\n', encoding="utf-8")
+    parameters = {"aqp": {"anchor_time": 0.6}}
+    run_benchmark(suite, tmp_path / "out", planners=["aqp"], parameters=parameters, n=1)
+    head = json.loads((tmp_path / "out" / "aqp.jsonl").read_text().splitlines()[0])
+    assert head["parameters"] == {"acceleration": 3.0, "anchor_time": 0.6}
+    suite.write_text(text, encoding="utf-8")  # the problems are the same, so other planners extend the results
+    assert list(run_benchmark(suite, tmp_path / "out", planners=["ruckig"], n=1).results) == ["ruckig", "aqp"]
 
 
 def test_other_parameters_of_a_planner_are_another_run(tmp_path: Path) -> None:

@@ -41,10 +41,15 @@ def test_a_suite_of_samples_is_reproducible_for_every_number_of_problems() -> No
     assert len(load_suite("airhockey-replan").problems(4)[0]) == 4  # a dataset is a suite of its samples
 
 
+SAMPLES = 'name = "a"\nversion = "1.0.0"\n[samples]\nrecipe = "heavy-object"\n'
 MISTAKES = {
     'name = "a"\nversion = "1.0.0"\n[pucks]\nrows = 0\n': "rows: 0 is too small",
     'name = "a"\nversion = "1.0.0"\n[samples]\nrecipe = "heavy-object"\nseed = -1\n': "seed: -1 is too small",
     'name = "a"\nversion = "1.0.0"\n[turns]\nwhen = ["350 ms"]\n': "turns: unknown key",
+    f"{SAMPLES}[planners.trajop]\niterations = 3\n": "planners.trajop: unknown planner (did you mean 'trajopt'?)",
+    f"{SAMPLES}[planners.trajopt]\niterations = 0\n": "planners.trajopt.iterations: 0 is too small",
+    f"{SAMPLES}[planners.trajopt]\nknots = 3\n": "planners.trajopt.knots: unknown key",
+    f"{SAMPLES}[planners]\ntrajopt = 3\n": "planners.trajopt: expected a table",
     'name = "a"\nversion = "1"\n[samples]\nrecipe = "heavy-object"\n': "version: '1' does not match",
 }
 
