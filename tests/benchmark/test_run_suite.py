@@ -38,6 +38,7 @@ import numpy as np
 from cnpgen.benchmark import Trajectory
 from cnpgen.benchmark.benchmark_planner import BenchmarkPlanner
 from cnpgen.benchmark.planners.learned import ShippedNetwork
+from cnpgen.benchmark.suite import load_suite
 
 @dataclass(frozen=True)
 class Unreliable(BenchmarkPlanner):
