@@ -64,9 +64,7 @@ def describe_dataset(recipe: DatasetRecipe) -> str:
 def describe_pipeline(pipeline: Pipeline) -> str:
     """Describe the stages of a pipeline, numbered."""
     steps = [(f"{number}.", kind_name(stage), stage.describe()) for number, stage in enumerate(pipeline.stage, 1)]
-    steps.append(
-        ("", "(always)", "reject what does not meet every constraint exactly, on the numbers as they are stored")
-    )
+    steps.append(("", "(always)", "reject samples whose stored values violate a constraint"))
     return "\n".join([f"pipeline {pipeline.name}", *title_lines(pipeline.title), *table(steps, indent="  ")])
 
 

@@ -26,7 +26,7 @@ GROUPS = {Stage: registry.STAGES, Constraint: registry.CONSTRAINTS, ObjectiveTer
 _INTRODUCTION = """\
 # Keys of recipe files
 
-Every key that a recipe file may have: what may be written, what counts where it is left out, and what it means.
+All keys of recipe files, with their values, defaults and meanings.
 `cnpgen show --keys` prints this page, `cnpgen show --keys pipeline` one part of it, and `--json` the same for programs.
 
 A number without a unit is in SI. A string may carry another unit of the same dimension: `"20 ms"`, `"[-170, 170] deg"`,

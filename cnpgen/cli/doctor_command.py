@@ -50,7 +50,7 @@ def machine_text(report: "MachineReport") -> str:
         "cores": f"{report.cores} available of {report.cores_present}, vector instructions: {report.vector}",
         "libraries": libraries,
         "HDF5": report.hdf5,
-        "variables": settings or "none that matter is set",
+        "variables": settings or "no variable that changes cnpgen is set",
         "compiler": report.compiler or "none",
         "backend": f"{report.backend or 'none'}: {report.backend_reason}",
         "cache": f"{report.cache_folder} ({_cache(report)})",

@@ -19,7 +19,7 @@ The command reads documents and shard records, not samples, so it is fast for la
 ones; 'cnpgen validate' verifies the samples. "accepts" is the share of candidates that pass a condition, "left" the
 share of all candidates that remain after it. The exit code is 1 if the dataset is damaged, 0 if it is unfinished.
 """
-_UNREAD = "checksums of the shards were not looked at, 'cnpgen validate' does"
+_UNREAD = "checksums of the shards were not checked, 'cnpgen validate' does"
 
 
 def add(commands: "Commands[Parser]") -> None:

@@ -7,27 +7,27 @@ from cnpgen.robots.shape.link_pairs import LinkPair
 from cnpgen.robots.shape.shape import Shape
 
 _LEFT_OUT = {
-    "adjacent": "not looked at: joined by a joint",
-    "always": "not looked at: always in contact",
-    "disabled": "not looked at: disabled by the SRDF or by ignored_pairs",
+    "adjacent": "ignored: joined by a joint",
+    "always": "ignored: always in contact",
+    "disabled": "ignored: disabled by the SRDF or by ignored_pairs",
 }
 
 
 def link_rows(shape: Shape) -> list[tuple[str, ...]]:
-    """List the links: how many pieces and corners, and the capsule that covers them."""
-    head = ("link", "pieces", "corners", "capsule length [mm]", "radius [mm]", "overhang [mm]", "joint")
+    """List the links: numbers of convex parts and corners, and the capsule that covers them."""
+    head = ("link", "convex parts", "corners", "capsule length [mm]", "radius [mm]", "overhang [mm]", "joint")
     rows: list[tuple[str, ...]] = [head]
     for capsule in shape.capsules:
-        pieces = [piece for piece in shape.convex_parts if piece.link == capsule.link]
-        corners, length = sum(len(piece.vertices) for piece in pieces), math.dist(capsule.first, capsule.second)
+        parts = [part for part in shape.convex_parts if part.link == capsule.link]
+        corners, length = sum(len(part.vertices) for part in parts), math.dist(capsule.first, capsule.second)
         lengths = (f"{1e3 * value:.1f}" for value in (length, capsule.radius, capsule.overhang))
         joint = shape.joints[capsule.link]
-        rows.append((capsule.link, str(len(pieces)), str(corners), *lengths, str(joint) if joint else "none"))
+        rows.append((capsule.link, str(len(parts)), str(corners), *lengths, str(joint) if joint else "none"))
     return rows
 
 
 def pair_rows(shape: Shape) -> list[tuple[str, ...]]:
-    """List the pairs of links: in how many random states they collide, and who looks at them."""
+    """List the pairs of links: share of random states in which they collide, and their users."""
     head = ("links", "", "colliding", "false capsule contacts", "checked by")
     return [head, *((pair.first, pair.second, *_shares(pair), _use(pair)) for pair in shape.pairs)]
 
@@ -48,7 +48,7 @@ def shape_to_dict(shape: Shape) -> dict[str, Any]:
         {
             "link": each.link,
             "joint": shape.joints[each.link],
-            "pieces": sum(piece.link == each.link for piece in shape.convex_parts),
+            "convex_parts": sum(part.link == each.link for part in shape.convex_parts),
             "capsule": {"first": each.first.tolist(), "second": each.second.tolist(), "radius": each.radius},
             "overhang": each.overhang,
         }

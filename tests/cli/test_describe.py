@@ -116,10 +116,10 @@ def test_the_links_of_a_shape_and_their_pairs_are_listed(tmp_path):
     assert re.search(r"turret +1 +128 +[\d.]+ +99\.\d +29\.\d +1$", next(line for line in lines if " turret " in line))
     hand = next(line for line in lines if line.startswith("    base ") and " hand " in line)
     assert re.search(r"3\.\d\d% +[45]\.\d\d% +judges and solvers$", hand)
-    assert any(re.search(r"arm +fore +not looked at: joined by a joint", line) for line in lines)
+    assert any(re.search(r"arm +fore +ignored: joined by a joint", line) for line in lines)
     content = json.loads(json.dumps(plain(recipe_to_dict(problem))))["shape"]
     turret = next(link for link in content["links"] if link["link"] == "turret")
-    assert (turret["joint"], turret["pieces"], round(turret["overhang"], 3)) == (1, 1, 0.029)
+    assert (turret["joint"], turret["convex_parts"], round(turret["overhang"], 3)) == (1, 1, 0.029)
     assert len(content["pairs"]) == 14
     assert "shape" not in recipe_to_dict(load_problem("heavy-object"))
 

@@ -519,7 +519,7 @@ def test_a_file_that_is_not_there_or_not_toml_is_one_line(run, tmp_path):
 def test_inspect_shows_rows_ranges_and_yield(run, hits):
     code, out, err = run("inspect", hits)
     assert (code, err) == (0, "")
-    state = "complete; checksums of the shards were not looked at, 'cnpgen validate' does"
+    state = "complete; checksums of the shards were not checked, 'cnpgen validate' does"
     for text in (state, "200: train 182, validation 18", "too close together", "joint_6", "rad/s^2", "100.00 %"):
         assert text in out
     assert max(len(line) for line in out.splitlines()) <= 100

@@ -187,7 +187,7 @@ def test_visual_meshes_are_shown_where_they_are_found(tmp_path):
 def test_without_its_meshes_a_robot_is_shown_as_judges_see_it(name, tmp_path):
     problem = load_problem(_with_visual(tmp_path, name))
     (tmp_path / "crane" / "meshes" / "broken.stl").write_bytes(b"no mesh")
-    assert robot_bodies(problem, load_robot(problem))[1] == "pieces"
+    assert robot_bodies(problem, load_robot(problem))[1] == "convex parts"
 
 
 def volume(body) -> float:

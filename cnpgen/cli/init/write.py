@@ -110,7 +110,7 @@ def _about(initial: InitialProblem, robot: Robot) -> Iterator[str]:
     for note in initial.notes:
         yield from ("#", *wrap(note, RECIPE_LINE_WIDTH, initial_indent="#   - ", subsequent_indent="#     "))
     if robot.shape is not None:
-        yield from ("#", "#   Links: capsules round them are for solvers, judges look at the pieces", "#")
+        yield from ("#", "#   Links: solvers use capsules around them, judges their convex parts", "#")
         yield from table(link_rows(robot.shape), indent="#   ", right=range(1, 6))
         yield from ("#", "#   Pairs of links, by random states", "#")
         yield from table(pair_rows(robot.shape), indent="#   ", right=(2, 3))

@@ -17,7 +17,7 @@ from cnpgen.robots.robot import Robot
 
 _NOTES = {
     "meshes": "",
-    "pieces": "drawn with the convex parts of its collision geometry",
+    "convex parts": "drawn with the convex parts of its collision geometry",
     "line": "drawn as the line through its joints' origins",
 }
 SHARE_DIGITS = 4  # of shares of limits
@@ -58,7 +58,7 @@ def _content(scene: ViewScene) -> dict[str, Any]:
         "joints": _joints(scene.robot),
         "tip": _matrix(scene.robot.model.frames[scene.robot.tip_frame].placement.homogeneous),
         "joints_and_tip": scene.views[0].poses.shape[1],
-        "robot": [_body(body, smooth=scene.kind != "pieces") for body in scene.bodies],
+        "robot": [_body(body, smooth=scene.kind != "convex parts") for body in scene.bodies],
         "capsules": [_body(body, smooth=True) for body in scene.capsules],
         "held": [_body(body) for body in scene.held],
         "mallet": [_body(body) for body in scene.mallet],

@@ -47,13 +47,12 @@ class Body:
 
 
 def robot_bodies(problem: Problem, robot: Robot, *, with_meshes: bool = True) -> tuple[list[Body], str]:
-    """Return the bodies of a robot, and what they are: "meshes", "pieces" or "line".
+    """Return the bodies of a robot, and their kind: "meshes", "convex parts" or "line".
 
     Args:
         problem: The problem.
         robot: Its robot.
-        with_meshes: Whether the visual meshes that its URDF names are read, if they are there; those that a file from
-            elsewhere names had better not be.
+        with_meshes: Whether to read the visual meshes that its URDF names; false for untrusted files.
     """
     try:
         visual = list(_visual_bodies(problem, robot)) if with_meshes else []
@@ -62,10 +61,10 @@ def robot_bodies(problem: Problem, robot: Robot, *, with_meshes: bool = True) ->
     if visual and sum(len(body.triangles) for body in visual) <= MAX_TRIANGLES:
         return visual, "meshes"
     if robot.shape is not None:
-        pieces = robot.shape.convex_parts
+        parts = robot.shape.convex_parts
         return [
-            wrapped(each.link, robot.shape.joints[each.link], each.vertices, each.radius) for each in pieces
-        ], "pieces"
+            wrapped(each.link, robot.shape.joints[each.link], each.vertices, each.radius) for each in parts
+        ], "convex parts"
     return list(_line(robot, problem.arm_radius or LINE_ARM_RADIUS_M)), "line"
 
 

@@ -73,7 +73,7 @@ class ViewScene:
     Attributes:
         robot: The robot.
         bodies: Bodies of the robot.
-        kind: Their kind: "meshes", "pieces" or "line".
+        kind: Their kind: "meshes", "convex parts" or "line".
         capsules: Capsules around its links.
         held: The held object, in the tip's frame.
         mallet: The mallet, relative to the position of the tip.

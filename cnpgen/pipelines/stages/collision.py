@@ -46,7 +46,7 @@ class Collision(Stage):
     def describe(self) -> str:
         """Describe the stage in one sentence."""
         ends = "both ends" if self.end == "both" else f"the {self.end} configuration"
-        how = "by an exact segment-to-box test" if self.judge == "segments" else "judged by Coal on arm and object"
+        how = "by an exact segment-to-box test" if self.judge == "segments" else "checked by Coal with arm and object"
         return f"require {ends} to be free of collision, {how}"
 
     def outputs(self, context: Context) -> tuple[Field, ...]:

@@ -34,7 +34,7 @@ class BallisticReach(Stage):
             rules.append(f"the start's position + velocity x {1e3 * self.start_time:g} ms")
         if self.goal_time:
             rules.append(f"the goal's position +- hit velocity x {1e3 * self.goal_time:g} ms")
-        return "require over the table: " + " and ".join(rules) + " (cheap; braking-reach loses far fewer problems)"
+        return "require over the table: " + " and ".join(rules) + " (fast; braking-reach rejects far fewer problems)"
 
     def prepare(self, context: Context) -> StageFunction:
         """Load the kernel."""
