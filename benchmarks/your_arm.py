@@ -5,6 +5,10 @@ are not installed are omitted. An arm completes the page if every command has th
 
     python benchmarks/your_arm.py
     python benchmarks/your_arm.py --arms z1 kinova --timeout 3600
+    python benchmarks/your_arm.py --gaps --urdf fetch=fetch.urdf:gripper_link iiwa=model.urdf:lbr_iiwa_link_7
+
+--gaps runs ``cnpgen init`` only. It prints the share of the random states without contact of the meshes that convex
+hulls reject, and the share that the convex parts of the written problem reject.
 """
 
 import argparse
@@ -29,6 +33,14 @@ ARMS = {  # name -> URDF in the package, tip
     "xarm7": ("xarm_description/urdf/xarm7.urdf", "link7"),
     "so101": ("so_arm_description/urdf/so101.urdf", "gripper_frame_link"),
 }
+GAP_ARMS = {  # whose convex parts are compared with their meshes
+    **ARMS,
+    "ur5": ("ur_description/urdf/ur5_robot.urdf", "tool0"),
+    "panda": ("panda_description/urdf/panda.urdf", "panda_hand"),
+    "tiago": ("tiago_description/robots/tiago.urdf", "wrist_ft_tool_link"),
+    "baxter": ("baxter_description/urdf/baxter.urdf", "left_gripper_base_link"),
+}
+MAX_GAP = 0.02
 TARGET = 5  # arms that complete the page
 BLOCK = re.compile(r"(?:<!-- library: (\w+) -->\n)?```bash\n(.*?)```", re.DOTALL)
 
@@ -75,13 +87,55 @@ def complete(name: str, urdf: Path, tip: str, seconds: float) -> dict[str, Any]:
     return {"arm": name, "blocks": done, "of": len(blocks), "outcome": outcome}
 
 
+def gap(name: str, urdf: Path, tip: str) -> dict[str, Any]:
+    """Write the recipes of one arm; return the shares of free states that hulls and convex parts reject."""
+    from cnpgen.problems.problem_file import load_problem
+
+    with tempfile.TemporaryDirectory(prefix="cnpgen-arm-") as folder:
+        command = [sys.executable, "-m", "cnpgen", "init", name, "--urdf", str(urdf), "--tip", tip]
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+        if done.returncode:
+            return {"arm": name, "outcome": f"{done.stderr.strip().splitlines()[-1]:.120}"}
+        robot = load_problem(Path(folder) / name / "problem.toml").robot
+    hulls = re.search(r"([\d.]+)% of the random states in which no meshes overlap", done.stderr)
+    return {"arm": name, "hulls": float(hulls[1]) / 100 if hulls else None, "parts": robot.hull_gap}
+
+
+def named_urdf(text: str) -> tuple[str, tuple[str, str]]:
+    """Parse NAME=FILE:TIP."""
+    name, _, place = text.partition("=")
+    file, _, tip = place.rpartition(":")
+    return name, (str(Path(file).resolve()), tip)
+
+
+def report_gaps(found: dict[str, tuple[str, str]], *, as_json: bool) -> None:
+    rows = []
+    for name, (file, tip) in found.items():
+        rows.append(gap(name, robots() / file, tip))
+        progress(f"{name}: {rows[-1]}")
+    cells = [
+        (row["arm"], f"{row['hulls']:.2%}", f"{row['parts']:.2%}", *verdict(row["parts"], MAX_GAP, at_most=True))
+        if "parts" in row
+        else (row["arm"], "", "", row["outcome"], "")
+        for row in rows
+    ]
+    report(
+        {"gaps": rows}, [table("free states rejected", ("arm", "hulls", "parts", "target", ""), cells)], as_json=as_json
+    )
+
+
 def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--arms", nargs="+", choices=tuple(ARMS), default=[*ARMS])
     parser.add_argument("--timeout", type=float, default=3600, help="seconds per arm")
+    parser.add_argument("--gaps", action="store_true", help="measure the convex parts of links instead")
+    parser.add_argument("--urdf", nargs="+", type=named_urdf, default=[], metavar="NAME=FILE:TIP")
 
 
 def main() -> None:
     chosen = arguments(__doc__, options)
+    if chosen.gaps:
+        report_gaps({**GAP_ARMS, **dict(chosen.urdf)}, as_json=chosen.json)
+        return
     rows = [complete(name, robots() / ARMS[name][0], ARMS[name][1], chosen.timeout) for name in chosen.arms]
     count = sum(row["outcome"] == "completed" for row in rows)
     cells = [(row["arm"], f"{row['blocks']} of {row['of']}", row["outcome"]) for row in rows]

@@ -156,10 +156,16 @@ def nearest(name: str, known: Iterable[str], *, similarity: float = 0.5) -> str:
     return f" (did you mean {close[0]!r}?)" if close else ""
 
 
+def listed(names: Sequence[object], most: int = 20) -> str:
+    """Join names for a message, at most so many: ``"a, b and 3 more"``."""
+    text = ", ".join(map(str, names[:most]))
+    return f"{text} and {len(names) - most:,} more" if len(names) > most else text
+
+
 def lacks(noun: str, name: str, known: Iterable[str]) -> str:
     """Return the message for an unknown name: ``"has no split 'x', only train, test"``."""
     names = list(known)
-    return f"has no {noun} {name!r}{nearest(name, names)}, only {', '.join(names) or 'none'}"
+    return f"has no {noun} {name!r}{nearest(name, names)}, only {listed(names) or 'none'}"
 
 
 def either(choices: Sequence[str]) -> str:

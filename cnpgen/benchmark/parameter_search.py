@@ -3,7 +3,7 @@
 import csv
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,9 @@ import numpy as np
 
 from cnpgen.benchmark.run_suite import Benchmark, run_benchmark
 from cnpgen.errors import UsageError
+from cnpgen.schema import registry
 from cnpgen.schema.arguments import integer
+from cnpgen.schema.keys import Key, keys
 from cnpgen.store.files.atomic import write_file
 
 SEARCH_FILE = "search.csv"
@@ -27,7 +29,7 @@ class Trial:
     Attributes:
         number: Its number; 0 has the default parameters.
         parameters: Values of the fields of the planner.
-        solved: Ratio of successful executions, or of valid plans without a plant.
+        solved: Ratio of successful executions, the mean of all plants, or of valid plans without a plant.
         planning_cpu_ms: Median planning time [ms], nan if the planner does not apply.
         duration_s: Median motion time [s], nan without a plan.
     """
@@ -52,7 +54,7 @@ def search_parameters(
     """Try random parameters of a planner on a suite; an interrupted search resumes.
 
     Values are uniform in their range, or log-uniform if both ends are positive and differ by a factor of 10 or more.
-    Ranges of two whole numbers give whole numbers. Tune on other problems than those of the comparison: the name of a
+    Fields of type int get whole numbers. Tune on other problems than those of the comparison: the name of a
     dataset gives fresh ones.
 
     Args:
@@ -72,7 +74,9 @@ def search_parameters(
         RecipeError, MachineError: As ``run_benchmark``.
     """
     trials, seed = integer("trials", trials, least=1, most=MAX_TRIALS), integer("seed", seed, least=0)
-    sets: list[dict[str, Any]] = [{}, *(random_parameters(ranges, [seed, number]) for number in range(trials))]
+    whole = {key.name for key in _keys_of(planner) if key.hint is int}
+    drawn = (random_parameters(ranges, [seed, number], whole=whole) for number in range(trials))
+    sets: list[dict[str, Any]] = [{}, *drawn]
     done = []
     for number, parameters in enumerate(sets):
         benchmark = run_benchmark(
@@ -89,12 +93,21 @@ def search_parameters(
     return ranked
 
 
-def random_parameters(ranges: Mapping[str, Sequence[float]], seed: Sequence[int]) -> dict[str, Any]:
+def _keys_of(planner: str) -> tuple[Key, ...]:
+    """Return the fields of a planner; empty if it is unknown, which ``run_benchmark`` reports."""
+    known = registry.names(registry.PLANNERS)
+    return keys(registry.load(registry.PLANNERS, planner)) if planner in known else ()
+
+
+def random_parameters(
+    ranges: Mapping[str, Sequence[float]], seed: Sequence[int], *, whole: Collection[str] = ()
+) -> dict[str, Any]:
     """Draw a value for each field.
 
     Args:
         ranges: See ``search_parameters``.
         seed: Seed of the generator.
+        whole: Fields whose values are whole numbers.
 
     Raises:
         UsageError: There is no range, or one is not two increasing, finite numbers.
@@ -106,12 +119,11 @@ def random_parameters(ranges: Mapping[str, Sequence[float]], seed: Sequence[int]
         if len(ends) != 2 or not all(map(math.isfinite, ends)) or not ends[0] < ends[1]:
             raise UsageError(f"must have two increasing numbers for {key!r}, got {ends!r:.100}", argument="ranges")
         low, high = ends
-        is_whole = all(isinstance(end, int) for end in ends)
         if low > 0 and high / low >= MIN_LOGARITHMIC_RANGE:
             value = float(np.exp(random.uniform(math.log(low), math.log(high))))
         else:
             value = float(random.uniform(low, high))
-        values[key] = int(np.clip(round(value), low, high)) if is_whole else value
+        values[key] = int(np.clip(round(value), low, high)) if key in whole else value
     return values
 
 
@@ -132,11 +144,14 @@ def csv_of(trials: Sequence[Trial], keys: Sequence[str]) -> str:
 
 
 def _trial(number: int, parameters: Mapping[str, Any], benchmark: Benchmark, planner: str) -> Trial:
-    plant = benchmark.executions[0]
-    summary = benchmark.summary(plant)[planner]
-    ratio = summary["ratios"].get("success" if plant else "valid", {"share": 0.0})
-    medians = [summary["figures"].get(key, {}).get("median", math.nan) for key in ("planning_cpu_ms", "duration_s")]
-    return Trial(number, parameters, ratio["share"], *medians)
+    summaries = {plant: benchmark.summary(plant)[planner] for plant in benchmark.executions}
+    ratios = [
+        summary["ratios"].get("success" if plant else "valid", {"share": 0.0})["share"]
+        for plant, summary in summaries.items()
+    ]
+    figures = summaries[benchmark.executions[0]]["figures"]
+    medians = [figures.get(key, {}).get("median", math.nan) for key in ("planning_cpu_ms", "duration_s")]
+    return Trial(number, parameters, float(np.mean(ratios)), *medians)
 
 
 def _rank(trial: Trial) -> tuple[float, float, float, int]:

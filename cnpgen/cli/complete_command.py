@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names
 from cnpgen.cli.parser import Commands, Parser, add_command, add_json
-from cnpgen.errors import counted
+from cnpgen.errors import counted, listed
 
 if TYPE_CHECKING:
     from cnpgen.make.complete import Completed
@@ -73,8 +73,7 @@ def _summary(found: "Completed") -> list[str]:
     """Summarize how many tasks have an answer, and the reasons of the others."""
     lines = [f"{len(found):,} of {counted(len(found.reasons), 'task')} completed"]
     for reason, count in found.rejections.items():
-        indices = [task for task, why in enumerate(found.reasons) if why == reason][:MAX_LISTED_TASKS]
-        more = f" and {count - MAX_LISTED_TASKS:,} more" if count > MAX_LISTED_TASKS else ""
-        named = f"task{'s' * (count > 1)} {', '.join(map(str, indices))}{more}"
+        indices = [task for task, why in enumerate(found.reasons) if why == reason]
+        named = f"task{'s' * (count > 1)} {listed(indices, MAX_LISTED_TASKS)}"
         lines += textwrap.wrap(f"  {count:,} {reason}: {named}", 110, subsequent_indent="    ")
     return lines

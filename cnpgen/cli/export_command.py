@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Commands, Parser, add_command
 from cnpgen.cli.plan_files import read_plans
-from cnpgen.errors import UsageError, counted
+from cnpgen.errors import UsageError, counted, listed
 
 if TYPE_CHECKING:
     from cnpgen.plans import Plans
@@ -105,9 +105,9 @@ def _counted(exported: "Exported") -> str:
 
 def _invalid(exported: "Exported") -> str:
     """List the exported plans that are known to be invalid."""
-    first, left = exported.invalid[:MAX_LISTED_PLANS], len(exported.invalid[MAX_LISTED_PLANS:])
-    which = ", ".join(map(str, first)) + (f" and {left:,} more" if left else "")
-    return f"not valid by their status ('cnpgen evaluate' reports why): plan{'s' * (len(first) > 1)} {which}"
+    plural = "s" * (len(exported.invalid) > 1)
+    which = listed(exported.invalid, MAX_LISTED_PLANS)
+    return f"not valid by their status ('cnpgen evaluate' reports why): plan{plural} {which}"
 
 
 def _place(arguments: argparse.Namespace, exporter: "Exporter") -> Path:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from cnpgen.cli import values
 from cnpgen.cli.parser import Options
-from cnpgen.errors import UsageError
+from cnpgen.errors import UsageError, listed
 
 if TYPE_CHECKING:
     from cnpgen.plans.evaluate_trajectories import TrajectoryEvaluation
@@ -65,8 +65,7 @@ def load_file(arguments: argparse.Namespace, problem: "str | Problem") -> "Loade
     given = {name: getattr(arguments, name) for name in TRAJECTORY_OPTIONS if getattr(arguments, name) is not None}
     loaded = load_trajectories(arguments.file, problem, **given)
     if loaded.ignored:
-        more = f" and {len(loaded.ignored) - MAX_IGNORED} more" if len(loaded.ignored) > MAX_IGNORED else ""
-        print(f"columns that are not used: {', '.join(loaded.ignored[:MAX_IGNORED])}{more}", file=sys.stderr)
+        print(f"columns that are not used: {listed(loaded.ignored, MAX_IGNORED)}", file=sys.stderr)
     return loaded
 
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from cnpgen.errors import DatasetError, RecipeError, UsageError
+from cnpgen.errors import DatasetError, RecipeError, UsageError, listed
 from cnpgen.make.certify import certified
 from cnpgen.make.make_dataset import Begin, MadeDataset, Progress, finish
 from cnpgen.make.recipe import recipe_digest
@@ -119,8 +119,7 @@ def _owners(folders: Sequence[Path], out: Path, spec: DatasetSpec) -> dict[Shard
         else:
             missing.append(task.file)
     if missing:
-        more = f" and {len(missing) - MAX_LISTED_SHARDS} more" if len(missing) > MAX_LISTED_SHARDS else ""
-        raise DatasetError(f"no part has {', '.join(missing[:MAX_LISTED_SHARDS])}{more}: make what is missing first")
+        raise DatasetError(f"no part has {listed(missing, MAX_LISTED_SHARDS)}: make the missing shards first")
     return owners
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-from cnpgen.errors import PluginError, RecipeError, nearest
+from cnpgen.errors import PluginError, RecipeError, listed, nearest
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.plausible_values import MAX_LIMIT_RATIO, MAX_RANGE_RATIO, ImplausibleValue
 from cnpgen.robots.robot_spec import LimitSpec
@@ -124,7 +124,7 @@ def missing_frame(tree: ElementTree.Element, path: Path, name: str) -> str:
     return (
         ""
         if name in frames
-        else f"{path.name} has no frame {name!r}{nearest(name, frames)}; its frames: {', '.join(frames)}"
+        else f"{path.name} has no frame {name!r}{nearest(name, frames)}; its frames: {listed(frames)}"
     )
 
 

@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import RecipeError, nearest
+from cnpgen.errors import RecipeError, listed, nearest
 from cnpgen.robots.chain import frame_of
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ def attach(model: "pin.Model", attached: Attached) -> None:
     if not model.existFrame(attached.frame):
         known = [frame.name for frame in model.frames]
         text = f"{model.name} has no frame {attached.frame!r}{nearest(attached.frame, known)}"
-        raise RecipeError([f"robot.tip: {text}; its frames: {', '.join(known)}"])
+        raise RecipeError([f"robot.tip: {text}; its frames: {listed(known)}"])
     index = frame_of(model, attached.frame)
     frame = model.frames[index]
     placement = frame.placement * pin.SE3(attached.rotation, attached.translation)

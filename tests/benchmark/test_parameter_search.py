@@ -12,14 +12,15 @@ from cnpgen.errors import UsageError
 
 
 def test_random_values_lie_in_their_ranges_and_are_log_uniform_in_wide_ones() -> None:
-    ranges = {"whole": (5, 50), "narrow": (1.0, 2.0), "wide": (1e-4, 1.0), "signed": (-1.0, 100.0)}
-    draws = [random_parameters(ranges, [3, number]) for number in range(400)]
+    ranges = {"whole": (5, 50), "narrow": (1, 2), "wide": (1e-4, 1.0), "signed": (-1.0, 100.0)}
+    draws = [random_parameters(ranges, [3, number], whole={"whole"}) for number in range(400)]
     assert all(isinstance(draw["whole"], int) for draw in draws)
+    assert len({draw["narrow"] for draw in draws}) == len(draws)  # the notation of the range does not matter
     for key, (low, high) in ranges.items():
         assert all(low <= draw[key] <= high for draw in draws)
     assert np.median([draw["wide"] for draw in draws]) == pytest.approx(1e-2, rel=0.6)
     assert np.median([draw["signed"] for draw in draws]) == pytest.approx(49.5, rel=0.2)
-    assert random_parameters(ranges, [3, 7]) == draws[7]
+    assert random_parameters(ranges, [3, 7], whole={"whole"}) == draws[7]
 
 
 @pytest.mark.parametrize("ends", [(2.0, 1.0), (1.0,), (0.0, float("inf"))])

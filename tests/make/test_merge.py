@@ -93,7 +93,7 @@ def refused(parts: list[Path], out: Path, error: type[Exception], text: str) -> 
 def test_gaps_overlaps_and_damage_are_refused_by_name(parts, tmp_path):
     out = tmp_path / "out"
     refused(parts[:1], out, DatasetError, "no part has train/shard-00001.h5, train/shard-00002.h5, validation/shard-0")
-    refused(parts[1:], out, DatasetError, "no part has train/shard-00000.h5: make what is missing first")
+    refused(parts[1:], out, DatasetError, "no part has train/shard-00000.h5: make the missing shards first")
     twice = shutil.copytree(parts[0], tmp_path / "twice")
     text = f"{parts[0]} and {twice} both have train/shard-00000.h5: parts must not overlap"
     refused([*parts, twice], out, UsageError, text)

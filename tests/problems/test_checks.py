@@ -1,10 +1,12 @@
-"""Robots that are wrong are said to be wrong, by what is wrong with them."""
+"""Mistakes in robots are reported with the element that has them."""
 
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 
-from cnpgen.errors import RecipeError
+from cnpgen.errors import RecipeError, listed
+from cnpgen.problems.checks import missing_frame
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
 from tests.examples.shaped_robot import JOINTS, urdf, write_problem
@@ -93,3 +95,12 @@ def test_limits_far_above_those_of_the_urdf_are_in_another_unit(tmp_path, limit,
 @pytest.mark.parametrize("limit", ["velocity = 19", 'velocity = "80 deg/s"', "acceleration = 190", "torque = 5000"])
 def test_limits_of_another_motor_are_accepted(tmp_path, limit):
     load_robot(load_problem(limited(tmp_path, limit)))
+
+
+def test_a_message_lists_at_most_twenty_frames() -> None:
+    links = "".join(f'<link name="link_{index}"/>' for index in range(30))
+    tree = ElementTree.fromstring(f"<robot>{links}</robot>")
+    text = missing_frame(tree, Path("long.urdf"), "link_99")
+    assert text.endswith("link_17, link_18, link_19 and 10 more")
+    assert missing_frame(tree, Path("long.urdf"), "link_29") == ""
+    assert listed(["a", "b"]) == "a, b"

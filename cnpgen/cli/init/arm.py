@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.etree import ElementTree
 
-from cnpgen.errors import RecipeError, UsageError
+from cnpgen.errors import RecipeError, UsageError, listed
 from cnpgen.problems.checks import frames_of, missing_frame, unread_xacro
 from cnpgen.robots.urdf import number_in, read_urdf, urdf_tree
 
@@ -94,7 +94,7 @@ def read_arm(urdf: Path, tip: str | None) -> Arm:
     path = list(_path(urdf, tip, joints))
     moving = [joint for joint in path if _moves(joint)]
     if not moving:
-        raise RecipeError([f"{urdf}: no joint moves the frame {tip!r}; its frames: {', '.join(frames_of(tree))}"])
+        raise RecipeError([f"{urdf}: no joint moves the frame {tip!r}; its frames: {listed(frames_of(tree))}"])
     planned = tuple(_joint(urdf, joint) for joint in moving)
     names = {joint.name for joint in planned}
     return Arm(
