@@ -2,11 +2,12 @@
 
 import csv
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from cnpgen.benchmark.parameter_search import Trial, _rank, random_parameters, search_parameters
+from cnpgen.benchmark.parameter_search import Trial, _rank, _trial, random_parameters, search_parameters
 from cnpgen.cli.main import main
 from cnpgen.errors import UsageError
 
@@ -34,6 +35,16 @@ def test_trials_are_ranked_by_solved_problems_then_by_times() -> None:
     trials = [Trial(0, {}, 0.5, 1.0, nan), Trial(1, {}, 0.9, 5.0, 2.0), Trial(2, {}, 0.9, 4.0, 2.0)]
     trials += [Trial(3, {}, 0.9, 9.0, 1.0), Trial(4, {}, 0.5, 9.0, 3.0)]
     assert [trial.number for trial in sorted(trials, key=_rank)] == [3, 2, 1, 4, 0]
+
+
+def test_a_trial_counts_the_successes_on_all_plants() -> None:
+    shares = {"nominal": 1.0, "challenge": 0.5}
+    figures = {"planning_cpu_ms": {"median": 7.0}, "duration_s": {"median": 0.4}}
+    benchmark = SimpleNamespace(
+        executions=tuple(shares),
+        summary=lambda plant: {"aqp": {"ratios": {"success": {"share": shares[plant]}}, "figures": figures}},
+    )
+    assert _trial(3, {}, benchmark, "aqp") == Trial(3, {}, 0.75, 7.0, 0.4)  # type: ignore[arg-type]
 
 
 @pytest.mark.slow
