@@ -33,7 +33,7 @@ from cnpgen.store.files.figure_file import new_figure
 ROOT = Path(__file__).parents[1]
 
 
-STRAY = (  # files that were left lying about
+STRAY = (  # files that do not belong to the package
     "datasets/models/experiment.h5",
     "datasets/models/airhockey-hit.h5.checkpoint",
     "datasets/rows.csv",
@@ -46,16 +46,16 @@ STRAY = (  # files that were left lying about
 
 @pytest.fixture(scope="session")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
-    """The wheel of a copy of the repository in which files were left lying about."""
+    """The wheel of a copy of the repository with files that do not belong to the package."""
     pytest.importorskip("build")
     pytest.importorskip("hatchling")
     copy, out = tmp_path_factory.mktemp("copy"), tmp_path_factory.mktemp("wheel")
     for name in ("cnpgen", "problems", "pipelines", "datasets", "docs"):
         shutil.copytree(ROOT / name, copy / name, ignore=shutil.ignore_patterns("__pycache__"))
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
+    for name in ("pyproject.toml", "hatch_build.py", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, copy)
     for name in STRAY:
-        (copy / name).write_text("left lying about")
+        (copy / name).write_text("stray")
     command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(out), str(copy)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -63,8 +63,8 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
 
 
 def test_the_wheel_installs_cnpgen_and_nothing_else(wheel: zipfile.ZipFile) -> None:
-    obstacle_poses = {name.split("/")[0] for name in wheel.namelist()}
-    assert obstacle_poses == {"cnpgen", f"cnpgen-{cnpgen.__version__}.dist-info"}
+    top_level = {name.split("/")[0] for name in wheel.namelist()}
+    assert top_level == {"cnpgen", f"cnpgen-{cnpgen.__version__}.dist-info"}
 
 
 def test_the_wheel_carries_every_recipe_and_robot(wheel: zipfile.ZipFile) -> None:
@@ -80,7 +80,7 @@ def test_the_wheel_carries_every_recipe_and_robot(wheel: zipfile.ZipFile) -> Non
     assert set(sources) <= set(wheel.namelist())
 
 
-def test_the_wheel_carries_nothing_that_was_left_lying_about(wheel: zipfile.ZipFile) -> None:
+def test_the_wheel_has_no_stray_files(wheel: zipfile.ZipFile) -> None:
     shipped = {name.removeprefix("cnpgen/_recipes/") for name in wheel.namelist()}
     assert not shipped.intersection(STRAY)
     tracked = (
@@ -173,9 +173,14 @@ def test_the_version_and_the_address_are_the_same_everywhere() -> None:
     assert changelog is not None
     assert citation[1] == changelog[1] == cnpgen.__version__
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    assert project["dynamic"] == ["version"]
-    assert project["urls"]["Homepage"] == DOCUMENTATION_URL
-    assert all(url.startswith(DOCUMENTATION_URL) for url in project["urls"].values())
+    assert project["dynamic"] == ["version", "urls"]
+    urls = dict(entry.split(", ") for entry in importlib.metadata.metadata("cnpgen").get_all("Project-URL", []))
+    assert urls["Homepage"] == DOCUMENTATION_URL
+    assert urls.keys() >= {"Documentation", "Changelog"}
+    assert all(url.startswith(DOCUMENTATION_URL) for url in urls.values())
+    sources = [path for pattern in ("*.toml", "cnpgen/**/*.py", "docs/**/*.md") for path in ROOT.glob(pattern)]
+    holders = [path.name for path in sources if DOCUMENTATION_URL in path.read_text(encoding="utf-8")]
+    assert holders == ["versions.py"]
 
 
 def bridge(framework: str) -> Callable[[], object]:

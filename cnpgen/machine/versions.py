@@ -4,7 +4,7 @@ from functools import cache
 
 __version__ = "1.0.0"
 
-DOCUMENTATION_URL = "https://cnpgen.example.org/"  # the publisher replaces this address, also in pyproject.toml
+DOCUMENTATION_URL = "https://cnpgen.example.org/"  # the only place of the address, which the publisher replaces
 
 
 @cache
