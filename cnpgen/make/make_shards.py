@@ -21,6 +21,7 @@ from cnpgen.pipelines.prepared import Block, PreparedPipeline
 from cnpgen.robots.scene_arrays import scene_poses
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask
 from cnpgen.store.field import Field
+from cnpgen.store.manifest import source_date
 from cnpgen.store.sampling_statistics import SamplingStatistics, merge_sampling
 from cnpgen.store.scene_table import SCENE_ID, SceneTable, concatenate_scenes
 from cnpgen.store.shard import storage_dtype
@@ -83,12 +84,12 @@ def make_shards(job: Job, tasks: Sequence[ShardTask]) -> Iterator[tuple[int, Sam
         MachineError: The disk or the backend fails.
         UsageError: Another dataset replaced this one in the folder.
     """
-    started, clock = datetime.now(UTC).isoformat(timespec="seconds"), time.perf_counter()
+    started, clock = _now(), time.perf_counter()
     prepared = _prepared(job)
     for task, (columns, sampling, scenes) in zip(tasks, shard_columns(prepared, job.spec, tasks), strict=True):
         checked = replace(sampling, verification=spot_check(prepared, columns, job.spec, task, scenes))
         require_dataset_spec(job.folder, job.spec)
-        seconds = round(time.perf_counter() - clock, 3)
+        seconds = 0.0 if source_date() else round(time.perf_counter() - clock, 3)
         commit_shard(
             job.folder,
             job.spec,
@@ -100,8 +101,13 @@ def make_shards(job: Job, tasks: Sequence[ShardTask]) -> Iterator[tuple[int, Sam
             seconds=seconds,
             versions=versions(),
         )
-        started, clock = datetime.now(UTC).isoformat(timespec="seconds"), time.perf_counter()
+        started, clock = _now(), time.perf_counter()
         yield task.rows, checked
+
+
+def _now() -> str:
+    """Return the time, or SOURCE_DATE_EPOCH, in UTC to the second."""
+    return (source_date() or datetime.now(UTC)).isoformat(timespec="seconds")
 
 
 def shard_columns(

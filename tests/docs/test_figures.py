@@ -65,7 +65,15 @@ def test_the_comparison_of_planners_plans_for_at_most_nine_hours(
     limited = figures.QuotedCommand("a", "cnpgen benchmark hits-81 --simulate --time-limit 9s --planners a b --json")
     assert limited.planning_bound() == pytest.approx(2 * 81 * 10 / 3600)
     assert figures.QuotedCommand("a", "benchmarks/loss.py").planning_bound() is None
-    counts = {"hits-81": 81, "hits-110": 110, "heavy-100": 100, "replans-200": 200, "clutter": 200}
+    counts = {
+        "hits-81": 81,
+        "hits-110": 110,
+        "heavy-100": 100,
+        "replans-200": 200,
+        "clutter": 200,
+        "replan": 24,
+        "online": 24,
+    }
     monkeypatch.setattr(
         "cnpgen.benchmark.suite.load_suite",
         lambda name: SimpleNamespace(problems=lambda: (range(counts[name]), None)),
@@ -73,3 +81,11 @@ def test_the_comparison_of_planners_plans_for_at_most_nine_hours(
     figures.print_list(figures.quoted_commands(["planners"]))
     *_, last = capsys.readouterr().out.splitlines()
     assert 5 < float(last.split()[-4]) <= 9
+
+
+def test_the_tables_of_the_comparison_are_those_of_the_archived_results() -> None:
+    command = [sys.executable, str(ROOT / "benchmarks" / "planner_tables.py")]
+    printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip().split("\n\n")
+    page = (ROOT / "docs" / "benchmarks" / "planners.md").read_text(encoding="utf-8")
+    assert {table.split(" | ")[0] for table in printed} >= {"| hits-81", "| heavy-100", "| replans-200", "| clutter"}
+    assert [table.partition("\n")[0] for table in printed if table not in page] == []

@@ -1,5 +1,6 @@
 """Making datasets: the same bytes however they are made, whoever makes which part of them."""
 
+import json
 import shutil
 from collections import Counter
 from collections.abc import Callable
@@ -41,6 +42,18 @@ def test_one_worker_and_two_make_the_same_bytes(tiny: Callable[[str], Path], tmp
     assert digests(tmp_path / "two") == digests(tiny(name))
     assert len(digests(tiny(name))) == SHARDS
     assert load_manifest(tmp_path / "two")["fingerprint"] == load_manifest(tiny(name))["fingerprint"]
+
+
+def test_a_fixed_date_makes_equal_manifests(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1795651200")
+    folders = [
+        make_dataset("airhockey-hit", tmp_path / str(workers) / "hits", n=20, workers=workers).folder
+        for workers in (1, 2)
+    ]
+    first, second = (Path(folder, "manifest.json").read_bytes() for folder in folders)
+    assert first == second
+    record = json.loads(Path(folders[0], "train", "shard-00000.json").read_text(encoding="utf-8"))
+    assert (record["started"], record["seconds"]) == ("2026-11-26T00:00:00+00:00", 0.0)
 
 
 def test_threads_make_the_same_bytes(tiny: Callable[[str], Path], tmp_path):
