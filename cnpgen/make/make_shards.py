@@ -3,7 +3,7 @@
 import platform
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -41,6 +41,7 @@ class Job:
         pipeline: Pipeline of the dataset; None to rebuild it from the specification, for workers without its files.
         backend: Backend of the kernels.
         cache_folder: Folder of compiled kernels; None for the default folder of the worker's machine.
+        date: Date of all records, from SOURCE_DATE_EPOCH; None for the current time and durations.
     """
 
     folder: Path
@@ -48,6 +49,7 @@ class Job:
     pipeline: Pipeline | None
     backend: Backend
     cache_folder: Path | None
+    date: datetime | None = field(default_factory=source_date)
 
 
 def prepare(job: Job) -> PreparedPipeline:
@@ -84,12 +86,12 @@ def make_shards(job: Job, tasks: Sequence[ShardTask]) -> Iterator[tuple[int, Sam
         MachineError: The disk or the backend fails.
         UsageError: Another dataset replaced this one in the folder.
     """
-    started, clock = _now(), time.perf_counter()
+    started, clock = _now(job), time.perf_counter()
     prepared = _prepared(job)
     for task, (columns, sampling, scenes) in zip(tasks, shard_columns(prepared, job.spec, tasks), strict=True):
         checked = replace(sampling, verification=spot_check(prepared, columns, job.spec, task, scenes))
         require_dataset_spec(job.folder, job.spec)
-        seconds = 0.0 if source_date() else round(time.perf_counter() - clock, 3)
+        seconds = 0.0 if job.date else round(time.perf_counter() - clock, 3)
         commit_shard(
             job.folder,
             job.spec,
@@ -101,13 +103,13 @@ def make_shards(job: Job, tasks: Sequence[ShardTask]) -> Iterator[tuple[int, Sam
             seconds=seconds,
             versions=versions(),
         )
-        started, clock = _now(), time.perf_counter()
+        started, clock = _now(job), time.perf_counter()
         yield task.rows, checked
 
 
-def _now() -> str:
-    """Return the time, or SOURCE_DATE_EPOCH, in UTC to the second."""
-    return (source_date() or datetime.now(UTC)).isoformat(timespec="seconds")
+def _now(job: Job) -> str:
+    """Return the date of a job, or the time, in UTC to the second."""
+    return (job.date or datetime.now(UTC)).isoformat(timespec="seconds")
 
 
 def shard_columns(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import tempfile
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -303,8 +304,9 @@ def _comparable(record: ProblemRecord) -> dict[str, Any]:
     robot = {key: value for key, value in kept["robot"].items() if key not in {*FILES, "base"}}
     robot["urdf"] = hashlib.sha256(record.urdf.encode()).hexdigest()
     constraints: dict[str, Any] = {}
+    counts = Counter[str]()
     for kind in kept["constraint"]:
-        count = sum(name.split()[0] == kind["use"] for name in constraints)
-        name = f"{kind['use']} {count + 1}" if count else kind["use"]
+        counts[kind["use"]] += 1
+        name = f"{kind['use']} {counts[kind['use']]}" if counts[kind["use"]] > 1 else kind["use"]
         constraints[name] = {key: value for key, value in kind.items() if key not in _JUDGED_BY}
     return kept | {"robot": robot, "constraint": constraints}

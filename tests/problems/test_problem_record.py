@@ -1,5 +1,6 @@
-"""A problem may be meant by itself, by its record, or by a name or a file that leads to it."""
+"""Problems, their records, and the names and files that identify them."""
 
+import json
 import pickle
 import shutil
 import subprocess
@@ -10,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cnpgen.errors import RecipeError, UsageError
+from cnpgen.errors import CnpgenError, RecipeError, UsageError
 from cnpgen.losses.plan_loss import PlanLoss
 from cnpgen.planner.boundary_layer import BoundaryLayer
 from cnpgen.plans import make_plans, record_problem
@@ -36,7 +37,17 @@ def test_a_record_is_rebuilt_once_and_its_urdf_stays() -> None:
     assert as_record(RECORD) is RECORD
 
 
-def test_a_problem_in_a_strangers_file_reads_no_mesh_from_the_disk(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["", " ", "joint-position 2"])
+def test_the_digest_of_a_record_with_an_unknown_constraint_exists_and_the_record_is_refused(name: str) -> None:
+    content = json.loads(RECORD.recipe)
+    content["constraint"][1]["use"] = name
+    changed = replace(RECORD, recipe=json.dumps(content))
+    assert changed.comparable_sha256 != RECORD.comparable_sha256
+    with pytest.raises(CnpgenError, match=f"constraint {name!r} is not installed"):
+        as_problem(changed)
+
+
+def test_a_problem_in_an_untrusted_file_reads_no_mesh_from_the_disk(tmp_path: Path) -> None:
     problem = load_problem(write_problem(tmp_path))
     assert open_problem(record_problem(problem))[1].shape.convex_parts
     outside = problem.urdf_path.read_text()
