@@ -24,7 +24,7 @@ COMMAND = re.compile(rf"`(?:python )?({QUOTED}[^`]*)`|^(?:python )?({QUOTED}.*)$
 OWN_NAME = Path(__file__).name
 OTHER_PAGES = tuple(ROOT / "docs" / "how-to" / name for name in ("benchmark.md", "trajectories.md"))
 CLONE, FOLDER = "air_hockey_challenge", "FOLDER"
-PATTERN_CHARACTERS = "*?"  # of files that the reader trains first
+GIVEN_FILE = re.compile(r"[*?]|\bFILE\b")  # a file that the reader makes first
 DEFAULT_TIME_LIMIT_S = 12 * 3600.0
 HOUR_S = 3600.0
 
@@ -49,7 +49,7 @@ class QuotedCommand:
     def arguments(self, out: Path, environment: Path | None) -> list[str] | None:
         """Return the arguments of the process, or None if the command needs a clone or files that are missing."""
         words = shlex.split(self.text)
-        if any(character in word for word in words for character in PATTERN_CHARACTERS):
+        if any(GIVEN_FILE.search(word) for word in words):
             return None
         if CLONE in words and environment is None:
             return None

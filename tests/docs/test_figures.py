@@ -42,6 +42,8 @@ def test_outputs_are_kept_and_commands_without_their_files_skipped(figures: Modu
     in_challenge = figures.QuotedCommand("a", "benchmarks/challenge_mallet.py air_hockey_challenge")
     assert figures.run(in_challenge, tmp_path, None, 1.0).startswith("skipped")
     assert in_challenge.arguments(tmp_path, tmp_path)[2] == str(tmp_path)
+    for text in ("benchmarks/trajectories.py FILE --import", "benchmarks/your_arm.py --gaps --urdf a=FILE:tip"):
+        assert figures.QuotedCommand("a", text).arguments(tmp_path, tmp_path) is None
     suite = figures.QuotedCommand("a", "cnpgen benchmark hits-81 --simulate")
     assert suite.arguments(tmp_path, None)[1:] == [
         *("-m", "cnpgen", "benchmark", "hits-81", "--simulate", "-o", str(tmp_path / "work" / "hits-81"))
