@@ -59,9 +59,13 @@ def table_frame(ranges: ParameterRanges, pivot: Array, parameters: Array) -> Tab
     columns = dict(zip(ranges.names, parameters.T, strict=True))
     zero = np.zeros(len(parameters))
     roll, pitch, height = (columns.get(name, zero) for name in ("table_roll", "table_pitch", "table_height"))
+    return TableFrame(turned_axes(roll, pitch).transpose(0, 2, 1), pivot, height)
+
+
+def turned_axes(roll: Array, pitch: Array) -> Array:
+    """Return the axes x, y and z after N rolls and then pitches [rad], one per row, shape (N, 3, 3)."""
     axes = table_axes(np.sin(roll), np.cos(roll), np.sin(pitch), np.cos(pitch))
-    matrices = np.array([[component + zero for component in axis] for axis in axes]).transpose(2, 1, 0)
-    return TableFrame(matrices, pivot, height)
+    return np.array([[component + np.zeros(len(roll)) for component in axis] for axis in axes]).transpose(2, 0, 1)
 
 
 def table_axes(sin_roll: Any, cos_roll: Any, sin_pitch: Any, cos_pitch: Any) -> tuple[list[Any], ...]:
