@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.robots.parameter_ranges import ParameterRanges
+from cnpgen.robots.parameter_ranges import UPRIGHT_TURN, ParameterRanges
 
 Array = NDArray[np.float64]
 
@@ -60,6 +60,17 @@ def table_frame(ranges: ParameterRanges, pivot: Array, parameters: Array) -> Tab
     zero = np.zeros(len(parameters))
     roll, pitch, height = (columns.get(name, zero) for name in ("table_roll", "table_pitch", "table_height"))
     return TableFrame(turned_axes(roll, pitch).transpose(0, 2, 1), pivot, height)
+
+
+def upright_axes(ranges: ParameterRanges, parameters: Array) -> Array:
+    """Return the axes that turn with the upright direction of N samples, one per row, shape (N, 3, 3).
+
+    Args:
+        ranges: Parameters that samples have.
+        parameters: Parameters of the samples, shape (N, width).
+    """
+    columns, zero = dict(zip(ranges.names, parameters.T, strict=True)), np.zeros(len(parameters))
+    return turned_axes(*(columns.get(name, zero) for name in UPRIGHT_TURN))
 
 
 def turned_axes(roll: Array, pitch: Array) -> Array:

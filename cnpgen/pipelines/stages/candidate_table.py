@@ -8,8 +8,8 @@ from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.stage import Array, CandidateBatch
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.obstacles import table_frame_of
-from cnpgen.robots.parameter_ranges import UPRIGHT_TURN
-from cnpgen.robots.table_frame import TableFrame, moved_box, turned_axes
+from cnpgen.robots import table_frame
+from cnpgen.robots.table_frame import TableFrame, moved_box
 
 
 def candidate_table(context: Context, candidates: CandidateBatch) -> TableFrame | None:
@@ -19,7 +19,7 @@ def candidate_table(context: Context, candidates: CandidateBatch) -> TableFrame 
 
 def table_corners(context: Context, candidates: CandidateBatch) -> tuple[Array, Array]:
     """Return the lower and the upper corner of the rectangle of every table: x and y [m], shape (2, n) each."""
-    columns = parameter_columns(context, candidates)
+    columns = dict(zip(context.problem.parameters.names, candidates["parameters"], strict=True))
     low, high = context.constraint(Table).bounds_of(columns)
     zero = 0 * next(iter(columns.values()))
     return np.array([value + zero for value in low]), np.array([value + zero for value in high])
@@ -27,18 +27,11 @@ def table_corners(context: Context, candidates: CandidateBatch) -> tuple[Array, 
 
 def upright_axes(context: Context, candidates: CandidateBatch) -> list[Array]:
     """Return the axes that turn with the upright direction, shape (9, n), in a list that is empty if none turns."""
-    if not context.problem.parameters.turns_upright:
+    ranges = context.problem.parameters
+    if not ranges.turns_upright:
         return []
-    columns = parameter_columns(context, candidates)
-    zero = 0 * next(iter(columns.values()))
-    axes = turned_axes(*(columns.get(name, zero) for name in UPRIGHT_TURN))
+    axes = table_frame.upright_axes(ranges, candidates["parameters"].T)
     return [np.ascontiguousarray(axes.reshape(len(axes), 9).T)]
-
-
-def parameter_columns(context: Context, candidates: CandidateBatch) -> dict[str, Array]:
-    """Return the parameters of all candidates by name, shape (n,) each."""
-    names = context.problem.parameters.names
-    return dict(zip(names, candidates["parameters"], strict=True)) if names else {}
 
 
 def in_world(context: Context, candidates: CandidateBatch, positions: Array) -> Array:
