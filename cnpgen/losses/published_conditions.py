@@ -18,6 +18,7 @@ from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.constraints.vertical import Vertical
+from cnpgen.robots.parameter_ranges import UPRIGHT_TOLERANCE
 
 MAX_POINT_SPACING_M = 0.1  # between points on the capsule axes of the robot
 
@@ -30,7 +31,9 @@ def published_conditions(constraint: Constraint, state: SymbolicState) -> tuple[
     import casadi as ca
 
     if isinstance(constraint, Vertical):
-        return _zero("orientation", "1", 1 - state.kinematics.rotation[2][2])
+        up = state.along_upright([row[2] for row in state.kinematics.rotation])
+        ratio = constraint.tolerance / state.parameters.get(UPRIGHT_TOLERANCE, constraint.tolerance)
+        return _zero("orientation", "1", (1 - up[2]) * (1 if isinstance(ratio, float) else ratio**2))
     boxes = [solid.bounds for solid in symbolic_solids(state) if isinstance(solid, SymbolicUprightBox)]
     if len(boxes) < len(state.obstacles):
         return constraint.penalized(state)

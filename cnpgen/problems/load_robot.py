@@ -65,6 +65,7 @@ def load_robot(problem: Problem) -> Robot:
         chain=chain,
         parameters=problem.parameters,
         table_origin=problem.table_origin,
+        nominal_parameters=problem.nominal_parameters,
     )
     if mistakes := list(_mistakes(problem, robot)):
         raise RecipeError(mistakes)

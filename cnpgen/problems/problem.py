@@ -13,13 +13,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import MachineError
+from cnpgen.problems.constraints.axis import TipAxis
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.constraints.object_clearance import ObjectClearance
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.objectives import Centrifugal, ObjectiveTerm
 from cnpgen.robots.obstacle import Obstacle
-from cnpgen.robots.parameter_ranges import NO_PARAMETERS, PAYLOAD_PARAMETERS, ParameterRanges
+from cnpgen.robots.parameter_ranges import (
+    NO_PARAMETERS,
+    PAYLOAD_CENTRE,
+    PAYLOAD_PARAMETERS,
+    UPRIGHT_TOLERANCE,
+    ParameterRanges,
+)
 from cnpgen.robots.robot_spec import HeldObject, LimitSpec, Payload, RobotSpec
 from cnpgen.robots.scene import PARKED_POSITION_M
 from cnpgen.robots.shape.inline import with_inline_meshes
@@ -29,7 +36,7 @@ from cnpgen.robots.solid import pose_width
 from cnpgen.robots.urdf import read_urdf
 from cnpgen.schema import registry
 from cnpgen.schema.argument_types import checked_arguments
-from cnpgen.schema.keys import NAME, field, to_dict
+from cnpgen.schema.keys import NAME, Range, field, to_dict
 from cnpgen.store.files.cache_folder import default_cache_folder, make_private_folder, trust_problem
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
@@ -138,16 +145,25 @@ class Problem:
         if self.parameters.changes_payload and self.payload is None:
             (name, *_) = (name for name in self.parameters.names if name in PAYLOAD_PARAMETERS)
             yield "parameters", f"{name} needs the body of the load: give [payload], too"
+        if (names := [name for name in self.parameters.names if name.startswith("upright_")]) and (
+            count := sum(isinstance(item, TipAxis) for item in self.constraint)
+        ) != 1:
+            yield "parameters", f"{names[0]} needs one constraint 'vertical' or 'axis', the problem has {count}"
         nominal = self.nominal_parameters.tolist()
         for name, span, value in zip(self.parameters.names, self.parameters.ranges, nominal, strict=True):
             if not span.low <= value <= span.high:
                 yield "parameters", f"{name} must include {value:g}, the value of samples without parameters"
-        if not self.parameters.tilts_table:
+        if not self.parameters.tilts_table and not self.parameters.changes_rectangle:
             return
         tables = [constraint for constraint in self.constraint if isinstance(constraint, Table)]
         if len(tables) != 1:
             yield "parameters", f"table parameters need one constraint 'table', the problem has {len(tables)}"
-        if any(table.start_band for table in tables):
+        for side in ("x", "y") if tables else ():
+            low, high = (getattr(self.parameters, f"table_{side}_{end}") for end in ("low", "high"))
+            sides: Range = getattr(tables[0], side)
+            if (low.high if low else sides.low) >= (high.low if high else sides.high):
+                yield "parameters", f"table_{side}_low must be below table_{side}_high in all samples"
+        if self.parameters.tilts_table and any(table.start_band for table in tables):
             yield "parameters", "table parameters need starts on the table: remove start_band of the constraint 'table'"
 
     @property
@@ -158,8 +174,14 @@ class Problem:
     @property
     def nominal_parameters(self) -> NDArray[np.float64]:
         """Parameters of a sample for which none are given, shape (width,)."""
-        payload, ranges = self.payload, self.parameters
-        return ranges.nominal() if payload is None else ranges.nominal(payload.mass, payload.centre)
+        values: dict[str, float] = {}
+        if (payload := self.payload) is not None:
+            values |= {"payload_mass": payload.mass} | dict(zip(PAYLOAD_CENTRE, payload.centre, strict=True))
+        if (table := self.first(Table)) is not None:
+            values |= table.bounds
+        uprights = (item for item in self.constraint if isinstance(item, TipAxis))
+        values[UPRIGHT_TOLERANCE] = next((item.nominal_tolerance for item in uprights), 0.0)
+        return self.parameters.nominal(values)
 
     @property
     def table_origin(self) -> NDArray[np.float64]:

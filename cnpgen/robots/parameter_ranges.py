@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,9 +15,12 @@ from cnpgen.schema.keys import Range, field, keys
 Array = NDArray[np.float64]
 
 TABLE_PARAMETERS = ("table_height", "table_roll", "table_pitch")
+TABLE_BOUNDS = ("table_x_low", "table_x_high", "table_y_low", "table_y_high")
+UPRIGHT_TURN = ("upright_roll", "upright_pitch")
+UPRIGHT_TOLERANCE = "upright_tolerance"
 PAYLOAD_CENTRE = ("payload_x", "payload_y", "payload_z")
 PAYLOAD_PARAMETERS = ("payload_mass", *PAYLOAD_CENTRE, "payload_inertia")
-MAX_TILT_RAD = 0.5  # of a table about each axis
+MAX_TILT_RAD = 0.5  # of a table or an upright direction about each axis
 RANGE_ROUNDING = 1e-12  # of values at the ends of a range
 
 
@@ -43,6 +46,36 @@ class ParameterRanges:
         since_version=2,
         low=-MAX_TILT_RAD,
         high=MAX_TILT_RAD,
+    )
+    table_x_low: Range | None = field(
+        "lower bound of the table's rectangle along its x axis", unit="m", default=None, since_version=2
+    )
+    table_x_high: Range | None = field("upper bound along x", unit="m", default=None, since_version=2)
+    table_y_low: Range | None = field("lower bound along y", unit="m", default=None, since_version=2)
+    table_y_high: Range | None = field("upper bound along y", unit="m", default=None, since_version=2)
+    upright_roll: Range | None = field(
+        "turn about world x of the direction of the constraint 'vertical' or 'axis'",
+        unit="rad",
+        default=None,
+        since_version=2,
+        low=-MAX_TILT_RAD,
+        high=MAX_TILT_RAD,
+    )
+    upright_pitch: Range | None = field(
+        "its turn about world y, after the roll",
+        unit="rad",
+        default=None,
+        since_version=2,
+        low=-MAX_TILT_RAD,
+        high=MAX_TILT_RAD,
+    )
+    upright_tolerance: Range | None = field(
+        "'angle' of the constraint 'axis', or 'tolerance' of an aligned axis and of 'vertical'",
+        unit="rad",
+        default=None,
+        since_version=2,
+        low=1e-4,
+        high=1.5,
     )
     velocity_factor: Range | None = field(
         "joint velocity limit, as a fraction of that of [limits]", default=None, since_version=2, low=1e-3, high=1.0
@@ -92,6 +125,16 @@ class ParameterRanges:
         return any(name in TABLE_PARAMETERS for name in self.names)
 
     @property
+    def changes_rectangle(self) -> bool:
+        """Whether the rectangle of the table differs from sample to sample."""
+        return any(name in TABLE_BOUNDS for name in self.names)
+
+    @property
+    def turns_upright(self) -> bool:
+        """Whether the direction of ``vertical`` or ``axis`` differs from sample to sample."""
+        return any(name in UPRIGHT_TURN for name in self.names)
+
+    @property
     def changes_payload(self) -> bool:
         """Whether the payload differs from sample to sample."""
         return any(name in PAYLOAD_PARAMETERS for name in self.names)
@@ -99,17 +142,15 @@ class ParameterRanges:
     def __len__(self) -> int:
         return len(self.names)
 
-    def nominal(self, payload_mass: float = 0.0, payload_centre: Sequence[float] = (0.0, 0.0, 0.0)) -> Array:
+    def nominal(self, values: Mapping[str, float]) -> Array:
         """Return the values of a sample without parameters, shape (width,).
 
         Args:
-            payload_mass: Mass of the problem's payload [kg].
-            payload_centre: Its centre of mass in the tip frame [m], shape (3,).
+            values: Values of the problem file for parameters that do not describe a change, by name.
         """
-        values = dict.fromkeys(TABLE_PARAMETERS, 0.0) | dict(zip(PAYLOAD_CENTRE, payload_centre, strict=True))
-        values |= {"velocity_factor": 1.0, "acceleration_factor": 1.0}
-        values |= {"payload_mass": payload_mass, "payload_inertia": 1.0}
-        return np.array([values[name] for name in self.names], np.float64)
+        factors = ("velocity_factor", "acceleration_factor", "payload_inertia")
+        nominal = dict.fromkeys(self.names, 0.0) | dict.fromkeys(factors, 1.0) | dict(values)
+        return np.array([nominal[name] for name in self.names], np.float64)
 
     def split(self, values: Sequence[Any] | Array, nominal: Array) -> tuple[Any, dict[str, Any]]:
         """Split the values of a scene after its obstacles: those for a constraint, and the parameters by name.

@@ -51,6 +51,7 @@ class Robot:
         held_shape: Link geometry and the held object, for collisions between the two; None if these are not checked.
         parameters: Parameters that differ from sample to sample.
         table_origin: Point about which the table turns, the center of its rectangle [m], shape (3,).
+        nominal_parameters: Parameters of a sample for which none are given, shape (width,).
     """
 
     urdf: Path
@@ -71,6 +72,7 @@ class Robot:
     held_shape: Shape | None = None
     parameters: ParameterRanges = NO_PARAMETERS
     table_origin: Array = field(default_factory=lambda: np.zeros(3))
+    nominal_parameters: Array = field(default_factory=lambda: np.empty(0))
 
     @property
     def n(self) -> int:
@@ -81,16 +83,6 @@ class Robot:
     def sliding(self) -> tuple[bool, ...]:
         """Whether each joint is prismatic [m] and not revolute [rad]."""
         return tuple(joint.prismatic for joint in self.chain.joints)
-
-    @cached_property
-    def nominal_parameters(self) -> Array:
-        """Parameters of a sample for which none are given, shape (width,)."""
-        payload = self.attached.payload
-        return (
-            self.parameters.nominal()
-            if payload is None
-            else self.parameters.nominal(payload.mass, payload.com.tolist())
-        )
 
     def units(self, turning: str) -> str:
         """Return the units of a joint quantity from its unit for revolute joints; see ``units_of_joints``."""

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.robots.parameter_ranges import ParameterRanges
+from cnpgen.robots.parameter_ranges import UPRIGHT_TURN, ParameterRanges
 
 Array = NDArray[np.float64]
 
@@ -59,9 +59,24 @@ def table_frame(ranges: ParameterRanges, pivot: Array, parameters: Array) -> Tab
     columns = dict(zip(ranges.names, parameters.T, strict=True))
     zero = np.zeros(len(parameters))
     roll, pitch, height = (columns.get(name, zero) for name in ("table_roll", "table_pitch", "table_height"))
+    return TableFrame(turned_axes(roll, pitch).transpose(0, 2, 1), pivot, height)
+
+
+def upright_axes(ranges: ParameterRanges, parameters: Array) -> Array:
+    """Return the axes that turn with the upright direction of N samples, one per row, shape (N, 3, 3).
+
+    Args:
+        ranges: Parameters that samples have.
+        parameters: Parameters of the samples, shape (N, width).
+    """
+    columns, zero = dict(zip(ranges.names, parameters.T, strict=True)), np.zeros(len(parameters))
+    return turned_axes(*(columns.get(name, zero) for name in UPRIGHT_TURN))
+
+
+def turned_axes(roll: Array, pitch: Array) -> Array:
+    """Return the axes x, y and z after N rolls and then pitches [rad], one per row, shape (N, 3, 3)."""
     axes = table_axes(np.sin(roll), np.cos(roll), np.sin(pitch), np.cos(pitch))
-    matrices = np.array([[component + zero for component in axis] for axis in axes]).transpose(2, 1, 0)
-    return TableFrame(matrices, pivot, height)
+    return np.array([[component + np.zeros(len(roll)) for component in axis] for axis in axes]).transpose(2, 0, 1)
 
 
 def table_axes(sin_roll: Any, cos_roll: Any, sin_pitch: Any, cos_pitch: Any) -> tuple[list[Any], ...]:

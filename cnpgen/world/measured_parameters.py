@@ -1,15 +1,16 @@
-"""Parameters of a sample in Pinocchio's terms: the inertia of the load and the pose of the table."""
+"""Parameters of a sample in Pinocchio's terms: inertia of the load, pose of the table, upright direction."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.robots.chain import frame_of
-from cnpgen.robots.parameter_ranges import PAYLOAD_CENTRE
+from cnpgen.robots.parameter_ranges import PAYLOAD_CENTRE, UPRIGHT_TURN
 from cnpgen.robots.robot import Robot, reduced_model
 
 if TYPE_CHECKING:
@@ -31,9 +32,10 @@ class MeasuredParameters:
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
         self.model = robot.model
-        self.values: dict[str, float] = {}
-        self.scene_values = np.empty(0)
+        self.scene_values: Array = np.empty(0)
+        self.values: dict[str, float] = robot.parameters.split(np.empty(0), robot.nominal_parameters)[1]
         self._turn, self._origin = np.eye(3), np.zeros(3)
+        self._upright = np.eye(3)
         self._load: tuple[int, pin.Inertia, pin.SE3] | None = None
         if self.changes_payload:
             self._hold_load()
@@ -45,6 +47,8 @@ class MeasuredParameters:
             self._set_load()
         if self._robot.parameters.tilts_table:
             self._set_table()
+        if self._robot.parameters.turns_upright:
+            self._upright = self._turned(*UPRIGHT_TURN)
 
     @property
     def changes_payload(self) -> bool:
@@ -71,6 +75,12 @@ class MeasuredParameters:
         """Return vectors along the axes of the table, shape (3,) or (3, K)."""
         return np.asarray(self._turn.T @ vector) if self._robot.parameters.tilts_table else vector
 
+    def along_upright(self, vector: Sequence[Any] | Array) -> Array:
+        """Return vectors along axes that parameters turn with the upright direction, shape (3, ...)."""
+        if not self._robot.parameters.turns_upright:
+            return np.asarray(vector)
+        return np.tensordot(self._upright.T, np.asarray(vector), axes=1)
+
     def _hold_load(self) -> None:
         """Copy the model, and keep the last body without its load."""
         robot = self._robot
@@ -93,8 +103,12 @@ class MeasuredParameters:
         self.model.inertias[joint] = bare + placement.act(body)
 
     def _set_table(self) -> None:
+        self._turn = self._turned("table_roll", "table_pitch")
+        self._origin = self._robot.table_origin + np.array([0.0, 0.0, self.values.get("table_height", 0.0)])
+
+    def _turned(self, *names: str) -> Array:
+        """Return the rotation by two parameters, Ry(pitch) Rx(roll)."""
         import pinocchio as pin
 
-        roll, pitch = (self.values.get(name, 0.0) for name in ("table_roll", "table_pitch"))
-        self._turn = pin.rpy.rpyToMatrix(roll, pitch, 0.0)  # Ry(pitch) Rx(roll)
-        self._origin = self._robot.table_origin + np.array([0.0, 0.0, self.values.get("table_height", 0.0)])
+        roll, pitch = (self.values.get(name, 0.0) for name in names)
+        return np.asarray(pin.rpy.rpyToMatrix(roll, pitch, 0.0))

@@ -126,8 +126,26 @@ def test_the_simulator_holds_the_load_of_each_plan() -> None:
         found[mass] = simulate_plans(one).executed[0]
         assert found[mass] == simulate_plans(alone).executed[0]
     assert found[4.0] != found[14.0]
-    with pytest.raises(UsageError, match="tilted tables"):
-        simulate_plans(draw_boundary_problems("airhockey-tables", 1, seed=1))
+
+
+def test_the_simulator_moves_the_table_of_each_plan() -> None:
+    plans = cnpgen.solve_plans(draw_boundary_problems("airhockey-tables", 2, seed=1)).plans
+    for result in simulate_plans(plans).executed:
+        assert result.hit
+        assert not result.touched_early
+        assert result.plane_error < 5e-4
+    swapped = replace(plans, boundary=replace(plans.boundary, parameters=plans.boundary.parameters[::-1].copy()))
+    assert all(result.plane_error > 5e-3 for result in simulate_plans(swapped).executed)
+    with pytest.raises(UsageError, match="the environment's table does not move"):
+        simulate_plans(plans, environment="clone")
+
+
+def test_an_unmoved_table_is_simulated_as_without_parameters() -> None:
+    plans = cnpgen.solve_plans(draw_boundary_problems("airhockey-hit", 1, seed=1)).plans
+    still = replace(
+        plans, problem=record_problem(TABLES), boundary=replace(plans.boundary, parameters=np.array([[0, 0, 0, 1.0]]))
+    )
+    assert simulate_plans(still).executed == simulate_plans(plans).executed
 
 
 def test_table_coordinates_are_those_of_pinocchio() -> None:

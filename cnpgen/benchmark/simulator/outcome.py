@@ -78,23 +78,23 @@ def outcome_of(scene: SimulatorScene, reference: Reference, goal_xyz: Array, rec
         record: Record of all ticks.
     """
     ticks, height = min(reference.ticks, len(record.q)), scene.height
-    during = slice(0, ticks)
+    during, tip = slice(0, ticks), scene.on_table(record.tip)
     goal_distance = float(np.linalg.norm(record.tip[ticks - 1] - goal_xyz))
     executed = Executed(
         finished=goal_distance < MAX_GOAL_DISTANCE_M,
         goal_distance=goal_distance,
-        z_error=np.nan if height is None else TICK_S * float(np.abs(record.tip[during, 2] - height).sum()),
+        z_error=np.nan if height is None else TICK_S * float(np.abs(tip[during, 2] - height).sum()),
         vertical_error=np.nan
         if height is not None
-        else TICK_S * float(tilt(record.rotation[during].transpose(1, 2, 0)).sum()),
+        else TICK_S * float(tilt((scene.upright.T @ record.rotation[during]).transpose(1, 2, 0)).sum()),
         tracking_error=TICK_S * float(np.abs(record.q[during] - record.reference[during]).sum()),
         torque_use=float(np.abs(record.torque_use).max()),
         violated_steps=record.violated_steps,
         penalty=record.penalty,
     )
-    planned_tip = _tip_positions(scene, reference.q[: reference.ticks])
+    planned_tip = scene.on_table(_tip_positions(scene, reference.q[: reference.ticks]))
     if height is not None:
-        executed = _with_table(executed, record, planned_tip[:, 2] - height, record.tip[during, 2] - height)
+        executed = _with_table(executed, record, planned_tip[:, 2] - height, tip[during, 2] - height)
     if scene.puck is None:
         return replace(executed, collided=record.max_penetration > MAX_LEGAL_PENETRATION_M)
     return _with_puck(executed, record, planned_tip)

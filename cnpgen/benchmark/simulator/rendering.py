@@ -108,7 +108,8 @@ def _renderer(scene: SimulatorScene) -> Iterator[Any]:
     def draw(execution: Execution, tick: int) -> Image:
         data.qpos[:] = execution.states[tick]
         if model.nmocap and scene.height is not None:
-            data.mocap_pos[0] = execution.tip[tick] - [0.0, 0.0, hockey.MALLET_HEIGHT_M]
+            data.mocap_pos[0] = execution.tip[tick] - hockey.MALLET_HEIGHT_M * scene.table_rotation[:, 2]
+            mujoco.mju_mat2Quat(data.mocap_quat[0], np.ravel(scene.table_rotation))
         mujoco.mj_forward(model, data)
         renderer.update_scene(data, camera)
         return np.array(renderer.render())

@@ -23,6 +23,7 @@ from cnpgen.plans.plans import Plans
 from cnpgen.plans.tips import correct_tips
 from cnpgen.problems.problem_record import open_problem, with_payload_of
 from cnpgen.robots.robot import Robot
+from cnpgen.robots.table_frame import table_frame, upright_axes
 from cnpgen.schema.argument_types import checked_arguments
 
 Array = NDArray[np.float64]
@@ -95,19 +96,19 @@ def simulate_plans(
         progress: Called with the number of plans executed since the last call.
 
     Raises:
-        UsageError: The plant is unknown, there is less than one worker, parameters of the problem move the table, or
-            ``environment`` is not a clone or does not support the plans.
+        UsageError: The plant is unknown, there is less than one worker, or ``environment`` is not a clone or does not
+            support the plans.
         RecipeError: MuJoCo cannot simulate the robot, or the problem needs a plug-in that is not installed.
         MachineError: MuJoCo is missing, the environment cannot be imported, or a worker died.
     """
     plant, plans = as_plant(plant), correct_tips(plans)
-    if plans.problem.parameters.tilts_table:
-        raise UsageError(
-            f"plans of {plans.problem.name!r} are not simulated: the simulator has no raised and tilted tables",
-            concerns="plans",
-        )
     load_mujoco()
     if environment is not None:
+        if plans.problem.parameters.tilts_table:
+            raise UsageError(
+                f"plans of {plans.problem.name!r} are not simulated: the environment's table does not move",
+                concerns="plans",
+            )
         plant = challenge_plant(environment)
         check_challenge(*open_problem(plans.problem))
     count = worker_count(
@@ -124,18 +125,9 @@ def simulate_plans(
 
 def _simulate(plan: Plans, *, plant: Plant) -> Executed:
     try:
-        return execute_plan(_with_own_payload(plan), plant)[2].executed
+        return execute_plan(plan, plant)[2].executed
     except UsageError as error:
         return Executed(failure=str(error))
-
-
-def _with_own_payload(plan: Plans) -> Plans:
-    """Return a plan of a problem with parameters as one of the problem with the payload of this plan."""
-    values = plan.boundary.parameters
-    if values is None:
-        return plan
-    own = with_payload_of(plan.problem, values[0])
-    return replace(plan, problem=own, boundary=replace(plan.boundary, parameters=None))
 
 
 def execute_plan(plan: Plans, plant: Plant) -> tuple[SimulatorScene, Reference, Execution]:
@@ -182,21 +174,28 @@ def execute_states(
 def simulator_scene(problem: Plans, plant: Plant) -> SimulatorScene:
     """Build the simulated world of one boundary problem: obstacles, and the puck if the goal is a hit.
 
-    The columns ``puck_xy`` [m] and ``puck_velocity`` [m/s] of hits of moving pucks define the puck at the start.
+    Parameters of the problem determine the load, the pose of the table and the upright direction. The columns
+    ``puck_xy`` [m] and ``puck_velocity`` [m/s] of hits of moving pucks define the puck at the start.
 
     Args:
         problem: One boundary problem, or a plan for it.
         plant: The robot.
     """
-    loaded, robot = open_problem(problem.problem)
-    goal_xyz, scene = problem.columns["goal_xyz"][0], SimulatorScene(loaded, robot, plant, problem.scene.poses[0])
+    record, values = problem.problem, problem.boundary.parameters
+    loaded, robot = open_problem(record if values is None else with_payload_of(record, values[0]))
+    scene = SimulatorScene(loaded, robot, plant, problem.scene.poses[0])
+    if values is not None:
+        table, up = table_frame(record.parameters, loaded.table_origin, values), upright_axes(record.parameters, values)
+        position = table.to_world(np.zeros((1, 3)))[0]
+        scene = replace(scene, table_rotation=table.axes[0], table_position=position, upright=up[0].T)
     if scene.height is None:
         return scene
     if "puck_xy" in problem.columns:
         puck, (vx, vy) = problem.columns["puck_xy"][0], problem.columns["puck_velocity"][0].tolist()
         return replace(scene, puck=puck, puck_velocity=(vx, vy))
     velocity = _tip_velocity(robot, problem.boundary.goal_q[0], problem.boundary.goal_dq[0])
-    return replace(scene, puck=puck_of(goal_xyz, velocity))
+    goal_xyz = scene.on_table(problem.columns["goal_xyz"][0])
+    return replace(scene, puck=puck_of(goal_xyz, velocity @ scene.table_rotation))
 
 
 def _tip_velocity(robot: Robot, q: Array, dq: Array) -> Array:

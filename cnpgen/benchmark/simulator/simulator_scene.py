@@ -7,7 +7,7 @@ Joints and obstacles have numbers as names, because their own names are untruste
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,8 +68,11 @@ class SimulatorScene:
         robot: Its robot.
         plant: Deviations from the nominal model.
         obstacle_poses: Poses and sizes of the obstacles, shape (width,).
-        puck: Position of the puck [m], shape (2,), or None.
-        puck_velocity: Velocity of the puck at the start [m/s].
+        puck: Position of the puck on the table [m], shape (2,), or None.
+        puck_velocity: Velocity of the puck on the table at the start [m/s].
+        table_rotation: Axes of the table in the world, columns x, y and the normal, shape (3, 3).
+        table_position: Origin of the table's coordinates in the world [m], shape (3,).
+        upright: Axes of which the last is the upright direction, as columns, shape (3, 3).
     """
 
     problem: Problem
@@ -78,12 +81,19 @@ class SimulatorScene:
     obstacle_poses: Array
     puck: Array | None = None
     puck_velocity: tuple[float, float] = (0.0, 0.0)
+    table_rotation: Array = field(default_factory=lambda: np.eye(3))
+    table_position: Array = field(default_factory=lambda: np.zeros(3))
+    upright: Array = field(default_factory=lambda: np.eye(3))
 
     @property
     def height(self) -> float | None:
         """Height of the tip over the table [m]; None without a table."""
         table = self.problem.first(Table)
         return None if table is None else table.z
+
+    def on_table(self, positions: Array) -> Array:
+        """Return positions in the world [m] in coordinates of the table, shape (..., 3)."""
+        return np.asarray((positions - self.table_position) @ self.table_rotation)
 
 
 def scene_xml(scene: SimulatorScene) -> str:
@@ -118,7 +128,7 @@ def _arm(scene: SimulatorScene) -> Iterator[str]:
         zip(chain.joints, ends, joint_friction(scene.problem, scene.robot), strict=True)
     ):
         kind = "slide" if joint.prismatic else "hinge"
-        place = f'pos="{_numbers(joint.translation)}" quat="{_quaternion(joint.rotation)}"'
+        place = f'pos="{_numbers(joint.translation)}" quat="{quaternion(joint.rotation)}"'
         yield f'<body name="link {index + 1}" {place}>{_inertial(joint, scene.plant.mass)}'
         yield f'<joint name="joint {index + 1}" type="{kind}" axis="{_numbers(joint.axis)}"'
         yield f' damping="{friction.viscous}" frictionloss="{friction.dry}"/>'
@@ -127,7 +137,7 @@ def _arm(scene: SimulatorScene) -> Iterator[str]:
             radius, color = (0.012, "0.3 0.3 0.3 1") if is_last else (LINK_RADIUS_M, "1 0.55 0.15 1")
             yield f'<geom name="link {index + 1}" type="capsule" fromto="0 0 0 {_numbers(end)}" size="{radius}"'
             yield f' rgba="{color}"/>'
-    yield f'<body name="tip" pos="{_numbers(chain.tip_translation)}" quat="{_quaternion(chain.tip_rotation)}">'
+    yield f'<body name="tip" pos="{_numbers(chain.tip_translation)}" quat="{quaternion(chain.tip_rotation)}">'
     yield '<site name="tip" size="0.001"/>'
     yield f'<geom name="mallet" type="sphere" size="{MALLET_POINT_RADIUS_M}"/>'
     if scene.problem.object_size is not None:
@@ -158,6 +168,8 @@ def _environment(scene: SimulatorScene) -> Iterator[str]:
     if scene.height is None:
         return
     surface = scene.height - hockey.MALLET_HEIGHT_M
+    place = f'pos="{_numbers(scene.table_position)}" quat="{quaternion(scene.table_rotation)}"'
+    yield f'<body name="table" {place}>'
     center = hockey.HOME_M + hockey.LENGTH_M / 2
     yield f'<geom type="box" pos="{center} 0 {surface - 0.02}" size="{hockey.LENGTH_M / 2} {hockey.WIDTH_M / 2} 0.02"'
     yield ' rgba="0.97 0.97 1 1"/>'
@@ -169,6 +181,7 @@ def _environment(scene: SimulatorScene) -> Iterator[str]:
         yield ' rgba="0.5 0.5 0.5 1"/>'
     if scene.puck is not None:
         yield from _puck(surface, scene.height)
+    yield "</body>"
     yield '<body name="shown mallet" mocap="true">'
     yield f'<geom type="cylinder" size="{hockey.MALLET_RADIUS_M} 0.01" pos="0 0 0.01" rgba="0.15 0.15 0.15 1"/>'
     yield f'<geom type="cylinder" size="0.015 {hockey.MALLET_HEIGHT_M / 2}" pos="0 0 {hockey.MALLET_HEIGHT_M / 2}"'
@@ -208,12 +221,12 @@ def _obstacles(scene: SimulatorScene) -> Iterator[tuple[str, Obstacle, Solid]]:
 def _puck(surface: float, height: float) -> Iterator[str]:
     """Yield the puck: a disc for the bands, and a disc with the sum of both radii for the mallet.
 
-    The coordinates are those of its centre in the world. The larger disc extends from below the table to the height at
-    which the mallet's lower face passes over the puck.
+    The coordinates are those of its centre on the table. The larger disc extends from below the table to the height at
+    which the mallet's lower face passes over the puck. Gravity does not move the puck on a tilted table.
     """
     inertia = f"{PUCK_INERTIA} {PUCK_INERTIA} {2 * PUCK_INERTIA}"
     low, high = height - 0.05, height + hockey.PUCK_HEIGHT_M
-    yield f'<body name="puck" pos="0 0 {surface}">'
+    yield f'<body name="puck" pos="0 0 {surface}" gravcomp="1">'
     yield f'<inertial pos="0 0 0" mass="{hockey.PUCK_MASS_KG}" diaginertia="{inertia}"/>'
     yield f'<joint name="puck x" type="slide" axis="1 0 0" damping="{hockey.PUCK_DRAG_N_S_M}"/>'
     yield f'<joint name="puck y" type="slide" axis="0 1 0" damping="{hockey.PUCK_DRAG_N_S_M}"/>'
@@ -246,7 +259,7 @@ def _pairs(scene: SimulatorScene) -> Iterator[str]:
             yield f'<pair geom1="{name}" geom2="{obstacle}" {_SOFT}/>'
 
 
-def _quaternion(rotation: Array) -> str:
+def quaternion(rotation: Array) -> str:
     """Write a rotation matrix as MuJoCo's quaternion, scalar first."""
     from scipy.spatial.transform import Rotation
 

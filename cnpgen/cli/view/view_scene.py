@@ -277,8 +277,9 @@ def _world(problem: Problem, scene: Scene) -> Iterator[Body]:
             yield wrapped(obstacle.name, 0, solid.position + solid.corners, solid.radius)
     contact, table = problem.first(PuckContact), problem.first(Table)
     if table is not None:
-        low = np.array([table.x.low, table.y.low, table.z - DRAWN_TABLE_M])
-        corners = _corners(low, np.array([table.x.high, table.y.high, table.z]))
+        values = scene.poses[0, problem.scene_width - len(problem.parameters) :]
+        low, high = table.bounds_of(dict(zip(problem.parameters.names, values.tolist(), strict=True)))
+        corners = _corners(np.array([*low, table.z - DRAWN_TABLE_M]), np.array([*high, table.z]))
         yield wrapped("table", 0, _on_table(problem, scene, corners), 0.0)
     if contact is not None:
         x, y = scene.poses[0, pose_width(scene.obstacles) :][2:4]

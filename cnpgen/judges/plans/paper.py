@@ -5,7 +5,7 @@ They follow the authors' baselines and tables. The constraints of a problem dete
 * joint velocity and torque within the nominal limits, those before the problem's scales; on a table also accelerations,
   with the scale of the velocity (the rules for the heavy object have none);
 * on a table: the tip within 1 cm of its height and of its rectangle over the whole motion;
-* with a vertical constraint: ``1 - R_22 < 0.05`` (18 degrees);
+* with a vertical constraint: ``1 - R_22 < 0.05`` (18 degrees), along the upright direction of the sample;
 * a held object: the distance of its center from every obstacle above half its height minus 2 cm, no corner deeper than
   2 cm;
 * the tip ends within 1 cm of the goal.
@@ -60,9 +60,12 @@ def _checks(problem: Problem, world: PathWorld, obstacle_poses: Array) -> Iterat
         ):
             yield constraint.reason, _is_nominal(constraint, problem, world)
         elif isinstance(constraint, Table):
-            yield constraint.reason, _is_on_table(constraint, world.parameters.on_table(world.tip_position))
+            yield constraint.reason, _is_on_table(constraint, world)
         elif isinstance(constraint, Vertical):
-            yield constraint.reason, bool(np.all(1 - world.tip_rotation[2, 2] < MAX_TILT))
+            yield (
+                constraint.reason,
+                bool(np.all(1 - world.parameters.along_upright(world.tip_rotation)[2, 2] < MAX_TILT)),
+            )
         elif isinstance(constraint, ObjectContact):
             yield constraint.reason, _is_clear(problem, world, obstacle_poses)
 
@@ -80,9 +83,10 @@ def _is_nominal(constraint: Constraint, problem: Problem, world: PathWorld) -> b
     return bool(np.all(np.abs(values) <= limit[:, None]))
 
 
-def _is_on_table(table: Table, tip: Array) -> bool:
-    low = np.array([table.x.low, table.y.low, table.z]) - TABLE_TOLERANCE_M
-    high = np.array([table.x.high, table.y.high, table.z]) + TABLE_TOLERANCE_M
+def _is_on_table(table: Table, world: PathWorld) -> bool:
+    tip, corners = world.parameters.on_table(world.tip_position), table.bounds_of(world.parameters.values)
+    low, high = (np.array([*corner, table.z], float) for corner in corners)
+    low, high = low - TABLE_TOLERANCE_M, high + TABLE_TOLERANCE_M
     return bool(np.all((low[:, None] < tip) & (tip < high[:, None])))
 
 
@@ -128,7 +132,9 @@ def metrics_of(problem: Problem, world: PathWorld, samples: Samples, jerk: Array
         jerk=float(np.max(np.abs(jerk) / robot.jerk_limit[:, None])),
         hit_speed=float(np.linalg.norm(world.tip_velocity_at(-1))),
         z_error=np.nan if table is None else samples.integral(np.abs(tip[2] - table.z)),
-        vertical_error=samples.integral(tilt(world.tip_rotation)) if upright else np.nan,
+        vertical_error=samples.integral(tilt(world.parameters.along_upright(world.tip_rotation)))
+        if upright
+        else np.nan,
     )
 
 

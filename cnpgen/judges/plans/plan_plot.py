@@ -245,7 +245,8 @@ def _draw_over_table(figure: "SubFigure", table: Table, world: PathWorld, s: Arr
     """Draw the tip from above in the rectangle, and its height over time in the valid band."""
     above, beside = figure.subplots(2, 1, height_ratios=[1.5, 1.0])
     x, y, z = world.parameters.on_table(world.tip_position)
-    _draw_rectangle(above, (table.x.low, table.x.high), (table.y.low, table.y.high), fill=False)
+    low, high = table.bounds_of(world.parameters.values)
+    _draw_rectangle(above, (low[0], high[0]), (low[1], high[1]), fill=False)
     _draw_tip_path(above, x, y)
     above.set_aspect("equal")
     above.margins(0.08)

@@ -9,7 +9,7 @@ from cnpgen.kernels.symbolic.dynamics import Load, acceleration_at, body_motions
 from cnpgen.kernels.symbolic.kinematics import Kinematics, bias_acceleration, forward_kinematics, tip_velocity
 from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, constants, cross, dot, scale, subtract, symbols, times
 from cnpgen.robots.obstacle import Obstacle
-from cnpgen.robots.parameter_ranges import PAYLOAD_CENTRE, PAYLOAD_PARAMETERS
+from cnpgen.robots.parameter_ranges import PAYLOAD_CENTRE, PAYLOAD_PARAMETERS, UPRIGHT_TURN
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.capsule import Capsule
 from cnpgen.robots.shape.shape import Shape
@@ -88,13 +88,21 @@ class SymbolicState:
         axes = self._table_axes
         return vector if axes is None else [dot(axis, vector) for axis in axes]
 
+    def along_upright(self, vector: Vec) -> Vec:
+        """Return a vector along axes that are the world's unless parameters turn the upright direction."""
+        if not self.robot.parameters.turns_upright:
+            return vector
+        return [dot(axis, vector) for axis in self._turned_axes(*UPRIGHT_TURN)]
+
     @cached_property
     def _table_axes(self) -> tuple[Vec, ...] | None:
+        return self._turned_axes("table_roll", "table_pitch") if self.robot.parameters.tilts_table else None
+
+    def _turned_axes(self, *names: str) -> tuple[Vec, ...]:
+        """Return axes that two parameters turn: a roll, then a pitch."""
         import casadi as ca
 
-        if not self.robot.parameters.tilts_table:
-            return None
-        roll, pitch = (ca.SX(self.parameters.get(name, 0.0)) for name in ("table_roll", "table_pitch"))
+        roll, pitch = (ca.SX(self.parameters.get(name, 0.0)) for name in names)
         return table_axes(ca.sin(roll), ca.cos(roll), ca.sin(pitch), ca.cos(pitch))
 
     @cached_property

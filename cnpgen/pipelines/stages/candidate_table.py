@@ -1,4 +1,4 @@
-"""The table of candidates, which parameters of the problem may move, and the factors of their limits."""
+"""Table and upright direction of candidates, which parameters of the problem may move, and factors of limits."""
 
 from collections.abc import Sequence
 
@@ -6,13 +6,32 @@ import numpy as np
 
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.stage import Array, CandidateBatch
+from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.obstacles import table_frame_of
+from cnpgen.robots import table_frame
 from cnpgen.robots.table_frame import TableFrame, moved_box
 
 
 def candidate_table(context: Context, candidates: CandidateBatch) -> TableFrame | None:
     """Return the frame of the table of every candidate; None if no parameters move the table."""
     return table_frame_of(context.problem, candidates["parameters"].T if context.problem.parameters else None)
+
+
+def table_corners(context: Context, candidates: CandidateBatch) -> tuple[Array, Array]:
+    """Return the lower and the upper corner of the rectangle of every table: x and y [m], shape (2, n) each."""
+    columns = dict(zip(context.problem.parameters.names, candidates["parameters"], strict=True))
+    low, high = context.constraint(Table).bounds_of(columns)
+    zero = 0 * next(iter(columns.values()))
+    return np.array([value + zero for value in low]), np.array([value + zero for value in high])
+
+
+def upright_axes(context: Context, candidates: CandidateBatch) -> list[Array]:
+    """Return the axes that turn with the upright direction, shape (9, n), in a list that is empty if none turns."""
+    ranges = context.problem.parameters
+    if not ranges.turns_upright:
+        return []
+    axes = table_frame.upright_axes(ranges, candidates["parameters"].T)
+    return [np.ascontiguousarray(axes.reshape(len(axes), 9).T)]
 
 
 def in_world(context: Context, candidates: CandidateBatch, positions: Array) -> Array:

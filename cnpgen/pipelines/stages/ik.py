@@ -11,6 +11,7 @@ from cnpgen.kernels.symbolic.kinematics import Kinematics, forward_kinematics
 from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, dot, gram, scale, solve, subtract, symbols
 from cnpgen.kernels.tape import Loop
 from cnpgen.pipelines.context import Context
+from cnpgen.pipelines.stages.candidate_table import upright_axes
 from cnpgen.pipelines.stages.draw import uniform
 from cnpgen.pipelines.stages.stage import CandidateBatch, Stage, StageFunction
 from cnpgen.robots.robot import Robot
@@ -40,8 +41,9 @@ class _IK(Stage):
         low, high = context.robot.position_lower[:, None], context.robot.position_upper[:, None]
 
         def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
-            held = (candidates["held"],) if hold else ()
-            q, error = kernel(candidates[initial], candidates[f"{end}_xyz"], *held)
+            more = [candidates["held"]] if hold else []
+            more += upright_axes(context, candidates) if self.orientation == "vertical" else []
+            q, error = kernel(candidates[initial], candidates[f"{end}_xyz"], *more)
             candidates[f"{end}_q"] = q
             candidates.reject(error[0] < IK_TOLERANCE, f"no inverse kinematics of the {end}")
             q = candidates[f"{end}_q"]
@@ -211,7 +213,8 @@ def ik_step(robot: Robot, *, vertical: bool, max_step: float, hold: bool = False
 
     Args:
         robot: Robot.
-        vertical: Whether the tip's z axis must be vertical, too.
+        vertical: Whether the tip's z axis must be vertical, too. If parameters of the problem turn the upright
+            direction, the last argument has three axes, of which the last is the direction, shape (9,).
         max_step: Maximum change of a joint [rad].
         hold: Whether there is a third argument, 1 for joints that stay constant and 0 for the others.
     """
@@ -222,8 +225,10 @@ def ik_step(robot: Robot, *, vertical: bool, max_step: float, hold: bool = False
     kin = forward_kinematics(robot.chain, q)
     rows = [[column[row] for column in kin.jacobian] for row in range(3)]
     error = subtract(p, kin.tip)
+    turned = vertical and robot.parameters.turns_upright
+    axes_sx, axes = symbols("axes", 9)
     if vertical:
-        tilt, tilt_rows = _tilt(kin)
+        tilt, tilt_rows = _tilt(kin, [axes[:3], axes[3:6], axes[6:]] if turned else None)
         error, rows = [*error, *tilt], [*rows, *tilt_rows]
     if hold:
         rows = [[x * (1 - stays) for x, stays in zip(row, held, strict=True)] for row in rows]
@@ -239,22 +244,25 @@ def ik_step(robot: Robot, *, vertical: bool, max_step: float, hold: bool = False
     left = [[x * ok for x, ok in zip(row, free, strict=True)] for row in rows]
     again, _ = clipped_step(left, rest, max_step, IK_DAMPING + ca.fmin(MAX_LIMIT_DAMPING, LIMIT_DAMPING_RATE * square))
     following = [_clip(x, robot, i) for i, x in enumerate(add(add(q, moved), again))]
-    given = [q_sx, p_sx, held_sx] if hold else [q_sx, p_sx]
+    given = [q_sx, p_sx, *([held_sx] if hold else []), *([axes_sx] if turned else [])]
     return ca.Function("ik", given, [ca.vertcat(*following), ca.sqrt(square)])
 
 
-def _tilt(kin: Kinematics) -> tuple[Vec, list[Vec]]:
-    """Return the angular error of the tip's z axis about world x and y, and its Jacobian rows.
+def _tilt(kin: Kinematics, frame: list[Vec] | None) -> tuple[Vec, list[Vec]]:
+    """Return the angular error of the tip's z axis about x and y of a frame, and its Jacobian rows.
 
-    The error is ``z x e_z`` scaled by ``2 / (1 + z_z) = 2 tan(angle / 2) / sin(angle)``, so that the inverted
-    orientation is not a fixed point.
+    The frame is the world if it is None. The error is ``z x e_z`` scaled by
+    ``2 / (1 + z_z) = 2 tan(angle / 2) / sin(angle)``, so that the inverted orientation is not a fixed point.
     """
     import casadi as ca
 
-    up = [row[2] for row in kin.rotation]
+    up, turns_about = [row[2] for row in kin.rotation], kin.axes
+    if frame is not None:
+        up = [dot(axis, up) for axis in frame]
+        turns_about = [[dot(axis, turning) for axis in frame] for turning in kin.axes]
     stretch = 2.0 / ca.fmax(1.0 + up[2], 1e-3)
     rows = [
-        [axis[row] if turns else 0.0 for axis, turns in zip(kin.axes, kin.turning, strict=True)] for row in range(2)
+        [axis[row] if turns else 0.0 for axis, turns in zip(turns_about, kin.turning, strict=True)] for row in range(2)
     ]
     return [up[1] * stretch, -up[0] * stretch], rows
 

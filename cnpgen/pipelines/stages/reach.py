@@ -8,7 +8,7 @@ import numpy as np
 
 from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, subtract, symbols
 from cnpgen.pipelines.context import Context
-from cnpgen.pipelines.stages.candidate_table import on_table
+from cnpgen.pipelines.stages.candidate_table import on_table, table_corners
 from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Stage, StageFunction
 from cnpgen.problems.constraints.table import Table
 from cnpgen.schema.keys import field
@@ -46,39 +46,42 @@ class BallisticReach(Stage):
         return self._require(context, "is off the table, or leaves it")
 
     def _require(self, context: Context, reason: str) -> StageFunction:
-        table = context.constraint(Table)
+        table, varies = context.constraint(Table), context.problem.parameters.changes_rectangle
         sides = [[side.low, side.high] for side in (table.x, table.y)]
-        over = context.kernels.load(over_table, sides=sides)
+        over = context.kernels.load(over_table, sides=None if varies else sides)
 
         def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
+            corners = [np.concatenate(table_corners(context, candidates))] if varies else []
             if self.start_time:
                 displacement = self.start_time * candidates["start_tip_velocity"][:2]
-                ahead, _ = over(candidates["start_xyz"][:2], displacement)
+                ahead, _ = over(candidates["start_xyz"][:2], displacement, *corners)
                 candidates.reject(ahead[0] > 0, f"the start {reason}")
             if self.goal_time:
                 goal = on_table(context, candidates, candidates["goal_xyz"])[:2]
-                _, both = over(goal, self.goal_time * hit_velocity(candidates))
+                _, both = over(goal, self.goal_time * hit_velocity(candidates), *corners)
                 candidates.reject(both[0] > 0, f"the hit {reason}")
 
         return work
 
 
-def over_table(*, sides: list[list[float]]) -> Any:
+def over_table(*, sides: list[list[float]] | None) -> Any:
     """Build ``(p, d) -> (ahead, both)``: whether p + d is over the table, and whether p + d and p - d both are.
 
     Args:
-        sides: Lower and upper bound of the table along x and along y [m].
+        sides: Lower and upper bound of the table along x and along y [m]; None for a third argument, both corners.
     """
     import casadi as ca
 
-    (p_sx, p), (d_sx, d) = symbols("p", 2), symbols("d", 2)
+    (p_sx, p), (d_sx, d), (corners_sx, corners) = symbols("p", 2), symbols("d", 2), symbols("corners", 4)
+    given = [p_sx, d_sx] if sides else [p_sx, d_sx, corners_sx]
+    spans: Any = sides or list(zip(corners[:2], corners[2:], strict=True))
 
     def is_over(position: Vec) -> Scalar:
-        inside = [ca.logic_and(low <= at, at <= high) for at, (low, high) in zip(position, sides, strict=True)]
+        inside = [ca.logic_and(low <= at, at <= high) for at, (low, high) in zip(position, spans, strict=True)]
         return ca.logic_and(*inside)
 
     ahead, behind = is_over(add(p, d)), is_over(subtract(p, d))
-    return ca.Function("over_table", [p_sx, d_sx], [ahead, ca.logic_and(ahead, behind)])
+    return ca.Function("over_table", given, [ahead, ca.logic_and(ahead, behind)])
 
 
 def hit_velocity(candidates: CandidateBatch) -> Array:

@@ -1,7 +1,7 @@
 """Constraints that align an axis of the tip with a world direction, exactly or within an angle."""
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from cnpgen.problems.constraints.constraint import Condition, Constraint, End
 from cnpgen.problems.constraints.tip_manifold import Vector, along, beside, unit
+from cnpgen.robots.parameter_ranges import UPRIGHT_TOLERANCE
 from cnpgen.schema.keys import field
 
 if TYPE_CHECKING:
@@ -27,6 +28,9 @@ class TipAxis(Constraint):
     e1 and e2 are orthogonal to d: ``1 - d . R a`` has no gradient at the solution. The two values are the components of
     the tilt [rad] to first order. The verdict limits the angle between both, so the tolerance of each component is that
     of the angle divided by the square root of 2.
+
+    Parameters of the problem may turn d and change the tolerance. Vectors are then along axes that turn with d, and the
+    tilt of motions is multiplied by the ratio of the tolerances, so that the bounds are the same for all samples.
     """
 
     training_weight = 300.0
@@ -42,29 +46,55 @@ class TipAxis(Constraint):
         found: list[list[float]] = beside(np.array(self.directions[1])).tolist()
         return found
 
+    @property
+    def nominal_tolerance(self) -> float:
+        """Value of the parameter ``upright_tolerance`` of samples without it [rad]."""
+        return self.tolerance
+
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the tilt [rad]."""
-        return self._held(state.kinematics.rotation)
+        return self._held(self._symbolic_axis(state), state.parameters)
 
     def measured(self, world: "World") -> tuple[Condition, ...]:
         """Evaluate the tilt of Pinocchio's tip frame [rad]."""
-        return self._held(list(world.tip_rotation))
+        return self._held(self._measured_axis(world), world.parameters.values)
+
+    def symbolic_at(self, state: "SymbolicState", end: End) -> tuple[Condition, ...]:  # noqa: ARG002
+        """State the tilt of a boundary state [rad], in radians for all samples."""
+        return self._held(self._symbolic_axis(state), {})
+
+    def measured_at(self, world: "World", end: End) -> tuple[Condition, ...]:  # noqa: ARG002
+        """Evaluate the tilt of a boundary state [rad], in radians for all samples."""
+        return self._held(self._measured_axis(world), {})
 
     def judged(self, world: "World") -> tuple[Condition, ...]:
         """Evaluate the angle between axis and direction [rad]."""
-        tilt, upright = self.measured(world)
+        tilt, upright = self._held(self._measured_axis(world), {})
         angle = np.arctan2(np.hypot(*tilt.g), upright.g[0])
-        return (replace(tilt, g=[angle], lower=np.zeros(1), upper=np.zeros(1), parts=()),)
+        tolerance = world.parameters.values.get(UPRIGHT_TOLERANCE)
+        accepted = None if tolerance is None else np.array([float(tolerance)])
+        return (replace(tilt, g=[angle], lower=np.zeros(1), upper=np.zeros(1), parts=(), accepted=accepted),)
 
     def allowed(self, condition: Condition) -> Array:
         """Return the tolerance of the angle, or of each of its components."""
+        if condition.accepted is not None:
+            return condition.accepted
         return np.asarray(super().allowed(condition) / np.sqrt(len(condition.g)))
 
-    def _held(self, rotation: Sequence[Any]) -> tuple[Condition, ...]:
-        axis, direction = self.directions
-        pointing = [along(axis, row) for row in rotation]
+    def _symbolic_axis(self, state: "SymbolicState") -> list[Any]:
+        axis, _ = self.directions
+        return state.along_upright([along(axis, row) for row in state.kinematics.rotation])
+
+    def _measured_axis(self, world: "World") -> list[Any]:
+        axis, _ = self.directions
+        return list(world.parameters.along_upright([along(axis, row) for row in world.tip_rotation]))
+
+    def _held(self, pointing: Sequence[Any], parameters: Mapping[str, Any]) -> tuple[Condition, ...]:
+        """State the tilt of an axis, which is given along axes that turn with the direction."""
         tilt = [along(row, pointing) for row in self.across]
-        upright = [along(direction, pointing)]
+        if (tolerance := parameters.get(UPRIGHT_TOLERANCE)) is not None:
+            tilt = [value * (self.tolerance / tolerance) for value in tilt]
+        upright = [along(self.directions[1], pointing)]
         return (
             Condition("tilt", "rad", tilt, np.zeros(2), np.zeros(2), "angle", ("x", "y")),
             Condition("upright", "1", upright, np.zeros(1), np.full(1, np.inf), "angle"),
@@ -95,44 +125,55 @@ class Axis(TipAxis):
         """The axis in the tip's frame and the direction in the world, unit vectors."""
         return unit(self.axis, "axis").tolist(), unit(self.direction, "direction").tolist()
 
+    @property
+    def nominal_tolerance(self) -> float:
+        """Value of the parameter ``upright_tolerance`` of samples without it [rad]."""
+        return self.angle or self.tolerance
+
     def allowed(self, condition: Condition) -> Array:
         """Return the tolerance of motions; with an angle, that of its cosine."""
-        if not self.angle:
+        if not self.angle or condition.accepted is not None:
             return super().allowed(condition)
-        return np.full(len(condition.g), np.cos(self.angle) - np.cos(min(self.angle + self.tolerance, np.pi)))
+        return np.full(len(condition.g), self._cosine_tolerance(self.angle))
 
     def judged(self, world: "World") -> tuple[Condition, ...]:
         """Evaluate the angle between axis and direction [rad], or its cosine for a range of angles."""
-        return self.measured(world) if self.angle else super().judged(world)
+        if not self.angle:
+            return super().judged(world)
+        (condition,), angle = self._held(self._measured_axis(world), {}), world.parameters.values.get(UPRIGHT_TOLERANCE)
+        if angle is None:
+            return (condition,)
+        return (replace(condition, lower=np.cos([angle]), accepted=np.array([self._cosine_tolerance(angle)])),)
 
     def symbolic_at(self, state: "SymbolicState", end: End) -> tuple[Condition, ...]:
         """State the tilt and, for an aligned axis, its rates."""
-        found = super().symbolic_at(state, end)
         if self.angle:
-            return found
-        turning = state.tip_angular_velocity, state.tip_angular_acceleration
-        return (*found, *self._resting(state.kinematics.rotation, *turning))
+            return self.symbolic(state)
+        turning = map(state.along_upright, (state.tip_angular_velocity, state.tip_angular_acceleration))
+        return (*super().symbolic_at(state, end), *self._resting(self._symbolic_axis(state), *turning))
 
     def measured_at(self, world: "World", end: End) -> tuple[Condition, ...]:
         """Evaluate the tilt and, for an aligned axis, its rates."""
-        found = super().measured_at(world, end)
         if self.angle:
-            return found
-        turning = list(world.tip_angular_velocity), list(world.tip_angular_acceleration)
-        return (*found, *self._resting(list(world.tip_rotation), *turning))
+            return self.measured(world)
+        turning = map(world.parameters.along_upright, (world.tip_angular_velocity, world.tip_angular_acceleration))
+        return (*super().measured_at(world, end), *self._resting(self._measured_axis(world), *map(list, turning)))
 
-    def _held(self, rotation: Sequence[Any]) -> tuple[Condition, ...]:
+    def _held(self, pointing: Sequence[Any], parameters: Mapping[str, Any]) -> tuple[Condition, ...]:
         if not self.angle:
-            return super()._held(rotation)
-        axis, direction = self.directions
-        cosine = [along(direction, [along(axis, row) for row in rotation])]
-        bounds = np.full(1, np.cos(self.angle)), np.full(1, np.inf)
-        return (Condition("tilt cosine", "1", cosine, *bounds, "angle"),)
+            return super()._held(pointing, parameters)
+        cosine, least = along(self.directions[1], pointing), np.cos(self.angle)
+        if (angle := parameters.get(UPRIGHT_TOLERANCE)) is not None:
+            ratio = self._cosine_tolerance(self.angle) / self._cosine_tolerance(angle)
+            cosine = least + (cosine - _cosine(angle)) * ratio
+        return (Condition("tilt cosine", "1", [cosine], np.full(1, least), np.full(1, np.inf), "angle"),)
 
-    def _resting(self, rotation: Sequence[Any], omega: Sequence[Any], alpha: Sequence[Any]) -> tuple[Condition, ...]:
+    def _cosine_tolerance(self, angle: Any) -> Any:
+        """Return by how much the cosine of a valid tilt may be below that of an angle; ``angle`` may be a symbol."""
+        return _cosine(angle) - _cosine(angle + self.tolerance)
+
+    def _resting(self, u: Sequence[Any], omega: Sequence[Any], alpha: Sequence[Any]) -> tuple[Condition, ...]:
         """Return the rates of the axis u orthogonal to the direction, from ``w x u`` and ``a x u + w x (w x u)``."""
-        axis, _ = self.directions
-        u = [along(axis, row) for row in rotation]
         rate = _cross(omega, u)
         second = [a + b for a, b in zip(_cross(alpha, u), _cross(omega, rate), strict=True)]
         zero, rows = np.zeros(2), self.across
@@ -140,6 +181,13 @@ class Axis(TipAxis):
             Condition("tilt rate", "rad/s", [along(row, rate) for row in rows], zero, zero, "velocity"),
             Condition("tilt acceleration", "rad/s^2", [along(row, second) for row in rows], zero, zero, "acceleration"),
         )
+
+
+def _cosine(angle: Any) -> Any:
+    """Return the cosine of an angle, -1 above a half turn; ``angle`` may be a symbol."""
+    import casadi as ca
+
+    return np.cos(min(angle, np.pi)) if isinstance(angle, float) else ca.cos(ca.fmin(angle, np.pi))
 
 
 def _cross(a: Sequence[Any], b: Sequence[Any]) -> list[Any]:

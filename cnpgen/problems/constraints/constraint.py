@@ -54,6 +54,7 @@ class Condition:
         tolerance: Key of ``BOUNDARY_TOLERANCES``, the tolerances of boundary states.
         parts: Names of the m values; empty for numbered values.
         sufficient: Whether the condition is conservative: only the measured form can prove a violation.
+        accepted: Violation that a valid motion may have if it differs from sample to sample, shape (m,).
     """
 
     name: str
@@ -64,6 +65,7 @@ class Condition:
     tolerance_kind: str
     parts: tuple[str, ...] = ()
     sufficient: bool = False
+    accepted: NDArray[np.float64] | None = None
 
     @property
     def is_equality(self) -> bool:

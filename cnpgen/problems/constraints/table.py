@@ -1,12 +1,19 @@
 """The table manifold: the tip stays over a rectangle at one height (paper, Appendix B, loss of the hitting task)."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from cnpgen.problems.constraints.constraint import Condition
 from cnpgen.problems.constraints.tip_manifold import BOUND_KINKS, TipManifold, TipRegion
+from cnpgen.robots.parameter_ranges import TABLE_BOUNDS
 from cnpgen.schema.keys import Range, field
+
+if TYPE_CHECKING:
+    from cnpgen.world.world import World
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -14,7 +21,8 @@ class Table(TipManifold):
     """Constraint: the tip stays in a rectangle at the table's height, with ``dz/dt = d2z/dt2 = 0`` at the ends.
 
     It equals a ``plane`` normal to z with a rectangle along x and y. Parameters of the problem may raise the table and
-    turn it about the center of its rectangle; then all coordinates are those of the table.
+    turn it about the center of its rectangle; then all coordinates are those of the table. They may also change the
+    rectangle; the table still turns about the center of that in the problem file.
     """
 
     reason = "off the table"
@@ -40,3 +48,35 @@ class Table(TipManifold):
     def band(self) -> float:
         """Maximum vertical distance of a start from the table [m]."""
         return self.start_band
+
+    @property
+    def bounds(self) -> dict[str, float]:
+        """Bounds of the rectangle [m], by the names of parameters."""
+        return dict(zip(TABLE_BOUNDS, (self.x.low, self.x.high, self.y.low, self.y.high), strict=True))
+
+    def bounds_of(self, parameters: Mapping[str, Any]) -> tuple[Any, Any]:
+        """Return the lower and the upper corner of the rectangle of a sample: x and y [m] each."""
+        x_low, x_high, y_low, y_high = (parameters.get(name, value) for name, value in self.bounds.items())
+        return [x_low, y_low], [x_high, y_high]
+
+    def judged(self, world: "World") -> tuple[Condition, ...]:
+        """Evaluate the tip position with the rectangle of the sample."""
+        conditions, values = self.measured(world), world.parameters.values
+        if values.keys().isdisjoint(TABLE_BOUNDS):
+            return conditions
+        inside, height = conditions
+        low, high = (np.array(corner, float) for corner in self.bounds_of(values))
+        tip = self._measured_tip(world)[:2]
+        return replace(inside, g=list(tip), lower=low, upper=high, parts=self.parts[0]), height
+
+    def _inside(self, tip: Sequence[Any], parameters: Mapping[str, Any]) -> Condition:
+        """State the distance from every side separately if sides move: bounds are the same for all samples."""
+        condition = super()._inside(tip, parameters)
+        if parameters.keys().isdisjoint(TABLE_BOUNDS):
+            return condition
+        sides = [tip[0], tip[0], tip[1], tip[1]]
+        shifts = [parameters.get(name, bound) - bound for name, bound in self.bounds.items()]
+        g = [value - shift for value, shift in zip(sides, shifts, strict=True)]
+        lower = np.array([self.x.low, -np.inf, self.y.low, -np.inf])
+        upper = np.array([np.inf, self.x.high, np.inf, self.y.high])
+        return replace(condition, g=g, lower=lower, upper=upper, parts=("x low", "x high", "y low", "y high"))

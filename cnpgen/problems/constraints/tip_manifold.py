@@ -5,7 +5,7 @@ ends, a motion has velocity and acceleration along the other directions only (pa
 """
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -80,21 +80,21 @@ class TipManifold(Constraint):
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the tip position [m]."""
-        return self._position(self._symbolic_tip(state), 0.0)
+        return self._position(self._symbolic_tip(state), 0.0, state.parameters)
 
     def measured(self, world: "World") -> tuple[Condition, ...]:
         """Evaluate Pinocchio's tip position [m]."""
-        return self._position(self._measured_tip(world), 0.0)
+        return self._position(self._measured_tip(world), 0.0, world.parameters.values)
 
     def symbolic_at(self, state: "SymbolicState", end: End) -> tuple[Condition, ...]:
         """State position, velocity and acceleration of a boundary state."""
-        position = self._position(self._symbolic_tip(state), self._band_at(end))
+        position = self._position(self._symbolic_tip(state), self._band_at(end), state.parameters)
         rates = state.tip_velocity, state.tip_acceleration
         return (*position, *self._moving(*(map(state.along_table, rates) if self.moves_with_table else rates)))
 
     def measured_at(self, world: "World", end: End) -> tuple[Condition, ...]:
         """Evaluate position, velocity and acceleration with Pinocchio."""
-        position = self._position(self._measured_tip(world), self._band_at(end))
+        position = self._position(self._measured_tip(world), self._band_at(end), world.parameters.values)
         velocity, acceleration = world.tip_velocity, world.tip_acceleration
         if self.moves_with_table:
             velocity, acceleration = map(world.parameters.along_table, (velocity, acceleration))
@@ -126,17 +126,21 @@ class TipManifold(Constraint):
         off = reduce(np.maximum, [np.abs(along(row, start_tip.T).T - height) for row, height in pairs])
         return np.asarray(np.minimum(off, self.band))
 
-    def _position(self, tip: Sequence[Any], band: float) -> tuple[Condition, ...]:
+    def _position(self, tip: Sequence[Any], band: float, parameters: Mapping[str, Any]) -> tuple[Condition, ...]:
         place = self.place
         found = []
         if place.ranges:
-            g = [along(row, tip) for row in place.bounded]
-            found.append(Condition(self.inside_name, "m", g, *place.bounds, "position", self.parts[0]))
+            found.append(self._inside(tip, parameters))
         if place.held:
             low, high = place.height - band, place.height + band
             g = [along(row, tip) for row in place.held]
             found.append(Condition(self.held_name, "m", g, low, high, "position", self.parts[1]))
         return tuple(found)
+
+    def _inside(self, tip: Sequence[Any], parameters: Mapping[str, Any]) -> Condition:  # noqa: ARG002
+        """State the position within the ranges, which parameters of the problem may change."""
+        g = [along(row, tip) for row in self.place.bounded]
+        return Condition(self.inside_name, "m", g, *self.place.bounds, "position", self.parts[0])
 
     def _band_at(self, end: End) -> float:
         return self.band if end == "start" else 0.0

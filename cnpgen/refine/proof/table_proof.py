@@ -64,7 +64,7 @@ def table_bounds(problem: Problem, start_tip: Array, *, tolerances: float) -> Ta
         tolerances: Fraction of the tolerance by which the rectangles are enlarged.
     """
     tables = [constraint for constraint in problem.constraint if isinstance(constraint, Table)]
-    if not tables or problem.parameters.tilts_table:
+    if not tables or problem.parameters.tilts_table or problem.parameters.changes_rectangle:
         return None
     limits = []
     for table in tables:
