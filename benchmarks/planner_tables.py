@@ -70,10 +70,12 @@ class Suite:
         for row in self._repeated:
             of_plant = counts.setdefault(row["planner"], {}).setdefault(row["plant"], {})
             of_plant[row["repetition"]] = of_plant.get(row["repetition"], 0) + (row["success"] == "1")
-        head = f"| {self.name}, successes of repetitions | {' | '.join(self.plants)} |"
-        lines = [head, f"|{'---|' * (len(self.plants) + 1)}"]
+        most = max(len(found) for of_plants in counts.values() for found in of_plants.values())
+        plants = [plant for plant in self.plants if all(len(of.get(plant, {})) == most for of in counts.values())]
+        head = f"| {self.name}, successes of {most} repetitions | {' | '.join(plants)} |"
+        lines = [head, f"|{'---|' * (len(plants) + 1)}"]
         for planner in (name for name in ORDER if name in counts):
-            cells = (", ".join(map(str, counts[planner].get(plant, {}).values())) for plant in self.plants)
+            cells = (", ".join(map(str, counts[planner][plant].values())) for plant in plants)
             lines.append(f"| `{planner}` | {' | '.join(cells)} |")
         return ["\n".join(lines)]
 
