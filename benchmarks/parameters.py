@@ -57,7 +57,8 @@ def single_value_model(name: str) -> Model:
 def measure(name: str, model: Model, options: argparse.Namespace, *, refined: int) -> dict[str, Any]:
     """Plan new problems; refine some of the plans."""
     problems = draw_boundary_problems(name, options.problems, seed=options.seed)
-    plans = cnpgen.Planner(model).plan_batch(problems.boundary, columns=problems.columns)
+    planner = cnpgen.Planner(model, scale_time=not options.no_time_scaling)
+    plans = planner.plan_batch(problems.boundary, columns=problems.columns)
     progress(f"{name}: {len(plans)} plans")
     verdicts = cnpgen.evaluate_plans(plans, workers=1).verdicts
     figures = {
@@ -79,6 +80,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--refined", type=int, default=200, help="plans that are refined")
     parser.add_argument("--seed", type=int, default=480_213, help="seed of the problems")
     parser.add_argument("--sets", nargs="+", choices=SINGLE, default=list(SINGLE), help="sets of problems")
+    parser.add_argument("--no-time-scaling", action="store_true", help="do not scale motions from rest to rest in time")
     parser.add_argument("--models", nargs="+", type=Path, help="model files in place of the shipped ones")
     parser.add_argument("--start", type=Path, help="file for the network of the first set to start training from")
 

@@ -10,10 +10,13 @@ import pytest
 
 import cnpgen
 from cnpgen.judges.rows.verify import verify_rows
+from cnpgen.kernels.library import choose_backend
 from cnpgen.losses.plan_loss import PlanLoss
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.make.recipe_file import as_dataset_recipe
+from cnpgen.pipelines.completion import Completion
+from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.pipelines.stages.collision import Collision
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.constraints.axis import Axis, TipAxis
@@ -210,3 +213,18 @@ def test_configurations_of_tasks_are_along_the_direction_of_each_sample() -> Non
         pin.forwardKinematics(robot.model, data, q)
         R = pin.updateFramePlacement(robot.model, data, robot.tip_frame).rotation
         np.testing.assert_allclose(R[:, 2], pin.rpy.rpyToMatrix(roll, pitch, 0.0)[:, 2], atol=1e-8)
+
+
+def test_tasks_are_checked_with_the_rectangle_of_each_sample() -> None:
+    backend, folder = choose_backend(None)
+    pipeline = recipe_of("airhockey-tables", RECTANGLES).pipeline
+    context = PreparedPipeline(pipeline, backend=backend, cache_folder=folder, dtype="float64").context
+    columns = {
+        "start_xyz": np.array([[0.65], [0.0], [0.16]]),
+        "goal_xyz": np.array([[1.0], [0.4], [0.16]]),
+        "hit_angle": np.zeros((1, 1)),
+        "hit_speed_share": np.full((1, 1), 0.5),
+        "parameters": np.array([[0.6, 2.0, -0.45, y_high] for y_high in (0.45, 0.36, 0.5)]).T,
+    }
+    tasks = Completion(pipeline, context, list(columns))(columns)
+    assert tasks.alive.tolist() == [0, 2]
