@@ -174,5 +174,6 @@ def either(choices: Sequence[str]) -> str:
 
 
 def counted(number: int, noun: str) -> str:
-    """Format a number with its noun: ``"1 row"``, ``"120,000 rows"``."""
-    return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"
+    """Format a number with its noun: ``"1 row"``, ``"120,000 rows"``, ``"2 trajectories"``."""
+    plural = f"{noun[:-1]}ies" if noun.endswith("ry") else f"{noun}s"
+    return f"{number:,} {noun if number == 1 else plural}"

@@ -54,7 +54,7 @@ class TrajectoryEvaluation:
 
     def __repr__(self) -> str:
         texts = ", ".join(f"{count:,} {decision}" for decision, count in self.counts.items() if count)
-        return f"<{counted(len(self.verdicts), 'trajectory').replace('trajectorys', 'trajectories')}: {texts}>"
+        return f"<{counted(len(self.verdicts), 'trajectory')}: {texts}>"
 
     @property
     def counts(self) -> dict[str, int]:

@@ -127,6 +127,26 @@ def test_a_plan_that_is_too_fast_is_never_valid(label: str, rate: float) -> None
             assert verdict.conditions[name].decision != Decision.VALID, (name, orders)
 
 
+def test_a_velocity_between_positions_that_a_line_hides_is_undecided() -> None:
+    plans = plans_of(load("hit"))
+    margin = cnpgen.evaluate_plans(plans, workers=1).verdicts[0].margins["joint velocity"]
+    limit, joint, t = abs(margin.bound), plans.problem.joint_names.index(margin.part), np.arange(21) * 0.01
+    decisions = []
+    for mean in (0.84, 0.82):  # of the limit: the velocity rises to 101 % and to 99 %, lines to at most 100 %
+        q = np.repeat(plans.boundary.start_q[:1], len(t), axis=0)
+        q[:, joint] = limit * (mean * (t - 0.1) + 0.17 * np.sin(40 * np.pi * t) / (40 * np.pi))
+        trajectory = Trajectory(t, q)
+        for interpolation in (None, "linear"):
+            found = cnpgen.evaluate_trajectories(plans.problem, [trajectory], interpolation=interpolation)
+            decisions.append(found.verdicts[0].conditions["joint velocity"])
+    hidden, line, *slower = decisions
+    assert hidden.decision == Decision.UNDECIDED
+    assert abs(hidden.margin.value) == pytest.approx(1.01 * limit, rel=2e-3)
+    assert 0 < hidden.undecided_share < 1
+    assert hidden.uncertainty > hidden.margin.violation
+    assert {entry.decision for entry in (line, *slower)} == {Decision.VALID}
+
+
 @pytest.mark.parametrize("label", LABELS)
 @pytest.mark.parametrize(("rate", "orders", "noise"), [(30, 0, 0.0), (30, 1, 5e-5), (30, 2, 1e-3), (100, 1, 5e-5)])
 def test_coarse_or_noisy_samples_give_no_wrong_decision(label: str, rate: float, orders: int, noise: float) -> None:

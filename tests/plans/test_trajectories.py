@@ -274,6 +274,7 @@ def test_arrays_of_several_trajectories_and_wrapped_angles(tmp_path: Path) -> No
     np.savez(tmp_path / "a.npz", q=np.stack([Q, turned]), t=T)
     loaded = load_trajectories(tmp_path / "a.npz", "airhockey", unwrap=True)
     assert [np.allclose(trajectory.q, Q) for trajectory in loaded.trajectories] == [True, True]
+    assert repr(cnpgen.evaluate_trajectories("airhockey", loaded.trajectories)).startswith("<2 trajectories: ")
 
 
 BAD = {

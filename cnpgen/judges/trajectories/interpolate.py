@@ -72,6 +72,19 @@ def family_of_data(t: Array, data: list[Array]) -> CurveFamily:
     return CurveFamily(t, coefficients, (exact, exact, exact, exact))
 
 
+def through_positions(trajectory: Trajectory, neighbors: int) -> CurveFamily:
+    """Return the curve of polynomials through the positions around every span; its velocities jump at the samples.
+
+    Args:
+        trajectory: The samples.
+        neighbors: Number of samples that determine a polynomial.
+    """
+    _, weights, data = polynomials_of_positions(trajectory.t, trajectory.q, neighbors)
+    exact = np.zeros((len(data), trajectory.q.shape[1]))
+    coefficients = np.einsum("scw,swn->csn", weights, data)
+    return CurveFamily(trajectory.t, coefficients, (exact, exact, exact, exact))
+
+
 def bounded_jerk(trajectory: Trajectory, max_jerk: Array, noise: Array) -> CurveFamily | None:
     """Return all curves through samples with noise whose jerks are bounded; None if the samples contradict the bound.
 

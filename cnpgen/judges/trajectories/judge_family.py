@@ -60,7 +60,14 @@ class FamilyJudge:
         names = self._problem.parameters.names
         return self._limits if parameters is None else self._limits.scaled(dict(zip(names, parameters, strict=True)))
 
-    def __call__(self, family: CurveFamily, trajectory: Trajectory, *, scene: Array | None = None) -> TrajectoryVerdict:
+    def __call__(
+        self,
+        family: CurveFamily,
+        trajectory: Trajectory,
+        *,
+        scene: Array | None = None,
+        smooth: CurveFamily | None = None,
+    ) -> TrajectoryVerdict:
         """Judge one family; values that cannot be evaluated give an undecided verdict.
 
         Args:
@@ -69,14 +76,17 @@ class FamilyJudge:
                 parameters nominal.
             scene: Poses and sizes of the obstacles, then values for a constraint and parameters, shape (width,). By
                 default, they follow from the ends of the curves and the parameters.
+            smooth: Another curve at the same times; joint limits that it violates are not valid.
         """
         if not family.duration < MAX_DURATION_S or len(family.t) > MAX_TIME_SAMPLES:
             reason = f"{Reason.TOO_LONG}: at most {MAX_DURATION_S:g} s and {MAX_TIME_SAMPLES:,} samples are judged"
             return TrajectoryVerdict(Decision.UNDECIDED, reason, duration=family.duration)
         with np.errstate(all="ignore"):  # overflows give inf or nan, which are detected
-            return self._judge(family, trajectory, scene)
+            return self._judge(family, trajectory, scene, smooth)
 
-    def _judge(self, family: CurveFamily, trajectory: Trajectory, scene: Array | None) -> TrajectoryVerdict:
+    def _judge(
+        self, family: CurveFamily, trajectory: Trajectory, scene: Array | None, smooth: CurveFamily | None
+    ) -> TrajectoryVerdict:
         s = checked_phases(family, self._step)
         table = np.array([[0.0, 1.0], [0.0, family.duration]])
         samples = Samples(s, times(s, table))
@@ -95,7 +105,7 @@ class FamilyJudge:
         measured = [errors.add(condition, s) for condition in context.measured]
         context = replace(context, measured=measured, with_uncertainty=errors.add)
         limits = self._limits.scaled(self._world.parameters.values)
-        entries = [*_limit_entries(limits, family, samples), *_measured_entries(context)]
+        entries = [*_limit_entries(limits, family, smooth, samples), *_measured_entries(context)]
         names = list(by_name([entry.margin for entry in entries]))
         conditions = dict(zip(names, (entry.decided() for entry in entries), strict=True))
         return _verdict(conditions, family.duration, len(s))
@@ -185,28 +195,36 @@ def _share(mask: NDArray[np.bool_], t: Array) -> float:
     return float(np.diff(t) @ (mask[1:] & mask[:-1])) / float(t[-1])
 
 
-def _limit_entries(limits: ProvenJointLimits, family: CurveFamily, samples: Samples) -> list[_Entry]:
-    """Decide the joint limits."""
-    entries, states = [], family.evaluate(samples.s, jerk=True)
+def _limit_entries(
+    limits: ProvenJointLimits, family: CurveFamily, smooth: CurveFamily | None, samples: Samples
+) -> list[_Entry]:
+    """Decide the joint limits; a violation by the smooth curve leaves a limit undecided."""
+    entries, curves = [], [family] if smooth is None else [family, smooth]
+    states = [curve.evaluate(samples.s, jerk=True) for curve in curves]
     bounds_at = dict(zip(ORDERS, family.bounds_at(samples.s), strict=True))
     bounds = dict(zip(ORDERS, family.bounds, strict=True))
+    n = len(limits.joints)
+    rows = np.arange(2 * n) % n
     for limit, constraint in enumerate(limits.constraints):
-        name = quantity_of(constraint)
-        values, n = getattr(family.polynomials, name), len(limits.joints)
-        rows = np.arange(2 * n)
-        nominal = (values[..., rows % n] - limits.bounds[limit]) / limits.scale[limit]
-        error = bounds[name][:, rows % n] / np.abs(limits.scale[limit])
+        name, bound, scale = quantity_of(constraint), limits.bounds[limit], limits.scale[limit]
+        nominal, *others = ((getattr(curve.polynomials, name)[..., rows] - bound) / scale for curve in curves)
+        error = bounds[name][:, rows] / np.abs(scale)
         possible = find_maximum(nominal + error, family.edges)
+        for other in others:
+            possible = find_maximum(other, family.edges, possible)
         certain = find_maximum(nominal - error, family.edges)[0]
         t = float(possible[2] * family.duration)
         margin = limits.margin_at(limit, possible, t)
         span = min(int(np.searchsorted(family.edges, possible[2], "right")) - 1, len(family.t) - 2)
-        at = (getattr(states, name)[rows % n] - limits.bounds[limit][:, None]) / limits.scale[limit][:, None]
-        error_at = bounds_at[name][rows % n] / np.abs(limits.scale[limit])[:, None]
-        highest, lowest = (at + error_at).max(axis=0), (at - error_at).max(axis=0)
+        joint = possible[1] % n
+        there = [getattr(curve.evaluate(np.array(possible[2:]), jerk=True), name)[joint, 0] for curve in curves]
+        uncertainty = max(float(bounds[name][span, joint]), float(np.ptp(there)))
+        at, *others = ((getattr(state, name)[rows].T - bound) / scale for state in states)
+        error_at = bounds_at[name][rows].T / np.abs(scale)
+        highest, lowest = np.max([at + error_at, *others], axis=(0, 2)), (at - error_at).max(axis=1)
         violated = _share(lowest > 1, samples.t)
-        uncertainty = float(bounds[name][span, possible[1] % n])
-        entries.append(_Entry(margin, uncertainty, certain, violated, _share((highest > 1) & (lowest <= 1), samples.t)))
+        share = _share((highest > 1) & (lowest <= 1), samples.t)
+        entries.append(_Entry(margin, uncertainty, certain, violated, share))
     return entries
 
 

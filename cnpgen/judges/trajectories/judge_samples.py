@@ -3,14 +3,15 @@
 A trajectory is valid if its samples resolve the motion and the smooth curve through them is valid. At both ends this
 curve has the smallest changes of acceleration within the limits, which samples of faster changes allow. Otherwise every
 condition is decided for all curves within the errors of the samples' resolution. Exact positions without derivatives at
-100 Hz or more are connected by lines.
+100 Hz or more are connected by lines. Lines hide velocities between samples, so joint limits must also hold for
+polynomials through the positions around every span.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.judges.plans.joint_limits import ProvenJointLimits, quantity_of
-from cnpgen.judges.trajectories.interpolate import data_of, family_of_data, interpolated
+from cnpgen.judges.trajectories.interpolate import data_of, family_of_data, interpolated, through_positions
 from cnpgen.judges.trajectories.judge_family import FamilyJudge
 from cnpgen.judges.trajectories.resolved_curves import is_resolved, resolved_curves
 from cnpgen.judges.trajectories.smooth_curve import AccelerationLimits, smooth_curve
@@ -20,6 +21,7 @@ from cnpgen.trajectory.sampled_trajectory import Trajectory
 Array = NDArray[np.float64]
 
 MAX_LINEAR_SPAN_S = 0.0101  # between exact positions that a controller connects by lines
+SMOOTH_NEIGHBORS = 8  # positions that determine velocities between two of them
 TOLERANCE_SHARE = 0.9  # of the tolerance of accelerations and jerks that the smooth curve uses
 
 
@@ -36,7 +38,8 @@ def judge_samples(
     """
     limits = acceleration_limits(judge.limits(trajectory.parameters))
     if trajectory.dq is None and not noise.any() and np.diff(trajectory.t).max() <= MAX_LINEAR_SPAN_S:
-        return judge(interpolated(trajectory, "linear", noise), trajectory, scene=scene)
+        line = interpolated(trajectory, "linear", noise)
+        return judge(line, trajectory, scene=scene, smooth=through_positions(trajectory, SMOOTH_NEIGHBORS))
     if not noise.any() and is_resolved(trajectory, limits.acceleration):
         curves = [smooth_curve(trajectory, limits)]
         if trajectory.ddq is not None:
