@@ -178,6 +178,8 @@ def _trajectory(table: TrajectoryTable, options: _Options) -> tuple[Trajectory, 
     q = columns["q"]
     if q is None:
         raise UsageError(f"{table.place}: {_missing(table, options)}")
+    if not len(q):
+        raise UsageError(f"{table.place}: there are no positions, expected at least one row")
     t = _times(table, options, len(q), used)
     for name, values in (("times", t), *columns.items()):
         if values is not None and len(values) != len(q):

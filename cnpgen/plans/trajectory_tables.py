@@ -28,6 +28,7 @@ from cnpgen.store.paths import require_path
 Values = NDArray[Any]
 
 MAX_ARCHIVE_BYTES = 1 << 32  # of the arrays of an archive
+MAX_FEATURE_WIDTH = 10_000  # values of a feature of LeRobot
 HELD_JOINTS_FILE = "held_joints.yaml"  # beside exported plans; it holds no trajectory
 LEROBOT_INFO = "meta/info.json"  # in a folder of LeRobot
 LEROBOT_ENVIRONMENT = "observation.environment_state"
@@ -209,20 +210,28 @@ def _parquet_column(table: Any, name: str, path: Path) -> Values:
         raise UsageError(f"{path}: column {name!r}: its rows have different lengths") from error
 
 
+def _number_column(table: Any, name: str, path: Path, width: int) -> Values:
+    """Return a column of numbers, or of lists of them, shape (rows, width)."""
+    values = _parquet_column(table, name, path)
+    try:
+        return values.astype(float).reshape(table.num_rows, width)
+    except (TypeError, ValueError) as error:
+        text = f"{width} numbers" if width > 1 else "a number"
+        raise UsageError(f"{path}: column {name!r}: expected {text} per row") from error
+
+
 def _read_lerobot(folder: Path) -> Iterator[TrajectoryTable]:
     """Yield the episodes of a LeRobotDataset v3: states, or actions without them, with their names."""
     try:
         info = parse_json(read_file(folder / LEROBOT_INFO, max_bytes=MAX_TABLE_BYTES).decode())
         features, version = info["features"], str(info["codebase_version"])
         key = next(key for key in ("observation.state", "action") if key in features)
-        width = int(features[key]["shape"][0])
+        names = _feature_names(features[key])
+        described = _feature_names(features[LEROBOT_ENVIRONMENT]) if LEROBOT_ENVIRONMENT in features else []
     except (ValueError, KeyError, TypeError, IndexError, StopIteration) as error:
         raise UsageError(f"{folder / LEROBOT_INFO} does not describe a dataset of LeRobot: {error!r:.200}") from error
     if not version.startswith("v3"):
         raise UsageError(f"{folder} has LeRobot's format {version}, expected v3.0: convert it with LeRobot")
-    names = _feature_names(features[key].get("names"), width)
-    described = features.get(LEROBOT_ENVIRONMENT, {}).get("names")
-    described = _feature_names(described, len(described) if isinstance(described, list) else 0)
     parameters = {name: k for k, name in enumerate(described) if name in PARAMETER_UNITS}
     for path in sorted(folder.glob("data/*/*.parquet")):
         table = read_parquet(path)
@@ -230,18 +239,26 @@ def _read_lerobot(folder: Path) -> Iterator[TrajectoryTable]:
         missing = [name for name in needed if name not in table.column_names]
         if missing:
             raise UsageError(f"{path}: there is no column {missing[0]!r}, only {', '.join(table.column_names)}")
-        times, episodes, values, *environment = (_parquet_column(table, name, path) for name in needed)
-        values = values.reshape(len(times), -1)
-        for episode in dict.fromkeys(episodes.tolist()):
-            rows = episodes == episode
-            columns: dict[str, Values] = {MESSAGE_TIME: times[rows].astype(float)}
-            columns |= {name: values[rows, k].astype(float) for k, name in enumerate(names)}
-            columns |= {name: environment[0][rows, k].astype(float) for name, k in parameters.items()}
-            yield TrajectoryTable(f"{folder}: episode {episode}", columns)
+        widths = 1, 1, len(names), *([len(described)] if parameters else [])
+        columns_of = zip(needed, widths, strict=True)
+        times, episodes, values, *environment = (_number_column(table, name, path, width) for name, width in columns_of)
+        for episode in dict.fromkeys(episodes[:, 0].tolist()):
+            rows = episodes[:, 0] == episode
+            columns: dict[str, Values] = {MESSAGE_TIME: times[rows, 0]}
+            columns |= {name: values[rows, k] for k, name in enumerate(names)}
+            columns |= {name: environment[0][rows, k] for name, k in parameters.items()}
+            yield TrajectoryTable(f"{folder}: episode {episode:g}", columns)
 
 
-def _feature_names(names: Any, width: int) -> list[str]:
-    """Return the names of a feature's values: a list, a list in an object, or indices."""
+def _feature_names(feature: Any) -> list[str]:
+    """Return the names of a feature's values: a list, a list in an object, or indices.
+
+    Raises:
+        TypeError, KeyError, ValueError, IndexError: It is no feature.
+    """
+    width, names = int(feature["shape"][0]), feature.get("names") if isinstance(feature, dict) else None
+    if not 0 < width <= MAX_FEATURE_WIDTH:
+        raise ValueError(f"a feature has {width} values, expected 1 to {MAX_FEATURE_WIDTH:,}")
     if isinstance(names, dict):
         names = next((entry for entry in names.values() if isinstance(entry, list)), None)
     if isinstance(names, list) and len(names) == width:

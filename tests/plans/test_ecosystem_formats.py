@@ -164,6 +164,23 @@ def test_other_datasets_of_lerobot_are_refused(dataset: Path, key: str, value: A
         load_trajectories(dataset, AIRHOCKEY)
 
 
+@pytest.mark.parametrize(
+    ("feature", "value", "message"),
+    [
+        ("observation.environment_state", "a text", "does not describe"),
+        ("observation.state", {"names": ["a"]}, "does not describe"),
+        ("observation.state", {"shape": [10**12]}, "does not describe"),
+        ("observation.state", {"shape": [3], "names": ["a", "b", "c"]}, "expected 3 numbers per row"),
+    ],
+)
+def test_damaged_features_of_lerobot_are_refused(dataset: Path, feature: str, value: Any, message: str) -> None:
+    path = dataset / "meta" / "info.json"
+    info = json.loads(path.read_text())
+    path.write_text(json.dumps(_set(info, "features", _set(info["features"], feature, value))))
+    with pytest.raises(UsageError, match=message):
+        load_trajectories(dataset, AIRHOCKEY)
+
+
 def test_frames_per_second_are_a_whole_number(plans: Plans, tmp_path: Path) -> None:
     pytest.importorskip("pyarrow")
     with pytest.raises(UsageError, match="whole number"):

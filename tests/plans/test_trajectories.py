@@ -382,6 +382,12 @@ def test_a_file_with_a_stack_of_no_trajectories_is_an_error(tmp_path: Path, unit
         load_trajectories(tmp_path / "none.npz", "airhockey", unit=unit)
 
 
+def test_a_table_without_rows_is_an_error(tmp_path: Path) -> None:
+    np.savez(tmp_path / "none.npz", t=np.zeros(0), q=np.zeros((0, 6)))
+    with pytest.raises(UsageError, match="there are no positions"):
+        load_trajectories(tmp_path / "none.npz", "airhockey")
+
+
 def test_names_in_a_parquet_file_that_are_no_texts_are_an_error(tmp_path: Path) -> None:
     pyarrow = pytest.importorskip("pyarrow")
     parquet = pytest.importorskip("pyarrow.parquet")
