@@ -8,6 +8,7 @@ import argparse
 import copy
 import math
 import time
+from dataclasses import replace
 from itertools import pairwise
 
 import torch
@@ -21,6 +22,7 @@ WIDTH, LAYERS, BATCH, RATE, WARM_UP = 192, 5, 128, 1e-3, 200  # the last: steps 
 NODES, SHIFTS = 32, 16  # quadrature nodes of the loss, which move from step to step
 SAMPLE_CLIP, BATCH_CLIP = 30.0, 2.0  # of gradients, in medians of the batch and in running norms
 GROWTH = 3000.0  # of the weights of constraints during the run
+MARGINS = {"joint-acceleration": 0.96, "joint-velocity": 0.98}  # of limits, so that small errors stay within them
 MEMORY = 0.999  # decay of the average of the parameters
 
 
@@ -66,7 +68,9 @@ def clip_samples(gradient):
 
 def train(planner, dataset, *, seconds, steps):
     """Train for some CPU time or steps; return the planner with the average of the last parameters."""
-    loss = cnpgen.PlanLoss(dataset.problem, nodes=NODES, margins=suggested_margins(planner.layer.problem))
+    margins = suggested_margins(planner.layer.problem)
+    margins = replace(margins, factors={**margins.factors, **MARGINS})
+    loss = cnpgen.PlanLoss(dataset.problem, nodes=NODES, margins=margins)
     metric = Metric(suggested_weights(loss.problem, loss.weights0), loss.budgets, MetricSettings(growth=GROWTH))
     batches, average = BatchDataset(dataset.batches(BATCH, fields=STATES)), copy.deepcopy(planner)
     parameters, means = list(planner.parameters()), list(average.parameters())
