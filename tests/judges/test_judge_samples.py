@@ -130,7 +130,7 @@ def test_a_plan_that_is_too_fast_is_never_valid(label: str, rate: float) -> None
 def test_a_velocity_between_positions_that_a_line_hides_is_undecided() -> None:
     plans = plans_of(load("hit"))
     margin = cnpgen.evaluate_plans(plans, workers=1).verdicts[0].margins["joint velocity"]
-    limit, joint, t = abs(margin.bound), plans.problem.joint_names.index(margin.part), np.arange(21) * 0.01
+    limit, joint, t = abs(margin.bound), plans.problem.joint_names.index(margin.part), 0.01 * np.arange(21.0)
     decisions = []
     for mean in (0.84, 0.82):  # of the limit: the velocity rises to 101 % and to 99 %, lines to at most 100 %
         q = np.repeat(plans.boundary.start_q[:1], len(t), axis=0)
