@@ -38,7 +38,7 @@ class Suite:
 
     Attributes:
         name: Name of the suite.
-        planners: Names of the planners in the order of the tables.
+        planners: Names of the planners with any plan, in the order of the tables.
         plants: Names of the plants.
     """
 
@@ -50,7 +50,7 @@ class Suite:
             row for row in rows if row["planner"] in {r["planner"] for r in rows if r["repetition"] != "0"}
         ]
         rows = [row for row in rows if row["repetition"] == "0"]
-        names = {row["planner"] for row in rows}
+        names = {row["planner"] for row in rows if row["planned"] == "1"}
         self.planners = [name for name in ORDER if name in names]
         self.plants = list(dict.fromkeys(row["plant"] for row in rows if row["plant"]))
         self._rows: dict[tuple[str, str], Rows] = {}

@@ -18,7 +18,7 @@ from cnpgen.schema.keys import Key, Range, keys
 from cnpgen.schema.toml import Kind
 
 FILES: dict[Kind, type] = {"problem": Problem, "pipeline": Pipeline, "dataset": DatasetRecipe, "suite": Suite}
-"""What the files of a kind are read as."""
+"""Kind of a file -> type of its recipe."""
 
 GROUPS = {Stage: registry.STAGES, Constraint: registry.CONSTRAINTS, ObjectiveTerm: registry.OBJECTIVES}
 """Tables with a key ``use`` that names their kind -> registry of the kinds."""
@@ -141,8 +141,8 @@ def _expected(key: Key) -> str:
     """Describe the accepted values: ``"a length [m], at least 0"``."""
     bounds = {"at least": key.low, "at most": key.high}
     given = ((which, bound) for which, bound in bounds.items() if bound is not None)
-    said = [f"{which} {bound}" if isinstance(bound, int) else f"{which} {bound:g}" for which, bound in given]
-    return ", ".join([key.expected, *said])
+    limits = [f"{which} {bound}" if isinstance(bound, int) else f"{which} {bound:g}" for which, bound in given]
+    return ", ".join([key.expected, *limits])
 
 
 def _table_to_dict(cls: type) -> dict[str, Any]:

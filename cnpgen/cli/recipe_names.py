@@ -64,7 +64,7 @@ def check_there(what: str, *kinds: str) -> None:
         *kinds: Kinds of recipes, datasets and pipelines by default.
 
     Raises:
-        UsageError: There is nothing of the kind.
+        UsageError: No recipe has this name.
         MachineError: The path cannot be read.
     """
     from cnpgen.store.files.atomic import check_readable

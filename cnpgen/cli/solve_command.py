@@ -93,7 +93,7 @@ def _name(what: Path) -> str:
 
 
 def _problems(arguments: argparse.Namespace) -> "Plans":
-    """Read or draw the boundary problems, by what it is that was given."""
+    """Read or draw the boundary problems, depending on the type of the input."""
     from cnpgen.problems.scenes.scene_files import holds_scenes
     from cnpgen.store.paths import file_kind
 

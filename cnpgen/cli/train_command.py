@@ -128,14 +128,14 @@ def _length(arguments: argparse.Namespace) -> dict[str, Any]:
 
 def _command(arguments: argparse.Namespace) -> str:
     """Return the command that makes this model, without what changes nothing."""
-    said = [(name, getattr(arguments, name)) for name in ("preset", *_LENGTHS)]
-    said += [*passed_settings(arguments), ("check", arguments.check)]
+    given = [(name, getattr(arguments, name)) for name in ("preset", *_LENGTHS)]
+    given += [*passed_settings(arguments), ("check", arguments.check)]
     if arguments.start_from is not None:
-        said.insert(0, ("from", shlex.quote(Path(arguments.start_from).name)))
+        given.insert(0, ("from", shlex.quote(Path(arguments.start_from).name)))
     if arguments.robot is not None:
-        said.insert(0, ("robot", shlex.quote(Path(arguments.robot).name)))
+        given.insert(0, ("robot", shlex.quote(Path(arguments.robot).name)))
     default = arguments.parser.get_default
-    options = [f"--{name.replace('_', '-')} {value!s}" for name, value in said if value not in {None, default(name)}]
+    options = [f"--{name.replace('_', '-')} {value!s}" for name, value in given if value not in {None, default(name)}]
     options = [option.removesuffix(" True") for option in options]
     places = [shlex.quote(path.resolve().name) for path in (arguments.folder, arguments.out)]
     return " ".join(["cnpgen train", places[0], "-o", places[1], *options])

@@ -21,7 +21,7 @@ def whole(text: str) -> int:
     """Read a whole number: ``120000``, ``120_000``, or ``1e6`` if it is exact.
 
     Raises:
-        ValueError: It is none.
+        ValueError: The text is no whole number.
     """
     if len(text) <= _MAX_DIGITS and _PLAIN.fullmatch(text):
         return int(text)

@@ -30,7 +30,7 @@ _TALLIES = {
 
 
 def summary_text(file: Path, found: "Evaluation") -> str:
-    """Lay out what is said of all plans together."""
+    """Format the summary of all plans."""
     from cnpgen.judges.plans.sampling import MAX_TIME_SAMPLES
 
     summary, count = found.summary(), len(found.verdicts)

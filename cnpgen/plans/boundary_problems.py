@@ -128,7 +128,7 @@ def _of_file(path: Path, wanted: ProblemRecord | None, *, allow_large_angles: bo
     problem = agreed_problem(
         path, file.problem(required=wanted is None), wanted, content="boundary problems", command="solve"
     )
-    if (said := file.text("problem_sha256")) and said != problem.comparable_sha256:
+    if (recorded := file.text("problem_sha256")) and recorded != problem.comparable_sha256:
         raise DatasetError(f"{path} is of another problem than {problem.name!r}: its problem_sha256 is not this one's")
     file.check_obstacles(problem)
     boundary = file.boundary(open_problem(problem)[1], allow_large_angles=allow_large_angles)

@@ -23,14 +23,14 @@ def correct_tips(plans: Plans, *, where: str = "") -> Plans:
     """
     found = {}
     for end in ("start", "goal"):
-        name, said = f"{end}_xyz", plans.columns[f"{end}_xyz"]
+        name, recorded = f"{end}_xyz", plans.columns[f"{end}_xyz"]
         tip = plans.problem.tip_positions(getattr(plans.boundary, f"{end}_q"))
-        off = np.linalg.norm(said - tip, axis=1)
+        off = np.linalg.norm(recorded - tip, axis=1)
         wrong = ~(off <= TIP_TOLERANCE_M) & np.isfinite(tip).all(axis=1)
         if wrong.any():
             first = int(np.argmax(wrong))
             text = f"{where}{name} of {counted(int(wrong.sum()), 'plan')} is not where {end}_q puts the tip"
             detail = f"the first is plan {first}, {off[first]:.3g} m off"
-            warnings.warn(f"{text} ({detail}): what the joints say counts", RuntimeWarning, stacklevel=3)
-            found[name] = np.where(wrong[:, None], tip, said)
+            warnings.warn(f"{text} ({detail}): the joint positions are used", RuntimeWarning, stacklevel=3)
+            found[name] = np.where(wrong[:, None], tip, recorded)
     return replace(plans, columns={**plans.columns, **found}) if found else plans

@@ -116,11 +116,11 @@ def _with_meshes(problem: Problem, path: Path, where: RecipeLocation, mistakes: 
 def without_defaults(value: Any) -> Any:
     """Remove nulls, empty arrays and records of plug-ins, which recipes do not contain."""
     if isinstance(value, dict):
-        said = {key: entry for key, entry in value.items() if entry is not None and entry != []}
-        if "use" in said:
-            said.pop("source", None)
-            said.pop("package", None)
-        return {key: without_defaults(entry) for key, entry in said.items()}
+        given = {key: entry for key, entry in value.items() if entry is not None and entry != []}
+        if "use" in given:
+            given.pop("source", None)
+            given.pop("package", None)
+        return {key: without_defaults(entry) for key, entry in given.items()}
     return [without_defaults(entry) for entry in value] if isinstance(value, list) else value
 
 

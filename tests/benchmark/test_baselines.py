@@ -30,7 +30,10 @@ from cnpgen.benchmark.process import PlannerProcess
 from cnpgen.benchmark.results_file import answer_from_dict
 from cnpgen.benchmark.suite import load_suite
 from cnpgen.errors import UsageError
-from cnpgen.plans import Plans, open_problem
+from cnpgen.plans import Plans, open_problem, record_problem
+from cnpgen.problems.constraints.constraint import Constraint
+from cnpgen.problems.constraints.joint import JointAcceleration, JointPosition, JointTorque, JointVelocity
+from cnpgen.problems.problem_file import load_problem
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.sampled_trajectory import Trajectory
@@ -208,6 +211,20 @@ def test_baselines_refuse_obstacles_that_are_not_upright_boxes() -> None:
     ball = Obstacle(name="ball", kind="sphere", position=(0.4, 0.1, 0.5), radius=0.1)
     with pytest.raises(UsageError, match="supported are upright boxes only, 'heavy-object' has ball"):
         boxes_of(replace(problem, obstacle=(*problem.obstacle, ball)), one_of("heavy-100").scene)
+
+
+@pytest.mark.parametrize("planner", [TrajOpt(), CBiRRT()])
+def test_baselines_do_not_apply_to_problems_without_table_and_object(planner: BenchmarkPlanner) -> None:
+    if isinstance(planner, CBiRRT):
+        pytest.importorskip("ompl")
+    heavy = load_problem("heavy-object")
+    free = replace(heavy, object=None, obstacle=(), constraint=tuple(c for c in heavy.constraint if is_of_joints(c)))
+    with pytest.raises(UsageError, match="has neither table nor object"):
+        planner.prepare(Setting(record_problem(free)))
+
+
+def is_of_joints(constraint: Constraint) -> bool:
+    return isinstance(constraint, JointPosition | JointVelocity | JointAcceleration | JointTorque)
 
 
 def at_rest(joints: int, distance: np.ndarray) -> Boundary:

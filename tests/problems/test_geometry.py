@@ -74,7 +74,7 @@ def test_a_missing_mesh_is_a_mistake_of_the_problem(tmp_path):
     (tmp_path / "crane" / "meshes" / "wedge.stl").unlink()
     (found,) = mistakes(file)
     assert found.startswith("robot.urdf: ")
-    assert f"looked for at\n  {tmp_path}/crane/crane/meshes/wedge.stl\n" in found
+    assert f"searched paths:\n  {tmp_path}/crane/crane/meshes/wedge.stl\n" in found
 
 
 def test_packages_are_relative_to_the_problem_file(tmp_path):

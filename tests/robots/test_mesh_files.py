@@ -66,5 +66,5 @@ def test_a_problem_whose_package_is_missing_can_be_listed_and_its_robot_says_wha
         load_robot(problem)
     assert caught.value.exit_code == 3
     said = str(caught.value)
-    assert said.startswith(f"{file}: the file 'package://{package}/no/such.urdf' is missing; looked for at\n")
+    assert said.startswith(f"{file}: the file 'package://{package}/no/such.urdf' is missing; searched paths:\n")
     assert hint in said

@@ -92,9 +92,9 @@ def test_a_problem_holds_its_meshes(tmp_path: Path) -> None:
     assert len(corners_of(again.obstacle[-1].mesh)) == len(WEDGE)
 
 
-def test_a_mesh_that_is_missing_is_named_with_the_places_looked_at(tmp_path: Path) -> None:
+def test_a_missing_mesh_is_reported_with_the_searched_paths(tmp_path: Path) -> None:
     file = write_problem(tmp_path, obstacles=KINDS.replace("wedge.stl", "wegde.stl"))
-    with pytest.raises(RecipeError, match=r"(?s)obstacle 5\.mesh: .*'crane/meshes/wegde\.stl' is missing; looked for"):
+    with pytest.raises(RecipeError, match=r"(?s)obstacle 5\.mesh: .*'crane/meshes/wegde\.stl' is missing; searched"):
         load_problem(file)
     (tmp_path / "crane" / "meshes" / "wegde.stl").write_bytes(b"solid")
     with pytest.raises(RecipeError, match=r"obstacle 5\.mesh: .*wegde\.stl: "):

@@ -54,11 +54,11 @@ def places_of(error: RecipeError) -> list[str]:
     return [line.strip() for line in str(error).splitlines()[1:-1]]
 
 
-def test_a_missing_mesh_is_an_error_with_every_place_that_was_looked_at(tmp_path, monkeypatch):
+def test_a_missing_mesh_is_an_error_with_the_searched_paths(tmp_path, monkeypatch):
     monkeypatch.setenv("ROS_PACKAGE_PATH", f"{tmp_path / 'ros'}:{tmp_path / 'more'}")
     monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path / "ament"))
     file = tmp_path / "arm" / "urdf" / "arm.urdf"
-    with pytest.raises(RecipeError, match="missing; looked for at") as caught:
+    with pytest.raises(RecipeError, match="missing; searched paths:") as caught:
         find_named_file("package://arm/a%20b.stl", file, [tmp_path / "named", tmp_path / "x" / "arm"])
     folders = ["named/arm", "x/arm/arm", "x/arm", "ros/arm", "more/arm", "ament/share/arm", "arm/urdf/arm", "arm/arm"]
     found = places_of(caught.value)
@@ -84,7 +84,7 @@ def test_a_package_whose_folder_has_another_name_is_found_around_the_urdf(tmp_pa
     name = "package://arm_description/meshes/palm.stl"
     for place in ("arm.urdf", "urdf/arm.urdf", "urdf/left/arm.urdf"):
         assert find_named_file(name, tmp_path / "renamed" / place) == mesh
-    with pytest.raises(RecipeError, match="missing; looked for at"):
+    with pytest.raises(RecipeError, match="missing; searched paths:"):
         find_named_file(name, tmp_path / "renamed" / "a" / "b" / "c" / "arm.urdf")
 
 

@@ -18,6 +18,7 @@ from cnpgen.benchmark.planners.obstacle_boxes import (
     boxes_of,
     depth,
     distance,
+    require_table_or_transport,
 )
 from cnpgen.benchmark.planners.tip import Tip
 from cnpgen.errors import requires_extra
@@ -50,6 +51,7 @@ class CBiRRT(BenchmarkPlanner):
         """Import OMPL."""
         ompl = load_ompl()
         problem, robot = open_problem(setting.problem)
+        require_table_or_transport(problem)
 
         def plan(task: Plans) -> Answer:
             seed_ompl(ompl, setting, task)

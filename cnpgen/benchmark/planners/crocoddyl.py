@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from cnpgen.benchmark.benchmark_planner import Answer, BenchmarkPlanner, Plan, Setting
 from cnpgen.benchmark.planners.crocoddyl_costs import ShootingCosts, load_crocoddyl
-from cnpgen.benchmark.planners.obstacle_boxes import require_transport
+from cnpgen.benchmark.planners.obstacle_boxes import require_table_or_transport
 from cnpgen.plans.plans import Plans
-from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import field
@@ -42,8 +41,7 @@ class Crocoddyl(BenchmarkPlanner):
         """Import Crocoddyl and check the kind of problem."""
         load_crocoddyl()
         problem, robot = open_problem(setting.problem)
-        if problem.first(Table) is None:
-            require_transport(problem)
+        require_table_or_transport(problem)
 
         def plan(task: Plans) -> Answer:
             deadline = time.perf_counter() + setting.time_limit

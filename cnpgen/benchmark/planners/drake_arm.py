@@ -6,7 +6,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.benchmark.planners.obstacle_boxes import require_transport
+from cnpgen.benchmark.planners.obstacle_boxes import require_table_or_transport
 from cnpgen.errors import UsageError, requires_extra
 from cnpgen.problems.constraints.joint import JointTorque
 from cnpgen.problems.constraints.table import Table
@@ -41,8 +41,7 @@ def check_robot(problem: Problem, robot: Robot) -> None:
     Raises:
         UsageError: The problem has neither a table nor a held object among boxes, or a payload or another tip frame.
     """
-    if problem.first(Table) is None:
-        require_transport(problem)
+    require_table_or_transport(problem)
     if robot.attached.payload is not None or robot.attached.tip != robot.attached.frame:
         raise UsageError(f"supported are tips of the URDF without payload, {problem.name!r} has another one")
 

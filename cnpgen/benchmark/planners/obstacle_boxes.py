@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
+from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.scene import Scene
 
@@ -24,6 +25,16 @@ def boxes_of(problem: Problem, scene: Scene) -> tuple[Array, list[Box]]:
     size = require_transport(problem)
     boxes = [(np.array([*solid.low[:2], -np.inf]), solid.high) for solid in scene.bodies()]
     return size, boxes
+
+
+def require_table_or_transport(problem: Problem) -> None:
+    """Check that a problem has a table, or a held object among upright boxes.
+
+    Raises:
+        UsageError: It has neither.
+    """
+    if problem.first(Table) is None:
+        require_transport(problem)
 
 
 def require_transport(problem: Problem) -> Array:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from cnpgen.benchmark.benchmark_planner import Answer, BenchmarkPlanner, Plan, Setting
 from cnpgen.benchmark.planners.knots import KnotConstraints, knot_constraints
+from cnpgen.benchmark.planners.obstacle_boxes import require_table_or_transport
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.robots.robot import Robot
@@ -34,6 +35,7 @@ class TrajOpt(BenchmarkPlanner):
     def prepare(self, setting: Setting) -> Plan:
         """Choose the constraints at the knots."""
         problem, robot = open_problem(setting.problem)
+        require_table_or_transport(problem)
 
         def plan(task: Plans) -> Answer:
             at_knots = knot_constraints(problem, robot, task.scene)

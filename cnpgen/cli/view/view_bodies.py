@@ -34,8 +34,8 @@ class Body:
     """Triangles that a joint moves.
 
     Attributes:
-        name: What it is.
-        joint: The joint, from 1 on; 0 for what stands still.
+        name: Name of the body.
+        joint: Index of the joint, from 1; 0 for a fixed body.
         corners: Corners in the joint's frame [m], shape (V, 3).
         triangles: Numbers of their corners, shape (F, 3).
     """
@@ -56,7 +56,7 @@ def robot_bodies(problem: Problem, robot: Robot, *, with_meshes: bool = True) ->
     """
     try:
         visual = list(_visual_bodies(problem, robot)) if with_meshes else []
-    except (RecipeError, ValueError):  # a mesh is not there, or is none: judges do not need it
+    except (RecipeError, ValueError):  # a mesh is missing or unreadable; the verdict does not need it
         visual = []
     if visual and sum(len(body.triangles) for body in visual) <= MAX_TRIANGLES:
         return visual, "meshes"
@@ -79,10 +79,10 @@ def wrapped(name: str, joint: int, corners: Array, radius: float) -> Body:
     """Return the hull of points, inflated by a radius, as triangles that face outwards.
 
     Args:
-        name: What it is.
-        joint: The joint that moves it.
+        name: Name of the body.
+        joint: Index of the joint that moves it.
         corners: The points [m], shape (V, 3).
-        radius: How thick the hull is wrapped [m].
+        radius: Thickness of the layer around the hull [m].
     """
     from scipy.spatial import ConvexHull
 

@@ -25,7 +25,7 @@ def find_urdf(name: str, problem: Path, packages: Sequence[Path] = ()) -> Path:
         packages: Package folders of the problem.
 
     Raises:
-        PluginError: It is one of a package that is not here; with every place that was looked at.
+        PluginError: The package of the file is not installed; the message lists the searched folders.
     """
     if urlparse(name).scheme not in _PACKAGE:
         return problem.parent / name
@@ -77,9 +77,9 @@ def _find(name: str, beside: Path, packages: Sequence[Path]) -> Path:
     places = list(dict.fromkeys(_places(name, beside.absolute(), packages)))
     found = _first(places)
     if found is None:
-        none = "  nowhere: a file of this kind of address is not read"
-        said = "\n".join(f"  {str(place)[:MAX_NAME_LENGTH]}" for place in places) or none
-        raise RecipeError([f"the file {show(name)} is missing; looked for at\n{said}{_hint(name)}"])
+        none = "  none: this kind of address is not read"
+        searched = "\n".join(f"  {str(place)[:MAX_NAME_LENGTH]}" for place in places) or none
+        raise RecipeError([f"the file {show(name)} is missing; searched paths:\n{searched}{_hint(name)}"])
     return found
 
 
