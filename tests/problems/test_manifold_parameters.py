@@ -31,6 +31,7 @@ from cnpgen.training.settings import TrainingSettings
 from cnpgen.trajectory.boundary import assemble
 from cnpgen.world.path import PathWorld
 from cnpgen.world.world import World
+from tests.examples.example_robots import needs_robots
 
 TABLE_RANGES = ParameterRanges(
     table_x_low=Range(0.55, 0.62),
@@ -99,7 +100,11 @@ def solved(name: str) -> Plans:
     return cnpgen.solve_plans(problems).plans
 
 
-@pytest.mark.parametrize("problem", [RECTANGLES, OBJECTS, WIPE, in_range(WIPE, 0.04)], ids=lambda each: each.name)
+@pytest.mark.parametrize(
+    "problem",
+    [RECTANGLES, OBJECTS, *(pytest.param(each, marks=needs_robots) for each in (WIPE, in_range(WIPE, 0.04)))],
+    ids=lambda each: each.name,
+)
 def test_both_forms_agree_on_motions_and_at_their_ends(problem: Problem) -> None:
     robot, random, n = load_robot(problem), np.random.default_rng(2), 8
     exact = tuple(item for item in problem.constraint if isinstance(item, Table | TipAxis))
