@@ -151,8 +151,8 @@ def test_the_goal_is_where_the_joints_put_the_tip_whatever_a_column_says(
     with warnings.catch_warnings():
         warnings.simplefilter("always")
         code, out, err = run(file)
-    said = "goal_xyz of 1 plan is not where goal_q puts the tip (the first is plan 1, 0.3 m off): what the joints say"
-    assert (code, err) == (0, f"cnpgen: warning: {file}: {said} counts\n")
+    said = "goal_xyz of 1 plan is not where goal_q puts the tip (the first is plan 1, 0.3 m off)"
+    assert (code, err) == (0, f"cnpgen: warning: {file}: {said}: the joint positions are used\n")
     assert re.search(r"^  at the goal by the paper's rules +2 of 2 ", out, re.M)
 
 

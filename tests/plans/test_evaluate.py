@@ -53,8 +53,8 @@ def test_plans_in_memory_and_in_a_file_get_one_verdict_where_a_tip_position_was_
     right = plans_of(load("transport"), load("transport"))
     moved = right.columns[f"{end}_xyz"] + np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.05]])
     changed = replace(right, columns={**right.columns, f"{end}_xyz": moved})
-    said = f"{end}_xyz of 1 plan is not where {end}_q puts the tip .the first is plan 1, 0.05 m off.: what the joints"
-    with pytest.warns(RuntimeWarning, match=f"^{said}"):
+    said = f"{end}_xyz of 1 plan is not where {end}_q puts the tip .the first is plan 1, 0.05 m off."
+    with pytest.warns(RuntimeWarning, match=f"^{said}: the joint positions are used"):
         in_memory = evaluate_plans(changed)
     save_plans(tmp_path / "changed.h5", changed)
     with pytest.warns(RuntimeWarning, match=f"changed.h5: {said}"):
