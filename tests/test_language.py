@@ -115,6 +115,21 @@ def test_no_numeric_constant_has_two_values() -> None:
     assert not findings, "\n".join(findings)
 
 
+def test_no_constant_is_assigned_twice_without_use_of_its_first_value() -> None:
+    findings = []
+    for path in (path for folder in FOLDERS for path in sorted((ROOT / folder).rglob("*.py"))):
+        lines: dict[str, int] = {}
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            for target in node.targets if isinstance(node, ast.Assign) else []:
+                if not isinstance(target, ast.Name) or not target.id.isupper():
+                    continue
+                used = {part.id for part in ast.walk(node.value) if isinstance(part, ast.Name)}
+                if target.id in lines and target.id not in used:
+                    findings.append(f"{path.relative_to(ROOT)}:{node.lineno}: {target.id}, see line {lines[target.id]}")
+                lines[target.id] = node.lineno
+    assert not findings, "\n".join(findings)
+
+
 def test_no_two_classes_have_the_same_name() -> None:
     classes: dict[str, list[str]] = defaultdict(list)
     for path, tree in sources():
