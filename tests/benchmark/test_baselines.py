@@ -141,6 +141,16 @@ def test_paths_in_the_plane_have_smooth_headings_correct_lengths_and_ends(hit: t
     np.testing.assert_allclose(first / np.linalg.norm(first), direction / np.linalg.norm(direction), atol=1e-3)
 
 
+@pytest.mark.parametrize("hit", [(0.9, 0.05), (0.8, -0.1)])
+def test_paths_to_a_hit_behind_the_start_are_straight_and_stop_within_the_table(hit: tuple[float, float]) -> None:
+    start, end = np.array([1.0, 0.0]), np.array(hit)
+    forwards = striking_path(start, end, np.array([1.5, 0.0]), 1.5, 8.0)
+    assert forwards.length == pytest.approx(np.linalg.norm(end - start))
+    points = np.array([*forwards.sampled(0.01), *stopping_path(forwards).sampled(0.01)])
+    assert np.isfinite(points).all()
+    assert np.all((points > MIN_MALLET_XY_M - 1e-9) & (points < MAX_MALLET_XY_M + 1e-9))
+
+
 def test_aqp_hits_the_goal_in_the_required_direction() -> None:
     task = one_of("hits-81", 40)
     trajectory = AQP().prepare(Setting(task.problem))(task)

@@ -110,7 +110,8 @@ def stopping_path(hit_path: PlanePath) -> PlanePath:
     aside = STOP_OFFSET_M * np.array([1.0, -1.0 if hit[1] > 0 else 1.0])
     end = np.clip(hit + aside, [-np.inf, -MAX_STOP_XY_M[1]], MAX_STOP_XY_M)
     low, high = np.minimum(hit, end), np.maximum(hit, end)
-    forwards = hit_path.end - hit_path.bend
+    bends = bool((hit != hit_path.bend).any())
+    forwards = hit - (hit_path.bend if bends else hit_path.start)
     return PlanePath(hit, _exit_point(hit, forwards, low, high), end, hit_path.speed, stops=True)
 
 
