@@ -20,7 +20,7 @@ from cnpgen.planner.model import Model
 from cnpgen.planner.plan_requests import drawing_stages
 from cnpgen.plans.format import CONDITIONS
 from cnpgen.plans.plausible import UNITS, is_usual
-from cnpgen.robots.plausible_values import check_plausible
+from cnpgen.robots.plausible_values import MAX_LIMIT_RATIO, check_plausible
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.arguments import concerning, numbers
 from cnpgen.trajectory.boundary import Boundary
@@ -117,8 +117,9 @@ def _parameter_columns(context: Context, parameters: ArrayLike | None) -> dict[s
 
 def _check_state(robot: Robot, parts: Sequence[Array]) -> None:
     """Check that positions, velocities and accelerations of the arm, shape (n, N) each, are not in degrees."""
-    columns = {name: values.T for name, values in zip(HIT_COLUMNS[:3], parts, strict=True)}
-    if all(is_usual(robot, name, values) for name, values in columns.items()):
+    states = {name: values.T for name, values in zip(HIT_COLUMNS[:3], parts, strict=True)}
+    columns = {name: values for name, values in states.items() if not is_usual(robot, name, values)}
+    if not columns:
         return
     with concerning("state"):
         check_plausible(
@@ -130,7 +131,8 @@ def _check_distance(completion: Completion, contact_distance: float, positions: 
     """Check that lengths are not in millimetres."""
     lengths = {"contact_distance": np.array([[contact_distance]])}
     lengths |= {name: values.T for name, values in positions.items()}
-    if max(np.abs(values).max(initial=0) for values in lengths.values()) < completion.context.robot.reach:
+    largest = MAX_LIMIT_RATIO * completion.context.robot.reach
+    if all(np.abs(values).max(initial=0) <= largest for values in lengths.values()):
         return  # the usual case: the check takes 50 microseconds
     check_plausible(completion.context.robot, lengths, dict.fromkeys(lengths, "m"), noun="hit")
 

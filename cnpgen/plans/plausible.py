@@ -33,6 +33,8 @@ def check_boundary_units(
     """
     conditions = {name: np.asarray(values) for name, values in boundary.conditions().items()}
     columns = {name: values for name, values in conditions.items() if not is_usual(robot, name, values)}
+    if not columns:
+        return
     units = {name: robot.units(UNITS[name.rpartition("_")[2]]) for name in columns}
     try:
         check_plausible(robot, columns, units, noun="plan")
@@ -49,14 +51,12 @@ def check_boundary_units(
 
 
 def is_usual(robot: Robot, name: str, values: NDArray[Any]) -> bool:
-    """Return whether positions are within the limits, and derivatives within the smallest one: a fast check."""
-    if not name.endswith("_q"):
-        if not np.count_nonzero(values):
-            return True
-        limit = robot.velocity_limit if name.endswith("_dq") else robot.acceleration_limit
-        return bool(np.abs(values).max() <= limit.min())
-    within = (robot.position_lower <= values) & (values <= robot.position_upper)
-    return bool(np.count_nonzero(within) == values.size)
+    """Return whether positions and their derivatives are within the limits: a fast check."""
+    if name.endswith("_q"):
+        within = (robot.position_lower <= values) & (values <= robot.position_upper)
+    else:
+        within = np.abs(values) <= (robot.velocity_limit if name.endswith("_dq") else robot.acceleration_limit)
+    return bool(np.count_nonzero(within) == within.size)  # a third of the time of all()
 
 
 def _users_level() -> int:

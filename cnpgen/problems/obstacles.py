@@ -53,10 +53,9 @@ def scene_of(
     if constraint is not None:
         if goal_velocity is None:
             raise UsageError(f"is missing: the problem {problem.name!r} needs it", argument="goal_velocity")
-        shapes = [np.shape(xyz) for xyz in (start_xyz, goal_xyz, goal_velocity)]
-        if len(set(shapes)) > 1 or shapes[0][1:] != (3,):
+        shapes = [xyz.shape for xyz in (start_xyz, goal_xyz, goal_velocity)]
+        if not shapes[0] == shapes[1] == shapes[2] == (len(poses), 3):
             raise UsageError(f"positions and velocities must have one shape (N, 3), got {shapes}")
-        goal_xyz = np.asarray(goal_xyz)
         if (frame := table_frame_of(problem, parameters)) is not None:
             goal_xyz, goal_velocity = frame.to_table(goal_xyz), frame.along_table(goal_velocity)
         poses = np.concatenate([poses, constraint.scene_values(goal_xyz, goal_velocity)], axis=1)

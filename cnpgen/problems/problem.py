@@ -191,7 +191,7 @@ class Problem:
             return np.zeros(3)
         return np.array([(table.x.low + table.x.high) / 2, (table.y.low + table.y.high) / 2, table.z])
 
-    @property
+    @cached_property
     def scene_constraint(self) -> Constraint | None:
         """The constraint that depends on values of each motion (``Constraint.scene_values``), or None."""
         return next((constraint for constraint in self.constraint if constraint.scene_width), None)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -98,7 +99,7 @@ class ParameterRanges:
         low=0.0,
     )
 
-    @property
+    @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the parameters that samples have."""
         return tuple(key.name for key in keys(type(self)) if getattr(self, key.name) is not None)
@@ -119,22 +120,22 @@ class ParameterRanges:
         """Ranges of the parameters that samples have."""
         return tuple(getattr(self, name) for name in self.names)
 
-    @property
+    @cached_property
     def tilts_table(self) -> bool:
         """Whether the table is raised or tilted."""
         return any(name in TABLE_PARAMETERS for name in self.names)
 
-    @property
+    @cached_property
     def changes_rectangle(self) -> bool:
         """Whether the rectangle of the table differs from sample to sample."""
         return any(name in TABLE_BOUNDS for name in self.names)
 
-    @property
+    @cached_property
     def turns_upright(self) -> bool:
         """Whether the direction of ``vertical`` or ``axis`` differs from sample to sample."""
         return any(name in UPRIGHT_TURN for name in self.names)
 
-    @property
+    @cached_property
     def changes_payload(self) -> bool:
         """Whether the payload differs from sample to sample."""
         return any(name in PAYLOAD_PARAMETERS for name in self.names)

@@ -121,8 +121,11 @@ def _refined(folder: Path) -> object:
 
 
 def _model(folder: Path) -> object:
-    """Return the parameters of a model; its file also has the times of the run."""
-    assert not {".checkpoint", ".tmp", ".lock"} & {path.suffix for path in folder.iterdir()}
+    """Return the parameters of a model; its file also has the times of the run.
+
+    A run that is killed after its last step may leave the lock file, which then locks nothing.
+    """
+    assert not {".checkpoint", ".tmp"} & {path.suffix for path in folder.iterdir()}
     return load_model(folder / "model.h5").parameters.tobytes()
 
 
@@ -202,14 +205,17 @@ def _killed(kind: Kind, folder: Path, chosen: random.Random, uninterrupted: tupl
                 n_signals += 1
             code = process.wait(MAX_RUN_TIME_S)
         assert code in {0, 1, 3, 130, 143, -signal.SIGKILL, -signal.SIGTERM, -signal.SIGINT}, f"it ended with {code}"
-        if (folder / "plans.h5").exists() or (
-            folder / "model.h5"
-        ).exists():  # the run finished before the signal, and would refuse to replace its plans
+        if (folder / "plans.h5").exists() or _is_trained(folder):  # the same command would refuse to replace them
             break
     else:
         _finish(kind.words(folder, 2), kind.codes)
     assert kind.product(folder) == expected, "another result"
     return n_signals, f"ended with {code}"
+
+
+def _is_trained(folder: Path) -> bool:
+    """Return whether a training is complete; a run that still has its checkpoint finishes when it is resumed."""
+    return (folder / "model.h5").exists() and not (folder / "model.checkpoint").exists()
 
 
 def _hit(process: subprocess.Popen[bytes], chosen: random.Random) -> None:
