@@ -167,7 +167,7 @@ HITS: tuple[Column, ...] = (
     ("acceleration / limit: median, largest", extremes("acceleration_use")),
 )
 REPLANS: tuple[Column, ...] = (
-    *PLANS[1:],
+    *PLANS,
     ("touched the puck early", flag("touched_early", NOMINAL)),
     ("success", flag("success", NOMINAL)),
     ("95 % interval [%]", interval("success", NOMINAL)),

@@ -19,7 +19,7 @@ from cnpgen.planner.inference_pipeline import loaded_problem
 from cnpgen.planner.model import Model
 from cnpgen.planner.plan_requests import drawing_stages
 from cnpgen.plans.format import CONDITIONS
-from cnpgen.plans.plausible import UNITS, is_usual
+from cnpgen.plans.plausible import UNITS, are_usual
 from cnpgen.robots.plausible_values import MAX_LIMIT_RATIO, check_plausible
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.arguments import concerning, numbers
@@ -117,9 +117,8 @@ def _parameter_columns(context: Context, parameters: ArrayLike | None) -> dict[s
 
 def _check_state(robot: Robot, parts: Sequence[Array]) -> None:
     """Check that positions, velocities and accelerations of the arm, shape (n, N) each, are not in degrees."""
-    states = {name: values.T for name, values in zip(HIT_COLUMNS[:3], parts, strict=True)}
-    columns = {name: values for name, values in states.items() if not is_usual(robot, name, values)}
-    if not columns:
+    columns = {name: values.T for name, values in zip(HIT_COLUMNS[:3], parts, strict=True)}
+    if are_usual(robot, list(columns.values())):
         return
     with concerning("state"):
         check_plausible(
@@ -129,11 +128,11 @@ def _check_state(robot: Robot, parts: Sequence[Array]) -> None:
 
 def _check_distance(completion: Completion, contact_distance: float, positions: Mapping[str, Array]) -> None:
     """Check that lengths are not in millimetres."""
+    values = np.concatenate([[contact_distance], *(values.ravel() for values in positions.values())])
+    if np.abs(values).max() <= MAX_LIMIT_RATIO * completion.context.robot.reach:
+        return  # the usual case: the check takes 50 microseconds
     lengths = {"contact_distance": np.array([[contact_distance]])}
     lengths |= {name: values.T for name, values in positions.items()}
-    largest = MAX_LIMIT_RATIO * completion.context.robot.reach
-    if all(np.abs(values).max(initial=0) <= largest for values in lengths.values()):
-        return  # the usual case: the check takes 50 microseconds
     check_plausible(completion.context.robot, lengths, dict.fromkeys(lengths, "m"), noun="hit")
 
 

@@ -114,9 +114,9 @@ class InferencePipeline:
         """Plan N motions; return the tasks with the selected lines, and the motions."""
         ends = ends_of(boundary)
         tasks = self.prepare(boundary, ends=ends, obstacle_poses=obstacle_poses)
-        motion = self._fitted(self._projected(model, tasks, ends), tasks.scene.poses)
+        motion = self._projected(model, tasks, ends)
         if self.via_points is None:
-            return tasks, motion
+            return tasks, self._fitted(motion, tasks.scene.poses)
         return self._with_via_points(self.via_points, model, tasks, motion)
 
     def motion(self, model: Model, tasks: Tasks) -> Motion:
@@ -154,11 +154,15 @@ class InferencePipeline:
     def _with_via_points(
         self, via_points: ViaPoints, model: Model, tasks: Tasks, motion: Motion
     ) -> tuple[Tasks, Motion]:
-        """Replace motions that violate static conditions by ones through via points with a smaller violation."""
+        """Replace motions that violate static conditions by ones through via points with a smaller violation.
+
+        The rates of motion are not fitted; those of the result are.
+        """
         path, rate, before = motion.path.copy(), motion.rate.copy(), via_points.violation(motion, tasks.scene.poses)
         correction = np.zeros_like(path[:, 3 : path.shape[1] - tasks.boundary.fixed_at_goal])
         correction += 0.0 if tasks.correction is None else tasks.correction
         violating, count = np.flatnonzero(before > 1), min(MAX_LINES, len(via_points.via_points))
+        kept = np.ones(len(path), bool)
         for some in (violating[block] for block in blocks_of_motions(len(violating))):
             repeated = np.repeat(some, len(via_points.via_points))
             lines = self.prepare(tasks.boundary[repeated], np.tile(via_points.via_points, (len(some), 1)))
@@ -177,7 +181,8 @@ class InferencePipeline:
             better = violation < before[some]
             replaced, sources = some[better], np.searchsorted(candidates, fastest[better])
             path[replaced], rate[replaced] = fitted.path[sources], fitted.rate[sources]
-            correction[replaced] = alternatives.correction[fastest[better]]
+            correction[replaced], kept[replaced] = alternatives.correction[fastest[better]], False
+        rate[kept] = self._fitted(motion[kept], tasks.scene.poses[kept]).rate
         return replace(tasks, correction=correction), replace(motion, path=path, rate=rate)
 
 

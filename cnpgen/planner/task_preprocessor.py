@@ -109,7 +109,7 @@ class TaskPreprocessor:
         if correction is None and self.iterated:
             correction = np.zeros((len(boundary), *self._interior(boundary), boundary.start_q.shape[1]))
         tasks = Tasks(boundary, start_xyz, goal_xyz, time, scene, correction, placed)
-        return self._observed(tasks, self._line(boundary, correction))
+        return tasks if self.scene_features is None else self._observed(tasks, self._line(boundary, correction))
 
     def along(self, tasks: Tasks, path: Array) -> Tasks:
         """Return tasks whose lines are the paths of other plans for them.

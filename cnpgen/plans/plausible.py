@@ -2,6 +2,7 @@
 
 import inspect
 import warnings
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -31,9 +32,8 @@ def check_boundary_units(
     Raises:
         UnitError: A value is probably in another unit.
     """
-    conditions = {name: np.asarray(values) for name, values in boundary.conditions().items()}
-    columns = {name: values for name, values in conditions.items() if not is_usual(robot, name, values)}
-    if not columns:
+    columns = {name: np.asarray(values) for name, values in boundary.conditions().items()}
+    if are_usual(robot, list(columns.values())):
         return
     units = {name: robot.units(UNITS[name.rpartition("_")[2]]) for name in columns}
     try:
@@ -50,12 +50,21 @@ def check_boundary_units(
         ) from error
 
 
-def is_usual(robot: Robot, name: str, values: NDArray[Any]) -> bool:
-    """Return whether positions and their derivatives are within the limits: a fast check."""
-    if name.endswith("_q"):
-        within = (robot.position_lower <= values) & (values <= robot.position_upper)
-    else:
-        within = np.abs(values) <= (robot.velocity_limit if name.endswith("_dq") else robot.acceleration_limit)
+def are_usual(robot: Robot, states: Sequence[NDArray[Any]]) -> bool:
+    """Return whether states are within the limits of the joints: a fast check.
+
+    Args:
+        robot: Robot of the problem.
+        states: Positions, velocities and accelerations of one state, or of two without or with the last accelerations;
+            shape (N, n) each.
+    """
+    shape = (len(states[0]), robot.n)
+    if any(values.shape != shape for values in states):
+        return False
+    values = np.concatenate(states, axis=1)
+    low, high = robot.state_bounds
+    width = values.shape[1]
+    within = (low[:width] <= values) & (values <= high[:width])
     return bool(np.count_nonzero(within) == within.size)  # a third of the time of all()
 
 

@@ -44,30 +44,33 @@ def scene_of(
         UsageError: The problem needs the velocities, and they are missing, or the poses do not fit the problem.
     """
     half = 0.0 if problem.object is None else problem.object.size[2] / 2
-    bottoms = {"start": np.asarray(start_xyz)[..., 2] - half, "goal": np.asarray(goal_xyz)[..., 2] - half}
-    poses, constraint = place_obstacles(problem.obstacle, bottoms), problem.scene_constraint
+    parts, constraint = [], problem.scene_constraint
+    if problem.obstacle:
+        bottoms = {"start": start_xyz[:, 2] - half, "goal": goal_xyz[:, 2] - half}
+        parts.append(place_obstacles(problem.obstacle, bottoms))
     if not problem.parameters:
         parameters = None
     elif parameters is None:
-        parameters = np.tile(problem.nominal_parameters, (len(poses), 1))
+        parameters = np.tile(problem.nominal_parameters, (len(start_xyz), 1))
     if constraint is not None:
         if goal_velocity is None:
             raise UsageError(f"is missing: the problem {problem.name!r} needs it", argument="goal_velocity")
         shapes = [xyz.shape for xyz in (start_xyz, goal_xyz, goal_velocity)]
-        if not shapes[0] == shapes[1] == shapes[2] == (len(poses), 3):
+        if not shapes[0] == shapes[1] == shapes[2] == (len(start_xyz), 3):
             raise UsageError(f"positions and velocities must have one shape (N, 3), got {shapes}")
         if (frame := table_frame_of(problem, parameters)) is not None:
             goal_xyz, goal_velocity = frame.to_table(goal_xyz), frame.along_table(goal_velocity)
-        poses = np.concatenate([poses, constraint.scene_values(goal_xyz, goal_velocity)], axis=1)
+        parts.append(constraint.scene_values(goal_xyz, goal_velocity))
     if parameters is not None:
-        poses = np.concatenate([poses, parameters], axis=1)
+        parts.append(parameters)
+    poses = np.concatenate(parts, axis=1) if parts else np.empty((len(start_xyz), 0))
     scene = Scene(tuple(problem.obstacle), poses)
     return scene if obstacle_poses is None else scene.with_poses(obstacle_poses)
 
 
 def table_frame_of(problem: Problem, parameters: Array | None) -> TableFrame | None:
     """Return the frame of the table of N samples, with parameters of shape (N, width); None if none move it."""
-    if not problem.parameters.tilts_table or parameters is None:
+    if parameters is None or not problem.parameters.tilts_table:
         return None
     return table_frame(problem.parameters, problem.table_origin, parameters)
 

@@ -80,6 +80,13 @@ class Robot:
         return len(self.joint_names)
 
     @cached_property
+    def state_bounds(self) -> tuple[Array, Array]:
+        """Lower and upper limits of positions, velocities and accelerations at both ends, shape (6 n,) each."""
+        moving = self.velocity_limit, self.acceleration_limit
+        low = [self.position_lower, *(-limit for limit in moving)]
+        return np.concatenate(2 * low), np.concatenate(2 * [self.position_upper, *moving])
+
+    @cached_property
     def sliding(self) -> tuple[bool, ...]:
         """Whether each joint is prismatic [m] and not revolute [rad]."""
         return tuple(joint.prismatic for joint in self.chain.joints)

@@ -83,12 +83,13 @@ class PuckContact(Constraint):
             goal_xyz: Tip positions at the goal [m], shape (N, 3).
             goal_velocity: Tip velocities at the goal [m/s], shape (N, 3).
         """
-        values, velocity = np.empty((len(goal_xyz), 4)), goal_velocity[:, :2]
-        speed = np.hypot(velocity[:, 0], velocity[:, 1])[:, None]
+        goal, velocity = goal_xyz[:, :2], goal_velocity[:, :2]
+        speed = np.hypot(velocity[:, :1], velocity[:, 1:])
         is_hit = speed > MIN_HIT_SPEED_M_S
-        values[:, :2] = goal_xyz[:, :2]
-        values[:, 2:] = goal_xyz[:, :2] + self.contact_distance * velocity / np.where(is_hit, speed, 1.0)
-        values[~is_hit[:, 0]] = PUCK_OUT_OF_REACH_M
+        puck = goal + self.contact_distance * velocity / np.maximum(speed, MIN_HIT_SPEED_M_S)
+        values = np.concatenate([goal, puck], axis=1)
+        if np.count_nonzero(is_hit) < len(is_hit):
+            values[~is_hit[:, 0]] = PUCK_OUT_OF_REACH_M
         return values
 
     def symbolic(self, state: SymbolicState) -> tuple[Condition, ...]:
