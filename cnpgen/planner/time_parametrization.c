@@ -56,6 +56,9 @@ I quadratic along(direction d, const double *a, long size) {
     square * d.square[2] + mixed * d.mixed[2]};
 }
 
+/* Upper bound of the change of a row at a step of at most `up`. */
+I v largest_change(quadratic f, double up) { return up * (vabs(f.l) + up * vabs(f.q)); }
+
 /* Largest allowed and smallest required step per lane, and mask of the violated lanes. */
 typedef struct { v up, back; vi violated; } limits;
 
@@ -78,18 +81,20 @@ static double advance(const parametrization *p, const workspace *m, long from, l
     long k = from + (steps / 2 + (i % 2 ? -(i + 1) / 2 : i / 2)) * W;
     direction d = direction_at(m, k);
     v worst = K(-1);
-    EACH(row, 0, rows) { /* upper bound of the violation at a step of `up` */
+    EACH(row, 0, rows) {
       quadratic f = along(d, coefficients + row * phases + k, size);
-      v violation = larger(f.g - upper[row], lower[row] - f.g) + up * (vabs(f.l) + up * vabs(f.q));
+      v violation = larger(f.g - upper[row], lower[row] - f.g) + largest_change(f, up);
       put(critical + row * W, violation);
       worst = larger(violation, worst);
     }
     if (!(largest(worst) > 0)) continue;
-    EACH(row, 0, rows) if (largest(at(critical + row * W)) > 0) {
+    EACH(row, 0, rows) if (largest(at(critical + row * W)) > 0) { /* few: roots and divisions take most of the time */
       quadratic f = along(d, coefficients + row * phases + k, size);
-      found = with_bound(with_bound(found, upper[row] - f.g, f.l, f.q), f.g - lower[row], -f.l, -f.q);
+      v above = f.g - upper[row], below = lower[row] - f.g, change = largest_change(f, up);
+      if (largest(above + change) > 0) found = with_bound(found, -above, f.l, f.q);
+      if (largest(below + change) > 0) found = with_bound(found, -below, -f.l, -f.q);
+      up = -largest(-found.up);
     }
-    up = -largest(-found.up);
   }
   if (!(largest(flag(found.violated)) > 0)) return up;
   double back = -largest(found.back);
@@ -135,7 +140,7 @@ static double max_violation(const parametrization *p, const workspace *m, const 
 
 /* Move the control points of r in their order; return the largest relative change of one. */
 static double sweep(const parametrization *p, double *c, const workspace *m) {
-  double *r = m->r, *r1 = m->r1, *b = m->b, *b1 = m->b1, largest_change = 0;
+  double *r = m->r, *r1 = m->r1, *b = m->b, *b1 = m->b1, max_change = 0;
   EACH(move, 0, p->moves) {
     long j = p->order[move];
     const double *basis = p->rate + j * p->phases, *derivative = basis + p->points * p->phases;
@@ -145,9 +150,9 @@ static double sweep(const parametrization *p, double *c, const workspace *m) {
     if (x > 0) x *= p->step_fractions[move];
     add(r + from, x, b + from, to - from), add(r1 + from, x, b1 + from, to - from);
     c[j] += x * c[j];
-    if (x > largest_change) largest_change = x;
+    if (x > max_change) max_change = x;
   }
-  return largest_change;
+  return max_change;
 }
 
 /* Fit the rate of a motion; return whether its control points moved twice. */

@@ -51,13 +51,16 @@ class TimeScaling(PhaseGrid):
             Shape (N,).
         """
         factor, phases = np.ones(len(motion)), self.path.shape[1]
+        columns, motions = [], []  # of phases with a violation: few
         for block in blocks_of_motions(len(motion)):
             column = self.column(motion[block], obstacle_poses[block])
             (violation,) = self.violation(column)
-            violating = np.flatnonzero(violation[0] > 0)  # empty for most motions
-            if len(violating):
-                required = self._required_scale(column.take(violating, axis=1))
-                np.maximum.at(factor[block], violating // phases, required)
+            violating = np.flatnonzero(violation[0] > 0)
+            columns.append(column.take(violating, axis=1))
+            motions.append(block.start + violating // phases)
+        if not any(map(len, motions)):
+            return factor
+        np.maximum.at(factor, np.concatenate(motions), self._required_scale(np.concatenate(columns, axis=1)))
         return np.where(factor > 1, np.minimum(factor * (1 + TIME_SCALE_MARGIN), MAX_TIME_SCALE), 1.0)
 
     def _required_scale(self, column: Array) -> Array:

@@ -23,9 +23,9 @@ STATES = ["start_q", "start_dq", "start_ddq", "goal_q", "goal_dq"]
 WIDTH, LAYERS, BATCH, RATE, WARM_UP = 192, 5, 128, 1e-3, 200  # the last: steps until the full learning rate
 NODES, SHIFTS = 32, 16  # quadrature nodes of the loss, which move from step to step
 SAMPLE_CLIP, BATCH_CLIP = 30.0, 2.0  # of gradients, in medians of the batch and in running norms
-GROWTH = 3000.0  # of the weights of constraints during the run
+GROWTH = 10000.0  # of the weights of constraints during the run
 MEMORY = 0.999  # decay of the average of the parameters
-MARGINS = {"joint-acceleration": 0.96, "joint-velocity": 0.98}  # of limits, so that small errors stay within them
+MARGINS = {"joint-acceleration": 0.92, "joint-velocity": 0.98}  # of limits, so that small errors stay within them
 
 
 def make_parameters(layer, inputs):
