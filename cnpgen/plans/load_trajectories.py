@@ -32,6 +32,7 @@ KIND_NAMES = {
     "dq": ("dq", "qd", "velocity", "velocities", "vel"),
     "ddq": ("ddq", "qdd", "acceleration", "accelerations", "acc"),
 }
+MAX_RATE_DEVIATION = 0.01  # of a stated rate from that of the file's times, relative
 MIN_DOUBTFUL_STEP_S = 0.5  # of times without a unit
 MAX_DOUBTFUL_SPEED = 2e-3  # relative to the velocity limits; twice the limit if the times are milliseconds
 UNUSED_KINDS = ("jerk", "effort", "efforts")  # not reported as ignored
@@ -242,13 +243,28 @@ def _times(table: TrajectoryTable, options: _Options, count: int, used: set[str]
     name = _time_column(table)
     if name is not None:
         used.add(name)
-    if options.rate is not None:
+    if options.rate is not None and (name is None or not _has_times_of_rate(table, name, options.rate)):
         return np.asarray(np.arange(count) / options.rate)
     if name is None:
         raise UsageError(
             f"{table.place}: no column of times ({', '.join(TIME_NAMES)}): state {{rate}}", remedies={"rate": 100}
         )
     return _numbers(table, name, ndim=1) * _factor(table, name, "s", 1.0)
+
+
+def _has_times_of_rate(table: TrajectoryTable, name: str, rate: float) -> bool:
+    """Return whether the file has increasing times; raise UsageError if they do not agree with a stated rate."""
+    try:
+        steps = np.diff(_numbers(table, name, ndim=1)) * _factor(table, name, "s", 1.0)
+    except UsageError:
+        return False
+    step = float(np.median(steps)) if len(steps) else 0.0
+    if step > 0 and abs(step * rate - 1) > MAX_RATE_DEVIATION:
+        text = (
+            f"must agree with the times of the file, got {rate:g} Hz; {name} of {table.place} has steps of {step:.3g} s"
+        )
+        raise UsageError(f"{text}: omit it", argument="rate")
+    return step > 0
 
 
 def _time_column(table: TrajectoryTable) -> str | None:

@@ -221,6 +221,21 @@ def test_a_table_in_degrees_with_a_rate_and_other_names(tmp_path: Path) -> None:
     assert loaded.ignored == ("grip",)
 
 
+def test_a_rate_must_agree_with_the_times_of_the_file(tmp_path: Path) -> None:
+    """Otherwise a motion would be judged at another speed."""
+    file = write_csv(tmp_path / "a.csv", ["t", *JOINTS], [T, *Q.T])
+    rate = 1 / (T[1] - T[0])
+    (trajectory,) = load_trajectories(file, "airhockey", rate=rate).trajectories
+    assert np.allclose(trajectory.t, T)
+    with pytest.raises(
+        UsageError, match=r"rate must agree with the times of the file, got .*; t of .*a\.csv.* has steps"
+    ):
+        load_trajectories(file, "airhockey", rate=2 * rate)
+    without = write_csv(tmp_path / "b.csv", ["t", *JOINTS], [0 * T, *Q.T])
+    (trajectory,) = load_trajectories(without, "airhockey", rate=50).trajectories
+    assert np.allclose(trajectory.t, np.arange(len(T)) / 50)
+
+
 @pytest.mark.parametrize("pattern", ["{}", "q_{}", "{}_position", "{}.pos", "position {} [deg]"])
 def test_columns_are_found_by_their_usual_names(tmp_path: Path, pattern: str) -> None:
     values = np.rad2deg(Q) if "deg" in pattern else Q
