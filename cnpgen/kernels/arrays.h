@@ -8,6 +8,19 @@ typedef void kernel(long n, const double *const *in, const long *distances, doub
 I v at(const double *p) { return *(const vu *)p; }
 I void put(double *p, v x) { *(vu *)p = x; }
 
+/* Whether a lane of a mask is set. */
+I int any_lane(vi mask) {
+#if defined(HAVE_BUILTINS) && defined(__AVX512F__)
+  return __builtin_ia32_ptestmq512(mask, mask, -1) != 0;
+#elif defined(HAVE_BUILTINS)
+  return !__builtin_ia32_ptestz256(mask, mask);
+#else
+  integer set = 0;
+  EACH(i, 0, (long)(sizeof mask / sizeof set)) set |= mask[i];
+  return set != 0;
+#endif
+}
+
 /* a += f b */
 static void add(double *restrict a, double f, const double *restrict b, long n) {
   long i = 0;

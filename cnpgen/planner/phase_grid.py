@@ -17,9 +17,9 @@ Array = NDArray[np.float64]
 MOTIONS_PER_BLOCK = 64  # small enough for arrays to stay in the CPU cache
 
 
-def blocks_of_motions(count: int) -> list[slice]:
-    """Split motions into blocks of ``MOTIONS_PER_BLOCK``."""
-    return [slice(first, first + MOTIONS_PER_BLOCK) for first in range(0, count, MOTIONS_PER_BLOCK)]
+def blocks_of_motions(count: int, size: int = MOTIONS_PER_BLOCK) -> list[slice]:
+    """Split motions into blocks of ``size``."""
+    return [slice(first, first + size) for first in range(0, count, size)]
 
 
 @dataclass(frozen=True)

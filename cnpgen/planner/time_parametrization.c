@@ -87,16 +87,16 @@ static double advance(const parametrization *p, const workspace *m, long from, l
       put(critical + row * W, violation);
       worst = larger(violation, worst);
     }
-    if (!(largest(worst) > 0)) continue;
-    EACH(row, 0, rows) if (largest(at(critical + row * W)) > 0) { /* few: roots and divisions take most of the time */
+    if (!any_lane(worst > K(0))) continue;
+    EACH(row, 0, rows) if (any_lane(at(critical + row * W) > K(0))) { /* few: roots and divisions take most of the time */
       quadratic f = along(d, coefficients + row * phases + k, size);
       v above = f.g - upper[row], below = lower[row] - f.g, change = largest_change(f, up);
-      if (largest(above + change) > 0) found = with_bound(found, -above, f.l, f.q);
-      if (largest(below + change) > 0) found = with_bound(found, -below, -f.l, -f.q);
+      if (any_lane(above + change > K(0))) found = with_bound(found, -above, f.l, f.q);
+      if (any_lane(below + change > K(0))) found = with_bound(found, -below, -f.l, -f.q);
       up = -largest(-found.up);
     }
   }
-  if (!(largest(flag(found.violated)) > 0)) return up;
+  if (!any_lane(found.violated)) return up;
   double back = -largest(found.back);
   return back > p->max_decrease ? back : p->max_decrease;
 }

@@ -34,6 +34,7 @@ Array = NDArray[np.float64]
 
 SOURCE = Path(__file__).with_name("time_parametrization.c")
 PARAMETRIZATION_INTERVALS = 79  # between phases; the 80 phases fill vectors of any width
+INTERVALS_AT_REST = 63  # from rest to rest, where RATE_MARGIN covers excesses between the phases
 FIXED_RATE_POINTS = 2  # at either end of motions that are not at rest there
 RATE_MARGIN = 3e-3  # relative decrease of the rates from rest to rest, for excesses between the phases
 STEP_FRACTIONS = 0.65, 0.9  # of the step to the first bound: of every second control point, then of those between
@@ -177,7 +178,8 @@ def make_time_parametrization(
     """
     if problem.path_orders > 3:
         raise UsageError(f"plans of {problem.name!r} cannot be time-parametrized: it bounds the jerk")
-    library, speeds = kernels.load_source(SOURCE), make_phase_grid(problem, kernels, PARAMETRIZATION_INTERVALS)
+    intervals = INTERVALS_AT_REST if at_rest else PARAMETRIZATION_INTERVALS
+    library, speeds = kernels.load_source(SOURCE), make_phase_grid(problem, kernels, intervals)
     if library is not None:
         function = library.parametrize_rates
         function.argtypes, function.restype = (c_void_p, c_long, *[c_void_p] * 5), None

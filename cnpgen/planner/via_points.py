@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.kernels.kernel import Kernel
+from cnpgen.kernels.grid_kernel import GridKernel
 from cnpgen.kernels.library import KernelLibrary
+from cnpgen.kernels.tape import GridSpec
 from cnpgen.planner.control_points import along_line
 from cnpgen.planner.expressions import static_violation
 from cnpgen.planner.phase_grid import blocks_of_motions
@@ -19,6 +20,8 @@ Array = NDArray[np.float64]
 
 STATIC_INTERVALS = 32  # between phases
 COARSE_PHASES = slice(2, None, 4)  # that most violating motions fail at
+MOTIONS_PER_CALL = 512  # of the kernel
+SLOW_DURATION = 1.8  # in expected times, above which motions along other lines may be faster
 MAX_LINES = 4  # that motions are planned along
 
 
@@ -28,13 +31,13 @@ class ViaPoints:
 
     Attributes:
         via_points: Configurations [rad], shape (M, n).
-        static_violation: Kernel of ``expressions.static_violation``.
-        path: Basis of p at K phases, shape (K, C).
+        static_violation: Kernel of ``expressions.static_violation`` at phases of motions, in single precision.
+        path: Basis of p at K phases, shape (K, C), float32.
     """
 
     via_points: Array
-    static_violation: Kernel
-    path: Array
+    static_violation: GridKernel
+    path: NDArray[np.float32]
 
     def violation(self, motion: Motion, obstacle_poses: Array) -> Array:
         """Return the largest violation of conditions on positions and holding torques by N motions, in tolerances.
@@ -58,15 +61,14 @@ class ViaPoints:
         bound[unclear] = self.violation(motion[unclear], obstacle_poses[unclear])
         return bound
 
-    def _violation_at(self, basis_of_p: Array, path: Array, obstacle_poses: Array) -> Array:
-        violation, phases = np.empty(len(path)), len(basis_of_p)
-        for block in blocks_of_motions(len(path)):
-            q = (basis_of_p @ path[block]).reshape(-1, path.shape[2])
-            (worst,) = self.static_violation(
-                np.ascontiguousarray(q.T), np.repeat(obstacle_poses[block].T, phases, axis=1)
-            )
-            violation[block] = worst.reshape(-1, phases).max(axis=1)
-        return np.nan_to_num(violation, nan=np.inf, posinf=np.inf)
+    def _violation_at(self, basis_of_p: NDArray[np.float32], path: Array, obstacle_poses: Array) -> Array:
+        values = np.empty((1, len(basis_of_p), len(path)), np.float32)
+        for block in blocks_of_motions(len(path), MOTIONS_PER_CALL):
+            q = np.matmul(basis_of_p, path[block].transpose(2, 1, 0).astype(np.float32, order="C"))
+            poses = obstacle_poses[block].T.astype(np.float32, order="C")
+            self.static_violation(q, poses, out=[values[..., block]])
+        worst: Array = values[0].max(axis=0).astype(np.float64)
+        return np.nan_to_num(worst, nan=np.inf, posinf=np.inf)
 
     def best_lines(self, lines: Tasks, count: int) -> NDArray[np.intp]:
         """Return the lines with the smallest violations at a few phases, in their order.
@@ -113,4 +115,5 @@ def make_via_points(problem: Problem, kernels: KernelLibrary, via_points: Array)
     """
     spec = problem.trajectory
     path = basis(chebyshev(STATIC_INTERVALS), spec.path_control_points, spec.degree)
-    return ViaPoints(via_points, kernels.load(static_violation), path)
+    kernel = kernels.load_grid(static_violation, GridSpec(("point", "lane"), ("point",)), dtype="float32")
+    return ViaPoints(via_points, kernel, path.astype(np.float32))

@@ -10,8 +10,9 @@ The next attempt is made only if no earlier one was accepted. Attempts in their 
    search these paths, they come right after step 2, whose finer levels run only for nearly valid attempts.
 
 Acceptance (``RefinementSearch``): the independent verdict decides, never the solver's own residuals. The first valid
-plan is returned if it is precise; otherwise one more attempt is judged. If the verdict rejects an attempt for a shallow
-collision of hulls, the solver continues it with a constraint at the phase that the verdict names. The result is never
+plan is returned if it is precise; otherwise one more attempt is judged. A plan whose links touch something within the
+tolerance is not precise. If the verdict rejects an attempt for a shallow collision of hulls, or finds such a contact,
+the solver continues it with a constraint at the phase that the verdict names. The result is never
 worse than the input plan: it replaces it only if the verdict finds a smaller violation, or none and a lower cost.
 """
 
@@ -20,6 +21,7 @@ from __future__ import annotations
 import time
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +44,7 @@ from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.solver.bounds import PRECISE_FRACTION
 from cnpgen.refine.solver.deadline import Deadline
 from cnpgen.refine.solver.hull_feedback import MAX_FED_BACK_M
+from cnpgen.refine.solver.hull_problem import without_contacts
 from cnpgen.refine.solver.hulls import Hulls, has_clearance_constraints
 from cnpgen.refine.solver.sqp import Result
 from cnpgen.refine.task import MAX_JUDGED_VIOLATION, Attempt, Outcome, RefinementTask
@@ -183,11 +186,23 @@ class PlanChecker:
     """
 
     def __init__(self, problem: Problem, robot: Robot, *, degree: int) -> None:
-        self._judge, self._degree = Judge(problem, robot), degree
+        self._problem, self._robot, self._degree = problem, robot, degree
 
     def verdict(self, task: RefinementTask, path: Array, rate: Array) -> Verdict:
         """Judge path control points (C, n) and rate control points (R,) as a plan of the task, with early exit."""
         return self._judge(*self._arguments(task, path, rate), early_exit=True)[0]
+
+    def strict_verdict(self, task: RefinementTask, path: Array, rate: Array) -> Verdict:
+        """Judge such a plan without a tolerance of contacts of the links."""
+        return self._strict_judge(*self._arguments(task, path, rate), early_exit=True)[0]
+
+    @cached_property
+    def _judge(self) -> Judge:
+        return Judge(self._problem, self._robot)
+
+    @cached_property
+    def _strict_judge(self) -> Judge:
+        return Judge(without_contacts(self._problem), self._robot)
 
     def refutes(self, task: RefinementTask, path: Array, rate: Array) -> bool:
         """Return whether a few samples prove that such a plan is not valid."""
@@ -278,15 +293,23 @@ class RefinementSearch:
 
     def judge(self, plan: Attempt) -> Attempt:
         """Return a plan with its verdict."""
-        verdict = self.verdict = self.checker.verdict(self.task, plan.path, plan.rate)
+        verdict = self.verdict = self._verdict(plan)
+        touches = not verdict.valid and verdict.reason in COLLISION_REASONS
+        if self.refiner.measures_hulls and touches:
+            verdict = self.checker.verdict(self.task, plan.path, plan.rate)
         keeps_outcome = verdict.valid or plan.outcome in INPUT_OUTCOMES
         return replace(
             plan,
             outcome=plan.outcome if keeps_outcome else Outcome.UNSOLVED,
             reason=verdict.reason,
             severity=_severity(verdict),
-            is_precise=self._is_precise(verdict),
+            is_precise=self._is_precise(verdict) and not touches,
         )
+
+    def _verdict(self, plan: Attempt) -> Verdict:
+        """Return the verdict, without a tolerance of contacts if the solver can remove them."""
+        judge = self.checker.strict_verdict if self.refiner.measures_hulls else self.checker.verdict
+        return judge(self.task, plan.path, plan.rate)
 
     def _judge_attempt(self, attempt: Attempt) -> Attempt:
         if attempt.outcome is Outcome.ADJUSTED and _is_input(self.task, attempt.path, attempt.rate):

@@ -120,7 +120,7 @@ class Attempt:
         violation: Largest violation on the 600-point grid, as a multiple of its tolerance; at most 1 is accepted. It is
             0 where it was not evaluated because the solver converged within its bounds.
         severity: 1 if the plan is valid; otherwise larger, inf if it cannot be evaluated.
-        is_precise: Whether equalities are met within a fraction of their tolerance.
+        is_precise: Whether equalities are met within a fraction of their tolerance, and links do not touch anything.
         x: Variables of the transcription, shape (nx,), or None.
     """
 

@@ -41,19 +41,20 @@ def test_static_violations_agree_with_pinocchio_and_coal() -> None:
     on_way = plan.motion.at(np.linspace(0, 1, 6)).q[0]
     states = np.concatenate([random.uniform(robot.position_lower, robot.position_upper, (6, robot.n)), on_way])
     via_points = make_via_points(problem, quickest("heavy-object").kernels, np.empty((0, robot.n)))
-    (found,) = via_points.static_violation(
-        np.ascontiguousarray(states.T), np.repeat(obstacle_poses[:, None], len(states), axis=1)
-    )
-    for q, violation in zip(states, found[0], strict=True):
+    q, found = np.ascontiguousarray(states.T[:, None], np.float32), np.empty((1, 1, len(states)), np.float32)
+    poses = np.repeat(obstacle_poses[:, None], len(states), axis=1).astype(np.float32)
+    via_points.static_violation(q, poses, out=[found])
+    found = found[0, 0]
+    for q, violation in zip(states, found, strict=True):
         world.set_state(q, 0 * q, 0 * q, obstacle_poses)
         worst = max(
             float((np.maximum(each.lower - each.g, each.g - each.upper) / constraint.allowed(each)).max())
             for constraint in problem.constraint
             for each in constraint.measured(world)
         )
-        assert violation == pytest.approx(worst, rel=1e-6, abs=1e-4)
-    assert (found[0, :6] > 1).all()
-    assert (found[0, 6:] <= 1).all()
+        assert violation == pytest.approx(worst, rel=1e-4, abs=1e-3)
+    assert (found[:6] > 1).all()
+    assert (found[6:] <= 1).all()
 
 
 def test_candidates_are_lines_without_violation_or_else_the_one_with_the_smallest() -> None:
@@ -94,7 +95,7 @@ def test_the_best_lines_have_the_smallest_violations(checks: ViaPoints) -> None:
 
 @pytest.mark.slow  # it compiles for a minute
 @needs_compiler
-def test_via_points_repair_plans_and_keep_those_without_violation(model: Model, problems: Boundary) -> None:
+def test_via_points_repair_plans_and_replace_valid_ones_by_faster_ones(model: Model, problems: Boundary) -> None:
     straight = Planner(replace(model, config=replace(model.config, via_points=()))).plan_batch(problems)
     planner = Planner(model)
     found, inference = planner.plan_batch(problems), planner._inference
@@ -102,8 +103,11 @@ def test_via_points_repair_plans_and_keep_those_without_violation(model: Model, 
     obstacle_poses = found.scene.poses
     before, after = (inference.via_points.violation(plans.motion, obstacle_poses) for plans in (straight, found))
     same = (found.path_control_points == straight.path_control_points).all(axis=(1, 2))
-    assert same[before <= 1].all()
-    assert (after[~same] < before[~same]).all()
+    faster = ~same & (before <= 1)
+    assert 0 < faster.sum() < 0.1 * len(problems)
+    assert (after[faster] <= 1).all()
+    assert (found.duration[faster] < straight.duration[faster]).all()
+    assert (after[~same & (before > 1)] < before[~same & (before > 1)]).all()
     repaired = np.flatnonzero((before > 1) & (after <= 1))
     assert len(repaired) >= 10
     assert evaluate_plans(found[repaired], workers=1).valid.mean() > 0.5

@@ -1,5 +1,6 @@
 """Levels on the links' hulls: exact derivatives, and a solution where capsules leave none."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 from cnpgen.kernels.collision.collision_checker import load_collision_library
 from cnpgen.kernels.library import KernelLibrary, choose_backend
+from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.refine import obstacle_attempts, strategy, tree_paths
@@ -15,7 +17,7 @@ from cnpgen.refine.refine_engine import load_refiner
 from cnpgen.refine.solver.hull_feedback import HullFeedback
 from cnpgen.refine.solver.hulls import MEASURED_RANGE_M, Hulls, has_clearance_constraints
 from cnpgen.refine.solver.sqp import DEFAULT_SETTINGS
-from cnpgen.refine.strategy import PlanChecker, refine_task
+from cnpgen.refine.strategy import PlanChecker, RefinementSearch, refine_task
 from cnpgen.refine.task import Outcome
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.trajectory.spline_motion import Motion
@@ -25,6 +27,7 @@ from tests.examples.narrow import BESIDE_WALL, IN_SLOT, SLOT, WALL, between, nar
 from tests.examples.shaped_robot import KINDS, OBSTACLES, write_problem
 
 STEP = 1e-6  # rad, of finite differences
+CONTACT_TURN_RAD, CONTACT_M, CLOSE_M = 1e-3, 5e-5, 0.01  # the contact is half the tolerance
 
 
 @pytest.fixture(params=["coal", pytest.param("compiled", marks=needs_compiler)])
@@ -217,3 +220,32 @@ def test_a_slot_that_is_too_narrow_for_capsules_is_wide_enough_for_hulls(tmp_pat
     states = Motion(path[None], rate[None], tool.spec.degree).at(np.linspace(0, 1, 300)).q[0]
     meshes = Meshes(problem, robot, tmp_path)
     assert min(min(meshes.distances(q)) for q in states) > -1e-4  # the tolerance of the problem
+
+
+@pytest.mark.slow
+@needs_compiler
+def test_a_contact_within_the_tolerance_is_removed(tmp_path):
+    """A plan approaches an obstacle half way; the required distance is larger by half the tolerance."""
+    problem = narrow(tmp_path, SLOT)
+    robot, task, degree = load_robot(problem), between(problem, IN_SLOT), problem.trajectory.degree
+    tool = load_refiner(problem, robot)
+    found = refine_task(tool, PlanChecker(problem, robot, degree=degree), task)
+    path = found.path.copy()
+    path[5:-5, 1] += CONTACT_TURN_RAD
+    q = Motion(path[None], found.rate[None], degree).at(np.linspace(0, 1, 2000)).q[0].T.copy()
+    close = tool.hulls.placed_checker(task.scene.poses[0]).close_bodies(q, CLOSE_M, of_obstacles=True)
+    distance = close.distance.min() + CONTACT_M
+    constraints = (
+        replace(each, distance=distance) if isinstance(each, RobotClearance) else each for each in problem.constraint
+    )
+    larger = replace(problem, constraint=tuple(constraints))
+    tool, checker = load_refiner(larger, robot), PlanChecker(larger, robot, degree=degree)
+    x = tool.check.transcription(task).pack(path, found.rate)
+    touching = replace(found, path=path, x=x, violation=1.0)
+    assert checker.verdict(task, touching.path, touching.rate).valid
+    assert checker.strict_verdict(task, touching.path, touching.rate).reason == RobotClearance.reason
+    search = RefinementSearch(tool, checker, task)
+    assert not search.add(touching)
+    assert search.continue_rejected(touching)
+    best = search.best()
+    assert checker.strict_verdict(task, best.path, best.rate).valid

@@ -4,6 +4,7 @@ The kernels of such a problem are those of the problem without clearances, so th
 """
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -33,6 +34,17 @@ def without_distances(problem: Problem) -> Problem:
     """Return a problem without clearances of links, and without obstacles unless another constraint may use them."""
     others = tuple(item for item in problem.constraint if not isinstance(item, RobotClearance | SelfClearance))
     uses_obstacles = problem.structure is None or any(isinstance(item, ObjectContact) for item in others)
-    rest = replace(problem, constraint=others, obstacle=problem.obstacle if uses_obstacles else ())
-    vars(rest)["urdf_text"] = problem.urdf_text  # a cached property, expensive to read again
-    return rest
+    return _changed(problem, constraint=others, obstacle=problem.obstacle if uses_obstacles else ())
+
+
+def without_contacts(problem: Problem) -> Problem:
+    """Return a problem whose links may not touch each other or an obstacle, not even within a tolerance."""
+    clearances = RobotClearance | SelfClearance
+    strict = (replace(each, tolerance=0.0) if isinstance(each, clearances) else each for each in problem.constraint)
+    return _changed(problem, constraint=tuple(strict))
+
+
+def _changed(problem: Problem, **changes: Any) -> Problem:
+    changed = replace(problem, **changes)
+    vars(changed)["urdf_text"] = problem.urdf_text  # a cached property, expensive to read again
+    return changed
