@@ -10,7 +10,7 @@ from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.rrt_connect import find_paths
 from cnpgen.refine.solver.hulls import Hulls, has_clearance_constraints
 from cnpgen.refine.task import MAX_JUDGED_VIOLATION, Attempt, Outcome, RefinementTask
-from cnpgen.refine.tree_paths import find_obstacle_paths
+from cnpgen.refine.tree_paths import TreeSearch
 
 Array = NDArray[np.float64]
 
@@ -79,9 +79,8 @@ def _on_hulls(refiner: Refiner, task: RefinementTask, guess: Attempt, hulls: Hul
 def path_guesses(refiner: Refiner, task: RefinementTask, hulls: Hulls | None = None) -> Iterator[Attempt]:
     """Yield motions along valid joint-space paths, scaled in time if they are from rest to rest."""
     boundary, space = task.boundary, refiner.rest_space(task, hulls)
-    paths: Iterator[Array] | list[Array] = []
     if hulls is not None and refiner.measures_hulls:
-        paths = find_obstacle_paths(task, space, hulls)
+        paths = TreeSearch(task, space, hulls).paths()
     else:
         paths = find_paths(boundary.start_q[0], boundary.goal_q[0], refiner.robot, space.follow)
     for states in paths:

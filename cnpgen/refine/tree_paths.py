@@ -4,7 +4,8 @@ Several trees with different margins grow in milliseconds; deeper ones follow wh
 sorted by an estimated duration.
 """
 
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import count, islice
 
 import numpy as np
@@ -20,42 +21,67 @@ Array = NDArray[np.float64]
 TREE_MARGINS_M = (6e-3, 3e-3, 1e-3, 0.0)  # of the trees in turn, added to the required distances
 TREE_ROUNDS = ((12, 4_000), (8, 16_000), (4, 64_000))  # trees and their extensions, until there are enough paths
 MIN_TREE_PATHS, MAX_TREE_PATHS = 3, 8
+FURTHER_TREES, FURTHER_EXTENSIONS = 16, 64_000
 TREE_SHORTCUTS = 400  # attempted on a path
 
 
-def find_obstacle_paths(task: RefinementTask, space: RestSpace, hulls: Hulls) -> list[Array]:
-    """Search for paths between the ends of a task.
+@dataclass(frozen=True)
+class TreeSearch:
+    """Search for paths between the ends of a task by trees with different margins.
 
     Args:
         task: The task.
         space: Valid states at rest; conditions other than distances are checked on the paths, not in the trees.
         hulls: Clearances of the hulls with compiled checks.
-
-    Returns:
-        At most ``MAX_TREE_PATHS`` paths, corners of shape (K, n) each. Those that meet all conditions at rest come
-        first, sorted by their estimated duration.
     """
-    robot, paths = space.robot, list[Array]()
-    start, goal = task.boundary.start_q[0], task.boundary.goal_q[0]
-    box = (
-        np.maximum(robot.position_lower, np.minimum(start, goal) - MAX_TURN),
-        np.minimum(robot.position_upper, np.maximum(start, goal) + MAX_TURN),
-    )
-    checker = hulls.placed_checker(task.scene.poses[0])
-    settings = TreeSettings(hulls.obstacle_distance, hulls.self_distance, shortcuts=TREE_SHORTCUTS)
-    seeds = count()
-    for trees, extensions in TREE_ROUNDS:
-        for seed in islice(seeds, trees):
-            margin = TREE_MARGINS_M[seed % len(TREE_MARGINS_M)]
-            tree = replace(settings, margin=margin, max_extensions=extensions)
-            path = find_tree_path(checker, (start, goal), box, robot.velocity_limit, tree, seed=seed)
-            if path is not None:
-                paths.append(path)
-            if path is not None and len(path) == 2:  # the straight line is free
-                return [path]
-        if len(paths) >= MIN_TREE_PATHS:
-            break
-    durations = [
-        (not space.meets_other_conditions(path), estimated_duration(path, robot.velocity_limit)) for path in paths
-    ]
-    return [paths[index] for index in sorted(range(len(paths)), key=durations.__getitem__)[:MAX_TREE_PATHS]]
+
+    task: RefinementTask
+    space: RestSpace
+    hulls: Hulls
+
+    def paths(self) -> Iterator[Array]:
+        """Yield paths, corners of shape (K, n) each.
+
+        At most ``MAX_TREE_PATHS`` paths of the first trees are sorted: those that meet all conditions at rest come
+        first, and then those of shorter estimated duration. Where few trees connect, paths of further ones follow.
+        """
+        found = self._first_paths()
+        space, limit = self.space, self.space.robot.velocity_limit
+        durations = [(not space.meets_other_conditions(path), estimated_duration(path, limit)) for path in found]
+        for index in sorted(range(len(found)), key=durations.__getitem__)[:MAX_TREE_PATHS]:
+            yield found[index]
+        if len(found) >= MIN_TREE_PATHS or (found and len(found[0]) == 2):
+            return
+        first = sum(trees for trees, _ in TREE_ROUNDS)
+        further = (self._grow(seed, FURTHER_EXTENSIONS) for seed in range(first, first + FURTHER_TREES))
+        yield from (path for path in further if path is not None)
+
+    def _first_paths(self) -> list[Array]:
+        """Return the paths of the first trees; the straight line alone if it is free."""
+        paths, seeds = list[Array](), count()
+        for trees, extensions in TREE_ROUNDS:
+            for seed in islice(seeds, trees):
+                path = self._grow(seed, extensions)
+                if path is not None and len(path) == 2:
+                    return [path]
+                if path is not None:
+                    paths.append(path)
+            if len(paths) >= MIN_TREE_PATHS:
+                break
+        return paths
+
+    def _grow(self, seed: int, extensions: int) -> Array | None:
+        """Return the path of one pair of trees, or None."""
+        task, hulls, robot = self.task, self.hulls, self.space.robot
+        start, goal = task.boundary.start_q[0], task.boundary.goal_q[0]
+        lower, upper = np.minimum(start, goal) - MAX_TURN, np.maximum(start, goal) + MAX_TURN
+        box = np.maximum(robot.position_lower, lower), np.minimum(robot.position_upper, upper)
+        settings = TreeSettings(
+            hulls.obstacle_distance,
+            hulls.self_distance,
+            margin=TREE_MARGINS_M[seed % len(TREE_MARGINS_M)],
+            shortcuts=TREE_SHORTCUTS,
+            max_extensions=extensions,
+        )
+        checker = hulls.placed_checker(task.scene.poses[0])
+        return find_tree_path(checker, (start, goal), box, robot.velocity_limit, settings, seed=seed)
