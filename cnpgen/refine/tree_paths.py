@@ -21,7 +21,9 @@ Array = NDArray[np.float64]
 TREE_MARGINS_M = (6e-3, 3e-3, 1e-3, 0.0)  # of the trees in turn, added to the required distances
 TREE_ROUNDS = ((12, 4_000), (8, 16_000), (4, 64_000))  # trees and their extensions, until there are enough paths
 MIN_TREE_PATHS, MAX_TREE_PATHS = 3, 8
-FURTHER_TREES, FURTHER_EXTENSIONS = 16, 64_000
+TREE_EXTENSION_RAD = 1.0  # length of an edge [rad or m]
+FURTHER_TREES, FURTHER_EXTENSIONS = 6, 128_000
+FURTHER_EXTENSION_RAD = 0.5  # shorter edges find narrower passages
 TREE_SHORTCUTS = 400  # attempted on a path
 
 
@@ -53,7 +55,8 @@ class TreeSearch:
         if len(found) >= MIN_TREE_PATHS or (found and len(found[0]) == 2):
             return
         first = sum(trees for trees, _ in TREE_ROUNDS)
-        further = (self._grow(seed, FURTHER_EXTENSIONS) for seed in range(first, first + FURTHER_TREES))
+        narrow = self._settings(0.0, FURTHER_EXTENSIONS, FURTHER_EXTENSION_RAD)
+        further = (self._grow(seed, narrow) for seed in range(first, first + FURTHER_TREES))
         yield from (path for path in further if path is not None)
 
     def _first_paths(self) -> list[Array]:
@@ -61,7 +64,8 @@ class TreeSearch:
         paths, seeds = list[Array](), count()
         for trees, extensions in TREE_ROUNDS:
             for seed in islice(seeds, trees):
-                path = self._grow(seed, extensions)
+                margin = TREE_MARGINS_M[seed % len(TREE_MARGINS_M)]
+                path = self._grow(seed, self._settings(margin, extensions, TREE_EXTENSION_RAD))
                 if path is not None and len(path) == 2:
                     return [path]
                 if path is not None:
@@ -70,18 +74,21 @@ class TreeSearch:
                 break
         return paths
 
-    def _grow(self, seed: int, extensions: int) -> Array | None:
+    def _settings(self, margin: float, extensions: int, length: float) -> TreeSettings:
+        return TreeSettings(
+            self.hulls.obstacle_distance,
+            self.hulls.self_distance,
+            margin=margin,
+            extension=length,
+            max_extensions=extensions,
+            shortcuts=TREE_SHORTCUTS,
+        )
+
+    def _grow(self, seed: int, settings: TreeSettings) -> Array | None:
         """Return the path of one pair of trees, or None."""
-        task, hulls, robot = self.task, self.hulls, self.space.robot
+        task, robot = self.task, self.space.robot
         start, goal = task.boundary.start_q[0], task.boundary.goal_q[0]
         lower, upper = np.minimum(start, goal) - MAX_TURN, np.maximum(start, goal) + MAX_TURN
         box = np.maximum(robot.position_lower, lower), np.minimum(robot.position_upper, upper)
-        settings = TreeSettings(
-            hulls.obstacle_distance,
-            hulls.self_distance,
-            margin=TREE_MARGINS_M[seed % len(TREE_MARGINS_M)],
-            shortcuts=TREE_SHORTCUTS,
-            max_extensions=extensions,
-        )
-        checker = hulls.placed_checker(task.scene.poses[0])
+        checker = self.hulls.placed_checker(task.scene.poses[0])
         return find_tree_path(checker, (start, goal), box, robot.velocity_limit, settings, seed=seed)
