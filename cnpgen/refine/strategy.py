@@ -11,9 +11,10 @@ The next attempt is made only if no earlier one was accepted. Attempts in their 
 
 Acceptance (``RefinementSearch``): the independent verdict decides, never the solver's own residuals. The first valid
 plan is returned if it is precise; otherwise one more attempt is judged. A plan whose links touch something within the
-tolerance is not precise. If the verdict rejects an attempt for a shallow collision of hulls, or finds such a contact,
-the solver continues it with a constraint at the phase that the verdict names. The result is never
-worse than the input plan: it replaces it only if the verdict finds a smaller violation, or none and a lower cost.
+tolerance is not precise, and up to ``MAX_CONTACTS`` attempts are judged. If the verdict rejects an attempt for a
+shallow collision of hulls, or finds such a contact, the solver continues it with a constraint at the phase that the
+verdict names. The result is never worse than the input plan: it replaces it only if the verdict finds a smaller
+violation, or none and a lower cost.
 """
 
 from __future__ import annotations
@@ -58,6 +59,7 @@ Array = NDArray[np.float64]
 
 NEARLY_VALID = 30.0  # tolerances; attempts with larger violations are left for joint-space paths
 MAX_VERDICT_FEEDBACKS = 3  # of collisions of one attempt from the verdict to the solver
+MAX_CONTACTS = 6  # valid attempts whose links touch something within the tolerance, before the search ends with one
 FEEDBACK_GROWTH = 3.0  # of the added distance, from one of them to the next: an edge may pass between grid points
 MAX_ROUNDING_ERROR = 1e-12  # rad and 1/s: smaller differences are rounding errors
 COLLISION_REASONS = {RobotClearance.reason, SelfClearance.reason}
@@ -237,10 +239,11 @@ class RefinementSearch:
     found_no_path: bool = False
 
     def add(self, attempt: Attempt) -> bool:
-        """Judge an attempt; return whether the search ends: it is valid and precise, or an earlier one is valid."""
+        """Judge an attempt; return whether the search ends: it is valid and precise, or enough others are valid."""
         self.iterations += attempt.iterations
         self.found_no_path |= attempt.outcome is Outcome.NO_PATH
-        found_valid = any(earlier.valid for earlier in self.judged)
+        enough = MAX_CONTACTS if self.refiner.measures_hulls else 1
+        found_valid = sum(earlier.valid for earlier in self.judged) >= enough
         if attempt.violation > MAX_JUDGED_VIOLATION:
             self.skipped.append(attempt)
             return found_valid

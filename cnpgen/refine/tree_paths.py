@@ -45,15 +45,15 @@ class TreeSearch:
         """Yield paths, corners of shape (K, n) each.
 
         At most ``MAX_TREE_PATHS`` paths of the first trees are sorted: those that meet all conditions at rest come
-        first, and then those of shorter estimated duration. Where few trees connect, paths of further ones follow.
+        first, and then those of shorter estimated duration. Where few of them connect, paths of further trees follow.
         """
         found = self._first_paths()
         space, limit = self.space, self.space.robot.velocity_limit
         durations = [(not space.meets_other_conditions(path), estimated_duration(path, limit)) for path in found]
         for index in sorted(range(len(found)), key=durations.__getitem__)[:MAX_TREE_PATHS]:
             yield found[index]
-        if len(found) >= MIN_TREE_PATHS or (found and len(found[0]) == 2):
-            return
+        if not 0 < len(found) < MIN_TREE_PATHS or len(found[0]) == 2:
+            return  # without any path there is probably none
         first = sum(trees for trees, _ in TREE_ROUNDS)
         narrow = self._settings(0.0, FURTHER_EXTENSIONS, FURTHER_EXTENSION_RAD)
         further = (self._grow(seed, narrow) for seed in range(first, first + FURTHER_TREES))

@@ -112,7 +112,7 @@ def test_an_arm_moves_over_a_wall_that_no_other_guess_avoids(wall, monkeypatch):
     checker = PlanChecker(wall, robot, degree=tool.spec.degree)
     found = refine_task(tool, checker, task)
     assert found.valid
-    assert found.outcome in {Outcome.TIME_SCALED, Outcome.RESTARTED}
+    assert found.outcome in {Outcome.TIME_SCALED, Outcome.RESTARTED, Outcome.SOLVED_FINE}
     meshes = Meshes(wall, robot, wall.path.parent)
     states = Motion(found.path[None], found.rate[None], tool.spec.degree).at(np.linspace(0, 1, 300)).q[0]
     assert min(min(meshes.distances(q)) for q in states) > -1e-4  # what the problem allows
