@@ -17,7 +17,7 @@ from cnpgen.planner.task_preprocessor import TaskPreprocessor, ends_of, lanes, m
 from cnpgen.planner.tasks import Tasks
 from cnpgen.planner.time_parametrization import TimeParametrization, make_time_parametrization
 from cnpgen.planner.time_scaling import TimeScaling, make_time_scaling
-from cnpgen.planner.via_points import MAX_LINES, SLOW_DURATION, ViaPoints, make_via_points
+from cnpgen.planner.via_points import MAX_LINES, ViaPoints, make_via_points
 from cnpgen.plans.format import OBSTACLE_POSES
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.load_robot import load_robot
@@ -154,64 +154,36 @@ class InferencePipeline:
     def _with_via_points(
         self, via_points: ViaPoints, model: Model, tasks: Tasks, motion: Motion
     ) -> tuple[Tasks, Motion]:
-        """Fit the rates of motions; replace those that violate static conditions or are slow by others.
+        """Replace motions that violate static conditions by ones through via points with a smaller violation.
 
-        The others pass through via points and have a smaller violation, or none and a shorter duration.
+        The rates of motion are not fitted; those of the result are.
         """
-        poses = tasks.scene.poses
-        path, rate, before = motion.path.copy(), motion.rate.copy(), via_points.violation(motion, poses)
+        path, rate, before = motion.path.copy(), motion.rate.copy(), via_points.violation(motion, tasks.scene.poses)
         correction = np.zeros_like(path[:, 3 : path.shape[1] - tasks.boundary.fixed_at_goal])
         correction += 0.0 if tasks.correction is None else tasks.correction
-        duration, free, violating = np.full(len(path), np.inf), np.flatnonzero(before <= 1), before > 1
-        fitted = self._fitted(motion[free], poses[free])
-        rate[free], duration[free] = fitted.rate, fitted.duration()
-        poor, kept = np.flatnonzero(duration > SLOW_DURATION * tasks.expected_time), violating.copy()
-        for some in (poor[block] for block in blocks_of_motions(len(poor))):
-            found = self._through_via_points(via_points, model, tasks, some)
-            is_faster = (found.violation <= 1) & (found.duration < duration[some])
-            better = np.where(violating[some], found.violation < before[some], is_faster)
-            replaced = some[better]
-            path[replaced], rate[replaced] = found.motion.path[better], found.motion.rate[better]
-            correction[replaced], kept[replaced] = found.correction[better], False
-        rate[kept] = self._fitted(motion[kept], poses[kept]).rate
+        violating, count = np.flatnonzero(before > 1), min(MAX_LINES, len(via_points.via_points))
+        kept = np.ones(len(path), bool)
+        for some in (violating[block] for block in blocks_of_motions(len(violating))):
+            repeated = np.repeat(some, len(via_points.via_points))
+            lines = self.prepare(tasks.boundary[repeated], np.tile(via_points.via_points, (len(some), 1)))
+            alternatives = lines.take(via_points.best_lines(lines, count))
+            assert alternatives.correction is not None
+            motions = self._projected(model, alternatives, ends_of(alternatives.boundary))
+            poses = alternatives.scene.poses
+            after = via_points.lower_bound(motions, poses)
+            candidates = via_points.candidates(after, count)
+            fitted, time = self._fitted(motions[candidates], poses[candidates]), np.full(len(motions), np.inf)
+            time[candidates] = fitted.duration()
+            fastest = time.reshape(len(some), -1).argmin(axis=1) + count * np.arange(len(some))
+            violation = after[fastest]
+            unclear = violation > 1  # lower bounds
+            violation[unclear] = via_points.violation(motions[fastest[unclear]], poses[fastest[unclear]])
+            better = violation < before[some]
+            replaced, sources = some[better], np.searchsorted(candidates, fastest[better])
+            path[replaced], rate[replaced] = fitted.path[sources], fitted.rate[sources]
+            correction[replaced], kept[replaced] = alternatives.correction[fastest[better]], False
+        rate[kept] = self._fitted(motion[kept], tasks.scene.poses[kept]).rate
         return replace(tasks, correction=correction), replace(motion, path=path, rate=rate)
-
-    def _through_via_points(
-        self, via_points: ViaPoints, model: Model, tasks: Tasks, some: NDArray[np.intp]
-    ) -> "_Alternatives":
-        """Plan some of the tasks along the most promising lines; return the fastest of the best motions."""
-        repeated, lines = np.repeat(some, len(via_points.via_points)), min(MAX_LINES, len(via_points.via_points))
-        all_lines = self.prepare(tasks.boundary[repeated], np.tile(via_points.via_points, (len(some), 1)))
-        alternatives = all_lines.take(via_points.best_lines(all_lines, lines))
-        assert alternatives.correction is not None
-        motions, poses = self._projected(model, alternatives, ends_of(alternatives.boundary)), alternatives.scene.poses
-        violation = via_points.lower_bound(motions, poses)
-        candidates = via_points.candidates(violation, lines)
-        fitted = self._fitted(motions[candidates], poses[candidates])
-        duration = np.full(len(motions), np.inf)
-        duration[candidates] = fitted.duration()
-        fastest = duration.reshape(len(some), -1).argmin(axis=1) + lines * np.arange(len(some))
-        unclear = fastest[violation[fastest] > 1]  # lower bounds
-        violation[unclear] = via_points.violation(motions[unclear], poses[unclear])
-        motion = fitted[np.searchsorted(candidates, fastest)]
-        return _Alternatives(motion, duration[fastest], violation[fastest], alternatives.correction[fastest])
-
-
-@dataclass(frozen=True)
-class _Alternatives:
-    """Motions through via points.
-
-    Attributes:
-        motion: N motions.
-        duration: Their durations [s], shape (N,).
-        violation: Their largest violations of static conditions, in tolerances, shape (N,).
-        correction: Corrections of their lines, shape (N, M, n).
-    """
-
-    motion: Motion
-    duration: Array
-    violation: Array
-    correction: Array
 
 
 def make_inference_pipeline(

@@ -21,7 +21,6 @@ Array = NDArray[np.float64]
 STATIC_INTERVALS = 32  # between phases
 COARSE_PHASES = slice(2, None, 4)  # that most violating motions fail at
 MOTIONS_PER_CALL = 512  # of the kernel
-SLOW_DURATION = 1.8  # in expected times, above which motions along other lines may be faster
 MAX_LINES = 4  # that motions are planned along
 
 

@@ -95,7 +95,7 @@ def test_the_best_lines_have_the_smallest_violations(checks: ViaPoints) -> None:
 
 @pytest.mark.slow  # it compiles for a minute
 @needs_compiler
-def test_via_points_repair_plans_and_replace_valid_ones_by_faster_ones(model: Model, problems: Boundary) -> None:
+def test_via_points_repair_plans_and_keep_those_without_violation(model: Model, problems: Boundary) -> None:
     straight = Planner(replace(model, config=replace(model.config, via_points=()))).plan_batch(problems)
     planner = Planner(model)
     found, inference = planner.plan_batch(problems), planner._inference
@@ -103,11 +103,8 @@ def test_via_points_repair_plans_and_replace_valid_ones_by_faster_ones(model: Mo
     obstacle_poses = found.scene.poses
     before, after = (inference.via_points.violation(plans.motion, obstacle_poses) for plans in (straight, found))
     same = (found.path_control_points == straight.path_control_points).all(axis=(1, 2))
-    faster = ~same & (before <= 1)
-    assert 0 < faster.sum() < 0.1 * len(problems)
-    assert (after[faster] <= 1).all()
-    assert (found.duration[faster] < straight.duration[faster]).all()
-    assert (after[~same & (before > 1)] < before[~same & (before > 1)]).all()
+    assert same[before <= 1].all()
+    assert (after[~same] < before[~same]).all()
     repaired = np.flatnonzero((before > 1) & (after <= 1))
     assert len(repaired) >= 10
     assert evaluate_plans(found[repaired], workers=1).valid.mean() > 0.5
