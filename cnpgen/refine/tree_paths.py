@@ -1,7 +1,7 @@
 """Initial paths among obstacles from compiled trees, for problems whose states at rest are free of equalities.
 
-Several trees with different margins grow in milliseconds; deeper ones follow where few of them connect. Their paths are
-sorted by an estimated duration.
+Several trees with different margins grow in milliseconds; their paths are sorted by an estimated duration. Deeper trees
+follow one by one, until a motion along one of their paths is valid.
 """
 
 from collections.abc import Iterator
@@ -19,11 +19,11 @@ from cnpgen.refine.task import RefinementTask
 Array = NDArray[np.float64]
 
 TREE_MARGINS_M = (6e-3, 3e-3, 1e-3, 0.0)  # of the trees in turn, added to the required distances
-TREE_ROUNDS = ((12, 4_000), (8, 16_000), (4, 64_000))  # trees and their extensions, until there are enough paths
+TREE_ROUNDS = ((12, 4_000), (8, 16_000))  # trees and their extensions, until there are enough paths
 MIN_TREE_PATHS, MAX_TREE_PATHS = 3, 8
 TREE_EXTENSION_RAD = 1.0  # length of an edge [rad or m]
-FURTHER_TREES, FURTHER_EXTENSIONS = 6, 128_000
-FURTHER_EXTENSION_RAD = 0.5  # shorter edges find narrower passages
+DEEP_TREES, MAX_UNCONNECTED_TREES, DEEP_EXTENSIONS = 12, 6, 128_000  # without any path fewer trees
+DEEP_EXTENSION_RAD = 0.5  # shorter edges find narrower passages
 TREE_SHORTCUTS = 400  # attempted on a path
 
 
@@ -45,19 +45,24 @@ class TreeSearch:
         """Yield paths, corners of shape (K, n) each.
 
         At most ``MAX_TREE_PATHS`` paths of the first trees are sorted: those that meet all conditions at rest come
-        first, and then those of shorter estimated duration. Where few of them connect, paths of further trees follow.
+        first, and then those of shorter estimated duration. Paths of deep trees follow, of fewer ones if there is no
+        path yet.
         """
         found = self._first_paths()
         space, limit = self.space, self.space.robot.velocity_limit
         durations = [(not space.meets_other_conditions(path), estimated_duration(path, limit)) for path in found]
         for index in sorted(range(len(found)), key=durations.__getitem__)[:MAX_TREE_PATHS]:
             yield found[index]
-        if not 0 < len(found) < MIN_TREE_PATHS or len(found[0]) == 2:
-            return  # without any path there is probably none
-        first = sum(trees for trees, _ in TREE_ROUNDS)
-        narrow = self._settings(0.0, FURTHER_EXTENSIONS, FURTHER_EXTENSION_RAD)
-        further = (self._grow(seed, narrow) for seed in range(first, first + FURTHER_TREES))
-        yield from (path for path in further if path is not None)
+        if found and len(found[0]) == 2:
+            return  # the straight line is free
+        deep, first = self._settings(0.0, DEEP_EXTENSIONS, DEEP_EXTENSION_RAD), sum(trees for trees, _ in TREE_ROUNDS)
+        for number in range(DEEP_TREES):
+            if not found and number == MAX_UNCONNECTED_TREES:
+                return  # there is probably no path
+            path = self._grow(first + number, deep)
+            if path is not None:
+                found.append(path)
+                yield path
 
     def _first_paths(self) -> list[Array]:
         """Return the paths of the first trees; the straight line alone if it is free."""
