@@ -1,6 +1,6 @@
 """Initial paths among obstacles from compiled trees, for problems whose states at rest are free of equalities.
 
-Several trees with different margins grow in milliseconds; their paths are sorted by an estimated duration. Deeper trees
+Several trees with different margins grow in milliseconds; their paths are sorted by an estimated duration. Larger trees
 follow one by one, until a motion along one of their paths is valid.
 """
 
@@ -22,8 +22,8 @@ TREE_MARGINS_M = (6e-3, 3e-3, 1e-3, 0.0)  # of the trees in turn, added to the r
 TREE_ROUNDS = ((12, 4_000), (8, 16_000))  # trees and their extensions, until there are enough paths
 MIN_TREE_PATHS, MAX_TREE_PATHS = 3, 8
 TREE_EXTENSION_RAD = 1.0  # length of an edge [rad or m]
-DEEP_TREES, MAX_UNCONNECTED_TREES, DEEP_EXTENSIONS = 12, 6, 128_000  # without any path fewer trees
-DEEP_EXTENSION_RAD = 0.5  # shorter edges find narrower passages
+LARGE_TREES, MAX_UNCONNECTED_TREES, LARGE_TREE_EXTENSIONS = 12, 6, 128_000  # without any path fewer trees
+LARGE_TREE_EXTENSION_RAD = 0.5  # shorter edges find narrower passages
 TREE_SHORTCUTS = 400  # attempted on a path
 
 
@@ -45,7 +45,7 @@ class TreeSearch:
         """Yield paths, corners of shape (K, n) each.
 
         At most ``MAX_TREE_PATHS`` paths of the first trees are sorted: those that meet all conditions at rest come
-        first, and then those of shorter estimated duration. Paths of deep trees follow, of fewer ones if there is no
+        first, and then those of shorter estimated duration. Paths of large trees follow, of fewer ones if there is no
         path yet.
         """
         found = self._first_paths()
@@ -55,11 +55,12 @@ class TreeSearch:
             yield found[index]
         if found and len(found[0]) == 2:
             return  # the straight line is free
-        deep, first = self._settings(0.0, DEEP_EXTENSIONS, DEEP_EXTENSION_RAD), sum(trees for trees, _ in TREE_ROUNDS)
-        for number in range(DEEP_TREES):
+        large = self._settings(0.0, LARGE_TREE_EXTENSIONS, LARGE_TREE_EXTENSION_RAD)
+        first = sum(trees for trees, _ in TREE_ROUNDS)
+        for number in range(LARGE_TREES):
             if not found and number == MAX_UNCONNECTED_TREES:
                 return  # there is probably no path
-            path = self._grow(first + number, deep)
+            path = self._grow(first + number, large)
             if path is not None:
                 found.append(path)
                 yield path

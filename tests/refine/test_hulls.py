@@ -145,7 +145,7 @@ def test_a_collision_of_the_verdict_becomes_larger_distances_around_its_phase(tm
     assert (extra[3][collides] > 0.003).all()
 
 
-def test_deep_trees_follow_the_first_ones(monkeypatch):
+def test_large_trees_follow_the_first_ones(monkeypatch):
     grown = list[tuple[int, float, int]]()
 
     def find(checker, ends, box, velocity, settings, *, seed):
@@ -158,17 +158,17 @@ def test_deep_trees_follow_the_first_ones(monkeypatch):
     hulls = SimpleNamespace(obstacle_distance=0.0, self_distance=0.0, placed_checker=lambda _: None)
     boundary = SimpleNamespace(start_q=np.zeros((1, 2)), goal_q=np.ones((1, 2)))
     task = SimpleNamespace(boundary=boundary, scene=SimpleNamespace(poses=np.zeros((1, 0))))
-    for hits, first, deep in (({0, 5, 7}, 12, 12), (set(), 20, 6), ({5, 13, 27}, 20, 12), ({22}, 20, 12)):
+    for hits, first, large in (({0, 5, 7}, 12, 12), (set(), 20, 6), ({5, 13, 27}, 20, 12), ({22}, 20, 12)):
         grown.clear()
         assert len(list(tree_paths.TreeSearch(task, space, hulls).paths())) == len(hits)
-        assert [seed for seed, _, _ in grown] == [*range(first), *range(20, 20 + deep)]
+        assert [seed for seed, _, _ in grown] == [*range(first), *range(20, 20 + large)]
     assert {extensions for _, _, extensions in grown} == {4_000, 16_000, 128_000}
     paths = tree_paths.TreeSearch(task, space, hulls).paths()
     hits.clear()
     hits.add(1)
     grown.clear()
     next(paths)
-    assert len(grown) == 20  # deep trees grow when their paths are needed
+    assert len(grown) == 20  # large trees grow when their paths are needed
     assert [margin for _, margin, _ in grown[:4]] == sorted((margin for _, margin, _ in grown[:4]), reverse=True)
 
 
