@@ -1,4 +1,4 @@
-"""Curves and figures of trainings with the paper's preset, from their logs.
+"""Curves and figures of trainings with the paper's preset, from their logs: files .jsonl, or models that hold them.
 
 cnpgen make-dataset airhockey-hit --out hits
 cnpgen train hits -o paper-1.h5 --preset paper --hidden 128 --epochs 1000 --seed 1
@@ -16,7 +16,6 @@ from typing import Any
 from common import arguments, report, table
 
 import cnpgen
-from cnpgen.planner.model import Model
 from cnpgen.store.files.figure_file import new_figure, save_figure
 
 
@@ -25,27 +24,37 @@ class Curve:
     """Log of one training.
 
     Attributes:
-        name: Name of the model file.
-        model: The model.
+        name: Name of the file.
         steps: Records with means of the terms and weights.
         checks: Records with a validation.
-        epochs: Number of steps of an epoch.
+        score: Final validation.
+        budget_factor: Factor of the budgets.
     """
 
     name: str
-    model: Model
     steps: list[dict[str, Any]]
     checks: list[dict[str, Any]]
-    epochs: float
+    score: dict[str, Any]
+    budget_factor: float
+
+    @property
+    def steps_per_epoch(self) -> float:
+        """Number of steps of an epoch."""
+        return float(self.steps[-1]["step"] / self.steps[-1]["epoch"])
 
 
 def read(path: Path) -> Curve:
-    """Read the log in a model file."""
-    model = cnpgen.load_model(path)
-    records = [json.loads(line) for line in model.log.splitlines()]
+    """Read a log, or the log in a model file; the budgets of a log without its model have the factor 1."""
+    factor = 1.0
+    if path.suffix == ".jsonl":
+        text = path.read_text(encoding="utf-8")
+    else:
+        model = cnpgen.load_model(path)
+        text, factor = model.log, float(model.training["settings"]["metric"].get("budget_factor", 1.0))
+    records = [json.loads(line) for line in text.splitlines()]
     steps = [record for record in records if "weights" in record]
     checks = [record for record in records if "validation" in record]
-    return Curve(path.stem, model, steps, checks, steps[-1]["step"] / steps[-1]["epoch"])
+    return Curve(path.stem, steps, checks, records[-1]["final"], factor)
 
 
 def learned_terms(curve: Curve) -> list[str]:
@@ -53,9 +62,9 @@ def learned_terms(curve: Curve) -> list[str]:
     return [name for name, budget in curve.steps[0]["budgets"].items() if budget]
 
 
-def factor(curve: Curve) -> float:
-    """Return the factor of the budgets."""
-    return float(curve.model.training["settings"]["metric"].get("budget_factor", 1.0))
+def ratios(curve: Curve, record: dict[str, Any], names: list[str]) -> list[float]:
+    """Return the means of terms over their budgets."""
+    return [record["terms"][name] / record["budgets"][name] / curve.budget_factor for name in names]
 
 
 def epoch_of_met_budgets(curve: Curve, tolerance: float = 0.05) -> str:
@@ -63,8 +72,7 @@ def epoch_of_met_budgets(curve: Curve, tolerance: float = 0.05) -> str:
     names = ("joint-velocity", "joint-acceleration")
     last = 0.0
     for record in curve.steps:
-        ratios = [record["terms"][name] / record["budgets"][name] / factor(curve) for name in names]
-        if max(abs(ratio - 1) for ratio in ratios) > tolerance:
+        if max(abs(ratio - 1) for ratio in ratios(curve, record, names)) > tolerance:
             last = record["epoch"]
     return "not reached" if last == curve.steps[-1]["epoch"] else f"{last:,.0f}"
 
@@ -73,17 +81,13 @@ def rows(curves: list[Curve]) -> list[tuple[str, ...]]:
     """Format a row per training."""
     cells: list[tuple[str, ...]] = []
     for curve in curves:
-        last, training = curve.steps[-1], curve.model.training
-        ratios = [last["terms"][name] / last["budgets"][name] / factor(curve) for name in learned_terms(curve)]
-        weights = [f"{last['weights'][name]:.3g}" for name in learned_terms(curve)]
-        score, met = training["score"], epoch_of_met_budgets(curve)
-        cells.append(
-            (
-                curve.name, str(curve.model.architecture), f"{last['epoch']:,.0f}", f"{training['cpu_seconds']:,.0f}",
-                met, f"{factor(curve):g}", ", ".join(f"{ratio:.3g}" for ratio in ratios), ", ".join(weights),
-                f"{100 * score['valid']:.1f} %", f"{100 * score['paper_valid']:.1f} %", f"{score['duration_s']:.3f}",
-            )
-        )  # fmt: skip
+        last, score, names = curve.steps[-1], curve.score, learned_terms(curve)
+        violations = ", ".join(f"{ratio:.3g}" for ratio in ratios(curve, last, names))
+        weights = ", ".join(f"{last['weights'][name]:.3g}" for name in names)
+        shares = (f"{100 * score[key]:.1f} %" for key in ("valid", "paper_valid"))
+        lengths = f"{last['epoch']:,.0f}", f"{last['seconds']:,.0f}"
+        met, duration = epoch_of_met_budgets(curve), f"{score['duration_s']:.3f}"
+        cells.append((curve.name, *lengths, met, f"{curve.budget_factor:g}", violations, weights, *shares, duration))
     return cells
 
 
@@ -100,7 +104,7 @@ def save_csv(curves: list[Curve], path: Path) -> None:
                 common = [curve.name, record["step"], record["epoch"], record["seconds"], *values]
                 writer.writerow([*common, *(record["weights"][name] for name in names)])
             for record in curve.checks:
-                found, epoch = record["validation"], record["step"] / curve.epochs
+                found, epoch = record["validation"], record["step"] / curve.steps_per_epoch
                 blank = [""] * (2 + 2 * len(names))
                 values = [found["valid"], found["paper_valid"], found["duration_s"]]
                 writer.writerow([curve.name, record["step"], epoch, record["seconds"], *blank, *values])
@@ -116,11 +120,11 @@ def plot(curves: list[Curve], path: Path) -> None:
         axes[0].plot(epochs, [record["loss"] for record in curve.steps], style, color="C0", label=curve.name)
         for index, name in enumerate(learned_terms(curve)):
             label = name if number == 0 else None
-            ratios = [record["terms"][name] / record["budgets"][name] / factor(curve) for record in curve.steps]
-            axes[1].plot(epochs, ratios, style, color=f"C{index}", label=label)
+            means = [ratios(curve, record, [name])[0] for record in curve.steps]
+            axes[1].plot(epochs, means, style, color=f"C{index}", label=label)
             weights = [record["weights"][name] for record in curve.steps]
             axes[2].plot(epochs, weights, style, color=f"C{index}", label=label)
-        checked = [record["step"] / curve.epochs for record in curve.checks]
+        checked = [record["step"] / curve.steps_per_epoch for record in curve.checks]
         for key, color in (("paper_valid", "C1"), ("valid", "C0")):
             shares = [100 * record["validation"][key] for record in curve.checks]
             label = {"valid": "strict", "paper_valid": "paper's rules"}[key] if number == 0 else None
@@ -141,28 +145,20 @@ def plot(curves: list[Curve], path: Path) -> None:
 
 def main() -> None:
     def add(parser: argparse.ArgumentParser) -> None:
-        parser.add_argument("models", nargs="+", type=Path, help="model files")
+        parser.add_argument("files", nargs="+", type=Path, help="logs or models")
         parser.add_argument("--plot", metavar="FILE", type=Path, help="figure to write")
         parser.add_argument("--csv", metavar="FILE", type=Path, help="table of the curves to write")
 
     options = arguments(__doc__, add)
-    curves = [read(path) for path in options.models]
+    curves = [read(path) for path in options.files]
     if options.plot:
         plot(curves, options.plot)
     if options.csv:
         save_csv(curves, options.csv)
     names = ", ".join(learned_terms(curves[0]))
-    head = (
-        "model",
-        "network",
-        "epochs",
-        "CPU s",
-        "budgets met from epoch",
-        "budget factor",
-        f"violation / budget: {names}",
-    )
+    head = ("training", "epochs", "CPU s", "budgets met from epoch", "budget factor", f"violation / budget: {names}")
     outcome = ("weights", "valid", "paper's rules", "duration s")
-    results = {"trainings": [dict(curve.model.training) for curve in curves]}
+    results = {"trainings": {curve.name: curve.score for curve in curves}}
     report(results, [table("The paper's preset", (*head, *outcome), rows(curves))], as_json=options.json)
 
 

@@ -91,3 +91,25 @@ def test_the_tables_of_the_comparison_are_those_of_the_archived_results() -> Non
     page = (ROOT / "docs" / "benchmarks" / "planners.md").read_text(encoding="utf-8")
     assert {table.split(" | ")[0] for table in printed} >= {"| hits-81", "| heavy-100", "| replans-200", "| clutter"}
     assert [table.partition("\n")[0] for table in printed if table not in page] == []
+
+
+def test_the_table_of_ablations_is_that_of_the_archived_results(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    ablations = importlib.import_module("ablations")
+    results = ablations.read(ROOT / "benchmarks" / "results" / "ablations.jsonl").values()
+    lines = ["| " + " | ".join(ablations.cells(row)) + " |" for row in ablations.rows_of(list(results))]
+    page = (ROOT / "docs" / "benchmarks" / "ablations.md").read_text(encoding="utf-8")
+    assert len(lines) >= 30
+    assert [line for line in lines if line not in page] == []
+
+
+@pytest.mark.parametrize("name", ["airhockey-hit-2048-seed1", "heavy-object-2048-seed1"])
+def test_logs_of_the_published_method_print_the_figures_of_the_page(name: str) -> None:
+    log = ROOT / "benchmarks" / "results" / "paper" / f"{name}.jsonl"
+    command = [sys.executable, str(ROOT / "benchmarks" / "paper.py"), str(log)]
+    printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    page = (ROOT / "docs" / "benchmarks" / "paper.md").read_text(encoding="utf-8")
+    *_, strict, _, by_rules, _, duration = printed.split()
+    assert f"{duration} s" in page
+    assert f"{strict} %" in page
+    assert f"{by_rules} %" in page
