@@ -10,7 +10,7 @@ from cnpgen.errors import RecipeError
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.hull import CUBE
-from cnpgen.robots.solid import place_obstacles, pose_width, solids_of
+from cnpgen.robots.solid import Solid, place_obstacles, pose_width, solids_of
 from cnpgen.world.collision_world import CollisionWorld
 from cnpgen.world.forward_kinematics import ForwardKinematics
 from cnpgen.world.measured_parameters import MeasuredParameters
@@ -69,6 +69,7 @@ class PathWorld:
         self._collisions = CollisionWorld(object_size, 1)
         self._bodies = None if robot.shape is None else RigidBodies(robot.shape, len(obstacles), robot.n)
         self._held = None if robot.held_shape is None else RigidBodies(robot.held_shape, 0, robot.n)
+        self._pose_width, self._poses, self._solids = pose_width(self.obstacles), np.empty(0), list[Solid]()
         rest = np.zeros((robot.n, 1))
         self.set_path(robot.base[:, None], rest, rest, place_obstacles(obstacles), rest)
 
@@ -94,12 +95,18 @@ class PathWorld:
         self._tip_motion: tuple[Array, Array] | None = None
         self._segments: Array | None = None
         self._pairs: dict[str, PairDistances] = {}
-        self._solids = solids_of(self.obstacles, obstacle_poses)
-        self.parameters.set(obstacle_poses[pose_width(self.obstacles) :])
+        self._place_obstacles(obstacle_poses[: self._pose_width])
+        self.parameters.set(obstacle_poses[self._pose_width :])
         if self.parameters.changes_payload:
             self._pool = pin.ModelPool(self._model, 1)  # a pool has its own copy of the model
-        self._collisions.place(self._solids)
         self._move()
+
+    def _place_obstacles(self, poses: Array) -> None:
+        """Move the obstacles, unless they stand there already."""
+        if not np.array_equal(poses, self._poses):
+            self._poses = poses.copy()
+            self._solids = solids_of(self.obstacles, self._poses)
+            self._collisions.place(self._solids)
 
     def _move(self) -> None:
         """Run the forward kinematics of every state and store the poses of the joints and the tip."""

@@ -105,7 +105,7 @@ class RigidBodies:
         Args:
             pairs: ``obstacle_pairs`` or ``link_pairs``.
         """
-        bodies = [(int(a), int(b)) for a, b in pairs]
+        bodies = [(a, b) for a, b in pairs.tolist()]
 
         def measure(pair: int, k: int) -> tuple[float, Array]:
             return self._measure(*bodies[pair], k)
@@ -178,11 +178,15 @@ class RigidBodies:
     def _separation(self, a: int, b: int, direction: Array, states: "slice | Pairs" = slice(None)) -> Array:
         """Compute the separation of b from a along a direction in the frame of a, at some states [m], shape (K,)."""
         (first, second), (frame, other) = (self._bodies[a], self._bodies[b]), (self._frames[a], self._frames[b])
-        along = np.einsum("ijk,j->ik", self._rotations[frame][..., states], direction)
-        in_b = np.einsum("ijk,ik->jk", self._rotations[other][..., states], along)
-        between = self._positions[other][:, states] - self._positions[frame][:, states]
+        rotation, between = self._rotations[other], self._positions[other] - self._positions[frame]
+        if a >= len(self._balls):  # an obstacle, whose frame has the axes of the world
+            in_b = (direction @ rotation.reshape(3, -1)).reshape(3, -1)
+            shift = direction @ between
+        else:
+            along = direction @ self._rotations[frame]
+            in_b, shift = np.einsum("ijk,ik->jk", rotation, along), np.einsum("ik,ik->k", along, between)
         reach = float((first.corners @ direction).max()) + first.radius + second.radius
-        return np.asarray(lowest_products(second.corners, in_b) + np.einsum("ik,ik->k", along, between) - reach)
+        return np.asarray(lowest_products(second.corners, in_b[:, states]) + shift[states] - reach)
 
 
 def lowest_products(corners: Array, directions: Array) -> Array:

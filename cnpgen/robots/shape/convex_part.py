@@ -15,6 +15,8 @@ from cnpgen.robots.urdf import urdf_tree
 Array = NDArray[np.float64]
 
 PRISM_SIDES = 64  # of the prism that contains a cylinder; its corners exceed the radius by 0.12 %
+_ANGLES = np.arange(PRISM_SIDES) * (2 * math.pi / PRISM_SIDES)
+UNIT_PRISM = np.array([[math.cos(angle), math.sin(angle), z] for z in (-1.0, 1.0) for angle in _ANGLES])
 
 
 @dataclass(frozen=True)
@@ -108,8 +110,7 @@ def prism(outer: float, half: float) -> Array:
         outer: Distance of the corners from the axis [m].
         half: Half the length of the prism [m].
     """
-    circle = [(outer * math.cos(a), outer * math.sin(a)) for a in np.arange(PRISM_SIDES) * (2 * math.pi / PRISM_SIDES)]
-    return np.array([[x, y, z] for z in (-half, half) for x, y in circle])
+    return UNIT_PRISM * [outer, outer, half]
 
 
 def origin_of(element: ElementTree.Element | None) -> tuple[Array, Array]:
