@@ -161,10 +161,13 @@ class RigidBodies:
         first, second = pairs.T
         turned = np.einsum("bijk,bj->bik", self._rotations[self._frames], self._centers)
         centers = turned + self._positions[self._frames]
-        gaps = np.abs(centers[second] - centers[first]) - self._half_sizes[first, :, None]
-        outside = np.linalg.norm(np.maximum(gaps, 0), axis=1)
-        distance = np.where(outside > 0, outside, gaps.max(axis=1))
-        return np.asarray(distance - (self._radii[first] + self._radii[second])[:, None])
+        gaps = np.abs(centers[second] - centers[first])
+        gaps -= self._half_sizes[first, :, None]
+        largest = gaps.max(axis=1)
+        np.maximum(gaps, 0, out=gaps)
+        distance: Array = np.where(largest > 0, np.sqrt(np.einsum("mik,mik->mk", gaps, gaps)), largest)
+        distance -= (self._radii[first] + self._radii[second])[:, None]
+        return distance
 
     def _measure(self, a: int, b: int, k: int) -> tuple[float, Array]:
         """Measure a pair at a state; the direction points from a to b, in the frame of a."""
