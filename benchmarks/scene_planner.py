@@ -62,11 +62,14 @@ def colliding_lines(problem: str, scenes: Sequence[SceneProblem]) -> list[SceneP
     return chosen
 
 
-def refined(plans: Plans) -> tuple[list[Attempt], float]:
-    """Refine plans one by one; return the results and the CPU time of each [s]."""
-    begun = time.process_time()
-    results = refine_serially(plans, DEFAULT_OPTIONS)
-    return results, (time.process_time() - begun) / len(plans)
+def refined(plans: Plans) -> tuple[list[Attempt], Array]:
+    """Refine plans one by one; return the results and their CPU times [s], shape (N,)."""
+    results, times = list[Attempt](), list[float]()
+    for index in range(len(plans)):
+        begun = time.process_time()
+        results += refine_serially(plans[index : index + 1], DEFAULT_OPTIONS)
+        times.append(time.process_time() - begun)
+    return results, np.array(times)
 
 
 def without_motions(plans: Plans) -> Plans:
@@ -117,9 +120,10 @@ def measure(
             | {
                 "refined": float((valid & own).mean()),
                 "refined, other guesses too": float(valid.mean()),
-                "refining cpu [s]": cpu,
+                "refining cpu [s]": float(cpu.mean()),
                 "solve": float(np.mean([each.valid for each in solved[0]])),
-                "solve cpu [s]": solved[1],
+                "solve cpu [s]": float(solved[1].mean()),
+                "medians": float(np.median(cpu) / np.median(solved[1])),
                 "motion time": float(np.median(plans.duration / [each.cost for each in attempts])),
             }
         )
@@ -156,14 +160,15 @@ def main() -> None:
             else:
                 scenes = [scene for scene in load_scenes(chosen.suite) if scene.name.rsplit(" ", 2)[0] == family]
             results += measure(chosen.models, chosen.robot, family, scenes, refining=not chosen.alone)
-    head = ("family", "model", "problems", "alone", "refined", "with others", "solve", "cpu: plan", "refine", "solve")
+    shares = ("alone", "refined", "with others", "solve")
+    head = ("family", "model", "problems", *shares, "cpu: plan", "refine", "solve", "refine / solve, medians")
     rows = [
         (
             each["family"],
             each["model"],
             f"{each['problems']}",
             *(cell(each, key) for key in ("alone", "refined", "refined, other guesses too", "solve")),
-            *(cell(each, key) for key in ("planning cpu [s]", "refining cpu [s]", "solve cpu [s]")),
+            *(cell(each, key) for key in ("planning cpu [s]", "refining cpu [s]", "solve cpu [s]", "medians")),
         )
         for each in results
     ]

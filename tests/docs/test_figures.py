@@ -103,7 +103,7 @@ def test_the_table_of_ablations_is_that_of_the_archived_results(monkeypatch: pyt
     assert [line for line in lines if line not in page] == []
 
 
-@pytest.mark.parametrize("name", ["airhockey-hit-2048-seed1", "heavy-object-2048-seed1"])
+@pytest.mark.parametrize("name", ["airhockey-hit-2048-seed1", "heavy-object-2048-seed1", "heavy-object-128-seed1"])
 def test_logs_of_the_published_method_print_the_figures_of_the_page(name: str) -> None:
     log = ROOT / "benchmarks" / "results" / "paper" / f"{name}.jsonl"
     command = [sys.executable, str(ROOT / "benchmarks" / "paper.py"), str(log)]
