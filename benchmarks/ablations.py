@@ -266,9 +266,9 @@ def draw_interval(
         axis.plot([value], [place], "o", color=color, markersize=4)
         return
     is_low = value < limits[0]
-    text, edge = f"{value:.3g}", limits[0] if is_low else limits[1]
-    text, alignment = (f" < {text}", "left") if is_low else (f"{text} > ", "right")
-    axis.text(edge, place, text, color=color, fontsize=7, va="center", ha=alignment)
+    edge, alignment = (limits[0], "left") if is_low else (limits[1], "right")
+    text = f" \u2190 {value:.3g}" if is_low else f"{value:.3g} \u2192 "
+    axis.text(edge, place, text, color=color, fontsize=7, va="bottom" if color == "C1" else "center", ha=alignment)
 
 
 def main() -> None:

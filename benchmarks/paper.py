@@ -43,9 +43,8 @@ class Curve:
         return float(self.steps[-1]["step"] / self.steps[-1]["epoch"])
 
 
-def read(path: Path) -> Curve:
-    """Read a log, or the log in a model file; the budgets of a log without its model have the factor 1."""
-    factor = 1.0
+def read(path: Path, factor: float) -> Curve:
+    """Read a log, or the log in a model file, whose settings have the factor of the budgets."""
     if path.suffix == ".jsonl":
         text = path.read_text(encoding="utf-8")
     else:
@@ -54,6 +53,8 @@ def read(path: Path) -> Curve:
     records = [json.loads(line) for line in text.splitlines()]
     steps = [record for record in records if "weights" in record]
     checks = [record for record in records if "validation" in record]
+    if not records or "final" not in records[-1]:
+        raise SystemExit(f"{path}: expected the log of a finished training, whose last line has the key 'final'")
     return Curve(path.stem, steps, checks, records[-1]["final"], factor)
 
 
@@ -68,13 +69,11 @@ def ratios(curve: Curve, record: dict[str, Any], names: list[str]) -> list[float
 
 
 def epoch_of_met_budgets(curve: Curve, tolerance: float = 0.05) -> str:
-    """Return the first epoch after which velocity and acceleration stay within a tolerance of their budgets."""
-    names = ("joint-velocity", "joint-acceleration")
-    last = 0.0
-    for record in curve.steps:
-        if max(abs(ratio - 1) for ratio in ratios(curve, record, names)) > tolerance:
-            last = record["epoch"]
-    return "not reached" if last == curve.steps[-1]["epoch"] else f"{last:,.0f}"
+    """Return the first epoch from which velocity and acceleration stay within a tolerance of their budgets."""
+    names = ["joint-velocity", "joint-acceleration"]
+    outside = [max(abs(ratio - 1) for ratio in ratios(curve, record, names)) > tolerance for record in curve.steps]
+    first = max((index + 1 for index, is_outside in enumerate(outside) if is_outside), default=0)
+    return "not reached" if first == len(outside) else f"{curve.steps[first]['epoch']:,.0f}"
 
 
 def rows(curves: list[Curve]) -> list[tuple[str, ...]]:
@@ -146,17 +145,20 @@ def plot(curves: list[Curve], path: Path) -> None:
 def main() -> None:
     def add(parser: argparse.ArgumentParser) -> None:
         parser.add_argument("files", nargs="+", type=Path, help="logs or models")
+        parser.add_argument(
+            "--budget-factor", type=float, default=1.0, help="factor of the budgets of logs (default: 1)"
+        )
         parser.add_argument("--plot", metavar="FILE", type=Path, help="figure to write")
         parser.add_argument("--csv", metavar="FILE", type=Path, help="table of the curves to write")
 
     options = arguments(__doc__, add)
-    curves = [read(path) for path in options.files]
+    curves = [read(path, options.budget_factor) for path in options.files]
     if options.plot:
         plot(curves, options.plot)
     if options.csv:
         save_csv(curves, options.csv)
     names = ", ".join(learned_terms(curves[0]))
-    head = ("training", "epochs", "CPU s", "budgets met from epoch", "budget factor", f"violation / budget: {names}")
+    head = ("training", "epochs", "seconds", "budgets met from epoch", "budget factor", f"violation / budget: {names}")
     outcome = ("weights", "valid", "paper's rules", "duration s")
     results = {"trainings": {curve.name: curve.score for curve in curves}}
     report(results, [table("The paper's preset", (*head, *outcome), rows(curves))], as_json=options.json)

@@ -1,7 +1,7 @@
 """Initial paths among obstacles from compiled trees, for problems whose states at rest are free of equalities.
 
 Several trees with different margins grow in milliseconds; their paths are sorted by an estimated duration. Larger trees
-follow one by one, until a motion along one of their paths is valid.
+follow one by one, until a motion along one of their paths is valid. If the straight line is free, it is the only path.
 """
 
 from collections.abc import Iterator
@@ -22,7 +22,7 @@ TREE_MARGINS_M = (6e-3, 3e-3, 1e-3, 0.0)  # of the trees in turn, added to the r
 TREE_ROUNDS = ((12, 4_000), (8, 16_000))  # trees and their extensions, until there are enough paths
 MIN_TREE_PATHS, MAX_TREE_PATHS = 3, 8
 TREE_EXTENSION_RAD = 1.0  # length of an edge [rad or m]
-LARGE_TREES, MAX_UNCONNECTED_TREES, LARGE_TREE_EXTENSIONS = 12, 6, 128_000  # without any path fewer trees
+LARGE_TREES, MAX_UNCONNECTED_TREES, LARGE_TREE_EXTENSIONS = 12, 6, 128_000  # six if no tree connected before
 LARGE_TREE_EXTENSION_RAD = 0.5  # shorter edges find narrower passages
 TREE_SHORTCUTS = 400  # attempted on a path
 

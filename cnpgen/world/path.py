@@ -69,7 +69,8 @@ class PathWorld:
         self._collisions = CollisionWorld(object_size, 1)
         self._bodies = None if robot.shape is None else RigidBodies(robot.shape, len(obstacles), robot.n)
         self._held = None if robot.held_shape is None else RigidBodies(robot.held_shape, 0, robot.n)
-        self._pose_width, self._poses, self._solids = pose_width(self.obstacles), np.empty(0), list[Solid]()
+        self._pose_width, self._solids = pose_width(self.obstacles), list[Solid]()
+        self._poses: Array | None = None
         rest = np.zeros((robot.n, 1))
         self.set_path(robot.base[:, None], rest, rest, place_obstacles(obstacles), rest)
 
@@ -103,10 +104,11 @@ class PathWorld:
 
     def _place_obstacles(self, poses: Array) -> None:
         """Move the obstacles, unless they stand there already."""
-        if not np.array_equal(poses, self._poses):
-            self._poses = poses.copy()
-            self._solids = solids_of(self.obstacles, self._poses)
+        if self._poses is None or not np.array_equal(poses, self._poses):
+            self._poses, copied = None, poses.copy()
+            self._solids = solids_of(self.obstacles, copied)
             self._collisions.place(self._solids)
+            self._poses = copied  # last: after an error the obstacles are placed again
 
     def _move(self) -> None:
         """Run the forward kinematics of every state and store the poses of the joints and the tip."""
