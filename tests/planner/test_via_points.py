@@ -79,7 +79,8 @@ def test_the_lower_bound_decides_like_the_violation(checks: ViaPoints) -> None:
     violation, bound = checks.violation(motion, poses), checks.lower_bound(motion, poses)
     assert 0 < (violation > 1).sum() < count
     np.testing.assert_array_equal(bound > 1, violation > 1)
-    assert (bound <= violation * (1 + 1e-4)).all()  # both in single precision, of different batches
+    eps = np.finfo(np.float32).eps
+    assert (bound <= violation * (1 + 64 * eps)).all()  # both in single precision, of different batches
 
 
 def test_the_best_lines_have_the_smallest_violations(checks: ViaPoints) -> None:

@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 PRISM_SIDES = 64  # of the prism that contains a cylinder; its corners exceed the radius by 0.12 %
 _ANGLES = np.arange(PRISM_SIDES) * (2 * math.pi / PRISM_SIDES)
-UNIT_PRISM = np.array([[math.cos(angle), math.sin(angle), z] for z in (-1.0, 1.0) for angle in _ANGLES])
+_UNIT_PRISM = np.array([[math.cos(angle), math.sin(angle), z] for z in (-1.0, 1.0) for angle in _ANGLES])
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ def prism(outer: float, half: float) -> Array:
         outer: Distance of the corners from the axis [m].
         half: Half the length of the prism [m].
     """
-    return UNIT_PRISM * [outer, outer, half]
+    return _UNIT_PRISM * [outer, outer, half]
 
 
 def origin_of(element: ElementTree.Element | None) -> tuple[Array, Array]:
