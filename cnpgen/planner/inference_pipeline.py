@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary, choose_backend, problem_kernels
 from cnpgen.planner.control_point_functions import projected_path
+from cnpgen.planner.control_points import along_line
 from cnpgen.planner.expressions import effective_steps
 from cnpgen.planner.model import Model, ModelConfig, Outputs
 from cnpgen.planner.phase_grid import blocks_of_motions
@@ -28,6 +29,9 @@ from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.spline_motion import Motion
 
 Array = NDArray[np.float64]
+
+SLOW_DURATION = 1.8  # in expected times, above which a motion nearer to the straight line may be faster
+OFFSET_FRACTION = 0.5  # of the offsets from the line that such motions keep
 
 
 @dataclass(frozen=True)
@@ -154,15 +158,15 @@ class InferencePipeline:
     def _with_via_points(
         self, via_points: ViaPoints, model: Model, tasks: Tasks, motion: Motion
     ) -> tuple[Tasks, Motion]:
-        """Replace motions that violate static conditions by ones through via points with a smaller violation.
+        """Fit the rates of motions; replace those that violate static conditions or are slow by better ones.
 
-        The rates of motion are not fitted; those of the result are.
+        Better are motions through via points with a smaller violation, and faster motions nearer to the straight line.
         """
-        path, rate, before = motion.path.copy(), motion.rate.copy(), via_points.violation(motion, tasks.scene.poses)
-        correction = np.zeros_like(path[:, 3 : path.shape[1] - tasks.boundary.fixed_at_goal])
+        path, rate, violation = motion.path.copy(), motion.rate.copy(), via_points.violation(motion, tasks.scene.poses)
+        fitted, kept = np.empty_like(rate), np.ones(len(path), bool)
+        correction = np.zeros_like(path[:, self._interior(tasks.boundary)])
         correction += 0.0 if tasks.correction is None else tasks.correction
-        violating, count = np.flatnonzero(before > 1), min(MAX_LINES, len(via_points.via_points))
-        kept = np.ones(len(path), bool)
+        violating, count = np.flatnonzero(violation > 1), min(MAX_LINES, len(via_points.via_points))
         for some in (violating[block] for block in blocks_of_motions(len(violating))):
             repeated = np.repeat(some, len(via_points.via_points))
             lines = self.prepare(tasks.boundary[repeated], np.tile(via_points.via_points, (len(some), 1)))
@@ -172,18 +176,52 @@ class InferencePipeline:
             poses = alternatives.scene.poses
             after = via_points.lower_bound(motions, poses)
             candidates = via_points.candidates(after, count)
-            fitted, time = self._fitted(motions[candidates], poses[candidates]), np.full(len(motions), np.inf)
-            time[candidates] = fitted.duration()
+            others, time = self._fitted(motions[candidates], poses[candidates]), np.full(len(motions), np.inf)
+            time[candidates] = others.duration_bound()
             fastest = time.reshape(len(some), -1).argmin(axis=1) + count * np.arange(len(some))
-            violation = after[fastest]
-            unclear = violation > 1  # lower bounds
-            violation[unclear] = via_points.violation(motions[fastest[unclear]], poses[fastest[unclear]])
-            better = violation < before[some]
-            replaced, sources = some[better], np.searchsorted(candidates, fastest[better])
-            path[replaced], rate[replaced] = fitted.path[sources], fitted.rate[sources]
-            correction[replaced], kept[replaced] = alternatives.correction[fastest[better]], False
-        rate[kept] = self._fitted(motion[kept], tasks.scene.poses[kept]).rate
-        return replace(tasks, correction=correction), replace(motion, path=path, rate=rate)
+            unclear = fastest[after[fastest] > 1]  # lower bounds
+            after[unclear] = via_points.violation(motions[unclear], poses[unclear])
+            better = after[fastest] < violation[some]
+            replaced, fastest = some[better], fastest[better]
+            path[replaced], rate[replaced] = motions.path[fastest], motions.rate[fastest]
+            fitted[replaced] = others.rate[np.searchsorted(candidates, fastest)]
+            violation[replaced], correction[replaced] = after[fastest], alternatives.correction[fastest]
+            kept[replaced] = False
+        fitted[kept] = self._fitted(motion[kept], tasks.scene.poses[kept]).rate
+        self._shorten(via_points, tasks, Motion(path, rate, motion.degree), fitted, violation)
+        return replace(tasks, correction=correction), Motion(path, fitted, motion.degree)
+
+    def _shorten(self, via_points: ViaPoints, tasks: Tasks, motion: Motion, fitted: Array, violation: Array) -> None:
+        """Move slow motions without violation nearer to the straight line in place, if they become faster.
+
+        Args:
+            via_points: The check of static conditions.
+            tasks: N tasks.
+            motion: N motions; their rates are the network's, shape (N, R).
+            fitted: Their fitted rates, shape (N, R).
+            violation: Their largest violations of static conditions, in tolerances, shape (N,).
+        """
+        bound = replace(motion, rate=fitted).duration_bound()
+        slow = np.flatnonzero((violation <= 1) & (bound > SLOW_DURATION * tasks.expected_time))
+        if not len(slow):
+            return
+        some, rate = tasks.take(slow), lanes(motion.rate[slow])
+        interior = motion.path[slow, self._interior(tasks.boundary)]
+        start, goal = some.boundary.start_q[:, None], some.boundary.goal_q[:, None]
+        offsets = interior - start - (goal - start) * along_line(interior.shape[1])
+        part = lanes((OFFSET_FRACTION * offsets).reshape(len(slow), -1))
+        (path,) = self.path(ends_of(some.boundary), part, rate, some.scene.lanes)
+        other, poses = Motion(rows(path, motion.path.shape[2]), motion.rate[slow], motion.degree), some.scene.poses
+        free = np.flatnonzero(via_points.lower_bound(other, poses) <= 1)
+        other = self._fitted(other[free], poses[free])
+        faster = other.duration_bound() < bound[slow[free]]
+        replaced = slow[free[faster]]
+        motion.path[replaced], fitted[replaced] = other.path[faster], other.rate[faster]
+
+    @staticmethod
+    def _interior(boundary: Boundary) -> slice:
+        """Control points of the path that the boundary conditions leave free."""
+        return slice(3, -boundary.fixed_at_goal)
 
 
 def make_inference_pipeline(

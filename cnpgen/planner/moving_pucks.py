@@ -86,9 +86,7 @@ def plan_moving_hits(  # noqa: PLR0917 - in the order of plan_hits
         if meeting.time is not None and iteration == 0 and len(active):
             continue  # the direction depends on the speed
         columns = {name: tasks[name][0] for name in CONTEXT}
-        plans = planner.plan_batch(
-            boundary_of_tasks(tasks, planner.model.fixed_at_goal), sample_id=active, columns=columns
-        )
+        plans = planner.plan_tasks(boundary_of_tasks(tasks, planner.model.fixed_at_goal), active, columns)
         contact = plans.duration - meeting.overlap / speed[active]
         change, last = np.abs(contact - time[active]), time[active]
         if meeting.time is not None or not len(active) or (change <= MAX_MEETING_ERROR_S).all():

@@ -128,7 +128,7 @@ def plan_hits(
         )
         columns = {name: tasks[name][0] for name in CONTEXT}
         boundary = boundary_of_tasks(tasks, planner.model.fixed_at_goal)
-        plans = planner.plan_batch(boundary, sample_id=tasks.alive, columns=columns)
+        plans = planner.plan_tasks(boundary, tasks.alive, columns)
         hits = PlannedHits(plans, tasks.why(), np.zeros(len(plans)), overlap)
     else:
         if parameters is not None:

@@ -154,6 +154,15 @@ class Planner:
             UsageError: See ``plan``.
         """
         check_boundary_units(self.robot, boundary, argument="boundary", allow_large_angles=allow_large_angles)
+        return self.plan_tasks(boundary, sample_id, columns)
+
+    def plan_tasks(
+        self,
+        boundary: Boundary,
+        sample_id: NDArray[np.int64] | None = None,
+        columns: Mapping[str, Array] | None = None,
+    ) -> Plans:
+        """Plan N motions like ``plan_batch``, without checks of types and units, and with the caller's BLAS threads."""
         return self._inference.plan(self.model, self._checked(boundary), sample_id=sample_id, columns=columns)
 
     @checked_arguments

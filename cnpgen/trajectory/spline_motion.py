@@ -15,6 +15,7 @@ from cnpgen.schema.arguments import numbers
 from cnpgen.trajectory.boundary import MotionIndexError
 from cnpgen.trajectory.spline import (
     basis,
+    clamped_knots,
     derivatives_of_each,
     edges_around,
     extrema,
@@ -149,6 +150,15 @@ class Motion:
         total[~self.runs_forward()] = np.inf
         total[~np.isfinite(self.rate).all(axis=1)] = np.nan
         return total
+
+    def duration_bound(self) -> Array:
+        """Return an upper bound of the duration [s], shape (N,), in a fraction of its time; all control points of r > 0.
+
+        1 / r is convex in r, so it is at most the mean of 1 / r_j with the weights of the basis at a phase (Jensen).
+        """
+        points, degree = self.rate.shape[1], self.degree
+        knots = clamped_knots(points, degree)
+        return np.asarray((1 / self.rate) @ ((knots[degree + 1 :] - knots[:points]) / (degree + 1)))
 
     def time_at(self, s: Array) -> Array:
         """Compute the time at phases s, ``t(s) = integral of 1 / r from 0 to s`` [s].

@@ -63,6 +63,14 @@ def test_the_duration_is_the_integral_of_one_over_r(spread: float) -> None:
     assert np.allclose(motion.time_at(np.array([0.3, 1.0]))[:, 1], motion.duration(), rtol=1e-9)
 
 
+@pytest.mark.parametrize(("spread", "excess"), [(0.0, 1e-12), (0.1, 0.01), (0.5, 0.2), (2.0, np.inf)])
+def test_the_duration_bound_is_at_least_the_duration(spread: float, excess: float) -> None:
+    motion = draw_motion(5, spread=spread)
+    ratio = motion.duration_bound() / motion.duration()
+    assert (ratio >= 1 - 1e-12).all()
+    assert (ratio <= 1 + excess).all()
+
+
 def test_a_slow_start_is_included_in_the_duration() -> None:
     """The first basis function is 0.01 wide: a quadrature on equal cells has errors of some percent."""
     rate = np.full((1, 20), 2.0)
