@@ -21,6 +21,7 @@ from cnpgen.problems.problem_file import load_problem
 from cnpgen.world.path import PathWorld
 from cnpgen.world.world import World
 from tests.conftest import HANGING
+from tests.docs.test_site import PARTS
 
 ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"
@@ -210,6 +211,8 @@ def test_what_a_page_links_to_is_there(page: Path) -> None:
         file, _, anchor = link.partition("#")
         target = page.parent / file if file else page
         assert target.exists(), f"{page.name} links to {link}"
+        top, *below = target.resolve().relative_to(ROOT).parts
+        assert top in PARTS or not below, f"{page.name} links to {link}, which is not on the site: write its name only"
         assert not anchor or anchor in anchors(target), f"{page.name} links to {link}; there are {anchors(target)}"
 
 
