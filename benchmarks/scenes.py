@@ -392,7 +392,7 @@ def search_reference(problem: Problem, solved: list[Solved], seconds: float) -> 
     for each in unsolved:
         checker.place(each.obstacles, place_obstacles(each.obstacles))
         ends, box_of_joints = each.plans.boundary, (robot.position_lower, robot.position_upper)
-        settings = TreeSettings(0.0, 0.0, max_extensions=REFERENCE_EXTENSIONS, shortcuts=0)
+        settings = TreeSettings(0.0, 0.0, max_extensions=REFERENCE_EXTENSIONS, max_nodes=10**9, shortcuts=0)
         begun, path, seed = time.process_time(), None, 0
         while path is None and time.process_time() - begun < seconds:
             end_states = ends.start_q[0], ends.goal_q[0]

@@ -7,7 +7,8 @@ The next attempt is made only if no earlier one was accepted. Attempts in their 
 3. Other initial guesses, and the best attempt so far after uniform time scaling.
 4. Step 2 again, from a straight line at constant rate, then from the best attempt so far.
 5. Without a deadline: levels on hulls in place of capsules, and joint-space paths of RRT-Connect. If compiled trees can
-   search these paths, they come right after step 2, whose finer levels run only for nearly valid attempts.
+   search these paths, they come right after step 2, whose finer levels run only for nearly valid attempts. Without a
+   path there are no further attempts.
 
 Acceptance (``RefinementSearch``): the independent verdict decides, never the solver's own residuals. The first valid
 plan is returned if it is precise; otherwise one more attempt is judged. A plan whose links touch something within the
@@ -77,7 +78,7 @@ def refine_task(refiner: Refiner, checker: PlanChecker, task: RefinementTask) ->
         return _invalid_input(refiner, task)
     search, x = RefinementSearch(refiner, checker, task), refiner.input_variables(task)
     for attempt in make_attempts(refiner, task, x):
-        if search.add(attempt) or search.continue_rejected(attempt):
+        if search.add(attempt) or search.found_no_path or search.continue_rejected(attempt):
             break
     if not (search.judged or search.skipped):  # no attempt stays near the input path
         path, rate, outcome = next(_input_plans(refiner, task, x))

@@ -1,7 +1,8 @@
 """Initial paths among obstacles from compiled trees, for problems whose states at rest are free of equalities.
 
-Several trees with different margins grow in milliseconds; their paths are sorted by an estimated duration. Larger trees
-follow one by one, until a motion along one of their paths is valid. If the straight line is free, it is the only path.
+Several small trees with different margins grow in milliseconds, and large ones if these find few paths. The paths are
+sorted by an estimated duration. Large trees with shorter edges follow one by one, until a motion along one of their
+paths is valid. If the straight line is free, it is the only path.
 """
 
 from collections.abc import Iterator
@@ -18,12 +19,12 @@ from cnpgen.refine.task import RefinementTask
 
 Array = NDArray[np.float64]
 
-TREE_MARGINS_M = (6e-3, 3e-3, 1e-3, 0.0)  # of the trees in turn, added to the required distances
-TREE_ROUNDS = ((12, 4_000), (8, 16_000))  # trees and their extensions, until there are enough paths
+TREE_MARGINS_M = (6e-3, 3e-3, 1e-3, 0.0)  # of small trees in turn, added to the required distances
+SMALL_TREES, SMALL_TREE_EXTENSIONS = 12, 4_000  # four, if these find too few paths
 MIN_TREE_PATHS, MAX_TREE_PATHS = 3, 8
-TREE_EXTENSION_RAD = 1.0  # length of an edge [rad or m]
-LARGE_TREES, MAX_UNCONNECTED_TREES, LARGE_TREE_EXTENSIONS = 12, 6, 128_000  # six if no tree connected before
-LARGE_TREE_EXTENSION_RAD = 0.5  # shorter edges find narrower passages
+LARGE_TREE_EXTENSIONS = 128_000  # without margin, in narrow passages
+LARGE_TREES, MAX_UNCONNECTED_TREES = 12, 3  # with edges of either length; three if no tree connects
+TREE_EXTENSION_RAD, SHORT_TREE_EXTENSION_RAD = 1.0, 0.5  # length of an edge [rad or m]; shorter ones after the others
 TREE_SHORTCUTS = 400  # attempted on a path
 
 
@@ -45,40 +46,44 @@ class TreeSearch:
         """Yield paths, corners of shape (K, n) each.
 
         At most ``MAX_TREE_PATHS`` paths of the first trees are sorted: those that meet all conditions at rest come
-        first, and then those of shorter estimated duration. Paths of large trees follow, of fewer ones if there is no
-        path yet.
+        first, and then those of shorter estimated duration. Paths of large trees with shorter edges follow.
         """
-        found = self._first_paths()
+        found, seeds = list[Array](), count()
+        for path in self._small_trees(seeds):
+            if len(path) == 2:
+                yield path  # the straight line is free
+                return
+            found.append(path)
+        missing = max(MIN_TREE_PATHS - len(found), 0)
+        found += islice(self._large_trees(seeds, TREE_EXTENSION_RAD, bool(found)), missing)
         space, limit = self.space, self.space.robot.velocity_limit
         durations = [(not space.meets_other_conditions(path), estimated_duration(path, limit)) for path in found]
         for index in sorted(range(len(found)), key=durations.__getitem__)[:MAX_TREE_PATHS]:
             yield found[index]
-        if found and len(found[0]) == 2:
-            return  # the straight line is free
-        large = self._settings(0.0, LARGE_TREE_EXTENSIONS, LARGE_TREE_EXTENSION_RAD)
-        first = sum(trees for trees, _ in TREE_ROUNDS)
-        for number in range(LARGE_TREES):
-            if not found and number == MAX_UNCONNECTED_TREES:
-                return  # there is probably no path
-            path = self._grow(first + number, large)
+        yield from self._large_trees(seeds, SHORT_TREE_EXTENSION_RAD, bool(found))
+
+    def _small_trees(self, seeds: Iterator[int]) -> Iterator[Array]:
+        """Yield the paths of small trees with every margin, and of further ones if these find enough."""
+        number = 0
+        for seed in islice(seeds, SMALL_TREES):
+            if seed == len(TREE_MARGINS_M) and number < MIN_TREE_PATHS:
+                return
+            margin = TREE_MARGINS_M[seed % len(TREE_MARGINS_M)]
+            path = self._grow(seed, self._settings(margin, SMALL_TREE_EXTENSIONS, TREE_EXTENSION_RAD))
             if path is not None:
-                found.append(path)
+                number += 1
                 yield path
 
-    def _first_paths(self) -> list[Array]:
-        """Return the paths of the first trees; the straight line alone if it is free."""
-        paths, seeds = list[Array](), count()
-        for trees, extensions in TREE_ROUNDS:
-            for seed in islice(seeds, trees):
-                margin = TREE_MARGINS_M[seed % len(TREE_MARGINS_M)]
-                path = self._grow(seed, self._settings(margin, extensions, TREE_EXTENSION_RAD))
-                if path is not None and len(path) == 2:
-                    return [path]
-                if path is not None:
-                    paths.append(path)
-            if len(paths) >= MIN_TREE_PATHS:
-                break
-        return paths
+    def _large_trees(self, seeds: Iterator[int], extension: float, connected: bool) -> Iterator[Array]:
+        """Yield the paths of large trees; of fewer ones if there is no path yet."""
+        settings = self._settings(0.0, LARGE_TREE_EXTENSIONS, extension)
+        for number, seed in enumerate(islice(seeds, LARGE_TREES)):
+            if number == MAX_UNCONNECTED_TREES and not connected:
+                return  # there is probably no path
+            path = self._grow(seed, settings)
+            if path is not None:
+                connected = True
+                yield path
 
     def _settings(self, margin: float, extensions: int, length: float) -> TreeSettings:
         return TreeSettings(

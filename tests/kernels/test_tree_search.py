@@ -62,6 +62,11 @@ def test_paths_are_reproducible(setting):
     assert not np.array_equal(paths[0], paths[2])
 
 
+def test_the_search_ends_with_enough_nodes(setting):
+    assert search(setting, max_nodes=3) is None
+    assert search(setting, max_nodes=10**9) is not None
+
+
 def test_shortcuts_reduce_the_estimated_duration(setting):
     velocity = setting[1].velocity_limit
     durations = [

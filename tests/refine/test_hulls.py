@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from cnpgen.kernels.collision.collision_checker import load_collision_library
+from cnpgen.kernels.collision.tree_search import TreeSettings
 from cnpgen.kernels.library import KernelLibrary, choose_backend
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.load_robot import load_robot
@@ -146,11 +147,11 @@ def test_a_collision_of_the_verdict_becomes_larger_distances_around_its_phase(tm
 
 
 def test_large_trees_follow_the_first_ones(monkeypatch):
-    grown = list[tuple[int, float, int]]()
+    grown, hits = list[TreeSettings](), set[int]()  # hits: numbers of the trees that find a path
 
     def find(checker, ends, box, velocity, settings, *, seed):
-        grown.append((seed, settings.margin, settings.max_extensions))
-        return np.zeros((3, 2)) if seed in hits else None
+        grown.append(settings)
+        return np.zeros((3, 2)) if len(grown) - 1 in hits else None
 
     monkeypatch.setattr(tree_paths, "find_tree_path", find)
     robot = SimpleNamespace(position_lower=-np.ones(2), position_upper=np.ones(2), velocity_limit=np.ones(2))
@@ -158,18 +159,29 @@ def test_large_trees_follow_the_first_ones(monkeypatch):
     hulls = SimpleNamespace(obstacle_distance=0.0, self_distance=0.0, placed_checker=lambda _: None)
     boundary = SimpleNamespace(start_q=np.zeros((1, 2)), goal_q=np.ones((1, 2)))
     task = SimpleNamespace(boundary=boundary, scene=SimpleNamespace(poses=np.zeros((1, 0))))
-    for hits, first, large in (({0, 5, 7}, 12, 12), (set(), 20, 6), ({5, 13, 27}, 20, 12), ({22}, 20, 12)):
+    search = tree_paths.TreeSearch(task, space, hulls)
+    cases = (
+        ({0, 1, 3}, (12, 0, 12)),  # small trees with every margin find enough paths
+        (set(), (4, 3, 3)),  # nothing connects
+        ({0, 3}, (4, 12, 12)),
+        ({1, 5, 6, 9}, (4, 3, 12)),  # large trees find the missing paths
+        ({8}, (4, 3, 12)),
+    )
+    for numbers, expected in cases:
         grown.clear()
-        assert len(list(tree_paths.TreeSearch(task, space, hulls).paths())) == len(hits)
-        assert [seed for seed, _, _ in grown] == [*range(first), *range(20, 20 + large)]
-    assert {extensions for _, _, extensions in grown} == {4_000, 16_000, 128_000}
-    paths = tree_paths.TreeSearch(task, space, hulls).paths()
-    hits.clear()
-    hits.add(1)
+        hits = numbers
+        assert len(list(search.paths())) == len(numbers)
+        kinds = [(settings.max_extensions, settings.extension) for settings in grown]
+        assert kinds == [
+            kind
+            for kind, count in zip([(4_000, 1.0), (128_000, 1.0), (128_000, 0.5)], expected, strict=True)
+            for _ in range(count)
+        ]
+        assert [settings.margin for settings in grown[:4]] == [6e-3, 3e-3, 1e-3, 0.0]
     grown.clear()
-    next(paths)
-    assert len(grown) == 20  # large trees grow when their paths are needed
-    assert [margin for _, margin, _ in grown[:4]] == sorted((margin for _, margin, _ in grown[:4]), reverse=True)
+    hits = {0, 1, 3}
+    next(search.paths())
+    assert len(grown) == 12  # large trees grow when their paths are needed
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ typedef struct {
   const double *start, *goal, *lower, *upper, *velocity; /* ends, ranges of random configurations, velocity limits */
   double obstacle_distance, self_distance, margin, ramp; /* the margin is complete at a distance `ramp` from the ends */
   double spacing, extension, corner_time;                /* of states; largest of a tree; time that a corner costs [s] */
-  long max_extensions, shortcuts;
+  long max_extensions, max_nodes, shortcuts; /* nodes of both trees */
   unsigned long long seed;
 } tree_settings;
 
@@ -172,7 +172,7 @@ long find_path(const tree_settings *s, double *path, long max_points) {
     memcpy(path, s->start, n * sizeof(double)), memcpy(path + n, s->goal, n * sizeof(double));
     count = 2;
   }
-  for (long trial = 0; trial < s->max_extensions && !count; trial++) {
+  for (long trial = 0; trial < s->max_extensions && trees[0].count + trees[1].count < s->max_nodes && !count; trial++) {
     int own = trees[0].count > trees[1].count, reached;
     for (long j = 0; j < n; j++) target[j] = s->lower[j] + uniform(&h) * (s->upper[j] - s->lower[j]);
     tree *near = trees + own, *other = trees + !own;

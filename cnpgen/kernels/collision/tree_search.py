@@ -23,7 +23,7 @@ class _TreeSettings(ctypes.Structure):
         *((name, c_void_p) for name in ("scene", "start", "goal", "lower", "upper", "velocity")),
         *((name, c_double) for name in ("obstacle_distance", "self_distance", "margin", "ramp")),
         *((name, c_double) for name in ("spacing", "extension", "corner_time")),
-        *((name, c_long) for name in ("max_extensions", "shortcuts")),
+        *((name, c_long) for name in ("max_extensions", "max_nodes", "shortcuts")),
         ("seed", c_ulonglong),
     )
 
@@ -40,6 +40,7 @@ class TreeSettings:
         spacing: Largest joint difference of neighboring checked states [rad or m].
         extension: Largest length of an edge [rad or m].
         max_extensions: Largest number of extensions of the trees.
+        max_nodes: Largest number of nodes of both trees: trees that fill so much space are probably not connected.
         shortcuts: Attempts to shorten a path.
     """
 
@@ -50,6 +51,7 @@ class TreeSettings:
     spacing: float = 0.03
     extension: float = 1.0
     max_extensions: int = 4000
+    max_nodes: int = 3000
     shortcuts: int = 100
 
 
@@ -87,6 +89,7 @@ def find_tree_path(
         settings.extension,
         CORNER_TIME_S,
         settings.max_extensions,
+        settings.max_nodes,
         settings.shortcuts,
         seed + 1,
     )
