@@ -152,7 +152,7 @@ class Motion:
         return total
 
     def duration_bound(self) -> Array:
-        """Return an upper bound of the duration [s], shape (N,), in a fraction of its time, for positive control points of r.
+        """Return a fast upper bound of the duration [s], shape (N,), for positive control points of r.
 
         1 / r is convex in r, so it is at most the mean of 1 / r_j with the weights of the basis at a phase (Jensen).
         """
