@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from cnpgen.errors import UsageError
 from cnpgen.pipelines.completion import Completion
 from cnpgen.planner.hit_tasks import State, boundary_of_tasks, hit_tasks, lanes
-from cnpgen.planner.planner import Planner
+from cnpgen.planner.planner import Planner, plan_tasks
 from cnpgen.planner.puck_model import PuckModel
 from cnpgen.plans.boundary_file import CONTEXT
 from cnpgen.plans.plans import Plans
@@ -86,7 +86,7 @@ def plan_moving_hits(  # noqa: PLR0917 - in the order of plan_hits
         if meeting.time is not None and iteration == 0 and len(active):
             continue  # the direction depends on the speed
         columns = {name: tasks[name][0] for name in CONTEXT}
-        plans = planner.plan_tasks(boundary_of_tasks(tasks, planner.model.fixed_at_goal), active, columns)
+        plans = plan_tasks(planner, boundary_of_tasks(tasks, planner.model.fixed_at_goal), active, columns)
         contact = plans.duration - meeting.overlap / speed[active]
         change, last = np.abs(contact - time[active]), time[active]
         if meeting.time is not None or not len(active) or (change <= MAX_MEETING_ERROR_S).all():

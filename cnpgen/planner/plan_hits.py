@@ -13,7 +13,7 @@ from cnpgen.machine.threads import one_thread
 from cnpgen.pipelines.completion import Completion
 from cnpgen.planner.hit_tasks import State, boundary_of_tasks, hit_tasks, load_completion
 from cnpgen.planner.moving_pucks import Meeting, plan_moving_hits
-from cnpgen.planner.planner import Planner
+from cnpgen.planner.planner import Planner, plan_tasks
 from cnpgen.planner.puck_model import PuckModel
 from cnpgen.plans.boundary_file import CONTEXT
 from cnpgen.plans.join import JoinedPlans, join_plans
@@ -128,7 +128,7 @@ def plan_hits(
         )
         columns = {name: tasks[name][0] for name in CONTEXT}
         boundary = boundary_of_tasks(tasks, planner.model.fixed_at_goal)
-        plans = planner.plan_tasks(boundary, tasks.alive, columns)
+        plans = plan_tasks(planner, boundary, tasks.alive, columns)
         hits = PlannedHits(plans, tasks.why(), np.zeros(len(plans)), overlap)
     else:
         if parameters is not None:

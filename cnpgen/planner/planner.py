@@ -154,16 +154,7 @@ class Planner:
             UsageError: See ``plan``.
         """
         check_boundary_units(self.robot, boundary, argument="boundary", allow_large_angles=allow_large_angles)
-        return self.plan_tasks(boundary, sample_id, columns)
-
-    def plan_tasks(
-        self,
-        boundary: Boundary,
-        sample_id: NDArray[np.int64] | None = None,
-        columns: Mapping[str, Array] | None = None,
-    ) -> Plans:
-        """Plan N motions like ``plan_batch``, without checks of types and units, and with the caller's BLAS threads."""
-        return self._inference.plan(self.model, self._checked(boundary), sample_id=sample_id, columns=columns)
+        return plan_tasks(self, boundary, sample_id, columns)
 
     @checked_arguments
     def replan(
@@ -241,3 +232,13 @@ class Planner:
         if boundary.goal_ddq is not None:
             raise UsageError("the model leaves goal accelerations free, so goal_ddq must be None", concerns="goal_ddq")
         return replace(boundary, goal_ddq=np.zeros_like(boundary.goal_q))
+
+
+def plan_tasks(
+    planner: Planner,
+    boundary: Boundary,
+    sample_id: NDArray[np.int64] | None = None,
+    columns: Mapping[str, Array] | None = None,
+) -> Plans:
+    """Plan N motions like ``Planner.plan_batch``, without checks of types and units, in any number of BLAS threads."""
+    return planner._inference.plan(planner.model, planner._checked(boundary), sample_id=sample_id, columns=columns)
