@@ -238,7 +238,7 @@ class Dataset:
 
     def _source(self, split: str) -> SplitShards:
         if split not in self.shards:
-            raise DatasetError(f"{self.folder} {lacks('split', str(split), self.shards)}")
+            raise DatasetError(f"{self.folder} {lacks('split', str(split), self.shards)}", concerns="split")
         return SplitShards(split, self.shards[split], self.reader, self.fingerprint, self.spec.dtype)
 
     def _row_format(

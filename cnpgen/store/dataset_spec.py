@@ -227,7 +227,7 @@ class DatasetSpec:
         """
         by_name = {item.name: item for item in self.fields}
         if name not in by_name:
-            raise DatasetError(f"{self.name} has no field {name!r}{nearest(name, by_name)}")
+            raise DatasetError(f"{self.name} has no field {name!r}{nearest(name, by_name)}", concerns="fields")
         return by_name[name]
 
 

@@ -45,7 +45,7 @@ class StoredDataset:
             DatasetError: There is no such split.
         """
         if split not in self.spec.splits:
-            raise DatasetError(f"{self.folder} {lacks('split', split, self.spec.splits)}")
+            raise DatasetError(f"{self.folder} {lacks('split', split, self.spec.splits)}", concerns="split")
         tasks = [task for task in shards(self.spec) if task.split == split]
         if self.manifest is None:
             return [task for task in tasks if is_committed(self.folder, self.spec, task)]

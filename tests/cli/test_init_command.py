@@ -273,6 +273,13 @@ def test_an_srdf_is_used_and_named_from_the_recipes(tmp_path):
     assert "disables the pair base, hand" in head_of(tmp_path / "arm" / "problem.toml")
 
 
+def test_an_entry_of_an_srdf_without_a_link_is_named(tmp_path, capsys):
+    urdf, srdf = write_crane(tmp_path), tmp_path / "crane.srdf"
+    srdf.write_text('<robot name="crane"><disable_collisions link1="hand"/></robot>')
+    said = refused(capsys, 2, tmp_path / "arm", "--urdf", urdf, "--tip", "hand", "--srdf", srdf)
+    assert "crane.srdf: {'link1': 'hand'} lacks link2" in said
+
+
 def test_a_torque_limit_below_what_gravity_needs_is_replaced(tmp_path):
     weak = '<limit lower="-2" upper="2" velocity="2" effort="3"/>'
     urdf = write_arm(tmp_path / "arm.urdf", [ELBOW[0], ("revolute", "0 1 0", weak), ELBOW[2]], mass=8.0)
@@ -291,10 +298,12 @@ def test_a_torque_limit_below_what_gravity_needs_is_replaced(tmp_path):
         (('lower="-2" upper="2"', 'lower="2" upper="-2"'), "'joint_2': its limits lower=2 and upper=-2 are swapped"),
         (('axis xyz="0 1 0"', 'axis xyz="0 0 0"'), "joint 'joint_2': <axis xyz='0 0 0'> has no direction"),
         (('mass value="2.0"', 'mass value="-2.0"'), "<mass value='-2.0'> must not be negative: give the mass"),
+        (('mass value="2.0"', 'mass value="2,0"'), "link 'link_2': <mass value='2,0'> must be a number"),
+        (('velocity="2"', 'velocity="-2"'), "joint 'joint_2': velocity=-2 must not be negative"),
         (('xyz="0.3 0 0.0"', 'xyz="300 0 0"'), "m long, expected 0.01 to 100 m; lengths of a URDF are in m, not in mm"),
         (('xyz="0.3 0 0', 'xyz="0.00003 0 0'), "the arm is 0.000"),
     ],
-    ids=["swapped limits", "zero axis", "negative mass", "joints in mm", "tiny arm"],
+    ids=["swapped limits", "zero axis", "negative mass", "comma", "negative limit", "joints in mm", "tiny arm"],
 )  # fmt: skip
 def test_implausible_input_is_refused_with_a_remedy(tmp_path, capsys, change, message):
     urdf = write_arm(tmp_path / "arm.urdf", ELBOW)

@@ -70,8 +70,12 @@ def test_an_unknown_split_is_refused_and_the_existing_ones_are_named(dataset: Da
         lambda: dataset.frame("val"),
         lambda: open_dataset(folder).read("val"),
     ):
-        with pytest.raises(DatasetError, match=message):
+        with pytest.raises(DatasetError, match=message) as caught:
             read()
+        assert caught.value.argument == "split"
+    with pytest.raises(DatasetError, match="has no field 'start_p'") as caught:
+        dataset.batches(8, fields=["start_p"])
+    assert caught.value.argument == "fields"
 
 
 def test_the_problem_of_a_dataset_is_that_of_its_recipe(tiny) -> None:

@@ -219,6 +219,21 @@ def test_an_address_where_nobody_listens_is_one_sentence_within_seconds(engine, 
     assert time.monotonic() - begun < clusters.CONNECTION_TIMEOUT_S
 
 
+def test_the_answer_of_another_service_is_one_sentence(monkeypatch):
+    def connect(*_: object, **_options: object) -> None:
+        raise MemoryError  # of dask, which reads a length from the answer
+
+    distributed = pytest.importorskip("distributed")
+    monkeypatch.setattr(distributed, "Client", connect)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = f"127.0.0.1:{server.getsockname()[1]}"
+        with (
+            pytest.raises(MachineError, match=f"^cannot reach the dask cluster at {address}: "),
+            assembled(Engine("dask", address), 1),
+        ):
+            pass
+
+
 def test_ray_without_tokens_is_refused_for_local_clusters(monkeypatch):
     monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
     monkeypatch.setenv("RAY_AUTH_TOKEN", "replaced below, and restored after the test")

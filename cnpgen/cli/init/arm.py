@@ -106,9 +106,7 @@ def read_arm(urdf: Path, tip: str | None) -> Arm:
         ),
         moved=tuple(link for link in links if moving[0] in _path(urdf, link, joints)),
         frames=tuple(frames_of(tree)),
-        masses={
-            link.get("name", ""): _number(urdf, link.find("inertial/mass"), "value") for link in tree.findall("link")
-        },
+        masses={link.get("name", ""): _mass(urdf, link) for link in tree.findall("link")},
         shaped=tuple(link.get("name", "") for link in tree.findall("link") if link.find("collision") is not None),
         meshes=tuple(mesh.get("filename", "") for mesh in tree.iterfind("link//mesh")),
     )
@@ -153,10 +151,13 @@ def _moves(joint: ElementTree.Element) -> bool:
 def _joint(urdf: Path, joint: ElementTree.Element) -> ArmJoint:
     """Read a joint, and fill in missing limits."""
     limit, kind = joint.find("limit"), joint.get("type", "")
-    lower, upper, velocity, effort = (_number(urdf, limit, key) for key in ("lower", "upper", "velocity", "effort"))
+    owner = f"joint {joint.get('name', '')!r}: "
+    lower, upper, velocity, effort = (
+        _number(urdf, limit, key, owner) for key in ("lower", "upper", "velocity", "effort")
+    )
     if lower > upper and kind in ("revolute", "prismatic"):
         text = f"its limits lower={lower:g} and upper={upper:g} are swapped: exchange them"
-        raise RecipeError([f"{urdf}: joint {joint.get('name', '')!r}: {text}"])
+        raise RecipeError([f"{urdf}: {owner}{text}"])
     missing = {"position": kind == "continuous" or not lower < upper, "velocity": velocity <= 0, "torque": effort <= 0}
     half = DEFAULT_RANGE_M if kind == "prismatic" else DEFAULT_RANGE_RAD
     return ArmJoint(
@@ -170,8 +171,13 @@ def _joint(urdf: Path, joint: ElementTree.Element) -> ArmJoint:
     )
 
 
-def _number(urdf: Path, element: ElementTree.Element | None, attribute: str) -> float:
+def _mass(urdf: Path, link: ElementTree.Element) -> float:
+    return _number(urdf, link.find("inertial/mass"), "value", f"link {link.get('name', '')!r}: ")
+
+
+def _number(urdf: Path, element: ElementTree.Element | None, attribute: str, owner: str) -> float:
+    """Return a number of an element, 0 without it; an error begins with the element's owner."""
     try:
         return number_in(element, attribute, 0.0)
     except ValueError as error:
-        raise RecipeError([f"{urdf}: {error}"]) from error
+        raise RecipeError([f"{urdf}: {owner}{error}"]) from error

@@ -39,9 +39,12 @@ def with_ignored_pairs(urdf: str, pairs: Iterable[tuple[str, str]]) -> str:
 
 def _with_entries(urdf: str, entries: list[dict[str, str]], source: str) -> str:
     robot = urdf_tree(urdf)
-    links = {link.get("name") for link in robot.iter("link")}
-    named = {entry.get(key) for entry in entries for key in ("link1", "link2")}
-    if unknown := sorted(map(str, named - links)):
+    links = {link.get("name", "") for link in robot.iter("link")}
+    for entry in entries:
+        if missing := [key for key in ("link1", "link2") if key not in entry]:
+            raise RecipeError([f"{source}: {entry} lacks {', '.join(missing)}"])
+    named = {entry[key] for entry in entries for key in ("link1", "link2")}
+    if unknown := sorted(named - links):
         raise RecipeError([f"{source}: the URDF has no link {', '.join(unknown)}"])
     for entry in entries:
         robot.append(ElementTree.Element(_TAG, entry))
