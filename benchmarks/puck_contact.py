@@ -69,11 +69,17 @@ def early_depth(plans: Plans, pucks: np.ndarray) -> np.ndarray:
     return np.array(depths)
 
 
-def moving_hits(count: int, seed: int) -> tuple[PlannedHits, np.ndarray]:
-    """Plan hits of random pucks from random moving states; return them and the pucks [m], shape (count, 2)."""
+def moving_tasks(count: int, seed: int) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
+    """Draw moving states and pucks [m], shape (count, 2)."""
     start = draw_boundary_problems(NAME, count, seed=seed).boundary
     pucks = np.random.default_rng(seed).uniform(PUCKS[0], PUCKS[1], (count, 2))
-    return plan_hits(Planner(NAME), (start.start_q, start.start_dq, start.start_ddq), pucks, TARGET), pucks
+    return (start.start_q, start.start_dq, start.start_ddq), pucks
+
+
+def moving_hits(count: int, seed: int) -> tuple[PlannedHits, np.ndarray]:
+    """Plan hits of random pucks from random moving states; return them and the pucks [m], shape (count, 2)."""
+    states, pucks = moving_tasks(count, seed)
+    return plan_hits(Planner(NAME), states, pucks, TARGET), pucks
 
 
 def evaluated(plans: Plans, pucks: np.ndarray) -> dict[str, Any]:
@@ -135,15 +141,13 @@ def planning_ratio(name: str, count: int, seed: int) -> float:
     """Return the CPU time of planning one hit with the constraint over that without: the median of alternating hits."""
     model = load_model(name)
     planners = Planner(model), Planner(replace(model, problem=without_contact(model.problem)))
-    start = draw_boundary_problems(NAME, count, seed=seed).boundary
-    pucks = np.random.default_rng(seed).uniform(PUCKS[0], PUCKS[1], (count, 2))
+    (q, dq, ddq), pucks = moving_tasks(count, seed)
     ratios = []
     for index in range(count):
         row, seconds = slice(index, index + 1), []
         for planner in planners:
-            state = start.start_q[row], start.start_dq[row], start.start_ddq[row]
             begin = time.process_time()
-            plan_hits(planner, state, pucks[row], TARGET)
+            plan_hits(planner, (q[row], dq[row], ddq[row]), pucks[row], TARGET)
             seconds.append(time.process_time() - begin)
         ratios.append(seconds[0] / seconds[1])
     return median(ratios)

@@ -255,7 +255,7 @@ def _dask(address: str | None, workers: int | None, what: str) -> Iterator[Clust
                 with signals_blocked():  # local workers do not receive the Ctrl-C of a terminal
                     cluster = _local_dask(workers)
                     client = Client(cluster, set_as_default=False, security=cluster.security)
-        except (OSError, ValueError, TypeError, RuntimeError, MemoryError) as error:  # memory: garbled answer
+        except (OSError, ValueError, TypeError, RuntimeError, MemoryError) as error:  # memory: of a foreign answer
             raise MachineError(f"cannot reach {what}: {str(error) or 'it is no scheduler'}") from error
         try:
             yield _Dask(client, what, workers)

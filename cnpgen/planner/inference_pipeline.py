@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary, choose_backend, problem_kernels
 from cnpgen.planner.control_point_functions import projected_path
-from cnpgen.planner.control_points import along_line
 from cnpgen.planner.expressions import effective_steps
 from cnpgen.planner.model import Model, ModelConfig, Outputs
 from cnpgen.planner.phase_grid import blocks_of_motions
@@ -25,7 +24,7 @@ from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import ProblemRecord
 from cnpgen.robots.robot import Robot
-from cnpgen.trajectory.boundary import Boundary
+from cnpgen.trajectory.boundary import Boundary, anchor_line
 from cnpgen.trajectory.spline_motion import Motion
 
 Array = NDArray[np.float64]
@@ -207,8 +206,7 @@ class InferencePipeline:
             return
         some, rate = tasks.take(slow), lanes(motion.rate[slow])
         interior = motion.path[slow, self._interior(tasks.boundary)]
-        start, goal = some.boundary.start_q[:, None], some.boundary.goal_q[:, None]
-        offsets = interior - start - (goal - start) * along_line(interior.shape[1])
+        offsets = interior - anchor_line(some.boundary, motion.rate[slow], motion.spec)
         part = lanes((OFFSET_FRACTION * offsets).reshape(len(slow), -1))
         (path,) = self.path(ends_of(some.boundary), part, rate, some.scene.lanes)
         other, poses = Motion(rows(path, motion.path.shape[2]), motion.rate[slow], motion.degree), some.scene.poses

@@ -18,7 +18,7 @@ from cnpgen.robots.mimic import check_mimic
 from cnpgen.robots.model_comparison import check_model
 from cnpgen.robots.parameter_ranges import NO_PARAMETERS, ParameterRanges
 from cnpgen.robots.shape.shape import Shape
-from cnpgen.robots.urdf import check_magnitudes, urdf_tree
+from cnpgen.robots.urdf import urdf_tree
 from cnpgen.robots.urdf_parameters import urdf_parameters
 from cnpgen.store.joint_units import units_of_joints
 
@@ -141,7 +141,6 @@ def reduced_model(urdf: Path, text: str, joints: tuple[str, ...], attached: Atta
         limited = bounded(text, tree, attached)
         with _mistakes_in(urdf):
             parameters = urdf_parameters(tree)
-            check_magnitudes(tree)
         model = pin.buildModelFromXML(limited)
         name_links_uniquely(model)
     except (ValueError, RuntimeError, IndexError) as error:

@@ -91,22 +91,6 @@ def _tree_without_namespaces(text: str) -> ElementTree.Element:
     return builder.close()
 
 
-def check_magnitudes(tree: ElementTree.Element) -> None:
-    """Check that the velocity and effort limits of the joints are not negative.
-
-    Raises:
-        RecipeError: A limit is negative, or no number.
-    """
-    for joint in tree.iter("joint"):
-        for key in ("velocity", "effort"):
-            try:
-                value = number_in(joint.find("limit"), key, 0.0)
-            except ValueError as error:
-                raise RecipeError([f"joint {joint.get('name', '')!r}: {error}"]) from error
-            if value < 0:
-                raise RecipeError([f"joint {joint.get('name', '')!r}: {key}={value:g} must not be negative"])
-
-
 def number_in(element: ElementTree.Element | None, attribute: str, default: float) -> float:
     """Return a numeric attribute of an element.
 

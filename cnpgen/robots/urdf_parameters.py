@@ -177,6 +177,9 @@ def _joint(element: Element) -> UrdfJoint:
     limit, kind = element.find("limit"), element.get("type", "")
     keys = ("velocity", "effort") if kind == "continuous" else ("lower", "upper", "velocity", "effort")
     limits = {} if limit is None else {key: number_in(limit, key, 0.0) for key in keys}
+    for key in ("velocity", "effort"):
+        if kind in _TURNING_OR_SLIDING and limits.get(key, 0.0) < 0:
+            raise ValueError(f"{key}={limits[key]:g} must not be negative")
     ends = {tag: found.get("link", "") for tag in ("parent", "child") if (found := element.find(tag)) is not None}
     axis = np.array(numbers_in(element.find("axis"), "xyz", (1.0, 0.0, 0.0)))
     length = float(np.linalg.norm(axis))
