@@ -14,11 +14,13 @@ from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem, kept_folder
 from cnpgen.robots.attached import Attached, PayloadBody
 from cnpgen.robots.chain import chain_from_model
+from cnpgen.robots.plausible_sizes import check_plausible_sizes
 from cnpgen.robots.robot import Robot, reduced_model
 from cnpgen.robots.shape.convex_part import turned
 from cnpgen.robots.shape.held_object import HeldBody, load_held_shape
 from cnpgen.robots.shape.shape import Shape, load_shape
 from cnpgen.schema.keys import PerJoint
+from cnpgen.schema.units import PLAUSIBLE_MAX, suggested_unit
 from cnpgen.store.joint_units import unit_of
 
 Array = NDArray[np.float64]
@@ -70,7 +72,9 @@ def load_robot(problem: Problem) -> Robot:
     if mistakes := list(_mistakes(problem, robot)):
         raise RecipeError(mistakes)
     shape = _shape(problem, robot) if spec.geometry == "urdf" else None
-    return replace(robot, shape=shape, held_shape=_held_shape(problem, robot))
+    robot = replace(robot, shape=shape, held_shape=_held_shape(problem, robot))
+    check_plausible_sizes(robot)
+    return robot
 
 
 def _attached(problem: Problem) -> Attached:
@@ -137,12 +141,23 @@ def _mistakes(problem: Problem, robot: Robot) -> Iterator[str]:
                 yield f"{robot.urdf}: {name}: the {what} limit must be positive and finite, got {value:g}"
     if any(isinstance(constraint, JointTorque) for constraint in problem.constraint):
         yield from _weightless(robot)
-    low, high = np.array(robot.model.lowerPositionLimit), np.array(robot.model.upperPositionLimit)
-    for joint in np.flatnonzero(~(low < high)):
-        text = f"the lower position limit must be below the upper one, got {low[joint]:g} and {high[joint]:g}"
-        yield f"{robot.urdf}: {robot.joint_names[joint]}: {text}"
-    if (low < high).all():
+    yield from (wrong := list(_position_mistakes(robot)))
+    if not wrong:
         yield from _base_mistakes(problem, robot)
+
+
+def _position_mistakes(robot: Robot) -> Iterator[str]:
+    """Yield error messages for position limits that are swapped, equal or in degrees."""
+    limits = zip(robot.joint_names, robot.model.lowerPositionLimit, robot.model.upperPositionLimit, strict=True)
+    for (name, low, high), sliding in zip(limits, robot.sliding, strict=True):
+        text, largest = f"{robot.urdf}: {name}: ", max(low, high, key=abs)
+        if low >= high:
+            remedy = "they are swapped: exchange them" if low > high else "give both of them"
+            yield f"{text}the lower position limit must be below the upper one, got {low:g} and {high:g}; {remedy}"
+        elif not sliding and abs(largest) > PLAUSIBLE_MAX["rad"]:
+            remedy = "for a joint without limits, give ranges of all joints ('position' in [limits])"
+            expected = f"limits of positions are at most {PLAUSIBLE_MAX['rad']:.3g} rad, got {largest:g} rad"
+            yield f"{text}{expected}{suggested_unit(largest, 'rad')}; {remedy}"
 
 
 def _weightless(robot: Robot) -> Iterator[str]:
@@ -162,9 +177,10 @@ def _base_mistakes(problem: Problem, robot: Robot) -> Iterator[str]:
     worst = int(np.argmax(np.maximum(low - base, base - high)))
     if not low[worst] <= base[worst] <= high[worst]:
         unit = unit_of(robot.units("rad"), worst)
+        hint = suggested_unit(base[worst], unit) if abs(base[worst]) > 2 * np.pi else ""
         yield (
             f"{problem.path}: robot.base: {robot.joint_names[worst]} = {base[worst]:g} {unit} is outside its planning"
-            f" limits [{low[worst]:g}, {high[worst]:g}]"
+            f" limits [{low[worst]:g}, {high[worst]:g}]{hint}"
         )
     for table in (each for each in problem.constraint if isinstance(each, Table)):
         height = _tip_height(robot, base)

@@ -1,5 +1,6 @@
 """Obstacles of a problem file."""
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -45,6 +46,8 @@ class Obstacle:
         "rotation: roll, pitch and yaw about the world's axes, as <origin rpy> of a URDF",
         unit="rad",
         default=_OPTIONAL["rotation"],
+        low=-2 * math.pi,
+        high=2 * math.pi,
         since_version=2,
     )
     size: tuple[float, float, float] | None = field(

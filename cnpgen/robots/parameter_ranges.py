@@ -88,10 +88,19 @@ class ParameterRanges:
         "mass of the payload, whose inertia is proportional to it", unit="kg", default=None, since_version=2, low=1e-9
     )
     payload_x: Range | None = field(
-        "centre of mass of the payload along the tip's x axis", unit="m", default=None, since_version=2
+        "centre of mass of the payload along the tip's x axis",
+        unit="m",
+        default=None,
+        since_version=2,
+        low=-5.0,
+        high=5.0,
     )
-    payload_y: Range | None = field("the same along its y axis", unit="m", default=None, since_version=2)
-    payload_z: Range | None = field("the same along its z axis", unit="m", default=None, since_version=2)
+    payload_y: Range | None = field(
+        "the same along its y axis", unit="m", default=None, since_version=2, low=-5.0, high=5.0
+    )
+    payload_z: Range | None = field(
+        "the same along its z axis", unit="m", default=None, since_version=2, low=-5.0, high=5.0
+    )
     payload_inertia: Range | None = field(
         "inertia of the payload about its centre, as a fraction of that of [payload] at equal mass",
         default=None,

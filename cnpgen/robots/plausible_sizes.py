@@ -10,6 +10,7 @@ from cnpgen.robots.robot import Robot
 MIN_REACH_M, MAX_REACH_M = 0.01, 100.0  # of an arm, along its joints
 MAX_LINK_RATIO = 20.0  # size of a link / reach; pedestals and mobile bases may be larger than arms
 MIN_LINK_RATIO = 0.02  # size of the largest moving link / reach
+MIN_LINK_M = 1e-3  # size of a link with collision geometry
 
 
 def check_plausible_sizes(robot: Robot) -> None:
@@ -38,6 +39,10 @@ def _mistakes(robot: Robot) -> Iterator[str]:
         if size > MAX_LINK_RATIO * reach:
             remedy = 'write scale="0.001 0.001 0.001" in the <mesh> of a file in mm'
             yield f"link {link!r}: its collision geometry is {size:.3g} m large, the arm {reach:.3g} m; {remedy}"
+        elif size < MIN_LINK_M:
+            remedy = "remove the scale of its <mesh> elements, or correct it"
+            text = f"its collision geometry is {size:.3g} m large, expected {MIN_LINK_M:g} m or more"
+            yield f"link {link!r}: {text}; {remedy}"
     largest = max(size for link, size in sizes.items() if robot.shape.joints[link])
     if largest < MIN_LINK_RATIO * reach:
         remedy = "remove the scale of its <mesh> elements, or correct it"

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.robots.robot import Robot
+from cnpgen.schema.units import suggested_unit
 from cnpgen.store.joint_units import unit_of
 
 MAX_RANGE_RATIO = 2.0  # distance from the center of a joint's range, in half ranges
@@ -16,7 +17,6 @@ MAX_LIMIT_RATIO = (
     10.0  # of velocities, accelerations and positions of the tip; deg/s is 57 times rad/s, mm 1,000 times m
 )
 MAX_ANGLE_RAD = 2 * np.pi  # of directions
-OTHER_UNITS = {"rad": ("deg", 180 / np.pi), "m": ("mm", 1000.0)}  # unit -> likely other unit, factor
 
 
 class UnitError(UsageError):
@@ -44,16 +44,8 @@ class ImplausibleValue:
     unit: str
 
     def __str__(self) -> str:
-        value, unit = f"{self.value:.6g}", self.unit
-        text = f"must be from {self.low:.3g} to {self.high:.3g} {unit}, got {value} {unit}"
-        base, slash, per = unit.partition("/")
-        if base not in OTHER_UNITS:
-            return text
-        name, factor = OTHER_UNITS[base]
-        other, converted = f"{name}{slash}{per}", f"{self.value / factor:.3g} {unit}"
-        if base == "rad":
-            text = f"{text}; {value} {unit} is {self.value * factor:.0f} {other}"
-        return f"{text}; did you mean {value} {other} = {converted}?"
+        text = f"must be from {self.low:.3g} to {self.high:.3g} {self.unit}, got {self.value:.6g} {self.unit}"
+        return text + suggested_unit(self.value, self.unit)
 
 
 def find_implausible_value(robot: Robot, name: str, values: NDArray[Any], unit: str) -> ImplausibleValue | None:

@@ -139,7 +139,7 @@ def reduced_model(urdf: Path, text: str, joints: tuple[str, ...], attached: Atta
         tree = urdf_tree(text)
         check_mimic(tree, joints)
         limited = bounded(text, tree, attached)
-        with _mistakes_in(urdf):
+        with mistakes_in(urdf):
             parameters = urdf_parameters(tree)
         model = pin.buildModelFromXML(limited)
         name_links_uniquely(model)
@@ -153,14 +153,14 @@ def reduced_model(urdf: Path, text: str, joints: tuple[str, ...], attached: Atta
     reduced = pin.buildReducedModel(model, locked, pin.neutral(model)) if locked else model
     if tuple(reduced.names)[1:] != tuple(joints):
         raise RecipeError([f"robot.joints: must be in the URDF's order {list(reduced.names)[1:]}, got {list(joints)}"])
-    with _mistakes_in(urdf):
+    with mistakes_in(urdf):
         check_model(reduced, parameters)
     attach(reduced, attached)
     return reduced
 
 
 @contextmanager
-def _mistakes_in(urdf: Path) -> Iterator[None]:
+def mistakes_in(urdf: Path) -> Iterator[None]:
     """Put the name of the URDF before the mistakes that the block raises."""
     try:
         yield

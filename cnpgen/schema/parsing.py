@@ -1,6 +1,7 @@
 """Parser of TOML tables to dataclasses: checks types, units and bounds, and reports mistakes with file and key."""
 
 import dataclasses
+import math
 import re
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
@@ -9,7 +10,7 @@ from typing import Any, NoReturn, TypeVar, get_args, get_origin
 
 from cnpgen.errors import nearest
 from cnpgen.schema.keys import Key, PerJoint, Range, RecipeLocation, keys
-from cnpgen.schema.units import parse_number, parse_numbers, parse_range, show
+from cnpgen.schema.units import PLAUSIBLE_MAX, parse_number, parse_numbers, parse_range, show, suggested_unit
 
 T = TypeVar("T")
 
@@ -208,12 +209,15 @@ _Number = TypeVar("_Number", int, float)
 
 
 def _bounded(number: _Number, key: Key) -> _Number:
+    """Return a number within the bounds of its key, or within the plausible range of its unit."""
     unit = "" if key.unit == "1" else f" {key.unit}"
-    if key.low is not None and number < key.low:
-        raise ValueError(f"{number}{unit} is too small, expected at least {key.low:g}{unit}")
-    if key.high is not None and number > key.high:
-        raise ValueError(f"{number}{unit} is too large, expected at most {key.high:g}{unit}")
-    return number
+    plausible = PLAUSIBLE_MAX.get(key.unit, math.inf)
+    low = -plausible if key.low is None else key.low
+    high = plausible if key.high is None else key.high
+    if low <= number <= high:
+        return number
+    bound = f"small, expected at least {low:.4g}" if number < low else f"large, expected at most {high:.4g}"
+    raise ValueError(f"{number}{unit} is too {bound}{unit}{suggested_unit(number, key.unit, low, high)}")
 
 
 _LEAVES: dict[Any, Callable[[Any, Key], Any]] = {

@@ -29,6 +29,25 @@ UNITS: dict[str, tuple[str, Decimal]] = {
 }
 """Unit -> SI unit and conversion factor. Decimal, so that "9 mm" and 0.009 are the same float."""
 
+PLAUSIBLE_MAX = {
+    "m": 100.0,
+    "s": 3600.0,
+    "rad": 8 * math.pi,
+    "rad/s": 200.0,
+    "rad/s^2": 1e4,
+    "rad/s^3": 1e7,
+    "m/s": 100.0,
+    "m/s^2": 1e4,
+    "kg": 2500.0,
+    "N": 1e6,
+    "N m": 1e5,
+    "kg m^2": 1e4,
+}
+"""SI unit -> largest plausible absolute value of a quantity; larger ones are probably in another unit."""
+
+OTHER_UNITS = {"rad": "deg", "m": "mm", "s": "ms", "kg": "g"}
+"""SI unit -> unit in which values are often given by mistake."""
+
 _DIMENSIONS = {
     "1": "a number",
     "m": "a length [m]",
@@ -55,6 +74,24 @@ _SPELLINGS = (("**", "^"), ("*", " "), ("·", " "), ("²", "^2"), ("°", "deg"),
 def dimension(unit: str) -> str:
     """Return the name of the dimension of an SI unit: ``"a time [s]"``."""
     return _DIMENSIONS.get(unit, f"a quantity [{unit}]")
+
+
+def suggested_unit(value: float, unit: str, low: float = -math.inf, high: float = math.inf) -> str:
+    """Return a hint for a value outside of its plausible range: ``"; did you mean 15 deg = 0.262 rad?"``.
+
+    Args:
+        value: The value, read in ``unit``.
+        unit: SI unit, such as "rad" or "rad/s"; the hint is empty for units without a common mistake.
+        low: Minimum value; the hint is empty if the converted value is below it.
+        high: Maximum value.
+    """
+    base, slash, per = unit.partition("/")
+    factor = float(UNITS[OTHER_UNITS[base]][1]) if base in OTHER_UNITS else 0.0
+    if not factor or not low <= value * factor <= high:
+        return ""
+    other = f"{OTHER_UNITS[base]}{slash}{per}"
+    text = f"; {value:.6g} {unit} is {value / factor:.0f} {other}" if base == "rad" else ""
+    return f"{text}; did you mean {value:.6g} {other} = {value * factor:.3g} {unit}?"
 
 
 def show(value: object) -> str:

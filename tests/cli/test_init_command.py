@@ -295,7 +295,9 @@ def test_a_torque_limit_below_what_gravity_needs_is_replaced(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (('lower="-2" upper="2"', 'lower="2" upper="-2"'), "'joint_2': its limits lower=2 and upper=-2 are swapped"),
+        (('lower="-2" upper="2"', 'lower="2" upper="-2"'), "upper one, got 2 and -2; they are swapped: exchange them"),
+        (('lower="-2" upper="2"', 'lower="-115" upper="90"'), "joint_2: limits of positions are at most 25.1 rad"),
+        (('lower="-2" upper="2"', 'lower="-115" upper="90"'), "did you mean -115 deg = -2.01 rad?"),
         (('axis xyz="0 1 0"', 'axis xyz="0 0 0"'), "joint 'joint_2': <axis xyz='0 0 0'> has no direction"),
         (('mass value="2.0"', 'mass value="-2.0"'), "<mass value='-2.0'> must not be negative: give the mass"),
         (('mass value="2.0"', 'mass value="2,0"'), "link 'link_2': <mass value='2,0'> must be a number"),
@@ -303,7 +305,7 @@ def test_a_torque_limit_below_what_gravity_needs_is_replaced(tmp_path):
         (('xyz="0.3 0 0.0"', 'xyz="300 0 0"'), "m long, expected 0.01 to 100 m; lengths of a URDF are in m, not in mm"),
         (('xyz="0.3 0 0', 'xyz="0.00003 0 0'), "the arm is 0.000"),
     ],
-    ids=["swapped limits", "zero axis", "negative mass", "comma", "negative limit", "joints in mm", "tiny arm"],
+    ids=["swapped limits", "degrees", "suggestion", "zero axis", "negative mass", "comma", "negative limit", "joints in mm", "tiny arm"],
 )  # fmt: skip
 def test_implausible_input_is_refused_with_a_remedy(tmp_path, capsys, change, message):
     urdf = write_arm(tmp_path / "arm.urdf", ELBOW)

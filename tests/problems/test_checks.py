@@ -80,7 +80,7 @@ def limited(folder: Path, limit: str) -> Path:
         ("velocity = [2, 2, 115, 2]", "limits.velocity: elbow: must be from 0 to 20 rad/s, got 115 rad/s;"),
         ("acceleration = 573", "limits.acceleration: swing: must be from 0 to 200 rad/s^2, got 573 rad/s^2;"),
         (
-            'position = ["[-2, 2]", "[-120, 120]", "[-2, 2]", "[-2, 2]"]',
+            'position = ["[-2, 2]", "[-12, 12]", "[-2, 2]", "[-2, 2]"]',
             "position: lift: must be from -5 to 5 rad, got",
         ),
     ],

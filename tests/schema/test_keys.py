@@ -312,3 +312,19 @@ def test_a_place_names_file_and_key():
     assert (RecipeLocation("f") / "robot" / "base").message("x") == "f: robot.base: x"
     assert (RecipeLocation("f") / "stage" / 3 / "cone").message("x") == "f: stage 4.cone: x"
     assert RecipeLocation("f").message("x") == "f: x"
+
+
+@pytest.mark.parametrize(
+    ("text", "mistake"),
+    [
+        ("angles = [10, 45]", "angles: 45.0 rad is too large, expected at most 25.13 rad; 45 rad is 2578 deg; did you"),
+        ("angles = [-90]", "angles: -90.0 rad is too small, expected at least -25.13 rad; -90 rad is -5157 deg; did"),
+        ("stops = [[0, 250]]", "stops 1: 250.0 m is too large, expected at most 100 m; did you mean 250 mm = 0.25 m?"),
+        ("load = 12000", "load: 12000.0 kg is too large, expected at most 2500 kg; did you mean 12000 g = 12 kg?"),
+        ("tilt = [0, 30]", "tilt: 30.0 rad is too large, expected at most 1 rad; 30 rad is 1719 deg; did you mean 30"),
+    ],
+)
+def test_values_that_are_probably_in_another_unit_have_a_suggestion(text, mistake):
+    (found,) = mistakes_of(text)
+    assert found.startswith(f"cart.toml: {mistake}")
+    assert "did you mean" in found

@@ -30,7 +30,9 @@ MAX_CONSECUTIVE_STEPS = 100  # before it continues from another node
 class MPCMPNet(BenchmarkPlanner):
     """A tree of states, steered by the cross-entropy method towards proposals of a network (Li et al., 2021)."""
 
-    witness_radius: float = field("distance of the tip within which one node is kept", unit="m", default=0.02, low=0.0)
+    witness_radius: float = field(
+        "distance of the tip within which one node is kept", unit="m", default=0.02, low=0.0, high=5.0
+    )
     samples: int = field("controls per iteration of the cross-entropy method", default=64, low=2)
     elites: int = field("best controls, which determine the next distribution", default=4, low=1)
     iterations: int = field("largest number of iterations of the cross-entropy method", default=30, low=1)

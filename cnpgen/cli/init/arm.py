@@ -1,14 +1,15 @@
 """An arm in a URDF: its frames and links, the joints that move a tip, and missing limits."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from xml.etree import ElementTree
 
 from cnpgen.errors import RecipeError, UsageError, listed
 from cnpgen.problems.checks import frames_of, missing_frame, unread_xacro
-from cnpgen.robots.urdf import number_in, read_urdf, urdf_tree
+from cnpgen.robots.robot import mistakes_in
+from cnpgen.robots.urdf import read_urdf, urdf_tree
+from cnpgen.robots.urdf_parameters import UrdfJoint, urdf_parameters
 
 DEFAULT_RANGE_RAD, DEFAULT_RANGE_M = math.pi, 0.5  # ranges to either side, where the URDF has none
 DEFAULT_SPEED = 1.0  # rad/s or m/s, where the URDF has none
@@ -86,27 +87,25 @@ def read_arm(urdf: Path, tip: str | None) -> Arm:
         raise RecipeError([f"{urdf}: {error}"]) from error
     if text := unread_xacro(tree, urdf):
         raise RecipeError([text])
-    links = [link.get("name", "") for link in tree.findall("link")]
-    joints = {_end(joint, "child"): joint for joint in tree.findall("joint") if joint.find("child") is not None}
+    with mistakes_in(urdf):
+        parameters = urdf_parameters(tree)
+    links, joints = list(parameters.inertias), parameters.joints
     tip = tip if tip is not None else _only_leaf(urdf, links, joints)
     if text := missing_frame(tree, urdf, tip):
         raise UsageError(f"--tip: {text}")
-    path = list(_path(urdf, tip, joints))
-    moving = [joint for joint in path if _moves(joint)]
+    moving = [joint for joint in _path(tip, joints) if _moves(joint)]
     if not moving:
         raise RecipeError([f"{urdf}: no joint moves the frame {tip!r}; its frames: {listed(frames_of(tree))}"])
-    planned = tuple(_joint(urdf, joint) for joint in moving)
+    planned = tuple(map(_joint, moving))
     names = {joint.name for joint in planned}
     return Arm(
         urdf=urdf,
         tip=tip,
         planned=planned,
-        locked=tuple(
-            str(joint.get("name")) for joint in joints.values() if _moves(joint) and joint.get("name") not in names
-        ),
-        moved=tuple(link for link in links if moving[0] in _path(urdf, link, joints)),
+        locked=tuple(joint.name for joint in joints.values() if _moves(joint) and joint.name not in names),
+        moved=tuple(link for link in links if moving[0] in _path(link, joints)),
         frames=tuple(frames_of(tree)),
-        masses={link.get("name", ""): _mass(urdf, link) for link in tree.findall("link")},
+        masses={link: inertia.mass if inertia else 0.0 for link, inertia in parameters.inertias.items()},
         shaped=tuple(link.get("name", "") for link in tree.findall("link") if link.find("collision") is not None),
         meshes=tuple(mesh.get("filename", "") for mesh in tree.iterfind("link//mesh")),
     )
@@ -118,8 +117,8 @@ def with_torques(arm: Arm, torques: list[float]) -> Arm:
     return replace(arm, planned=tuple(replace(each, effort=each.effort or torque) for each, torque in pairs))
 
 
-def _only_leaf(urdf: Path, links: list[str], joints: Mapping[str, ElementTree.Element]) -> str:
-    parents = {_end(joint, "parent") for joint in joints.values()}
+def _only_leaf(urdf: Path, links: list[str], joints: Mapping[str, UrdfJoint]) -> str:
+    parents = {joint.parent for joint in joints.values()}
     leaves = [link for link in links if link not in parents]
     if len(leaves) != 1:
         leaf_text = f"{len(leaves)} links have no child: {', '.join(leaves)}" if leaves else "every link has a child"
@@ -127,57 +126,35 @@ def _only_leaf(urdf: Path, links: list[str], joints: Mapping[str, ElementTree.El
     return leaves[0]
 
 
-def _path(urdf: Path, frame: str, joints: Mapping[str, ElementTree.Element]) -> Iterator[ElementTree.Element]:
+def _path(frame: str, joints: Mapping[str, UrdfJoint]) -> list[UrdfJoint]:
     """Return the joints between the root and a frame, from the root outwards."""
-    named = {joint.get("name"): child for child, joint in joints.items()}
-    found, link = list[ElementTree.Element](), frame if frame in joints else named.get(frame, frame)
+    child_of = {joint.name: child for child, joint in joints.items()}
+    found, link = list[UrdfJoint](), frame if frame in joints else child_of.get(frame, frame)
     while link in joints:
         found.append(joints[link])
-        link = _end(joints[link], "parent")
-        if len(found) > len(joints):
-            raise RecipeError([f"{urdf}: its joints form a cycle at link {link!r}"])
-    return reversed(found)
+        link = joints[link].parent
+    return found[::-1]
 
 
-def _end(joint: ElementTree.Element, which: str) -> str:
-    element = joint.find(which)
-    return "" if element is None else element.get("link", "")
+def _moves(joint: UrdfJoint) -> bool:
+    return joint.kind != "fixed"
 
 
-def _moves(joint: ElementTree.Element) -> bool:
-    return joint.get("type", "fixed") != "fixed"
-
-
-def _joint(urdf: Path, joint: ElementTree.Element) -> ArmJoint:
-    """Read a joint, and fill in missing limits."""
-    limit, kind = joint.find("limit"), joint.get("type", "")
-    owner = f"joint {joint.get('name', '')!r}: "
-    lower, upper, velocity, effort = (
-        _number(urdf, limit, key, owner) for key in ("lower", "upper", "velocity", "effort")
-    )
-    if lower > upper and kind in ("revolute", "prismatic"):
-        text = f"its limits lower={lower:g} and upper={upper:g} are swapped: exchange them"
-        raise RecipeError([f"{urdf}: {owner}{text}"])
-    missing = {"position": kind == "continuous" or not lower < upper, "velocity": velocity <= 0, "torque": effort <= 0}
-    half = DEFAULT_RANGE_M if kind == "prismatic" else DEFAULT_RANGE_RAD
+def _joint(joint: UrdfJoint) -> ArmJoint:
+    """Fill in missing limits of a joint; swapped limits remain, and loading the robot raises the error."""
+    lower, upper, velocity, effort = (joint.limits.get(key, 0.0) for key in ("lower", "upper", "velocity", "effort"))
+    missing = {
+        "position": joint.kind == "continuous" or lower == upper,
+        "velocity": velocity == 0,
+        "torque": effort == 0,
+    }
+    half = DEFAULT_RANGE_M if joint.kind == "prismatic" else DEFAULT_RANGE_RAD
     return ArmJoint(
-        name=joint.get("name", ""),
-        kind=kind,
+        name=joint.name,
+        kind=joint.kind,
         lower=-half if missing["position"] else lower,
         upper=half if missing["position"] else upper,
         velocity=DEFAULT_SPEED if missing["velocity"] else velocity,
-        effort=max(effort, 0.0),
+        effort=effort,
         missing=tuple(name for name, is_missing in missing.items() if is_missing),
     )
-
-
-def _mass(urdf: Path, link: ElementTree.Element) -> float:
-    return _number(urdf, link.find("inertial/mass"), "value", f"link {link.get('name', '')!r}: ")
-
-
-def _number(urdf: Path, element: ElementTree.Element | None, attribute: str, owner: str) -> float:
-    """Return a number of an element, 0 without it; an error begins with the element's owner."""
-    try:
-        return number_in(element, attribute, 0.0)
-    except ValueError as error:
-        raise RecipeError([f"{urdf}: {owner}{error}"]) from error

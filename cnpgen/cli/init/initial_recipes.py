@@ -26,7 +26,6 @@ from cnpgen.problems.constraints.joint import JointAcceleration, JointJerk, Join
 from cnpgen.problems.constraints.self_clearance import SelfClearance
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
-from cnpgen.robots.plausible_sizes import check_plausible_sizes
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.robot_spec import LimitSpec, RobotSpec
 from cnpgen.schema.keys import PerJoint, Range
@@ -72,7 +71,6 @@ def problem_of(arm: Arm, name: str, folder: Path, packages: tuple[Path, ...], sr
     """
     problem = _problem(with_torques(arm, [1.0] * len(arm.planned)), name, folder, packages, srdf)
     with _warnings_as_notes() as notes:
-        check_plausible_sizes(load_robot(problem))
         overlaps = resolve_overlaps(problem) if arm.has_shape else None
         problem = overlaps.problem if overlaps else problem
         robot = load_robot(problem)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cnpgen.pipelines.families.family import Layout, SceneFamily, uniform, whole
+from cnpgen.pipelines.families.family import Layout, SceneFamily, length, uniform, whole
 from cnpgen.pipelines.families.furniture import Furniture, place_furniture
 from cnpgen.schema.keys import Range, field
 
@@ -30,11 +30,11 @@ def _open_box(
 class OpenBox(SceneFamily):
     """A box that is open at the top, with objects in it."""
 
-    distance: Range = field("distance of the box's front from the base", unit="m", default=Range(0.3, 0.42))
-    bottom: Range = field("height of the bottom", unit="m", default=Range(-0.05, 0.2))
-    width: Range = field("width of the box", unit="m", default=Range(0.4, 0.6), low=0.2)
-    depth: Range = field("depth of the box", unit="m", default=Range(0.32, 0.42), low=0.2)
-    height: Range = field("height of the walls", unit="m", default=Range(0.2, 0.32), low=0.05)
+    distance: Range = length("distance of the box's front from the base", Range(0.3, 0.42))
+    bottom: Range = length("height of the bottom", Range(-0.05, 0.2))
+    width: Range = length("width of the box", Range(0.4, 0.6), low=0.2)
+    depth: Range = length("depth of the box", Range(0.32, 0.42), low=0.2)
+    height: Range = length("height of the walls", Range(0.2, 0.32), low=0.05)
     objects: Range = field("number of cylinders in the box", default=Range(0, 2), low=0, high=10)
 
     def draw(self, random: np.random.Generator) -> Layout:
@@ -58,10 +58,10 @@ class OpenBox(SceneFamily):
 class Cage(SceneFamily):
     """A cage with walls, a roof and bars in front, through which an object is grasped."""
 
-    distance: Range = field("distance of the bars from the base", unit="m", default=Range(0.36, 0.48))
-    bottom: Range = field("height of the floor", unit="m", default=Range(0.0, 0.2))
-    size: Range = field("width, depth and height of the cage", unit="m", default=Range(0.6, 0.75), low=0.3)
-    opening: Range = field("height between the bars in front", unit="m", default=Range(0.3, 0.42), low=0.15)
+    distance: Range = length("distance of the bars from the base", Range(0.36, 0.48))
+    bottom: Range = length("height of the floor", Range(0.0, 0.2))
+    size: Range = length("width, depth and height of the cage", Range(0.6, 0.75), low=0.3)
+    opening: Range = length("height between the bars in front", Range(0.3, 0.42), low=0.15)
 
     def draw(self, random: np.random.Generator) -> Layout:
         """Draw walls, bars and an object in the cage."""
@@ -93,12 +93,12 @@ class Cage(SceneFamily):
 class Dresser(SceneFamily):
     """A dresser with one or two open drawers, into which the tip reaches."""
 
-    distance: Range = field("distance of the open drawers from the base", unit="m", default=Range(0.3, 0.4))
+    distance: Range = length("distance of the open drawers from the base", Range(0.3, 0.4))
     drawers: Range = field("number of open drawers", default=Range(1, 2), low=1, high=2)
-    width: Range = field("width of a drawer", unit="m", default=Range(0.4, 0.5), low=0.2)
-    extension: Range = field("length of the open part of a drawer", unit="m", default=Range(0.28, 0.36), low=0.1)
-    height: Range = field("height of a drawer", unit="m", default=Range(0.12, 0.18), low=0.05)
-    bottom: Range = field("height of the lower drawer's bottom", unit="m", default=Range(0.05, 0.25))
+    width: Range = length("width of a drawer", Range(0.4, 0.5), low=0.2)
+    extension: Range = length("length of the open part of a drawer", Range(0.28, 0.36), low=0.1)
+    height: Range = length("height of a drawer", Range(0.12, 0.18), low=0.05)
+    bottom: Range = length("height of the lower drawer's bottom", Range(0.05, 0.25))
 
     def draw(self, random: np.random.Generator) -> Layout:
         """Draw the body, the drawers side by side, and grasps in them."""
@@ -109,13 +109,13 @@ class Dresser(SceneFamily):
         body, total = 0.3, float(random.uniform(0.6, 0.9))
         front = max(lengths)
         dresser.box("body", (front + body / 2, 0, total / 2), (body, 1.0, total))
-        for index, length in enumerate(lengths):
+        for index, extended in enumerate(lengths):
             y = 0.0 if count == 1 else (index - 0.5) * (width + 0.03)
             z = bottom + (float(random.uniform(0.0, 0.25)) if index else 0.0)
-            x = front - length / 2
-            _open_box(dresser, f"drawer {index + 1}", (x, y), z, (length, width, height))
+            x = front - extended / 2
+            _open_box(dresser, f"drawer {index + 1}", (x, y), z, (extended, width, height))
             for _ in range(4):
-                place = x + length * random.uniform(-0.15, 0.15), y + width * random.uniform(-0.2, 0.2)
+                place = x + extended * random.uniform(-0.15, 0.15), y + width * random.uniform(-0.2, 0.2)
                 level = z + WALL_M + float(random.uniform(0.05, height))
                 dresser.grasp((float(place[0]), float(place[1]), level), (0.2, 0, -1), tilt=0.35)
         return dresser.layout()

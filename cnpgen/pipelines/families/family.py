@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,8 @@ from cnpgen.schema.argument_types import check_fields
 from cnpgen.schema.keys import Range, field
 
 Array = NDArray[np.float64]
+
+MAX_LENGTH_M = 10.0  # of furniture; larger lengths are probably in another unit
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +47,16 @@ class Layout:
         check_fields(self)
 
 
+def length(doc: str, default: Range, *, low: float = -MAX_LENGTH_M) -> Any:
+    """Declare a range of lengths around an arm; see ``field``."""
+    return field(doc, unit="m", default=default, low=low, high=MAX_LENGTH_M)
+
+
+def angle(doc: str, default: Range) -> Any:
+    """Declare a range of angles; see ``field``."""
+    return field(doc, unit="rad", default=default, low=-2 * np.pi, high=2 * np.pi)
+
+
 @dataclass(frozen=True, kw_only=True)
 class SceneFamily(ABC):
     """Family of scenes: a frozen dataclass whose fields are the ranges of its random numbers.
@@ -51,11 +64,9 @@ class SceneFamily(ABC):
     The furniture stands around the base of an arm with a reach of about 0.85 m, which is the origin of the world.
     """
 
-    distance: Range = field(
-        "distance of the furniture's front from the base", unit="m", default=Range(0.42, 0.6), low=0.1
-    )
-    bearing: Range = field("direction of the furniture from the base", unit="rad", default=Range(-0.7, 0.7))
-    turn: Range = field("rotation of the furniture against its direction", unit="rad", default=Range(-0.3, 0.3))
+    distance: Range = length("distance of the furniture's front from the base", Range(0.42, 0.6), low=0.1)
+    bearing: Range = angle("direction of the furniture from the base", Range(-0.7, 0.7))
+    turn: Range = angle("rotation of the furniture against its direction", Range(-0.3, 0.3))
     share: float = field("share of the family among the scenes of a pipeline, relative to others", default=1.0, low=0.0)
 
     @classmethod

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cnpgen.pipelines.families.family import Grasp, Layout, SceneFamily, uniform, whole
+from cnpgen.pipelines.families.family import Grasp, Layout, SceneFamily, angle, length, uniform, whole
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.schema.keys import Range, field
 
@@ -21,10 +21,10 @@ class FreeMix(SceneFamily):
     count: Range = field("number of obstacles", default=Range(6, 12), low=1, high=60)
     spheres: float = field("share of spheres", default=0.0, low=0.0, high=1.0)
     cylinders: float = field("share of cylinders", default=0.4, low=0.0, high=1.0)
-    size: Range = field("edge lengths of boxes, diameters and lengths", unit="m", default=Range(0.06, 0.35), low=0.01)
-    radius: Range = field("distance of the centers from the axis of the base", unit="m", default=Range(0.35, 0.85))
-    height: Range = field("heights of the centers", unit="m", default=Range(0.05, 0.9))
-    bearing: Range = field("directions of the centers from the base", unit="rad", default=Range(-2.2, 2.2))
+    size: Range = length("edge lengths of boxes, diameters and lengths", Range(0.06, 0.35), low=0.01)
+    radius: Range = length("distance of the centers from the axis of the base", Range(0.35, 0.85))
+    height: Range = length("heights of the centers", Range(0.05, 0.9))
+    bearing: Range = angle("directions of the centers from the base", Range(-2.2, 2.2))
 
     def draw(self, random: np.random.Generator) -> Layout:
         """Draw the obstacles, and grasps between them in all directions."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cnpgen.pipelines.families.family import Layout, SceneFamily, uniform, whole
+from cnpgen.pipelines.families.family import Layout, SceneFamily, length, uniform, whole
 from cnpgen.pipelines.families.furniture import Furniture, Objects, place_furniture, place_objects
 from cnpgen.schema.keys import Range, field
 
@@ -17,15 +17,15 @@ SHELF_BOARD_M = 0.03
 class Bookshelf(SceneFamily):
     """A bookshelf with boards one above the other and objects on them."""
 
-    distance: Range = field("distance of the front from the base", unit="m", default=Range(0.4, 0.55))
-    bottom: Range = field("height of the lowest board", unit="m", default=Range(0.05, 0.3))
+    distance: Range = length("distance of the front from the base", Range(0.4, 0.55))
+    bottom: Range = length("height of the lowest board", Range(0.05, 0.3))
     levels: Range = field("number of levels between boards", default=Range(1, 1), low=1, high=6)
-    spacing: Range = field("height of a level", unit="m", default=Range(0.32, 0.42), low=0.1)
-    width: Range = field("width of the boards", unit="m", default=Range(0.8, 1.2), low=0.2)
-    depth: Range = field("depth of the boards", unit="m", default=Range(0.35, 0.45), low=0.1)
+    spacing: Range = length("height of a level", Range(0.32, 0.42), low=0.1)
+    width: Range = length("width of the boards", Range(0.8, 1.2), low=0.2)
+    depth: Range = length("depth of the boards", Range(0.35, 0.45), low=0.1)
     objects: Range = field("number of objects on each level", default=Range(1, 3), low=0, high=10)
-    object_width: Range = field("widths of objects", unit="m", default=Range(0.04, 0.09), low=0.01)
-    object_height: Range = field("heights of objects", unit="m", default=Range(0.1, 0.22), low=0.01)
+    object_width: Range = length("widths of objects", Range(0.04, 0.09), low=0.01)
+    object_height: Range = length("heights of objects", Range(0.1, 0.22), low=0.01)
 
     def draw(self, random: np.random.Generator) -> Layout:
         """Draw boards, sides and objects."""
@@ -56,9 +56,9 @@ class BookshelfSmall(Bookshelf):
 class BookshelfTall(Bookshelf):
     """A bookshelf of three levels."""
 
-    bottom: Range = field("height of the lowest board", unit="m", default=Range(0.0, 0.1))
+    bottom: Range = length("height of the lowest board", Range(0.0, 0.1))
     levels: Range = field("number of levels between boards", default=Range(3, 3), low=1, high=6)
-    spacing: Range = field("height of a level", unit="m", default=Range(0.28, 0.34), low=0.1)
+    spacing: Range = length("height of a level", Range(0.28, 0.34), low=0.1)
     objects: Range = field("number of objects on each level", default=Range(0, 2), low=0, high=10)
 
 
@@ -66,9 +66,9 @@ class BookshelfTall(Bookshelf):
 class BookshelfThin(Bookshelf):
     """A narrow bookshelf of two levels."""
 
-    bottom: Range = field("height of the lowest board", unit="m", default=Range(0.0, 0.2))
+    bottom: Range = length("height of the lowest board", Range(0.0, 0.2))
     levels: Range = field("number of levels between boards", default=Range(2, 2), low=1, high=6)
-    width: Range = field("width of the boards", unit="m", default=Range(0.42, 0.5), low=0.2)
+    width: Range = length("width of the boards", Range(0.42, 0.5), low=0.2)
     objects: Range = field("number of objects on each level", default=Range(0, 1), low=0, high=10)
 
 
@@ -76,11 +76,11 @@ class BookshelfThin(Bookshelf):
 class Cubby(SceneFamily):
     """A cubby: two columns and two rows of cells, open towards the robot."""
 
-    distance: Range = field("distance of the front from the base", unit="m", default=Range(0.4, 0.55))
-    bottom: Range = field("height of the lowest board", unit="m", default=Range(0.0, 0.2))
-    width: Range = field("width of the cubby", unit="m", default=Range(0.8, 1.2), low=0.4)
-    height: Range = field("height of the cubby", unit="m", default=Range(0.7, 0.85), low=0.4)
-    depth: Range = field("depth of the cubby", unit="m", default=Range(0.25, 0.35), low=0.1)
+    distance: Range = length("distance of the front from the base", Range(0.4, 0.55))
+    bottom: Range = length("height of the lowest board", Range(0.0, 0.2))
+    width: Range = length("width of the cubby", Range(0.8, 1.2), low=0.4)
+    height: Range = length("height of the cubby", Range(0.7, 0.85), low=0.4)
+    depth: Range = length("depth of the cubby", Range(0.25, 0.35), low=0.1)
     shift: Range = field("place of the inner walls relative to the size", default=Range(0.42, 0.58), low=0.3, high=0.7)
     merged: bool = field("whether two of the cells are joined", default=False)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cnpgen.pipelines.families.family import Layout, SceneFamily, uniform, whole
+from cnpgen.pipelines.families.family import Layout, SceneFamily, length, uniform, whole
 from cnpgen.pipelines.families.furniture import Furniture, Objects, place_furniture, place_objects
 from cnpgen.schema.keys import Range, field
 
@@ -19,13 +19,13 @@ class Tabletop(SceneFamily):
     """One to three tables around the robot with boxes and cylinders on them."""
 
     tables: Range = field("number of tables", default=Range(1, 3), low=1, high=3)
-    height: Range = field("height of the upper faces of the tables", unit="m", default=Range(0.0, 0.3), low=0.0)
-    width: Range = field("width of the tables", unit="m", default=Range(0.6, 1.0), low=0.2)
-    depth: Range = field("depth of the tables", unit="m", default=Range(0.4, 0.6), low=0.2)
-    distance: Range = field("distance of the first table's front from the base", unit="m", default=Range(0.22, 0.35))
+    height: Range = length("height of the upper faces of the tables", Range(0.0, 0.3), low=0.0)
+    width: Range = length("width of the tables", Range(0.6, 1.0), low=0.2)
+    depth: Range = length("depth of the tables", Range(0.4, 0.6), low=0.2)
+    distance: Range = length("distance of the first table's front from the base", Range(0.22, 0.35))
     objects: Range = field("number of objects on each table", default=Range(2, 4), low=0, high=20)
-    object_width: Range = field("widths of objects", unit="m", default=Range(0.05, 0.14), low=0.01)
-    object_height: Range = field("heights of objects", unit="m", default=Range(0.08, 0.35), low=0.01)
+    object_width: Range = length("widths of objects", Range(0.05, 0.14), low=0.01)
+    object_height: Range = length("heights of objects", Range(0.08, 0.35), low=0.01)
 
     def draw(self, random: np.random.Generator) -> Layout:
         """Draw the tables, at right angles, and their objects."""
@@ -53,11 +53,11 @@ class Tabletop(SceneFamily):
 class TablePick(SceneFamily):
     """A table with dense objects, from which one is grasped."""
 
-    height: Range = field("height of the table top", unit="m", default=Range(0.0, 0.35), low=0.0)
-    distance: Range = field("distance of the table's front from the base", unit="m", default=Range(0.22, 0.32))
+    height: Range = length("height of the table top", Range(0.0, 0.35), low=0.0)
+    distance: Range = length("distance of the table's front from the base", Range(0.22, 0.32))
     objects: Range = field("number of objects", default=Range(7, 11), low=1, high=40)
-    object_width: Range = field("widths of objects", unit="m", default=Range(0.05, 0.1), low=0.01)
-    object_height: Range = field("heights of objects", unit="m", default=Range(0.1, 0.4), low=0.01)
+    object_width: Range = length("widths of objects", Range(0.05, 0.1), low=0.01)
+    object_height: Range = length("heights of objects", Range(0.1, 0.4), low=0.01)
 
     def draw(self, random: np.random.Generator) -> Layout:
         """Draw the table and the objects."""
@@ -78,12 +78,12 @@ class TablePick(SceneFamily):
 class TableUnderPick(SceneFamily):
     """A table with legs and objects below its top, which are grasped from the front."""
 
-    height: Range = field("height of the table top", unit="m", default=Range(0.45, 0.65), low=0.2)
-    floor: Range = field("height of the floor below the table", unit="m", default=Range(-0.1, 0.05))
-    distance: Range = field("distance of the table's front from the base", unit="m", default=Range(0.25, 0.4))
+    height: Range = length("height of the table top", Range(0.45, 0.65), low=0.2)
+    floor: Range = length("height of the floor below the table", Range(-0.1, 0.05))
+    distance: Range = length("distance of the table's front from the base", Range(0.25, 0.4))
     objects: Range = field("number of objects", default=Range(2, 4), low=1, high=20)
-    object_width: Range = field("widths of objects", unit="m", default=Range(0.05, 0.09), low=0.01)
-    object_height: Range = field("heights of objects", unit="m", default=Range(0.1, 0.25), low=0.01)
+    object_width: Range = length("widths of objects", Range(0.05, 0.09), low=0.01)
+    object_height: Range = length("heights of objects", Range(0.1, 0.25), low=0.01)
 
     def draw(self, random: np.random.Generator) -> Layout:
         """Draw the table, the plate on which it stands, and the objects."""

@@ -20,7 +20,10 @@ class BehindPuck(Stage):
 
     inputs = ("goal_xyz", "hit_angle")
     distance: float = field(
-        "distance of the centres of puck and mallet at contact: sum of the radii", unit="m", low=0.0
+        "distance of the centres of puck and mallet at contact: sum of the radii",
+        unit="m",
+        low=0.0,
+        high=1.0,
     )
 
     def describe(self) -> str:

@@ -33,7 +33,9 @@ class BrakingReach(Stage):
     """Stage: full braking keeps the tip over the table, from the start and, reversed in time, from the goal."""
 
     inputs = ("start_q", "start_dq", "goal_q", "goal_dq")
-    margin: float = field("distance before the edge at which full braking must end", unit="m", default=1e-3, low=0.0)
+    margin: float = field(
+        "distance before the edge at which full braking must end", unit="m", default=1e-3, low=0.0, high=1.0
+    )
 
     def describe(self) -> str:
         """Describe the stage in one sentence."""

@@ -33,7 +33,7 @@ class _IK(Stage):
     """Base class: Gauss-Newton inverse kinematics with clipped steps that saturate at the joint limits."""
 
     orientation: str = field("required orientation of the tip", choices=("free", "vertical"), default="free")
-    max_step: float = field("maximum change of a joint per iteration", unit="rad", default=0.4, low=1e-3)
+    max_step: float = field("maximum change of a joint per iteration", unit="rad", default=0.4, low=1e-3, high=np.pi)
 
     def _solve(self, context: Context, end: str, initial: str, *, hold: bool = False) -> StageFunction:
         options = {"vertical": self.orientation == "vertical", "max_step": self.max_step, "hold": hold}

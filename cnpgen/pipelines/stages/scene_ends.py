@@ -42,10 +42,18 @@ class SceneEnds(Stage):
     grasp: float = field("share of starts at another grasp", default=0.4, low=0.0, high=1.0)
     random: float = field("share of random starts", default=0.2, low=0.0, high=1.0)
     spread: float = field(
-        "standard deviation of starts around the base configuration", unit="rad", default=0.1, low=0.0
+        "standard deviation of starts around the base configuration",
+        unit="rad",
+        default=0.1,
+        low=0.0,
+        high=np.pi,
     )
     margin: float = field(
-        "distance of both ends from obstacles, in addition to that of the problem", unit="m", default=0.005, low=0.0
+        "distance of both ends from obstacles, in addition to that of the problem",
+        unit="m",
+        default=0.005,
+        low=0.0,
+        high=1.0,
     )
     straight: float = field(
         "share of the samples whose straight line may be free of collisions", default=0.1, low=0.0, high=1.0

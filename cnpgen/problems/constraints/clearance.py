@@ -32,12 +32,21 @@ class RobotClearance(Constraint):
     reason = "robot in collision"
     training_weight = 3000.0
     radius: float | None = field(
-        'radius of the paper\'s capsules, with geometry = "paper-capsules" only', unit="m", low=1e-6, default=None
+        'radius of the paper\'s capsules, with geometry = "paper-capsules" only',
+        unit="m",
+        low=1e-6,
+        default=None,
+        high=2.0,
     )
     distance: float = field(
-        "minimum distance of the robot from obstacles", unit="m", low=0.0, default=0.0, since_version=2
+        "minimum distance of the robot from obstacles",
+        unit="m",
+        low=0.0,
+        default=0.0,
+        since_version=2,
+        high=2.0,
     )
-    tolerance: float = field("violation that a valid motion may have", unit="m", low=0.0)
+    tolerance: float = field("violation that a valid motion may have", unit="m", low=0.0, high=0.5)
 
     @property
     def effective_tolerance(self) -> float:
@@ -110,8 +119,8 @@ class ObjectContact(Constraint):
 
     reason = "object in collision"
     training_weight, training_inset = 3e4, 5e-4  # the inset in m
-    depth: float = field("depth of legal contact", unit="m", low=0.0)
-    tolerance: float = field("additional depth that a valid motion may have", unit="m", low=0.0)
+    depth: float = field("depth of legal contact", unit="m", low=0.0, high=0.5)
+    tolerance: float = field("additional depth that a valid motion may have", unit="m", low=0.0, high=0.5)
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the separation of the object from every obstacle [m]."""

@@ -31,7 +31,9 @@ class Pose(TipManifold):
     reason = "not in its pose"
     inside_name, held_name = "pose box", "pose position"
     velocity_name, acceleration_name = "velocity out of the pose", "acceleration out of the pose"
-    rpy: tuple[float, float, float] = field("orientation in the world: roll, pitch, yaw, as in a URDF", unit="rad")
+    rpy: tuple[float, float, float] = field(
+        "orientation in the world: roll, pitch, yaw, as in a URDF", unit="rad", low=-2 * np.pi, high=2 * np.pi
+    )
     x: Range | None = field("range of the tip along world x", unit="m", default=None)
     y: Range | None = field("range of the tip along world y", unit="m", default=None)
     z: Range | None = field("range of the tip along world z", unit="m", default=None)
