@@ -147,13 +147,12 @@ def _mistakes(problem: Problem, robot: Robot) -> Iterator[str]:
 
 
 def _position_mistakes(robot: Robot) -> Iterator[str]:
-    """Yield error messages for position limits that are swapped, equal or in degrees."""
+    """Yield error messages for position limits that are equal or in degrees."""
     limits = zip(robot.joint_names, robot.model.lowerPositionLimit, robot.model.upperPositionLimit, strict=True)
     for (name, low, high), sliding in zip(limits, robot.sliding, strict=True):
         text, largest = f"{robot.urdf}: {name}: ", max(low, high, key=abs)
         if low >= high:
-            remedy = "they are swapped: exchange them" if low > high else "give both of them"
-            yield f"{text}the lower position limit must be below the upper one, got {low:g} and {high:g}; {remedy}"
+            yield f"{text}the lower position limit must be below the upper one, got {low:g} and {high:g}"
         elif not sliding and abs(largest) > PLAUSIBLE_MAX["rad"]:
             remedy = "for a joint without limits, give ranges of all joints ('position' in [limits])"
             expected = f"limits of positions are at most {PLAUSIBLE_MAX['rad']:.3g} rad, got {largest:g} rad"

@@ -11,6 +11,7 @@ MIN_REACH_M, MAX_REACH_M = 0.01, 100.0  # of an arm, along its joints
 MAX_LINK_RATIO = 20.0  # size of a link / reach; pedestals and mobile bases may be larger than arms
 MIN_LINK_RATIO = 0.02  # size of the largest moving link / reach
 MIN_LINK_M = 1e-3  # size of a link with collision geometry
+MIN_MASS_KG = 0.01  # of bodies whose inertia is checked; lighter ones have placeholders
 
 
 def check_plausible_sizes(robot: Robot) -> None:
@@ -29,6 +30,13 @@ def _mistakes(robot: Robot) -> Iterator[str]:
         remedy = "lengths of a URDF are in m, not in mm: convert the <origin xyz> of its joints"
         yield f"the arm is {reach:.3g} m long, expected {MIN_REACH_M:g} to {MAX_REACH_M:g} m; {remedy}"
         return
+    for name, joint in zip(robot.joint_names, robot.chain.joints, strict=True):
+        if joint.mass < MIN_MASS_KG:
+            continue
+        center, gyration = np.linalg.norm(joint.com), np.sqrt(max(np.trace(joint.inertia), 0.0) / (2 * joint.mass))
+        if max(center, gyration) > MAX_LINK_RATIO * reach:
+            text = f"the center of mass is {center:.3g} m away, the radius of gyration {gyration:.3g} m"
+            yield f"{name}: {text}, the arm {reach:.3g} m long; an <inertial> is in kg, m and kg m^2, not in mm or g"
     if robot.shape is None:
         return
     sizes: dict[str, float] = {}

@@ -295,7 +295,7 @@ def test_a_torque_limit_below_what_gravity_needs_is_replaced(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (('lower="-2" upper="2"', 'lower="2" upper="-2"'), "upper one, got 2 and -2; they are swapped: exchange them"),
+        (('lower="-2" upper="2"', 'lower="2" upper="-2"'), "'joint_2': its limits lower=2 and upper=-2 are swapped"),
         (('lower="-2" upper="2"', 'lower="-115" upper="90"'), "joint_2: limits of positions are at most 25.1 rad"),
         (('lower="-2" upper="2"', 'lower="-115" upper="90"'), "did you mean -115 deg = -2.01 rad?"),
         (('axis xyz="0 1 0"', 'axis xyz="0 0 0"'), "joint 'joint_2': <axis xyz='0 0 0'> has no direction"),
@@ -305,8 +305,7 @@ def test_a_torque_limit_below_what_gravity_needs_is_replaced(tmp_path):
         (('xyz="0.3 0 0.0"', 'xyz="300 0 0"'), "m long, expected 0.01 to 100 m; lengths of a URDF are in m, not in mm"),
         (('xyz="0.3 0 0', 'xyz="0.00003 0 0'), "the arm is 0.000"),
     ],
-    ids=["swapped limits", "degrees", "suggestion", "zero axis", "negative mass", "comma", "negative limit", "joints in mm", "tiny arm"],
-)  # fmt: skip
+)
 def test_implausible_input_is_refused_with_a_remedy(tmp_path, capsys, change, message):
     urdf = write_arm(tmp_path / "arm.urdf", ELBOW)
     first, *others = urdf.read_text().split('<link name="link_2">')
@@ -332,6 +331,15 @@ def test_meshes_in_millimetres_are_refused_with_a_remedy(tmp_path, capsys, mesh,
     said = refused(capsys, 2, tmp_path / "arm", "--urdf", urdf, "--tip", "hand")
     assert message in said
     assert 'write scale="0.001 0.001 0.001" in the <mesh> of a file in mm' in said
+
+
+def test_inertias_that_no_body_has_are_noted(tmp_path):
+    urdf = write_arm(tmp_path / "arm.urdf", ELBOW)
+    urdf.write_text(urdf.read_text().replace('ixx="0.01"', 'ixx="0.05"', 1))
+    assert main(["init", str(tmp_path / "arm"), "--urdf", str(urdf)]) == 0
+    assert "no body has the <inertia> of link_1: a principal moment is negative" in head_of(
+        tmp_path / "arm/problem.toml"
+    )
 
 
 def test_meshes_that_are_tiny_are_refused_with_a_remedy(tmp_path, capsys):

@@ -92,6 +92,31 @@ def test_limits_far_above_those_of_the_urdf_are_in_another_unit(tmp_path, limit,
     assert ("'velocity_scale' is a fraction of the URDF's limit" in found) == limit.startswith("velocity")
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "text"),
+    [
+        ('scale="0.001 0.001 0.001"', 'scale="1 1 1"', "link 'fore': its collision geometry is 250 m large"),
+        (
+            'scale="0.001 0.001 0.001"',
+            'scale="1e-6 1e-6 1e-6"',
+            "geometry is 0.00025 m large, expected 0.001 m or more",
+        ),
+        ('xyz="0.4 0 0"', 'xyz="400 0 0"', "the arm is 401 m long, expected 0.01 to 100 m; lengths of a URDF are in m"),
+        ('lower="-2.5" upper="2.5"', 'lower="-143" upper="143"', "25.1 rad, got -143 rad; -143 rad is -8193 deg; did"),
+        (
+            'lower="-2.5" upper="2.5"',
+            'lower="2.5" upper="-2.5"',
+            "joint 'swing': its limits lower=2.5 and upper=-2.5 are swapped: exch",
+        ),
+        ('<mass value="1"/>', '<mass value="1"/><origin xyz="0 90 0"/>', "the center of mass is 90 m away"),
+        ('ixx="0.01"', 'ixx="10000"', "the radius of gyration 70.7 m, the arm 1.02 m long; an <inertial> is in kg, m"),
+    ],
+    ids=["mesh in mm", "tiny mesh", "joints in mm", "degrees", "swapped", "center in mm", "inertia in g mm^2"],
+)
+def test_a_urdf_that_was_changed_later_is_checked_again(tmp_path, old, new, text):
+    assert text in mistakes(crane(tmp_path, old, new))
+
+
 @pytest.mark.parametrize("limit", ["velocity = 19", 'velocity = "80 deg/s"', "acceleration = 190", "torque = 5000"])
 def test_limits_of_another_motor_are_accepted(tmp_path, limit):
     load_robot(load_problem(limited(tmp_path, limit)))

@@ -5,13 +5,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from cnpgen.errors import RecipeError, UsageError, listed
 from cnpgen.problems.checks import frames_of, missing_frame, unread_xacro
 from cnpgen.robots.robot import mistakes_in
 from cnpgen.robots.urdf import read_urdf, urdf_tree
-from cnpgen.robots.urdf_parameters import UrdfJoint, urdf_parameters
+from cnpgen.robots.urdf_parameters import LinkInertia, UrdfJoint, urdf_parameters
 
 DEFAULT_RANGE_RAD, DEFAULT_RANGE_M = math.pi, 0.5  # ranges to either side, where the URDF has none
+MAX_INERTIA_ERROR = 0.01  # relative; published URDFs round their numbers
 DEFAULT_SPEED = 1.0  # rad/s or m/s, where the URDF has none
 
 
@@ -50,6 +53,7 @@ class Arm:
         moved: The links that planned joints move.
         frames: Names of all links and joints.
         masses: Link -> its mass [kg]; 0 where it has none.
+        impossible: The links that planned joints move with inertias that no body has.
         shaped: The links that have a ``<collision>`` element.
         meshes: The mesh files that links name.
     """
@@ -61,6 +65,7 @@ class Arm:
     moved: tuple[str, ...]
     frames: tuple[str, ...]
     masses: Mapping[str, float]
+    impossible: tuple[str, ...]
     shaped: tuple[str, ...]
     meshes: tuple[str, ...]
 
@@ -97,15 +102,17 @@ def read_arm(urdf: Path, tip: str | None) -> Arm:
     if not moving:
         raise RecipeError([f"{urdf}: no joint moves the frame {tip!r}; its frames: {listed(frames_of(tree))}"])
     planned = tuple(map(_joint, moving))
+    moved = tuple(link for link in links if moving[0] in _path(link, joints))
     names = {joint.name for joint in planned}
     return Arm(
         urdf=urdf,
         tip=tip,
         planned=planned,
         locked=tuple(joint.name for joint in joints.values() if _moves(joint) and joint.name not in names),
-        moved=tuple(link for link in links if moving[0] in _path(link, joints)),
+        moved=moved,
         frames=tuple(frames_of(tree)),
         masses={link: inertia.mass if inertia else 0.0 for link, inertia in parameters.inertias.items()},
+        impossible=tuple(link for link in moved if _is_impossible(parameters.inertias[link])),
         shaped=tuple(link.get("name", "") for link in tree.findall("link") if link.find("collision") is not None),
         meshes=tuple(mesh.get("filename", "") for mesh in tree.iterfind("link//mesh")),
     )
@@ -136,12 +143,20 @@ def _path(frame: str, joints: Mapping[str, UrdfJoint]) -> list[UrdfJoint]:
     return found[::-1]
 
 
+def _is_impossible(inertia: LinkInertia | None) -> bool:
+    """Return whether a principal moment of inertia is negative or exceeds the sum of the others."""
+    if inertia is None:
+        return False
+    low, middle, high = np.linalg.eigvalsh(inertia.inertia)
+    return bool(low < -MAX_INERTIA_ERROR * high or high > (1 + MAX_INERTIA_ERROR) * (low + middle))
+
+
 def _moves(joint: UrdfJoint) -> bool:
     return joint.kind != "fixed"
 
 
 def _joint(joint: UrdfJoint) -> ArmJoint:
-    """Fill in missing limits of a joint; swapped limits remain, and loading the robot raises the error."""
+    """Fill in missing limits of a joint."""
     lower, upper, velocity, effort = (joint.limits.get(key, 0.0) for key in ("lower", "upper", "velocity", "effort"))
     missing = {
         "position": joint.kind == "continuous" or lower == upper,
