@@ -22,13 +22,13 @@ from cnpgen.losses.margins import Margins, constraint_terms
 from cnpgen.losses.plan_batch import MAX_VECTOR_LANES, PLANS_PER_BLOCK, PlanBatch, check_batch, check_shapes
 from cnpgen.losses.quadrature import BasisTable, basis_table, check_quadrature
 from cnpgen.losses.time_varying_bound import TimeVaryingBound, make_time_varying_bound
-from cnpgen.machine.memory import check_memory
 from cnpgen.machine.threads import one_thread
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import as_problem
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import flag, integer, number, numbers
+from cnpgen.schema.memory import check_memory
 from cnpgen.store.dataset_spec import StoredProblem
 
 Array = NDArray[Any]

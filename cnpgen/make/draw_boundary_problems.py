@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 
 from cnpgen.kernels.library import choose_backend
-from cnpgen.machine.memory import check_memory
 from cnpgen.make.recipe import MAX_SEED, DatasetRecipe
 from cnpgen.make.recipe_file import as_dataset_recipe
 from cnpgen.plans.boundary_problems import plans_of_rows
@@ -15,6 +14,7 @@ from cnpgen.problems.problem_record import record_problem
 from cnpgen.robots.scene_arrays import scene_poses
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
+from cnpgen.schema.memory import check_memory
 from cnpgen.store.scene_table import SCENE_ID, concatenate_scenes
 
 SPLIT = "(fresh draws)"  # an invalid name of a split: no dataset contains these rows

@@ -18,6 +18,7 @@ from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import missing_kinds, missing_kinds_of_problem, restoring_reader, without_defaults
 from cnpgen.schema import registry
 from cnpgen.schema.argument_types import checked_arguments
+from cnpgen.schema.arguments import concerning
 from cnpgen.schema.catalogue import load_recipe, read_kind, reference
 from cnpgen.schema.keys import RecipeLocation
 from cnpgen.schema.parsing import Reader, parse
@@ -53,7 +54,8 @@ def as_dataset_recipe(recipe: object) -> DatasetRecipe:
     if isinstance(recipe, DatasetRecipe):
         return recipe
     if isinstance(recipe, str | Path):
-        return load_dataset_recipe(recipe)
+        with concerning("recipe"):
+            return load_dataset_recipe(recipe)
     expected = "the name of a dataset or pipeline, the path of a recipe file or a DatasetRecipe"
     if isinstance(recipe, Pipeline):
         rows = f'DatasetRecipe(name={recipe.name!r}, pipeline=..., splits={{"train": 1000}})'

@@ -8,7 +8,6 @@ import numpy as np
 
 from cnpgen.errors import UsageError
 from cnpgen.kernels.library import choose_backend
-from cnpgen.machine.memory import check_memory
 from cnpgen.machine.versions import versions
 from cnpgen.make.make_shards import Job
 from cnpgen.make.recipe import MAX_SEED, DatasetRecipe, recipe_digest, split_rows
@@ -16,6 +15,7 @@ from cnpgen.pipelines.prepared import PreparedPipeline
 from cnpgen.problems.problem import resolved
 from cnpgen.robots.scene_arrays import scene_capacity
 from cnpgen.schema.arguments import integer
+from cnpgen.schema.memory import check_memory
 from cnpgen.store.dataset_spec import DatasetSpec, default_shard_size
 from cnpgen.store.workspace import Workspace
 

@@ -55,7 +55,8 @@ def acceptance(context: Context, written: set[str], *, given: Collection[End] = 
     narrow_phase = narrow_phase_of_scenes if has_scenes else narrow_phase_of
     decisions = {end: narrow_phase(context, end, exact=end not in given) for end in ends}
     n, constraints = context.robot.n, len(context.problem.constraint)
-    reasons = [*(constraint.reason for constraint in context.problem.constraint), "tip not at its position"]
+    reasons = [each.boundary_reason or each.reason for each in context.problem.constraint]
+    reasons.append("tip not at its position")
     reasons += ["hit not along its direction"] if hit["goal"] else []
 
     def accept(candidates: CandidateBatch, _random: np.random.Generator) -> None:

@@ -12,6 +12,7 @@ from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.stages.stage import Array, TaskBatch
 from cnpgen.pipelines.steps import PipelineStep, prepare_steps, steps_of, stored_fields, written_columns
 from cnpgen.problems.constraints.constraint import End
+from cnpgen.problems.constraints.puck_contact import PuckContact
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.obstacles import table_frame_of
 from cnpgen.store.field import Field
@@ -78,6 +79,8 @@ class Completion:
             run_stage(candidates, self._random)
         candidates.stage = "acceptance"
         self._accept(candidates, self._random)
+        if len(candidates.alive) < candidates.size:
+            self._name_touching_starts(candidates)
         return candidates
 
     def rows(self, tasks: TaskBatch) -> dict[str, Array]:
@@ -91,6 +94,20 @@ class Completion:
             field.name: np.ascontiguousarray(tasks[field.name].T) if field.width else tasks[field.name][0]
             for field in fields
         }
+
+    def _name_touching_starts(self, tasks: TaskBatch) -> None:
+        """Set the reason of rejected hits whose start touches the puck, which earlier stages do not notice."""
+        problem, drawn = self.context.problem, tasks.drawn
+        contact = problem.first(PuckContact)
+        if contact is None or not {"start_xyz", "goal_xyz", "hit_angle"} <= drawn.keys():
+            return
+        start, goal, angle = drawn["start_xyz"].T, drawn["goal_xyz"].T, drawn["hit_angle"][0]
+        frame = table_frame_of(problem, drawn["parameters"].T if problem.parameters else None)
+        if frame is not None:
+            start, goal = frame.to_table(start), frame.to_table(goal)
+        direction = np.stack([np.cos(angle), np.sin(angle), np.zeros(tasks.size)], axis=1)
+        touching = contact.touches(start, contact.scene_values(goal, direction)) & (tasks.outcome > 0)
+        tasks.outcome[touching] = 1 + tasks.reasons.index(contact.boundary_reason)
 
     def _derive(self, candidates: TaskBatch) -> None:
         for name in self._derived:

@@ -14,10 +14,12 @@ from cnpgen.planner.planner import Planner, plan_tasks
 from cnpgen.planner.puck_model import PuckModel
 from cnpgen.plans.boundary_file import CONTEXT
 from cnpgen.plans.plans import Plans
-from cnpgen.schema.arguments import numbers
+from cnpgen.schema.arguments import check_range, numbers
 
 Array = NDArray[np.float64]
 
+MAX_MEETING_TIME_S = 60.0
+MAX_PUCK_SPEED_M_S = 20.0
 MAX_MEETING_ITERATIONS = 12
 MAX_MEETING_ERROR_S = 1e-4  # of the time at which mallet and puck meet
 EXPECTED_HIT_SPEED_M_S = 1.5  # of the first iteration
@@ -122,6 +124,8 @@ class _Hits:
             name: lanes(name, np.reshape(numbers(name, values), (-1, 1)), {1}).T for name, values in scalars.items()
         }
         parts |= {f"state {index}": lanes("state", values, {n}).T for index, values in enumerate(state)}
+        check_range("meeting_time", parts["meeting_time"], 0.0, MAX_MEETING_TIME_S, "s")
+        check_range("puck_velocity", parts["puck_velocity"], -MAX_PUCK_SPEED_M_S, MAX_PUCK_SPEED_M_S, "m/s")
         self._size = max(len(values) for values in parts.values())
         for name, values in parts.items():
             if len(values) not in {1, self._size}:

@@ -24,6 +24,7 @@ from cnpgen.plans.plausible import check_boundary_units
 from cnpgen.problems.problem import Problem
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import concerning, numbers
+from cnpgen.schema.memory import check_memory
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.boundary_arguments import boundary_of
@@ -67,6 +68,7 @@ class Planner:
         with concerning("model"):
             self.model = model if isinstance(model, Model) else load_model(model)
         self.backend, self._scale_time = backend, scale_time
+        spec = self.model.problem.trajectory
         config = self.model.config if scale_time else replace(self.model.config, time_parametrized=False)
         with loaded_problem(self.model.problem, backend) as loaded:
             self.robot = loaded.robot
@@ -77,6 +79,7 @@ class Planner:
                 fixed_at_goal=self.model.fixed_at_goal,
                 observed=SCENE in self.model.features.blocks,
             )
+            self._numbers_per_plan = self.robot.n * spec.path_control_points + spec.rate_control_points
             limits = {"dq": loaded.robot.velocity_limit, "ddq": loaded.robot.acceleration_limit}
             ends = ("start", "goal")
             self._rest_tolerance = {f"{end}_{name}": REST_TOLERANCE * limits[name] for end in ends for name in limits}
@@ -209,6 +212,7 @@ class Planner:
 
     def _checked(self, boundary: Boundary) -> Boundary:
         """Set conditions that were zero in all training rows to exactly zero; check that they are zero to rounding."""
+        check_memory("start_q", len(boundary), len(boundary) * self._numbers_per_plan)
         boundary, zeroed = self._with_goal_acceleration(boundary), {}
         for name in self.model.zero_conditions:
             values = getattr(boundary, name)

@@ -23,7 +23,7 @@ from cnpgen.problems.problem_file import load_problem_behind, restore_problem
 from cnpgen.robots.parameter_ranges import NO_PARAMETERS, ParameterRanges
 from cnpgen.robots.urdf import urdf_tree
 from cnpgen.schema.argument_types import checked_arguments
-from cnpgen.schema.arguments import numbers
+from cnpgen.schema.arguments import concerning, numbers
 from cnpgen.schema.keys import RecipeLocation
 from cnpgen.schema.parsing import parse
 from cnpgen.store.dataset_spec import StoredProblem
@@ -245,7 +245,8 @@ def as_problem(problem: object) -> Problem:
     if isinstance(problem, StoredProblem):
         return _rebuilt(as_record(problem))
     if isinstance(problem, str | Path):
-        return load_problem_behind(problem)
+        with concerning("problem"):
+            return load_problem_behind(problem)
     expected = "a Problem, a ProblemRecord, or the name or the file of a problem, a pipeline or a dataset"
     raise UsageError(f"must be {expected}, got {problem!r:.60}", argument="problem")
 

@@ -7,7 +7,9 @@ from cnpgen.errors import UsageError
 from cnpgen.problems.objectives import read_objective
 from cnpgen.refine.solver.sqp import DEFAULT_SETTINGS
 from cnpgen.schema.argument_types import check_fields
-from cnpgen.schema.arguments import integer, number
+from cnpgen.schema.arguments import check_range, integer, number
+
+MAX_STAY_WITHIN = 1.0  # rad or m
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,7 @@ class RefineOptions:
             raise UsageError(f"must be above 0 s, got {self.deadline}", argument="deadline")
         if self.stay_within is not None and number("stay_within", self.stay_within) <= 0:
             raise UsageError(f"must be above 0, got {self.stay_within}", argument="stay_within")
+        check_range("stay_within", self.stay_within or 0.0, 0.0, MAX_STAY_WITHIN, "rad")
 
     def document(self) -> dict[str, Any]:
         """Return the options for JSON, without a deadline or a distance of None."""

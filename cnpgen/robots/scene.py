@@ -13,6 +13,7 @@ from cnpgen.errors import UsageError
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.hull import MAX_COORDINATE_M
 from cnpgen.robots.solid import Solid, pose_width, solids_of
+from cnpgen.schema.argument_types import check_fields
 from cnpgen.schema.arguments import integer
 
 Array = NDArray[np.float64]
@@ -35,6 +36,9 @@ class Scene:
 
     obstacles: tuple[Obstacle, ...]
     poses: Array
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
     def __len__(self) -> int:
         return len(self.poses)

@@ -15,7 +15,7 @@ from typing import Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cnpgen.errors import CnpgenError, UsageError, either, nearest
+from cnpgen.errors import CnpgenError, MachineError, UsageError, either, nearest
 from cnpgen.schema.arguments import flag, integer, number, reject_masked
 
 P = ParamSpec("P")
@@ -80,6 +80,10 @@ def checked_arguments(function: Callable[P, R]) -> Callable[P, R]:
             return function(*args, **keywords)
         except CnpgenError:
             raise
+        except MemoryError as error:
+            raise MachineError(
+                f"out of memory in {function.__name__}: {error or 'pass fewer or smaller arrays'}"
+            ) from error
         except Exception:
             known.run(known.late, args, keywords)
             raise

@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cnpgen.errors import UsageError
+from cnpgen.errors import RecipeError, UsageError
+from cnpgen.schema.memory import LARGE_SIZE, check_memory
+from cnpgen.schema.units import suggested_unit
 
 Array = NDArray[Any]
 
@@ -65,12 +67,12 @@ def numbers(name: str, values: ArrayLike, dtype: str = "float64", *, differentia
         UsageError: The values are not real numbers, have rows of different lengths, or are not in CPU memory.
     """
     if type(values) is np.ndarray and values.dtype == dtype:  # the usual case
-        return values
+        return _fitting(name, values)
     reject_masked(name, values)
     wrong = f"must be an array of numbers, got {type(values).__name__}"
     try:
         detached = values.detach() if hasattr(values, "detach") and not differentiable else values
-        array = np.asarray(detached)
+        array = _fitting(name, np.asarray(detached))
         if array.dtype == dtype:
             return array
         with np.errstate(over="ignore"):
@@ -82,6 +84,34 @@ def numbers(name: str, values: ArrayLike, dtype: str = "float64", *, differentia
     if array.dtype.kind in "cUSmM" or missing:  # NumPy would drop imaginary parts and convert texts and None
         raise UsageError(f"{wrong}: {array.dtype} is no real type", argument=name)
     return real
+
+
+def _fitting(name: str, array: Array) -> Array:
+    """Return an array if a copy of it fits into memory: views that repeat values may be of any size."""
+    if array.size > LARGE_SIZE:
+        check_memory(name, len(array), array.size)
+    return array
+
+
+def check_range(name: str, values: ArrayLike, low: float, high: float, unit: str) -> None:
+    """Raise an error for a value outside of its range, with the unit that was probably meant.
+
+    Args:
+        name: Name of the argument.
+        values: One value or an array [unit].
+        low: Minimum value.
+        high: Maximum value.
+        unit: SI unit.
+
+    Raises:
+        UsageError: A value is outside of the range, or nan.
+    """
+    array = np.asarray(values, np.float64)
+    outside = ~((low <= array) & (array <= high))
+    if outside.any():
+        value = float(array[outside].flat[0])
+        text = f"must be from {low:g} to {high:g} {unit}, got {value:g} {unit}"
+        raise UsageError(text + suggested_unit(value, unit, low, high), argument=name)
 
 
 def reject_masked(name: str, values: Any) -> None:
@@ -97,9 +127,12 @@ def reject_masked(name: str, values: Any) -> None:
 
 @contextmanager
 def concerning(argument: str) -> Iterator[None]:
-    """Attribute usage errors of a function that is called in the block to an argument of the caller."""
+    """Attribute errors about arguments of a function that is called in the block to an argument of the caller."""
     try:
         yield
+    except RecipeError as error:
+        error.argument = error.argument and argument
+        raise
     except UsageError as error:
         raise UsageError(str(error), concerns=argument) from error
 

@@ -78,7 +78,9 @@ def find_recipe(kinds: tuple[Kind, ...], name_or_path: str | Path, folder: Path 
     try:
         return find_file(kinds, name_or_path, folder)
     except ValueError as error:
-        raise RecipeError([str(error)]) from error
+        unknown = RecipeError([str(error)])
+        unknown.argument = "name_or_path"
+        raise unknown from error
 
 
 def load_recipe(

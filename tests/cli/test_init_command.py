@@ -337,7 +337,7 @@ def test_inertias_that_no_body_has_are_noted(tmp_path):
     urdf = write_arm(tmp_path / "arm.urdf", ELBOW)
     urdf.write_text(urdf.read_text().replace('ixx="0.01"', 'ixx="0.05"', 1))
     assert main(["init", str(tmp_path / "arm"), "--urdf", str(urdf)]) == 0
-    assert "no body has the <inertia> of link_1: a principal moment is negative" in head_of(
+    assert "no body has the <inertia> of link_1: a principal inertia is negative" in head_of(
         tmp_path / "arm/problem.toml"
     )
 

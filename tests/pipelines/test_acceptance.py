@@ -74,7 +74,7 @@ def test_candidates_of_the_stages_are_accepted(prepare: Prepare, batches, name, 
     _, candidates = batches[name]
     again = judged(prepare(name, backend), candidates)
     assert len(again.alive) == again.size > 40
-    reasons = [constraint.reason for constraint in prepare(name).context.problem.constraint]
+    reasons = [each.boundary_reason or each.reason for each in prepare(name).context.problem.constraint]
     extra = ["hit not along its direction"] if name.startswith("airhockey") else []
     assert again.reasons == [*reasons, "tip not at its position", *extra]
 

@@ -181,7 +181,7 @@ def test_attempts_count_the_candidates_between_rows_across_batches(prepared, who
 
 def test_every_reason_of_stages_and_constraints_is_listed_even_without_rejections(prepared, whole):
     reasons = list(whole.sampling.rejections)
-    constraints = [constraint.reason for constraint in prepared.context.problem.constraint]
+    constraints = [each.boundary_reason or each.reason for each in prepared.context.problem.constraint]
     assert reasons[0] == "too close together"
     assert [reason for reason in reasons if reason in constraints] == constraints
     assert "tip not at its position" in reasons

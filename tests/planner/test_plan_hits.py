@@ -128,6 +128,11 @@ def test_a_missing_direction_and_numbers_that_are_not_finite_raise_errors(planne
 def test_a_start_that_touches_the_puck_has_this_reason(planner, state):
     one = tuple(np.atleast_2d(values)[0].astype(float) for values in state)
     tip = Arm(open_problem(planner.model.problem)[1]).pose(one[0]).translation[:2]
-    touching = plan_hits(planner, one, np.add(tip, [0.079, 0.0]), TARGET)
-    assert touching.reasons == ("early contact with the puck",)
-    assert not len(touching.plans)
+    angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    around = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    ahead = np.subtract(TARGET, tip) / np.linalg.norm(np.subtract(TARGET, tip))  # some are within 10 mm of the goal
+    for puck in (tip + 0.079 * around, tip + 0.03 * around, tip + np.linspace(0.062, 0.079, 8)[:, None] * ahead):
+        touching = plan_hits(planner, one, puck, TARGET)
+        assert set(touching.reasons) == {"start touches the puck"}
+        assert not len(touching.plans)
+    assert "start touches the puck" not in plan_hits(planner, one, tip + 0.081 * around, TARGET).reasons

@@ -144,11 +144,11 @@ def _path(frame: str, joints: Mapping[str, UrdfJoint]) -> list[UrdfJoint]:
 
 
 def _is_impossible(inertia: LinkInertia | None) -> bool:
-    """Return whether a principal moment of inertia is negative or exceeds the sum of the others."""
+    """Return whether a principal inertia is negative or exceeds the sum of the others."""
     if inertia is None:
         return False
-    low, middle, high = np.linalg.eigvalsh(inertia.inertia)
-    return bool(low < -MAX_INERTIA_ERROR * high or high > (1 + MAX_INERTIA_ERROR) * (low + middle))
+    low, medium, high = np.linalg.eigvalsh(inertia.inertia)
+    return bool(low < -MAX_INERTIA_ERROR * high or high > (1 + MAX_INERTIA_ERROR) * (low + medium))
 
 
 def _moves(joint: UrdfJoint) -> bool:

@@ -76,7 +76,7 @@ def problem_of(arm: Arm, name: str, folder: Path, packages: tuple[Path, ...], sr
         robot = load_robot(problem)
     notes += overlaps.notes if overlaps else ()
     if arm.impossible:
-        text = "a principal moment is negative or exceeds the sum of the others; torques may be wrong"
+        text = "a principal inertia is negative or exceeds the sum of the others; torques may be wrong"
         notes.append(f"no body has the <inertia> of {', '.join(arm.impossible)}: {text}")
     arm, overloaded = _with_torque_limits(arm, robot)
     limits = replace(problem.limits, **_replaced_limits(arm))

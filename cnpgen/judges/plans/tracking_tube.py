@@ -23,12 +23,14 @@ from cnpgen.problems.constraints.joint import JointPosition
 from cnpgen.problems.constraints.needs import measured_needs
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
+from cnpgen.schema.arguments import check_range
 from cnpgen.world.path import PathWorld
 from cnpgen.world.world import World
 
 Array = NDArray[np.float64]
 TrackingError = float | Sequence[float] | Array  # of every joint [rad], or one for all
 
+MAX_TRACKING_ERROR = 0.5  # rad or m
 TUBE_CURVATURE_FACTOR = 1.5  # on the sum of changes
 TUBE_COMBINATIONS = 8  # random ones of all changes
 
@@ -47,9 +49,11 @@ class TrackingTube:
 
     def __init__(self, problem: Problem, robot: Robot, error: TrackingError) -> None:
         values = np.asarray(error, float)
-        if values.shape not in ((), (robot.n,)) or not (np.isfinite(values).all() and (values >= 0).all()):
-            expected = f"one number [rad], or {robot.n}, one per joint, none below 0"
+        if values.shape not in ((), (robot.n,)) or not np.isfinite(values).all():
+            expected = f"one number [rad], or {robot.n}, one per joint"
             raise UsageError(f"must be {expected}, got {error!r}", argument="tracking_error")
+        unit = "m" if all(robot.sliding) else "rad"
+        check_range("tracking_error", values, 0.0, MAX_TRACKING_ERROR, unit)
         self._problem, self._error = problem, np.broadcast_to(values, robot.n).copy()
         self._world = PathWorld(robot, problem.obstacle, problem.object_size)
         world = World(robot, problem.obstacle, problem.object_size)

@@ -101,6 +101,7 @@ class Constraint(ABC):
 
     Attributes:
         reason: Rejection reason of samples that violate the constraint.
+        boundary_reason: Rejection reason of samples whose ends violate it; by default ``reason``.
         kinks: Phases at which its ``bound_relaxation`` is not smooth; the verdict checks these.
         uses_jerk: Whether it uses the jerk, which is computed only for problems with such a constraint.
         training_weight: Initial weight of the violation in training; None for ``WEIGHT_FACTOR`` times ``weight``.
@@ -115,6 +116,7 @@ class Constraint(ABC):
     """
 
     reason: ClassVar[str]
+    boundary_reason: ClassVar[str] = ""
     kinks: ClassVar[tuple[float, ...]] = ()
     uses_jerk: ClassVar[bool] = False
     training_weight: ClassVar[float | None] = None

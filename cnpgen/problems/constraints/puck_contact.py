@@ -48,6 +48,7 @@ class PuckContact(Constraint):
     """
 
     reason = "early contact with the puck"
+    boundary_reason = "start touches the puck"
     training_weight = 3e6
     has_solver_margin = True
     scene_width = 4
@@ -96,46 +97,59 @@ class PuckContact(Constraint):
 
     def symbolic(self, state: SymbolicState) -> tuple[Condition, ...]:
         """State the distance of the centres [m] in the form for solvers."""
-        return self._symbolic(state, SOLVER_MARGIN_M)
+        return self._cone(*self._symbolic_distances(state), SOLVER_MARGIN_M)
 
     def penalized(self, state: SymbolicState) -> tuple[Condition, ...]:
         """State the distance for the training loss: the square of a large violation grows linearly."""
         import casadi as ca
 
-        (condition,) = self._symbolic(state, TRAINING_MARGIN_M)
+        (condition,) = self._cone(*self._symbolic_distances(state), TRAINING_MARGIN_M)
         violation = ca.fmax(0, condition.lower[0] - condition.g[0])
         return (replace(condition, g=[condition.lower[0] - violation / ca.sqrt(1 + violation / TRAINING_KNEE_M)]),)
 
     def symbolic_at(self, state: SymbolicState, end: End) -> tuple[Condition, ...]:
-        """State the distance at the start [m]; the goal is in contact."""
-        return self._symbolic(state, None) if end == "start" else ()
+        """State the distance at the start [m], where no contact is allowed; the goal is in contact."""
+        if end == "goal":
+            return ()
+        return _at_least(self.contact_range + ADDED_RADIUS_M, self._symbolic_distances(state)[1])
 
     def measured(self, world: World) -> tuple[Condition, ...]:
         """Evaluate the distance of the centres with Pinocchio's tip position [m]."""
-        return self._measured(world, None)
+        return self._condition(*self._measured_distances(world))
 
     def measured_at(self, world: World, end: End) -> tuple[Condition, ...]:
-        """Evaluate the distance at the start; the goal is in contact."""
-        return self.measured(world) if end == "start" else ()
+        """Evaluate the distance at the start, where no contact is allowed; the goal is in contact."""
+        if end == "goal":
+            return ()
+        return _at_least(self.contact_range + ADDED_RADIUS_M, self._measured_distances(world)[1])
+
+    def touches(self, tip: Array, scene_values: Array) -> NDArray[np.bool_]:
+        """Return whether the mallet touches the puck at N positions.
+
+        Args:
+            tip: Tip positions [m], shape (N, 3).
+            scene_values: Goal and puck, see ``scene_values``, shape (N, 4).
+        """
+        touching: NDArray[np.bool_] = np.hypot(*(tip[:, :2] - scene_values[:, 2:]).T) < self.contact_range
+        return touching
 
     def solved(self, world: World) -> tuple[Condition, ...]:
         """Return the form for solvers."""
-        return self._measured(world, SOLVER_MARGIN_M)
+        return self._cone(*self._measured_distances(world), SOLVER_MARGIN_M)
 
-    def _symbolic(self, state: SymbolicState, margin: float | None) -> tuple[Condition, ...]:
+    def _symbolic_distances(self, state: SymbolicState) -> tuple[Any, Any]:
+        """Return the squared distance of the tip from the goal [m^2] and the distance of the centres [m]."""
         import casadi as ca
 
         tip = state.on_table(state.kinematics.tip)
         values = state.scene_values or [PUCK_OUT_OF_REACH_M] * self.scene_width
         from_goal, from_puck = ((tip[0] - x) ** 2 + (tip[1] - y) ** 2 for x, y in (values[:2], values[2:]))
-        distance = ca.sqrt(from_puck + MIN_SQUARED_PUCK_DISTANCE_M2)
-        return self._condition(from_goal, distance) if margin is None else self._cone(from_goal, distance, margin)
+        return from_goal, ca.sqrt(from_puck + MIN_SQUARED_PUCK_DISTANCE_M2)
 
-    def _measured(self, world: World, margin: float | None) -> tuple[Condition, ...]:
+    def _measured_distances(self, world: World) -> tuple[Any, Any]:
         values = world.scene_values if len(world.scene_values) else [PUCK_OUT_OF_REACH_M] * self.scene_width
         (x, y), (goal_x, goal_y, puck_x, puck_y) = world.parameters.on_table(world.tip_position)[:2], values
-        from_goal, distance = (x - goal_x) ** 2 + (y - goal_y) ** 2, np.hypot(x - puck_x, y - puck_y)
-        return self._condition(from_goal, distance) if margin is None else self._cone(from_goal, distance, margin)
+        return (x - goal_x) ** 2 + (y - goal_y) ** 2, np.hypot(x - puck_x, y - puck_y)
 
     def _condition(self, from_goal: Any, distance: Any) -> tuple[Condition, ...]:
         """State the distance of the centres, larger by a relaxation near the goal.

@@ -10,7 +10,7 @@ from cnpgen.problems.scenes.scene_problem import MAX_SCENE_OBSTACLES
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.hull import MAX_COORDINATE_M
 from cnpgen.schema.argument_types import checked_arguments
-from cnpgen.schema.arguments import integer, number, numbers
+from cnpgen.schema.arguments import check_range, integer, number, numbers
 
 Array = NDArray[np.float64]
 Voxels = NDArray[np.int64]
@@ -19,6 +19,7 @@ MAX_POINTS = 1_000_000
 MAX_GRID_VOXELS = 1 << 24  # of the grid around all points
 VOXEL_GROWTH = 1.25  # of the edge length, until there are few enough boxes
 MIN_VOXEL_M = 0.01
+MAX_POINT_SIZE_M = 1.0  # radius of points and edge length of voxels
 
 
 @checked_arguments
@@ -55,10 +56,8 @@ def obstacles_of_points(
         row = int(np.argmin(valid))
         text = f"must be finite and at most {MAX_COORDINATE_M:g} m, got {cloud[row]} in point {row}"
         raise UsageError(text, argument="points")
-    if not 1e-6 <= number("radius", radius) <= MAX_COORDINATE_M:
-        raise UsageError(f"must be at least 1e-6 m, got {radius}", argument="radius")
-    if not number("resolution", resolution) >= MIN_VOXEL_M:
-        raise UsageError(f"must be at least {MIN_VOXEL_M} m, got {resolution}", argument="resolution")
+    check_range("radius", number("radius", radius), 1e-6, MAX_POINT_SIZE_M, "m")
+    check_range("resolution", number("resolution", resolution), MIN_VOXEL_M, MAX_POINT_SIZE_M, "m")
     least = integer("max_obstacles", max_obstacles, least=1)
     edge = max(resolution, float((np.prod(np.ptp(cloud, axis=0) + resolution) / MAX_GRID_VOXELS) ** (1 / 3)))
     boxes = _boxes(cloud, edge)

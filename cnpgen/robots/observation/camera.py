@@ -13,6 +13,7 @@ from cnpgen.robots.observation.primitives import KINDS, Primitives
 from cnpgen.robots.observation.surface_points import unit_offset
 from cnpgen.schema.argument_types import check_fields
 from cnpgen.schema.arguments import integer
+from cnpgen.schema.units import suggested_unit
 
 Array = NDArray[np.float64]
 
@@ -43,7 +44,10 @@ class Camera:
         for name in ("width", "height"):
             integer(name, getattr(self, name), least=1, most=MAX_PIXELS)
         if not 0 < self.field_of_view < math.pi:
-            raise UsageError(f"must be above 0 and below pi, got {self.field_of_view:g}", argument="field_of_view")
+            hint = suggested_unit(self.field_of_view, "rad", 0.0, math.pi)
+            raise UsageError(
+                f"must be above 0 and below pi, got {self.field_of_view:g}{hint}", argument="field_of_view"
+            )
         if not np.isfinite([*self.position, *self.target]).all() or math.dist(self.position, self.target) < 1e-6:
             raise UsageError(
                 f"must be finite and away from the position {self.position}, got {self.target}", argument="target"

@@ -3,6 +3,7 @@
 from cnpgen.errors import UsageError
 
 BYTES_PER_FLOAT = 8
+LARGE_SIZE = 10_000_000  # floats from which on the available memory is measured
 
 
 def check_memory(argument: str, value: int, n_floats: int) -> None:
@@ -16,8 +17,8 @@ def check_memory(argument: str, value: int, n_floats: int) -> None:
     Raises:
         UsageError: The arrays need more than the available memory.
     """
-    needed, available = n_floats * BYTES_PER_FLOAT, available_bytes()
-    if needed > available:
+    needed = n_floats * BYTES_PER_FLOAT
+    if n_floats > LARGE_SIZE and needed > (available := available_bytes()):
         text = f"{needed / 1e9:,.3g} GB of memory, {available / 1e9:,.3g} GB are available"
         raise UsageError(f"must be smaller: {value:,} needs at least {text}", argument=argument)
 

@@ -1,0 +1,89 @@
+"""Arguments out of their range, larger than the memory, or names of no recipe name the argument and a remedy."""
+
+import numpy as np
+import pytest
+
+import cnpgen
+from cnpgen.errors import MachineError, RecipeError, UsageError
+from cnpgen.planner.plan_hits import plan_hits
+from cnpgen.refine.options import RefineOptions
+from cnpgen.robots.observation.camera import Camera
+from cnpgen.schema import memory
+from cnpgen.schema.argument_types import checked_arguments
+from cnpgen.schema.arguments import check_range, numbers
+
+
+@pytest.fixture(scope="module")
+def planner():
+    return cnpgen.Planner("airhockey-replan")
+
+
+def test_a_value_in_another_unit_has_a_suggestion():
+    check_range("error", [0.0, 0.5], 0.0, 0.5, "rad")
+    with pytest.raises(UsageError, match=r"from 0 to 0.5 rad, got 2 rad; 2 rad is 115 deg; did you mean 2 deg = 0.034"):
+        check_range("error", [0.1, 2.0], 0.0, 0.5, "rad")
+    with pytest.raises(UsageError, match=r"from 0 to 60 s, got 500 s; did you mean 500 ms = 0.5 s\?"):
+        check_range("time", 500.0, 0.0, 60.0, "s")
+    with pytest.raises(UsageError, match=r"from 0 to 60 s, got nan s$"):
+        check_range("time", np.nan, 0.0, 60.0, "s")
+
+
+def test_public_functions_check_their_ranges(planner):
+    state = (planner.robot.base, *np.zeros((2, planner.robot.n)))
+    plans = planner.plan(planner.robot.base, planner.robot.base + 0.1)
+    calls = {
+        "meeting_time": lambda: plan_hits(planner, state, [1.0, 0.1], [2.49, 0.0], meeting_time=500),
+        "puck_velocity": lambda: plan_hits(planner, state, [1.0, 0.1], [2.49, 0.0], puck_velocity=[900.0, 0.0]),
+        "tracking_error": lambda: cnpgen.evaluate_plans(plans, tracking_error=2.0),
+        "stay_within": lambda: RefineOptions(stay_within=2.0),
+        "radius": lambda: cnpgen.scenes.obstacles_of_points(np.zeros((1, 3)), radius=5.0),
+        "field_of_view": lambda: Camera(field_of_view=60.0),
+    }
+    for argument, call in calls.items():
+        with pytest.raises(UsageError, match="did you mean") as caught:
+            call()
+        assert caught.value.argument == argument
+
+
+@pytest.mark.parametrize(
+    ("call", "argument"),
+    [
+        (cnpgen.load_problem, "name_or_path"),
+        (cnpgen.recipes.load_pipeline, "name_or_path"),
+        (cnpgen.recipes.load_dataset_recipe, "name_or_path"),
+        (cnpgen.make_dataset, "recipe"),
+        (cnpgen.RobotModel, "problem"),
+    ],
+)
+def test_names_of_no_recipe_carry_the_argument(call, argument):
+    with pytest.raises(RecipeError, match=r"unknown .* 'nope'") as caught:
+        call("nope")
+    assert caught.value.argument == argument
+
+
+def test_views_that_repeat_values_are_compared_with_the_memory(planner):
+    q = np.broadcast_to(planner.robot.base, (10**13, planner.robot.n))
+    with pytest.raises(UsageError, match=r"start_q must be smaller: 10,000,000,000,000 needs at least .* GB"):
+        planner.plan(q, q)
+    with pytest.raises(UsageError, match="goal_xyz must be smaller"):
+        cnpgen.complete("airhockey-hit", goal_xyz=np.broadcast_to([1.0, 0.1], (10**13, 2)))
+
+
+def test_many_plans_are_compared_with_the_memory(planner, monkeypatch):
+    q = np.repeat(planner.robot.base[None], 1000, axis=0)
+    monkeypatch.setattr(memory, "LARGE_SIZE", 100)
+    monkeypatch.setattr(memory, "available_bytes", lambda: 100_000)
+    with pytest.raises(UsageError, match=r"start_q must be smaller: 1,000 needs at least"):
+        planner.plan(q, q)
+    with pytest.raises(UsageError, match=r"start_q must be smaller: 1,000 needs at least"):
+        planner.plan_batch(cnpgen.Boundary(q, *np.zeros((2, *q.shape)), q, np.zeros(q.shape)))
+    assert len(numbers("q", q)) == 1000
+
+
+def test_a_failed_allocation_is_an_error_of_the_machine():
+    @checked_arguments
+    def allocate(n: int) -> None:
+        raise MemoryError(f"Unable to allocate {n} GiB")
+
+    with pytest.raises(MachineError, match="out of memory in allocate: Unable to allocate 4 GiB"):
+        allocate(4)
