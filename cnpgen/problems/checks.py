@@ -14,10 +14,12 @@ from cnpgen.robots.robot_spec import LimitSpec
 from cnpgen.robots.shape.mesh_files import find_urdf
 from cnpgen.robots.urdf import number_in, read_urdf, urdf_tree
 from cnpgen.schema.keys import RecipeLocation
+from cnpgen.schema.registry import BUILT_IN, CONSTRAINTS
 from cnpgen.schema.units import show
 from cnpgen.store.joint_units import units_of_joints
 
 _LIMIT_UNITS = {"position": "rad", "velocity": "rad/s", "acceleration": "rad/s^2"}
+OBSTACLE_CONSTRAINTS = frozenset({"robot-clearance", "object-contact"})
 _XACRO = "{http://www.ros.org/wiki/xacro}"
 
 
@@ -28,7 +30,11 @@ def problem_mistakes(table: dict[str, Any], where: RecipeLocation, folder: Path)
         yield from _robot_mistakes(robot, where / "robot", folder)
     yield from _repeated(table, where, "constraint", "use")
     yield from _repeated(table, where, "obstacle", "name")
+    uses = {each.get("use") for _, each in tables(table, "constraint")}
     for index, obstacle in tables(table, "obstacle"):
+        if index == 0 and uses <= BUILT_IN[CONSTRAINTS].keys() - OBSTACLE_CONSTRAINTS:  # plug-ins may use them
+            text = 'no constraint uses it: add a [[constraint]] with use = "robot-clearance" and a tolerance'
+            yield (where / "obstacle" / index).message(text)
         if obstacle.get("below") and "object" not in table:
             yield (where / "obstacle" / index / "below").message("nothing stands on the obstacle: there is no [object]")
 

@@ -3,11 +3,12 @@
 import warnings
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import RecipeError
+from cnpgen.errors import RecipeError, listed
 from cnpgen.problems.constraints.joint import JointTorque
 from cnpgen.problems.constraints.object_clearance import ObjectClearance
 from cnpgen.problems.constraints.table import Table
@@ -25,6 +26,7 @@ from cnpgen.store.joint_units import unit_of
 
 Array = NDArray[np.float64]
 
+MAX_PAIRS = 6  # that a warning lists
 JERK_RATE = 5.0  # 1/s: jerk limit / acceleration limit in the authors' code
 
 
@@ -104,20 +106,21 @@ def _given(values: PerJoint | None, what: str, otherwise: Array) -> Array:
 
 
 def _shape(problem: Problem, robot: Robot) -> Shape:
-    """Load the shape of the robot; warn about collisions that an SRDF of the URDF disables."""
+    """Load the shape of the robot; warn once about all collisions that an SRDF of the URDF disables."""
     try:
         shape = load_shape(robot.urdf_text, robot.model, kept_folder())
     except RecipeError as error:
         raise RecipeError([f"{problem.path}: {mistake}" for mistake in error.mistakes]) from error
     ignored = set(map(frozenset, problem.robot.ignored_pairs))
-    for pair in shape.pairs if problem.robot.srdf else ():
-        if pair.left_out == "disabled" and pair.colliding and {pair.first, pair.second} not in ignored:
-            warnings.warn(
-                f"{problem.robot.srdf} disables the pair {pair.first}, {pair.second}, which collides in"
-                f" {pair.colliding:.1%} of random states: these collisions are not noticed",
-                RuntimeWarning,
-                stacklevel=4,
-            )
+    disabled = (pair for pair in shape.pairs if pair.left_out == "disabled" and pair.colliding)
+    missed = [pair for pair in disabled if {pair.first, pair.second} not in ignored] if problem.robot.srdf else []
+    if missed:
+        missed.sort(key=lambda pair: -pair.colliding)
+        pairs = listed([f"{pair.first} and {pair.second} ({pair.colliding:.1%})" for pair in missed], most=MAX_PAIRS)
+        text = "these collisions are not noticed, with their fraction of random states"
+        warnings.warn(
+            f"{Path(problem.robot.srdf).name} disables pairs of links: {text}: {pairs}", RuntimeWarning, stacklevel=4
+        )
     return shape
 
 

@@ -117,6 +117,12 @@ def test_a_urdf_that_was_changed_later_is_checked_again(tmp_path, old, new, text
     assert text in mistakes(crane(tmp_path, old, new))
 
 
+def test_obstacles_that_no_constraint_uses_are_refused(tmp_path):
+    file = write_problem(tmp_path)
+    file.write_text(file.read_text(encoding="utf-8").replace("robot-clearance", "self-clearance"), encoding="utf-8")
+    assert 'obstacle 1: no constraint uses it: add a [[constraint]] with use = "robot-clearance"' in mistakes(file)
+
+
 @pytest.mark.parametrize("limit", ["velocity = 19", 'velocity = "80 deg/s"', "acceleration = 190", "torque = 5000"])
 def test_limits_of_another_motor_are_accepted(tmp_path, limit):
     load_robot(load_problem(limited(tmp_path, limit)))

@@ -21,6 +21,7 @@ from cnpgen.pipelines.stages.draw import DrawPositions
 from cnpgen.pipelines.stages.ik import GoalIK, StartIK
 from cnpgen.pipelines.stages.stage import Stage
 from cnpgen.pipelines.stages.torque import GravityTorque
+from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.constraints.joint import JointAcceleration, JointJerk, JointPosition, JointTorque, JointVelocity
 from cnpgen.problems.constraints.self_clearance import SelfClearance
@@ -141,19 +142,20 @@ def _problem(arm: Arm, name: str, folder: Path, packages: tuple[Path, ...], srdf
         JointAcceleration(tolerance=5e-3, budget=6e-2),
     )
     if arm.has_shape:
-        constraints = (*constraints, SelfClearance(tolerance=1e-3, budget=1e-6))
+        clearances = RobotClearance(tolerance=1e-3, budget=1e-6), SelfClearance(tolerance=1e-3, budget=1e-6)
+        constraints = (*constraints, *clearances)  # obstacles may follow
     path, title = folder / "problem.toml", f"Move {arm.urdf.stem} within its limits"
     return Problem(name=name, title=title, robot=robot, limits=limits, constraint=constraints, path=path.absolute())
 
 
 @contextmanager
 def _warnings_as_notes() -> Iterator[list[str]]:
-    """Collect the warnings of the block, such as those about simplified meshes, in a list without repetitions."""
+    """Collect the warnings of the block, such as those about simplified meshes: the last one of each subject."""
     notes: list[str] = []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         yield notes
-    notes += dict.fromkeys(str(each.message) for each in caught)
+    notes += {text.partition(": ")[0]: text for text in (str(each.message) for each in caught)}.values()
 
 
 def _replaced_limits(arm: Arm) -> dict[str, Any]:

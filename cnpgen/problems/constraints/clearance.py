@@ -46,7 +46,13 @@ class RobotClearance(Constraint):
         since_version=2,
         high=2.0,
     )
-    tolerance: float = field("violation that a valid motion may have", unit="m", low=0.0, high=0.5)
+    tolerance: float = field(
+        "violation that a valid motion may have; links may enter obstacles by 0.1 mm at most, the paper's capsules by all"
+        " of it",
+        unit="m",
+        low=0.0,
+        high=0.5,
+    )
 
     @property
     def effective_tolerance(self) -> float:
