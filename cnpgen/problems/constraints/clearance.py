@@ -47,7 +47,7 @@ class RobotClearance(Constraint):
         high=2.0,
     )
     tolerance: float = field(
-        "violation that a valid motion may have; links may enter obstacles by 0.1 mm at most, the paper's capsules by all"
+        "violation that a valid motion may have; links may enter obstacles by 0.1 mm, the paper's capsules by all"
         " of it",
         unit="m",
         low=0.0,
