@@ -73,6 +73,10 @@ def _paper_mistakes(table: dict[str, Any], where: RecipeLocation) -> Iterator[st
         yield (where / "constraint" / place).message(text)
     if _robot(table).get("convex_parts", 1) != 1:
         yield (where / "robot" / "convex_parts").message('meshes matter with geometry = "urdf" only')
+    payload = table.get("payload")
+    if isinstance(payload, dict) and payload.get("touch_links"):
+        text = 'a payload is a body with geometry = "urdf" in [robot] only'
+        yield (where / "payload" / "touch_links").message(text)
     for key in ("srdf", "ignored_pairs"):
         if _robot(table).get(key):
             yield (where / "robot" / key).message('pairs of links matter with geometry = "urdf" only')

@@ -31,6 +31,7 @@ from cnpgen.robots.robot_spec import HeldObject, LimitSpec, Payload, RobotSpec
 from cnpgen.robots.scene import PARKED_POSITION_M
 from cnpgen.robots.shape.inline import with_inline_meshes
 from cnpgen.robots.shape.mesh_files import find_urdf
+from cnpgen.robots.shape.payload_link import PAYLOAD, with_payload_link
 from cnpgen.robots.shape.srdf import with_disabled_pairs, with_ignored_pairs
 from cnpgen.robots.solid import pose_width
 from cnpgen.robots.urdf import read_urdf
@@ -236,7 +237,8 @@ class Problem:
     def urdf_text(self) -> str:
         """Text of the URDF, read once, so that robot, kernels and identity use the same text.
 
-        If constraints use the URDF's geometry, the text includes the hulls of meshes and the pairs of an SRDF.
+        If constraints use the URDF's geometry, the text includes the hulls of meshes, the pairs of an SRDF and the
+        box of a payload that is a body.
 
         Raises:
             RecipeError: The URDF, a mesh or the SRDF cannot be read, or is not UTF-8.
@@ -249,7 +251,11 @@ class Problem:
             text, self.urdf_path, self.packages, most=spec.convex_parts, links=spec.decomposed, keep=keep
         )
         text = with_disabled_pairs(text, self.path.parent / spec.srdf) if spec.srdf else text
-        return with_ignored_pairs(text, spec.ignored_pairs) if spec.ignored_pairs else text
+        ignored = spec.ignored_pairs
+        if self.payload is not None and self.payload.touch_links:
+            text = with_payload_link(text, spec, self.payload)
+            ignored = (*ignored, *((link, PAYLOAD) for link in self.payload.touch_links))
+        return with_ignored_pairs(text, ignored) if ignored else text
 
     @cached_property
     def identity(self) -> str:

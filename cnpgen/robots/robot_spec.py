@@ -130,7 +130,10 @@ class LimitSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class Payload:
-    """Rigid body carried at the tip frame; a point mass without inertia and size."""
+    """Rigid body carried at the tip frame; a point mass without inertia and size.
+
+    With ``touch_links``, its box is a body that touches neither other links nor obstacles.
+    """
 
     mass: float = field("mass", unit="kg", low=1e-9)
     centre: tuple[float, float, float] = field(
@@ -149,10 +152,18 @@ class Payload:
         high=10.0,
     )
 
+    touch_links: tuple[str, ...] = field(
+        "links that carry the payload and may touch it; its box of 'size' is then a body that touches nothing else",
+        default=(),
+        since_version=2,
+    )
+
     def find_mistakes(self) -> Iterator[tuple[str, str]]:
         """Yield (key, mistake) pairs."""
         if self.inertia is not None and self.size is not None:
             yield "size", "the payload has both an 'inertia' and a 'size', expected one of them"
+        if self.touch_links and self.size is None:
+            yield "touch_links", "a payload that is a body needs a 'size'"
         principal = np.linalg.eigvalsh(self.inertia_matrix)
         if principal[0] < 0 or principal[2] > (principal[0] + principal[1]) * (1 + 1e-9):
             text = ", ".join(f"{each:g}" for each in principal)
@@ -168,7 +179,7 @@ class Payload:
         xx, yy, zz, xy, xz, yz = (
             self.inertia_matrix[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]] * (factor * mass / self.mass)
         ).tolist()
-        return replace(self, mass=mass, centre=(x, y, z), inertia=(xx, yy, zz, xy, xz, yz), size=None)
+        return replace(self, mass=mass, centre=(x, y, z), inertia=(xx, yy, zz, xy, xz, yz), size=None, touch_links=())
 
     @property
     def inertia_matrix(self) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
