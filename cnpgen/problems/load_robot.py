@@ -26,7 +26,7 @@ from cnpgen.store.joint_units import unit_of
 
 Array = NDArray[np.float64]
 
-MAX_PAIRS = 6  # that a warning lists
+MAX_LISTED_PAIRS = 6  # that a warning lists
 JERK_RATE = 5.0  # 1/s: jerk limit / acceleration limit in the authors' code
 
 
@@ -116,7 +116,9 @@ def _shape(problem: Problem, robot: Robot) -> Shape:
     missed = [pair for pair in disabled if {pair.first, pair.second} not in ignored] if problem.robot.srdf else []
     if missed:
         missed.sort(key=lambda pair: -pair.colliding)
-        pairs = listed([f"{pair.first} and {pair.second} ({pair.colliding:.1%})" for pair in missed], most=MAX_PAIRS)
+        pairs = listed(
+            [f"{pair.first} and {pair.second} ({pair.colliding:.1%})" for pair in missed], most=MAX_LISTED_PAIRS
+        )
         text = "these collisions are not noticed, with their fraction of random states"
         warnings.warn(
             f"{Path(problem.robot.srdf).name} disables pairs of links: {text}: {pairs}", RuntimeWarning, stacklevel=4
