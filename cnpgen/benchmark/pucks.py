@@ -39,7 +39,7 @@ class Pucks:
     columns: int = field("number of columns of pucks, evenly spaced along x", low=1)
     rows: int = field("number of rows of pucks, evenly spaced along y", low=1)
     goal: tuple[float, float] = field("target of the pucks: x, y", unit="m")
-    behind: float = field("distance of the tip behind the puck's centre at the hit", unit="m", low=0.0, high=1.0)
+    behind: float = field("distance of the tip behind the puck's centre at the hit", unit="m", low=0.0, plausible=1.0)
 
     def find_mistakes(self) -> Iterator[tuple[str, str]]:
         """Yield (key, mistake) pairs."""

@@ -99,7 +99,7 @@ def _folder(name: str) -> Path:
 
 def _refuse(there: list[str]) -> None:
     if there:
-        raise UsageError(f"{', '.join(there)} exists already: --force writes over it")
+        raise UsageError(f"{', '.join(there)} exist{'s' if len(there) == 1 else ''} already: --force writes over it")
 
 
 def _say_next(folder: Path) -> None:

@@ -19,7 +19,7 @@ METRICS = {  # metric -> what it is called, in a summary and in a list, and its 
     "vertical_error_rad_s": ("vertical error [rad s]", "tilt [rad s]", "{:.4f}"),
     "hit_speed_m_s": ("speed at the goal [m/s]", "v [m/s]", "{:.2f}"),
     "effort_s": ("effort [s]", "effort [s]", "{:.3f}"),
-    "jerk": ("largest jerk [5/s x limit]", "jerk", "{:.2f}"),
+    "jerk": ("largest jerk [x limit]", "jerk", "{:.2f}"),
 }
 LONG = 1e6  # of any unit: control points that are garbage make metrics of hundreds of digits
 _TALLIES = {

@@ -13,7 +13,7 @@ from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.scene_arrays import scene_poses
 from cnpgen.robots.solid import pose_width
 from cnpgen.schema.keys import RecipeLocation
-from cnpgen.schema.parsing import parse
+from cnpgen.schema.parsing import parse, stored_values
 from cnpgen.store.dataset_spec import DatasetSpec
 from cnpgen.store.field import Field
 from cnpgen.store.scene_table import SceneTable
@@ -27,7 +27,8 @@ def problem_obstacles(spec: DatasetSpec) -> tuple[Obstacle, ...]:
         return ()
     tables = spec.recipe["pipeline"]["problem"]["obstacle"]
     given = [{key: value for key, value in table.items() if value is not None} for table in tables]
-    parsed = [parse(Obstacle, table, where=RecipeLocation("obstacle"), mistakes=[]) for table in given]
+    with stored_values():
+        parsed = [parse(Obstacle, table, where=RecipeLocation("obstacle"), mistakes=[]) for table in given]
     return tuple(obstacle for obstacle in parsed if obstacle is not None)
 
 

@@ -21,7 +21,7 @@ from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import concerning
 from cnpgen.schema.catalogue import load_recipe, read_kind, reference
 from cnpgen.schema.keys import RecipeLocation
-from cnpgen.schema.parsing import Reader, parse
+from cnpgen.schema.parsing import Reader, parse, stored_values
 from cnpgen.schema.texts import read_own, utf8_text
 from cnpgen.schema.toml import is_kind, read_table
 from cnpgen.store.dataset_spec import GENERATOR_REVISION, DatasetSpec
@@ -88,9 +88,10 @@ def restore_dataset_recipe(content: dict[str, Any], urdf: str, folder: Path) -> 
         parsed = parse(Pipeline, value, where=where, mistakes=mistakes, readers=readers)
         return parsed and replace(parsed, path=path)
 
-    recipe = parse(
-        DatasetRecipe, content, where=RecipeLocation(str(path)), mistakes=mistakes, readers={Pipeline: pipeline}
-    )
+    with stored_values():
+        recipe = parse(
+            DatasetRecipe, content, where=RecipeLocation(str(path)), mistakes=mistakes, readers={Pipeline: pipeline}
+        )
     if recipe is None or mistakes:
         raise RecipeError(mistakes)
     return replace(recipe, path=path)

@@ -17,7 +17,7 @@ from cnpgen.schema import registry
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.catalogue import load_recipe, read_kind, reference
 from cnpgen.schema.keys import RecipeLocation
-from cnpgen.schema.parsing import Reader, parse
+from cnpgen.schema.parsing import Reader, parse, stored_values
 from cnpgen.schema.toml import read_table
 
 
@@ -80,9 +80,11 @@ def restore_pipeline(name: str, stages: Sequence[Mapping[str, Any]], problem: Pr
         raise PluginError(missing)
     mistakes = list[str]()
     read = partial(read_kind, registry.STAGES)
-    read_stages = [
-        read(table, RecipeLocation(name) / "stage" / at, mistakes) for at, table in enumerate(without_defaults(tables))
-    ]
+    with stored_values():
+        read_stages = [
+            read(table, RecipeLocation(name) / "stage" / at, mistakes)
+            for at, table in enumerate(without_defaults(tables))
+        ]
     if mistakes:
         raise RecipeError(mistakes)
     return Pipeline(name=name, problem=problem, stage=tuple(read_stages), path=Path(name))

@@ -19,7 +19,6 @@ from cnpgen.schema.units import show
 from cnpgen.store.joint_units import units_of_joints
 
 _LIMIT_UNITS = {"position": "rad", "velocity": "rad/s", "acceleration": "rad/s^2"}
-OBSTACLE_CONSTRAINTS = frozenset({"robot-clearance", "object-contact"})
 _XACRO = "{http://www.ros.org/wiki/xacro}"
 
 
@@ -30,9 +29,10 @@ def problem_mistakes(table: dict[str, Any], where: RecipeLocation, folder: Path)
         yield from _robot_mistakes(robot, where / "robot", folder)
     yield from _repeated(table, where, "constraint", "use")
     yield from _repeated(table, where, "obstacle", "name")
-    uses = {each.get("use") for _, each in tables(table, "constraint")}
+    uses = {str(each.get("use")) for _, each in tables(table, "constraint")}
+    using = {"robot-clearance", "object-contact"} if "object" in table else {"robot-clearance"}
     for index, obstacle in tables(table, "obstacle"):
-        if index == 0 and uses <= BUILT_IN[CONSTRAINTS].keys() - OBSTACLE_CONSTRAINTS:  # plug-ins may use them
+        if index == 0 and uses <= BUILT_IN[CONSTRAINTS].keys() - using:  # plug-ins may use them
             text = 'no constraint uses it: add a [[constraint]] with use = "robot-clearance" and a tolerance'
             yield (where / "obstacle" / index).message(text)
         if obstacle.get("below") and "object" not in table:
@@ -151,7 +151,8 @@ def _repeated(table: dict[str, Any], where: RecipeLocation, array: str, key: str
     seen: list[Any] = []
     for index, entry in tables(table, array):
         if key in entry and entry[key] in seen:
-            yield (where / array / index / key).message(f"there is a {array} {show(entry[key])} already")
+            text = f"there is a {array} {show(entry[key])} already: edit that one, or remove one of them"
+            yield (where / array / index / key).message(text)
         seen.append(entry.get(key))
 
 

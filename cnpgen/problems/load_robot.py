@@ -1,21 +1,19 @@
 """Loading of the robot of a problem, with scaled limits and consistency checks."""
 
-import warnings
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import RecipeError, listed
+from cnpgen.errors import RecipeError
 from cnpgen.problems.constraints.joint import JointTorque
 from cnpgen.problems.constraints.object_clearance import ObjectClearance
 from cnpgen.problems.constraints.table import Table
+from cnpgen.problems.plausible_sizes import check_plausible_sizes
 from cnpgen.problems.problem import Problem, kept_folder
 from cnpgen.robots.attached import Attached, PayloadBody
 from cnpgen.robots.chain import chain_from_model
-from cnpgen.robots.plausible_sizes import check_plausible_sizes
 from cnpgen.robots.robot import Robot, reduced_model
 from cnpgen.robots.shape.convex_part import turned
 from cnpgen.robots.shape.held_object import HeldBody, load_held_shape
@@ -26,7 +24,6 @@ from cnpgen.store.joint_units import unit_of
 
 Array = NDArray[np.float64]
 
-MAX_LISTED_PAIRS = 6  # that a warning lists
 JERK_RATE = 5.0  # 1/s: jerk limit / acceleration limit in the authors' code
 
 
@@ -75,7 +72,8 @@ def load_robot(problem: Problem) -> Robot:
         raise RecipeError(mistakes)
     shape = _shape(problem, robot) if spec.geometry == "urdf" else None
     robot = replace(robot, shape=shape, held_shape=_held_shape(problem, robot))
-    check_plausible_sizes(robot)
+    if not problem.is_stored:
+        check_plausible_sizes(robot, problem)
     return robot
 
 
@@ -106,24 +104,11 @@ def _given(values: PerJoint | None, what: str, otherwise: Array) -> Array:
 
 
 def _shape(problem: Problem, robot: Robot) -> Shape:
-    """Load the shape of the robot; warn once about all collisions that an SRDF of the URDF disables."""
+    """Load the shape of the robot."""
     try:
-        shape = load_shape(robot.urdf_text, robot.model, kept_folder())
+        return load_shape(robot.urdf_text, robot.model, kept_folder())
     except RecipeError as error:
         raise RecipeError([f"{problem.path}: {mistake}" for mistake in error.mistakes]) from error
-    ignored = set(map(frozenset, problem.robot.ignored_pairs))
-    disabled = (pair for pair in shape.pairs if pair.left_out == "disabled" and pair.colliding)
-    missed = [pair for pair in disabled if {pair.first, pair.second} not in ignored] if problem.robot.srdf else []
-    if missed:
-        missed.sort(key=lambda pair: -pair.colliding)
-        pairs = listed(
-            [f"{pair.first} and {pair.second} ({pair.colliding:.1%})" for pair in missed], most=MAX_LISTED_PAIRS
-        )
-        text = "these collisions are not noticed, with their fraction of random states"
-        warnings.warn(
-            f"{Path(problem.robot.srdf).name} disables pairs of links: {text}: {pairs}", RuntimeWarning, stacklevel=4
-        )
-    return shape
 
 
 def _held_shape(problem: Problem, robot: Robot) -> Shape | None:
@@ -146,22 +131,23 @@ def _mistakes(problem: Problem, robot: Robot) -> Iterator[str]:
                 yield f"{robot.urdf}: {name}: the {what} limit must be positive and finite, got {value:g}"
     if any(isinstance(constraint, JointTorque) for constraint in problem.constraint):
         yield from _weightless(robot)
-    yield from (wrong := list(_position_mistakes(robot)))
-    if not wrong:
+    yield from (mistakes := list(_position_mistakes(problem, robot)))
+    if not mistakes:
         yield from _base_mistakes(problem, robot)
 
 
-def _position_mistakes(robot: Robot) -> Iterator[str]:
-    """Yield error messages for position limits that are equal or in degrees."""
+def _position_mistakes(problem: Problem, robot: Robot) -> Iterator[str]:
+    """Yield error messages for position limits that are equal or in another unit."""
     limits = zip(robot.joint_names, robot.model.lowerPositionLimit, robot.model.upperPositionLimit, strict=True)
     for (name, low, high), sliding in zip(limits, robot.sliding, strict=True):
-        text, largest = f"{robot.urdf}: {name}: ", max(low, high, key=abs)
+        text, largest, unit = f"{robot.urdf}: {name}: ", max(low, high, key=abs), "m" if sliding else "rad"
+        most = PLAUSIBLE_MAX[unit]
         if low >= high:
             yield f"{text}the lower position limit must be below the upper one, got {low:g} and {high:g}"
-        elif not sliding and abs(largest) > PLAUSIBLE_MAX["rad"]:
-            remedy = "for a joint without limits, give ranges of all joints ('position' in [limits])"
-            expected = f"limits of positions are at most {PLAUSIBLE_MAX['rad']:.3g} rad, got {largest:g} rad"
-            yield f"{text}{expected}{suggested_unit(largest, 'rad')}; {remedy}"
+        elif abs(largest) > most and not problem.is_stored:
+            remedy = "give ranges of joints without limits in [limits] ('position')"
+            expected = f"limits of positions are at most {most:.3g} {unit}, got {largest:g} {unit}"
+            yield f"{text}{expected}{suggested_unit(largest, unit, -most, most)}; {remedy}"
 
 
 def _weightless(robot: Robot) -> Iterator[str]:
@@ -181,7 +167,7 @@ def _base_mistakes(problem: Problem, robot: Robot) -> Iterator[str]:
     worst = int(np.argmax(np.maximum(low - base, base - high)))
     if not low[worst] <= base[worst] <= high[worst]:
         unit = unit_of(robot.units("rad"), worst)
-        hint = suggested_unit(base[worst], unit) if abs(base[worst]) > 2 * np.pi else ""
+        hint = suggested_unit(base[worst], unit, low[worst], high[worst])
         yield (
             f"{problem.path}: robot.base: {robot.joint_names[worst]} = {base[worst]:g} {unit} is outside its planning"
             f" limits [{low[worst]:g}, {high[worst]:g}]{hint}"

@@ -91,6 +91,7 @@ class Problem:
     trajectory: TrajectorySpec = field("parametrization of motions", default=TrajectorySpec())
     objective: Objective = field("objective of the optimization", default=Objective())
     path: Path = Path()
+    is_stored: bool = False  # in a dataset, a plan or a model: implausible sizes and limits were accepted before
 
     @checked_arguments
     def first(self, kind: type[Kind]) -> Kind | None:

@@ -22,7 +22,7 @@ from cnpgen.schema import registry
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.catalogue import load_recipe, read_kind, reference
 from cnpgen.schema.keys import RecipeLocation
-from cnpgen.schema.parsing import Reader, parse
+from cnpgen.schema.parsing import Reader, parse, stored_values
 from cnpgen.schema.toml import Kind, read_table
 from cnpgen.schema.units import show
 
@@ -159,11 +159,12 @@ def restoring_reader(urdf: str, path: Path) -> Reader:
             raise ValueError("expected the table of a problem, with a robot")  # noqa: TRY004 - as of other mistakes
         robot = {key: entry for key, entry in value["robot"].items() if key not in FILES}
         value = {**value, "robot": robot | {"urdf": "robot.urdf"}}
-        made = parse(Problem, value, where=where, mistakes=mistakes, readers=KIND_READERS)
+        with stored_values():
+            made = parse(Problem, value, where=where, mistakes=mistakes, readers=KIND_READERS)
         if made is None or (named := list(_meshes_on_disk(made, urdf, where))):
             mistakes.extend(() if made is None else named)
             return None
-        return replace(made, path=path)
+        return replace(made, path=path, is_stored=True)
 
     return read
 

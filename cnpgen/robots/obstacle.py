@@ -46,8 +46,7 @@ class Obstacle:
         "rotation: roll, pitch and yaw about the world's axes, as <origin rpy> of a URDF",
         unit="rad",
         default=_OPTIONAL["rotation"],
-        low=-2 * math.pi,
-        high=2 * math.pi,
+        plausible=2 * math.pi,
         since_version=2,
     )
     size: tuple[float, float, float] | None = field(

@@ -92,15 +92,10 @@ class ParameterRanges:
         unit="m",
         default=None,
         since_version=2,
-        low=-5.0,
-        high=5.0,
+        plausible=5.0,
     )
-    payload_y: Range | None = field(
-        "the same along its y axis", unit="m", default=None, since_version=2, low=-5.0, high=5.0
-    )
-    payload_z: Range | None = field(
-        "the same along its z axis", unit="m", default=None, since_version=2, low=-5.0, high=5.0
-    )
+    payload_y: Range | None = field("the same along its y axis", unit="m", default=None, since_version=2, plausible=5.0)
+    payload_z: Range | None = field("the same along its z axis", unit="m", default=None, since_version=2, plausible=5.0)
     payload_inertia: Range | None = field(
         "inertia of the payload about its centre, as a fraction of that of [payload] at equal mass",
         default=None,

@@ -1,6 +1,6 @@
 """Robot: Pinocchio model, reduced to the planned joints, and planning limits of the problem."""
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -19,7 +19,7 @@ from cnpgen.robots.model_comparison import check_model
 from cnpgen.robots.parameter_ranges import NO_PARAMETERS, ParameterRanges
 from cnpgen.robots.shape.shape import Shape
 from cnpgen.robots.urdf import urdf_tree
-from cnpgen.robots.urdf_parameters import urdf_parameters
+from cnpgen.robots.urdf_parameters import UrdfParameters, urdf_parameters
 from cnpgen.store.joint_units import units_of_joints
 
 if TYPE_CHECKING:
@@ -141,6 +141,7 @@ def reduced_model(urdf: Path, text: str, joints: tuple[str, ...], attached: Atta
         limited = bounded(text, tree, attached)
         with mistakes_in(urdf):
             parameters = urdf_parameters(tree)
+            check_order_of_limits(parameters, joints)
         model = pin.buildModelFromXML(limited)
         name_links_uniquely(model)
     except (ValueError, RuntimeError, IndexError) as error:
@@ -157,6 +158,26 @@ def reduced_model(urdf: Path, text: str, joints: tuple[str, ...], attached: Atta
         check_model(reduced, parameters)
     attach(reduced, attached)
     return reduced
+
+
+def check_order_of_limits(parameters: UrdfParameters, joints: Collection[str]) -> None:
+    """Raise an error for lower limits above the upper ones.
+
+    Args:
+        parameters: Parameters of the URDF.
+        joints: Names of the planned joints; others may have any limits.
+
+    Raises:
+        RecipeError: Limits are swapped; the error lists all of them.
+    """
+    limits = {joint.name: joint.limits for joint in parameters.joints.values() if joint.name in joints}
+    mistakes = [
+        f"joint {name!r}: its limits lower={of['lower']:g} and upper={of['upper']:g} are swapped: exchange them"
+        for name, of in limits.items()
+        if of.get("lower", 0.0) > of.get("upper", 0.0)
+    ]
+    if mistakes:
+        raise RecipeError(mistakes)
 
 
 @contextmanager

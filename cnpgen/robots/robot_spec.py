@@ -20,21 +20,19 @@ class RobotSpec:
     urdf: str = field("URDF file, relative to the problem file")
     joints: tuple[str, ...] = field("planned joints, in order; all other joints stay at zero")
     tip: str = field("name of the tip frame (URDF link)")
-    base: tuple[float, ...] = field("base configuration of the planned joints", unit="rad")
+    base: tuple[float, ...] = field("base configuration of the planned joints", unit="rad", plausible=100.0)
     tip_offset: tuple[float, float, float] = field(
         "offset of the tip in the frame 'tip': x, y, z",
         unit="m",
         default=(0.0, 0.0, 0.0),
         since_version=2,
-        low=-5.0,
-        high=5.0,
+        plausible=5.0,
     )
     tip_rotation: tuple[float, float, float] = field(
         "rotation of the tip in the frame 'tip': roll, pitch and yaw about fixed axes",
         unit="rad",
         default=(0.0, 0.0, 0.0),
-        low=-2 * np.pi,
-        high=2 * np.pi,
+        plausible=2 * np.pi,
         since_version=2,
     )
     geometry: str = field(
@@ -96,12 +94,13 @@ class LimitSpec:
     velocity_scale: float = field("planning limit / URDF limit of joint velocities", default=1.0, low=1e-3, high=1.0)
     acceleration_rate: float = field("acceleration limit / velocity limit", unit="1/s", default=10.0, low=1e-3)
     acceleration_cap: float = field(
-        "maximum of the acceleration limits", unit="rad/s^2", default=20.0, low=1e-3, high=1000.0
+        "maximum of the acceleration limits", unit="rad/s^2", default=20.0, low=1e-3, plausible=1000.0
     )
     torque_scale: float = field("planning limit / URDF limit of joint torques", default=1.0, low=1e-3, high=1.0)
     position: tuple[Range, ...] | None = field(
         "limits of joint positions in place of the URDF's, one range per planned joint; required for continuous joints",
         unit="rad",
+        plausible=100.0,
         default=None,
         since_version=2,
     )
@@ -121,7 +120,7 @@ class LimitSpec:
         default=None,
         low=1e-6,
         since_version=2,
-        high=1e5,
+        plausible=1e5,
     )
     torque: PerJoint | None = field(
         "limits of joint torques in place of the URDF's", unit="N m", default=None, low=1e-6, since_version=2
@@ -137,7 +136,7 @@ class Payload:
 
     mass: float = field("mass", unit="kg", low=1e-9)
     centre: tuple[float, float, float] = field(
-        "centre of mass in the tip frame", unit="m", default=(0.0, 0.0, 0.0), low=-5.0, high=5.0
+        "centre of mass in the tip frame", unit="m", default=(0.0, 0.0, 0.0), plausible=5.0
     )
     inertia: tuple[float, float, float, float, float, float] | None = field(
         "inertia about the centre of mass along the tip frame's axes: xx, yy, zz, xy, xz, yz",
@@ -149,7 +148,7 @@ class Payload:
         unit="m",
         default=None,
         low=1e-6,
-        high=10.0,
+        plausible=10.0,
     )
 
     touch_links: tuple[str, ...] = field(
@@ -196,7 +195,7 @@ class HeldObject:
     """Upright cuboid held rigidly with its center at the tip frame."""
 
     size: tuple[float, float, float] = field(
-        "edge lengths along the tip frame's x, y, z", unit="m", low=1e-6, high=10.0
+        "edge lengths along the tip frame's x, y, z", unit="m", low=1e-6, plausible=10.0
     )
     touch_links: tuple[str, ...] = field(
         "links that carry the object and may touch it (constraint 'object-clearance')", default=(), since_version=2

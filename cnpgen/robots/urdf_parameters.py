@@ -180,10 +180,6 @@ def _joint(element: Element) -> UrdfJoint:
     for key in ("velocity", "effort"):
         if kind in _TURNING_OR_SLIDING and limits.get(key, 0.0) < 0:
             raise ValueError(f"{key}={limits[key]:g} must not be negative")
-    if kind in _LIMITED and limits.get("lower", 0.0) > limits.get("upper", 0.0):
-        raise ValueError(
-            f"its limits lower={limits['lower']:g} and upper={limits['upper']:g} are swapped: exchange them"
-        )
     ends = {tag: found.get("link", "") for tag in ("parent", "child") if (found := element.find(tag)) is not None}
     axis = np.array(numbers_in(element.find("axis"), "xyz", (1.0, 0.0, 0.0)))
     length = float(np.linalg.norm(axis))

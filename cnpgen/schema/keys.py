@@ -43,6 +43,7 @@ def field(
     default: Any = MISSING,
     low: float | None = None,
     high: float | None = None,
+    plausible: float | None = None,
     choices: tuple[str, ...] = (),
     pattern: str = "",
     form: str = "",
@@ -56,6 +57,8 @@ def field(
         default: Value of an absent key; without a default the key is required.
         low: Minimum value.
         high: Maximum value.
+        plausible: Largest plausible absolute value: larger ones in a user's file are probably in another unit. By
+            default that of the unit, ``PLAUSIBLE_MAX``.
         choices: Allowed strings.
         pattern: Regular expression that a string, or the names in a table of integers, must match.
         form: Notation of the value, if the type does not determine it.
@@ -65,7 +68,7 @@ def field(
     Returns:
         A dataclass field with this as metadata.
     """
-    bounds = {"low": low, "high": high, "choices": choices, "pattern": pattern}
+    bounds = {"low": low, "high": high, "plausible": plausible, "choices": choices, "pattern": pattern}
     return dataclasses.field(
         default=default, metadata={"doc": doc, "unit": unit, "form": form, "since_version": since_version, **bounds}
     )
@@ -88,6 +91,7 @@ class Key:
     unit: str
     low: float | None
     high: float | None
+    plausible: float | None
     choices: tuple[str, ...]
     pattern: str
     form: str

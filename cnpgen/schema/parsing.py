@@ -3,8 +3,9 @@
 import dataclasses
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from dataclasses import MISSING, dataclass
 from typing import Any, NoReturn, TypeVar, get_args, get_origin
 
@@ -15,6 +16,19 @@ from cnpgen.schema.units import PLAUSIBLE_MAX, parse_number, parse_numbers, pars
 T = TypeVar("T")
 
 MAX_UNKNOWN_KEYS = 20  # unknown keys of a table that messages name
+
+_IS_STORED = ContextVar("_IS_STORED", default=False)
+
+
+@contextmanager
+def stored_values() -> Iterator[None]:
+    """Accept implausible values in the block: those of a stored recipe, which nobody can edit."""
+    token = _IS_STORED.set(True)
+    try:
+        yield
+    finally:
+        _IS_STORED.reset(token)
+
 
 Reader = Callable[[Any, RecipeLocation, list[str]], Any]
 """Function of (TOML value, location, mistakes) that returns an object, or None after adding to the mistakes."""
@@ -98,13 +112,13 @@ class _Parser:
         if hint in self.readers:
             return self.readers[hint](value, where, self.mistakes)
         if hint in _LEAVES:
-            return _LEAVES[hint](value, key)
+            return _plausible(_LEAVES[hint](value, key), value, key)
         if dataclasses.is_dataclass(hint):
             return self.table(hint, value, where)  # type: ignore[arg-type]
         if get_origin(hint) is dict:
             return self.entries(args[1], value, key, where)
         if get_origin(hint) is tuple and args[0] is float:
-            return _floats(value, key, None if args[1] is Ellipsis else len(args))
+            return _plausible(_floats(value, key, None if args[1] is Ellipsis else len(args)), value, key)
         if get_origin(hint) is tuple:
             return self.array(args[0], None if args[1] is Ellipsis else len(args), value, key, where)
         raise ValueError(f"the type of this key, {hint}, is not one that a recipe can hold")
@@ -209,15 +223,46 @@ _Number = TypeVar("_Number", int, float)
 
 
 def _bounded(number: _Number, key: Key) -> _Number:
-    """Return a number within the bounds of its key, or within the plausible range of its unit."""
     unit = "" if key.unit == "1" else f" {key.unit}"
-    plausible = PLAUSIBLE_MAX.get(key.unit, math.inf)
-    low = -plausible if key.low is None else key.low
-    high = plausible if key.high is None else key.high
-    if low <= number <= high:
-        return number
-    bound = f"small, expected at least {low:.4g}" if number < low else f"large, expected at most {high:.4g}"
-    raise ValueError(f"{number}{unit} is too {bound}{unit}{suggested_unit(number, key.unit, low, high)}")
+    if key.low is not None and number < key.low:
+        raise ValueError(f"{number}{unit} is too small, expected at least {key.low:g}{unit}")
+    if key.high is not None and number > key.high:
+        hint = suggested_unit(number, key.unit, high=key.high)
+        raise ValueError(f"{number}{unit} is too large, expected at most {key.high:g}{unit}{hint}")
+    return number
+
+
+def _plausible(read: Any, value: Any, key: Key) -> Any:
+    """Return a value in SI; raise ValueError if it is probably in another unit.
+
+    Args:
+        read: The value in SI: a number, a range, or several numbers.
+        value: The TOML value; a hint follows only if it has no unit.
+        key: Its key.
+    """
+    limit = PLAUSIBLE_MAX.get(key.unit, math.inf) if key.plausible is None else key.plausible
+    if limit == math.inf or _IS_STORED.get():
+        return read
+    for number in _numbers_of(read):
+        if abs(number) > limit:
+            size = "small, expected at least -" if number < 0 else "large, expected at most "
+            hint = "" if _has_unit(value) else suggested_unit(number, key.unit, -limit, limit)
+            raise ValueError(f"{number} {key.unit} is too {size}{limit:.4g} {key.unit}{hint}")
+    return read
+
+
+def _numbers_of(read: Any) -> tuple[float, ...]:
+    if isinstance(read, Range):
+        return read.low, read.high
+    if isinstance(read, PerJoint):
+        return read.values
+    return read if isinstance(read, tuple) else (read,)
+
+
+def _has_unit(value: Any) -> bool:
+    """Return whether a TOML value states a unit."""
+    items = value if isinstance(value, list) else [value]
+    return any(isinstance(item, str) and bool(re.search(r"[a-zA-Z°](?![+-]?[0-9])", item)) for item in items)
 
 
 _LEAVES: dict[Any, Callable[[Any, Key], Any]] = {

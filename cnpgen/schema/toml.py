@@ -38,7 +38,7 @@ def kind_of_file(path: Path) -> Kind:
 def read_table(path: Path, kinds: tuple[Kind, ...], mistakes: list[str]) -> dict[str, Any] | None:
     """Return the top-level table of a recipe file, or None after a mistake."""
     try:
-        return _expect(kinds, _read(path))
+        return _expect(path, kinds, _read(path))
     except OSError as error:
         mistakes.append(f"{path}: cannot be read: {error.strerror}")
     except ValueError as error:
@@ -46,11 +46,13 @@ def read_table(path: Path, kinds: tuple[Kind, ...], mistakes: list[str]) -> dict
     return None
 
 
-def _expect(kinds: tuple[Kind, ...], table: dict[str, Any]) -> dict[str, Any]:
-    """Return the table; raise ValueError if it is a recipe of another kind."""
+def _expect(path: Path, kinds: tuple[Kind, ...], table: dict[str, Any]) -> dict[str, Any]:
+    """Return the table; raise ValueError if it is a recipe of another kind, with the right file beside it."""
     found = [kind for kind in MARKS if is_kind(kind, table)]
     if found and not set(found) & set(kinds):
-        raise ValueError(f"is a {found[0]}, expected a {' or a '.join(kinds)}")
+        beside = [path.parent / f"{kind}.toml" for kind in kinds]
+        hint = next((f" (did you mean {file}?)" for file in beside if file.is_file() and file != path), "")
+        raise ValueError(f"is a {found[0]}, expected a {' or a '.join(kinds)}{hint}")
     return table
 
 

@@ -92,7 +92,6 @@ def problem(tmp_path: Path) -> Problem:
     return load_problem(write_problem(tmp_path, robot='srdf = "crane.srdf"\npackages = ["."]'))
 
 
-@pytest.mark.filterwarnings("ignore:crane.srdf disables pairs")
 def test_a_record_has_the_shape_without_the_files(problem, tmp_path):
     identity, shape = problem.identity, load_robot(problem).shape
     record = record_problem(problem)
@@ -107,7 +106,6 @@ def test_a_record_has_the_shape_without_the_files(problem, tmp_path):
     assert record_problem(as_problem(record)).comparable_sha256 == record.comparable_sha256
 
 
-@pytest.mark.filterwarnings("ignore:crane.srdf disables pairs")
 def test_a_mesh_that_changes_changes_the_identity(problem, tmp_path):
     before, claw = record_problem(problem), tmp_path / "crane" / "meshes" / "claw.obj"
     claw.write_text(claw.read_text().replace("0.06", "0.0601"))
@@ -115,11 +113,6 @@ def test_a_mesh_that_changes_changes_the_identity(problem, tmp_path):
     assert after.identity != problem.identity
     assert record_problem(after).comparable_sha256 != before.comparable_sha256
     assert record_problem(after).differences(before) == ["robot.urdf"]
-
-
-def test_collisions_that_an_srdf_disables_are_warned_of_with_their_frequency(problem):
-    with pytest.warns(RuntimeWarning, match=r"disables pairs of links: .*: base and hand \([34]\.\d%\)"):
-        load_robot(problem)
 
 
 @pytest.mark.parametrize("name", ["airhockey", "heavy-object"])

@@ -15,7 +15,7 @@ from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.problems.problem_record import open_problem, record_problem
-from cnpgen.robots.robot_spec import HeldObject
+from cnpgen.robots.robot_spec import HeldObject, Payload
 from cnpgen.schema import registry
 from cnpgen.schema.keys import Range, keys
 from cnpgen.trajectory.boundary import Boundary
@@ -58,6 +58,8 @@ def changes(obj: Any) -> Iterator[tuple[str, Any]]:
             yield from ((f"{key.name}.{inner}", replace(obj, **{key.name: new})) for inner, new in changes(value))
         elif key.hint is HeldObject:
             yield key.name, replace(obj, **{key.name: HeldObject(size=(0.1, 0.1, 0.1))})
+        elif key.hint is Payload:
+            yield key.name, replace(obj, **{key.name: Payload(mass=1.5)})
         else:
             yield from ((key.name, replace(obj, **{key.name: new})) for new in other_values(value))
 

@@ -6,6 +6,7 @@ import pytest
 
 from cnpgen.errors import RecipeError
 from cnpgen.pipelines.pipeline_file import load_pipeline
+from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.schema.catalogue import find_recipe
 
@@ -57,7 +58,7 @@ def test_problems_refuse_quantities_in_another_unit(tmp_path, recipe, table, key
     file = tmp_path / "problem.toml"
     text = changed(source.read_text(encoding="utf-8"), table, key, value)
     file.write_text(re.sub(r'urdf = "([^:"]*)"', rf'urdf = "{source.parent}/\1"', text), encoding="utf-8")
-    found = mistakes(load_problem, file)
+    found = mistakes(lambda path: load_robot(load_problem(path)), file)
     assert any(f"{key}" in each and "did you mean" in each for each in found), found
 
 

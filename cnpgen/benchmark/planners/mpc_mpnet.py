@@ -31,7 +31,7 @@ class MPCMPNet(BenchmarkPlanner):
     """A tree of states, steered by the cross-entropy method towards proposals of a network (Li et al., 2021)."""
 
     witness_radius: float = field(
-        "distance of the tip within which one node is kept", unit="m", default=0.02, low=0.0, high=5.0
+        "distance of the tip within which one node is kept", unit="m", default=0.02, low=0.0, plausible=5.0
     )
     samples: int = field("controls per iteration of the cross-entropy method", default=64, low=2)
     elites: int = field("best controls, which determine the next distribution", default=4, low=1)

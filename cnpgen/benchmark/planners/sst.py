@@ -30,7 +30,7 @@ class SST(BenchmarkPlanner):
     """Stable sparse trees over the arm's states with random accelerations, to a position of the tip."""
 
     witness_radius: float = field(
-        "distance of the tip within which one node is kept", unit="m", default=0.02, low=0.0, high=5.0
+        "distance of the tip within which one node is kept", unit="m", default=0.02, low=0.0, plausible=5.0
     )
     max_steps: int = field("largest number of steps of 5 ms of a control", default=20, low=1)
     goal_bias: float = field("share of samples that are the goal", default=0.05, low=0.0, high=1.0)

@@ -1,7 +1,7 @@
 """An arm in a URDF: its frames and links, the joints that move a tip, and missing limits."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from cnpgen.robots.urdf_parameters import LinkInertia, UrdfJoint, urdf_parameter
 
 DEFAULT_RANGE_RAD, DEFAULT_RANGE_M = math.pi, 0.5  # ranges to either side, where the URDF has none
 MAX_INERTIA_ERROR = 0.01  # relative; published URDFs round their numbers
+MAX_LIMITED_RAD = 1000.0  # largest limit of a revolute joint that is one
 DEFAULT_SPEED = 1.0  # rad/s or m/s, where the URDF has none
 
 
@@ -95,6 +96,8 @@ def read_arm(urdf: Path, tip: str | None) -> Arm:
     with mistakes_in(urdf):
         parameters = urdf_parameters(tree)
     links, joints = list(parameters.inertias), parameters.joints
+    if not links:
+        raise RecipeError([f"{urdf}: has no <link>, expected a URDF (an SRDF is given by --srdf)"])
     tip = tip if tip is not None else _only_leaf(urdf, links, joints)
     if text := missing_frame(tree, urdf, tip):
         raise UsageError(f"--tip: {text}")
@@ -116,6 +119,26 @@ def read_arm(urdf: Path, tip: str | None) -> Arm:
         shaped=tuple(link.get("name", "") for link in tree.findall("link") if link.find("collision") is not None),
         meshes=tuple(mesh.get("filename", "") for mesh in tree.iterfind("link//mesh")),
     )
+
+
+def arm_notes(arm: Arm) -> Iterator[str]:
+    """Yield a sentence for each finding: planned joints, placeholders of limits, and links without mass."""
+    yield f"the tip is {arm.tip}; planned joints: {', '.join(joint.name for joint in arm.planned)}"
+    placeholders = {
+        "position": f"{DEFAULT_RANGE_RAD:.3g} rad or {DEFAULT_RANGE_M:g} m to either side",
+        "velocity": f"{DEFAULT_SPEED:g} rad/s or m/s",
+        "torque": "the largest torque of random states in motion",
+    }
+    for limit, placeholder in placeholders.items():
+        if joints := [joint.name for joint in arm.planned if limit in joint.missing]:
+            reason = ", or the joint is continuous" if limit == "position" else ", or it is zero"
+            text = f"the URDF has no {limit} limit of {', '.join(joints)}{reason}"
+            yield f"{text}: [limits] has a placeholder, {placeholder}; enter the value of the data sheet"
+    if light := [link for link in arm.moved if link in arm.shaped and not arm.masses.get(link)]:
+        yield f"no mass: {', '.join(light)}"
+    if arm.impossible:
+        text = "a principal inertia is negative or exceeds the sum of the others; torques may be wrong"
+        yield f"no body has the <inertia> of {', '.join(arm.impossible)}: {text}"
 
 
 def with_torques(arm: Arm, torques: list[float]) -> Arm:
@@ -156,10 +179,11 @@ def _moves(joint: UrdfJoint) -> bool:
 
 
 def _joint(joint: UrdfJoint) -> ArmJoint:
-    """Fill in missing limits of a joint."""
+    """Fill in missing limits of a joint; limits of many turns stand for none."""
     lower, upper, velocity, effort = (joint.limits.get(key, 0.0) for key in ("lower", "upper", "velocity", "effort"))
+    endless = joint.kind == "revolute" and max(abs(lower), abs(upper)) > MAX_LIMITED_RAD
     missing = {
-        "position": joint.kind == "continuous" or lower == upper,
+        "position": joint.kind == "continuous" or lower == upper or endless,
         "velocity": velocity == 0,
         "torque": effort == 0,
     }

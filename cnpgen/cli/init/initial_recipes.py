@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.cli.init.arm import Arm, ArmJoint, with_torques
+from cnpgen.cli.init.arm import Arm, ArmJoint, arm_notes, with_torques
 from cnpgen.cli.init.draws import MAX_LOAD, comfortable_base, find_boxes
 from cnpgen.cli.init.link_overlaps import LinkOverlaps, resolve_overlaps
 from cnpgen.make.recipe import DatasetRecipe
@@ -76,18 +76,17 @@ def problem_of(arm: Arm, name: str, folder: Path, packages: tuple[Path, ...], sr
         problem = overlaps.problem if overlaps else problem
         robot = load_robot(problem)
     notes += overlaps.notes if overlaps else ()
-    if arm.impossible:
-        text = "a principal inertia is negative or exceeds the sum of the others; torques may be wrong"
-        notes.append(f"no body has the <inertia> of {', '.join(arm.impossible)}: {text}")
     arm, overloaded = _with_torque_limits(arm, robot)
     limits = replace(problem.limits, **_replaced_limits(arm))
     problem = _with_jerk_limits(replace(problem, limits=limits), robot)
     if robot.chain.joints[-1].mass > 0:  # torques of links without masses are meaningless
         limit = JointTorque(tolerance=5e-3, budget=6e-2)
         problem = replace(problem, constraint=(*problem.constraint[:4], limit, *problem.constraint[4:]))
+    else:
+        notes.append("no mass that the last joint moves: its torques have no meaning, so 'joint-torque' is omitted")
     base, base_notes = comfortable_base(problem, load_robot(problem))
     problem = replace(problem, robot=replace(problem.robot, base=base))
-    return InitialProblem(problem, arm, overlaps, (*notes, *overloaded, *base_notes))
+    return InitialProblem(problem, arm, overlaps, (*arm_notes(arm), *notes, *overloaded, *base_notes))
 
 
 def dataset_of(initial: InitialProblem, folder: Path) -> tuple[DatasetRecipe, float]:
@@ -150,12 +149,12 @@ def _problem(arm: Arm, name: str, folder: Path, packages: tuple[Path, ...], srdf
 
 @contextmanager
 def _warnings_as_notes() -> Iterator[list[str]]:
-    """Collect the warnings of the block, such as those about simplified meshes: the last one of each subject."""
+    """Collect the warnings of the block, such as those about simplified meshes, in a list without repetitions."""
     notes: list[str] = []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         yield notes
-    notes += {text.partition(": ")[0]: text for text in (str(each.message) for each in caught)}.values()
+    notes += dict.fromkeys(str(each.message) for each in caught)
 
 
 def _replaced_limits(arm: Arm) -> dict[str, Any]:

@@ -1,13 +1,16 @@
 """Convex parts of an arm's links, chosen by the free space that they reject, and pairs in permanent contact."""
 
 import sys
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import takewhile
 
+from cnpgen.errors import listed
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.shape.hull_gap import GAP_STATES, HullGap, PairGap, measure_hull_gap
 from cnpgen.robots.shape.inline import mesh_links
+from cnpgen.robots.shape.link_pairs import LinkPair
 from cnpgen.robots.urdf import read_urdf
 
 MAX_GAP = 0.01  # fraction of the free states that convex parts may reject without further decomposition
@@ -16,6 +19,8 @@ LARGE_PAIR_GAP = 0.02  # of a pair that a note names
 PART_COUNTS = (4, 8, 16)  # maximum numbers of convex parts of a mesh, in the order in which they are tried
 MIN_FREE_FRACTION = 0.01  # of the sampled states, below which pairs in contact are ignored
 MAX_IGNORED_PAIRS = 20
+LARGE_COLLIDING_FRACTION = 0.1  # of the random states, from which on a note names a pair
+MAX_LISTED_PAIRS = 6  # of a note
 
 
 @dataclass(frozen=True)
@@ -47,10 +52,7 @@ def resolve_overlaps(problem: Problem) -> LinkOverlaps:
     hulls = _gap(problem)
     problem, parts = _decompose(problem, hulls)
     problem, parts, contacts = _ignore_contacts(problem, parts)
-    always = [pair for pair in load_robot(problem).shape.pairs if pair.left_out == "always"]  # type: ignore[union-attr]
-    if always:
-        names = "; ".join(f"{pair.first}, {pair.second}" for pair in always)
-        contacts.append(f"not checked, since they are always in contact: {names}")
+    contacts += _pair_notes(load_robot(problem).shape.pairs, {*map(frozenset, problem.robot.ignored_pairs)})  # type: ignore[union-attr]
     problem = replace(problem, robot=replace(problem.robot, hull_gap=round(parts.fraction, 4)))
     return LinkOverlaps(problem, hulls, parts, (*_gap_notes(problem, hulls, parts), *contacts))
 
@@ -96,6 +98,26 @@ def _ignore_contacts(problem: Problem, gap: HullGap) -> tuple[Problem, HullGap, 
     )
 
 
+def _pair_notes(pairs: Sequence[LinkPair], ignored: set[frozenset[str]]) -> Iterator[str]:
+    """Yield sentences about pairs in permanent contact, pairs that collide often, and pairs that an SRDF disables."""
+    if always := [pair for pair in pairs if pair.left_out == "always"]:
+        names = "; ".join(f"{pair.first}, {pair.second}" for pair in always)
+        yield f"not checked, since they are always in contact: {names}"
+    often = [pair for pair in pairs if not pair.left_out and pair.colliding > LARGE_COLLIDING_FRACTION]
+    if often:
+        remedy = "if that is impossible, pass --srdf or name the pair in 'ignored_pairs'"
+        yield f"these links collide in many states: {_shares(often)}; {remedy}"
+    disabled = [pair for pair in pairs if pair.left_out == "disabled" and pair.colliding > 0]
+    if missed := [pair for pair in disabled if frozenset((pair.first, pair.second)) not in ignored]:
+        yield f"the SRDF disables links that collide, and these collisions are not noticed: {_shares(missed)}"
+
+
+def _shares(pairs: list[LinkPair]) -> str:
+    """List pairs with their fractions of the random states, the largest first."""
+    pairs = sorted(pairs, key=lambda pair: -pair.colliding)
+    return listed([f"{pair.first} and {pair.second} ({pair.colliding:.1%})" for pair in pairs], most=MAX_LISTED_PAIRS)
+
+
 def _overlap(pair: PairGap) -> str:
     shares = f"their convex parts overlap in {pair.parts:.1%} of the random states, their meshes in {pair.meshes:.1%}"
     return f"{pair.first}, {pair.second} ({shares})"
@@ -103,11 +125,12 @@ def _overlap(pair: PairGap) -> str:
 
 def _gap_notes(problem: Problem, hulls: HullGap, parts: HullGap) -> list[str]:
     """Report the gaps before and after the decomposition."""
-    text = "of the random states in which no meshes overlap are rejected by the"
-    notes = [f"{hulls.fraction:.2%} {text} convex hulls of the meshes"]
+    if not mesh_links(read_urdf(problem.urdf_path)):
+        return []
+    text = f"free space: convex hulls of the meshes reject {hulls.fraction:.2%} of the states that the meshes accept"
     if problem.robot.decomposed:
-        links = ", ".join(problem.robot.decomposed)
-        notes.append(f"{parts.fraction:.2%} {text} convex parts; decomposed: {links}")
+        text += f", the convex parts {parts.fraction:.2%}; decomposed: {', '.join(problem.robot.decomposed)}"
+    notes = [text]
     for pair in takewhile(lambda pair: pair.rejected > LARGE_PAIR_GAP, parts.pairs):
         rejected = f"the pair {pair.first}, {pair.second} rejects {pair.rejected:.2%} of them"
         notes.append(f"{rejected}: finer convex parts of its links or 'ignored_pairs' would accept them")

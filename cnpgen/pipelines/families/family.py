@@ -47,14 +47,14 @@ class Layout:
         check_fields(self)
 
 
-def length(doc: str, default: Range, *, low: float = -MAX_LENGTH_M) -> Any:
+def length(doc: str, default: Range, *, low: float | None = None) -> Any:
     """Declare a range of lengths around an arm; see ``field``."""
-    return field(doc, unit="m", default=default, low=low, high=MAX_LENGTH_M)
+    return field(doc, unit="m", default=default, low=low, plausible=MAX_LENGTH_M)
 
 
 def angle(doc: str, default: Range) -> Any:
     """Declare a range of angles; see ``field``."""
-    return field(doc, unit="rad", default=default, low=-2 * np.pi, high=2 * np.pi)
+    return field(doc, unit="rad", default=default, plausible=2 * np.pi)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,7 +23,7 @@ class BehindPuck(Stage):
         "distance of the centres of puck and mallet at contact: sum of the radii",
         unit="m",
         low=0.0,
-        high=1.0,
+        plausible=1.0,
     )
 
     def describe(self) -> str:

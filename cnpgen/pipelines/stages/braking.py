@@ -34,7 +34,7 @@ class BrakingReach(Stage):
 
     inputs = ("start_q", "start_dq", "goal_q", "goal_dq")
     margin: float = field(
-        "distance before the edge at which full braking must end", unit="m", default=1e-3, low=0.0, high=1.0
+        "distance before the edge at which full braking must end", unit="m", default=1e-3, low=0.0, plausible=1.0
     )
 
     def describe(self) -> str:

@@ -23,7 +23,7 @@ class DrawPositions(Stage):
     start: tuple[Range, Range, Range] = field("box of start positions: x, y, z", unit="m")
     goal: tuple[Range, Range, Range] = field("box of goal positions: x, y, z", unit="m")
     min_distance: float = field(
-        "minimum horizontal distance of start and goal", unit="m", default=0.0, low=0.0, high=10.0
+        "minimum horizontal distance of start and goal", unit="m", default=0.0, low=0.0, plausible=10.0
     )
 
     def describe(self) -> str:
@@ -59,7 +59,9 @@ class DrawGoal(Stage):
 
     inputs = ("start_xyz",)
     goal: tuple[Range, Range, Range] = field("box of goal positions: x, y, z", unit="m")
-    min_distance: float = field("minimum horizontal distance from the start", unit="m", default=0.0, low=0.0, high=10.0)
+    min_distance: float = field(
+        "minimum horizontal distance from the start", unit="m", default=0.0, low=0.0, plausible=10.0
+    )
 
     def describe(self) -> str:
         """Describe the stage in one sentence."""

@@ -14,6 +14,7 @@ from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.candidate_table import upright_axes
 from cnpgen.pipelines.stages.draw import uniform
 from cnpgen.pipelines.stages.stage import CandidateBatch, Stage, StageFunction
+from cnpgen.robots.plausible_values import find_implausible_value
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import Range, field
 from cnpgen.store.field import Field
@@ -33,7 +34,9 @@ class _IK(Stage):
     """Base class: Gauss-Newton inverse kinematics with clipped steps that saturate at the joint limits."""
 
     orientation: str = field("required orientation of the tip", choices=("free", "vertical"), default="free")
-    max_step: float = field("maximum change of a joint per iteration", unit="rad", default=0.4, low=1e-3, high=np.pi)
+    max_step: float = field(
+        "maximum change of a joint per iteration", unit="rad", default=0.4, low=1e-3, plausible=np.pi
+    )
 
     def _solve(self, context: Context, end: str, initial: str, *, hold: bool = False) -> StageFunction:
         options = {"vertical": self.orientation == "vertical", "max_step": self.max_step, "hold": hold}
@@ -91,6 +94,11 @@ class GuessedIK(_IK):
         n = context.robot.n
         if self.guess and len(self.guess) != n:
             raise RecipeError([f"guess: needs {n} ranges, one per planned joint, got {len(self.guess)}"])
+        for index, each in enumerate(self.guess):
+            ends = np.full((2, n), context.robot.base)
+            ends[:, index] = each.low, each.high
+            if wrong := find_implausible_value(context.robot, "guess_q", ends, context.robot.units("rad")):
+                raise RecipeError([f"guess: {context.robot.joint_names[index]}: {wrong}"])
         guess = self.guess or tuple(Range(float(x), float(x)) for x in context.robot.base)
 
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:

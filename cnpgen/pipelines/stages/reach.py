@@ -18,8 +18,8 @@ from cnpgen.schema.keys import field
 class BallisticReach(Stage):
     """Stage: the tip at constant velocity, ``p + v t``, stays over the table after the start and around the goal."""
 
-    start_time: float = field("time ahead of the start", unit="s", default=0.0, low=0.0, high=5.0)
-    goal_time: float = field("time ahead of the goal and before it", unit="s", default=0.0, low=0.0, high=5.0)
+    start_time: float = field("time ahead of the start", unit="s", default=0.0, low=0.0, plausible=5.0)
+    goal_time: float = field("time ahead of the goal and before it", unit="s", default=0.0, low=0.0, plausible=5.0)
 
     @property
     def inputs(self) -> tuple[str, ...]:

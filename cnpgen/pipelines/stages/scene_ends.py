@@ -46,14 +46,14 @@ class SceneEnds(Stage):
         unit="rad",
         default=0.1,
         low=0.0,
-        high=np.pi,
+        plausible=np.pi,
     )
     margin: float = field(
         "distance of both ends from obstacles, in addition to that of the problem",
         unit="m",
         default=0.005,
         low=0.0,
-        high=1.0,
+        plausible=1.0,
     )
     straight: float = field(
         "share of the samples whose straight line may be free of collisions", default=0.1, low=0.0, high=1.0

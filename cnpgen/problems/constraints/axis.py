@@ -109,7 +109,7 @@ class Axis(TipAxis):
     axis: Vector = field("axis in the tip frame, of any length", default=(0.0, 0.0, 1.0))
     direction: Vector = field("direction in the world, of any length", default=(0.0, 0.0, 1.0))
     angle: float = field("maximum angle between axis and direction", unit="rad", default=0.0, low=0.0, high=1.5)
-    tolerance: float = field("additional angle that a valid motion may have", unit="rad", low=1e-9, high=1.0)
+    tolerance: float = field("additional angle that a valid motion may have", unit="rad", low=1e-9, plausible=1.0)
 
     def __post_init__(self) -> None:
         """Check both directions.

@@ -36,7 +36,7 @@ class RobotClearance(Constraint):
         unit="m",
         low=1e-6,
         default=None,
-        high=2.0,
+        plausible=2.0,
     )
     distance: float = field(
         "minimum distance of the robot from obstacles",
@@ -44,14 +44,14 @@ class RobotClearance(Constraint):
         low=0.0,
         default=0.0,
         since_version=2,
-        high=2.0,
+        plausible=2.0,
     )
     tolerance: float = field(
         "violation that a valid motion may have; links may enter obstacles by 0.1 mm, the paper's capsules by all"
         " of it",
         unit="m",
         low=0.0,
-        high=0.5,
+        plausible=0.5,
     )
 
     @property
@@ -125,8 +125,8 @@ class ObjectContact(Constraint):
 
     reason = "object in collision"
     training_weight, training_inset = 3e4, 5e-4  # the inset in m
-    depth: float = field("depth of legal contact", unit="m", low=0.0, high=0.5)
-    tolerance: float = field("additional depth that a valid motion may have", unit="m", low=0.0, high=0.5)
+    depth: float = field("depth of legal contact", unit="m", low=0.0, plausible=0.5)
+    tolerance: float = field("additional depth that a valid motion may have", unit="m", low=0.0, plausible=0.5)
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the separation of the object from every obstacle [m]."""

@@ -65,7 +65,7 @@ class JointPosition(Constraint):
 
     reason = "joint position limit"
     training_weight, training_factor = 4000.0, 0.999
-    tolerance: float = field("violation that a valid motion may have", unit="rad", low=0.0, high=1.0)
+    tolerance: float = field("violation that a valid motion may have", unit="rad", low=0.0, plausible=1.0)
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the limits on q [rad]."""

@@ -20,8 +20,10 @@ class Line(TipManifold):
     point: Vector = field("point of the line", unit="m")
     direction: Vector = field("direction of the line, of any length")
     piece: Range | None = field("range of the tip along the line, from the point", unit="m", default=None)
-    start_band: float = field("violation that the start of a motion may have", unit="m", default=0.0, low=0.0, high=0.5)
-    tolerance: float = field("violation that a valid motion may have", unit="m", low=1e-9, high=0.5)
+    start_band: float = field(
+        "violation that the start of a motion may have", unit="m", default=0.0, low=0.0, plausible=0.5
+    )
+    tolerance: float = field("violation that a valid motion may have", unit="m", low=1e-9, plausible=0.5)
 
     def __post_init__(self) -> None:
         """Check the direction.

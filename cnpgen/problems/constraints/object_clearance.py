@@ -31,8 +31,10 @@ class ObjectClearance(Constraint):
     reason = "object in collision with the robot"
     uses_obstacles = False
     training_weight = 3000.0
-    distance: float = field("minimum distance of the object from the links", unit="m", low=0.0, default=0.0, high=2.0)
-    tolerance: float = field("violation that a valid motion may have", unit="m", low=0.0, default=0.0, high=0.5)
+    distance: float = field(
+        "minimum distance of the object from the links", unit="m", low=0.0, default=0.0, plausible=2.0
+    )
+    tolerance: float = field("violation that a valid motion may have", unit="m", low=0.0, default=0.0, plausible=0.5)
 
     @property
     def effective_tolerance(self) -> float:

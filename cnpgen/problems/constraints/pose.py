@@ -32,7 +32,7 @@ class Pose(TipManifold):
     inside_name, held_name = "pose box", "pose position"
     velocity_name, acceleration_name = "velocity out of the pose", "acceleration out of the pose"
     rpy: tuple[float, float, float] = field(
-        "orientation in the world: roll, pitch, yaw, as in a URDF", unit="rad", low=-2 * np.pi, high=2 * np.pi
+        "orientation in the world: roll, pitch, yaw, as in a URDF", unit="rad", plausible=2 * np.pi
     )
     x: Range | None = field("range of the tip along world x", unit="m", default=None)
     y: Range | None = field("range of the tip along world y", unit="m", default=None)

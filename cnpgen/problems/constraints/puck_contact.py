@@ -52,13 +52,13 @@ class PuckContact(Constraint):
     training_weight = 3e6
     has_solver_margin = True
     scene_width = 4
-    mallet_radius: float = field("radius of the mallet", unit="m", low=1e-6, high=0.5)
-    puck_radius: float = field("radius of the puck", unit="m", low=1e-6, high=0.5)
+    mallet_radius: float = field("radius of the mallet", unit="m", low=1e-6, plausible=0.5)
+    puck_radius: float = field("radius of the puck", unit="m", low=1e-6, plausible=0.5)
     contact_distance: float = field(
-        "distance of the centres of mallet and puck at the goal", unit="m", low=0.0, high=1.0
+        "distance of the centres of mallet and puck at the goal", unit="m", low=0.0, plausible=1.0
     )
-    last: float = field("length of the end of the path on which contact is allowed", unit="m", low=1e-6, high=0.5)
-    tolerance: float = field("violation that a valid motion may have", unit="m", low=0.0, high=0.5)
+    last: float = field("length of the end of the path on which contact is allowed", unit="m", low=1e-6, plausible=0.5)
+    tolerance: float = field("violation that a valid motion may have", unit="m", low=0.0, plausible=0.5)
 
     def find_mistakes(self) -> Iterator[tuple[str, str]]:
         """Yield (key, mistake) pairs."""

@@ -29,8 +29,8 @@ class SelfClearance(Constraint):
 
     reason = "robot in collision with itself"
     uses_obstacles = False
-    distance: float = field("minimum distance of links", unit="m", low=0.0, default=0.0, high=2.0)
-    tolerance: float = field("violation that a valid motion may have", unit="m", low=0.0, high=0.5)
+    distance: float = field("minimum distance of links", unit="m", low=0.0, default=0.0, plausible=2.0)
+    tolerance: float = field("violation that a valid motion may have", unit="m", low=0.0, plausible=0.5)
 
     @property
     def effective_tolerance(self) -> float:

@@ -36,9 +36,9 @@ class Table(TipManifold):
     y: Range = field("range of the tip along world y", unit="m")
     z: float = field("height of the tip with the mallet on the table", unit="m")
     start_band: float = field(
-        "height error that the start of a motion may have", unit="m", default=0.0, low=0.0, high=0.5
+        "height error that the start of a motion may have", unit="m", default=0.0, low=0.0, plausible=0.5
     )
-    tolerance: float = field("violation that a valid motion may have", unit="m", low=1e-9, high=0.5)
+    tolerance: float = field("violation that a valid motion may have", unit="m", low=1e-9, plausible=0.5)
 
     @cached_property
     def place(self) -> TipRegion:

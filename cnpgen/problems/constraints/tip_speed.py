@@ -21,7 +21,7 @@ class TipSpeed(Constraint):
 
     reason = "tip too fast"
     limit: float = field("maximum speed of the tip", unit="m/s", low=1e-6)
-    tolerance: float = field("additional speed that a valid motion may have", unit="m/s", low=0.0, high=1.0)
+    tolerance: float = field("additional speed that a valid motion may have", unit="m/s", low=0.0, plausible=1.0)
 
     def allowed(self, condition: Condition) -> NDArray[np.float64]:
         """Return the tolerance of the square of the speed [m^2/s^2]."""

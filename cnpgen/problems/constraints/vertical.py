@@ -12,7 +12,7 @@ class Vertical(TipAxis):
     """Constraint: the tip's z axis points up, a special case of ``axis``: ``R_02 = R_12 = 0`` and ``R_22 > 0``."""
 
     reason = "not vertical"
-    tolerance: float = field("tilt that a valid motion may have", unit="rad", low=1e-9, high=1.0)
+    tolerance: float = field("tilt that a valid motion may have", unit="rad", low=1e-9, plausible=1.0)
 
     @cached_property
     def directions(self) -> tuple[list[float], list[float]]:

@@ -18,13 +18,15 @@ def with_disabled_pairs(urdf: str, srdf: Path) -> str:
         srdf: Path of the SRDF file.
 
     Raises:
-        RecipeError: The SRDF cannot be read, or names links that the URDF does not have.
+        RecipeError: The SRDF cannot be read, is a URDF, or names links that the URDF does not have.
     """
     try:
-        entries = list(urdf_tree(read_urdf(srdf)).iter(_TAG))
+        tree = urdf_tree(read_urdf(srdf))
     except ValueError as error:
         raise RecipeError([f"{srdf}: not an SRDF that can be read: {error}"]) from error
-    return _with_entries(urdf, [dict(entry.attrib) for entry in entries], str(srdf))
+    if tree.find("link") is not None:
+        raise RecipeError([f"{srdf}: is a URDF, expected an SRDF with <{_TAG}> elements"])
+    return _with_entries(urdf, [dict(entry.attrib) for entry in tree.iter(_TAG)], str(srdf))
 
 
 def with_ignored_pairs(urdf: str, pairs: Iterable[tuple[str, str]]) -> str:
