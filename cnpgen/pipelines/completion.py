@@ -83,6 +83,11 @@ class Completion:
             self._name_touching_starts(candidates)
         return candidates
 
+    def tip_positions(self, q: Array) -> Array:
+        """Compute tip positions [m], shape (3, N), at joint positions q [rad], shape (n, N)."""
+        (position,) = self._tip(np.ascontiguousarray(q))
+        return np.asarray(position)
+
     def rows(self, tasks: TaskBatch) -> dict[str, Array]:
         """Return the fields of the M solved tasks in the layout of a dataset.
 
@@ -114,7 +119,7 @@ class Completion:
             if name == "start_q":
                 candidates[name] = np.repeat(self.context.robot.base[:, None], candidates.size, axis=1)
             else:
-                (candidates[name],) = self._tip(candidates[name.replace("xyz", "q")])
+                candidates[name] = self.tip_positions(candidates[name.replace("xyz", "q")])
 
     def _on_table(self, values: Array, parameters: Array | None) -> Array:
         """Return positions on the table of the tasks, shape (2, N), in the world frame, shape (3, N)."""

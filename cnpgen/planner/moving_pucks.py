@@ -14,12 +14,16 @@ from cnpgen.planner.planner import Planner, plan_tasks
 from cnpgen.planner.puck_model import PuckModel
 from cnpgen.plans.boundary_file import CONTEXT
 from cnpgen.plans.plans import Plans
+from cnpgen.problems.constraints.puck_contact import PuckContact
 from cnpgen.schema.arguments import check_range, numbers
 
 Array = NDArray[np.float64]
 
 MAX_MEETING_TIME_S = 60.0
 MAX_PUCK_SPEED_M_S = 20.0
+EARLY_CONTACT_PHASES = 65  # at which early contacts are checked; motion between them is straight
+EARLY_CONTACT_MARGIN_M = 2e-3  # of the mallet's path before the contact, on which it is no early one
+MAX_EARLY_DEPTH_M = 5e-4
 MAX_MEETING_ITERATIONS = 12
 MAX_MEETING_ERROR_S = 1e-4  # of the time at which mallet and puck meet
 EXPECTED_HIT_SPEED_M_S = 1.5  # of the first iteration
@@ -42,6 +46,11 @@ class Meeting:
     distance: float
     overlap: float
     time: ArrayLike | None
+
+    def touches(self, puck: Array, mallet: Array) -> NDArray[np.bool_]:
+        """Return whether pucks and mallets touch, at positions of any equal shape (..., 2) [m]."""
+        touching: NDArray[np.bool_] = np.hypot(*np.moveaxis(puck - mallet, -1, 0)) < self.distance + self.overlap
+        return touching
 
 
 def plan_moving_hits(  # noqa: PLR0917 - in the order of plan_hits
@@ -101,7 +110,55 @@ def plan_moving_hits(  # noqa: PLR0917 - in the order of plan_hits
         accepted = delay >= 0
     for row in active[~accepted].tolist():
         reasons[row] = reason
+    touched = _touched_early(completion, meeting, hits, plans, delay)
+    for row in active[accepted & touched].tolist():
+        reasons[row] = PuckContact.reason
+    touching = meeting.touches(hits.puck, completion.tip_positions(hits.state[0].T)[:2].T)
+    for row in np.flatnonzero(touching).tolist():
+        reasons[row] = PuckContact.boundary_reason
+    accepted &= ~touched & ~touching[active]
     return hits.with_pucks(plans[accepted], meeting.model, delay[accepted]), tuple(reasons), delay[accepted]
+
+
+def _touched_early(
+    completion: Completion, meeting: Meeting, hits: _Hits, plans: Plans, delay: Array
+) -> NDArray[np.bool_]:
+    """Return whether moving pucks touch the mallet before the meeting, while it waits or moves.
+
+    Args:
+        completion: The stages, for tip positions.
+        meeting: Rules of the meeting.
+        hits: All hits.
+        plans: M plans; ``plans.sample_id`` is the index of each hit.
+        delay: Waiting times before the plans [s], shape (M,); negative ones belong to hits that are too late.
+    """
+    if not len(plans):
+        return np.zeros(0, bool)
+    phases, rows, speed = np.linspace(0, 1, EARLY_CONTACT_PHASES), plans.sample_id, plans.columns["hit_speed"]
+    q = np.asarray(plans.motion.at(phases).q)
+    moving = completion.tip_positions(q.reshape(-1, q.shape[2]).T)[:2].T.reshape(*q.shape[:2], 2)
+    start = np.maximum(delay, 0.0)[:, None]
+    times = start + plans.motion.time_at(phases)
+    before = times <= times[:, -1:] - (meeting.overlap + EARLY_CONTACT_MARGIN_M) / speed[:, None]
+    parts = [(moving, times, before)]
+    if start.any():
+        parts.append((np.repeat(moving[:, :1], len(phases), axis=1), start * phases, np.ones_like(before)))
+    touched = np.zeros(len(plans), bool)
+    for mallet, time, is_early in parts:
+        puck, velocity = (np.repeat(values[rows], len(phases), axis=0) for values in (hits.puck, hits.velocity))
+        relative = meeting.model.predict(puck, velocity, time.ravel())[0].reshape(mallet.shape) - mallet
+        distance = _distances_to_origin(relative[:, :-1], relative[:, 1:])
+        touching = distance < meeting.distance + meeting.overlap - MAX_EARLY_DEPTH_M
+        touched |= (touching & is_early[:, 1:]).any(axis=1)
+    return touched
+
+
+def _distances_to_origin(first: Array, second: Array) -> Array:
+    """Return the distances of segments from the origin, for ends of shape (..., 2)."""
+    along = second - first
+    length = np.maximum(np.sum(along**2, axis=-1), 1e-18)
+    share = np.clip(-np.sum(first * along, axis=-1) / length, 0.0, 1.0)
+    return np.asarray(np.linalg.norm(first + share[..., None] * along, axis=-1))
 
 
 class _Hits:

@@ -96,6 +96,22 @@ def test_the_contact_reverses_the_approach_and_friction_ends_sliding():
     assert abs((weak - before)[0] @ tangent) == pytest.approx(0.005 * normal_impulse)
 
 
+def test_pucks_that_touch_the_mallet_before_the_meeting_have_a_reason(planner, still):
+    tip = Arm(open_problem(planner.model.problem)[1]).pose(still[0]).translation[:2]
+    random = np.random.default_rng(3)
+    angle, distance = random.uniform(-np.pi, np.pi, 50), random.uniform(0, CONTACT_RANGE - 1e-4, 50)
+    near = tip + distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    for options in ({"meeting_time": 2.0, "puck_velocity": [-0.1, 0.05]}, {"puck_velocity": [0.3, 0.05]}):
+        assert set(plan_hits(planner, still, near, TARGET, **options).reasons) == {"start touches the puck"}
+    crossing = tip + [0.3, -0.3], np.array([0.0, 0.35])  # beside the mallet
+    model = PuckModel(drag=0.0)
+    free = plan_hits(planner, still, crossing[0], TARGET, puck_velocity=crossing[1], meeting_time=0.9, puck_model=model)
+    assert free.reasons == ("",)
+    through = tip + [0.229, -0.147], np.array([-0.405, 0.26])  # through the waiting mallet, and back from the bands
+    met = plan_hits(planner, still, through[0], TARGET, puck_velocity=through[1], meeting_time=2.057, puck_model=model)
+    assert met.reasons == ("early contact with the puck",)
+
+
 @pytest.mark.parametrize("friction", [0.0, 0.1, 1.0])
 def test_hits_in_the_computed_directions_send_pucks_to_the_target(pucks, friction):
     model, speed = PuckModel(restitution=0.5, friction=friction), np.full(40, 1.4)
