@@ -11,7 +11,7 @@ With ``--reference``, hits of the first planner that are not valid after refinin
 50 configurations on the table, for at most 60 s each. The target is 97 % of all hits that either method solves.
 
     python benchmarks/puck_contact.py
-    python benchmarks/puck_contact.py --hits 300 --seed 777302 --reference --simulate 300
+    python benchmarks/puck_contact.py --hits 300 --seed 27112811 --reference --simulate 300
 """
 
 import argparse

@@ -16,6 +16,7 @@ from cnpgen.problems.problem import Problem
 from cnpgen.schema import registry
 from cnpgen.schema.keys import Key, Range, keys
 from cnpgen.schema.toml import Kind
+from cnpgen.schema.units import PLAUSIBLE_MAX
 
 FILES: dict[Kind, type] = {"problem": Problem, "pipeline": Pipeline, "dataset": DatasetRecipe, "suite": Suite}
 """Kind of a file -> type of its recipe."""
@@ -23,14 +24,18 @@ FILES: dict[Kind, type] = {"problem": Problem, "pipeline": Pipeline, "dataset": 
 GROUPS = {Stage: registry.STAGES, Constraint: registry.CONSTRAINTS, ObjectiveTerm: registry.OBJECTIVES}
 """Tables with a key ``use`` that names their kind -> registry of the kinds."""
 
-_INTRODUCTION = """\
+_INTRODUCTION = f"""\
 # Keys of recipe files
 
 All keys of recipe files, with their values, defaults and meanings.
 `cnpgen show --keys` prints this page, `cnpgen show --keys pipeline` one part of it, and `--json` the same for programs.
 
 A number without a unit is in SI. A string may carry another unit of the same dimension: `"20 ms"`, `"[-170, 170] deg"`,
-`"5 %"`. A range is `"[low, high] unit"`; a single number is a range of one point."""
+`"5 %"`. A range is `"[low, high] unit"`; a single number is a range of one point.
+
+Values that are probably in another unit are refused with a suggestion. The largest absolute values are
+{", ".join(f"{value:,.4g} {unit}" for unit, value in PLAUSIBLE_MAX.items())}. Keys of small
+quantities, such as tolerances, have smaller ones. Limits and sizes are also compared with those of the URDF."""
 
 
 def kind_summary(kind: type) -> str:

@@ -106,12 +106,19 @@ def _text(file: Path, found: "Simulation") -> str:
     ]
     figures = [
         (text, form.format(summary["medians"][name]))
-        for name, (text, form) in _FIGURES.items()
+        for name, (text, form) in _figures(found).items()
         if name in summary["medians"]
     ]
     lines = [head, "", *table(tallies, indent="  ", right=(1, 2)), "", "  medians", *table(figures, indent="    ")]
     refused = [(index, each.failure) for index, each in enumerate(found.executed) if each.failure]
     return "\n".join(lines + [f"  plan {index} was not executed: {why}" for index, why in refused])
+
+
+def _figures(found: "Simulation") -> dict[str, tuple[str, str]]:
+    """Return the figures that are shown, with text and format; that of the tilt only if a constraint limits it."""
+    uses = {constraint.get("use") for constraint in found.plans.problem.content.get("constraint", [])}
+    hidden = set() if uses & {"vertical", "axis", "pose"} else {"vertical_error_rad_s"}
+    return {name: figure for name, figure in _FIGURES.items() if name not in hidden}
 
 
 def _lines(found: "Simulation") -> list[str]:
@@ -120,7 +127,7 @@ def _lines(found: "Simulation") -> list[str]:
     for index, each in enumerate(found.executed):
         row = each.to_dict()
         flags = [text for name, text in _NAMES.items() if row.get(name) is True]
-        figures = [f"{text} {form.format(row[name])}" for name, (text, form) in _FIGURES.items() if name in row]
+        figures = [f"{text} {form.format(row[name])}" for name, (text, form) in _figures(found).items() if name in row]
         lines.append(f"plan {index}: {'; '.join([*flags, *figures]) or each.failure}")
     return lines
 

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from cnpgen.errors import DatasetError, UsageError, counted
 from cnpgen.kernels.library import choose_backend
 from cnpgen.make.complete_poses import PoseTasks, problem_of_poses
+from cnpgen.make.goal_poses import MAX_GOAL_STATES
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.make.recipe_file import as_dataset_recipe
 from cnpgen.make.task_table import read_tasks
@@ -29,6 +30,7 @@ from cnpgen.robots.plausible_values import UnitError, check_plausible
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import numbers
+from cnpgen.schema.memory import check_memory
 from cnpgen.store.field import Field
 
 Array = NDArray[np.float64]
@@ -117,6 +119,8 @@ def complete(
 def _completed(pipeline: Pipeline, context: Context, columns: Mapping[str, ArrayLike]) -> Completed:
     completion = Completion(pipeline, context, columns)
     given = _given(completion.given, columns, completion.context.robot, flat=completion.height is not None)
+    argument = max(given, key=lambda name: len(given[name]))
+    check_memory(argument, len(given[argument]), len(given[argument]) * completion.width)
     tasks = completion({name: rows.T for name, rows in given.items()})
     rows = {**completion.rows(tasks), "sample_id": tasks.alive.astype(np.int64)}
     problem, source = record_problem(pipeline.problem), f"tasks completed by {pipeline.name}"
@@ -125,7 +129,10 @@ def _completed(pipeline: Pipeline, context: Context, columns: Mapping[str, Array
 
 def _completed_poses(poses: PoseTasks, columns: Mapping[str, ArrayLike]) -> Completed:
     poses.check(columns)
-    return Completed(*poses.complete(_given(poses.fields, columns, poses.robot, flat=False)))
+    given = _given(poses.fields, columns, poses.robot, flat=False)
+    argument = max(given, key=lambda name: len(given[name]))
+    check_memory(argument, len(given[argument]), len(given[argument]) * MAX_GOAL_STATES * 3 * poses.robot.n)
+    return Completed(*poses.complete(given))
 
 
 def _given(

@@ -57,6 +57,11 @@ class Completion:
             self._accept = acceptance(context, written, given=_given_ends(given))
         self._random = np.random.default_rng(0)  # for plug-ins that bypass candidates.draw
 
+    @property
+    def width(self) -> int:
+        """Number of values of a completed task."""
+        return sum(max(field.width, 1) for field in self._fields)
+
     def __call__(self, columns: Mapping[str, Array]) -> TaskBatch:
         """Complete N tasks independently of each other.
 

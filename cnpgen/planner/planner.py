@@ -131,6 +131,7 @@ class Planner:
         """
         states = start_q, start_dq, start_ddq, goal_q, goal_dq, goal_ddq
         boundary = boundary_of(self.robot.n, *states, parameters)
+        self._check_memory("start_q", boundary)
         check_boundary_units(self.robot, boundary, allow_large_angles=allow_large_angles)
         return self._inference.plan(self.model, self._checked(boundary))
 
@@ -156,6 +157,7 @@ class Planner:
         Raises:
             UsageError: See ``plan``.
         """
+        self._check_memory("boundary", boundary)
         check_boundary_units(self.robot, boundary, argument="boundary", allow_large_angles=allow_large_angles)
         return plan_tasks(self, boundary, sample_id, columns)
 
@@ -210,9 +212,12 @@ class Planner:
             plans, times = plans[np.zeros(len(new), int)], np.repeat(times, len(new))
         return reuse_previous_plan(plans, times, new, acceleration_limit=self.robot.acceleration_limit)
 
+    def _check_memory(self, argument: str, boundary: Boundary) -> None:
+        """Refuse plans that exceed the memory."""
+        check_memory(argument, len(boundary), len(boundary) * self._numbers_per_plan)
+
     def _checked(self, boundary: Boundary) -> Boundary:
         """Set conditions that were zero in all training rows to exactly zero; check that they are zero to rounding."""
-        check_memory("start_q", len(boundary), len(boundary) * self._numbers_per_plan)
         boundary, zeroed = self._with_goal_acceleration(boundary), {}
         for name in self.model.zero_conditions:
             values = getattr(boundary, name)

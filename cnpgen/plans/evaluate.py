@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import counted
+from cnpgen.errors import UsageError, counted
 from cnpgen.judges.plans import Reason, Verdict, judge, summarize_verdicts
 from cnpgen.judges.plans.judge import check_step
 from cnpgen.machine.workers import distribute, worker_count
@@ -116,6 +116,8 @@ def evaluate_plans(
         MachineError: A worker died.
     """
     check_step(step := number("step", step))
+    if isinstance(tracking_error, bool):
+        raise UsageError(f"must be angles [rad], got {tracking_error}", argument="tracking_error")
     error = () if tracking_error is None else tuple(np.atleast_1d(numbers("tracking_error", tracking_error)).tolist())
     plans = correct_tips(plans)
     parts = [plans[first : first + PLANS_PER_VERDICT_TASK] for first in range(0, len(plans), PLANS_PER_VERDICT_TASK)]

@@ -22,6 +22,7 @@ from cnpgen.problems.problem_record import ProblemRecord, as_record, open_proble
 from cnpgen.robots.scene import Scene
 from cnpgen.schema.argument_types import check_fields, checked_arguments
 from cnpgen.schema.arguments import integer, numbers, reject_masked
+from cnpgen.schema.memory import check_memory
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.spline_motion import Motion, states_at_times
@@ -162,6 +163,9 @@ class Plans:
             PlanIndexError: The mask has another length, or an index is out of range; a subclass of IndexError.
         """
         which = _checked(which, len(self))
+        if isinstance(which, np.ndarray):
+            numbers_per_plan = self.path_control_points[0].size if len(self) else 1
+            check_memory("which", len(which), len(which) * numbers_per_plan)
         return replace(
             self,
             boundary=self.boundary[which],

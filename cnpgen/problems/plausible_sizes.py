@@ -16,7 +16,7 @@ MAX_LINK_RATIO = 20.0  # size of a link / reach; pedestals and mobile bases may 
 MIN_LINK_RATIO = 0.02  # size of the largest moving link / reach
 MIN_MESH_M = 1e-3  # size of a link with a mesh
 MIN_MASS_KG = 0.01  # of bodies whose inertia is checked; lighter ones have placeholders
-MAX_CENTER_RATIO = 5.0  # distance of a center of mass from its joint, and radius of gyration / reach
+MAX_CENTER_RATIO = 3.0  # distance of a center of mass from its joint, and radius of gyration / reach
 MAX_PAYLOAD_RATIO = 10.0  # mass of a payload / mass of the arm
 MAX_OBSTACLE_RATIO = 10.0  # distance of an obstacle / reach
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import RecipeError, UsageError
-from cnpgen.schema.memory import LARGE_SIZE, check_memory
+from cnpgen.schema.memory import MIN_CHECKED_SIZE, check_memory
 from cnpgen.schema.units import suggested_unit
 
 Array = NDArray[Any]
@@ -88,7 +88,7 @@ def numbers(name: str, values: ArrayLike, dtype: str = "float64", *, differentia
 
 def _fitting(name: str, array: Array) -> Array:
     """Return an array if a copy of it fits into memory: views that repeat values may be of any size."""
-    if array.size > LARGE_SIZE:
+    if array.size > MIN_CHECKED_SIZE:
         check_memory(name, len(array), array.size)
     return array
 
@@ -131,7 +131,8 @@ def concerning(argument: str) -> Iterator[None]:
     try:
         yield
     except RecipeError as error:
-        error.argument = error.argument and argument
+        if error.argument is not None:
+            error.argument = argument
         raise
     except UsageError as error:
         raise UsageError(str(error), concerns=argument) from error

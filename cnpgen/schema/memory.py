@@ -3,7 +3,7 @@
 from cnpgen.errors import UsageError
 
 BYTES_PER_FLOAT = 8
-LARGE_SIZE = 10_000_000  # floats from which on the available memory is measured
+MIN_CHECKED_SIZE = 10_000_000  # floats from which on the available memory is measured
 
 
 def check_memory(argument: str, value: int, n_floats: int) -> None:
@@ -18,7 +18,7 @@ def check_memory(argument: str, value: int, n_floats: int) -> None:
         UsageError: The arrays need more than the available memory.
     """
     needed = n_floats * BYTES_PER_FLOAT
-    if n_floats > LARGE_SIZE and needed > (available := available_bytes()):
+    if n_floats > MIN_CHECKED_SIZE and needed > (available := available_bytes()):
         text = f"{needed / 1e9:,.3g} GB of memory, {available / 1e9:,.3g} GB are available"
         raise UsageError(f"must be smaller: {value:,} needs at least {text}", argument=argument)
 

@@ -48,7 +48,8 @@ def boundary_of(  # noqa: PLR0917 - in the order of the paper
     }
     arrays = {name: _rows(name, values, n) for name, values in arguments.items() if values is not None}
     if parameters is not None:
-        arrays["parameters"] = _rows("parameters", parameters, np.shape(parameters)[-1] if np.ndim(parameters) else 0)
+        values = numbers("parameters", parameters)
+        arrays["parameters"] = _rows("parameters", values, values.shape[-1] if values.ndim else 0)
     rows = max(len(values) for values in arrays.values())
     for name, values in arrays.items():
         if len(values) not in {1, rows}:

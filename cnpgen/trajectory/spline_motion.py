@@ -72,7 +72,10 @@ class Motion:
     degree: int = 7
 
     def __post_init__(self) -> None:
-        path, rate = np.shape(self.path), np.shape(self.rate)
+        try:
+            path, rate = np.shape(self.path), np.shape(self.rate)
+        except ValueError as error:  # rows of different lengths
+            raise UsageError(f"control points must be arrays: {error}", concerns="path") from error
         if len(path) != 3 or len(rate) != 2 or path[0] != rate[0]:
             raise UsageError(
                 f"control points must have shapes (N, C, n) and (N, R), got {path} and {rate}", concerns="path"

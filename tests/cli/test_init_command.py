@@ -332,6 +332,33 @@ def test_meshes_in_millimetres_are_refused_with_a_remedy(tmp_path, capsys, mesh,
     assert 'write scale="0.001 0.001 0.001" in the <mesh> of a file in mm' in said
 
 
+def test_findings_are_printed_as_notes(tmp_path, capsys):
+    continuous = ("continuous", "0 0 1", '<limit velocity="0" effort="20"/>')
+    urdf = write_arm(tmp_path / "arm.urdf", [continuous, *ELBOW[1:]], mass=0)
+    assert main(["init", str(tmp_path / "arm"), "--urdf", str(urdf)]) == 0
+    notes = [line.removeprefix("note: ") for line in capsys.readouterr().err.splitlines() if line.startswith("note: ")]
+    assert notes[0] == "the tip is end; planned joints: joint_1, joint_2, joint_3"
+    assert any(note.startswith("the URDF has no position limit of joint_1, or the joint is cont") for note in notes)
+    assert any(note.startswith("the URDF has no velocity limit of joint_1, or it is zero: [limits]") for note in notes)
+    assert any(note.startswith("no mass that the last joint moves") for note in notes)
+
+
+def test_limits_of_many_turns_stand_for_none(tmp_path, capsys):
+    urdf = write_arm(tmp_path / "arm.urdf", ELBOW)
+    urdf.write_text(urdf.read_text().replace('lower="-2" upper="2"', 'lower="-1e16" upper="1e16"', 1))
+    assert main(["init", str(tmp_path / "arm"), "--urdf", str(urdf)]) == 0
+    assert "the URDF has no position limit of joint_1" in capsys.readouterr().err
+
+
+def test_a_urdf_in_the_place_of_an_srdf_and_the_reverse_are_named(tmp_path, capsys):
+    urdf, srdf = write_crane(tmp_path), tmp_path / "crane.srdf"
+    srdf.write_text('<robot name="crane"><disable_collisions link1="hand" link2="base"/></robot>')
+    arm = tmp_path / "arm"
+    said = refused(capsys, 2, arm, "--urdf", urdf, "--tip", "hand", "--srdf", urdf)
+    assert "is a URDF, expected an SRDF" in said
+    assert "has no <link>, expected a URDF (an SRDF is given by --srdf)" in refused(capsys, 2, arm, "--urdf", srdf)
+
+
 def test_inertias_that_no_body_has_are_noted(tmp_path):
     urdf = write_arm(tmp_path / "arm.urdf", ELBOW)
     urdf.write_text(urdf.read_text().replace('ixx="0.01"', 'ixx="0.05"', 1))

@@ -382,4 +382,4 @@ def test_plans_are_not_imported_as_trajectories(said: Said, hit: Path) -> None:
 def test_large_angles_need_a_unit(said: Said, option: tuple[str, str]) -> None:
     code, line = said((option[0], "plans.h5", option[1], "2"), "")
     assert code == 2
-    assert "expected angles with their unit, such as 2deg; got '2'" in line
+    assert "expected at most 1 rad or m, such as 2deg; got '2'" in line

@@ -94,7 +94,7 @@ def test_requests_that_exceed_the_memory_are_refused(monkeypatch: pytest.MonkeyP
         cnpgen.draw_boundary_problems("airhockey-hit", 10**15)
     with pytest.raises(UsageError, match=r"^nodes must be smaller"):
         cnpgen.PlanLoss("airhockey", nodes=10**15)
-    monkeypatch.setattr(memory, "LARGE_SIZE", 1000)
+    monkeypatch.setattr(memory, "MIN_CHECKED_SIZE", 1000)
     monkeypatch.setattr(memory, "available_bytes", lambda: 10**6)
     with pytest.raises(UsageError, match=r"n must be smaller: 100,000 needs at least 0\.\d+ GB of memory, 0\.001 GB"):
         cnpgen.draw_boundary_problems("airhockey-hit", 100_000)

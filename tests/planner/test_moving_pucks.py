@@ -103,11 +103,14 @@ def test_pucks_that_touch_the_mallet_before_the_meeting_have_a_reason(planner, s
     near = tip + distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     for options in ({"meeting_time": 2.0, "puck_velocity": [-0.1, 0.05]}, {"puck_velocity": [0.3, 0.05]}):
         assert set(plan_hits(planner, still, near, TARGET, **options).reasons) == {"start touches the puck"}
-    crossing = tip + [0.3, -0.3], np.array([0.0, 0.35])  # beside the mallet
+    crossing = np.add(tip, [0.3, -0.3]), np.array([0.0, 0.35])  # beside the mallet
     model = PuckModel(drag=0.0)
     free = plan_hits(planner, still, crossing[0], TARGET, puck_velocity=crossing[1], meeting_time=0.9, puck_model=model)
     assert free.reasons == ("",)
-    through = tip + [0.229, -0.147], np.array([-0.405, 0.26])  # through the waiting mallet, and back from the bands
+    through = (
+        np.add(tip, [0.229, -0.147]),
+        np.array([-0.405, 0.26]),
+    )  # through the mallet
     met = plan_hits(planner, still, through[0], TARGET, puck_velocity=through[1], meeting_time=2.057, puck_model=model)
     assert met.reasons == ("early contact with the puck",)
 

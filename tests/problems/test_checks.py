@@ -117,6 +117,25 @@ def test_a_urdf_that_was_changed_later_is_checked_again(tmp_path, old, new, text
     assert text in mistakes(crane(tmp_path, old, new))
 
 
+def test_obstacles_far_out_of_reach_are_in_another_unit(tmp_path):
+    file = write_problem(tmp_path)
+    file.write_text(file.read_text(encoding="utf-8").replace("x = [0.45, 0.55]", "x = [45, 55]"), encoding="utf-8")
+    text = "obstacle 1: 'wall' is 45 m away, where the arm is 1.02 m long: lengths without a unit are in m"
+    assert text in mistakes(file)
+
+
+def test_payloads_in_grams_or_millimetres_are_refused(tmp_path):
+    for payload, text in {
+        "mass = 500": "payload.mass: is 500 kg, where the arm has 5 kg: masses are in kg, not in g",
+        "mass = 1\ncentre = [0, 0, 4.9]": "payload.centre: a length of 4.9 m from it",
+        "mass = 1\ninertia = [900, 900, 900, 0, 0, 0]": "payload.inertia: a length of 36.7 m from it",
+    }.items():
+        file = write_problem(tmp_path)
+        content = file.read_text(encoding="utf-8").replace("[robot]", f"[payload]\n{payload}\n[robot]")
+        file.write_text(content, encoding="utf-8")
+        assert text in mistakes(file)
+
+
 def test_obstacles_that_no_constraint_uses_are_refused(tmp_path):
     file = write_problem(tmp_path)
     file.write_text(file.read_text(encoding="utf-8").replace("robot-clearance", "self-clearance"), encoding="utf-8")

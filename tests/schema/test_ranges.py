@@ -1,16 +1,20 @@
 """Arguments out of their range, larger than the memory, or names of no recipe name the argument and a remedy."""
 
+import json
+
 import numpy as np
 import pytest
 
 import cnpgen
 from cnpgen.errors import MachineError, RecipeError, UsageError
 from cnpgen.planner.plan_hits import plan_hits
+from cnpgen.problems.problem_record import ProblemRecord, open_problem, record_problem
 from cnpgen.refine.options import RefineOptions
 from cnpgen.robots.observation.camera import Camera
 from cnpgen.schema import memory
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import check_range, numbers
+from cnpgen.schema.catalogue import find_recipe
 
 
 @pytest.fixture(scope="module")
@@ -71,11 +75,11 @@ def test_views_that_repeat_values_are_compared_with_the_memory(planner):
 
 def test_many_plans_are_compared_with_the_memory(planner, monkeypatch):
     q = np.repeat(planner.robot.base[None], 1000, axis=0)
-    monkeypatch.setattr(memory, "LARGE_SIZE", 100)
+    monkeypatch.setattr(memory, "MIN_CHECKED_SIZE", 100)
     monkeypatch.setattr(memory, "available_bytes", lambda: 100_000)
     with pytest.raises(UsageError, match=r"start_q must be smaller: 1,000 needs at least"):
         planner.plan(q, q)
-    with pytest.raises(UsageError, match=r"start_q must be smaller: 1,000 needs at least"):
+    with pytest.raises(UsageError, match=r"boundary must be smaller: 1,000 needs at least"):
         planner.plan_batch(cnpgen.Boundary(q, *np.zeros((2, *q.shape)), q, np.zeros(q.shape)))
     assert len(numbers("q", q)) == 1000
 
@@ -87,3 +91,31 @@ def test_a_failed_allocation_is_an_error_of_the_machine():
 
     with pytest.raises(MachineError, match="out of memory in allocate: Unable to allocate 4 GiB"):
         allocate(4)
+
+
+def test_stored_recipes_may_have_implausible_values(tmp_path):
+    text = find_recipe(("problem",), "heavy-object").read_text(encoding="utf-8")
+    source = find_recipe(("problem",), "heavy-object").parent / "iiwa14_object.urdf"
+    file = tmp_path / "problem.toml"
+    file.write_text(text.replace('"iiwa14_object.urdf"', f'"{source}"'), encoding="utf-8")
+    record = record_problem(cnpgen.load_problem(file))
+    content = json.loads(record.recipe)
+    content["limits"]["acceleration_cap"] = 1e6
+    stored = ProblemRecord(json.dumps(content), record.urdf.replace('upper="2.9670597283903604"', 'upper="30"', 1))
+    assert stored != record
+    problem, robot = open_problem(stored)
+    assert problem.limits.acceleration_cap == 1e6
+    assert robot.position_upper.max() == 30
+    file.write_text(file.read_text().replace('acceleration_cap = "20 rad/s^2"', "acceleration_cap = 1e6"))
+    with pytest.raises(RecipeError, match=r"acceleration_cap: .* too large"):
+        cnpgen.load_problem(file)
+
+
+def test_hints_follow_only_values_without_a_unit(tmp_path):
+    file = tmp_path / "problem.toml"
+    text = find_recipe(("problem",), "heavy-object").read_text(encoding="utf-8")
+    for value, hint in (('"103 deg"', False), ("1.8", True)):
+        file.write_text(text.replace('tolerance = "1.8 deg"', f"tolerance = {value}"), encoding="utf-8")
+        with pytest.raises(RecipeError, match=r"constraint 5.tolerance: 1\.\d+ rad is too large") as caught:
+            cnpgen.load_problem(file)
+        assert ("did you mean" in str(caught.value)) == hint

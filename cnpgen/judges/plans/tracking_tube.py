@@ -30,7 +30,7 @@ from cnpgen.world.world import World
 Array = NDArray[np.float64]
 TrackingError = float | Sequence[float] | Array  # of every joint [rad], or one for all
 
-MAX_TRACKING_ERROR = 0.5  # rad or m
+MAX_TRACKING_ERROR = 1.0  # rad or m
 TUBE_CURVATURE_FACTOR = 1.5  # on the sum of changes
 TUBE_COMBINATIONS = 8  # random ones of all changes
 
