@@ -154,3 +154,10 @@ def test_a_message_lists_at_most_twenty_frames() -> None:
     assert text.endswith("link_17, link_18, link_19 and 10 more")
     assert missing_frame(tree, Path("long.urdf"), "link_29") == ""
     assert listed(["a", "b"]) == "a, b"
+
+
+@pytest.mark.parametrize("use", ['["robot-clearance"]', "[]", "{ a = 1 }", "3"])
+def test_kinds_that_are_no_text_are_mistakes(tmp_path, use):
+    file = write_problem(tmp_path)
+    file.write_text(file.read_text(encoding="utf-8").replace('use = "robot-clearance"', f"use = {use}"), "utf-8")
+    assert "constraint 2.use: missing key, expected one of" in mistakes(file)

@@ -83,7 +83,7 @@ def problem_of(arm: Arm, name: str, folder: Path, packages: tuple[Path, ...], sr
         limit = JointTorque(tolerance=5e-3, budget=6e-2)
         problem = replace(problem, constraint=(*problem.constraint[:4], limit, *problem.constraint[4:]))
     else:
-        notes.append("no mass that the last joint moves: its torques have no meaning, so 'joint-torque' is omitted")
+        notes.append("no mass that the last joint moves: its torques would be wrong, so 'joint-torque' is omitted")
     base, base_notes = comfortable_base(problem, load_robot(problem))
     problem = replace(problem, robot=replace(problem.robot, base=base))
     return InitialProblem(problem, arm, overlaps, (*arm_notes(arm), *notes, *overloaded, *base_notes))
