@@ -1,9 +1,10 @@
 """Collision checks and plans among obstacles: states/s against Coal, and the CPU time of solving new scenes.
 
-The scenes are generated: tables, shelves, cages, boxes and desks with a Panda (3 kg at the hand) or a UR5. Every scene
-is solved once, in one process and thread, from a new problem: the set-up of the scene is part of its time. Kernels of
-a robot are compiled before, since they do not depend on its obstacles. With ``--meshes`` Pinocchio and Coal check valid
-plans on the meshes of the URDF. With ``--reference`` RRT-Connect alone searches for paths of unsolved problems.
+The scenes are generated: tables, shelves, cages, boxes and desks with a Panda (3 kg at the hand) or a UR5, or with
+``--shipped`` the families of ``cnpgen.scenes``. Every scene is solved once, in one process and thread, from a new
+problem: the set-up of the scene is part of its time. Kernels of a robot are compiled before, since they do not depend
+on its obstacles. With ``--meshes`` Pinocchio and Coal check valid plans on the meshes of the URDF. With ``--reference``
+RRT-Connect alone searches for paths of unsolved problems.
 """
 
 import argparse
@@ -26,6 +27,7 @@ from scene_datasets import Meshes, plan_states
 from cnpgen.kernels.collision.collision_checker import CollisionChecker, load_collision_library
 from cnpgen.kernels.collision.tree_search import TreeSettings, find_tree_path
 from cnpgen.kernels.library import KernelLibrary, choose_backend
+from cnpgen.pipelines.families.scene_generator import make_scenes
 from cnpgen.plans.boundary_problems import plans_of_rows
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.scene_plans import scene_plans
@@ -42,6 +44,7 @@ from cnpgen.refine.task import Attempt
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.solid import place_obstacles
+from cnpgen.schema import registry
 from cnpgen.schema.catalogue import list_recipes
 from cnpgen.schema.keys import PerJoint
 
@@ -318,6 +321,22 @@ def generate(
             yield base.with_obstacles(scene.obstacles), *ends
 
 
+def generate_shipped(
+    base: Problem, sampler: EndSampler, family: str, count: int, seed: int
+) -> Iterator[tuple[Problem, Array, Array]]:
+    """Yield problems of a family of ``cnpgen.scenes.make_scenes``, one in each scene; see ``generate``."""
+    made, batch = 0, 0
+    while made < count:
+        for scene in make_scenes(family, base, count, seed=seed + batch, per_scene=1):
+            start, goal = scene.start_q, scene.goal_q[0]
+            sampler.checker.place(scene.obstacles, place_obstacles(scene.obstacles))
+            usable = sampler.holds(start) and sampler.holds(goal)
+            if made < count and usable and (made % 5 == 4 or not sampler.line_is_free(start, goal)):
+                made += 1
+                yield base.with_obstacles(scene.obstacles), start, goal
+        batch += 1
+
+
 def boundary_columns(start: Array, goal: Array) -> dict[str, Array]:
     """Return the columns of a motion from rest to rest."""
     rest = np.zeros((1, len(start)))
@@ -461,9 +480,11 @@ def make_checker(robot: Robot) -> CollisionChecker:
     return CollisionChecker(library, robot)
 
 
-def solve_family(base: Problem, sampler: EndSampler, family: str, count: int, seed: int) -> list[Solved]:
+def solve_family(
+    base: Problem, sampler: EndSampler, family: str, count: int, seed: int, *, shipped: bool
+) -> list[Solved]:
     """Solve problems of a family, each from a new scene; the first one, which may compile kernels, is solved twice."""
-    problems = list(generate(base, sampler, family, count, seed))
+    problems = list((generate_shipped if shipped else generate)(base, sampler, family, count, seed))
     solve_scene(*problems[0])
     return [solve_scene(*problem) for problem in problems[1:]]
 
@@ -489,7 +510,8 @@ def summary(solved: list[Solved]) -> dict[str, Any]:
 def options(parser: argparse.ArgumentParser) -> None:
     """Add the options of this benchmark."""
     parser.add_argument("--robots", nargs="*", default=["panda"], choices=list(ROBOTS), help="robots")
-    parser.add_argument("--families", nargs="*", default=list(FAMILIES), choices=list(FAMILIES), help="families")
+    parser.add_argument("--families", nargs="*", help="families (default: all)")
+    parser.add_argument("--shipped", action="store_true", help="families of cnpgen.scenes.make_scenes")
     parser.add_argument("--count", type=int, default=21, help="problems of every family; the first is not counted")
     parser.add_argument("--seed", type=int, default=29_110_301, help="seed of the scenes")
     parser.add_argument("--suite", type=int, default=0, help="problems of the suite clutter")
@@ -502,9 +524,10 @@ def options(parser: argparse.ArgumentParser) -> None:
 def main() -> None:
     """Run the benchmark."""
     chosen = arguments(__doc__, options)
+    families = chosen.families or list(registry.names(registry.FAMILIES) if chosen.shipped else FAMILIES)
     with np.errstate(all="ignore"):
         checked, rows, results = checks(chosen.states), list[tuple[str, ...]](), dict[str, Any]()
-        for name, family in [("panda", "clutter")] * bool(chosen.suite) + list(product(chosen.robots, chosen.families)):
+        for name, family in [("panda", "clutter")] * bool(chosen.suite) + list(product(chosen.robots, families)):
             progress(f"{name}: {family}")
             problem, robot, checker = loaded(name)
             problem = as_problem("panda-3kg") if family == "clutter" else problem
@@ -512,7 +535,9 @@ def main() -> None:
             if family == "clutter":
                 solved = solve_suite(problem, chosen.suite)
             else:
-                solved = solve_family(problem, EndSampler(robot, checker), family, chosen.count, chosen.seed)
+                solved = solve_family(
+                    problem, EndSampler(robot, checker), family, chosen.count, chosen.seed, shipped=chosen.shipped
+                )
             figures = results[f"{name} {family}"] = summary(solved)
             rows.append((name, family, *(f"{value:.4g}" for key, value in figures.items() if key != "reasons")))
             if chosen.meshes:
