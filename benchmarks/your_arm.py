@@ -97,7 +97,7 @@ def gap(name: str, urdf: Path, tip: str) -> dict[str, Any]:
         if done.returncode:
             return {"arm": name, "outcome": f"{done.stderr.strip().splitlines()[-1]:.120}"}
         robot = load_problem(Path(folder) / name / "problem.toml").robot
-    hulls = re.search(r"([\d.]+)% of the random states in which no meshes overlap", done.stderr)
+    hulls = re.search(r"convex hulls of the meshes reject ([\d.]+)% of the states", done.stderr)
     return {"arm": name, "hulls": float(hulls[1]) / 100 if hulls else None, "parts": robot.hull_gap}
 
 
