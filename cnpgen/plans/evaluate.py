@@ -116,7 +116,7 @@ def evaluate_plans(
         MachineError: A worker died.
     """
     check_step(step := number("step", step))
-    if isinstance(tracking_error, bool):
+    if isinstance(tracking_error, bool | np.bool_):
         raise UsageError(f"must be angles [rad], got {tracking_error}", argument="tracking_error")
     error = () if tracking_error is None else tuple(np.atleast_1d(numbers("tracking_error", tracking_error)).tolist())
     plans = correct_tips(plans)

@@ -71,7 +71,8 @@ def load_robot(problem: Problem) -> Robot:
     if mistakes := list(_mistakes(problem, robot)):
         raise RecipeError(mistakes)
     shape = _shape(problem, robot) if spec.geometry == "urdf" else None
-    robot = replace(robot, shape=shape, held_shape=_held_shape(problem, robot))
+    model, robot = robot.model, replace(robot, shape=shape, held_shape=_held_shape(problem, robot))
+    vars(robot)["model"] = model  # a cached property, expensive to build again
     if not problem.is_stored:
         check_plausible_sizes(robot, problem)
     return robot
@@ -167,7 +168,7 @@ def _base_mistakes(problem: Problem, robot: Robot) -> Iterator[str]:
     worst = int(np.argmax(np.maximum(low - base, base - high)))
     if not low[worst] <= base[worst] <= high[worst]:
         unit = unit_of(robot.units("rad"), worst)
-        hint = suggested_unit(base[worst], unit, low[worst], high[worst])
+        hint = suggested_unit(base[worst], unit, low[worst], high[worst]) if abs(base[worst]) > 2 * np.pi else ""
         yield (
             f"{problem.path}: robot.base: {robot.joint_names[worst]} = {base[worst]:g} {unit} is outside its planning"
             f" limits [{low[worst]:g}, {high[worst]:g}]{hint}"

@@ -16,6 +16,7 @@ MAX_LINK_RATIO = 20.0  # size of a link / reach; pedestals and mobile bases may 
 MIN_LINK_RATIO = 0.02  # size of the largest moving link / reach
 MIN_MESH_M = 1e-3  # size of a link with a mesh
 MIN_MASS_KG = 0.01  # of bodies whose inertia is checked; lighter ones have placeholders
+MIN_ARM_KG = 0.1  # that a payload is compared with
 MAX_CENTER_RATIO = 3.0  # distance of a center of mass from its joint, and radius of gyration / reach
 MAX_PAYLOAD_RATIO = 10.0  # mass of a payload / mass of the arm
 MAX_OBSTACLE_RATIO = 10.0  # distance of an obstacle / reach
@@ -86,7 +87,7 @@ def _problem_mistakes(robot: Robot, problem: Problem) -> Iterator[str]:
     if payload is not None:
         arm, distance = mass - payload.mass, float(np.linalg.norm(payload.centre))
         gyration = float(np.sqrt(np.trace(payload.inertia_matrix) / (2 * payload.mass)))
-        if payload.mass > MAX_PAYLOAD_RATIO * arm > 0:
+        if arm > MIN_ARM_KG and payload.mass > MAX_PAYLOAD_RATIO * arm:
             yield f"payload.mass: is {payload.mass:g} kg, where the arm has {arm:.3g} kg: masses are in kg, not in g"
         for key, length in {"centre": distance, "inertia": gyration}.items():
             if length > MAX_CENTER_RATIO * reach:
@@ -96,7 +97,7 @@ def _problem_mistakes(robot: Robot, problem: Problem) -> Iterator[str]:
         distance = _distance(obstacle)
         if distance > MAX_OBSTACLE_RATIO * reach and obstacle.position != PARKED_POSITION_M:
             text = f"{obstacle.name!r} is {distance:.3g} m away, where the arm is {reach:.3g} m long"
-            yield f"obstacle {index}: {text}: lengths without a unit are in m"
+            yield f"obstacle {index}: {text}: check its unit"
 
 
 def _distance(obstacle: Obstacle) -> float:

@@ -147,6 +147,12 @@ class Problem:
         if self.parameters.changes_payload and self.payload is None:
             (name, *_) = (name for name in self.parameters.names if name in PAYLOAD_PARAMETERS)
             yield "parameters", f"{name} needs the body of the load: give [payload], too"
+        moving = [name for name in self.parameters.names if name in PAYLOAD_CENTRE]
+        if moving and self.payload is not None and self.payload.touch_links:
+            yield (
+                "parameters",
+                f"{moving[0]} moves the payload, whose body ('touch_links') cannot move: omit one of them",
+            )
         if (names := [name for name in self.parameters.names if name.startswith("upright_")]) and (
             count := sum(isinstance(item, TipAxis) for item in self.constraint)
         ) != 1:
@@ -253,8 +259,8 @@ class Problem:
         )
         text = with_disabled_pairs(text, self.path.parent / spec.srdf) if spec.srdf else text
         ignored = spec.ignored_pairs
-        if self.payload is not None and self.payload.touch_links:
-            text = with_payload_link(text, spec, self.payload)
+        text = with_payload_link(text, spec, self.payload, is_stored=self.is_stored)
+        if self.payload is not None:
             ignored = (*ignored, *((link, PAYLOAD) for link in self.payload.touch_links))
         return with_ignored_pairs(text, ignored) if ignored else text
 

@@ -25,7 +25,7 @@ from cnpgen.robots.urdf import urdf_tree
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import concerning, numbers
 from cnpgen.schema.keys import RecipeLocation
-from cnpgen.schema.parsing import parse
+from cnpgen.schema.parsing import parse, stored_values
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.store.files.cache_folder import temporary_folder
 from cnpgen.store.files.document_structure import ANY_KEY, NUMBER, TEXT, WHOLE, check_structure
@@ -115,7 +115,8 @@ class ProblemRecord(StoredProblem):
 
     def _parsed(self, kind: type[T], key: str, table: Any) -> T:
         mistakes: list[str] = []
-        parsed = parse(kind, table, where=RecipeLocation("problem_recipe", key), mistakes=mistakes)
+        with stored_values():
+            parsed = parse(kind, table, where=RecipeLocation("problem_recipe", key), mistakes=mistakes)
         if parsed is None:
             raise RecipeError(mistakes)
         return parsed

@@ -141,8 +141,13 @@ def reduced_model(urdf: Path, text: str, joints: tuple[str, ...], attached: Atta
         limited = bounded(text, tree, attached)
         with mistakes_in(urdf):
             parameters = urdf_parameters(tree)
-            check_order_of_limits(parameters, joints)
-        model = pin.buildModelFromXML(limited)
+            _check_order_of_limits(parameters, joints)
+        try:
+            model = pin.buildModelFromXML(limited)
+        except ValueError:
+            with mistakes_in(urdf):
+                _check_order_of_limits(parameters, [joint.name for joint in parameters.joints.values()])
+            raise
         name_links_uniquely(model)
     except (ValueError, RuntimeError, IndexError) as error:
         raise RecipeError([f"{urdf}: not a URDF that Pinocchio can read: {error}"]) from error
@@ -160,12 +165,12 @@ def reduced_model(urdf: Path, text: str, joints: tuple[str, ...], attached: Atta
     return reduced
 
 
-def check_order_of_limits(parameters: UrdfParameters, joints: Collection[str]) -> None:
+def _check_order_of_limits(parameters: UrdfParameters, joints: Collection[str]) -> None:
     """Raise an error for lower limits above the upper ones.
 
     Args:
         parameters: Parameters of the URDF.
-        joints: Names of the planned joints; others may have any limits.
+        joints: Names of the joints.
 
     Raises:
         RecipeError: Limits are swapped; the error lists all of them.

@@ -144,7 +144,7 @@ class Payload:
         default=None,
     )
     size: tuple[float, float, float] | None = field(
-        "edge lengths of a box of uniform density, in place of the inertia",
+        "edge lengths of a box of uniform density, in place of the inertia or, with touch_links, beside it",
         unit="m",
         default=None,
         low=1e-6,
@@ -159,7 +159,7 @@ class Payload:
 
     def find_mistakes(self) -> Iterator[tuple[str, str]]:
         """Yield (key, mistake) pairs."""
-        if self.inertia is not None and self.size is not None:
+        if self.inertia is not None and self.size is not None and not self.touch_links:
             yield "size", "the payload has both an 'inertia' and a 'size', expected one of them"
         if self.touch_links and self.size is None:
             yield "touch_links", "a payload that is a body needs a 'size'"
@@ -178,7 +178,13 @@ class Payload:
         xx, yy, zz, xy, xz, yz = (
             self.inertia_matrix[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]] * (factor * mass / self.mass)
         ).tolist()
-        return replace(self, mass=mass, centre=(x, y, z), inertia=(xx, yy, zz, xy, xz, yz), size=None, touch_links=())
+        return replace(
+            self,
+            mass=mass,
+            centre=(x, y, z),
+            inertia=(xx, yy, zz, xy, xz, yz),
+            size=self.size if self.touch_links else None,
+        )
 
     @property
     def inertia_matrix(self) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:

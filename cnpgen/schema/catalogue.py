@@ -113,7 +113,12 @@ def read_kind(group: str, value: Any, where: RecipeLocation, mistakes: list[str]
     """Read a ``[[stage]]`` or ``[[constraint]]`` table, whose key ``use`` names the kind."""
     use = value.get("use") if isinstance(value, dict) else None
     if not isinstance(use, str):
-        mistakes.append((where / "use").message(f"missing key, expected one of {', '.join(registry.names(group))}"))
+        known = ", ".join(registry.names(group))
+        given = isinstance(value, dict) and "use" in value
+        text = (
+            f"expected one of {known}, got {show(value['use'])}" if given else f"missing key, expected one of {known}"
+        )
+        mistakes.append((where / "use").message(text))
         return None
     try:
         kind = registry.load(group, use)

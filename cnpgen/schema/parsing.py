@@ -180,12 +180,12 @@ def _check_filled(kind: type, value: Any, key: Key) -> None:
 
 
 def _float(value: Any, key: Key) -> float:
-    return _bounded(parse_number(value, key.unit), key)
+    return _bounded(parse_number(value, key.unit), key, value)
 
 
 def _int(value: Any, key: Key) -> int:
     if isinstance(value, int) and not isinstance(value, bool):
-        return _bounded(value, key)
+        return _bounded(value, key, value)
     raise ValueError(f"expected an integer, got {show(value)}")
 
 
@@ -207,7 +207,7 @@ def _str(value: Any, key: Key) -> str:
 
 def _range(value: Any, key: Key) -> Range:
     low, high = parse_range(value, key.unit)
-    return Range(_bounded(low, key), _bounded(high, key))
+    return Range(_bounded(low, key, value), _bounded(high, key, value))
 
 
 def _per_joint(value: Any, key: Key) -> PerJoint:
@@ -216,18 +216,18 @@ def _per_joint(value: Any, key: Key) -> PerJoint:
 
 
 def _floats(value: Any, key: Key, count: int | None) -> tuple[float, ...]:
-    return tuple(_bounded(number, key) for number in parse_numbers(value, key.unit, count=count))
+    return tuple(_bounded(number, key, value) for number in parse_numbers(value, key.unit, count=count))
 
 
 _Number = TypeVar("_Number", int, float)
 
 
-def _bounded(number: _Number, key: Key) -> _Number:
+def _bounded(number: _Number, key: Key, value: Any) -> _Number:
     unit = "" if key.unit == "1" else f" {key.unit}"
     if key.low is not None and number < key.low:
         raise ValueError(f"{number}{unit} is too small, expected at least {key.low:g}{unit}")
     if key.high is not None and number > key.high:
-        hint = suggested_unit(number, key.unit, high=key.high)
+        hint = "" if _has_unit(value) else suggested_unit(number, key.unit, high=key.high)
         raise ValueError(f"{number}{unit} is too large, expected at most {key.high:g}{unit}{hint}")
     return number
 

@@ -120,7 +120,7 @@ def test_a_urdf_that_was_changed_later_is_checked_again(tmp_path, old, new, text
 def test_obstacles_far_out_of_reach_are_in_another_unit(tmp_path):
     file = write_problem(tmp_path)
     file.write_text(file.read_text(encoding="utf-8").replace("x = [0.45, 0.55]", "x = [45, 55]"), encoding="utf-8")
-    text = "obstacle 1: 'wall' is 45 m away, where the arm is 1.02 m long: lengths without a unit are in m"
+    text = "obstacle 1: 'wall' is 45 m away, where the arm is 1.02 m long: check its unit"
     assert text in mistakes(file)
 
 
@@ -160,4 +160,5 @@ def test_a_message_lists_at_most_twenty_frames() -> None:
 def test_kinds_that_are_no_text_are_mistakes(tmp_path, use):
     file = write_problem(tmp_path)
     file.write_text(file.read_text(encoding="utf-8").replace('use = "robot-clearance"', f"use = {use}"), "utf-8")
-    assert "constraint 2.use: missing key, expected one of" in mistakes(file)
+    assert "constraint 2.use: expected one of joint-position, " in (text := mistakes(file))
+    assert ", got " in text

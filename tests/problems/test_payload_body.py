@@ -1,6 +1,7 @@
 """A payload with touch links is a box that touches neither other links nor obstacles, for kernels, trees and judges."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,8 @@ from cnpgen.plans.boundary_problems import plans_of_rows
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import load_problem
-from cnpgen.problems.problem_record import open_problem, record_problem
+from cnpgen.problems.problem_record import as_problem, open_problem, record_problem, with_payload_of
+from cnpgen.robots.robot_spec import Payload
 from cnpgen.robots.shape.payload_link import PAYLOAD
 from tests.examples.shaped_robot import write_problem
 
@@ -57,6 +59,33 @@ def test_a_stored_problem_has_the_payload_once(tmp_path):
     assert PAYLOAD in robot.shape.joints
     with record.restored() as again:
         assert again.payload.touch_links == ("hand",)
+
+
+def test_a_changed_payload_of_a_stored_problem_changes_its_body(tmp_path):
+    problem = load_problem(with_payload(tmp_path))
+    stored = as_problem(record_problem(problem))
+    assert stored.urdf_text == problem.urdf_text
+    larger = replace(problem.payload, size=(0.2, 0.2, 0.6))
+    for payload, size in ((None, None), (Payload(mass=3.0), None), (larger, [0.2, 0.2, 0.6])):
+        shape = load_robot(replace(stored, payload=payload)).shape
+        parts = [part for part in shape.convex_parts if part.link == PAYLOAD]
+        assert [np.ptp(part.vertices, axis=0).round(9).tolist() for part in parts] == ([size] if size else [])
+    (tmp_path / "crane" / "crane.urdf").write_text(problem.urdf_text)
+    named = load_problem(tmp_path / "problem.toml")
+    with pytest.raises(RecipeError, match="payload: the URDF has a link or joint 'carried payload'"):
+        load_robot(named)
+
+
+def test_samples_of_a_body_keep_it_and_cannot_move_it(tmp_path):
+    ranges = "[parameters]\npayload_mass = [1.0, 3.0]\n"
+    problem = load_problem(with_payload(tmp_path, BODY + ranges))
+    sample = with_payload_of(record_problem(problem), np.array([2.5]))
+    _, robot = open_problem(sample)
+    assert robot.chain.joints[-1].mass == pytest.approx(3.5)
+    assert PAYLOAD in robot.shape.joints
+    moved = ranges.replace("payload_mass = [1.0, 3.0]", "payload_x = [0.0, 0.2]")
+    with pytest.raises(RecipeError, match=r"payload_x moves the payload, whose body \('touch_links'\) cannot move"):
+        load_problem(with_payload(tmp_path / "moved", BODY + moved))
 
 
 def test_the_payload_does_not_enter_obstacles(tmp_path):

@@ -94,7 +94,7 @@ class GuessedIK(_IK):
         n = context.robot.n
         if self.guess and len(self.guess) != n:
             raise RecipeError([f"guess: needs {n} ranges, one per planned joint, got {len(self.guess)}"])
-        for index, each in enumerate(self.guess):
+        for index, each in enumerate(() if context.problem.is_stored else self.guess):
             ends = np.full((2, n), context.robot.base)
             ends[:, index] = each.low, each.high
             if wrong := find_implausible_value(context.robot, "guess_q", ends, context.robot.units("rad")):

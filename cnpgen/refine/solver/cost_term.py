@@ -15,6 +15,7 @@ from cnpgen.robots.robot import Robot
 from cnpgen.schema import registry
 from cnpgen.schema.catalogue import read_kind
 from cnpgen.schema.keys import RecipeLocation
+from cnpgen.schema.parsing import stored_values
 
 Array = NDArray[np.float64]
 
@@ -113,4 +114,5 @@ def _restored(tables: list[dict[str, Any]]) -> list[ObjectiveTerm]:
     """Return the terms of ``CostTerm.tables``, of weight 1."""
     keys = [{key: value for key, value in table.items() if key not in {"source", "package"}} for table in tables]
     mistakes: list[str] = []
-    return [read_kind(registry.OBJECTIVES, table, RecipeLocation(table["use"]), mistakes) for table in keys]
+    with stored_values():
+        return [read_kind(registry.OBJECTIVES, table, RecipeLocation(table["use"]), mistakes) for table in keys]

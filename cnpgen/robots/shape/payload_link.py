@@ -9,27 +9,46 @@ from cnpgen.robots.robot_spec import Payload, RobotSpec
 from cnpgen.robots.shape.convex_part import turned
 from cnpgen.robots.urdf import urdf_tree
 
-PAYLOAD = "payload"  # name of the link
+PAYLOAD = "carried payload"  # name of the link and of its joint
 
 
-def with_payload_link(urdf: str, spec: RobotSpec, payload: Payload) -> str:
+def with_payload_link(urdf: str, spec: RobotSpec, payload: Payload | None, *, is_stored: bool) -> str:
     """Return a URDF with the box of the payload as a link without mass, fixed to the tip.
 
-    The mass belongs to the robot's attachments. A URDF with such a link, for example of a stored problem, is returned
-    unchanged.
+    The mass belongs to the robot's attachments.
 
     Args:
         urdf: Text of the URDF.
         spec: The robot of the problem, with the pose of the tip.
-        payload: The payload, with a size.
+        payload: The payload; a body if it has touch links.
+        is_stored: Whether the URDF is that of a stored problem, whose link is replaced if it differs.
 
     Raises:
-        RecipeError: A touch link or the tip does not exist.
+        RecipeError: A touch link or the tip does not exist, or the URDF has a link of this name.
     """
-    robot = urdf_tree(urdf)
-    links = [link.get("name", "") for link in robot.findall("link")]
-    if PAYLOAD in links:
+    is_body = payload is not None and bool(payload.touch_links)
+    if not is_body and PAYLOAD not in urdf:
         return urdf
+    robot = urdf_tree(urdf)
+    old = [part for part in robot if part.tag in {"link", "joint"} and part.get("name") == PAYLOAD]
+    if old and not is_stored:
+        raise RecipeError(
+            [f"payload: the URDF has a link or joint {PAYLOAD!r}, which is the name of the payload's own"]
+        )
+    new = list(_elements(robot, spec, payload)) if payload is not None and is_body else []
+    if [ElementTree.tostring(part) for part in old] == [ElementTree.tostring(part) for part in new]:
+        return urdf
+    for part in old:
+        robot.remove(part)
+    robot.extend(new)
+    return ElementTree.tostring(robot, encoding="unicode")
+
+
+def _elements(
+    robot: ElementTree.Element, spec: RobotSpec, payload: Payload
+) -> tuple[ElementTree.Element, ElementTree.Element]:
+    """Return the link and the joint of the payload."""
+    links = [link.get("name", "") for link in robot.findall("link")]
     children = {
         joint.get("name", ""): child.get("link", "")
         for joint in robot.findall("joint")
@@ -38,19 +57,18 @@ def with_payload_link(urdf: str, spec: RobotSpec, payload: Payload) -> str:
     parent = spec.tip if spec.tip in links else children.get(spec.tip, "")
     if not parent:
         raise RecipeError([f"robot.tip: the URDF has no frame {spec.tip!r}{nearest(spec.tip, links)}"])
-    for link in payload.touch_links:
-        if link not in links:
-            raise RecipeError([f"payload.touch_links: the URDF has no link {link!r}{nearest(link, links)}"])
-    box = ElementTree.SubElement(robot, "link", name=PAYLOAD)
+    for name in payload.touch_links:
+        if name not in links:
+            raise RecipeError([f"payload.touch_links: the URDF has no link {name!r}{nearest(name, links)}"])
+    link, joint = ElementTree.Element("link", name=PAYLOAD), ElementTree.Element("joint", name=PAYLOAD, type="fixed")
     for kind in ("visual", "collision"):
-        geometry = ElementTree.SubElement(ElementTree.SubElement(box, kind), "geometry")
+        geometry = ElementTree.SubElement(ElementTree.SubElement(link, kind), "geometry")
         ElementTree.SubElement(geometry, "box", size=_numbers(payload.size or ()))
-    joint = ElementTree.SubElement(robot, "joint", name=f"{PAYLOAD}_joint", type="fixed")
     ElementTree.SubElement(joint, "parent", link=parent)
     ElementTree.SubElement(joint, "child", link=PAYLOAD)
     center = np.array(spec.tip_offset) + turned(*spec.tip_rotation) @ np.array(payload.centre)
     ElementTree.SubElement(joint, "origin", xyz=_numbers(center.tolist()), rpy=_numbers(spec.tip_rotation))
-    return ElementTree.tostring(robot, encoding="unicode")
+    return link, joint
 
 
 def _numbers(values: tuple[float, ...] | list[float]) -> str:

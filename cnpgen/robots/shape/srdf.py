@@ -48,8 +48,10 @@ def _with_entries(urdf: str, entries: list[dict[str, str]], source: str) -> str:
     named = {entry[key] for entry in entries for key in ("link1", "link2")}
     if unknown := sorted(named - links):
         raise RecipeError([f"{source}: the URDF has no link {', '.join(unknown)}"])
+    known = [frozenset((one.get("link1"), one.get("link2"))) for one in robot.iter(_TAG)]
     for entry in entries:
-        robot.append(ElementTree.Element(_TAG, entry))
+        if frozenset((entry["link1"], entry["link2"])) not in known:
+            robot.append(ElementTree.Element(_TAG, entry))
     return ElementTree.tostring(robot, encoding="unicode")
 
 
