@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +17,7 @@ from cnpgen.plans.boundary_file import CONTEXT
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.constraints.puck_contact import PuckContact
 from cnpgen.schema.arguments import check_range, numbers
+from cnpgen.trajectory.spline import basis
 
 Array = NDArray[np.float64]
 
@@ -135,7 +137,7 @@ def _touched_early(
     if not len(plans):
         return np.zeros(0, bool)
     phases, rows, speed = np.linspace(0, 1, EARLY_CONTACT_PHASES), plans.sample_id, plans.columns["hit_speed"]
-    q = np.asarray(plans.motion.at(phases).q)
+    q = _path_basis(plans.path_control_points.shape[1], plans.motion.degree) @ plans.path_control_points
     moving = completion.tip_positions(q.reshape(-1, q.shape[2]).T)[:2].T.reshape(*q.shape[:2], 2)
     start = np.maximum(delay, 0.0)[:, None]
     times = start + plans.motion.time_at(phases)
@@ -151,6 +153,12 @@ def _touched_early(
         touching = distance < meeting.distance + meeting.overlap - MAX_EARLY_DEPTH_M
         touched |= (touching & is_early[:, 1:]).any(axis=1)
     return touched
+
+
+@cache
+def _path_basis(points: int, degree: int) -> Array:
+    """Return the basis of paths at the phases of ``_touched_early``, shape (K, C)."""
+    return basis(np.linspace(0, 1, EARLY_CONTACT_PHASES), points, degree)
 
 
 def _distances_to_origin(first: Array, second: Array) -> Array:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any
 
 import numpy as np
@@ -181,7 +181,7 @@ class Motion:
         times = np.empty((len(self), len(s)))
         for rows, coarse, _ in self._cells():
             edges = np.union1d(coarse, s)
-            table = _nodes(edges, self.rate.shape[1], self.degree)
+            table = _kept_nodes(edges.tobytes(), self.rate.shape[1], self.degree)
             times[rows] = self[rows]._times_at(edges, table)[:, np.searchsorted(edges, s)]
         return times
 
@@ -301,6 +301,12 @@ def _shared_cells(points: int, degree: int) -> tuple[Array, Array]:
     """Return the edges of the cells of motions with positive rate control points, and ``_nodes`` of them."""
     edges = graded_edges(points, degree)
     return edges, _nodes(edges, points, degree)
+
+
+@lru_cache(maxsize=16)
+def _kept_nodes(edges: bytes, points: int, degree: int) -> Array:
+    """Return ``_nodes`` of edges, kept for calls with equal phases."""
+    return _nodes(np.frombuffer(edges), points, degree)
 
 
 def _nodes(edges: Array, points: int, degree: int) -> Array:

@@ -81,7 +81,7 @@ def test_samples_of_a_body_keep_it_and_cannot_move_it(tmp_path):
     problem = load_problem(with_payload(tmp_path, BODY + ranges))
     sample = with_payload_of(record_problem(problem), np.array([2.5]))
     _, robot = open_problem(sample)
-    assert robot.chain.joints[-1].mass == pytest.approx(3.5)
+    assert robot.chain.joints[-1].mass == pytest.approx(4.5)  # with hand and claw
     assert PAYLOAD in robot.shape.joints
     moved = ranges.replace("payload_mass = [1.0, 3.0]", "payload_x = [0.0, 0.2]")
     with pytest.raises(RecipeError, match=r"payload_x moves the payload, whose body \('touch_links'\) cannot move"):
