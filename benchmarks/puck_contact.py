@@ -116,7 +116,7 @@ def by_via_points(plans: Plans, solved: np.ndarray, seed: int) -> np.ndarray:
 
 def executed(plans: Plans, count: int) -> dict[str, str]:
     """Execute the first hits on two plants; return the successes."""
-    chosen, results = plans[:count], {}
+    chosen, results = plans[:count], dict[str, str]()
     for plant in ("nominal", "heavier"):
         successes = [one.success for one in simulate_plans(chosen, plant=plant).executed]
         results[plant] = f"{sum(successes)} of {len(successes)}"
@@ -208,7 +208,7 @@ def main() -> None:
     chosen = arguments(__doc__, options)
     states, pucks = moving_tasks(chosen.hits, chosen.seed)
     hits = {name: plan_hits(Planner(name), states, pucks, TARGET) for name in PLANNERS}
-    results, simulated, solved = {}, {}, {}
+    results, simulated, solved = dict[str, dict[str, Any]](), dict[str, dict[str, str]](), dict[str, np.ndarray]()
     for name, found in hits.items():
         progress(f"hits of {name}")
         refined, ahead = refine_plans(found.plans).plans, pucks[found.plans.sample_id]
@@ -245,8 +245,8 @@ def main() -> None:
         *grid_tables(records, planning),
     ]
     counts = {} if reference is None else {"refined": int(solved_hits.sum()), "with via points": int(reference.sum())}
-    found = {"moving": results, "reference": counts, "reasons": reasons, "executed": simulated, "grid": records}
-    report({**found, "planning": planning}, tables, as_json=chosen.json)
+    document = {"moving": results, "reference": counts, "reasons": reasons, "executed": simulated, "grid": records}
+    report({**document, "planning": planning}, tables, as_json=chosen.json)
 
 
 if __name__ == "__main__":
