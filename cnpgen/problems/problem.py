@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import MachineError
+from cnpgen.errors import MachineError, UsageError
 from cnpgen.problems.constraints.axis import TipAxis
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.constraints.constraint import Constraint
@@ -100,7 +100,14 @@ class Problem:
 
     @checked_arguments
     def with_obstacles(self, obstacles: Sequence[Obstacle]) -> "Problem":
-        """Return the problem among other obstacles; robot, limits and constraints stay the same."""
+        """Return the problem among other obstacles; robot, limits and constraints stay the same.
+
+        Raises:
+            UsageError: A size or a pose of an obstacle is not finite, too large or not positive.
+        """
+        for obstacle in obstacles:
+            for key, mistake in obstacle.value_mistakes():
+                raise UsageError(f"obstacle {obstacle.name!r}: {key} {mistake}", concerns="obstacles")
         other = dataclasses.replace(self, obstacle=tuple(obstacles))
         vars(other)["urdf_text"] = self.urdf_text  # a cached property, expensive to read again
         return other

@@ -4,9 +4,9 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
-from cnpgen.robots.shape.hull import check_solid
+from cnpgen.robots.shape.hull import MAX_COORDINATE_M, check_solid
 from cnpgen.robots.shape.inline import corners_of, is_inline
-from cnpgen.schema.keys import Range, field
+from cnpgen.schema.keys import Range, field, keys
 
 _KEYS = {  # kind -> keys of pose and size; those of _OPTIONAL may be omitted
     "box": ("position", "size", "rotation"),
@@ -77,6 +77,18 @@ class Obstacle:
             yield from self._mistakes_upright()
         else:
             yield from self._mistakes_posed()
+
+    def value_mistakes(self) -> Iterator[tuple[str, str]]:
+        """Yield (key, mistake) pairs of numbers that are not finite, too large or too small."""
+        for key in keys(type(self)):
+            value = getattr(self, key.name)
+            ends = (value.low, value.high) if isinstance(value, Range) else value
+            entries = ends if isinstance(ends, tuple) else (ends,)
+            numbers = [entry for entry in entries if isinstance(entry, int | float)]
+            if not all(abs(number) <= MAX_COORDINATE_M for number in numbers):  # false for nan, too
+                yield key.name, f"must be finite and at most {MAX_COORDINATE_M:g}, got {value}"
+            elif key.low is not None and numbers and min(numbers) < key.low:
+                yield key.name, f"must be at least {key.low:g} {key.unit}, got {value}"
 
     @property
     def upright(self) -> bool:

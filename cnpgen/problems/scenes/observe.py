@@ -74,4 +74,8 @@ def scene_bodies(scenes: Scenes) -> Primitives:
     for scene, obstacles in enumerate(bodies):
         if not isinstance(obstacles, list | tuple) or not all(isinstance(body, Obstacle) for body in obstacles):
             raise UsageError(f"must contain scene problems or obstacles, not so at scene {scene}", argument="scenes")
+        for obstacle in obstacles:
+            for key, mistake in obstacle.value_mistakes():
+                text = f"scene {scene}: obstacle {obstacle.name!r}: {key} {mistake}"
+                raise UsageError(text, concerns="scenes")
     return scene_primitives(bodies)

@@ -173,16 +173,20 @@ def check_count(count: int, place: str) -> None:
 
 
 def check_scenes(scenes: Sequence[SceneProblem]) -> None:
-    """Check the type of every scene, and that there is one.
+    """Check the type of every scene, the numbers of its obstacles, and that there is one.
 
     Raises:
         UsageError: There are no scenes, or one is no ``SceneProblem``.
+        SceneError: A size or a pose of an obstacle is not finite, too large or not positive.
     """
     if not scenes:
         raise UsageError("there are no scenes", concerns="scenes")
     for index, scene in enumerate(scenes):
         if not isinstance(scene, SceneProblem):
             raise UsageError(f"must be SceneProblems, got {scene!r:.100} at {index}", argument="scenes")
+        for obstacle in scene.obstacles:
+            for key, mistake in obstacle.value_mistakes():
+                raise SceneError(f"{scene.place}: obstacle {obstacle.name!r}: {key} {mistake}")
 
 
 def checked_scene(scene: SceneProblem) -> SceneProblem:
