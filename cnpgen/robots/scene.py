@@ -13,7 +13,6 @@ from cnpgen.errors import UsageError
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.hull import MAX_COORDINATE_M
 from cnpgen.robots.solid import Solid, pose_width, solids_of
-from cnpgen.schema.argument_types import check_fields
 from cnpgen.schema.arguments import integer
 
 Array = NDArray[np.float64]
@@ -38,7 +37,10 @@ class Scene:
     poses: Array
 
     def __post_init__(self) -> None:
-        check_fields(self)
+        if not isinstance(self.obstacles, tuple):
+            raise UsageError(f"must be a tuple of obstacles, got {self.obstacles!r:.60}", argument="obstacles")
+        if getattr(self.poses, "ndim", None) != 2:  # of NumPy, JAX or torch
+            raise UsageError(f"must be an array of shape (N, width), got {self.poses!r:.60}", argument="poses")
 
     def __len__(self) -> int:
         return len(self.poses)

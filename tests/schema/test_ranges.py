@@ -11,6 +11,7 @@ from cnpgen.planner.plan_hits import plan_hits
 from cnpgen.problems.problem_record import ProblemRecord, open_problem, record_problem
 from cnpgen.refine.options import RefineOptions
 from cnpgen.robots.observation.camera import Camera
+from cnpgen.robots.scene import Scene
 from cnpgen.schema import memory
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import check_range, numbers
@@ -119,3 +120,10 @@ def test_hints_follow_only_values_without_a_unit(tmp_path):
         with pytest.raises(RecipeError, match=r"constraint 5.tolerance: 1\.\d+ rad is too large") as caught:
             cnpgen.load_problem(file)
         assert ("did you mean" in str(caught.value)) == hint
+
+
+def test_scenes_have_obstacles_and_poses():
+    with pytest.raises(UsageError, match="obstacles must be a tuple of obstacles, got 3"):
+        Scene(3, np.zeros((1, 3)))
+    with pytest.raises(UsageError, match=r"poses must be an array of shape \(N, width\), got 3"):
+        Scene((), 3)
