@@ -39,7 +39,7 @@ class Scene:
     def __post_init__(self) -> None:
         if not isinstance(self.obstacles, tuple):
             raise UsageError(f"must be a tuple of obstacles, got {self.obstacles!r:.60}", argument="obstacles")
-        if getattr(self.poses, "ndim", None) != 2:  # of NumPy, JAX or torch
+        if isinstance(self.poses, int | float | str | None):  # JAX puts objects of its own in the place of arrays
             raise UsageError(f"must be an array of shape (N, width), got {self.poses!r:.60}", argument="poses")
 
     def __len__(self) -> int:
