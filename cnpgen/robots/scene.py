@@ -37,10 +37,12 @@ class Scene:
     poses: Array
 
     def __post_init__(self) -> None:
-        if not isinstance(self.obstacles, tuple):
-            raise UsageError(f"must be a tuple of obstacles, got {self.obstacles!r:.60}", argument="obstacles")
-        if isinstance(self.poses, int | float | str | None):  # JAX puts objects of its own in the place of arrays
-            raise UsageError(f"must be an array of shape (N, width), got {self.poses!r:.60}", argument="poses")
+        obstacles: Any = self.obstacles
+        poses: Any = self.poses
+        if not isinstance(obstacles, tuple):
+            raise UsageError(f"must be a tuple of obstacles, got {obstacles!r:.60}", argument="obstacles")
+        if poses is None or isinstance(poses, int | float | str):  # JAX puts other objects in the place of arrays
+            raise UsageError(f"must be an array of shape (N, width), got {poses!r:.60}", argument="poses")
 
     def __len__(self) -> int:
         return len(self.poses)
