@@ -19,7 +19,8 @@ from cnpgen.store.files.journal import JournalFile, open_journal_file
 JOURNAL_MAGIC = b"cnpgen journal 1\n"
 # Errors of NumPy and Python for a record with a valid checksum that cnpgen has not written.
 _RECORD_ERRORS = (
-    ValueError, KeyError, TypeError, IndexError, EOFError, RuntimeError, MemoryError, OverflowError, zipfile.BadZipFile,
+    ValueError, KeyError, TypeError, IndexError, EOFError, AttributeError, RuntimeError, MemoryError, OverflowError,
+    zipfile.BadZipFile,
 )  # fmt: skip
 
 
