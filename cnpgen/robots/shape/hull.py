@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.errors import UsageError
+
 if TYPE_CHECKING:
     import coal
 
@@ -136,11 +138,19 @@ def coal_hull(corners: Array) -> "coal.Convex":
 
     Args:
         corners: Its corners [m], shape (V, 3); up to three are a point, a segment, a triangle.
+
+    Raises:
+        UsageError: The corners are those of no body, for example of a damaged scene.
     """
     import coal
-    from scipy.spatial import ConvexHull
+    from scipy.spatial import ConvexHull, QhullError
 
-    triangles = ConvexHull(corners).simplices if len(corners) > 3 else [np.arange(3) % len(corners)]
+    try:
+        triangles = ConvexHull(corners).simplices if len(corners) > 3 else [np.arange(3) % len(corners)]
+    except (QhullError, ValueError) as error:
+        raise UsageError(
+            f"corners from {corners.min(axis=0)} to {corners.max(axis=0)} m have no convex hull"
+        ) from error
     points, faces = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
     for corner in corners:
         points.append(corner)
