@@ -30,7 +30,7 @@ from cnpgen.robots.plausible_values import UnitError, check_plausible
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import numbers
-from cnpgen.schema.memory import check_memory
+from cnpgen.schema.memory import check_memory_of_rows
 from cnpgen.store.field import Field
 
 Array = NDArray[np.float64]
@@ -119,8 +119,7 @@ def complete(
 def _completed(pipeline: Pipeline, context: Context, columns: Mapping[str, ArrayLike]) -> Completed:
     completion = Completion(pipeline, context, columns)
     given = _given(completion.given, columns, completion.context.robot, flat=completion.height is not None)
-    argument = max(given, key=lambda name: len(given[name]))
-    check_memory(argument, len(given[argument]), len(given[argument]) * completion.width)
+    check_memory_of_rows({name: len(rows) for name, rows in given.items()}, completion.width)
     tasks = completion({name: rows.T for name, rows in given.items()})
     rows = {**completion.rows(tasks), "sample_id": tasks.alive.astype(np.int64)}
     problem, source = record_problem(pipeline.problem), f"tasks completed by {pipeline.name}"
@@ -130,8 +129,7 @@ def _completed(pipeline: Pipeline, context: Context, columns: Mapping[str, Array
 def _completed_poses(poses: PoseTasks, columns: Mapping[str, ArrayLike]) -> Completed:
     poses.check(columns)
     given = _given(poses.fields, columns, poses.robot, flat=False)
-    argument = max(given, key=lambda name: len(given[name]))
-    check_memory(argument, len(given[argument]), len(given[argument]) * MAX_GOAL_STATES * 3 * poses.robot.n)
+    check_memory_of_rows({name: len(rows) for name, rows in given.items()}, MAX_GOAL_STATES * 3 * poses.robot.n)
     return Completed(*poses.complete(given))
 
 

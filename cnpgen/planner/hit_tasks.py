@@ -23,7 +23,7 @@ from cnpgen.plans.plausible import UNITS, are_usual
 from cnpgen.robots.plausible_values import MAX_LIMIT_RATIO, check_plausible
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.arguments import concerning, numbers
-from cnpgen.schema.memory import check_memory
+from cnpgen.schema.memory import check_memory_of_rows
 from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]
@@ -102,14 +102,8 @@ def hit_tasks(
             raise UsageError("is empty, expected at least 1 hit", argument=name)
         if count not in {1, largest}:
             raise UsageError(f"has {count:,} hits, another argument has {largest:,}", argument=name)
-    check_memory(_largest_argument(counts), largest, largest * completion.width)
+    check_memory_of_rows({_ARGUMENT_OF.get(name, name): count for name, count in counts.items()}, completion.width)
     return completion(columns)
-
-
-def _largest_argument(counts: Mapping[str, int]) -> str:
-    """Return the argument with the most hits, from the number of hits of each column."""
-    column = max(counts, key=lambda name: counts[name])
-    return _ARGUMENT_OF.get(column, column)
 
 
 def _parameter_columns(context: Context, parameters: ArrayLike | None) -> dict[str, Array]:

@@ -15,7 +15,7 @@ from cnpgen.planner.planner import Planner, plan_tasks
 from cnpgen.planner.puck_model import PuckModel
 from cnpgen.plans.boundary_file import CONTEXT
 from cnpgen.plans.plans import Plans
-from cnpgen.problems.constraints.puck_contact import PuckContact
+from cnpgen.problems.constraints.puck_contact import PuckContact, distances_from_segments
 from cnpgen.schema.arguments import check_range, numbers
 from cnpgen.trajectory.spline import basis
 
@@ -48,11 +48,6 @@ class Meeting:
     distance: float
     overlap: float
     time: ArrayLike | None
-
-    def touches(self, puck: Array, mallet: Array) -> NDArray[np.bool_]:
-        """Return whether pucks and mallets touch, at positions of any equal shape (..., 2) [m]."""
-        touching: NDArray[np.bool_] = np.hypot(*np.moveaxis(puck - mallet, -1, 0)) < self.distance + self.overlap
-        return touching
 
 
 def plan_moving_hits(  # noqa: PLR0917 - in the order of plan_hits
@@ -115,7 +110,8 @@ def plan_moving_hits(  # noqa: PLR0917 - in the order of plan_hits
     touched = _touched_early(completion, meeting, hits, plans, delay)
     for row in active[accepted & touched].tolist():
         reasons[row] = PuckContact.reason
-    touching = meeting.touches(hits.puck, completion.tip_positions(hits.state[0].T)[:2].T)
+    start = completion.tip_positions(hits.state[0].T)[:2].T
+    touching = np.linalg.norm(hits.puck - start, axis=1) < meeting.distance + meeting.overlap
     for row in np.flatnonzero(touching).tolist():
         reasons[row] = PuckContact.boundary_reason
     accepted &= ~touched & ~touching[active]
@@ -149,7 +145,7 @@ def _touched_early(
     for mallet, time, is_early in parts:
         puck, velocity = (np.repeat(values[rows], len(phases), axis=0) for values in (hits.puck, hits.velocity))
         relative = meeting.model.predict(puck, velocity, time.ravel())[0].reshape(mallet.shape) - mallet
-        distance = _distances_to_origin(relative[:, :-1], relative[:, 1:])
+        distance = distances_from_segments(np.zeros(2), relative[:, :-1], relative[:, 1:])
         touching = distance < meeting.distance + meeting.overlap - MAX_EARLY_DEPTH_M
         touched |= (touching & is_early[:, 1:]).any(axis=1)
     return touched
@@ -159,14 +155,6 @@ def _touched_early(
 def _path_basis(points: int, degree: int) -> Array:
     """Return the basis of paths at the phases of ``_touched_early``, shape (K, C)."""
     return basis(np.linspace(0, 1, EARLY_CONTACT_PHASES), points, degree)
-
-
-def _distances_to_origin(first: Array, second: Array) -> Array:
-    """Return the distances of segments from the origin, for ends of shape (..., 2)."""
-    along = second - first
-    length = np.maximum(np.sum(along**2, axis=-1), 1e-18)
-    share = np.clip(-np.sum(first * along, axis=-1) / length, 0.0, 1.0)
-    return np.asarray(np.linalg.norm(first + share[..., None] * along, axis=-1))
 
 
 class _Hits:

@@ -19,7 +19,7 @@ from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.constraints.object_clearance import ObjectClearance
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.objectives import Centrifugal, ObjectiveTerm
-from cnpgen.robots.obstacle import Obstacle
+from cnpgen.robots.obstacle import Obstacle, invalid_obstacle
 from cnpgen.robots.parameter_ranges import (
     NO_PARAMETERS,
     PAYLOAD_CENTRE,
@@ -105,9 +105,8 @@ class Problem:
         Raises:
             UsageError: A size or a pose of an obstacle is not finite, too large or not positive.
         """
-        for obstacle in obstacles:
-            for key, mistake in obstacle.value_mistakes():
-                raise UsageError(f"obstacle {obstacle.name!r}: {key} {mistake}", concerns="obstacles")
+        if mistake := invalid_obstacle(obstacles):
+            raise UsageError(mistake, concerns="obstacles")
         other = dataclasses.replace(self, obstacle=tuple(obstacles))
         vars(other)["urdf_text"] = self.urdf_text  # a cached property, expensive to read again
         return other

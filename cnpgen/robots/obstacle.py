@@ -134,5 +134,11 @@ class Obstacle:
         return [key for key in sorted(keys) if getattr(self, key) not in (None, "", _OPTIONAL.get(key))]
 
 
+def invalid_obstacle(obstacles: Iterable[Obstacle]) -> str:
+    """Return the first mistake in the numbers of obstacles, with the name of the obstacle; empty without one."""
+    mistakes = ((each.name, *mistake) for each in obstacles for mistake in each.value_mistakes())
+    return next((f"obstacle {name!r}: {key} {text}" for name, key, text in mistakes), "")
+
+
 def _listed(keys: Sequence[str]) -> str:
     return f"{', '.join(map(repr, keys[:-1]))} and {keys[-1]!r}"

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.schema.arguments import numbers
-from cnpgen.schema.memory import check_memory
+from cnpgen.schema.memory import check_memory_of_rows
 from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]
@@ -54,7 +54,7 @@ def boundary_of(  # noqa: PLR0917 - in the order of the paper
     for name, values in arrays.items():
         if len(values) not in {1, rows}:
             raise UsageError(f"has {len(values)} rows, another boundary condition has {rows}", argument=name)
-    check_memory(max(arrays, key=lambda name: len(arrays[name])), rows, rows * 6 * n)
+    check_memory_of_rows({name: len(values) for name, values in arrays.items()}, 6 * n)
     if goal_ddq is None:
         del arguments["goal_ddq"]
     zero = np.zeros((1, n))

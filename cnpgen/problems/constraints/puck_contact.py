@@ -194,7 +194,7 @@ class PuckContact(Constraint):
         goal, puck, start = values[:2], values[2:], start_xyz[:2]
         hit = (puck - goal) / self.contact_distance
         entry = puck - (self.contact_range + self.overlap) * hit
-        if _distance_from_segment(puck, start, entry) >= self.contact_range:
+        if distances_from_segments(puck, start, entry) >= self.contact_range:
             return []
         radius = self.contact_range + GUESS_CLEARANCE_M
         offset = start - puck
@@ -223,8 +223,9 @@ def _at_least(bound: float, distance: Any) -> tuple[Condition, ...]:
     return (Condition("puck distance", "m", [distance], np.array([bound]), np.array([np.inf]), "position"),)
 
 
-def _distance_from_segment(point: Array, first: Array, second: Array) -> float:
-    """Return the distance of a point from a segment [m]."""
+def distances_from_segments(point: Array, first: Array, second: Array) -> Array:
+    """Return the distances of points from segments between two ends [m], for arrays of shape (..., 2)."""
     along = second - first
-    share = np.clip((point - first) @ along / max(float(along @ along), 1e-12), 0.0, 1.0)
-    return float(np.hypot(*(point - first - share * along)))
+    length = np.maximum(np.sum(along**2, axis=-1), 1e-12)
+    share = np.clip(np.sum((point - first) * along, axis=-1) / length, 0.0, 1.0)
+    return np.asarray(np.linalg.norm(point - first - share[..., None] * along, axis=-1))

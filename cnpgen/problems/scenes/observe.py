@@ -14,7 +14,7 @@ from cnpgen.robots.observation.observations import Observation, SceneBatch, as_o
 from cnpgen.robots.observation.primitives import Primitives
 from cnpgen.robots.observation.scene_primitives import scene_primitives
 from cnpgen.robots.observation.surface_points import scene_seeds
-from cnpgen.robots.obstacle import Obstacle
+from cnpgen.robots.obstacle import Obstacle, invalid_obstacle
 from cnpgen.robots.scene import Scene
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
@@ -74,8 +74,6 @@ def scene_bodies(scenes: Scenes) -> Primitives:
     for scene, obstacles in enumerate(bodies):
         if not isinstance(obstacles, list | tuple) or not all(isinstance(body, Obstacle) for body in obstacles):
             raise UsageError(f"must contain scene problems or obstacles, not so at scene {scene}", argument="scenes")
-        for obstacle in obstacles:
-            for key, mistake in obstacle.value_mistakes():
-                text = f"scene {scene}: obstacle {obstacle.name!r}: {key} {mistake}"
-                raise UsageError(text, concerns="scenes")
+        if mistake := invalid_obstacle(obstacles):
+            raise UsageError(f"scene {scene}: {mistake}", concerns="scenes")
     return scene_primitives(bodies)

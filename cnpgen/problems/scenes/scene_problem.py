@@ -13,7 +13,7 @@ from cnpgen.errors import UsageError
 from cnpgen.problems.scenes.quaternions import quaternion_mistake, roll_pitch_yaw, rotation_matrix
 from cnpgen.robots.observation.primitives import KINDS, primitives_of
 from cnpgen.robots.observation.signed_distance import signed_distances
-from cnpgen.robots.obstacle import Obstacle
+from cnpgen.robots.obstacle import Obstacle, invalid_obstacle
 from cnpgen.robots.shape.hull import MAX_COORDINATE_M, check_solid, hull_corners
 from cnpgen.robots.shape.inline import address_of, corners_of, is_inline
 from cnpgen.robots.solid import place_obstacles
@@ -184,9 +184,8 @@ def check_scenes(scenes: Sequence[SceneProblem]) -> None:
     for index, scene in enumerate(scenes):
         if not isinstance(scene, SceneProblem):
             raise UsageError(f"must be SceneProblems, got {scene!r:.100} at {index}", argument="scenes")
-        for obstacle in scene.obstacles:
-            for key, mistake in obstacle.value_mistakes():
-                raise SceneError(f"{scene.place}: obstacle {obstacle.name!r}: {key} {mistake}")
+        if mistake := invalid_obstacle(scene.obstacles):
+            raise SceneError(f"{scene.place}: {mistake}")
 
 
 def checked_scene(scene: SceneProblem) -> SceneProblem:
