@@ -5,6 +5,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+MAX_LINE_LENGTH = 4000  # characters of a message; exceptions of libraries may repeat the content of a file
+
 Spelling = Callable[[str, object], str]
 """Writes an argument with the value that a message proposes for it, None for any value."""
 
@@ -12,6 +14,14 @@ Spelling = Callable[[str, object], str]
 def python_spelling(name: str, value: object) -> str:
     """Write an argument as in a Python call: ``force=True``, ``out=``."""
     return f"{name}={'' if value is None else repr(value)}"
+
+
+def _limited(text: str) -> str:
+    """Keep the beginning and the end of a long text."""
+    if len(text) <= MAX_LINE_LENGTH:
+        return text
+    kept = MAX_LINE_LENGTH // 2 - 30  # with the note, the text stays within the limit
+    return f"{text[:kept]} [... {len(text) - 2 * kept:,} more characters ...] {text[-kept:]}"
 
 
 class CnpgenError(Exception):
@@ -54,13 +64,16 @@ class CnpgenError(Exception):
         return type(self), self.args, vars(self)
 
     def text(self, spelling: Spelling = python_spelling) -> str:
-        """Return the message with all arguments in one spelling, by default as in a Python call."""
+        """Return the message with all arguments in one spelling, by default as in a Python call.
+
+        A message of more than ``MAX_LINE_LENGTH`` characters keeps its beginning and its end.
+        """
         text = " ".join(str(part) for part in self.args)
         for name, value in self.remedies.items():
             text = text.replace(f"{{{name}}}", spelling(name, value))
-        if self.argument is None or not self.is_predicate:
-            return text
-        return spelling(self.argument, None).removesuffix("=") + " " + text
+        if self.argument is not None and self.is_predicate:
+            text = spelling(self.argument, None).removesuffix("=") + " " + text
+        return _limited(text)
 
     def __str__(self) -> str:
         return self.text()
@@ -78,7 +91,7 @@ class RecipeError(CnpgenError):
     """
 
     def __init__(self, mistakes: Sequence[str]) -> None:
-        self.mistakes = tuple(mistakes)
+        self.mistakes = tuple(_limited(mistake) for mistake in mistakes)
         Exception.__init__(self, self.mistakes)  # required for pickling in worker processes
 
     def __str__(self) -> str:

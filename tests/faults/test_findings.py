@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cnpgen.errors import DatasetError, UsageError
+from cnpgen.errors import MAX_LINE_LENGTH, DatasetError, RecipeError, UsageError
 from cnpgen.planner.puck_model import PuckModel
 from cnpgen.plans import PlanStatus, load_plans, save_plans
 from cnpgen.plans.evaluate import evaluate_plans
@@ -42,6 +42,24 @@ def test_a_histogram_with_one_bin_more_than_those_of_other_shards(dataset: Path)
     )
     (problem,) = inspect_dataset(dataset).summary.problems
     assert "a histogram must have shape (1, 64), got (1, 65)" in problem
+
+
+def test_an_archive_whose_damage_a_library_reports_with_the_content_of_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "plans.npz"
+    np.savez(path, q=np.zeros((4000, 7)))
+    content = bytearray(path.read_bytes())
+    content[26:28] = (30_000).to_bytes(2, "little")  # the length of the member's name, which zipfile's message repeats
+    path.write_bytes(content)
+    with pytest.raises(UsageError, match="more characters") as caught:
+        load_trajectories(path, "airhockey")
+    assert str(caught.value).startswith(f"{path} is not an archive")
+    assert len(str(caught.value)) <= MAX_LINE_LENGTH
+
+
+def test_a_long_line_of_a_recipe() -> None:
+    error = RecipeError(["key" * MAX_LINE_LENGTH, "another"])
+    assert [len(line) <= MAX_LINE_LENGTH for line in error.mistakes] == [True, True]
+    assert RecipeError(error.mistakes).mistakes == error.mistakes
 
 
 @pytest.mark.parametrize("planned", [True, False])
