@@ -1,10 +1,11 @@
 """Collision checks and plans among obstacles: states/s against Coal, and the CPU time of solving new scenes.
 
-The scenes are generated: tables, shelves, cages, boxes and desks with a Panda (3 kg at the hand) or a UR5, or with
-``--shipped`` the families of ``cnpgen.scenes``. Every scene is solved once, in one process and thread, from a new
-problem: the set-up of the scene is part of its time. Kernels of a robot are compiled before, since they do not depend
-on its obstacles. With ``--meshes`` Pinocchio and Coal check valid plans on the meshes of the URDF. With ``--reference``
-RRT-Connect alone searches for paths of unsolved problems.
+The scenes are generated: tables, shelves, cages, boxes and desks, or with ``--shipped`` the families of
+``cnpgen.scenes``. The robot is a Panda with 3 kg, a UR5, or a Panda that holds a cup upright (``--robots panda-cup``).
+Every scene is solved once, in one process and thread, from a new problem: the set-up of the scene is part of its time.
+Kernels of a robot are compiled before, since they do not depend on its obstacles. With ``--meshes`` Pinocchio and Coal
+check valid plans on the meshes of the URDF. With ``--reference`` RRT-Connect alone searches for paths of unsolved
+problems.
 """
 
 import argparse
@@ -32,6 +33,7 @@ from cnpgen.plans.boundary_problems import plans_of_rows
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.scene_plans import scene_plans
 from cnpgen.problems.constraints.joint import JointJerk
+from cnpgen.problems.constraints.vertical import Vertical
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import load_problem
@@ -43,6 +45,7 @@ from cnpgen.refine.solver.hulls import Hulls
 from cnpgen.refine.task import Attempt
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot import Robot
+from cnpgen.robots.shape.held_object import with_held_object
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.schema import registry
 from cnpgen.schema.catalogue import list_recipes
@@ -53,6 +56,8 @@ Random = np.random.Generator
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]  # lowest and highest corner [m]
 
 SAMPLES, MAX_BATCHES = 20_000, 40  # random states per batch of the search of ends
+PROJECTIONS, MAX_PROJECTION_STEP, PROJECTION_DAMPING = 12, 0.5, 1e-6  # of random states that hold a cup upright
+MAX_TILT = 1e-9  # of their ends
 MIN_END_CLEARANCE_M = 1e-3
 TORQUE_FRACTION = 0.95  # of the limits, at rest at both ends
 JERK_LIMITS = {"panda": (7500.0, 3750.0, 5000.0, 6250.0, 7500.0, 10000.0, 10000.0)}  # data sheet [rad/s^3]
@@ -90,21 +95,38 @@ tolerance = "0 mm"
 use = "self-clearance"
 tolerance = "0 mm"
 """
-ROBOTS = {
-    "panda": PROBLEM.format(
-        robot="""urdf = "package://example-robot-data/robots/panda_description/urdf/panda.urdf"
+UPRIGHT = """
+[[constraint]]
+use = "vertical"
+tolerance = "1.8 deg"
+[[constraint]]
+use = "object-contact"
+depth = "0 mm"
+tolerance = "0 mm"
+[[constraint]]
+use = "object-clearance"
+[object]
+size = "[7, 7, 12] cm"
+"""
+PANDA = PROBLEM.format(
+    robot="""urdf = "package://example-robot-data/robots/panda_description/urdf/panda.urdf"
 joints = [
   "panda_joint1", "panda_joint2", "panda_joint3", "panda_joint4", "panda_joint5", "panda_joint6", "panda_joint7",
 ]
 tip = "panda_hand_tcp"
 base = "[0, -45, 0, -135, 0, 90, 45] deg"
 """,
-        limits="""velocity = [2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61]
+    limits="""velocity = [2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61]
 acceleration = [15, 7.5, 10, 12.5, 15, 20, 20]
 torque = [87, 87, 87, 87, 12, 12, 12]
 """,
-        payload='[payload]\nmass = "3 kg"\nsize = "[8, 8, 8] cm"',
-    ),
+    payload='[payload]\nmass = "3 kg"\nsize = "[8, 8, 8] cm"',
+)
+LEVEL = 'tip_rotation = "[0, 90, 0] deg"\nbase = "[0, -30, 0, -150, 0, 210, 45] deg"'
+CUP = PANDA.replace('base = "[0, -45, 0, -135, 0, 90, 45] deg"', LEVEL) + UPRIGHT
+ROBOTS = {
+    "panda": PANDA,
+    "panda-cup": CUP,
     "ur5": PROBLEM.format(
         robot="""urdf = "package://example-robot-data/robots/ur_description/urdf/ur5_joint_limited_robot.urdf"
 joints = ["shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint", "wrist_1_joint", "wrist_2_joint", "wrist_3_joint"]
@@ -259,10 +281,13 @@ FAMILIES: dict[str, Callable[[Random], GeneratedScene]] = {
 
 
 class EndSampler:
-    """Random ends of motions: free of collisions, with feasible torques at rest, and the tip in a region."""
+    """Random ends of motions: free of collisions, with feasible torques at rest, and the tip in a region.
 
-    def __init__(self, robot: Robot, checker: CollisionChecker) -> None:
-        self.robot, self.checker = robot, checker
+    The object that a problem's robot holds is upright.
+    """
+
+    def __init__(self, problem: Problem, robot: Robot, checker: CollisionChecker) -> None:
+        self.robot, self.checker, self.is_upright = robot, checker, problem.first(Vertical) is not None
 
     def ends(self, scene: GeneratedScene, random: Random, *, line_may_be_free: bool) -> tuple[Array, Array] | None:
         """Return start and goal in different regions, or None if there are none in ``MAX_BATCHES`` batches."""
@@ -271,6 +296,7 @@ class EndSampler:
         robot = self.robot
         for _ in range(MAX_BATCHES):
             q = random.uniform(robot.position_lower, robot.position_upper, (SAMPLES, robot.n))
+            q = self.upright(q) if self.is_upright else q
             poses = self.checker.joint_poses(q.T)[:, -1]
             tip = poses[:, :9].reshape(-1, 3, 3) @ robot.chain.tip_translation + poses[:, 9:]
             for region, states in zip(scene.regions, found, strict=True):
@@ -290,6 +316,25 @@ class EndSampler:
                     if line_may_be_free or not self.line_is_free(start, goal):
                         return start, goal
         return None
+
+    def upright(self, q: Array) -> Array:
+        """Project states (K, n) by Gauss-Newton steps; return those with an upright tip axis within the limits."""
+        robot, chain = self.robot, self.robot.chain
+        joint_axes = np.array([joint.axis for joint in chain.joints])
+        for last in range(PROJECTIONS + 1):
+            rotations = self.checker.joint_poses(q.T)[:, 1:, :9].reshape(*q.shape, 3, 3)
+            tip_axis = rotations[:, -1] @ chain.tip_rotation[:, 2]
+            tilt = tip_axis[:, :2]
+            if last == PROJECTIONS:
+                break
+            axes = np.einsum("kjxy,jy->kjx", rotations, joint_axes)
+            columns = np.cross(axes, tip_axis[:, None])[..., :2]
+            square = np.einsum("kjx,kjy->kxy", columns, columns) + PROJECTION_DAMPING * np.eye(2)
+            step = np.einsum("kjx,kx->kj", columns, np.linalg.solve(square, tilt[..., None])[..., 0])
+            q = q - np.clip(step, -MAX_PROJECTION_STEP, MAX_PROJECTION_STEP)
+        inside = ((q > robot.position_lower) & (q < robot.position_upper)).all(axis=1)
+        upright = inside & (np.abs(tilt).max(axis=1) < MAX_TILT) & (tip_axis[:, 2] > 0)
+        return np.asarray(q[upright])
 
     def holds(self, q: Array) -> bool:
         """Return whether the torques at rest are within a fraction of the limits."""
@@ -406,7 +451,7 @@ def coal_obstacle(obstacle: Obstacle) -> tuple[Any, Any]:
 def search_reference(problem: Problem, solved: list[Solved], seconds: float) -> dict[str, int]:
     """Return the number of unsolved problems for which RRT-Connect finds a path in so much CPU time [s]."""
     robot = load_robot(problem)
-    checker, found = make_checker(robot), 0
+    checker, found = make_checker(problem, robot), 0
     unsolved = [each for each in solved if not each.attempt.valid]
     for each in unsolved:
         checker.place(each.obstacles, place_obstacles(each.obstacles))
@@ -470,14 +515,16 @@ def loaded(name: str) -> tuple[Problem, Robot, CollisionChecker]:
         problem = load_problem(path)
         robot = load_robot(problem)
         problem = problem.with_obstacles(())  # with the text of the URDF
-    return problem, robot, make_checker(robot)
+    return problem, robot, make_checker(problem, robot)
 
 
-def make_checker(robot: Robot) -> CollisionChecker:
-    """Return the compiled collision checks of a robot."""
+def make_checker(problem: Problem, robot: Robot) -> CollisionChecker:
+    """Return the compiled collision checks of a robot with the object that it holds."""
     library = load_collision_library(KernelLibrary(*choose_backend("compiled"), "", {}))
     assert library is not None
-    return CollisionChecker(library, robot)
+    assert robot.shape is not None
+    size = problem.object_size
+    return CollisionChecker(library, robot, size and with_held_object(robot.shape, robot.chain, size))
 
 
 def solve_family(
@@ -536,7 +583,12 @@ def main() -> None:
                 solved = solve_suite(problem, chosen.suite)
             else:
                 solved = solve_family(
-                    problem, EndSampler(robot, checker), family, chosen.count, chosen.seed, shipped=chosen.shipped
+                    problem,
+                    EndSampler(problem, robot, checker),
+                    family,
+                    chosen.count,
+                    chosen.seed,
+                    shipped=chosen.shipped,
                 )
             figures = results[f"{name} {family}"] = summary(solved)
             rows.append((name, family, *(f"{value:.4g}" for key, value in figures.items() if key != "reasons")))

@@ -1,6 +1,5 @@
-"""Build the CasADi functions of a planner: equality residuals, and residuals that depend on velocity."""
+"""Build the CasADi functions of a planner: residuals that depend on velocity, and largest violations."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from typing import Any
@@ -12,27 +11,11 @@ from cnpgen.kernels.library import KernelLibrary
 from cnpgen.kernels.symbolic.linalg import Vec, symbols
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState, time_derivatives
 from cnpgen.problems.constraints.constraint import MIN_TOLERANCE, Condition
-from cnpgen.problems.constraints.needs import symbolic_needs
+from cnpgen.problems.equalities import conditions_with_needs, equality_residuals, state_of_symbols
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
 
 Array = NDArray[np.float64]
-
-
-def equality_residuals(robot: Robot, problem: Problem) -> Any:
-    """Build ``(q, obstacle_poses) -> (r, dr/dq)``: residuals of the equalities, Jacobian column by column."""
-    import casadi as ca
-
-    columns, state = _state(robot, problem)
-    rows = [
-        value - float(target)
-        for condition, needs in _conditions(problem, state, columns[1:-1])
-        if needs == 0 and condition.is_equality
-        for value, target in zip(condition.g, condition.lower, strict=True)
-    ]
-    residual = ca.vertcat(*rows) if rows else ca.SX(0, 1)
-    jacobian = ca.densify(ca.jacobian(residual, columns[0]))
-    return ca.Function("equality_residuals", [columns[0], columns[-1]], ca.cse([residual, ca.vec(jacobian)]))
 
 
 def speed_residuals(robot: Robot, problem: Problem) -> Any:
@@ -42,8 +25,8 @@ def speed_residuals(robot: Robot, problem: Problem) -> Any:
     """
     import casadi as ca
 
-    columns, state = _state(robot, problem)
-    conditions = _conditions(problem, state, columns[1:-1])
+    columns, state = state_of_symbols(robot, problem)
+    conditions = conditions_with_needs(problem, state, columns[1:-1])
     rows = [value for condition, needs in conditions if needs for value in condition.g]
     g = ca.vertcat(*rows) if rows else ca.SX(0, 1)
     return ca.Function("speed_residuals", columns, [g])
@@ -65,7 +48,7 @@ def speed_violation(robot: Robot, problem: Problem) -> Any:
     dq, ddq, jerk = time_derivatives(path, rate)
     state = SymbolicState(robot, p, dq, ddq, obstacle_poses, problem.obstacle, problem.object_size, jerk)
     violations: list[Any] = []
-    for condition, needs in _conditions(problem, state, moving):
+    for condition, needs in conditions_with_needs(problem, state, moving):
         if needs:
             violations += _violations(condition, np.ones(len(condition.g)))
     worst = reduce(ca.fmax, violations) if violations else ca.SX(-1)
@@ -106,7 +89,7 @@ def static_violation(robot: Robot, problem: Problem) -> Any:
     """Build ``(q, obstacle_poses) -> e``: the largest violation of a condition by the robot at rest, in tolerances."""
     import casadi as ca
 
-    columns, state = _state(robot, problem)
+    columns, state = state_of_symbols(robot, problem)
     zero = [0.0] * robot.n
     rest = replace(state, dq=zero, ddq=zero, jerk=zero if problem.uses_jerk else None)
     violations: list[Any] = []
@@ -149,10 +132,10 @@ class SpeedBounds:
 
 def speed_bounds(robot: Robot, problem: Problem) -> SpeedBounds:
     """Return the bounds of the rows of ``speed_residuals``."""
-    columns, state = _state(robot, problem)
+    columns, state = state_of_symbols(robot, problem)
     rows = [
         (low, high, needs == 3, needs == 1 and _is_proportional(value, columns[1], low, high))
-        for condition, needs in _conditions(problem, state, columns[1:-1])
+        for condition, needs in conditions_with_needs(problem, state, columns[1:-1])
         if needs
         for value, low, high in zip(condition.g, condition.lower, condition.upper, strict=True)
     ]
@@ -174,15 +157,3 @@ def _on_path(robot: Robot, problem: Problem) -> tuple[list[Any], list[Vec]]:
     widths = (*[robot.n] * orders, orders - 1, problem.scene_width)
     columns, scalars = zip(*map(symbols, names, widths), strict=True)
     return list(columns), list(scalars)
-
-
-def _state(robot: Robot, problem: Problem) -> tuple[list[Any], SymbolicState]:
-    """Return the columns q, dq, ddq, the jerk if it is constrained, and obstacle poses, and their state."""
-    scene = problem.obstacle, problem.object_size, problem.scene_width
-    return SymbolicState.of_symbols(robot, *scene, uses_jerk=problem.uses_jerk)
-
-
-def _conditions(problem: Problem, state: SymbolicState, moving: Sequence[Any]) -> list[tuple[Condition, int]]:
-    """Return all constraints at a state, each with the highest derivative of q, of ``moving``, that it depends on."""
-    conditions = [condition for constraint in problem.constraint for condition in constraint.symbolic(state)]
-    return [(condition, symbolic_needs(condition, *moving)) for condition in conditions]

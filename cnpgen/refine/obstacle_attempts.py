@@ -36,7 +36,7 @@ def is_deep(refiner: Refiner, task: RefinementTask, hulls: Hulls) -> bool:
 def ends_penetrate(task: RefinementTask, hulls: Hulls) -> bool:
     """Return whether an end is inside an obstacle or another link, so that no motion is valid."""
     ends = np.stack([task.boundary.start_q[0], task.boundary.goal_q[0]], axis=1)
-    return hulls.max_penetration(ends, task.scene.poses[0]) > hulls.tolerance + MIN_END_PENETRATION_M
+    return hulls.violation(ends, task.scene.poses[0], above_tolerance=True) > MIN_END_PENETRATION_M
 
 
 def around_obstacles(refiner: Refiner, task: RefinementTask, best: Attempt, hulls: Hulls) -> Iterator[Attempt]:
@@ -57,7 +57,7 @@ def around_obstacles(refiner: Refiner, task: RefinementTask, best: Attempt, hull
             yield replace(best, outcome=Outcome.NO_PATH, iterations=0)
         return
     positions = refiner.check.transcription(task).positions(best.variables)
-    best_first = hulls.max_penetration(positions, task.scene.poses[0]) < MAX_PENETRATION_M
+    best_first = hulls.violation(positions, task.scene.poses[0]) < MAX_PENETRATION_M
     if best_first:
         yield from _on_hulls(refiner, task, best, hulls)
     for guess in path_guesses(refiner, task, hulls):
@@ -80,7 +80,7 @@ def path_guesses(refiner: Refiner, task: RefinementTask, hulls: Hulls | None = N
     """Yield motions along valid joint-space paths, scaled in time if they are from rest to rest."""
     boundary, space = task.boundary, refiner.rest_space(task, hulls)
     if hulls is not None and refiner.measures_hulls:
-        paths = TreeSearch(task, space, hulls).paths()
+        paths = TreeSearch(task, space, hulls, refiner.manifold(task)).paths()
     else:
         paths = find_paths(boundary.start_q[0], boundary.goal_q[0], refiner.robot, space.follow)
     for states in paths:

@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.kernels.collision.collision_checker import load_collision_library
+from cnpgen.kernels.collision.tree_search import EqualityKernel
 from cnpgen.kernels.library import KernelLibrary, problem_kernels
+from cnpgen.problems.equalities import equality_residuals
 from cnpgen.problems.obstacles import table_frame_of
 from cnpgen.problems.problem import Problem
 from cnpgen.refine import initial_guesses
@@ -102,6 +104,8 @@ class Refiner:
             poses=self.kernel_poses,
             penetration=self._penetration if self.measures_hulls else None,
         )
+        has_manifold = self.measures_hulls and bool(self.check.equalities)
+        self._equalities = kernels.load_by_structure(equality_residuals) if has_manifold else None
         every, orders = tuple(vars(self.levels).values()), problem.path_orders
         self._grids = {points: make_grid(self.spec, points, orders) for points in {level.points for level in every}}
         self._feedbacks = dict[int, HullFeedback]()
@@ -178,7 +182,7 @@ class Refiner:
 
     def _penetration(self, task: RefinementTask, q: Array) -> float:
         """Return by how much the hulls at states q (n, K) violate their required distances above the tolerance [m]."""
-        return self.hulls.violation(q, task.scene.poses[0]) - self.hulls.tolerance
+        return self.hulls.violation(q, task.scene.poses[0], above_tolerance=True)
 
     def bounds(self, task: RefinementTask, level: GridLevel, ends: Array) -> Bounds:
         """Return the bounds of a level for a motion whose boundary states have residuals ``ends``, shape (2, m)."""
@@ -338,12 +342,18 @@ class Refiner:
         bounds, poses = self.check.rest_bounds(task), self.kernel_poses(task)
         return RestSpace(self.residual_kernels, self.robot, bounds, poses, hulls, task.scene.poses[0])
 
+    def manifold(self, task: RefinementTask) -> EqualityKernel | None:
+        """Return the equalities that compiled trees keep, or None if there are none."""
+        if self._equalities is None or not self._equalities.tape.outputs[0]:
+            return None
+        return EqualityKernel(self._equalities, self.kernel_poses(task))
+
     @property
     def hulls(self) -> Hulls:
         """Clearances of the links' hulls, one object per thread; see ``has_clearance_constraints``."""
         thread = get_ident()
         if thread not in self._hulls:
-            self._hulls[thread] = Hulls(self.problem, self.robot, self._library)
+            self._hulls[thread] = Hulls(self.problem, self.robot, self._library, with_object=self.measures_hulls)
         return self._hulls[thread]
 
     def _guess_arguments(self, task: RefinementTask) -> tuple[Boundary, Array, TrajectorySpec]:

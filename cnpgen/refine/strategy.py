@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from cnpgen.judges.plans.judge import Judge
 from cnpgen.judges.plans.verdict import Reason, Verdict
-from cnpgen.problems.constraints.clearance import RobotClearance
+from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.constraints.self_clearance import SelfClearance
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.grid_levels import MAX_INITIAL_VIOLATION
@@ -63,7 +63,7 @@ MAX_VERDICT_FEEDBACKS = 3  # of collisions of one attempt from the verdict to th
 MAX_CONTACTS = 6  # valid attempts whose links touch something within the tolerance, before the search ends with one
 FEEDBACK_GROWTH = 3.0  # of the added distance, from one of them to the next: an edge may pass between grid points
 MAX_ROUNDING_ERROR = 1e-12  # rad and 1/s: smaller differences are rounding errors
-COLLISION_REASONS = {RobotClearance.reason, SelfClearance.reason}
+COLLISION_REASONS = {RobotClearance.reason, SelfClearance.reason, ObjectContact.reason}
 INPUT_OUTCOMES = {Outcome.UNCHANGED, Outcome.ADJUSTED}
 VERDICT_TIME_S = 5e-3  # of a verdict, before one was timed
 
@@ -228,6 +228,7 @@ class RefinementSearch:
         skipped: Attempts with violations above ``MAX_JUDGED_VIOLATION``.
         verdict: Last verdict.
         found_no_path: Whether trees searched paths among the obstacles in vain.
+        contacts: Number of valid plans whose links touch something within the tolerance.
     """
 
     refiner: Refiner
@@ -238,13 +239,14 @@ class RefinementSearch:
     skipped: list[Attempt] = field(default_factory=list)
     verdict: Verdict | None = None
     found_no_path: bool = False
+    contacts: int = 0
 
     def add(self, attempt: Attempt) -> bool:
         """Judge an attempt; return whether the search ends: it is valid and precise, or enough others are valid."""
         self.iterations += attempt.iterations
         self.found_no_path |= attempt.outcome is Outcome.NO_PATH
-        enough = MAX_CONTACTS if self.refiner.measures_hulls else 1
-        found_valid = sum(earlier.valid for earlier in self.judged) >= enough
+        valid = sum(earlier.valid for earlier in self.judged)
+        found_valid = valid >= MAX_CONTACTS or valid > self.contacts
         if attempt.violation > MAX_JUDGED_VIOLATION:
             self.skipped.append(attempt)
             return found_valid
@@ -301,6 +303,7 @@ class RefinementSearch:
         touches = not verdict.valid and verdict.reason in COLLISION_REASONS
         if self.refiner.measures_hulls and touches:
             verdict = self.checker.verdict(self.task, plan.path, plan.rate)
+            self.contacts += verdict.valid
         keeps_outcome = verdict.valid or plan.outcome in INPUT_OUTCOMES
         return replace(
             plan,

@@ -1,4 +1,4 @@
-"""Initial paths among obstacles from compiled trees, for problems whose states at rest are free of equalities.
+"""Initial paths among obstacles from compiled trees, on the manifold of a problem's equalities if it has any.
 
 Several small trees with different margins grow in milliseconds, and large ones if these find few paths. The paths are
 sorted by an estimated duration. Large trees with shorter edges follow one by one, until a motion along one of their
@@ -6,13 +6,13 @@ paths is valid. If the straight line is free, it is the only path.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import count, islice
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.kernels.collision.tree_search import TreeSettings, estimated_duration, find_tree_path
+from cnpgen.kernels.collision.tree_search import EqualityKernel, TreeSettings, estimated_duration, find_tree_path
 from cnpgen.refine.rrt_connect import MAX_TURN, RestSpace
 from cnpgen.refine.solver.hulls import Hulls
 from cnpgen.refine.task import RefinementTask
@@ -26,6 +26,8 @@ LARGE_TREE_EXTENSIONS = 128_000  # without margin, in narrow passages
 LARGE_TREES, MAX_UNCONNECTED_TREES = 12, 3  # with edges of either length; three if no tree connects
 TREE_EXTENSION_RAD, SHORT_TREE_EXTENSION_RAD = 1.0, 0.5  # length of an edge [rad or m]; shorter ones after the others
 TREE_SHORTCUTS = 400  # attempted on a path
+MANIFOLD_SPACING_RAD = 0.04  # of projected states, which are all nodes, so that trees have more of them
+MANIFOLD_NODES, MANIFOLD_LARGE_TREE_NODES = 6_000, 24_000
 
 
 @dataclass(frozen=True)
@@ -36,11 +38,13 @@ class TreeSearch:
         task: The task.
         space: Valid states at rest; conditions other than distances are checked on the paths, not in the trees.
         hulls: Clearances of the hulls with compiled checks.
+        manifold: Equalities of the problem, or None.
     """
 
     task: RefinementTask
     space: RestSpace
     hulls: Hulls
+    manifold: EqualityKernel | None
 
     def paths(self) -> Iterator[Array]:
         """Yield paths, corners of shape (K, n) each.
@@ -49,11 +53,11 @@ class TreeSearch:
         first, and then those of shorter estimated duration. Paths of large trees with shorter edges follow.
         """
         found, seeds = list[Array](), count()
-        for path in self._small_trees(seeds):
-            if len(path) == 2:
-                yield path  # the straight line is free
-                return
-            found.append(path)
+        line = self._grow(0, self._settings(0.0, 0, TREE_EXTENSION_RAD))
+        if line is not None:
+            yield line
+            return
+        found += self._small_trees(seeds)
         missing = max(MIN_TREE_PATHS - len(found), 0)
         found += islice(self._large_trees(seeds, TREE_EXTENSION_RAD, bool(found)), missing)
         space, limit = self.space, self.space.robot.velocity_limit
@@ -86,7 +90,7 @@ class TreeSearch:
                 yield path
 
     def _settings(self, margin: float, extensions: int, length: float) -> TreeSettings:
-        return TreeSettings(
+        settings = TreeSettings(
             self.hulls.obstacle_distance,
             self.hulls.self_distance,
             margin=margin,
@@ -94,6 +98,10 @@ class TreeSearch:
             max_extensions=extensions,
             shortcuts=TREE_SHORTCUTS,
         )
+        if self.manifold is None:
+            return settings
+        nodes = MANIFOLD_LARGE_TREE_NODES if extensions == LARGE_TREE_EXTENSIONS else MANIFOLD_NODES
+        return replace(settings, spacing=MANIFOLD_SPACING_RAD, max_nodes=nodes)
 
     def _grow(self, seed: int, settings: TreeSettings) -> Array | None:
         """Return the path of one pair of trees, or None."""
@@ -102,4 +110,6 @@ class TreeSearch:
         lower, upper = np.minimum(start, goal) - MAX_TURN, np.maximum(start, goal) + MAX_TURN
         box = np.maximum(robot.position_lower, lower), np.minimum(robot.position_upper, upper)
         checker = self.hulls.placed_checker(task.scene.poses[0])
-        return find_tree_path(checker, (start, goal), box, robot.velocity_limit, settings, seed=seed)
+        return find_tree_path(
+            checker, (start, goal), box, robot.velocity_limit, settings, seed=seed, manifold=self.manifold
+        )

@@ -8,11 +8,12 @@ import pytest
 from scipy.interpolate import BSpline
 
 from cnpgen.kernels.library import problem_kernels
-from cnpgen.planner.expressions import effective_steps, equality_residuals
+from cnpgen.planner.expressions import effective_steps
 from cnpgen.planner.inference_pipeline import make_inference_pipeline
 from cnpgen.planner.time_scaling import MAX_TIME_SCALE, SCALING_INTERVALS, make_time_scaling
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.plans import make_plans
+from cnpgen.problems.equalities import equality_residuals
 from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem_record import as_problem
 from cnpgen.trajectory.boundary import Boundary, anchor_line, assemble

@@ -22,10 +22,11 @@ from cnpgen.refine.strategy import PlanChecker, RefinementSearch, refine_task
 from cnpgen.refine.task import Outcome
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.trajectory.spline_motion import Motion
+from cnpgen.world.world import World
 from tests.conftest import needs_compiler
 from tests.examples.meshes import Meshes
 from tests.examples.narrow import BESIDE_WALL, IN_SLOT, SLOT, WALL, between, narrow, refiner
-from tests.examples.shaped_robot import KINDS, OBSTACLES, write_problem
+from tests.examples.shaped_robot import KINDS, OBSTACLES, SELF, write_problem
 
 STEP = 1e-6  # rad, of finite differences
 CONTACT_TURN_RAD, CONTACT_M, CLOSE_M = 1e-3, 5e-5, 0.01  # the contact is half the tolerance
@@ -69,7 +70,9 @@ def test_distances_agree_with_meshes(tmp_path, library):
     assert np.abs(found - expected)[in_range].max() < 1e-4  # round parts are prisms
     assert (found[expected > MEASURED_RANGE_M + 1e-4] == MEASURED_RANGE_M).all()
     assert np.array_equal(hulls.clear_states(q.T.copy(), obstacle_poses), found >= 0)
-    assert hulls.max_penetration(q.T.copy(), obstacle_poses) == -found.min()
+    assert hulls.violation(q.T.copy(), obstacle_poses) == pytest.approx(-found.min(), abs=1e-9)
+    allowed = hulls.violation(q.T.copy(), obstacle_poses, above_tolerance=True)
+    assert allowed == pytest.approx(-found.min() - 1e-4, abs=1e-9)
 
 
 def test_distances_of_positions_that_are_not_finite_are_nan(tmp_path, library):
@@ -108,9 +111,71 @@ def test_compiled_rows_are_the_distances_of_hulls_and_their_gradients(tmp_path):
     assert np.abs(gradients).max() > 0.1
 
 
+HELD = (
+    SELF
+    + """
+[object]
+size = [0.08, 0.06, 0.12]
+touch_links = ["fore", "hand", "claw"]
+[[constraint]]
+use = "object-contact"
+depth = 0.002
+tolerance = 5e-4
+"""
+)
+LEVEL = """
+[[constraint]]
+use = "plane"
+point = [0, 0, 0.45]
+normal = [0, 0, 1]
+tolerance = 1e-3
+"""
+
+
+@pytest.mark.parametrize("obstacles", [KINDS, OBSTACLES], ids=["kinds", "boxes"])
+def test_distances_of_the_held_object_are_those_of_the_verdict(tmp_path, obstacles, library):
+    problem = load_problem(write_problem(tmp_path, obstacles=obstacles, more=HELD))
+    robot, poses = load_robot(problem), place_obstacles(problem.obstacle)
+    hulls, links = Hulls(problem, robot, library, with_object=True), Hulls(problem, robot, library)
+    held = slice(len(links.min_distances), None)
+    assert (hulls.min_distances[held] == -0.002).all()
+    assert (hulls.tolerances[held] == 5e-4).all()
+    q = np.random.default_rng(3).uniform(robot.position_lower, robot.position_upper, (300, robot.n))
+    world, zero, expected = World(robot, problem.obstacle, problem.object_size), np.zeros(robot.n), []
+    for state in q:
+        world.set_state(state, zero, zero, poses)
+        expected.append(world.object_distances())
+    expected = np.array(expected)
+    found = hulls.measure(q.T.copy(), poses)[0]
+    np.testing.assert_allclose(found[:, : held.start], links.measure(q.T.copy(), poses)[0], atol=1e-12)
+    assert np.abs(found[:, held] - np.minimum(expected, MEASURED_RANGE_M - 0.002)).max() < 1e-4  # prisms
+    enters = expected.min(axis=1) < -0.003
+    assert 3 < enters.sum() < 290
+    clear = hulls.clear_states(q.T.copy(), poses)
+    assert not clear[enters].any()
+    np.testing.assert_array_equal(clear, links.clear_states(q.T.copy(), poses) & (found[:, held].min(axis=1) >= -0.002))
+
+
 @needs_compiler
-def test_scenes_of_a_robot_share_kernels(tmp_path):
-    problem = load_problem(write_problem(tmp_path, obstacles=KINDS))
+def test_compiled_rows_of_the_held_object_have_its_depth(tmp_path):
+    problem = load_problem(write_problem(tmp_path, more=HELD))
+    robot = load_robot(problem)
+    tool, poses = load_refiner(problem, robot), place_obstacles(problem.obstacle)
+    kernels, hulls = tool.residual_kernels, tool.hulls
+    q = np.random.default_rng(3).uniform(robot.position_lower, robot.position_upper, (60, robot.n)).T.copy()
+    w = np.ones((kernels.values.tape.inputs[0], 60))
+    w[: robot.n] = q
+    rows = kernels.values.tape.outputs[0]
+    (values,) = hulls.row_kernels(kernels, poses).values(w, np.zeros((0, 60)))
+    distances = Hulls(problem, robot, with_object=True).measure(q, poses)[0]
+    limited = np.minimum(0.1 * values[rows:].T, hulls.min_distances + MEASURED_RANGE_M)
+    np.testing.assert_allclose(limited, distances, atol=1e-4)
+
+
+@needs_compiler
+@pytest.mark.parametrize("more", [SELF, HELD, SELF + LEVEL, HELD + LEVEL], ids=["links", "held", "level", "held level"])
+def test_scenes_of_a_robot_share_kernels(tmp_path, more):
+    problem = load_problem(write_problem(tmp_path, obstacles=KINDS, more=more))
     other = problem.with_obstacles(problem.obstacle[:2])
     tapes = [load_refiner(item, load_robot(item)).residual_kernels.values.tape for item in (problem, other)]
     assert tapes[0].inputs == tapes[1].inputs
@@ -149,7 +214,9 @@ def test_a_collision_of_the_verdict_becomes_larger_distances_around_its_phase(tm
 def test_large_trees_follow_the_first_ones(monkeypatch):
     grown, hits = list[TreeSettings](), set[int]()  # hits: numbers of the trees that find a path
 
-    def find(checker, ends, box, velocity, settings, *, seed):
+    def find(checker, ends, box, velocity, settings, *, seed, manifold):
+        if not settings.max_extensions:
+            return None  # the straight line collides
         grown.append(settings)
         return np.zeros((3, 2)) if len(grown) - 1 in hits else None
 
@@ -159,7 +226,7 @@ def test_large_trees_follow_the_first_ones(monkeypatch):
     hulls = SimpleNamespace(obstacle_distance=0.0, self_distance=0.0, placed_checker=lambda _: None)
     boundary = SimpleNamespace(start_q=np.zeros((1, 2)), goal_q=np.ones((1, 2)))
     task = SimpleNamespace(boundary=boundary, scene=SimpleNamespace(poses=np.zeros((1, 0))))
-    search = tree_paths.TreeSearch(task, space, hulls)
+    search = tree_paths.TreeSearch(task, space, hulls, None)
     cases = (
         ({0, 1, 3}, (12, 0, 12)),  # small trees with every margin find enough paths
         (set(), (4, 3, 3)),  # nothing connects

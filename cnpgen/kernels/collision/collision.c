@@ -16,6 +16,7 @@ typedef struct {
   const long *first_part, *part_of_link; /* parts of a link: part_of_link[first_part[link]...] */
   const long *link_pairs, *first_pair, *pairs; /* two links; pairs of a link pair from first_pair on; two parts */
   const long *moving, *moving_frames; /* part -> index among the moving parts; their frames */
+  const double *added; /* to the limits of the links' distances from obstacles [m]; -INFINITY: not checked */
   const body *obstacles;
   const double *boxes; /* center, half sizes, rotation by rows, radius of bounding boxes: 16 rows of lanes */
   const double *vertices;
@@ -173,13 +174,15 @@ static void record(contact_list *list, long pair, const pose *f, const contact *
   list->count++;
 }
 
-/* Find the contacts closer than `limit` of moving parts and obstacles; without a list, return 1 at the first one. */
+/* Find the contacts of moving parts and obstacles closer than `limit` plus what the link adds; without a list, return 1 at the
+first one. */
 static int meet_obstacles(const robot_scene *s, memory *m, double limit, contact_list *list) {
   for (long l = s->n_links - 1; l >= 0; l--) {
     const capsule *link = s->links + l;
     if (!link->frame) continue;
     const double *e = m->ends + 6 * l;
-    double center[3], half[3], reach = link->radius + limit;
+    double center[3], half[3], within = limit + s->added[l], reach = link->radius + within;
+    if (!(within > -INFINITY)) continue;
     for (int i = 0; i < 3; i++) center[i] = (e[i] + e[3 + i]) / 2, half[i] = (e[3 + i] - e[i]) / 2;
     for (long o = 0; o < s->lanes; o += W) {
       v range = larger(reach + at(s->boxes + 15 * s->lanes + o), K(0));
@@ -194,8 +197,8 @@ static int meet_obstacles(const robot_scene *s, memory *m, double limit, contact
           long part = s->part_of_link[i];
           double *guess = m->obstacle_normal + 3 * (part * s->n_obstacles + o + lane);
           contact found = {0};
-          measure_bodies(s, s->parts + part, m->frame + link->frame, obstacle, &place, guess, limit, list != 0, m->work, &found);
-          if (!(found.distance < limit)) continue;
+          measure_bodies(s, s->parts + part, m->frame + link->frame, obstacle, &place, guess, within, list != 0, m->work, &found);
+          if (!(found.distance < within)) continue;
           if (!list) return 1;
           record(list, s->moving[part] * s->n_obstacles + o + lane, m->frame + link->frame, &found, guess, 1);
         }

@@ -4,7 +4,7 @@ Judges do not use it: verdicts measure with Coal.
 """
 
 import ctypes
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from ctypes import c_double, c_int, c_long, c_void_p
 from itertools import product
 from pathlib import Path
@@ -18,11 +18,13 @@ from cnpgen.kernels.compiled_kernel import address_of
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot import Robot
+from cnpgen.robots.shape.shape import Shape
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-SOURCES = [Path(__file__).with_name(name) for name in ("convex.c", "collision.c", "tree_search.c", "hull_rows.c")]
+_NAMES = ("convex.c", "collision.c", "tree_search.c", "manifold_search.c", "hull_rows.c")
+SOURCES = [Path(__file__).with_name(name) for name in _NAMES]
 MAX_JOINTS = 56  # of the arrays in collision.c
 MIN_CONTACT_CAPACITY = 1024  # of the first call; a second one follows where it is too small
 CAPSULE = np.dtype([("frame", np.int64), ("first", np.float64, 3), ("second", np.float64, 3), ("radius", np.float64)])
@@ -34,7 +36,7 @@ class _RobotScene(ctypes.Structure):
     _fields_ = (
         *((name, c_long) for name in ("n", "n_parts", "n_links", "n_link_pairs", "n_obstacles", "lanes")),
         *((name, c_void_p) for name in ("place", "axis", "sliding", "parts", "links", "first_part", "part_of_link")),
-        *((name, c_void_p) for name in ("link_pairs", "first_pair", "pairs", "moving", "moving_frames")),
+        *((name, c_void_p) for name in ("link_pairs", "first_pair", "pairs", "moving", "moving_frames", "added")),
         *((name, c_void_p) for name in ("obstacles", "boxes", "vertices")),
     )
 
@@ -79,17 +81,26 @@ class CollisionChecker:
 
     Args:
         library: Library of ``load_collision_library``.
-        robot: The robot, with link geometry and at most ``MAX_JOINTS`` planned joints.
+        robot: The robot, with at most ``MAX_JOINTS`` planned joints.
+        shape: Its link geometry, by default the robot's own.
+        added: Link -> distance that is added to its required ones from obstacles [m], by default 0; -inf for no check.
 
     Attributes:
         link_pairs: Pairs of convex parts of links that must not touch, the one nearer to the base first, shape (M, 2).
     """
 
-    def __init__(self, library: ctypes.CDLL, robot: Robot) -> None:
-        assert robot.shape is not None
+    def __init__(
+        self,
+        library: ctypes.CDLL,
+        robot: Robot,
+        shape: Shape | None = None,
+        added: Mapping[str, float] | None = None,
+    ) -> None:
+        shape = robot.shape if shape is None else shape
+        assert shape is not None
         self.library, self._n, self._arrays = library, robot.n, dict[str, Any]()
         self._scene = _RobotScene()
-        shape, links = robot.shape, {capsule.link: i for i, capsule in enumerate(robot.shape.capsules)}
+        links = {capsule.link: i for i, capsule in enumerate(shape.capsules)}
         chain = [np.append(joint.rotation.ravel(), joint.translation) for joint in robot.chain.joints]
         self._set("place", np.array(chain, np.float64))
         self._set("axis", np.array([joint.axis for joint in robot.chain.joints], np.float64))
@@ -104,6 +115,7 @@ class CollisionChecker:
         self._set("parts", parts)
         capsules = np.array([(shape.joints[c.link], c.first, c.second, c.radius) for c in shape.capsules], CAPSULE)
         self._set("links", capsules)
+        self._set("added", np.array([(added or {}).get(capsule.link, 0.0) for capsule in shape.capsules]))
         of_link = [np.flatnonzero(parts["link"] == link) for link in range(len(capsules))]
         self._set("first_part", np.append(0, np.cumsum([len(each) for each in of_link])))
         self._set("part_of_link", np.concatenate(of_link))

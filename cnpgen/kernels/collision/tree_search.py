@@ -9,10 +9,13 @@ from numpy.typing import NDArray
 
 from cnpgen.kernels.collision.collision_checker import CollisionChecker
 from cnpgen.kernels.compiled_kernel import address_of
+from cnpgen.kernels.kernel import Kernel
 
 Array = NDArray[np.float64]
 
 MAX_PATH_POINTS = 2000
+STATES_PER_PROJECTION = 16  # BLOCK in manifold_search.c
+MAX_PROJECTION_ERROR = 1e-4  # of residuals [rad or m]
 CORNER_TIME_S = 0.12  # of a corner of a path, added to the time at the velocity limits
 
 
@@ -55,6 +58,19 @@ class TreeSettings:
     shortcuts: int = 100
 
 
+@dataclass(frozen=True)
+class EqualityKernel:
+    """Equalities that the states of a path meet.
+
+    Attributes:
+        residuals: Compiled kernel ``(q, scene) -> (r, dr/dq)``, the Jacobian column by column.
+        scene: Values of the scene that it takes, shape (width,).
+    """
+
+    residuals: Kernel
+    scene: Array
+
+
 def find_tree_path(
     checker: CollisionChecker,
     ends: tuple[Array, Array],
@@ -63,8 +79,11 @@ def find_tree_path(
     settings: TreeSettings,
     *,
     seed: int,
+    manifold: EqualityKernel | None = None,
 ) -> Array | None:
     """Search for a path whose straight lines are clear; it is shortened by its estimated duration.
+
+    On a manifold the path consists of projected states at small distances, and fewer of them make it shorter.
 
     Args:
         checker: The robot among its obstacles.
@@ -73,6 +92,7 @@ def find_tree_path(
         velocity_limit: Velocity limits of the joints [rad/s], shape (n,).
         settings: Settings of the search.
         seed: Seed of the random numbers.
+        manifold: Equalities; they must hold at both ends.
 
     Returns:
         Corners of the path [rad], shape (K, n), or None if the trees do not connect.
@@ -94,9 +114,16 @@ def find_tree_path(
         seed + 1,
     )
     path = np.empty((MAX_PATH_POINTS, len(arrays[0])))
-    search = checker.library.find_path
-    search.restype, search.argtypes = c_long, (c_void_p, c_void_p, c_long)
-    count = search(ctypes.addressof(native), address_of(path), len(path))
+    if manifold is None:
+        search = checker.library.find_path
+        search.restype, search.argtypes = c_long, (c_void_p, c_void_p, c_long)
+        count = search(ctypes.addressof(native), address_of(path), len(path))
+    else:
+        search, scene = checker.library.find_manifold_path, np.repeat(manifold.scene, STATES_PER_PROJECTION)
+        search.restype, search.argtypes = c_long, (*(c_void_p,) * 3, c_long, c_double, c_void_p, c_long)
+        residuals, rows = manifold.residuals.address, manifold.residuals.tape.outputs[0]
+        errors = rows, MAX_PROJECTION_ERROR
+        count = search(ctypes.addressof(native), residuals, address_of(scene), *errors, address_of(path), len(path))
     return path[:count].copy() if count else None
 
 

@@ -16,6 +16,7 @@ Array = NDArray[np.float64]
 STATES_PER_INTERVAL = 10
 FEEDBACK_MARGIN_M = 2e-4  # added to the required distances between grid points
 MARGIN_EDGE = 0.05  # phase over which the margin fades in from either end, where the clearance may be smaller
+MIN_FED_BACK_M = 1e-6  # an object that stands on something at an end touches it up to rounding
 MAX_FED_BACK_M = 0.02  # larger collisions are not between grid points
 
 
@@ -48,7 +49,7 @@ class HullFeedback:
         """
         missing = hulls.missing((self._basis @ path).T, self._margins, obstacle_poses)
         worst = float((missing.max(axis=1) - self._margins).max())
-        if not 0 < worst < MAX_FED_BACK_M:
+        if not MIN_FED_BACK_M < worst < MAX_FED_BACK_M:
             return None
         between = missing.reshape(self._intervals, STATES_PER_INTERVAL, -1).max(axis=1)
         edge = np.zeros((1, between.shape[1]))

@@ -7,29 +7,31 @@ velocity of the points along the direction.
 """
 
 from ctypes import CDLL
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.kernels.collision.collision_checker import MAX_JOINTS, CollisionChecker
+from cnpgen.kernels.collision.collision_checker import MAX_JOINTS, CloseBodies, CollisionChecker
 from cnpgen.kernels.collision.row_kernels import DistanceColumns, RowKernels
 from cnpgen.kernels.kernel import Kernel
-from cnpgen.problems.constraints.clearance import RobotClearance
+from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.constraints.self_clearance import SelfClearance
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.solver.grid import Grid
 from cnpgen.refine.solver.residuals import DISTANCE_SCALE_M
 from cnpgen.refine.solver.transcription import Linearization, ResidualKernels, Transcription, cache_last
 from cnpgen.robots.robot import Robot
+from cnpgen.robots.shape.held_object import HELD_OBJECT, with_held_object
 from cnpgen.robots.solid import solids_of
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.world.forward_kinematics import ForwardKinematics
 from cnpgen.world.rigid_bodies import Contacts, RigidBodies
 
 Array = NDArray[np.float64]
+Pairs = NDArray[np.intp]
 MEASURED_RANGE_M = 0.04  # above the required distance; larger distances are not measured
 
 
@@ -39,6 +41,25 @@ def has_clearance_constraints(problem: Problem, robot: Robot) -> bool:
     return constraints and robot.shape is not None
 
 
+@dataclass(frozen=True)
+class _Group:
+    """Pairs of bodies of one constraint.
+
+    Attributes:
+        pairs: Pairs of bodies, shape (P, 2).
+        columns: Columns of their distances, shape (P,).
+        required: Required distance [m].
+        of_obstacles: Whether they are obstacles and moving parts, else two links.
+        numbers: Their numbers among all pairs of obstacles and moving parts, or of links, shape (P,).
+    """
+
+    pairs: Pairs
+    columns: Pairs
+    required: float
+    of_obstacles: bool
+    numbers: Pairs
+
+
 class Hulls:
     """Clearances of a robot's convex parts at many states. Not thread-safe: memory is reused.
 
@@ -46,42 +67,60 @@ class Hulls:
         problem: The problem.
         robot: Its robot; ``has_clearance_constraints`` must hold.
         library: Library of compiled collision checks, or None to measure with Coal.
+        with_object: Whether the held object is a part of the robot, for its contacts with obstacles.
 
     Attributes:
         checker: Compiled collision checks, or None.
-        obstacle_distance: Required distance from obstacles [m], None without such a constraint.
+        obstacle_distance: Largest required distance from obstacles [m], None without such a constraint.
         self_distance: Required distance of links from each other [m], None without such a constraint.
         min_distances: Required distances [m], shape (m,), of pairs of links or of a link and an obstacle.
-        tolerance: Accepted violation of them in a valid motion [m].
+        tolerances: Accepted violations of them in a valid motion [m], shape (m,).
     """
 
-    def __init__(self, problem: Problem, robot: Robot, library: CDLL | None = None) -> None:
+    def __init__(
+        self, problem: Problem, robot: Robot, library: CDLL | None = None, *, with_object: bool = False
+    ) -> None:
         assert robot.shape is not None
-        usable = library is not None and robot.n <= MAX_JOINTS
-        self.checker = CollisionChecker(library, robot) if library is not None and usable else None
+        shape, kinds = robot.shape, RobotClearance | SelfClearance
+        if with_object and problem.object_size is not None:
+            shape, kinds = with_held_object(robot.shape, robot.chain, problem.object_size), kinds | ObjectContact
+        constraints = [item for item in problem.constraint if isinstance(item, kinds)]
         self._poses_of_checker: Array | None = None
         self._row_kernels: tuple[Kernel, RowKernels] | None = None
         self._obstacles, self._n, self._kinematics = problem.obstacle, robot.n, ForwardKinematics(robot.model)
-        self._bodies = RigidBodies(robot.shape, len(problem.obstacle), robot.n)
-        constraints = [item for item in problem.constraint if isinstance(item, RobotClearance | SelfClearance)]
-        links = [part.link for part in robot.shape.convex_parts]
+        self._bodies = RigidBodies(shape, len(problem.obstacle), robot.n)
+        links = [part.link for part in shape.convex_parts]
         names = [*links, *range(len(problem.obstacle))]
         columns: dict[Any, int] = {}
-        self._groups, self._uncovered, min_distances = [], [], dict[int, float]()
-        covered = {frozenset((pair.first, pair.second)) for pair in robot.shape.pairs if pair.for_solvers}
+        self._groups, self._uncovered = list[_Group](), list[tuple[Pairs, float]]()
+        min_distances, tolerances = dict[int, float](), dict[int, float]()
+        covered = {frozenset((pair.first, pair.second)) for pair in shape.pairs if pair.for_solvers}
         for constraint in constraints:
-            of_obstacles = isinstance(constraint, RobotClearance)
-            pairs = self._bodies.obstacle_pairs if of_obstacles else self._bodies.link_pairs
+            of_links, required = isinstance(constraint, SelfClearance), _required(constraint)
+            pairs = self._bodies.link_pairs if of_links else self._bodies.obstacle_pairs
+            numbers = np.arange(len(pairs))
+            if not of_links:
+                is_object = np.array([links[part] == HELD_OBJECT for part in pairs[:, 1].tolist()], bool)
+                numbers = np.flatnonzero(is_object == isinstance(constraint, ObjectContact))
+            pairs = pairs[numbers]
             indices = [columns.setdefault((names[a], names[b]), len(columns)) for a, b in pairs.tolist()]
-            min_distances |= {column: max(min_distances.get(column, 0.0), constraint.distance) for column in indices}
-            self._groups.append((pairs, np.array(indices, np.intp), constraint.distance))
-            if not of_obstacles:
+            for column in indices:
+                min_distances[column] = max(min_distances.get(column, -np.inf), required)
+                tolerances[column] = min(tolerances.get(column, np.inf), _tolerance(constraint))
+            self._groups.append(_Group(pairs, np.array(indices, np.intp), required, not of_links, numbers))
+            if of_links:
                 uncovered = [frozenset((names[a], names[b])) not in covered for a, b in pairs.tolist()]
-                self._uncovered.append((pairs[np.array(uncovered, bool)], indices, constraint.distance))
+                self._uncovered.append((pairs[np.array(uncovered, bool)], required))
         self.min_distances = np.array([min_distances[column] for column in range(len(columns))])
-        self.tolerance = max(constraint.effective_tolerance for constraint in constraints)
-        self.obstacle_distance = _largest_distance(constraints, RobotClearance)
-        self.self_distance = _largest_distance(constraints, SelfClearance)
+        self.tolerances = np.array([tolerances[column] for column in range(len(columns))])
+        clearance, contact = _largest(constraints, RobotClearance), _largest(constraints, ObjectContact)
+        self.obstacle_distance = max((each for each in (clearance, contact) if each is not None), default=None)
+        self.self_distance = _largest(constraints, SelfClearance)
+        self.checker = None
+        if library is not None and robot.n <= MAX_JOINTS:
+            base = self.obstacle_distance or 0.0
+            added = dict.fromkeys(links, _difference(clearance, base)) | {HELD_OBJECT: _difference(contact, base)}
+            self.checker = CollisionChecker(library, robot, shape, added)
         self._axes = np.array([joint.axis for joint in robot.chain.joints])
         self._sliding = np.array(robot.sliding)
         supports = [list(joints) for joints in robot.model.supports]
@@ -102,8 +141,8 @@ class Hulls:
             return np.full((q.shape[1], len(self.min_distances)), np.nan), []
         distances = np.repeat((self.min_distances + MEASURED_RANGE_M)[None], q.shape[1], axis=0)
         groups = self._contacts(q, obstacle_poses)
-        for contacts, (_, columns, _) in zip(groups, self._groups, strict=True):
-            np.minimum.at(distances, (contacts.k, columns[contacts.pair]), contacts.distance)
+        for contacts, group in zip(groups, self._groups, strict=True):
+            np.minimum.at(distances, (contacts.k, group.columns[contacts.pair]), contacts.distance)
         return distances, groups
 
     def clear_states(self, q: Array, obstacle_poses: Array, *, uncovered_only: bool = False) -> NDArray[np.bool_]:
@@ -120,23 +159,25 @@ class Hulls:
             return checker.clear_states(q, obstacle_distance=limit, self_distance=self.self_distance)
         self._place(q, obstacle_poses)
         clear = np.ones(q.shape[1], bool)
-        for pairs, _, required in self._uncovered if uncovered_only else self._groups:
+        checked = self._uncovered if uncovered_only else [(group.pairs, group.required) for group in self._groups]
+        for pairs, required in checked:
             clear &= self._bodies.pair_distances(pairs).clear_states(required)
         return clear
 
-    def max_penetration(self, q: Array, obstacle_poses: Array) -> float:
-        """Return the largest violation of the required distances at states q (n, K) [m]."""
-        return float((self.min_distances - self.measure(q, obstacle_poses)[0]).max(initial=-MEASURED_RANGE_M))
+    def violation(self, q: Array, obstacle_poses: Array, *, above_tolerance: bool = False) -> float:
+        """Return the largest violation of the required distances at states q (n, K) [m], at least 0.
 
-    def violation(self, q: Array, obstacle_poses: Array) -> float:
-        """Return the largest violation of the required distances at states q (n, K) [m], at least 0."""
-        if self.checker is None or not np.isfinite(q).all():
-            return max(self.max_penetration(q, obstacle_poses), 0.0) if np.isfinite(q).all() else np.inf
-        checker, violation = self.placed_checker(obstacle_poses), 0.0
-        for required, of_obstacles in ((self.obstacle_distance, True), (self.self_distance, False)):
-            if required is not None:
-                close = checker.close_bodies(q, required, of_obstacles=of_obstacles)
-                violation = max(violation, float((required - close.distance).max(initial=0.0)))
+        Args:
+            q: Joint positions [rad], shape (n, K).
+            obstacle_poses: Poses and sizes of the obstacles, shape (width,).
+            above_tolerance: Whether only the part above the tolerance counts.
+        """
+        if not np.isfinite(q).all():
+            return np.inf
+        least, violation = self.min_distances - (self.tolerances if above_tolerance else 0.0), 0.0
+        for contacts, group in zip(self._contacts(q, obstacle_poses, 0.0), self._groups, strict=True):
+            below = least[group.columns[contacts.pair]] - contacts.distance
+            violation = max(violation, float(below.max(initial=0.0)))
         return violation
 
     def missing(self, q: Array, margins: Array, obstacle_poses: Array) -> Array:
@@ -154,8 +195,8 @@ class Hulls:
         if not np.isfinite(q).all():
             return missing + np.inf
         contacts_of = self._contacts(q, obstacle_poses, float(margins.max()))
-        for contacts, (_, columns, _) in zip(contacts_of, self._groups, strict=True):
-            column = columns[contacts.pair]
+        for contacts, group in zip(contacts_of, self._groups, strict=True):
+            column = group.columns[contacts.pair]
             below = self.min_distances[column] + margins[contacts.k] - contacts.distance
             np.maximum.at(missing, (contacts.k, column), below)
         return missing
@@ -164,8 +205,8 @@ class Hulls:
         """Differentiate the result of ``measure`` in q: shape (n, m, K), 0 for parts out of range."""
         gradients = np.zeros((q.shape[1], len(self.min_distances), self._n))
         axes, origins = self._joint_axes(q)
-        for contacts, (_, columns, _) in zip(groups, self._groups, strict=True):
-            k, column = contacts.k, columns[contacts.pair]
+        for contacts, group in zip(groups, self._groups, strict=True):
+            k, column = contacts.k, group.columns[contacts.pair]
             normals = np.repeat(contacts.normal[:, None], 2, axis=1)
             levers = np.cross(contacts.points, normals)  # of a unit force at the points, about the world's origin
             turning = np.einsum("cjx,cbx->cbj", axes[k], levers)
@@ -185,9 +226,12 @@ class Hulls:
 
     @cached_property
     def _columns(self) -> DistanceColumns:
-        rows = {True: np.zeros(0, np.int64), False: np.zeros(0, np.int64)}
-        for pairs, indices, _ in self._groups:
-            rows[pairs is self._bodies.obstacle_pairs] = np.ascontiguousarray(indices, np.int64)
+        rows = {
+            True: np.zeros(len(self._bodies.obstacle_pairs), np.int64),
+            False: np.zeros(len(self._bodies.link_pairs), np.int64),
+        }
+        for group in self._groups:
+            rows[group.of_obstacles][group.numbers] = group.columns
         distances = self.obstacle_distance, self.self_distance
         return DistanceColumns(
             self.min_distances, rows[True], rows[False], *distances, MEASURED_RANGE_M, DISTANCE_SCALE_M
@@ -205,13 +249,22 @@ class Hulls:
         """Measure the contacts of every constraint closer than the required distance plus ``within`` [m]."""
         if self.checker is None:
             self._place(q, obstacle_poses)
-            return [self._bodies.contacts(pairs, required + within) for pairs, _, required in self._groups]
-        checker, groups = self.placed_checker(obstacle_poses), []
-        for pairs, _, required in self._groups:
-            of_obstacles = pairs is self._bodies.obstacle_pairs
-            close = checker.close_bodies(q, required + within, of_obstacles=of_obstacles)
-            groups.append(Contacts(*close, joints=self._bodies.joints_of(pairs[close.pair])))
-        return groups
+            return [self._bodies.contacts(group.pairs, group.required + within) for group in self._groups]
+        checker, found = self.placed_checker(obstacle_poses), dict[bool, CloseBodies]()
+        for kind, required in ((True, self.obstacle_distance), (False, self.self_distance)):
+            if required is not None:
+                found[kind] = checker.close_bodies(q, required + within, of_obstacles=kind)
+        return [self._contacts_of(group, found[group.of_obstacles], group.required + within) for group in self._groups]
+
+    def _contacts_of(self, group: _Group, close: CloseBodies, within: float) -> Contacts:
+        """Return the pairs of a group that are closer than ``within`` [m]."""
+        pair = np.searchsorted(group.numbers, close.pair)
+        pair[pair == len(group.numbers)] = 0
+        kept = np.flatnonzero((close.distance < within) & (group.numbers[pair] == close.pair))
+        pair = pair[kept].astype(np.intp)
+        joints = self._bodies.joints_of(group.pairs[pair])
+        k, distance, normal, points = close.k[kept], close.distance[kept], close.normal[kept], close.points[kept]
+        return Contacts(pair, k, distance, normal, points, joints)
 
     def _joint_axes(self, q: Array) -> tuple[Array, Array]:
         """Return axes and origins [m] of the joints in the world frame, shape (K, n, 3) each."""
@@ -223,9 +276,23 @@ class Hulls:
         self._bodies.place(*self._kinematics.poses(q), solids_of(self._obstacles, obstacle_poses))
 
 
-def _largest_distance(constraints: list[Any], kind: type) -> float | None:
-    chosen: list[Any] = [constraint for constraint in constraints if isinstance(constraint, kind)]
-    return max((float(constraint.distance) for constraint in chosen), default=None)
+def _required(constraint: Any) -> float:
+    """Return the distance that a constraint requires [m]; contacts of the held object have a depth."""
+    return -float(constraint.depth) if isinstance(constraint, ObjectContact) else float(constraint.distance)
+
+
+def _tolerance(constraint: Any) -> float:
+    """Return the violation of a constraint that a valid motion may have [m]."""
+    return float(constraint.tolerance if isinstance(constraint, ObjectContact) else constraint.effective_tolerance)
+
+
+def _largest(constraints: list[Any], kind: type) -> float | None:
+    """Return the largest distance that constraints of a kind require [m]; None without one."""
+    return max((_required(constraint) for constraint in constraints if isinstance(constraint, kind)), default=None)
+
+
+def _difference(required: float | None, base: float) -> float:
+    return -np.inf if required is None else required - base
 
 
 class CompiledHullTranscription(Transcription):

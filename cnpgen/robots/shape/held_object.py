@@ -5,8 +5,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError, nearest
+from cnpgen.robots.chain import Chain
 from cnpgen.robots.shape.capsule import Capsule, covering_capsule
 from cnpgen.robots.shape.convex_part import ConvexPart, link_convex_parts
 from cnpgen.robots.shape.hull import CUBE, ball_round, coal_hull
@@ -23,6 +25,9 @@ from cnpgen.robots.shape.shape import SHAPE_REVISION, Shape, cached_capsules, pa
 if TYPE_CHECKING:
     import pinocchio as pin
 
+Array = NDArray[np.float64]
+Size = tuple[float, float, float]
+
 HELD_OBJECT = "held object"  # takes the place of a link's name
 SAMPLED_HELD_STATES = 2000  # states in which the object and the links are compared
 
@@ -37,7 +42,7 @@ class HeldBody:
         tip_frame: Index of the tip frame in the model.
     """
 
-    size: tuple[float, float, float]
+    size: Size
     touch_links: tuple[str, ...]
     tip_frame: int
 
@@ -69,8 +74,7 @@ def load_held_shape(urdf: str, model: "pin.Model", held: HeldBody, keep: Path | 
     tip = model.frames[held.tip_frame]
     carrier = int(tip.parentJoint)
     checked = [link for link in joints if link not in held.touch_links and joints[link] != carrier]
-    box = ConvexPart(HELD_OBJECT, CUBE * np.array(held.size))
-    box = box.moved(np.array(tip.placement.rotation), np.array(tip.placement.translation))
+    box = _box(held.size, np.array(tip.placement.rotation), np.array(tip.placement.translation))
     parts = (*(part for part in convex_parts if part.link in checked), box)
     joints = {link: joints[link] for link in checked} | {HELD_OBJECT: carrier}
 
@@ -85,6 +89,26 @@ def load_held_shape(urdf: str, model: "pin.Model", held: HeldBody, keep: Path | 
         text = f"the held object overlaps {', '.join(fixed)} in nearly all of {SAMPLED_HELD_STATES:,} random states"
         raise RecipeError([f"object.touch_links: {text}: name the links that may touch it"])
     return Shape(parts, joints, capsules, pairs)
+
+
+def with_held_object(shape: Shape, chain: Chain, size: Size) -> Shape:
+    """Return the link geometry with the held object as a further link, without pairs with the others.
+
+    Args:
+        shape: Link geometry of the robot.
+        chain: The chain from the base to the tip, the center of the object.
+        size: Edge lengths along the axes of the tip frame [m].
+    """
+    box, half = _box(size, chain.tip_rotation, chain.tip_translation), np.array(size) / 2
+    widest = int(np.argmax(half))
+    axis, radius = half[widest] * chain.tip_rotation[:, widest], float(np.linalg.norm(np.delete(half, widest)))
+    capsule = Capsule(HELD_OBJECT, chain.tip_translation - axis, chain.tip_translation + axis, radius, overhang=radius)
+    joints = {**shape.joints, HELD_OBJECT: len(chain.joints)}
+    return Shape((*shape.convex_parts, box), joints, (*shape.capsules, capsule), shape.pairs)
+
+
+def _box(size: Size, rotation: Array, translation: Array) -> ConvexPart:
+    return ConvexPart(HELD_OBJECT, CUBE * np.array(size)).moved(rotation, translation)
 
 
 def _compare(
