@@ -19,6 +19,7 @@ from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.constraints.object_clearance import ObjectClearance
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.objectives import Centrifugal, ObjectiveTerm
+from cnpgen.robots.locked_joints import with_locked_joints
 from cnpgen.robots.obstacle import Obstacle, invalid_obstacle
 from cnpgen.robots.parameter_ranges import (
     NO_PARAMETERS,
@@ -250,13 +251,15 @@ class Problem:
     def urdf_text(self) -> str:
         """Text of the URDF, read once, so that robot, kernels and identity use the same text.
 
-        If constraints use the URDF's geometry, the text includes the hulls of meshes, the pairs of an SRDF and the
-        box of a payload that is a body.
+        Locked joints are fixed. If constraints use the URDF's geometry, the text includes the hulls of meshes, the
+        pairs of an SRDF and the box of a payload that is a body.
 
         Raises:
-            RecipeError: The URDF, a mesh or the SRDF cannot be read, or is not UTF-8.
+            RecipeError: The URDF, a mesh or the SRDF cannot be read, or is not UTF-8, or a joint cannot be locked.
         """
-        text, spec = read_urdf(self.urdf_path), self.robot
+        spec = self.robot
+        positions = dict(zip(spec.locked_joints, spec.locked_positions, strict=True))
+        text = with_locked_joints(read_urdf(self.urdf_path), positions, is_stored=self.is_stored)
         if not self.uses_link_geometry:
             return text
         keep = kept_folder() if spec.convex_parts > 1 else None

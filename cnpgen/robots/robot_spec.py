@@ -18,7 +18,9 @@ class RobotSpec:
     """Robot of a problem: URDF file, planned joints and tip frame."""
 
     urdf: str = field("URDF file, relative to the problem file")
-    joints: tuple[str, ...] = field("planned joints, in order; all other joints stay at zero")
+    joints: tuple[str, ...] = field(
+        "planned joints, in order; all other joints stay at zero, or at their 'locked_positions'"
+    )
     tip: str = field("name of the tip frame (URDF link)")
     base: tuple[float, ...] = field("base configuration of the planned joints", unit="rad", plausible=100.0)
     tip_offset: tuple[float, float, float] = field(
@@ -41,6 +43,14 @@ class RobotSpec:
         choices=GEOMETRIES,
         default="paper-capsules",
         since_version=2,
+    )
+    locked_joints: tuple[str, ...] = field(
+        "joints that are not planned and stay at other positions than zero, such as those of an open gripper",
+        default=(),
+        since_version=2,
+    )
+    locked_positions: tuple[float, ...] = field(
+        "their positions, one per joint", unit="rad", default=(), plausible=100.0, since_version=2
     )
     packages: tuple[str, ...] = field(
         "folders, relative to the problem file, that are searched for package:// of the URDF",
@@ -82,6 +92,16 @@ class RobotSpec:
             yield "joints", f"each joint can be planned once, got {', '.join(twice)} more than once"
         if len(self.base) != len(self.joints):
             yield "base", f"expected {len(self.joints)} numbers, one per planned joint, got {len(self.base)}"
+        if len(self.locked_positions) != len(self.locked_joints):
+            count = len(self.locked_joints)
+            yield (
+                "locked_positions",
+                f"expected {count} numbers, one per locked joint, got {len(self.locked_positions)}",
+            )
+        if both := sorted(set(self.joints) & set(self.locked_joints)):
+            yield "locked_joints", f"a joint is planned or locked, got {', '.join(both)} in both lists"
+        if len(set(self.locked_joints)) != len(self.locked_joints):
+            yield "locked_joints", f"each joint can be locked once, got {list(self.locked_joints)}"
         if self.decomposed and self.convex_parts == 1:
             yield "decomposed", "links are decomposed into more than one part only: set 'convex_parts', such as 4"
 
