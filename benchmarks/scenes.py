@@ -524,7 +524,7 @@ def make_checker(problem: Problem, robot: Robot) -> CollisionChecker:
     assert library is not None
     assert robot.shape is not None
     size = problem.object_size
-    return CollisionChecker(library, robot, size and with_held_object(robot.shape, robot.chain, size))
+    return CollisionChecker(library, robot, size and with_held_object(robot.shape, robot.held_shape, robot.chain, size))
 
 
 def solve_family(

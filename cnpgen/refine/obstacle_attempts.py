@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.rrt_connect import find_paths
-from cnpgen.refine.solver.hulls import Hulls, has_clearance_constraints
+from cnpgen.refine.solver.hulls import Hulls
 from cnpgen.refine.task import MAX_JUDGED_VIOLATION, Attempt, Outcome, RefinementTask
 from cnpgen.refine.tree_paths import TreeSearch
 
@@ -21,9 +21,7 @@ MAX_LINE_PENETRATION_M = 0.05  # of the initial line, above which joint-space pa
 
 def hulls_of_trees(refiner: Refiner, task: RefinementTask) -> Hulls | None:
     """Return the clearances of the hulls if compiled trees can search paths for a task."""
-    if task.deadline is not None or not has_clearance_constraints(refiner.problem, refiner.robot):
-        return None
-    return refiner.hulls if refiner.measures_hulls else None
+    return refiner.hulls if refiner.measures_hulls and task.deadline is None else None
 
 
 def is_deep(refiner: Refiner, task: RefinementTask, hulls: Hulls) -> bool:

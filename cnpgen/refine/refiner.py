@@ -17,7 +17,7 @@ from cnpgen.refine import initial_guesses
 from cnpgen.refine.fine_check import FineCheck
 from cnpgen.refine.grid_levels import GridLevel, GridLevels, default_grid_levels
 from cnpgen.refine.rrt_connect import RestSpace
-from cnpgen.refine.solver.bounds import Bounds, bounds_template
+from cnpgen.refine.solver.bounds import Bounds, bounds_template, near_ends
 from cnpgen.refine.solver.compiled_backend import load_step_library
 from cnpgen.refine.solver.cost_term import CostTerm, cost_term_residuals, residual_counts
 from cnpgen.refine.solver.grid import make_grid
@@ -155,7 +155,9 @@ class Refiner:
                 kernel_poses=self.kernel_poses(task),
                 obstacle_poses=task.scene.poses[0],
             )
-            bounds = self._bounds[level].with_hull_distances(bounds, self.hulls.min_distances, extra)
+            accepted = (near_ends(self._grids[level.points].s) * self._accepted_at_ends(task)[:, None]).max(axis=0)
+            more = -accepted if extra is None else extra - accepted
+            bounds = self._bounds[level].with_hull_distances(bounds, self.hulls.min_distances, more)
         elif hulls is not None:
             motion = HullTranscription(
                 self.residual_kernels,
@@ -244,13 +246,19 @@ class Refiner:
         feedback, motion = self._feedback(level), self.transcription(task, level)
         for _ in range(MAX_FEEDBACKS):
             path, _ = motion.unpack(result.x)
-            missing = feedback.missing_clearance(path, self.hulls, task.scene.poses[0])
+            accepted = self._accepted_at_ends(task)
+            missing = feedback.missing_clearance(path, self.hulls, task.scene.poses[0], accepted=accepted)
             if missing is None:
                 break
             extra = missing if extra is None else extra + missing
             earlier, result = result.iterations, self.run_level(task, level, result.x, extra=extra)
             result = replace(result, iterations=earlier + result.iterations)
         return result
+
+    def _accepted_at_ends(self, task: RefinementTask) -> Array:
+        """Return by how much the hulls at both ends violate their distances within the tolerance [m], shape (2, m)."""
+        ends = np.stack([task.boundary.start_q[0], task.boundary.goal_q[0]], axis=1)
+        return self.hulls.accepted_at(ends, task.scene.poses[0])
 
     def _feedback(self, level: GridLevel) -> HullFeedback:
         if level.points not in self._feedbacks:

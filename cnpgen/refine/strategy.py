@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 from cnpgen.judges.plans.judge import Judge
 from cnpgen.judges.plans.verdict import Reason, Verdict
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
+from cnpgen.problems.constraints.object_clearance import ObjectClearance
 from cnpgen.problems.constraints.self_clearance import SelfClearance
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.grid_levels import MAX_INITIAL_VIOLATION
@@ -63,7 +64,8 @@ MAX_VERDICT_FEEDBACKS = 3  # of collisions of one attempt from the verdict to th
 MAX_CONTACTS = 6  # valid attempts whose links touch something within the tolerance, before the search ends with one
 FEEDBACK_GROWTH = 3.0  # of the added distance, from one of them to the next: an edge may pass between grid points
 MAX_ROUNDING_ERROR = 1e-12  # rad and 1/s: smaller differences are rounding errors
-COLLISION_REASONS = {RobotClearance.reason, SelfClearance.reason, ObjectContact.reason}
+LINK_REASONS = {RobotClearance.reason, SelfClearance.reason}
+COLLISION_REASONS = LINK_REASONS | {ObjectContact.reason, ObjectClearance.reason}
 INPUT_OUTCOMES = {Outcome.UNCHANGED, Outcome.ADJUSTED}
 VERDICT_TIME_S = 5e-3  # of a verdict, before one was timed
 
@@ -251,6 +253,7 @@ class RefinementSearch:
             self.skipped.append(attempt)
             return found_valid
         self.judged.append(self._judge_attempt(attempt))
+        self.contacts += self.judged[-1].touches
         return found_valid or (self.judged[-1].valid and self.judged[-1].is_precise)
 
     def continue_rejected(self, attempt: Attempt) -> bool:
@@ -300,10 +303,9 @@ class RefinementSearch:
     def judge(self, plan: Attempt) -> Attempt:
         """Return a plan with its verdict."""
         verdict = self.verdict = self._verdict(plan)
-        touches = not verdict.valid and verdict.reason in COLLISION_REASONS
+        touches = not verdict.valid and verdict.reason in LINK_REASONS
         if self.refiner.measures_hulls and touches:
             verdict = self.checker.verdict(self.task, plan.path, plan.rate)
-            self.contacts += verdict.valid
         keeps_outcome = verdict.valid or plan.outcome in INPUT_OUTCOMES
         return replace(
             plan,
@@ -311,6 +313,7 @@ class RefinementSearch:
             reason=verdict.reason,
             severity=_severity(verdict),
             is_precise=self._is_precise(verdict) and not touches,
+            touches=touches and verdict.valid,
         )
 
     def _verdict(self, plan: Attempt) -> Verdict:

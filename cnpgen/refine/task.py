@@ -108,7 +108,7 @@ class RefinementTask:
 class Attempt:
     """Trajectory for a boundary problem; after the independent check also its verdict.
 
-    ``violation``, ``severity``, ``is_precise`` and ``x`` are used by the search and not part of its result.
+    ``violation``, ``severity``, ``is_precise``, ``touches`` and ``x`` are used by the search, not part of its result.
 
     Attributes:
         path: Path control points [rad], shape (C, n).
@@ -121,6 +121,7 @@ class Attempt:
             0 where it was not evaluated because the solver converged within its bounds.
         severity: 1 if the plan is valid; otherwise larger, inf if it cannot be evaluated.
         is_precise: Whether equalities are met within a fraction of their tolerance, and links do not touch anything.
+        touches: Whether it is valid and its links touch something within the tolerance.
         x: Variables of the transcription, shape (nx,), or None.
     """
 
@@ -133,6 +134,7 @@ class Attempt:
     violation: float = np.nan
     severity: float = np.nan
     is_precise: bool = False
+    touches: bool = False
     x: Array | None = None
 
     @property
@@ -165,5 +167,6 @@ class Attempt:
             violation=np.nan,
             severity=np.nan,
             is_precise=False,
+            touches=False,
             x=None,
         )

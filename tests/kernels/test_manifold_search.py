@@ -9,7 +9,9 @@ from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.refine.refine_engine import load_refiner
 from cnpgen.refine.solver.hulls import Hulls
+from cnpgen.refine.strategy import PlanChecker, refine_task
 from cnpgen.robots.solid import place_obstacles
+from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.world.world import World
 from tests.conftest import needs_compiler
 from tests.examples.narrow import BESIDE_WALL, LIMITS, SLOT, WALL, between
@@ -46,15 +48,15 @@ class Setting:
         world.set_state(q, zero, zero, self.poses)
         return world.tip_position[2]
 
-    def level(self, q):
-        """Project a state onto the manifold with SciPy."""
-        return least_squares(lambda x: [1e3 * (self.height(x) - HEIGHT_M), *(1e-3 * (x - q))], q, xtol=1e-15).x
+    def level(self, q, height=HEIGHT_M):
+        """Project a state onto a height with SciPy."""
+        return least_squares(lambda x: [1e3 * (self.height(x) - height), *(1e-3 * (x - q))], q, xtol=1e-15).x
 
-    def search(self, seed=0, **settings):
+    def search(self, seed=0, ends=None, **settings):
         box = self.robot.position_lower, self.robot.position_upper
         chosen = TreeSettings(0.0, 0.0, **{"spacing": SPACING, "max_nodes": 20_000} | settings)
         checker = self.tool.hulls.placed_checker(self.poses)
-        limit, ends = self.robot.velocity_limit, tuple(self.ends)
+        limit, ends = self.robot.velocity_limit, tuple(self.ends if ends is None else ends)
         return find_tree_path(checker, ends, box, limit, chosen, seed=seed, manifold=self.manifold)
 
 
@@ -85,6 +87,27 @@ def test_paths_are_reproducible_and_shortened(setting):
     assert not np.array_equal(paths[0], paths[2])
     counts = [np.mean([len(setting.search(seed=seed, shortcuts=n)) for seed in range(6)]) for n in (0, 200)]
     assert counts[1] < 0.9 * counts[0]
+
+
+def test_paths_end_at_the_goal(setting):
+    for seed in range(8):
+        np.testing.assert_array_equal(setting.search(seed=seed)[[0, -1]], setting.ends)
+
+
+def test_a_start_off_the_manifold_is_left(setting):
+    ends = [setting.level(BESIDE_WALL[0], HEIGHT_M + 0.12), setting.ends[1]]
+    path = setting.search(ends=ends)
+    np.testing.assert_array_equal(path[[0, -1]], ends)
+    assert max(abs(setting.height(q) - HEIGHT_M) for q in path[1:]) < 1.5e-4
+
+
+def test_a_motion_around_a_wall_keeps_the_height(setting):
+    checker = PlanChecker(setting.problem, setting.robot, degree=setting.tool.spec.degree)
+    found = refine_task(setting.tool, checker, between(setting.problem, np.array(setting.ends)))
+    assert found.valid
+    states = Motion(found.path[None], found.rate[None], setting.tool.spec.degree).at(np.linspace(0, 1, 400)).q[0]
+    assert max(abs(setting.height(q) - HEIGHT_M) for q in states) < 1e-3
+    assert np.abs(states[:, 0]).min() < 0.05  # it passes the wall
 
 
 def test_the_search_ends_with_enough_nodes_or_extensions(setting):

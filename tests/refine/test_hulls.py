@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 from cnpgen.kernels.collision.collision_checker import load_collision_library
 from cnpgen.kernels.collision.tree_search import TreeSettings
@@ -25,7 +26,7 @@ from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.world.world import World
 from tests.conftest import needs_compiler
 from tests.examples.meshes import Meshes
-from tests.examples.narrow import BESIDE_WALL, IN_SLOT, SLOT, WALL, between, narrow, refiner
+from tests.examples.narrow import BESIDE_WALL, BOXES, IN_SLOT, LIMITS, SLOT, WALL, between, narrow, refiner
 from tests.examples.shaped_robot import KINDS, OBSTACLES, SELF, write_problem
 
 STEP = 1e-6  # rad, of finite differences
@@ -111,9 +112,7 @@ def test_compiled_rows_are_the_distances_of_hulls_and_their_gradients(tmp_path):
     assert np.abs(gradients).max() > 0.1
 
 
-HELD = (
-    SELF
-    + """
+CONTACT_ONLY = """
 [object]
 size = [0.08, 0.06, 0.12]
 touch_links = ["fore", "hand", "claw"]
@@ -121,8 +120,12 @@ touch_links = ["fore", "hand", "claw"]
 use = "object-contact"
 depth = 0.002
 tolerance = 5e-4
+[[constraint]]
+use = "object-clearance"
+distance = 0.01
+tolerance = 1e-3
 """
-)
+HELD = SELF + CONTACT_ONLY
 LEVEL = """
 [[constraint]]
 use = "plane"
@@ -137,23 +140,54 @@ def test_distances_of_the_held_object_are_those_of_the_verdict(tmp_path, obstacl
     problem = load_problem(write_problem(tmp_path, obstacles=obstacles, more=HELD))
     robot, poses = load_robot(problem), place_obstacles(problem.obstacle)
     hulls, links = Hulls(problem, robot, library, with_object=True), Hulls(problem, robot, library)
-    held = slice(len(links.min_distances), None)
+    count = len(links.min_distances)
+    held, beside = slice(count, count + len(problem.obstacle)), slice(count + len(problem.obstacle), None)
     assert (hulls.min_distances[held] == -0.002).all()
-    assert (hulls.tolerances[held] == 5e-4).all()
+    np.testing.assert_allclose(hulls.tolerances[held], 5e-4)
+    assert (hulls.min_distances[beside] == 0.01).all()
+    np.testing.assert_allclose(hulls.tolerances[beside], 1e-3)
     q = np.random.default_rng(3).uniform(robot.position_lower, robot.position_upper, (300, robot.n))
-    world, zero, expected = World(robot, problem.obstacle, problem.object_size), np.zeros(robot.n), []
+    world, zero, expected, around = World(robot, problem.obstacle, problem.object_size), np.zeros(robot.n), [], []
     for state in q:
         world.set_state(state, zero, zero, poses)
         expected.append(world.object_distances())
-    expected = np.array(expected)
+        around.append(min(world.held_object_distances()))
+    expected, around = np.array(expected), np.array(around)
     found = hulls.measure(q.T.copy(), poses)[0]
     np.testing.assert_allclose(found[:, : held.start], links.measure(q.T.copy(), poses)[0], atol=1e-12)
     assert np.abs(found[:, held] - np.minimum(expected, MEASURED_RANGE_M - 0.002)).max() < 1e-4  # prisms
+    nearest = found[:, beside].min(axis=1)
+    assert np.abs(nearest - np.minimum(around, MEASURED_RANGE_M + 0.01)).max() < 1e-4
+    assert (around < 0.01).sum() > 10
     enters = expected.min(axis=1) < -0.003
     assert 3 < enters.sum() < 290
     clear = hulls.clear_states(q.T.copy(), poses)
     assert not clear[enters].any()
-    np.testing.assert_array_equal(clear, links.clear_states(q.T.copy(), poses) & (found[:, held].min(axis=1) >= -0.002))
+    free = (found[:, held].min(axis=1) >= -0.002) & (nearest >= 0.01)
+    np.testing.assert_array_equal(clear, links.clear_states(q.T.copy(), poses) & free)
+
+
+@needs_compiler
+def test_an_end_within_the_tolerance_of_a_contact_is_accepted(tmp_path):
+    """Both ends hold the object 3 mm deep in a table, where 0 mm are legal and 5 mm accepted."""
+    table = BOXES.format([0.75, 0.0, 0.1], [0.5, 2.0, 0.2], [-2.0, 0.0, 0.4], [0.1, 0.1, 0.1])
+    more = LIMITS + CONTACT_ONLY.replace("depth = 0.002\ntolerance = 5e-4", "depth = 0.0\ntolerance = 5e-3")
+    more = more.replace("[0.08, 0.06, 0.12]", "[0.25, 0.25, 0.25]")
+    problem = load_problem(write_problem(tmp_path, obstacles=table, more=more))
+    robot, poses = load_robot(problem), place_obstacles(problem.obstacle)
+    tool, world, zero = load_refiner(problem, robot), World(robot, problem.obstacle, problem.object_size), np.zeros(4)
+
+    def depth(lift: float) -> float:
+        world.set_state(np.array([0.0, lift, 0.9, 0.0]), zero, zero, poses)
+        return min(world.object_distances()) + 0.003
+
+    lift = brentq(depth, -0.7, -0.3)
+    task = between(problem, np.array([[-0.8, lift, 0.9, 0.0], [0.8, lift, 0.9, 0.0]]))
+    found = refine_task(tool, PlanChecker(problem, robot, degree=tool.spec.degree), task)
+    assert found.valid
+    assert found.iterations < 60
+    accepted = tool.hulls.accepted_at(np.array([task.boundary.start_q[0]]).T, poses)
+    assert accepted.max() == pytest.approx(0.003, abs=1e-6)
 
 
 @needs_compiler
@@ -173,7 +207,11 @@ def test_compiled_rows_of_the_held_object_have_its_depth(tmp_path):
 
 
 @needs_compiler
-@pytest.mark.parametrize("more", [SELF, HELD, SELF + LEVEL, HELD + LEVEL], ids=["links", "held", "level", "held level"])
+@pytest.mark.parametrize(
+    "more",
+    [SELF, HELD, SELF + LEVEL, HELD + LEVEL, CONTACT_ONLY + LIMITS.partition('[[constraint]]\nuse = "self')[0]],
+    ids=["links", "held", "level", "held level", "contact only"],
+)
 def test_scenes_of_a_robot_share_kernels(tmp_path, more):
     problem = load_problem(write_problem(tmp_path, obstacles=KINDS, more=more))
     other = problem.with_obstacles(problem.obstacle[:2])

@@ -16,7 +16,7 @@ typedef struct {
   const long *first_part, *part_of_link; /* parts of a link: part_of_link[first_part[link]...] */
   const long *link_pairs, *first_pair, *pairs; /* two links; pairs of a link pair from first_pair on; two parts */
   const long *moving, *moving_frames; /* part -> index among the moving parts; their frames */
-  const double *added; /* to the limits of the links' distances from obstacles [m]; -INFINITY: not checked */
+  const double *added, *pair_added; /* to the limits of links and of link pairs [m]; -INFINITY: not checked */
   const body *obstacles;
   const double *boxes; /* center, half sizes, rotation by rows, radius of bounding boxes: 16 rows of lanes */
   const double *vertices;
@@ -208,18 +208,18 @@ static int meet_obstacles(const robot_scene *s, memory *m, double limit, contact
   return 0;
 }
 
-/* Find the contacts closer than `limit` of links with each other; see `meet_obstacles`. */
+/* Find the contacts of links with each other closer than `limit` plus what the pair adds; see `meet_obstacles`. */
 static int meet_itself(const robot_scene *s, memory *m, double limit, contact_list *list) {
   for (long i = 0; i < s->n_link_pairs; i++) {
     long a = s->link_pairs[2 * i], b = s->link_pairs[2 * i + 1];
-    double reach = s->links[a].radius + s->links[b].radius + limit;
+    double within = limit + s->pair_added[i], reach = s->links[a].radius + s->links[b].radius + within;
     if (reach < 0 || squared_segment_distance(m->ends + 6 * a, m->ends + 6 * b) > reach * reach) continue;
     for (long k = s->first_pair[i]; k < s->first_pair[i + 1]; k++) {
       const body *one = s->parts + s->pairs[2 * k], *two = s->parts + s->pairs[2 * k + 1];
       const pose *f = m->frame + one->frame;
       contact found = {0};
-      measure_bodies(s, one, f, two, m->frame + two->frame, m->pair_normal + 3 * k, limit, list != 0, m->work, &found);
-      if (!(found.distance < limit)) continue;
+      measure_bodies(s, one, f, two, m->frame + two->frame, m->pair_normal + 3 * k, within, list != 0, m->work, &found);
+      if (!(found.distance < within)) continue;
       if (!list) return 1;
       record(list, k, f, &found, m->pair_normal + 3 * k, 0);
     }

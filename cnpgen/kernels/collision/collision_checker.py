@@ -36,8 +36,8 @@ class _RobotScene(ctypes.Structure):
     _fields_ = (
         *((name, c_long) for name in ("n", "n_parts", "n_links", "n_link_pairs", "n_obstacles", "lanes")),
         *((name, c_void_p) for name in ("place", "axis", "sliding", "parts", "links", "first_part", "part_of_link")),
-        *((name, c_void_p) for name in ("link_pairs", "first_pair", "pairs", "moving", "moving_frames", "added")),
-        *((name, c_void_p) for name in ("obstacles", "boxes", "vertices")),
+        *((name, c_void_p) for name in ("link_pairs", "first_pair", "pairs", "moving", "moving_frames")),
+        *((name, c_void_p) for name in ("added", "pair_added", "obstacles", "boxes", "vertices")),
     )
 
 
@@ -84,6 +84,7 @@ class CollisionChecker:
         robot: The robot, with at most ``MAX_JOINTS`` planned joints.
         shape: Its link geometry, by default the robot's own.
         added: Link -> distance that is added to its required ones from obstacles [m], by default 0; -inf for no check.
+        pair_added: Two links -> distance that is added to their required one from each other [m], in the same way.
 
     Attributes:
         link_pairs: Pairs of convex parts of links that must not touch, the one nearer to the base first, shape (M, 2).
@@ -95,6 +96,7 @@ class CollisionChecker:
         robot: Robot,
         shape: Shape | None = None,
         added: Mapping[str, float] | None = None,
+        pair_added: Mapping[frozenset[str], float] | None = None,
     ) -> None:
         shape = robot.shape if shape is None else shape
         assert shape is not None
@@ -124,6 +126,8 @@ class CollisionChecker:
             [sorted(both, key=parts["frame"].__getitem__) for both in product(of_link[a], of_link[b])] for a, b in kept
         ]
         self._set("link_pairs", np.array(kept, np.int64).reshape(-1, 2))
+        names = [frozenset((pair.first, pair.second)) for pair in shape.pairs if not pair.left_out]
+        self._set("pair_added", np.array([(pair_added or {}).get(each, 0.0) for each in names], np.float64))
         self._set("first_pair", np.append(0, np.cumsum([len(each) for each in pairs])))
         self.link_pairs = np.array([both for each in pairs for both in each], np.int64).reshape(-1, 2)
         self._set("pairs", self.link_pairs)

@@ -2,7 +2,7 @@
 (CBiRRT, Berenson et al. 2009); tree_search.c precedes this file. All states of an edge are nodes, since the straight line between
 two distant states leaves the manifold. */
 
-enum { BLOCK = 16, MAX_EQUALITIES = 16, MAX_PROJECTIONS = 5 }; /* states that are projected at once; rows; steps */
+enum { BLOCK = 16, MAX_EQUALITIES = 64, MAX_PROJECTIONS = 5 }; /* states that are projected at once; rows; steps */
 #define MAX_STRETCH 3.0      /* of the spacing, between projected states */
 #define MAX_STEP 0.5         /* of a joint [rad or m] */
 #define RELATIVE_DAMPING 1e-6
@@ -81,6 +81,7 @@ first state is invalid. `reached`: whether it is the configuration, which is not
 static long follow(search *h, manifold *m, tree *t, long node, const double *target, double length, int *reached) {
   const tree_settings *s = h->s;
   long n = t->n, last = -1;
+  int is_root = t->parent[node] < 0; /* an end may miss the equalities, so that its neighbor is farther */
   double from[64], before[64], distance = sqrt(squared_difference(t->q + n * node, target, n));
   double share = distance > length ? length / distance : 1.0;
   memcpy(from, t->q + n * node, n * sizeof(double)), memcpy(before, from, n * sizeof(double));
@@ -96,7 +97,8 @@ static long follow(search *h, manifold *m, tree *t, long node, const double *tar
     for (long k = 0; k < block; k++) {
       for (long j = 0; j < n; j++) h->q[j] = m->q[j * BLOCK + k];
       int valid = length == INFINITY && first + k == count;
-      if (k >= met || largest_difference(h->q, before, n) > MAX_STRETCH * s->spacing) return last;
+      int jumps = largest_difference(h->q, before, n) > MAX_STRETCH * s->spacing;
+      if (k >= met || (jumps && !(is_root && last < 0))) return last;
       if (!valid && !state_is_clear(h, h->q)) return last;
       memcpy(before, h->q, n * sizeof(double));
       last = add_node(t, h->q, last < 0 ? node : last);
@@ -156,8 +158,8 @@ long find_manifold_path(const tree_settings *s, kernel *residuals, const double 
     if (!reached) continue;
     count = own ? join(trees, far, node, path, max_points) : join(trees, node, far, path, max_points);
   }
-  if (count) memcpy(path + n * (count - 1), s->goal, n * sizeof(double)); /* instead of its projection */
   if (count > 2) count = shorten_on_manifold(&h, &m, path, count);
+  if (count) memcpy(path + n * (count - 1), s->goal, n * sizeof(double)); /* instead of its projection */
   for (int i = 0; i < 2; i++) free(trees[i].q), free(trees[i].parent);
   free(target), free(numbers), free(h.q), free_memory(h.m);
   return count;

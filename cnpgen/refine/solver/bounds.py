@@ -223,16 +223,16 @@ class BoundsTemplate:
         upper[rows] = np.minimum(upper[rows], (positions[inner] + band) / scale)
         return Bounds(lower, upper, bounds.nonsmooth, bounds.interval_tolerance)
 
-    def with_hull_distances(self, bounds: Bounds, min_distances: Array, extra: Array | None = None) -> Bounds:
+    def with_hull_distances(self, bounds: Bounds, min_distances: Array, extra: Array | float = 0.0) -> Bounds:
         """Return bounds without those of capsules and with further columns for the distances of hulls.
 
         Args:
             bounds: Bounds of one motion.
             min_distances: Required distances [m], shape (columns,).
-            extra: Additional distances [m], shape (K, columns), or None.
+            extra: Additional distances [m], shape (K, columns).
         """
         added = _added_clearance(self._s, self._tightening)[:, None]
-        lower = (min_distances + (added if extra is None else added + extra)) / DISTANCE_SCALE_M
+        lower = (min_distances + added + extra) / DISTANCE_SCALE_M
         lower[self._s == 1] = -np.inf
         free = np.where(self.capsules, np.inf, 0.0)
         return Bounds(
@@ -246,8 +246,8 @@ class BoundsTemplate:
         lower, upper = bounds.lower, bounds.upper
         if not np.fmax.reduce(bounds.end_violations(ends), axis=None) > MIN_END_RELAXATION:
             return bounds
-        for g, row, s in ((ends[0], 0, self._s), (ends[1], -2, 1 - self._s)):  # most of the last row is unbounded
-            fade = np.clip((END_RELAXATION[1] - s) / (END_RELAXATION[1] - END_RELAXATION[0]), 0.0, 1.0)[:, None]
+        fades = near_ends(self._s)
+        for g, row, fade in ((ends[0], 0, fades[0]), (ends[1], -2, fades[1])):  # most of the last row is unbounded
             above, below = np.fmax(g - upper[row], 0.0), np.fmax(lower[row] - g, 0.0)
             if np.any(above > 0):
                 upper = np.asfortranarray(upper + np.minimum(above, self.tolerances) * fade)
@@ -268,6 +268,12 @@ class BoundsTemplate:
                 lower[:, columns] -= relaxation[:, None] / scale
                 upper[:, columns] += relaxation[:, None] / scale
         return Bounds(lower, upper, self._nonsmooth, self._interval_tolerance)
+
+
+def near_ends(s: Array) -> Array:
+    """Return the share of the violation of the start and of the goal that bounds accept at phases, shape (2, K, 1)."""
+    until, from_full = END_RELAXATION[1], END_RELAXATION[1] - END_RELAXATION[0]
+    return np.clip((until - np.stack([s, 1 - s])) / from_full, 0.0, 1.0)[..., None]
 
 
 def _time_varying_conditions(

@@ -7,6 +7,7 @@ collisions are found by the verdict only, which names their phase.
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.refine.solver.bounds import near_ends
 from cnpgen.refine.solver.hulls import Hulls
 from cnpgen.trajectory.spline import basis
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
@@ -33,21 +34,27 @@ class HullFeedback:
         phases = (s[:-1, None] + np.diff(s)[:, None] * fractions).ravel()
         self._spec, self._phases = spec, s
         self._basis = basis(phases, spec.path_control_points, spec.degree)
+        self._near_ends = near_ends(phases)
         self._margins = FEEDBACK_MARGIN_M * np.clip(np.minimum(phases, 1 - phases) / MARGIN_EDGE, 0, 1)
         self._intervals = len(s) - 1
 
-    def missing_clearance(self, path: Array, hulls: Hulls, obstacle_poses: Array) -> Array | None:
+    def missing_clearance(
+        self, path: Array, hulls: Hulls, obstacle_poses: Array, *, accepted: Array | None = None
+    ) -> Array | None:
         """Return by how much the required distances must grow at the grid points [m].
 
         Args:
             path: Path control points, shape (C, n).
             hulls: Clearances of the hulls.
             obstacle_poses: Poses and sizes of the obstacles, shape (width,).
+            accepted: Accepted violations of both ends [m], shape (2, columns), or None.
 
         Returns:
             Shape (K, columns), or None if no motion between grid points collides, or more than ``MAX_FED_BACK_M``.
         """
         missing = hulls.missing((self._basis @ path).T, self._margins, obstacle_poses)
+        if accepted is not None:
+            missing = np.maximum(missing - (self._near_ends * accepted[:, None]).max(axis=0), 0.0)
         worst = float((missing.max(axis=1) - self._margins).max())
         if not MIN_FED_BACK_M < worst < MAX_FED_BACK_M:
             return None

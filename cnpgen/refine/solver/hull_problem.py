@@ -9,11 +9,9 @@ from typing import Any
 import numpy as np
 
 from cnpgen.kernels.collision.collision_checker import MAX_JOINTS
-from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
-from cnpgen.problems.constraints.self_clearance import SelfClearance
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.solver.bounds import NO_TIGHTENING, bounds_template
-from cnpgen.refine.solver.hulls import has_clearance_constraints
+from cnpgen.refine.solver.hulls import LINK_CONSTRAINTS, OBJECT_CONSTRAINTS
 from cnpgen.robots.robot import Robot
 from cnpgen.world.world import World
 
@@ -21,14 +19,12 @@ TEMPLATE_POINTS = 32  # of a grid that is only used to find equalities
 
 
 def can_measure_hulls(problem: Problem, robot: Robot, world: World) -> bool:
-    """Return whether hulls replace capsules: clearances of link geometry, among obstacles or without equalities.
+    """Return whether hulls replace capsules: distances of link geometry, among obstacles or without equalities.
 
     On a manifold without obstacles a kernel with the few capsules of the links takes less time.
     """
-    if robot.n > MAX_JOINTS or not has_clearance_constraints(problem, robot):
-        return False
     others = without_distances(problem)
-    if not others.constraint:
+    if robot.n > MAX_JOINTS or robot.shape is None or len(others.constraint) in {0, len(problem.constraint)}:
         return False
     if problem.obstacle:
         return True
@@ -37,15 +33,16 @@ def can_measure_hulls(problem: Problem, robot: Robot, world: World) -> bool:
 
 def without_distances(problem: Problem) -> Problem:
     """Return a problem without distances that hulls measure, and without obstacles unless a plug-in may use them."""
-    measured = RobotClearance | SelfClearance | (ObjectContact if problem.object_size is not None else SelfClearance)
+    measured = LINK_CONSTRAINTS if problem.object_size is None else LINK_CONSTRAINTS | OBJECT_CONSTRAINTS
     others = tuple(item for item in problem.constraint if not isinstance(item, measured))
     return _changed(problem, constraint=others, obstacle=problem.obstacle if problem.structure is None else ())
 
 
 def without_contacts(problem: Problem) -> Problem:
     """Return a problem whose links may not touch each other or an obstacle, not even within a tolerance."""
-    clearances = RobotClearance | SelfClearance
-    strict = (replace(each, tolerance=0.0) if isinstance(each, clearances) else each for each in problem.constraint)
+    strict = (
+        replace(each, tolerance=0.0) if isinstance(each, LINK_CONSTRAINTS) else each for each in problem.constraint
+    )
     return _changed(problem, constraint=tuple(strict))
 
 

@@ -18,6 +18,7 @@ from cnpgen.kernels.collision.collision_checker import MAX_JOINTS, CloseBodies, 
 from cnpgen.kernels.collision.row_kernels import DistanceColumns, RowKernels
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
+from cnpgen.problems.constraints.object_clearance import ObjectClearance
 from cnpgen.problems.constraints.self_clearance import SelfClearance
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.solver.grid import Grid
@@ -32,12 +33,13 @@ from cnpgen.world.rigid_bodies import Contacts, RigidBodies
 
 Array = NDArray[np.float64]
 Pairs = NDArray[np.intp]
+LINK_CONSTRAINTS, OBJECT_CONSTRAINTS = RobotClearance | SelfClearance, ObjectContact | ObjectClearance
 MEASURED_RANGE_M = 0.04  # above the required distance; larger distances are not measured
 
 
 def has_clearance_constraints(problem: Problem, robot: Robot) -> bool:
     """Return whether a problem constrains clearances of a robot with link geometry."""
-    constraints = any(isinstance(item, RobotClearance | SelfClearance) for item in problem.constraint)
+    constraints = any(isinstance(item, LINK_CONSTRAINTS) for item in problem.constraint)
     return constraints and robot.shape is not None
 
 
@@ -67,12 +69,12 @@ class Hulls:
         problem: The problem.
         robot: Its robot; ``has_clearance_constraints`` must hold.
         library: Library of compiled collision checks, or None to measure with Coal.
-        with_object: Whether the held object is a part of the robot, for its contacts with obstacles.
+        with_object: Whether the held object is a part of the robot, for its constraints.
 
     Attributes:
         checker: Compiled collision checks, or None.
         obstacle_distance: Largest required distance from obstacles [m], None without such a constraint.
-        self_distance: Required distance of links from each other [m], None without such a constraint.
+        self_distance: Largest required distance of links from each other [m], None without such a constraint.
         min_distances: Required distances [m], shape (m,), of pairs of links or of a link and an obstacle.
         tolerances: Accepted violations of them in a valid motion [m], shape (m,).
     """
@@ -81,9 +83,10 @@ class Hulls:
         self, problem: Problem, robot: Robot, library: CDLL | None = None, *, with_object: bool = False
     ) -> None:
         assert robot.shape is not None
-        shape, kinds = robot.shape, RobotClearance | SelfClearance
+        shape, kinds = robot.shape, LINK_CONSTRAINTS
         if with_object and problem.object_size is not None:
-            shape, kinds = with_held_object(robot.shape, robot.chain, problem.object_size), kinds | ObjectContact
+            shape = with_held_object(robot.shape, robot.held_shape, robot.chain, problem.object_size)
+            kinds |= OBJECT_CONSTRAINTS
         constraints = [item for item in problem.constraint if isinstance(item, kinds)]
         self._poses_of_checker: Array | None = None
         self._row_kernels: tuple[Kernel, RowKernels] | None = None
@@ -93,34 +96,38 @@ class Hulls:
         names = [*links, *range(len(problem.obstacle))]
         columns: dict[Any, int] = {}
         self._groups, self._uncovered = list[_Group](), list[tuple[Pairs, float]]()
-        min_distances, tolerances = dict[int, float](), dict[int, float]()
+        min_distances, accepted_of = dict[int, float](), dict[int, float]()
         covered = {frozenset((pair.first, pair.second)) for pair in shape.pairs if pair.for_solvers}
         for constraint in constraints:
-            of_links, required = isinstance(constraint, SelfClearance), _required(constraint)
+            of_links, required = isinstance(constraint, SelfClearance | ObjectClearance), _required(constraint)
             pairs = self._bodies.link_pairs if of_links else self._bodies.obstacle_pairs
-            numbers = np.arange(len(pairs))
-            if not of_links:
-                is_object = np.array([links[part] == HELD_OBJECT for part in pairs[:, 1].tolist()], bool)
-                numbers = np.flatnonzero(is_object == isinstance(constraint, ObjectContact))
+            of_object = np.array([HELD_OBJECT in (names[a], names[b]) for a, b in pairs.tolist()], bool)
+            numbers = np.flatnonzero(of_object == isinstance(constraint, OBJECT_CONSTRAINTS))
             pairs = pairs[numbers]
             indices = [columns.setdefault((names[a], names[b]), len(columns)) for a, b in pairs.tolist()]
             for column in indices:
                 min_distances[column] = max(min_distances.get(column, -np.inf), required)
-                tolerances[column] = min(tolerances.get(column, np.inf), _tolerance(constraint))
+                accepted = max(accepted_of.get(column, -np.inf), required - _tolerance(constraint))
+                accepted_of[column] = accepted
             self._groups.append(_Group(pairs, np.array(indices, np.intp), required, not of_links, numbers))
             if of_links:
                 uncovered = [frozenset((names[a], names[b])) not in covered for a, b in pairs.tolist()]
                 self._uncovered.append((pairs[np.array(uncovered, bool)], required))
         self.min_distances = np.array([min_distances[column] for column in range(len(columns))])
-        self.tolerances = np.array([tolerances[column] for column in range(len(columns))])
-        clearance, contact = _largest(constraints, RobotClearance), _largest(constraints, ObjectContact)
-        self.obstacle_distance = max((each for each in (clearance, contact) if each is not None), default=None)
-        self.self_distance = _largest(constraints, SelfClearance)
+        self.tolerances = self.min_distances - np.array([accepted_of[column] for column in range(len(columns))])
         self.checker = None
+        clearance, contact, between_links, around_object = (
+            _largest(constraints, kind) for kind in (RobotClearance, ObjectContact, SelfClearance, ObjectClearance)
+        )
+        self.obstacle_distance = max((each for each in (clearance, contact) if each is not None), default=None)
+        self.self_distance = max((each for each in (between_links, around_object) if each is not None), default=None)
         if library is not None and robot.n <= MAX_JOINTS:
-            base = self.obstacle_distance or 0.0
+            base, own = self.obstacle_distance or 0.0, self.self_distance or 0.0
             added = dict.fromkeys(links, _difference(clearance, base)) | {HELD_OBJECT: _difference(contact, base)}
-            self.checker = CollisionChecker(library, robot, shape, added)
+            differences = _difference(between_links, own), _difference(around_object, own)
+            pairs_of_links = (frozenset((pair.first, pair.second)) for pair in shape.pairs)
+            pair_added = {pair: differences[HELD_OBJECT in pair] for pair in pairs_of_links}
+            self.checker = CollisionChecker(library, robot, shape, added, pair_added)
         self._axes = np.array([joint.axis for joint in robot.chain.joints])
         self._sliding = np.array(robot.sliding)
         supports = [list(joints) for joints in robot.model.supports]
@@ -179,6 +186,11 @@ class Hulls:
             below = least[group.columns[contacts.pair]] - contacts.distance
             violation = max(violation, float(below.max(initial=0.0)))
         return violation
+
+    def accepted_at(self, q: Array, obstacle_poses: Array) -> Array:
+        """Return the accepted part of the violations at states q (n, K): up to the tolerances [m], shape (K, m)."""
+        distances, _ = self.measure(q, obstacle_poses)
+        return np.asarray(np.clip(self.min_distances - distances, 0.0, self.tolerances))
 
     def missing(self, q: Array, margins: Array, obstacle_poses: Array) -> Array:
         """Return by how much the distances at states q (n, K) are below the required ones plus margins [m], at least 0.

@@ -91,11 +91,12 @@ def load_held_shape(urdf: str, model: "pin.Model", held: HeldBody, keep: Path | 
     return Shape(parts, joints, capsules, pairs)
 
 
-def with_held_object(shape: Shape, chain: Chain, size: Size) -> Shape:
-    """Return the link geometry with the held object as a further link, without pairs with the others.
+def with_held_object(shape: Shape, held: Shape | None, chain: Chain, size: Size) -> Shape:
+    """Return the link geometry with the held object as a further link.
 
     Args:
         shape: Link geometry of the robot.
+        held: Link geometry and the held object, whose pairs are added; None for no pairs with the object.
         chain: The chain from the base to the tip, the center of the object.
         size: Edge lengths along the axes of the tip frame [m].
     """
@@ -104,7 +105,8 @@ def with_held_object(shape: Shape, chain: Chain, size: Size) -> Shape:
     axis, radius = half[widest] * chain.tip_rotation[:, widest], float(np.linalg.norm(np.delete(half, widest)))
     capsule = Capsule(HELD_OBJECT, chain.tip_translation - axis, chain.tip_translation + axis, radius, overhang=radius)
     joints = {**shape.joints, HELD_OBJECT: len(chain.joints)}
-    return Shape((*shape.convex_parts, box), joints, (*shape.capsules, capsule), shape.pairs)
+    pairs = () if held is None else held.pairs
+    return Shape((*shape.convex_parts, box), joints, (*shape.capsules, capsule), (*shape.pairs, *pairs))
 
 
 def _box(size: Size, rotation: Array, translation: Array) -> ConvexPart:
