@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from cnpgen.robots.shape.hull import MAX_COORDINATE_M, check_solid
 from cnpgen.robots.shape.inline import corners_of, is_inline
 from cnpgen.schema.keys import Range, field, keys
+from cnpgen.schema.units import PLAUSIBLE_MAX, suggested_unit
 
 _KEYS = {  # kind -> keys of pose and size; those of _OPTIONAL may be omitted
     "box": ("position", "size", "rotation"),
@@ -79,16 +80,29 @@ class Obstacle:
             yield from self._mistakes_posed()
 
     def value_mistakes(self) -> Iterator[tuple[str, str]]:
-        """Yield (key, mistake) pairs of numbers that are not finite, too large or too small."""
+        """Yield (key, mistake) pairs of an obstacle that Python has built: its kind, missing keys, and numbers."""
+        if self.kind not in _KEYS:
+            yield "kind", f"must be one of {', '.join(_KEYS)}, got {self.kind!r}"
+            return
+        for name in ("x", "y"):
+            if not isinstance(getattr(self, name), Range | None):
+                yield name, f"must be a Range, got {getattr(self, name)!r}"
+                return
         for key in keys(type(self)):
             value = getattr(self, key.name)
             ends = (value.low, value.high) if isinstance(value, Range) else value
             entries = ends if isinstance(ends, tuple) else (ends,)
             numbers = [entry for entry in entries if isinstance(entry, int | float)]
-            if not all(abs(number) <= MAX_COORDINATE_M for number in numbers):  # false for nan, too
-                yield key.name, f"must be finite and at most {MAX_COORDINATE_M:g}, got {value}"
+            largest = max(map(abs, numbers), default=0.0)
+            limit = PLAUSIBLE_MAX.get(key.unit, MAX_COORDINATE_M) if key.plausible is None else key.plausible
+            if not all(map(math.isfinite, numbers)):
+                yield key.name, f"must be finite, got {value}"
+            elif largest > limit:
+                hint = suggested_unit(largest, key.unit, high=limit)
+                yield key.name, f"must be at most {limit:.4g} {key.unit}, got {value}{hint}"
             elif key.low is not None and numbers and min(numbers) < key.low:
                 yield key.name, f"must be at least {key.low:g} {key.unit}, got {value}"
+        yield from self.find_mistakes()
 
     @property
     def upright(self) -> bool:
@@ -135,7 +149,7 @@ class Obstacle:
 
 
 def invalid_obstacle(obstacles: Iterable[Obstacle]) -> str:
-    """Return the first mistake in the numbers of obstacles, with the name of the obstacle; empty without one."""
+    """Return the first mistake of obstacles, with the name of the obstacle; empty without one."""
     mistakes = ((each.name, *mistake) for each in obstacles for mistake in each.value_mistakes())
     return next((f"obstacle {name!r}: {key} {text}" for name, key, text in mistakes), "")
 

@@ -8,9 +8,9 @@ from numpy.typing import ArrayLike, NDArray
 from cnpgen.errors import UsageError, counted
 from cnpgen.problems.scenes.scene_problem import MAX_SCENE_OBSTACLES
 from cnpgen.robots.obstacle import Obstacle
-from cnpgen.robots.shape.hull import MAX_COORDINATE_M
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import check_range, integer, number, numbers
+from cnpgen.schema.units import PLAUSIBLE_MAX, suggested_unit
 
 Array = NDArray[np.float64]
 Voxels = NDArray[np.int64]
@@ -51,10 +51,12 @@ def obstacles_of_points(
         raise UsageError(f"must have shape (N, 3) with N > 0, got {cloud.shape}", argument="points")
     if len(cloud) > MAX_POINTS:
         raise UsageError(f"has {counted(len(cloud), 'point')}, expected at most {MAX_POINTS:,}", argument="points")
-    valid = (np.abs(cloud) <= MAX_COORDINATE_M).all(axis=1)  # false for nan
+    limit = PLAUSIBLE_MAX["m"]
+    valid = (np.abs(cloud) <= limit).all(axis=1)  # false for nan
     if not valid.all():
         row = int(np.argmin(valid))
-        text = f"must be finite and at most {MAX_COORDINATE_M:g} m, got {cloud[row]} in point {row}"
+        hint = suggested_unit(float(np.abs(cloud[row]).max()), "m", high=limit)
+        text = f"must be finite and at most {limit:g} m, got {cloud[row]} in point {row}{hint}"
         raise UsageError(text, argument="points")
     check_range("radius", number("radius", radius), 1e-6, MAX_POINT_SIZE_M, "m")
     check_range("resolution", number("resolution", resolution), MIN_VOXEL_M, MAX_POINT_SIZE_M, "m")

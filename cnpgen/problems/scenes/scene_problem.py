@@ -18,6 +18,7 @@ from cnpgen.robots.shape.hull import MAX_COORDINATE_M, check_solid, hull_corners
 from cnpgen.robots.shape.inline import address_of, corners_of, is_inline
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.schema.argument_types import check_fields
+from cnpgen.schema.units import PLAUSIBLE_MAX
 
 Array = NDArray[np.float64]
 
@@ -25,6 +26,7 @@ MAX_SCENE_OBSTACLES = 100  # as many as a problem may have
 MAX_SCENES = 100_000  # of one call
 MAX_BASE_DEPTH_M = 0.01  # of the robot's base in an obstacle, such as the plate that it stands on
 MIN_OBSTACLE_SIZE_M = 1e-6
+MAX_ROTATION_ERROR = 1e-6  # of the products of the rows of a rotation matrix
 _SIZES = {"box": 3, "sphere": 1, "cylinder": 2, "capsule": 2}  # edge lengths; radius; radius and length
 
 
@@ -177,7 +179,8 @@ def check_scenes(scenes: Sequence[SceneProblem]) -> None:
 
     Raises:
         UsageError: There are no scenes, or one is no ``SceneProblem``.
-        SceneError: A size or a pose of an obstacle is not finite, too large or not positive.
+        SceneError: An obstacle lacks a key, a number of it is not finite, too large or not positive, or joint
+            positions have another shape.
     """
     if not scenes:
         raise UsageError("there are no scenes", concerns="scenes")
@@ -186,6 +189,10 @@ def check_scenes(scenes: Sequence[SceneProblem]) -> None:
             raise UsageError(f"must be SceneProblems, got {scene!r:.100} at {index}", argument="scenes")
         if mistake := invalid_obstacle(scene.obstacles):
             raise SceneError(f"{scene.place}: {mistake}")
+        for name, axes, expected in (("start_q", 1, "(n,)"), ("goal_q", 2, "(G, n)")):
+            shape = np.shape(getattr(scene, name))
+            if len(shape) != axes:
+                raise SceneError(f"{scene.place}: {name} must have shape {expected}, got {shape}")
 
 
 def checked_scene(scene: SceneProblem) -> SceneProblem:
@@ -199,6 +206,13 @@ def checked_scene(scene: SceneProblem) -> SceneProblem:
     if pose is not None:
         if not (np.abs([*pose.position, *pose.rotation.ravel()]) <= MAX_COORDINATE_M).all():
             raise SceneError(f"{scene.place}: the goal pose has numbers that are not finite or too large")
+        if np.abs(pose.rotation @ pose.rotation.T - np.eye(3)).max() > MAX_ROTATION_ERROR:
+            raise SceneError(
+                f"{scene.place}: the rotation of the goal pose is no rotation matrix: {pose.rotation.tolist()}"
+            )
+        limits = PLAUSIBLE_MAX["m"], PLAUSIBLE_MAX["rad"]
+        if any((each > limit).any() for each, limit in zip(pose.tolerances, limits, strict=True)):
+            raise SceneError(f"{scene.place}: tolerances of the goal pose are in m and rad, got {pose.tolerances}")
         if not all((each >= 0).all() for each in pose.tolerances):
             raise SceneError(f"{scene.place}: tolerances of the goal pose must not be negative, got {pose.tolerances}")
     for what, values in (("start", scene.start_q), ("goal", scene.goal_q)):

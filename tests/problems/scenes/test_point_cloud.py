@@ -55,7 +55,8 @@ def test_the_number_of_boxes_is_bounded() -> None:
     ("points", "options", "message"),
     [
         ([[0.0, 0.0]], {}, r"points must have shape \(N, 3\)"),
-        ([[0.0, np.nan, 0.0]], {}, "must be finite and at most 10000 m, got .* in point 0"),
+        ([[0.0, np.nan, 0.0]], {}, "must be finite and at most 100 m, got .* in point 0"),
+        ([[600.0, 0.0, 0.0]], {}, "at most 100 m, got .* in point 0; did you mean 600 mm = 0.6 m"),
         ([[1.0, 0.0, 0.0]], {"radius": -1.0}, "radius must be from 1e-06 to 1 m, got -1 m"),
         ([[1.0, 0.0, 0.0]], {"resolution": 0.0}, "resolution must be from 0.01 to 1 m, got 0 m"),
     ],
