@@ -41,7 +41,7 @@ def acceptance(context: Context, written: set[str], *, given: Collection[End] = 
     ends: tuple[End, ...] = ("start", "goal")
     hit = {"start": (), "goal": ("hit_angle", "hit_speed") if "hit_angle" in written else ()}
     kernels = {
-        end: context.kernels.load(
+        end: context.kernels.load_by_structure(
             boundary_unmet,
             end=end,
             needs=2 if f"{end}_ddq" in written else 1,

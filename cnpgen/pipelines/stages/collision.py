@@ -70,7 +70,7 @@ class Collision(Stage):
         return ("start", "goal") if self.end == "both" else (self.end,)
 
     def _by_segments(self, context: Context, radius: float, clearance: float) -> StageFunction:
-        kernel = context.kernels.load(capsule_axes_distance)
+        kernel = context.kernels.load_by_structure(capsule_axes_distance)
 
         def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
             for end in self._ends():
@@ -81,7 +81,7 @@ class Collision(Stage):
         return work
 
     def _by_convex_parts(self, context: Context, distance: float) -> StageFunction:
-        kernel = context.kernels.load(capsule_clearance)
+        kernel = context.kernels.load_by_structure(capsule_clearance)
         with_object = self.judge == "coal"
         depth = _contact_depth(context) if with_object else 0.0
         problem = context.problem if with_object else replace(context.problem, object=None)

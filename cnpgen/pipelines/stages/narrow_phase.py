@@ -58,7 +58,7 @@ def narrow_phase_of(context: Context, end: End, *, exact: bool = True) -> Decide
     problem, robot = context.problem, context.robot
     if robot.shape is None and robot.held_shape is None and all(obstacle.upright for obstacle in problem.obstacle):
         return None
-    kernel = context.kernels.load(narrow_phase, end=end, dtype=context.dtype)
+    kernel = context.kernels.load_by_structure(narrow_phase, end=end, dtype=context.dtype)
     path = PathWorld(robot, problem.obstacle, problem.object_size)
 
     def decide_states(
