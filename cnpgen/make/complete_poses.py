@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError, lacks
-from cnpgen.make.goal_poses import MIN_DIFFERENCE_RAD, POSE_SEEDS, nearest_states, states_of_pose
+from cnpgen.make.goal_poses import MIN_DIFFERENCE_RAD, POSE_REASON, POSE_SEEDS, nearest_states, states_of_pose
 from cnpgen.pipelines.families.resting_states import RestingStates
 from cnpgen.plans.format import GOAL_OPTION
 from cnpgen.plans.plans import Plans, make_plans
@@ -28,7 +28,6 @@ from cnpgen.world.pose_ik import PoseKinematics
 Array = NDArray[np.float64]
 
 START_REASON = "start in collision, outside its limits or without holding torques"
-POSE_REASON = "no inverse kinematics of the goal"
 GOAL_REASON = "all goal states in collision or without holding torques"
 
 

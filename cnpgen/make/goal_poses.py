@@ -13,6 +13,7 @@ from cnpgen.world.pose_ik import PoseKinematics, PoseTolerance, solve_pose_ik
 Array = NDArray[np.float64]
 
 MAX_GOAL_STATES = 5  # of one task that are tried, the nearest first
+POSE_REASON = "no inverse kinematics of the goal"
 POSE_SEEDS = 128  # of the inverse kinematics of a goal pose
 MIN_DIFFERENCE_RAD = 0.3  # rad or m, of two goal states with one pose in their farthest joint
 

@@ -11,7 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.machine.times import NO_TIME, Times
-from cnpgen.make.goal_poses import MAX_GOAL_STATES, MIN_DIFFERENCE_RAD, POSE_SEEDS, nearest_states, states_of_pose
+from cnpgen.make.goal_poses import (
+    MAX_GOAL_STATES,
+    MIN_DIFFERENCE_RAD,
+    POSE_REASON,
+    POSE_SEEDS,
+    nearest_states,
+    states_of_pose,
+)
 from cnpgen.pipelines.families.resting_states import RestingStates
 from cnpgen.plans.concatenate import concatenate
 from cnpgen.plans.format import GOAL_OPTION
@@ -30,7 +37,7 @@ from cnpgen.problems.scene_capacity import Capacity
 from cnpgen.problems.scenes.scene_problem import GoalPose, SceneError, SceneProblem, check_scenes, checked_scene
 from cnpgen.refine.goal_options import Progress
 from cnpgen.refine.options import DEFAULT_OPTIONS, RefineOptions
-from cnpgen.refine.proof.explain import explain_plans
+from cnpgen.refine.proof.explain import Explanation, Feasibility, explain_plans
 from cnpgen.refine.refine_plans import solve_plans
 from cnpgen.refine.refinement import Refinement
 from cnpgen.refine.task import Attempt
@@ -40,6 +47,8 @@ from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.world.pose_ik import PoseKinematics
 
 Array = NDArray[np.float64]
+
+POSE_EXPLANATION = f"{POSE_SEEDS} searches from random joint positions found none with the goal pose within the limits"
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +81,8 @@ class SolvedScenes:
         explanations = explain_plans(self.plans, np.flatnonzero(~self.valid).tolist())
         for failure in facts["not_valid"]:
             scene, explanation = self.scenes[failure["plan"]], explanations[failure["plan"]]
+            if failure["reason"] == POSE_REASON:
+                explanation = Explanation(Feasibility.UNKNOWN, POSE_EXPLANATION)
             failure |= {"scene": scene.name, "file": scene.source}
             failure |= {"finding": str(explanation.kind), "explanation": explanation.text}
         return facts
@@ -95,7 +106,8 @@ def solve_scenes(
 
     Scenes with equal numbers of obstacles of each kind, rounded up to multiples of four, share compiled kernels. Of
     several goal states, the ``MAX_GOAL_STATES`` collision-free ones with the fastest straight lines are tried, and the
-    result is the best valid motion to any of them. A goal pose without goal states gets some by inverse kinematics.
+    result is the best valid motion to any of them. A goal pose without goal states gets some by inverse kinematics; a
+    scene for which it finds none is not solved, with the reason "no inverse kinematics of the goal".
 
     ``problem`` is the robot's problem, such as "panda"; obstacles of the scenes are added to its own. The other
     arguments are those of ``refine_plans``. The names of the journals are that of ``journal`` with a number.
@@ -173,7 +185,8 @@ class _SceneRun:
         chosen = replace(refinement.plans, columns=columns)
         wide = with_wider_capacity(chosen, self.problem, own, self._capacity)
         for row, (index, attempt) in enumerate(zip(indices, refinement.results, strict=True)):
-            self._found[index] = wide[row], attempt
+            without_goal = np.isnan(goals[row]).all()
+            self._found[index] = wide[row], replace(attempt, reason=POSE_REASON) if without_goal else attempt
 
     def _report(self, finished: int, valid: int) -> None:
         if self.progress is not None and finished:
@@ -201,7 +214,7 @@ def _start(scene: SceneProblem, robot: Robot) -> Array:
 
 
 def _states_of_pose(problem: Problem, robot: Robot, scene: SceneProblem, index: int) -> Array:
-    """Return collision-free joint positions with the goal pose of a scene, shape (G, n), G > 0."""
+    """Return collision-free joint positions with the goal pose of a scene, shape (G, n), G > 0; nan without any."""
     pose = scene.goal_pose
     if pose is None:
         raise SceneError(f"{scene.place} has neither goal states nor a goal pose")
@@ -209,7 +222,7 @@ def _states_of_pose(problem: Problem, robot: Robot, scene: SceneProblem, index: 
     states = RestingStates(problem, robot, scene.obstacles)
     valid, found = states_of_pose(kinematics, states, pose, np.random.default_rng([index, POSE_SEEDS]))
     if not len(found):
-        raise SceneError(f"{scene.place}: no joint positions with its goal pose were found")
+        return np.full((1, robot.n), np.nan)
     if not len(valid):
         return found[:1]  # in collision: the explanation of the unsolved scene names it
     return nearest_states(valid, _start(scene, robot), robot, min_difference=MIN_DIFFERENCE_RAD)

@@ -102,7 +102,7 @@ def _rounds(plans: Plans, min_duration: Array, lowest: dict[int, float]) -> Iter
     for option in np.unique(options):
         rows = np.flatnonzero(options == option)
         bound = np.array([lowest.get(int(task), np.inf) for task in plans.sample_id[rows]])
-        waiting = rows[min_duration[rows] < bound]
+        waiting = rows[(min_duration[rows] < bound) | np.isinf(bound)]  # also goals that are not finite
         if len(waiting):
             yield waiting
 

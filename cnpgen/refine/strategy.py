@@ -43,6 +43,7 @@ from cnpgen.refine.obstacle_attempts import (
     is_deep,
     path_guesses,
 )
+from cnpgen.refine.proof.end_violations import end_violations
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.solver.bounds import PRECISE_FRACTION
 from cnpgen.refine.solver.deadline import Deadline
@@ -93,6 +94,8 @@ def refine_task(refiner: Refiner, checker: PlanChecker, task: RefinementTask) ->
             best = min(best, judged, key=lambda attempt: attempt.rank)
             if judged.valid:
                 break
+    if best.outcome is Outcome.UNSOLVED:
+        best = replace(best, reason=checker.reason_of_ends(task) or best.reason)
     no_path = search.found_no_path and best.outcome is Outcome.UNSOLVED
     return best.result(search.iterations, Outcome.NO_PATH if no_path else None)
 
@@ -208,6 +211,12 @@ class PlanChecker:
     @cached_property
     def _strict_judge(self) -> Judge:
         return Judge(without_contacts(self._problem), self._robot)
+
+    def reason_of_ends(self, task: RefinementTask) -> str | None:
+        """Return the reason of a constraint that an end violates, so that no plan is valid; None without one."""
+        for constraint, _ in end_violations(self._problem, self._robot, task.boundary, task.scene):
+            return constraint.boundary_reason or constraint.reason
+        return None
 
     def refutes(self, task: RefinementTask, path: Array, rate: Array) -> bool:
         """Return whether a few samples prove that such a plan is not valid."""

@@ -126,6 +126,17 @@ def test_scenes_are_solved_and_judged(crane: Path, tmp_path: Path) -> None:
         assert model.min_distance(states.q[index], scene=solved.plans.scene[int(index)]).min() > -1e-4
 
 
+def test_a_scene_whose_goal_pose_is_out_of_reach_is_not_solved(crane: Path) -> None:
+    far = GoalPose("hand", np.array([3.0, 0.0, 0.5]), np.eye(3))
+    posed = replace(SCENES[0], name="far", goal_q=np.zeros((0, 4)), goal_pose=far)
+    solved = solve_scenes(crane, [SCENES[0], posed, SCENES[2]], workers=1)
+    assert solved.valid.tolist() == [True, False, True]
+    (failure,) = solved.summary()["not_valid"]
+    assert failure["reason"] == "no inverse kinematics of the goal"
+    assert failure["finding"] == "gave up"
+    assert "none with the goal pose" in failure["explanation"]
+
+
 @pytest.mark.slow
 def test_the_command_solves_scenes(crane: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     inside = replace(SCENES[0], name="inside", goal_q=np.array([[0.0, -0.5, 0.9, 0.0]]))

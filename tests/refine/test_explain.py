@@ -239,7 +239,7 @@ def test_violations_of_the_ends_are_reported_with_value_and_bound() -> None:
     tilted = explain(transport, start_q=transport.boundary.start_q + 0.2)
     assert tilted.kind is Feasibility.INFEASIBLE
     heavy = explain_case(transport.with_constraint("RobotClearance", radius=0.5))
-    assert heavy.text.startswith("at the start robot clearance is")
+    assert heavy.text.startswith("at the start robot clearance of segment 3, pedestal-1 is")
     assert "expected 0.5 m" in heavy.text
 
 

@@ -308,6 +308,8 @@ def test_no_attempt_is_made_if_an_end_is_inside_an_obstacle(tmp_path):
     tool, inside = refiner(problem), between(problem, np.add(IN_SLOT, [0.0, 0.0, 0.1, 0.0]))
     best = tool.attempt(inside, tool.line_guess(inside), 1.0, Outcome.SOLVED, iterations=0, violation=0.0)
     assert list(obstacle_attempts.around_obstacles(tool, inside, best, tool.hulls)) == []
+    found = refine_task(tool, PlanChecker(problem, load_robot(problem), degree=tool.spec.degree), inside)
+    assert found.reason == "robot in collision"  # not that of the attempt, which also exceeds other limits
 
 
 def test_robots_without_a_shape_have_no_hulls(tmp_path):

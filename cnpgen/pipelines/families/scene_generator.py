@@ -16,15 +16,18 @@ from cnpgen.pipelines.families.catalog import load_family
 from cnpgen.pipelines.families.family import Grasp, Layout, SceneFamily
 from cnpgen.pipelines.families.resting_states import RestingStates, seeds_of
 from cnpgen.problems.load_robot import load_robot
+from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import as_problem
 from cnpgen.problems.scenes.scene_problem import MAX_SCENES, SceneError, SceneProblem, checked_scene
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.hull import frame_along
+from cnpgen.schema import registry
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.world.pose_ik import PoseKinematics, solve_pose_ik
+from cnpgen.world.world import World
 
 Array = NDArray[np.float64]
 
@@ -65,7 +68,8 @@ def make_scenes(
         progress: Called with the number of problems since the last call.
 
     Raises:
-        UsageError: An argument is invalid, or no problems are found for this robot.
+        UsageError: An argument is invalid, the problem has an equality constraint, or no problems are found for this
+            robot.
     """
     n, seed = integer("n", n, least=1, most=MAX_SCENES), integer("seed", seed, least=0)
     per_scene = integer("per_scene", per_scene, least=1)
@@ -76,7 +80,9 @@ def make_scenes(
     else:
         name = type(family).__name__
     loaded = as_problem(problem)
-    generator = _Generator(loaded, load_robot(loaded), family)
+    robot = load_robot(loaded)
+    _check_no_manifold(loaded, robot)
+    generator = _Generator(loaded, robot, family)
     scenes, failed, index = list[SceneProblem](), 0, 0
     while len(scenes) < n:
         random = np.random.default_rng([seed, zlib.crc32(name.encode()), index])
@@ -91,6 +97,21 @@ def make_scenes(
         if progress is not None and found:
             progress(len(found))
     return scenes
+
+
+def _check_no_manifold(problem: Problem, robot: Robot) -> None:
+    """Raise UsageError for constraints that hardly any drawn end meets."""
+    world, zero = World(robot, problem.obstacle, problem.object_size), np.zeros(robot.n)
+    scene = scene_of(problem, np.zeros((1, 3)), np.zeros((1, 3)))
+    world.set_state(robot.base, zero, zero, scene.poses[0])
+    for constraint in problem.constraint:
+        if any(condition.g and condition.is_equality for condition in constraint.measured(world)):
+            name = registry.name_of(registry.CONSTRAINTS, type(constraint))
+            raise UsageError(
+                f"the problem {problem.name!r} has the equality constraint {name!r}, which the ends that a family draws"
+                " do not meet: build SceneProblems with own ends, or use a problem without it",
+                concerns="problem",
+            )
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,8 +22,10 @@ Array = NDArray[np.float64]
 BOUNDARY_MARGIN = (1e-5, 1e-5, 1e-3)
 
 
-def end_violations(problem: Problem, robot: Robot, boundary: Boundary, scene: Scene) -> Iterator[str]:
-    """Describe the constraints that an end of one motion violates by more than their tolerance.
+def end_violations(
+    problem: Problem, robot: Robot, boundary: Boundary, scene: Scene
+) -> Iterator[tuple[Constraint, str]]:
+    """Yield the constraints that an end of one motion violates by more than their tolerance, with a description.
 
     If the boundary conditions leave the acceleration at the goal free, there must be one within its limits whose
     torques are within theirs.
@@ -50,9 +52,11 @@ def end_violations(problem: Problem, robot: Robot, boundary: Boundary, scene: Sc
         pairs = [(constraint, condition) for constraint in problem.constraint for condition in constraint.judged(world)]
         for (constraint, condition), order in zip(pairs, orders, strict=True):
             if not (free and order == 2):
-                yield from _violation(constraint, condition, tip, end, BOUNDARY_MARGIN[order])
-    if boundary.goal_ddq is None and not _has_acceleration(problem, world):
-        yield "at the goal there is no acceleration within its limits whose torques are within theirs"
+                texts = _violation(constraint, condition, tip, end, BOUNDARY_MARGIN[order])
+                yield from ((constraint, text) for text in texts)
+    torque = problem.first(JointTorque)
+    if boundary.goal_ddq is None and torque is not None and not _has_acceleration(problem, world, torque):
+        yield torque, "at the goal there is no acceleration within its limits whose torques are within theirs"
 
 
 def _violation(
@@ -68,24 +72,21 @@ def _violation(
     worst = int(np.argmax(violation - tolerance))
     if violation[worst] > tolerance[worst] + margin * max(1.0, abs(bound[worst])):
         unit = "" if condition.unit == "1" else f" {unit_of(condition.unit, worst)}"
+        part = f" of {condition.parts[worst]}" if condition.parts else ""
         yield (
-            f"at the {end} {condition.name} is {g[worst]:.6g}{unit}, expected {bound[worst]:.6g}{unit}"
+            f"at the {end} {condition.name}{part} is {g[worst]:.6g}{unit}, expected {bound[worst]:.6g}{unit}"
             f" with a tolerance of {tolerance[worst]:.2g}{unit}"
         )
 
 
-def _has_acceleration(problem: Problem, world: World) -> bool:
+def _has_acceleration(problem: Problem, world: World, torque: JointTorque) -> bool:
     """Return whether an acceleration within its limits, tolerances included, has torques within theirs."""
     import pinocchio as pin
     from scipy.optimize import linprog
 
-    torque = [constraint for constraint in problem.constraint if isinstance(constraint, JointTorque)]
-    if not torque:
-        return True
     robot, q, dq = world.robot, world.q, world.dq
     acceleration = joint_limits(problem, robot, tolerances=1.0).acceleration
-    tolerance = min(constraint.tolerance for constraint in torque)
-    limit = robot.torque_limit * (1 + tolerance + BOUNDARY_MARGIN[2]) + BOUNDARY_MARGIN[2]
+    limit = robot.torque_limit * (1 + torque.tolerance + BOUNDARY_MARGIN[2]) + BOUNDARY_MARGIN[2]
     model, data = world.parameters.model, world.parameters.model.createData()
     bias = np.array(pin.rnea(model, data, q, dq, np.zeros(robot.n)))
     inertia = np.array([pin.rnea(model, data, q, dq, unit) - bias for unit in np.eye(robot.n)]).T

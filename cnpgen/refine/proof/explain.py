@@ -67,7 +67,7 @@ def explain_failure(problem: Problem, robot: Robot, boundary: Boundary, scene: S
     conditions = (scene.poses, *vars(boundary).values())
     if not all(values is None or np.isfinite(values).all() for values in conditions):
         return Explanation(Feasibility.INFEASIBLE, "the boundary conditions are not finite")
-    for text in end_violations(problem, robot, boundary, scene):
+    for _, text in end_violations(problem, robot, boundary, scene):
         return Explanation(Feasibility.INFEASIBLE, text)
     for text in _cannot_brake(problem, robot, boundary):
         return Explanation(Feasibility.INFEASIBLE, text)

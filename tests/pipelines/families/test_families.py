@@ -194,3 +194,9 @@ def test_every_family_has_problems_for_a_panda(name: str) -> None:
     problem = cnpgen.load_problem("panda-3kg")
     scenes = make_scenes(name, problem, 4, seed=77, per_scene=2)
     check_problems(problem, scenes)
+
+
+@needs_robots
+def test_families_refuse_problems_on_a_manifold():
+    with pytest.raises(UsageError, match="'panda-cup' has the equality constraint 'vertical'"):
+        make_scenes("tabletop", "panda-cup", 1)
