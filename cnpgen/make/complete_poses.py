@@ -9,7 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError, lacks
-from cnpgen.make.goal_poses import MIN_DIFFERENCE_RAD, POSE_REASON, POSE_SEEDS, nearest_states, states_of_pose
+from cnpgen.make.goal_poses import (
+    MIN_DIFFERENCE_RAD,
+    POSE_REASON,
+    POSE_SEEDS,
+    EndConditions,
+    nearest_states,
+    states_of_pose,
+)
 from cnpgen.pipelines.families.resting_states import RestingStates
 from cnpgen.plans.format import GOAL_OPTION
 from cnpgen.plans.plans import Plans, make_plans
@@ -21,14 +28,15 @@ from cnpgen.problems.scenes.quaternions import quaternion_mistake, rotation_matr
 from cnpgen.problems.scenes.scene_problem import GoalPose
 from cnpgen.schema.catalogue import list_recipes
 from cnpgen.schema.toml import kind_of_file
+from cnpgen.schema.units import PLAUSIBLE_MAX, suggested_unit
 from cnpgen.store.field import Field
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.world.pose_ik import PoseKinematics
 
 Array = NDArray[np.float64]
 
-START_REASON = "start in collision, outside its limits or without holding torques"
-GOAL_REASON = "all goal states in collision or without holding torques"
+START_REASON = "start in collision, outside its limits or off a constraint"
+GOAL_REASON = "all goal states in collision or off a constraint"
 
 
 def problem_of_poses(recipe: object) -> Problem | None:
@@ -71,6 +79,7 @@ class PoseTasks:
         )
         self.fields = {field.name: field for field in fields}
         self._kinematics = PoseKinematics(self.robot)
+        self._conditions = EndConditions(problem, self.robot)
         self._states = None if self.robot.shape is None else RestingStates(problem, self.robot)
 
     def check(self, names: Mapping[str, object]) -> None:
@@ -115,9 +124,11 @@ class PoseTasks:
     def _goals(self, task: int, given: Mapping[str, Array]) -> Array | str:
         """Return the goal states of a task, shape (G, n), or the reason why there are none."""
         start, pose = given["start_q"][task], self._pose(task, given)
-        if self._states is not None and not self._states.are_ends(start[:, None])[0]:
+        clear = self._states is None or self._states.are_ends(start[:, None])[0]
+        if not (clear and self._conditions.met(start[:, None])[0]):
             return START_REASON
-        valid, found = states_of_pose(self._kinematics, self._states, pose, np.random.default_rng(POSE_SEEDS))
+        random = np.random.default_rng(POSE_SEEDS)
+        valid, found = states_of_pose(self._kinematics, self._states, self._conditions, pose, random)
         if not len(found):
             return POSE_REASON
         return (
@@ -133,6 +144,11 @@ class PoseTasks:
         tolerances = {"goal_xyz_tolerance": np.zeros(3), "goal_rotation_tolerance": free}
         for name in tolerances.keys() & given.keys():
             tolerances[name] = given[name][task]
+            unit = "m" if name == "goal_xyz_tolerance" else "rad"
+            if (largest := float(tolerances[name].max())) > (limit := PLAUSIBLE_MAX[unit]):
+                hint = suggested_unit(largest, unit, high=limit)
+                text = f"must be at most {limit:.4g} {unit}, got {tolerances[name]} in task {task}{hint}"
+                raise UsageError(text, argument=name)
             if (tolerances[name] < 0).any():
                 raise UsageError(f"must not be negative, got {tolerances[name]} in task {task}", argument=name)
         return GoalPose("", given["goal_xyz"][task], rotation_matrix(wxyz), *tolerances.values())

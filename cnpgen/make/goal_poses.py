@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.pipelines.families.resting_states import RestingStates, seeds_of
+from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
+from cnpgen.problems.constraints.self_clearance import SelfClearance
+from cnpgen.problems.obstacles import scene_of
+from cnpgen.problems.problem import Problem
 from cnpgen.problems.scenes.scene_problem import GoalPose
+from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.robot import Robot
 from cnpgen.world.pose_ik import PoseKinematics, PoseTolerance, solve_pose_ik
+from cnpgen.world.world import World
 
 Array = NDArray[np.float64]
 
@@ -18,14 +26,51 @@ POSE_SEEDS = 128  # of the inverse kinematics of a goal pose
 MIN_DIFFERENCE_RAD = 0.3  # rad or m, of two goal states with one pose in their farthest joint
 
 
+class EndConditions:
+    """Conditions of a problem on states at rest, except for distances of links, which ``RestingStates`` checks.
+
+    Args:
+        problem: The problem.
+        robot: Its robot.
+        obstacles: Further obstacles.
+    """
+
+    def __init__(self, problem: Problem, robot: Robot, obstacles: Sequence[Obstacle] = ()) -> None:
+        placed = problem.with_obstacles((*problem.obstacle, *obstacles)) if obstacles else problem
+        others = RobotClearance | SelfClearance
+        if any(obstacle.below for obstacle in placed.obstacle):  # their places depend on both ends
+            others |= ObjectContact
+        self._constraints = [constraint for constraint in placed.constraint if not isinstance(constraint, others)]
+        self._world = World(robot, placed.obstacle, placed.object_size)
+        self._poses = scene_of(placed, np.zeros((1, 3)), np.zeros((1, 3))).poses[0]
+
+    def met(self, q: Array) -> NDArray[np.bool_]:
+        """Return which joint positions (n, K) meet the conditions within their tolerances, shape (K,)."""
+        return np.array([self._are_met(state) for state in q.T], bool)
+
+    def _are_met(self, q: Array) -> bool:
+        self._world.set_state(q, np.zeros_like(q), np.zeros_like(q), self._poses)
+        for constraint in self._constraints:
+            for condition in constraint.measured(self._world):
+                violation = np.maximum(condition.lower - condition.g, condition.g - condition.upper)
+                if (violation > constraint.allowed(condition)).any():
+                    return False
+        return True
+
+
 def states_of_pose(
-    kinematics: PoseKinematics, states: RestingStates | None, pose: GoalPose, random: np.random.Generator
+    kinematics: PoseKinematics,
+    states: RestingStates | None,
+    conditions: EndConditions,
+    pose: GoalPose,
+    random: np.random.Generator,
 ) -> tuple[Array, Array]:
     """Return joint positions with a goal pose.
 
     Args:
         kinematics: Kinematics of the frame that has the pose.
         states: Checks of states of rest in the scene; None if the robot has no link geometry.
+        conditions: Checks of the other conditions.
         pose: The pose with its tolerances.
         random: Random numbers for the seeds.
 
@@ -39,6 +84,7 @@ def states_of_pose(
     q, met = solve_pose_ik(kinematics, positions, rotations, seeds, tolerance=tolerance)
     found = q[:, met]
     valid = found if states is None else found[:, states.are_ends(found)]
+    valid = valid[:, conditions.met(valid)]
     return valid.T.copy(), found.T.copy()
 
 

@@ -16,6 +16,7 @@ from cnpgen.make.goal_poses import (
     MIN_DIFFERENCE_RAD,
     POSE_REASON,
     POSE_SEEDS,
+    EndConditions,
     nearest_states,
     states_of_pose,
 )
@@ -220,7 +221,8 @@ def _states_of_pose(problem: Problem, robot: Robot, scene: SceneProblem, index: 
         raise SceneError(f"{scene.place} has neither goal states nor a goal pose")
     kinematics = PoseKinematics(robot, _frame_of(robot, scene, pose))
     states = RestingStates(problem, robot, scene.obstacles)
-    valid, found = states_of_pose(kinematics, states, pose, np.random.default_rng([index, POSE_SEEDS]))
+    conditions = EndConditions(problem, robot, scene.obstacles)
+    valid, found = states_of_pose(kinematics, states, conditions, pose, np.random.default_rng([index, POSE_SEEDS]))
     if not len(found):
         return np.full((1, robot.n), np.nan)
     if not len(valid):

@@ -151,7 +151,8 @@ def _repeated(table: dict[str, Any], where: RecipeLocation, array: str, key: str
     seen: list[Any] = []
     for index, entry in tables(table, array):
         if key in entry and entry[key] in seen:
-            text = f"there is a {array} {show(entry[key])} already: edit that one, or remove one of them"
+            article = "an" if array[0] in "aeiou" else "a"
+            text = f"there is {article} {array} {show(entry[key])} already: edit that one, or remove one of them"
             yield (where / array / index / key).message(text)
         seen.append(entry.get(key))
 

@@ -33,6 +33,13 @@ def problem(crane: Path) -> Problem:
     return cnpgen.load_problem(crane)
 
 
+def quaternion(rotation: np.ndarray) -> list[float]:
+    """Return the quaternion w, x, y, z of a rotation matrix by less than half a turn."""
+    w = np.sqrt(1 + np.trace(rotation)) / 2
+    skew = np.array([rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]])
+    return [w, *(skew / (4 * w))]
+
+
 def test_a_task_has_several_goal_states_with_its_pose(problem: Problem) -> None:
     found = cnpgen.complete(problem, goal_xyz=GOALS[:2], goal_xyz_tolerance=[0.0, 0.0, 0.02])
     assert found.reasons == ("", OUT_OF_REACH)
@@ -49,13 +56,33 @@ def test_a_task_has_several_goal_states_with_its_pose(problem: Problem) -> None:
     assert difference[~np.eye(len(plans), dtype=bool)].min() > 0.29
 
 
+def test_goal_states_meet_the_constraints_of_the_problem(tmp_path: Path) -> None:
+    more = SELF + VELOCITY + '[[constraint]]\nuse = "vertical"\ntolerance = "2 deg"\n'
+    problem = cnpgen.load_problem(write_problem(tmp_path, obstacles="", more=more))
+    level, tilted = np.array([[0.7, -0.6, 0.6, 0.0], [0.7, -0.6, 1.0, 0.0]])
+    positions, rotations = cnpgen.RobotModel(problem).forward_kinematics(np.array([level, tilted]))
+    task = {"start_q": [0.0, -0.6, 0.6, 0.0], "goal_rotation_tolerance": [0, 0, 3.15]}
+    found = cnpgen.complete(problem, **task, goal_xyz=positions, goal_wxyz=[quaternion(each) for each in rotations])
+    assert found.reasons == ("", "all goal states in collision or off a constraint")
+    for q in found.plans.boundary.goal_q:
+        assert abs(q[1] + q[2]) < np.deg2rad(2)
+    start = [0.0, -0.6, 0.9, 0.0]
+    found = cnpgen.complete(problem, **task | {"start_q": start}, goal_xyz=positions[0])
+    assert found.reasons == ("start in collision, outside its limits or off a constraint",)
+
+
+def test_tolerances_in_degrees_are_refused(problem: Problem) -> None:
+    with pytest.raises(
+        UsageError, match=r"at most 25.13 rad, got .* in task 0; 180 rad is 10313 deg; did you mean 180 deg"
+    ):
+        cnpgen.complete(problem, goal_xyz=GOALS[0], goal_rotation_tolerance=[0.0, 0.0, 180.0])
+
+
 def test_a_quaternion_is_met_and_pi_frees_an_axis(problem: Problem) -> None:
     (aim,) = cnpgen.complete(problem, goal_xyz=GOALS[0]).plans[0]
     model = cnpgen.RobotModel(problem)
     (rotation,) = model.forward_kinematics(aim.boundary.goal_q)[1]
-    w = np.sqrt(1 + np.trace(rotation)) / 2
-    skew = np.array([rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]])
-    task = {"goal_xyz": GOALS[0], "goal_wxyz": [w, *(skew / (4 * w))]}
+    task = {"goal_xyz": GOALS[0], "goal_wxyz": quaternion(rotation)}
     exact = cnpgen.complete(problem, **task).plans
     free = cnpgen.complete(problem, **task, goal_rotation_tolerance=[np.pi, 0.0, 0.0]).plans
     poses = model.forward_kinematics(exact.boundary.goal_q)[1]
