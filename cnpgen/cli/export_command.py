@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from cnpgen.plans.join import JoinedPlans
 
 MAX_LISTED_PLANS = 10  # invalid plans that are listed by number
+NO_OBSTACLES = "the output lacks the obstacles of the plans: only a problem with these obstacles judges it among them"
 
 _TEXT = """\
 npz, parquet and mpd (B-splines of the paths) are one file. csv, joint-trajectory (a message of ROS 2, as JSON) and
@@ -70,6 +71,7 @@ def add(commands: "Commands[Parser]") -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     from cnpgen.plans.export import export_plans, load_exporter
+    from cnpgen.problems.problem_record import open_problem
 
     exporter = load_exporter(arguments.to)
     plans = _plans(arguments)
@@ -79,6 +81,8 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"cnpgen: left out: {why}", file=sys.stderr)
     if exported.invalid:
         print(f"cnpgen: warning: {_invalid(exported)}", file=sys.stderr)
+    if open_problem(plans.problem)[0].has_sample_obstacles:
+        print(f"cnpgen: note: {NO_OBSTACLES}", file=sys.stderr)
     print(f"exported {_counted(exported)} at {arguments.rate:g} Hz", file=sys.stderr)
     print(exported.files[0] if exporter.single_file else out)
     return 1 if exported.refused else 0

@@ -9,10 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+import cnpgen
 from cnpgen.cli.main import main
 from cnpgen.plans import PlanStatus, save_plans
+from cnpgen.robots.obstacle import Obstacle
+from cnpgen.scenes import SceneProblem, scene_plans
 from tests.examples.plan_files import garbage, plans_of
 from tests.examples.plans import load
+from tests.examples.shaped_robot import SELF, write_problem
 from tests.plans.test_plans import draw_plans
 
 Run = Callable[..., tuple[int, str, str]]
@@ -110,6 +114,18 @@ def test_plans_that_are_known_not_to_be_valid_are_exported_with_a_warning(run: R
     assert (code, err.splitlines()[0]) == (0, f"cnpgen: warning: {text}")
     _, _, err = run(tmp_path / "bad.h5", "--to", "npz", "--rate", 50, "--plan", "3", "--force")
     assert "warning" not in err
+
+
+def test_plans_with_their_own_obstacles_are_exported_with_a_note(run: Run, hits: Path, tmp_path: Path) -> None:
+    problem = cnpgen.load_problem(write_problem(tmp_path, obstacles="", more=SELF))
+    ball = Obstacle(name="ball", kind="sphere", position=(-0.5, -0.3, 0.5), radius=0.1)
+    scene = SceneProblem(name="one", obstacles=(ball,), start_q=np.zeros(4), goal_q=np.full((1, 4), 0.1))
+    plans = scene_plans(problem, [scene])
+    plans.path_control_points[:], plans.rate_control_points[:] = 0.0, 1.0
+    save_plans(tmp_path / "scenes.h5", plans)
+    note = "the output lacks the obstacles of the plans"
+    assert note in run(tmp_path / "scenes.h5", "--to", "csv", "-o", tmp_path / "out")[2]
+    assert note not in run(hits, "--to", "csv", "-o", tmp_path / "hits")[2]
 
 
 def test_a_place_in_a_folder_that_does_not_exist_is_refused(run: Run, hits: Path) -> None:
