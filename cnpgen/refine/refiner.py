@@ -155,7 +155,7 @@ class Refiner:
                 kernel_poses=self.kernel_poses(task),
                 obstacle_poses=task.scene.poses[0],
             )
-            accepted = (near_ends(self._grids[level.points].s) * self._accepted_at_ends(task)[:, None]).max(axis=0)
+            accepted = (near_ends(self._grids[level.points].s) * self.accepted_at_ends(task)[:, None]).max(axis=0)
             more = -accepted if extra is None else extra - accepted
             bounds = self._bounds[level].with_hull_distances(bounds, self.hulls.min_distances, more)
         elif hulls is not None:
@@ -246,7 +246,7 @@ class Refiner:
         feedback, motion = self._feedback(level), self.transcription(task, level)
         for _ in range(MAX_FEEDBACKS):
             path, _ = motion.unpack(result.x)
-            accepted = self._accepted_at_ends(task)
+            accepted = self.accepted_at_ends(task)
             missing = feedback.missing_clearance(path, self.hulls, task.scene.poses[0], accepted=accepted)
             if missing is None:
                 break
@@ -255,7 +255,7 @@ class Refiner:
             result = replace(result, iterations=earlier + result.iterations)
         return result
 
-    def _accepted_at_ends(self, task: RefinementTask) -> Array:
+    def accepted_at_ends(self, task: RefinementTask) -> Array:
         """Return by how much the hulls at both ends violate their distances within the tolerance [m], shape (2, m)."""
         ends = np.stack([task.boundary.start_q[0], task.boundary.goal_q[0]], axis=1)
         return self.hulls.accepted_at(ends, task.scene.poses[0])

@@ -47,7 +47,7 @@ from cnpgen.refine.proof.end_violations import end_violations
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.solver.bounds import PRECISE_FRACTION
 from cnpgen.refine.solver.deadline import Deadline
-from cnpgen.refine.solver.hull_feedback import MAX_FED_BACK_M
+from cnpgen.refine.solver.hull_feedback import MAX_FED_BACK_M, MIN_FED_BACK_M
 from cnpgen.refine.solver.hull_problem import without_contacts
 from cnpgen.refine.solver.hulls import Hulls, has_clearance_constraints
 from cnpgen.refine.solver.sqp import Result
@@ -313,7 +313,7 @@ class RefinementSearch:
         """Return a plan with its verdict."""
         verdict = self.verdict = self._verdict(plan)
         touches = not verdict.valid and verdict.reason in LINK_REASONS
-        if self.refiner.measures_hulls and touches:
+        if touches and self.refiner.measures_hulls and not self._ends_touch:
             verdict = self.checker.verdict(self.task, plan.path, plan.rate)
         keeps_outcome = verdict.valid or plan.outcome in INPUT_OUTCOMES
         return replace(
@@ -327,8 +327,13 @@ class RefinementSearch:
 
     def _verdict(self, plan: Attempt) -> Verdict:
         """Return the verdict, without a tolerance of contacts if the solver can remove them."""
-        judge = self.checker.strict_verdict if self.refiner.measures_hulls else self.checker.verdict
-        return judge(self.task, plan.path, plan.rate)
+        removable = self.refiner.measures_hulls and not self._ends_touch
+        return (self.checker.strict_verdict if removable else self.checker.verdict)(self.task, plan.path, plan.rate)
+
+    @cached_property
+    def _ends_touch(self) -> bool:
+        """Whether an end has a contact within the tolerance, which every motion has."""
+        return float(self.refiner.accepted_at_ends(self.task).max(initial=0.0)) > MIN_FED_BACK_M
 
     def _judge_attempt(self, attempt: Attempt) -> Attempt:
         if attempt.outcome is Outcome.ADJUSTED and _is_input(self.task, attempt.path, attempt.rate):

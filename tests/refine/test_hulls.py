@@ -347,6 +347,30 @@ def test_a_slot_that_is_too_narrow_for_capsules_is_wide_enough_for_hulls(tmp_pat
     assert min(min(meshes.distances(q)) for q in states) > -1e-4  # the tolerance of the problem
 
 
+@needs_compiler
+def test_a_contact_of_an_end_does_not_prolong_the_search(tmp_path, monkeypatch):
+    """The start is closer to the roof than required, within the tolerance: every motion has this contact."""
+    problem = narrow(tmp_path, SLOT)
+    robot = load_robot(problem)
+    farther = np.array([[0.0, 0.0, 0.0, 0.0], [0.0, -0.0005, 0.0, 0.0]])
+    task = between(problem, np.add(IN_SLOT, farther))
+    tool = load_refiner(problem, robot)
+    ends = np.stack([task.boundary.start_q[0], task.boundary.goal_q[0]], axis=1)
+    start, goal = tool.hulls.measure(ends, task.scene.poses[0])[0].min(axis=1)
+    assert goal - start > 1e-4
+    constraints = (
+        replace(each, distance=start + CONTACT_M) if isinstance(each, RobotClearance) else each
+        for each in problem.constraint
+    )
+    closer = replace(problem, constraint=tuple(constraints))
+    vars(closer)["urdf_text"] = problem.urdf_text
+    tool, checker = load_refiner(closer, robot), PlanChecker(closer, robot, degree=problem.trajectory.degree)
+    assert tool.accepted_at_ends(task)[0].max() == pytest.approx(CONTACT_M, abs=1e-9)
+    assert tool.accepted_at_ends(task)[1].max() == 0
+    monkeypatch.setattr(checker, "strict_verdict", None)  # it would find the contact of the start
+    assert refine_task(tool, checker, task).valid
+
+
 @pytest.mark.slow
 @needs_compiler
 def test_a_contact_within_the_tolerance_is_removed(tmp_path):
