@@ -206,7 +206,8 @@ def checked_scene(scene: SceneProblem) -> SceneProblem:
     if pose is not None:
         if not (np.abs([*pose.position, *pose.rotation.ravel()]) <= MAX_COORDINATE_M).all():
             raise SceneError(f"{scene.place}: the goal pose has numbers that are not finite or too large")
-        if np.abs(pose.rotation @ pose.rotation.T - np.eye(3)).max() > MAX_ROTATION_ERROR:
+        mirrored = float(np.linalg.det(pose.rotation)) < 0
+        if mirrored or np.abs(pose.rotation @ pose.rotation.T - np.eye(3)).max() > MAX_ROTATION_ERROR:
             raise SceneError(
                 f"{scene.place}: the rotation of the goal pose is no rotation matrix: {pose.rotation.tolist()}"
             )

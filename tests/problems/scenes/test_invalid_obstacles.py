@@ -69,6 +69,7 @@ def test_invalid_obstacles_are_refused_wherever_scenes_enter(problem, tmp_path, 
         ({"goal_q": np.zeros(4)}, r"goal_q must have shape \(G, n\), got \(4,\)"),
         ({"start_q": np.zeros((1, 4))}, r"start_q must have shape \(n,\), got \(1, 4\)"),
         ({"goal_pose": GoalPose("", np.ones(3), 2 * np.eye(3))}, "the rotation of the goal pose is no rotation matrix"),
+        ({"goal_pose": GoalPose("", np.ones(3), -np.eye(3))}, "the rotation of the goal pose is no rotation matrix"),
         (
             {"goal_pose": GoalPose("", np.ones(3), np.eye(3), 0.0, 180.0)},
             "tolerances of the goal pose are in m and rad",
