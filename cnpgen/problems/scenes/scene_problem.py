@@ -204,6 +204,11 @@ def checked_scene(scene: SceneProblem) -> SceneProblem:
     check_count(len(scene.obstacles), scene.place)
     pose = scene.goal_pose
     if pose is not None:
+        tolerances = pose.position_tolerance, pose.rotation_tolerance
+        shapes = np.shape(pose.position), np.shape(pose.rotation), *map(np.shape, tolerances)
+        if shapes[:2] != ((3,), (3, 3)) or not {(), (3,)}.issuperset(shapes[2:]):
+            text = f"of shape (3,), (3, 3), and (3,) or () for tolerances, got {', '.join(map(str, shapes))}"
+            raise SceneError(f"{scene.place}: a goal pose has a position, a rotation and tolerances {text}")
         if not (np.abs([*pose.position, *pose.rotation.ravel()]) <= MAX_COORDINATE_M).all():
             raise SceneError(f"{scene.place}: the goal pose has numbers that are not finite or too large")
         mirrored = float(np.linalg.det(pose.rotation)) < 0

@@ -69,6 +69,11 @@ def test_invalid_obstacles_are_refused_wherever_scenes_enter(problem, tmp_path, 
         ({"goal_q": np.zeros(4)}, r"goal_q must have shape \(G, n\), got \(4,\)"),
         ({"start_q": np.zeros((1, 4))}, r"start_q must have shape \(n,\), got \(1, 4\)"),
         ({"goal_pose": GoalPose("", np.ones(3), 2 * np.eye(3))}, "the rotation of the goal pose is no rotation matrix"),
+        ({"goal_pose": GoalPose("", np.ones(3), np.ones(4))}, r"a goal pose has .* got \(3,\), \(4,\), \(\), \(\)"),
+        (
+            {"goal_pose": GoalPose("", np.ones(3), np.eye(3), np.ones(2))},
+            r"a goal pose has .* got \(3,\), \(3, 3\), \(2,\)",
+        ),
         ({"goal_pose": GoalPose("", np.ones(3), -np.eye(3))}, "the rotation of the goal pose is no rotation matrix"),
         (
             {"goal_pose": GoalPose("", np.ones(3), np.eye(3), 0.0, 180.0)},
