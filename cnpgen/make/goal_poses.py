@@ -42,7 +42,8 @@ class EndConditions:
             others |= ObjectContact
         self._constraints = [constraint for constraint in placed.constraint if not isinstance(constraint, others)]
         self._world = World(robot, placed.obstacle, placed.object_size)
-        self._poses = scene_of(placed, np.zeros((1, 3)), np.zeros((1, 3))).poses[0]
+        zero = np.zeros((1, 3))
+        self._poses = scene_of(placed, zero, zero, zero).poses[0]
 
     def met(self, q: Array) -> NDArray[np.bool_]:
         """Return which joint positions (n, K) meet the conditions within their tolerances, shape (K,)."""

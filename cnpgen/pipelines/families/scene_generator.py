@@ -101,9 +101,8 @@ def make_scenes(
 
 def _check_no_manifold(problem: Problem, robot: Robot) -> None:
     """Raise UsageError for constraints that hardly any drawn end meets."""
-    world, zero = World(robot, problem.obstacle, problem.object_size), np.zeros(robot.n)
-    scene = scene_of(problem, np.zeros((1, 3)), np.zeros((1, 3)))
-    world.set_state(robot.base, zero, zero, scene.poses[0])
+    world, rest, zero = World(robot, problem.obstacle, problem.object_size), np.zeros(robot.n), np.zeros((1, 3))
+    world.set_state(robot.base, rest, rest, scene_of(problem, zero, zero, zero).poses[0])
     for constraint in problem.constraint if robot.shape is not None else ():  # the lack of a shape is reported later
         if any(condition.g and condition.is_equality for condition in constraint.measured(world)):
             name = registry.name_of(registry.CONSTRAINTS, type(constraint))
