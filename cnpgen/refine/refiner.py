@@ -17,7 +17,7 @@ from cnpgen.refine import initial_guesses
 from cnpgen.refine.fine_check import FineCheck
 from cnpgen.refine.grid_levels import GridLevel, GridLevels, default_grid_levels
 from cnpgen.refine.rrt_connect import RestSpace
-from cnpgen.refine.solver.bounds import Bounds, bounds_template, near_ends
+from cnpgen.refine.solver.bounds import Bounds, accepted_along, bounds_template, near_ends
 from cnpgen.refine.solver.compiled_backend import load_step_library
 from cnpgen.refine.solver.cost_term import CostTerm, cost_term_residuals, residual_counts
 from cnpgen.refine.solver.grid import make_grid
@@ -26,7 +26,7 @@ from cnpgen.refine.solver.hull_problem import can_measure_hulls, without_distanc
 from cnpgen.refine.solver.hulls import CompiledHullTranscription, Hulls, HullTranscription
 from cnpgen.refine.solver.residuals import stage_jacobian, stage_values
 from cnpgen.refine.solver.sqp import DEFAULT_SETTINGS, Result, Settings, minimize
-from cnpgen.refine.solver.transcription import ResidualKernels, Transcription
+from cnpgen.refine.solver.transcription import ResidualKernels, Transcription, cache_last
 from cnpgen.refine.task import Attempt, Outcome, RefinementTask
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.solid import pose_width
@@ -106,6 +106,7 @@ class Refiner:
         )
         has_manifold = self.measures_hulls and bool(self.check.equalities)
         self._equalities = kernels.load_by_structure(equality_residuals) if has_manifold else None
+        self._accepted = cache_last(self._measure_ends)  # several levels of a task need it
         every, orders = tuple(vars(self.levels).values()), problem.path_orders
         self._grids = {points: make_grid(self.spec, points, orders) for points in {level.points for level in every}}
         self._feedbacks = dict[int, HullFeedback]()
@@ -155,7 +156,7 @@ class Refiner:
                 kernel_poses=self.kernel_poses(task),
                 obstacle_poses=task.scene.poses[0],
             )
-            accepted = (near_ends(self._grids[level.points].s) * self.accepted_at_ends(task)[:, None]).max(axis=0)
+            accepted = accepted_along(near_ends(self._grids[level.points].s), self.accepted_at_ends(task))
             more = -accepted if extra is None else extra - accepted
             bounds = self._bounds[level].with_hull_distances(bounds, self.hulls.min_distances, more)
         elif hulls is not None:
@@ -244,9 +245,9 @@ class Refiner:
     def _separated(self, task: RefinementTask, level: GridLevel, result: Result, extra: Array | None = None) -> Result:
         """Run a level again with larger required distances where hulls collide between its grid points."""
         feedback, motion = self._feedback(level), self.transcription(task, level)
+        accepted = self.accepted_at_ends(task)
         for _ in range(MAX_FEEDBACKS):
             path, _ = motion.unpack(result.x)
-            accepted = self.accepted_at_ends(task)
             missing = feedback.missing_clearance(path, self.hulls, task.scene.poses[0], accepted=accepted)
             if missing is None:
                 break
@@ -257,6 +258,9 @@ class Refiner:
 
     def accepted_at_ends(self, task: RefinementTask) -> Array:
         """Return by how much the hulls at both ends violate their distances within the tolerance [m], shape (2, m)."""
+        return self._accepted(task)
+
+    def _measure_ends(self, task: RefinementTask) -> Array:
         ends = np.stack([task.boundary.start_q[0], task.boundary.goal_q[0]], axis=1)
         return self.hulls.accepted_at(ends, task.scene.poses[0])
 

@@ -99,6 +99,11 @@ position = [0.2, 0.55, 0.1]
 rotation = "[0, -60, 30] deg"
 """
 SELF = '[[constraint]]\nuse = "self-clearance"\ntolerance = 1e-4\n'
+HELD_OBJECT = """
+[object]
+size = [0.08, 0.06, 0.12]
+touch_links = ["fore", "hand", "claw"]
+"""
 _PIPELINE = """
 name = "{name}"
 problem = "problem.toml"

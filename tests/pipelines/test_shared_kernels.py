@@ -8,17 +8,17 @@ from cnpgen.pipelines.stages.collision import capsule_axes_distance, capsule_cle
 from cnpgen.pipelines.stages.narrow_phase import narrow_phase
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
-from tests.examples.shaped_robot import KINDS, SELF, write_problem
+from tests.examples.shaped_robot import HELD_OBJECT, KINDS, SELF, write_problem
 
-HELD = """
-[object]
-size = [0.08, 0.06, 0.12]
-touch_links = ["fore", "hand", "claw"]
+HELD = (
+    HELD_OBJECT
+    + """
 [[constraint]]
 use = "object-contact"
 depth = 0.0
 tolerance = 1e-3
 """
+)
 
 
 def test_moved_obstacles_have_the_same_tapes(tmp_path):

@@ -27,7 +27,7 @@ from cnpgen.world.world import World
 from tests.conftest import needs_compiler
 from tests.examples.meshes import Meshes
 from tests.examples.narrow import BESIDE_WALL, BOXES, IN_SLOT, LIMITS, SLOT, WALL, between, narrow, refiner
-from tests.examples.shaped_robot import KINDS, OBSTACLES, SELF, write_problem
+from tests.examples.shaped_robot import HELD_OBJECT, KINDS, OBSTACLES, SELF, write_problem
 
 STEP = 1e-6  # rad, of finite differences
 CONTACT_TURN_RAD, CONTACT_M, CLOSE_M = 1e-3, 5e-5, 0.01  # the contact is half the tolerance
@@ -112,10 +112,9 @@ def test_compiled_rows_are_the_distances_of_hulls_and_their_gradients(tmp_path):
     assert np.abs(gradients).max() > 0.1
 
 
-CONTACT_ONLY = """
-[object]
-size = [0.08, 0.06, 0.12]
-touch_links = ["fore", "hand", "claw"]
+CONTACT_ONLY = (
+    HELD_OBJECT
+    + """
 [[constraint]]
 use = "object-contact"
 depth = 0.002
@@ -125,6 +124,7 @@ use = "object-clearance"
 distance = 0.01
 tolerance = 1e-3
 """
+)
 HELD = SELF + CONTACT_ONLY
 LEVEL = """
 [[constraint]]

@@ -121,13 +121,14 @@ class CollisionChecker:
         of_link = [np.flatnonzero(parts["link"] == link) for link in range(len(capsules))]
         self._set("first_part", np.append(0, np.cumsum([len(each) for each in of_link])))
         self._set("part_of_link", np.concatenate(of_link))
-        kept = [(links[pair.first], links[pair.second]) for pair in shape.pairs if not pair.left_out]
+        checked = [(pair.first, pair.second) for pair in shape.pairs if not pair.left_out]
+        kept = [(links[first], links[second]) for first, second in checked]
         pairs = [
             [sorted(both, key=parts["frame"].__getitem__) for both in product(of_link[a], of_link[b])] for a, b in kept
         ]
         self._set("link_pairs", np.array(kept, np.int64).reshape(-1, 2))
-        names = [frozenset((pair.first, pair.second)) for pair in shape.pairs if not pair.left_out]
-        self._set("pair_added", np.array([(pair_added or {}).get(each, 0.0) for each in names], np.float64))
+        more = [(pair_added or {}).get(frozenset(pair), 0.0) for pair in checked]
+        self._set("pair_added", np.array(more, np.float64))
         self._set("first_pair", np.append(0, np.cumsum([len(each) for each in pairs])))
         self.link_pairs = np.array([both for each in pairs for both in each], np.int64).reshape(-1, 2)
         self._set("pairs", self.link_pairs)

@@ -276,6 +276,16 @@ def near_ends(s: Array) -> Array:
     return np.clip((until - np.stack([s, 1 - s])) / from_full, 0.0, 1.0)[..., None]
 
 
+def accepted_along(shares: Array, accepted: Array) -> Array:
+    """Return the violations that are accepted at K phases, shape (K, m).
+
+    Args:
+        shares: Result of ``near_ends``, shape (2, K, 1).
+        accepted: Accepted violations of both ends, shape (2, m).
+    """
+    return np.asarray((shares * accepted[:, None]).max(axis=0))
+
+
 def _time_varying_conditions(
     pairs: list[tuple[Constraint, Condition]],
 ) -> Iterator[tuple[Constraint, Condition, slice]]:

@@ -7,7 +7,7 @@ collisions are found by the verdict only, which names their phase.
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.refine.solver.bounds import near_ends
+from cnpgen.refine.solver.bounds import accepted_along, near_ends
 from cnpgen.refine.solver.hulls import Hulls
 from cnpgen.trajectory.spline import basis
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
@@ -54,7 +54,7 @@ class HullFeedback:
         """
         missing = hulls.missing((self._basis @ path).T, self._margins, obstacle_poses)
         if accepted is not None:
-            missing = np.maximum(missing - (self._near_ends * accepted[:, None]).max(axis=0), 0.0)
+            missing = np.maximum(missing - accepted_along(self._near_ends, accepted), 0.0)
         worst = float((missing.max(axis=1) - self._margins).max())
         if not MIN_FED_BACK_M < worst < MAX_FED_BACK_M:
             return None

@@ -9,7 +9,7 @@ velocity of the points along the direction.
 from ctypes import CDLL
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,7 @@ from cnpgen.refine.solver.residuals import DISTANCE_SCALE_M
 from cnpgen.refine.solver.transcription import Linearization, ResidualKernels, Transcription, cache_last
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.held_object import HELD_OBJECT, with_held_object
+from cnpgen.robots.shape.shape import Shape
 from cnpgen.robots.solid import solids_of
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.world.forward_kinematics import ForwardKinematics
@@ -60,6 +61,37 @@ class _Group:
     required: float
     of_obstacles: bool
     numbers: Pairs
+
+
+@dataclass(frozen=True)
+class _Distances:
+    """Largest distances that the constraints of each kind require [m]; None without one."""
+
+    kinds: ClassVar = (RobotClearance, ObjectContact, SelfClearance, ObjectClearance)
+    robot: float | None
+    object: float | None
+    links: float | None
+    object_from_links: float | None
+
+    @property
+    def from_obstacles(self) -> float | None:
+        """Largest required distance from obstacles [m]."""
+        return max((each for each in (self.robot, self.object) if each is not None), default=None)
+
+    @property
+    def from_links(self) -> float | None:
+        """Largest required distance of links and the held object from other links [m]."""
+        return max((each for each in (self.links, self.object_from_links) if each is not None), default=None)
+
+    def differences(self, shape: Shape) -> tuple[dict[str, float], dict[frozenset[str], float]]:
+        """Return what links and link pairs add to the largest distances, see ``CollisionChecker``."""
+        base, own = self.from_obstacles or 0.0, self.from_links or 0.0
+        added = dict.fromkeys(shape.joints, _difference(self.robot, base)) | {
+            HELD_OBJECT: _difference(self.object, base)
+        }
+        of_pairs = _difference(self.links, own), _difference(self.object_from_links, own)
+        pairs = (frozenset((pair.first, pair.second)) for pair in shape.pairs)
+        return added, {pair: of_pairs[HELD_OBJECT in pair] for pair in pairs}
 
 
 class Hulls:
@@ -100,10 +132,7 @@ class Hulls:
         covered = {frozenset((pair.first, pair.second)) for pair in shape.pairs if pair.for_solvers}
         for constraint in constraints:
             of_links, required = isinstance(constraint, SelfClearance | ObjectClearance), _required(constraint)
-            pairs = self._bodies.link_pairs if of_links else self._bodies.obstacle_pairs
-            of_object = np.array([HELD_OBJECT in (names[a], names[b]) for a, b in pairs.tolist()], bool)
-            numbers = np.flatnonzero(of_object == isinstance(constraint, OBJECT_CONSTRAINTS))
-            pairs = pairs[numbers]
+            pairs, numbers = self._pairs_of(constraint, names, of_links=of_links)
             indices = [columns.setdefault((names[a], names[b]), len(columns)) for a, b in pairs.tolist()]
             for column in indices:
                 min_distances[column] = max(min_distances.get(column, -np.inf), required)
@@ -115,23 +144,22 @@ class Hulls:
                 self._uncovered.append((pairs[np.array(uncovered, bool)], required))
         self.min_distances = np.array([min_distances[column] for column in range(len(columns))])
         self.tolerances = self.min_distances - np.array([accepted_of[column] for column in range(len(columns))])
+        distances = _Distances(*(_largest(constraints, kind) for kind in _Distances.kinds))
+        self.obstacle_distance, self.self_distance = distances.from_obstacles, distances.from_links
         self.checker = None
-        clearance, contact, between_links, around_object = (
-            _largest(constraints, kind) for kind in (RobotClearance, ObjectContact, SelfClearance, ObjectClearance)
-        )
-        self.obstacle_distance = max((each for each in (clearance, contact) if each is not None), default=None)
-        self.self_distance = max((each for each in (between_links, around_object) if each is not None), default=None)
         if library is not None and robot.n <= MAX_JOINTS:
-            base, own = self.obstacle_distance or 0.0, self.self_distance or 0.0
-            added = dict.fromkeys(links, _difference(clearance, base)) | {HELD_OBJECT: _difference(contact, base)}
-            differences = _difference(between_links, own), _difference(around_object, own)
-            pairs_of_links = (frozenset((pair.first, pair.second)) for pair in shape.pairs)
-            pair_added = {pair: differences[HELD_OBJECT in pair] for pair in pairs_of_links}
-            self.checker = CollisionChecker(library, robot, shape, added, pair_added)
+            self.checker = CollisionChecker(library, robot, shape, *distances.differences(shape))
         self._axes = np.array([joint.axis for joint in robot.chain.joints])
         self._sliding = np.array(robot.sliding)
         supports = [list(joints) for joints in robot.model.supports]
         self._moves = np.array([[joint in above for joint in range(1, robot.n + 1)] for above in supports])
+
+    def _pairs_of(self, constraint: Any, names: list[Any], *, of_links: bool) -> tuple[Pairs, Pairs]:
+        """Return the pairs of bodies of a constraint, shape (P, 2), and their numbers among all of their kind."""
+        pairs = self._bodies.link_pairs if of_links else self._bodies.obstacle_pairs
+        of_object = np.array([HELD_OBJECT in (names[a], names[b]) for a, b in pairs.tolist()], bool)
+        numbers = np.flatnonzero(of_object == isinstance(constraint, OBJECT_CONSTRAINTS))
+        return pairs[numbers], numbers
 
     def measure(self, q: Array, obstacle_poses: Array) -> tuple[Array, list[Contacts]]:
         """Measure the distances of close parts.
