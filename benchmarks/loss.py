@@ -1,10 +1,10 @@
 """The loss of plans and its gradient: microseconds per quadrature point, milliseconds per batch, errors of the rules.
 
-The clock is the process's CPU time. Every repetition measures all cases in turn. Times are medians over the
-repetitions, ratios are medians of the ratios within one repetition.
+The clock is the process's CPU time, and the elapsed time on a GPU. Every repetition measures all cases in turn. Times
+are medians over the repetitions, ratios are medians of the ratios within one repetition.
 
     python benchmarks/loss.py
-    python benchmarks/loss.py --torch
+    python benchmarks/loss.py --torch --device cuda --batch 4096
     python benchmarks/loss.py --batch 64 --nodes 32 --repeat 50
 """
 
@@ -97,10 +97,10 @@ class Timed:
         self.seconds += time.process_time() - start
 
 
-def seconds(function: Callable[[], None]) -> float:
-    start = time.process_time()
+def seconds(function: Callable[[], Any], clock: Callable[[], float] = time.process_time) -> float:
+    start = clock()
     function()
-    return time.process_time() - start
+    return clock() - start
 
 
 def prepare(problem: str, backend: str, dtype: str, options: argparse.Namespace) -> Case:
@@ -131,32 +131,37 @@ def speed_table(cases: list[Case], points: int) -> str:
     return table(title, (*head, ""), rows, left=3)
 
 
-def torch_row(case: Case, repeat: int) -> tuple[str, ...]:
+def torch_row(case: Case, options: argparse.Namespace) -> tuple[str, ...]:
     import torch
 
     from cnpgen.interop.torch import TensorLoss
 
     torch.set_num_threads(1)
-    path, rate = (torch.tensor(x, requires_grad=True) for x in (case.plans.path, case.plans.rate))
-    loss, weights = TensorLoss(case.loss), np.ones(len(case.loss.terms) - 1)
+    dtype, device, poses = getattr(torch, options.dtype), options.device, case.plans.obstacle_poses
+    path, rate = (
+        torch.tensor(x, requires_grad=True, dtype=dtype, device=device) for x in (case.plans.path, case.plans.rate)
+    )
+    loss, weights = TensorLoss(case.loss, compiled=options.compiled), np.ones(len(case.loss.terms) - 1)
+    fixed = {"weights": torch.tensor(weights, device=device), "obstacle_poses": torch.tensor(poses, device=device)}
 
     def gradient() -> Any:
-        total, _ = loss(path, rate, weights=weights, obstacle_poses=case.plans.obstacle_poses)
-        return torch.autograd.grad(total.sum(), [path])[0].numpy()
+        return torch.autograd.grad(loss(path, rate, **fixed)[0].sum(), [path])[0].cpu().numpy()  # waits for the GPU
 
-    times = [(seconds(gradient), seconds(case.call)) for _ in range(repeat)]
-    poses = case.plans.obstacle_poses
+    first = seconds(gradient, time.perf_counter)
+    clock = time.process_time if device == "cpu" else time.perf_counter
+    times = [(seconds(gradient, clock), seconds(case.call)) for _ in range(options.repeat)]
     expected = case.loss(case.plans.path, case.plans.rate, weights=weights, obstacle_poses=poses).path_gradient
     error = np.abs(gradient() - expected).max() / np.abs(expected).max()
     slower = median(a / b for a, b in times)
-    return case.problem, f"{1e3 * median(a for a, _ in times):.1f}", f"{slower:.1f}", f"{error:.1e}"
+    return case.problem, f"{first:.1f}", f"{1e3 * median(a for a, _ in times):.1f}", f"{slower:.2f}", f"{error:.1e}"
 
 
-def torch_table(cases: list[Case], repeat: int) -> str:
-    """Compare the loss in torch operations with the compiled one, in float64 on one thread."""
-    rows = [torch_row(case, repeat) for case in cases]
-    head = ("problem", "ms/batch", "times slower", "relative difference of the gradient")
-    return table("TensorLoss with its gradient on the CPU, against the compiled loss in float64", head, rows)
+def torch_table(cases: list[Case], options: argparse.Namespace) -> str:
+    """Compare the loss in torch operations with the compiled one on one thread of the CPU."""
+    rows = [torch_row(case, options) for case in cases]
+    head = ("problem", "first call, s", "ms/batch", "times slower", "relative difference of the gradient")
+    title = f"TensorLoss with its gradient on {options.device}, {options.dtype}, {options.batch} plans"
+    return table(f"{title}, against the compiled loss in float64 on one thread", head, rows)
 
 
 @dataclass(frozen=True)
@@ -228,6 +233,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--batch", type=int, default=128, help="plans per batch")
     parser.add_argument("--nodes", type=int, default=64, help="quadrature nodes")
     parser.add_argument("--torch", action="store_true", help="compare with the loss in torch operations, and stop")
+    parser.add_argument("--device", default="cpu", help="device of the torch operations")
+    parser.add_argument("--dtype", choices=("float32", "float64"), default="float64", help="their type")
+    parser.add_argument("--compiled", action="store_true", help="fuse them with torch.compile, which takes minutes")
     parser.add_argument("--repeat", type=int, default=15, help="repetitions")
 
 
@@ -236,7 +244,7 @@ def main() -> None:
     points = options.batch * options.nodes
     if options.torch:
         cases = [prepare(problem, "compiled", "float64", options) for problem in PROBLEMS]
-        report({}, [torch_table(cases, options.repeat)], as_json=options.json)
+        report({}, [torch_table(cases, options)], as_json=options.json)
         return
     cases = [prepare(problem, *variant, options) for problem in PROBLEMS for variant in VARIANTS]
     for number in range(options.repeat):

@@ -8,8 +8,10 @@ import shlex
 import shutil
 import signal
 import subprocess
+import sys
 from contextlib import suppress
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 
 from cnpgen.errors import MachineError
@@ -30,13 +32,14 @@ _running: set["subprocess.Popen[str]"] = set()  # compilers of all threads
 
 @cache
 def find_compiler() -> str | None:
-    """Return the command of the C compiler: ``$CC``, else cc, gcc or clang; None if there is none.
+    """Return the command of the C compiler: ``$CC``, else cc, gcc, clang or that of ziglang; None if there is none.
 
     It is quoted for a shell: CC may be a path with spaces, or a program with options ("ccache gcc").
     """
     if configured := os.environ.get("CC"):
         return _command([configured]) or _command(_words(configured))
-    return next((path for path in map(shutil.which, ["cc", "gcc", "clang"]) if path), None)
+    packaged = shlex.join([sys.executable, "-m", "ziglang", "cc"]) if find_spec("ziglang") else None
+    return next((path for path in map(shutil.which, ["cc", "gcc", "clang"]) if path), packaged)
 
 
 def _words(command: str) -> list[str]:
@@ -62,7 +65,7 @@ def require_compiler() -> str:
         return compiler
     if configured := os.environ.get("CC"):
         raise MachineError(f"no C compiler found: CC is {configured!r}, which names no program here (set or unset it)")
-    raise MachineError("no C compiler found (looked for cc, gcc, clang): install gcc or clang")
+    raise MachineError("no C compiler found (looked for cc, gcc, clang): install one, or pip install 'cnpgen[compiler]'")
 
 
 @cache

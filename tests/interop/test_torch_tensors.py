@@ -32,6 +32,7 @@ from tests.examples.shaped_robot import write_problem
 
 pytestmark = pytest.mark.slow
 
+DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 LABELS = ("hit", "transport")
 PROBLEMS = {"hit": "airhockey", "transport": "heavy-object"}
 
@@ -41,7 +42,15 @@ def given(label: str, count: int = 6) -> dict[str, Any]:
     plans = batch(label, count)
     tips = RobotModel(plans.problem, backend="numpy").forward_kinematics(plans.path[:, 0])[0]
     arrays = {"path": plans.path, "rate": plans.rate, "obstacle_poses": plans.obstacle_poses, "start_tip": tips}
-    return {name: torch.tensor(values) for name, values in arrays.items()}
+    return {name: tensor(values) for name, values in arrays.items()}
+
+
+def tensor(values: Any) -> Any:
+    return torch.tensor(values, device=DEVICE)
+
+
+def array(values: Any) -> np.ndarray:
+    return np.asarray(values.detach().cpu())
 
 
 def gradients(total: Any, variables: list[Any]) -> list[Any]:
@@ -53,18 +62,17 @@ def gradients(total: Any, variables: list[Any]) -> list[Any]:
 def test_the_loss_and_its_gradient_equal_the_compiled_ones(label: str, form: str) -> None:
     margins = Margins(factors={"joint-velocity": 0.9})
     loss = PlanLoss(PROBLEMS[label], dtype="float64", form=form, margins=margins, nodes=16, backend="numpy")
-    arguments, weights = given(label), torch.tensor(loss.weights0).requires_grad_()
+    arguments, weights = given(label), tensor(loss.weights0).requires_grad_()
     path, rate = arguments.pop("path").requires_grad_(), arguments.pop("rate").requires_grad_()
     total, terms = TensorLoss(loss)(path, rate, weights=weights, **arguments, shift=0.3)
-    arrays = {name: values.numpy() for name, values in arguments.items()}
-    plain = path.detach().numpy(), rate.detach().numpy()
+    arrays, plain = {name: array(values) for name, values in arguments.items()}, (array(path), array(rate))
     expected = loss(*plain, weights=loss.weights0, **arrays, shift=0.3)
-    np.testing.assert_allclose(total.detach(), expected.total, rtol=1e-9)
-    np.testing.assert_allclose(terms.detach(), expected.terms, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(array(total), expected.total, rtol=1e-9)
+    np.testing.assert_allclose(array(terms), expected.terms, rtol=1e-9, atol=1e-12)
     by_path, by_rate, by_weights = gradients(total, [path, rate, weights])
     for got, wanted in ((by_path, expected.path_gradient), (by_rate, expected.rate_gradient)):
-        np.testing.assert_allclose(got.detach(), wanted, rtol=1e-7, atol=1e-9 * np.abs(wanted).max())
-    np.testing.assert_allclose(by_weights.detach(), expected.terms[:, 1:].sum(0), rtol=1e-9)
+        np.testing.assert_allclose(array(got), wanted, rtol=1e-7, atol=1e-9 * np.abs(wanted).max())
+    np.testing.assert_allclose(array(by_weights), expected.terms[:, 1:].sum(0), rtol=1e-9)
 
 
 @pytest.mark.parametrize("label", some(LABELS, mark="extended"))
@@ -73,8 +81,8 @@ def test_second_derivatives_of_a_network_are_those_of_finite_differences(label: 
     layer = BoundaryLayer(PROBLEMS[label], backend="numpy")
     loss = TensorLoss(PlanLoss(layer.problem, dtype="float64", nodes=8, backend="numpy"))
     tasks, of = layer.tasks(boundary_for_layer(layer, 3)), TensorBoundaryLayer(layer)
-    x = torch.tensor(np.concatenate(outputs(layer, 3), axis=1))
-    direction = torch.randn(x.shape, generator=torch.Generator().manual_seed(0), dtype=x.dtype)
+    x = tensor(np.concatenate(outputs(layer, 3), axis=1))
+    direction = torch.randn(x.shape, generator=torch.Generator().manual_seed(0), dtype=x.dtype).to(DEVICE)
 
     def gradient(x: Any) -> Any:
         path, rate = of(tasks, *x.split([layer.path_outputs, layer.rate_outputs], dim=1))
@@ -95,11 +103,11 @@ def test_control_points_are_those_of_the_compiled_layer(label: str, acceleration
     layer = BoundaryLayer(PROBLEMS[label], goal_acceleration=acceleration, projection_steps=2, backend="numpy")
     tasks = layer.tasks(boundary_for_layer(layer, 4))
     phi, log_rate = outputs(layer, 4)
-    path, rate = TensorBoundaryLayer(layer)(tasks, torch.tensor(phi), torch.tensor(log_rate))
+    path, rate = TensorBoundaryLayer(layer)(tasks, tensor(phi), tensor(log_rate))
     expected = layer(tasks, phi, log_rate)
-    np.testing.assert_allclose(path, expected.path, atol=1e-10)
-    np.testing.assert_allclose(rate, expected.rate, rtol=1e-12)
-    half, _ = TensorBoundaryLayer(layer)(tasks, torch.tensor(phi).half(), torch.tensor(log_rate).half())
+    np.testing.assert_allclose(array(path), expected.path, atol=1e-10)
+    np.testing.assert_allclose(array(rate), expected.rate, rtol=1e-12)
+    half, _ = TensorBoundaryLayer(layer)(tasks, tensor(phi).half(), tensor(log_rate).half())
     assert half.dtype == torch.float32
 
 
@@ -141,7 +149,7 @@ def test_the_loss_can_be_compiled() -> None:
     problem = cnpgen.load_problem("airhockey")
     kernels = problem_kernels(problem, load_robot(problem), *choose_backend("numpy"))
     tape = TensorTape(kernels.tape(inverse_dynamics_of))
-    states = torch.randn((3, 6, 32), dtype=torch.float64, requires_grad=True)
+    states = torch.randn((3, 6, 32), dtype=torch.float64, device=DEVICE, requires_grad=True)
     compiled = torch.compile(lambda states: tape(*states)[0], fullgraph=True)
     torch.testing.assert_close(compiled(states), tape(*states)[0])
     assert all(torch.autograd.grad(compiled(states).sum(), [states])[0].isfinite().flatten())
@@ -154,18 +162,18 @@ def test_the_robot_equals_the_compiled_one(label: str) -> None:
     q = random.uniform(model.position_lower, model.position_upper, (5, len(model.joint_names)))
     dq, ddq = random.standard_normal((2, *q.shape))
     scene = model.scene(model.forward_kinematics(q)[0], model.forward_kinematics(q[::-1])[0])
-    tensors, expected = [torch.tensor(x) for x in (q, dq, ddq)], model.constraint_values(q, dq, ddq, scene=scene)
+    tensors, expected = [tensor(x) for x in (q, dq, ddq)], model.constraint_values(q, dq, ddq, scene=scene)
     for got, wanted in zip(robot.forward_kinematics(tensors[0]), model.forward_kinematics(q), strict=True):
-        np.testing.assert_allclose(got, wanted, atol=1e-12)
-    np.testing.assert_allclose(robot.jacobian(tensors[0]), model.jacobian(q), atol=1e-12)
-    np.testing.assert_allclose(robot.inverse_dynamics(*tensors), model.inverse_dynamics(q, dq, ddq), rtol=1e-9)
-    poses = torch.tensor(scene.poses)
+        np.testing.assert_allclose(array(got), wanted, atol=1e-12)
+    np.testing.assert_allclose(array(robot.jacobian(tensors[0])), model.jacobian(q), atol=1e-12)
+    np.testing.assert_allclose(array(robot.inverse_dynamics(*tensors)), model.inverse_dynamics(q, dq, ddq), rtol=1e-9)
+    poses = tensor(scene.poses)
     tensors[0].requires_grad_()
     values = robot.constraint_values(*tensors, obstacle_poses=poses)
-    np.testing.assert_allclose(values.detach(), expected.g, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(array(values), expected.g, rtol=1e-9, atol=1e-9)
     smooth = [index for index, name in enumerate(expected.names) if name.startswith("joint")]
     (by_q,) = torch.autograd.grad(values[:, smooth].sum(), [tensors[0]])
-    np.testing.assert_allclose(by_q, expected.jacobian_q[:, smooth].sum(1), rtol=1e-8, atol=1e-6)
+    np.testing.assert_allclose(array(by_q), expected.jacobian_q[:, smooth].sum(1), rtol=1e-8, atol=1e-6)
     with pytest.raises(UsageError, match=r"obstacle_poses must have shape \(5, "):
         robot.constraint_values(*tensors)
     with pytest.raises(UsageError, match=r"q must have shape \(N, "):
@@ -174,21 +182,22 @@ def test_the_robot_equals_the_compiled_one(label: str) -> None:
 
 def test_states_of_motions_are_those_of_scipy_and_differentiable_in_the_phase() -> None:
     plans = batch("hit", 3)
-    spec, s = cnpgen.load_problem("airhockey").trajectory, torch.linspace(0, 1, 9, dtype=torch.float64)
-    q, dq, ddq = joint_states(torch.tensor(plans.path), torch.tensor(plans.rate), s, spec)
+    spec, s = cnpgen.load_problem("airhockey").trajectory, np.linspace(0, 1, 9)
+    path, control_rate = tensor(plans.path), tensor(plans.rate)
+    q, dq, ddq = joint_states(path, control_rate, tensor(s), spec)
     p, r = (
         BSpline(clamped_knots(x.shape[1], spec.degree), np.moveaxis(x, 0, 1), spec.degree)
         for x in (plans.path, plans.rate)
     )
     rate, change = (r(s, order).T[..., None] for order in (0, 1))
     first, second = (np.moveaxis(p(s, order), 0, 1) for order in (1, 2))
-    np.testing.assert_allclose(q, np.moveaxis(p(s), 0, 1), atol=1e-12)
-    np.testing.assert_allclose(dq, first * rate, atol=1e-9)
-    np.testing.assert_allclose(ddq, second * rate**2 + first * rate * change, atol=1e-7)
-    phase = torch.full((3, 1), 0.37, dtype=torch.float64, requires_grad=True)
-    position, velocity, _ = joint_states(torch.tensor(plans.path), torch.tensor(plans.rate), phase, spec)
+    np.testing.assert_allclose(array(q), np.moveaxis(p(s), 0, 1), atol=1e-12)
+    np.testing.assert_allclose(array(dq), first * rate, atol=1e-9)
+    np.testing.assert_allclose(array(ddq), second * rate**2 + first * rate * change, atol=1e-7)
+    phase = tensor(np.full((3, 1), 0.37)).requires_grad_()
+    position, velocity, _ = joint_states(path, control_rate, phase, spec)
     (by_phase,) = torch.autograd.grad(position[..., 0].sum(), [phase])
-    np.testing.assert_allclose(by_phase[:, 0], velocity[:, 0, 0].detach().numpy() / r(0.37), rtol=1e-9)
+    np.testing.assert_allclose(array(by_phase)[:, 0], array(velocity)[:, 0, 0] / r(0.37), rtol=1e-9)
 
 
 def test_every_operation_of_tapes_has_one_on_tensors() -> None:

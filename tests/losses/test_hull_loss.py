@@ -7,11 +7,14 @@ from cnpgen.kernels.collision.clearance_loss import ClearanceLoss
 from cnpgen.kernels.collision.collision_checker import CollisionChecker, load_collision_library
 from cnpgen.kernels.library import KernelLibrary, choose_backend
 from cnpgen.losses.plan_loss import PlanLoss
-from cnpgen.plans.scene_plans import with_capacity
+from cnpgen.plans.scene_plans import shape_of, with_capacity
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
+from cnpgen.problems.scenes.scene_problem import make_mesh
 from cnpgen.robots.observation.scene_primitives import scene_primitives
 from cnpgen.robots.obstacle import Obstacle
+from cnpgen.robots.shape.convex_part import turned
+from cnpgen.robots.shape.hull import CUBE
 from cnpgen.robots.solid import number_slices, place_obstacles
 from tests.conftest import needs_compiler
 from tests.examples.shaped_robot import write_problem
@@ -22,6 +25,7 @@ SCENE = (
     Obstacle(name="wall", kind="box", position=(0.5, 0.0, 0.15), size=(0.1, 0.5, 0.3), rotation=(0, 0, 0.3)),
     Obstacle(name="ball", kind="sphere", position=(0.3, 0.35, 0.55), radius=0.08),
     Obstacle(name="post", kind="cylinder", position=(0.4, -0.3, 0.3), radius=0.05, length=0.6, rotation=(0.2, 0, 0)),
+    make_mesh("rock", 0.1 * CUBE[1:] + 0.05, np.array((0.1, -0.4, 0.4)), turned(0.3, 0.4, 0.5), place=""),
     Obstacle(name="rail", kind="capsule", position=(0.2, 0.4, 0.4), radius=0.03, length=0.4, rotation=(0, 1.0, 0)),
 )
 REQUIRED = 0.05
@@ -74,7 +78,7 @@ def plans(full, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_the_loss_sees_the_obstacles_of_each_sample(problem):
-    full = with_capacity(problem.with_obstacles(()), dict.fromkeys(("box", "sphere", "cylinder", "capsule"), 2))
+    full = with_capacity(problem.with_obstacles(()), dict.fromkeys(map(shape_of, SCENE), 2))
     assert full.has_sample_obstacles
     loss, (path, rate) = PlanLoss(full, dtype="float64", nodes=32), plans(full, 20)
     term, weights = loss.terms.index("robot-clearance"), loss.weights0

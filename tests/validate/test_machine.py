@@ -17,6 +17,7 @@ from cnpgen.kernels.compiler import find_compiler
 from cnpgen.machine import threads
 from cnpgen.validate import machine
 from cnpgen.validate.machine import check_machine, vector_instructions
+from tests.conftest import needs_compiler
 
 
 @pytest.fixture
@@ -122,6 +123,26 @@ def test_without_a_compiler_the_numpy_backend_runs(monkeypatch, fresh_compiler):
     assert report.compiler == ""
     assert report.environment["CC"] == "no-such-compiler"
     assert any("no C compiler" in note for note in report.notes)
+
+
+@needs_compiler
+def test_the_compiler_of_a_package_is_used_if_there_is_no_other(monkeypatch, tmp_path, fresh_compiler):
+    """Replace the compiler of ziglang by a module that runs the one of this machine."""
+    (tmp_path / "ziglang").mkdir()
+    call = f"subprocess.call([{find_compiler()!r}, *sys.argv[2:]], env={{'PATH': {os.environ['PATH']!r}}})"
+    program = f"import subprocess, sys\nsys.exit({call})\n"
+    (tmp_path / "ziglang" / "__main__.py").write_text(program, encoding="utf-8")
+    (tmp_path / "ziglang" / "__init__.py").touch()
+    find_compiler.cache_clear()
+    for variable, value in (("PATH", ""), ("PYTHONPATH", str(tmp_path)), ("CNPGEN_CACHE", str(tmp_path / "cache"))):
+        monkeypatch.setenv(variable, value)
+    monkeypatch.delenv("CC", raising=False)
+    assert find_compiler() is None
+    find_compiler.cache_clear()
+    monkeypatch.syspath_prepend(tmp_path)
+    report = check_machine()
+    assert report.compiler.startswith(sys.executable)
+    assert report.backend == "compiled"
 
 
 def test_an_unwritable_cache_is_a_note_and_nothing_is_left_behind(monkeypatch, tmp_path):

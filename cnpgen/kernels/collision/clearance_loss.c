@@ -1,12 +1,14 @@
 /* Huber's losses of the clearances of a robot's convex parts from the obstacles of samples, with their gradients;
 collision.c precedes this file. */
 
-enum { SOME_BOX, SOME_SPHERE, SOME_CYLINDER, SOME_CAPSULE };
+enum { SOME_BOX, SOME_SPHERE, SOME_CYLINDER, SOME_CAPSULE, SOME_MESH };
 
 typedef struct { /* obstacles of N samples with M bodies; a negative kind is no body */
   long bodies;
   const long *kind;
   const double *center, *rotation, *size;
+  const long *first, *count; /* of the vertices of meshes */
+  const double *vertices; /* of the robot, then of meshes */
 } sample_obstacles;
 
 /* Fill in the bodies and bounding boxes of a sample; `boxes` has 16 rows of lanes. */
@@ -24,9 +26,11 @@ static void place_sample(const sample_obstacles *a, long sample, body *bodies, d
     memcpy(b->position, a->center + 3 * from, sizeof b->position);
     memcpy(b->rotation, a->rotation + 9 * from, sizeof b->rotation);
     if (kind == SOME_BOX) memcpy(b->size, size, sizeof b->size);
+    else if (kind >= SOME_MESH) b->kind = HULL, b->first = a->first[kind - SOME_MESH], b->count = a->count[kind - SOME_MESH];
     else if (kind == SOME_CYLINDER) b->kind = CYLINDER, b->size[0] = b->size[1] = size[0], b->size[2] = size[1];
     else b->size[2] = size[1], b->radius = size[0];
-    for (int i = 0; i < 3; i++) boxes[i * lanes + k] = b->position[i], boxes[(3 + i) * lanes + k] = b->size[i];
+    const double *half = kind >= SOME_MESH ? size : b->size;
+    for (int i = 0; i < 3; i++) boxes[i * lanes + k] = b->position[i], boxes[(3 + i) * lanes + k] = half[i];
     for (int i = 0; i < 9; i++) boxes[(6 + i) * lanes + k] = b->rotation[i];
     boxes[15 * lanes + k] = b->radius;
   }
@@ -65,7 +69,7 @@ void clearance_losses(const robot_scene *robot, const sample_obstacles *obstacle
   body *bodies = malloc((obstacles->bodies + 1) * sizeof *bodies);
   double *boxes = malloc((16 * s.lanes + 8) * sizeof *boxes), *numbers = malloc(10 * capacity * sizeof *numbers);
   long *indices = malloc(2 * capacity * sizeof *indices);
-  s.obstacles = bodies, s.boxes = boxes;
+  s.obstacles = bodies, s.boxes = boxes, s.vertices = obstacles->vertices;
   memory *m = make_memory(&s);
   contact_list list = {0, capacity, 0, indices, indices + capacity, numbers, numbers + capacity, numbers + 4 * capacity};
   for (long sample = 0; sample < samples; sample++) {

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import MachineError, UsageError
+from cnpgen.kernels.collision.body_arrays import hull_vertices
 from cnpgen.kernels.collision.collision_checker import MAX_JOINTS, CollisionChecker, load_collision_library
 from cnpgen.kernels.compiled_kernel import address_of
 from cnpgen.kernels.library import KernelLibrary
@@ -22,7 +23,10 @@ SOURCES = [Path(__file__).with_name(name) for name in ("convex.c", "collision.c"
 class _SampleObstacles(ctypes.Structure):
     """``sample_obstacles`` of clearance_loss.c."""
 
-    _fields_ = (("bodies", c_long), *((name, c_void_p) for name in ("kind", "center", "rotation", "size")))
+    _fields_ = (
+        ("bodies", c_long),
+        *((name, c_void_p) for name in ("kind", "center", "rotation", "size", "first", "count", "vertices")),
+    )
 
 
 class ClearanceLoss:
@@ -60,7 +64,12 @@ class ClearanceLoss:
             Losses, shape (K, N), and their gradients, shape (K, n, N); nan for states that are not finite.
         """
         nodes, n, samples = q.shape
-        parts = [obstacles.kinds, obstacles.centers, obstacles.rotations, obstacles.sizes]
+        vertices = [self._checker.vertices, *(hull_vertices(mesh.corners) for mesh in obstacles.meshes)]
+        lengths = np.array([len(each) for each in vertices])
+        parts = [
+            *(obstacles.kinds, obstacles.centers, obstacles.rotations, obstacles.sizes),
+            *(np.cumsum(lengths)[:-1], lengths[1:] // 3, np.concatenate(vertices)),
+        ]
         keep = [np.ascontiguousarray(part) for part in parts]
         structure = _SampleObstacles(obstacles.kinds.shape[1], *map(address_of, keep))
         states = np.ascontiguousarray(q, np.float64)

@@ -88,6 +88,7 @@ class CollisionChecker:
 
     Attributes:
         link_pairs: Pairs of convex parts of links that must not touch, the one nearer to the base first, shape (M, 2).
+        vertices: Vertices of the convex parts by coordinates, flat [m].
     """
 
     def __init__(
@@ -113,7 +114,7 @@ class CollisionChecker:
             body["count"], body["first"], body["radius"] = len(blocks[-1]) // 3, first, part.radius
             body["frame"], body["link"] = shape.joints[part.link], links[part.link]
             first += len(blocks[-1])
-        self._vertices = np.concatenate(blocks)
+        self.vertices = np.concatenate(blocks)
         self._set("parts", parts)
         capsules = np.array([(shape.joints[c.link], c.first, c.second, c.radius) for c in shape.capsules], CAPSULE)
         self._set("links", capsules)
@@ -150,10 +151,10 @@ class CollisionChecker:
             obstacles: The obstacles.
             numbers: Their poses and sizes, shape (width,), see ``cnpgen.robots.solid``.
         """
-        bodies, vertices, boxes = obstacle_bodies(obstacles, numbers, len(self._vertices))
+        bodies, vertices, boxes = obstacle_bodies(obstacles, numbers, len(self.vertices))
         self._set("obstacles", bodies)
         self._set("boxes", boxes)
-        self._set("vertices", np.concatenate([self._vertices, vertices]))
+        self._set("vertices", np.concatenate([self.vertices, vertices]))
         self._scene.n_obstacles, self._scene.lanes = len(bodies), boxes.shape[1]
 
     @property

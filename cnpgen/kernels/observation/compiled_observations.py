@@ -28,6 +28,7 @@ class _SceneArrays(ctypes.Structure):
         ("scenes", c_long),
         ("bodies", c_long),
         *((name, c_void_p) for name in ("kind", "center", "rotation", "size")),
+        *((name, c_void_p) for name in ("first_triangle", "first_plane", "triangles", "planes")),
     )
 
 
@@ -85,8 +86,13 @@ class _Arrays:
     """Arrays of scenes for the library, and the address of their structure."""
 
     def __init__(self, scenes: Primitives) -> None:
-        types: tuple[Any, ...] = (np.int64, np.float64, np.float64, np.float64)
-        parts = (scenes.kinds, scenes.centers, scenes.rotations, scenes.sizes)
+        triangles, planes = ([getattr(mesh, name) for mesh in scenes.meshes] for name in ("triangles", "planes"))
+        types: tuple[Any, ...] = (np.int64, *(np.float64,) * 3, *(np.int64,) * 2, *(np.float32,) * 2)
+        parts = (
+            *(scenes.kinds, scenes.centers, scenes.rotations, scenes.sizes),
+            *(np.cumsum([0, *map(len, rows)]) for rows in (triangles, planes)),
+            *(np.concatenate([*map(np.ravel, rows), np.empty(0)]) for rows in (triangles, planes)),
+        )
         self._keep = [np.ascontiguousarray(part, dtype) for part, dtype in zip(parts, types, strict=True)]
         self._structure = _SceneArrays(*scenes.kinds.shape, *map(address_of, self._keep))
         self.address = ctypes.addressof(self._structure)

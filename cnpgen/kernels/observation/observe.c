@@ -1,5 +1,5 @@
-/* Observations of scenes of boxes, spheres, flat cylinders and capsules: signed distances of points, points on surfaces, and
-depth images. arrays.h precedes this file. Loops run over points, in single precision. */
+/* Observations of scenes of boxes, spheres, flat cylinders, capsules and convex meshes: signed distances of points, points on
+surfaces, and depth images. arrays.h precedes this file. Loops run over points, in single precision. */
 
 #include <stdint.h>
 #include <stdlib.h>
@@ -7,19 +7,27 @@ depth images. arrays.h precedes this file. Loops run over points, in single prec
 #define BLOCK 512 /* points whose temporary arrays stay in the cache */
 #define BOX 0
 #define CYLINDER 2
-#define MAX_PATCHES 6 /* of a body */
+#define MESH 4 /* the first mesh */
+#define MAX_PATCHES 6 /* of a body that is no mesh */
 #define UNIT (1.0f / 16777216.0f) /* 24 bits */
 
 typedef struct { /* arrays of N scenes with M bodies; a negative kind is no body */
   long scenes, bodies;
   const long *kind;
   const double *center, *rotation, *size;
+  const long *first_triangle, *first_plane; /* of each mesh, and after the last one */
+  const float *triangles, *planes; /* a corner and two edges (9); normal and offset (4) */
 } scene_arrays;
 
-typedef struct { float c[3], R[9], s[3]; long kind; } primitive;
+typedef struct { float c[3], R[9], s[3]; long kind, triangles, planes; const float *triangle, *plane; } primitive;
 
 I primitive primitive_of(const scene_arrays *a, long index) {
   primitive b = {.kind = a->kind[index]};
+  if (b.kind >= MESH) {
+    const long *triangle = a->first_triangle + b.kind - MESH, *plane = a->first_plane + b.kind - MESH;
+    b.triangle = a->triangles + 9 * triangle[0], b.triangles = triangle[1] - triangle[0];
+    b.plane = a->planes + 4 * plane[0], b.planes = plane[1] - plane[0];
+  }
   for (int i = 0; i < 3; i++) b.c[i] = a->center[3 * index + i], b.s[i] = a->size[3 * index + i];
   for (int i = 0; i < 9; i++) b.R[i] = a->rotation[9 * index + i];
   return b;
@@ -28,12 +36,57 @@ I primitive primitive_of(const scene_arrays *a, long index) {
 I float most(float a, float b) { return a > b ? a : b; }
 I float least(float a, float b) { return a < b ? a : b; }
 
+/* Smallest squared distances of n points from the triangles of a mesh, in its frame. */
+static void triangle_distances(const primitive *b, const float *x, const float *y, const float *z, long n, float *squared) {
+  EACH(i, 0, n) squared[i] = INFINITY;
+  for (long t = 0; t < b->triangles; t++) {
+    const float *corner = b->triangle + 9 * t, *e = corner + 3, *f = corner + 6;
+    float normal[3] = {e[1] * f[2] - e[2] * f[1], e[2] * f[0] - e[0] * f[2], e[0] * f[1] - e[1] * f[0]};
+    float starts[3][3], edges[3][3], sides[3][3], lengths[3], area = 0;
+    for (int m = 0; m < 3; m++) {
+      starts[0][m] = corner[m], starts[1][m] = corner[m] + e[m], starts[2][m] = corner[m] + f[m];
+      edges[0][m] = e[m], edges[1][m] = f[m] - e[m], edges[2][m] = -f[m];
+      area += normal[m] * normal[m];
+    }
+    for (int k = 0; k < 3; k++) {
+      const float *g = edges[k];
+      for (int m = 0; m < 3; m++) sides[k][m] = normal[(m + 1) % 3] * g[(m + 2) % 3] - normal[(m + 2) % 3] * g[(m + 1) % 3];
+      lengths[k] = 1 / (g[0] * g[0] + g[1] * g[1] + g[2] * g[2]);
+    }
+    EACH(i, 0, n) {
+      float nearest = INFINITY, above = 1, plane = 0;
+      for (int k = 0; k < 3; k++) {
+        const float *g = edges[k], *s = sides[k];
+        float u = x[i] - starts[k][0], v = y[i] - starts[k][1], w = z[i] - starts[k][2];
+        float along = least(most((u * g[0] + v * g[1] + w * g[2]) * lengths[k], 0.0f), 1.0f);
+        above = u * s[0] + v * s[1] + w * s[2] >= 0 ? above : 0;
+        if (k == 0) plane = u * normal[0] + v * normal[1] + w * normal[2];
+        u -= along * g[0], v -= along * g[1], w -= along * g[2];
+        nearest = least(nearest, u * u + v * v + w * w);
+      }
+      squared[i] = least(squared[i], above > 0 ? plane * plane / area : nearest);
+    }
+  }
+}
+
 /* Lower the distances of n points, at most BLOCK, to those of a body. */
 static void lower_distances(const primitive *b, const float *x, const float *y, const float *z, long n, float *distance) {
   float r = b->s[0], h = b->s[1];
 #define LOCAL(i, k) \
   float p##k = b->R[k] * (x[i] - b->c[0]) + b->R[3 + k] * (y[i] - b->c[1]) + b->R[6 + k] * (z[i] - b->c[2]);
-  if (b->kind == BOX) {
+  if (b->kind >= MESH) {
+    float px[BLOCK], py[BLOCK], pz[BLOCK], depth[BLOCK], squared[BLOCK];
+    int outside = 0;
+    EACH(i, 0, n) {
+      LOCAL(i, 0) LOCAL(i, 1) LOCAL(i, 2)
+      px[i] = p0, py[i] = p1, pz[i] = p2, depth[i] = -INFINITY;
+    }
+    for (const float *c = b->plane; c < b->plane + 4 * b->planes; c += 4)
+      EACH(i, 0, n) depth[i] = most(depth[i], c[0] * px[i] + c[1] * py[i] + c[2] * pz[i] + c[3]);
+    EACH(i, 0, n) outside |= depth[i] > 0 && depth[i] < distance[i]; /* planes are never farther than the mesh */
+    if (outside) triangle_distances(b, px, py, pz, n, squared);
+    EACH(i, 0, n) distance[i] = least(distance[i], outside && depth[i] > 0 ? sqrtf(squared[i]) : depth[i]);
+  } else if (b->kind == BOX) {
     EACH(i, 0, n) {
       LOCAL(i, 0) LOCAL(i, 1) LOCAL(i, 2)
       float u = fabsf(p0) - b->s[0], v = fabsf(p1) - b->s[1], w = fabsf(p2) - b->s[2];
@@ -83,13 +136,24 @@ I uint64_t mixed(uint64_t x) { /* finalizer of splitmix64 (Steele et al. 2014) *
 
 typedef struct { /* base + u U + v V; if round, base + radius(v) (cos, sin)(2 pi u) in the axes U, V + height(v) Z */
   float base[3], U[3], V[3], Z[3], r, h;
-  int form; /* 0 flat, 1 side of a cylinder, 2 disc, 3 half of a sphere */
+  int form; /* 0 flat, 1 side of a cylinder, 2 disc, 3 half of a sphere, 4 triangle */
   double area;
 } patch;
 
 /* Patches of the surface of a body; returns their number. */
 static int patches_of(const primitive *b, patch *p) {
   double r = b->s[0], h = b->s[1], pi = 3.14159265358979323846;
+  for (const float *c = b->triangle; b->kind >= MESH && c < b->triangle + 9 * b->triangles; c += 9, p++) {
+    const float *e = c + 3, *f = c + 6;
+    double x = e[1] * f[2] - e[2] * f[1], y = e[2] * f[0] - e[0] * f[2], z = e[0] * f[1] - e[1] * f[0];
+    p->form = 4, p->area = sqrt(x * x + y * y + z * z) / 2;
+    for (int m = 0; m < 3; m++) {
+      const float *R = b->R + 3 * m;
+      p->base[m] = b->c[m] + R[0] * c[0] + R[1] * c[1] + R[2] * c[2];
+      p->U[m] = R[0] * e[0] + R[1] * e[1] + R[2] * e[2], p->V[m] = R[0] * f[0] + R[1] * f[1] + R[2] * f[2];
+    }
+  }
+  if (b->kind >= MESH) return b->triangles;
   if (b->kind == BOX) {
     for (int k = 0; k < 3; k++) {
       int i = (k + 1) % 3, j = (k + 2) % 3;
@@ -127,7 +191,8 @@ static void scatter(const patch *p, uint64_t start, long n, float *out) {
       uint32_t k = done + i;
       float u = (float)(int32_t)((first + k * 3242174889u) >> 8) * UNIT;
       float v = (float)(int32_t)((second + k * 2447445414u) >> 8) * UNIT;
-      if (p->form == 0) {
+      if (p->form == 0 || p->form == 4) {
+        if (p->form == 4 && u > 1 - v) u = 1 - u, v = 1 - v; /* the other half of the parallelogram */
         x[i] = p->base[0] + u * p->U[0] + v * p->V[0];
         y[i] = p->base[1] + u * p->U[1] + v * p->V[1];
         z[i] = p->base[2] + u * p->U[2] + v * p->V[2];
@@ -150,7 +215,16 @@ static void scatter(const patch *p, uint64_t start, long n, float *out) {
 
 /* Points on the surfaces of each scene, in proportion to the areas of the patches; nan for a scene without bodies. */
 void scene_clouds(const scene_arrays *a, const uint64_t *seed, long count, float *points) {
-  patch *p = malloc((a->bodies + 1) * MAX_PATCHES * sizeof *p);
+  long most_patches = 0;
+  EACH(scene, 0, a->scenes) {
+    long sum = 0;
+    EACH(body, 0, a->bodies) {
+      primitive b = primitive_of(a, scene * a->bodies + body);
+      sum += b.kind >= MESH ? b.triangles : MAX_PATCHES;
+    }
+    most_patches = sum > most_patches ? sum : most_patches;
+  }
+  patch *p = malloc((most_patches + 1) * sizeof *p);
   EACH(scene, 0, a->scenes) {
     float *out = points + 3 * count * scene;
     double area = 0, sum = 0, offset = (double)(mixed(seed[scene]) >> 11) / 9007199254740992.0;
@@ -177,7 +251,7 @@ typedef struct { double origin[3], axes[9]; /* rows: forward, right, down; the l
 /* Range of pixels in which the bounding box of a body is seen; the whole image where a corner is not before the camera. */
 static void seen(const primitive *b, const double *o, const double *axes, long width, long height, long *range) {
   double half[3] = {b->s[0], b->s[1], b->s[2]}, low[2] = {INFINITY, INFINITY}, high[2] = {-INFINITY, -INFINITY};
-  if (b->kind != BOX) half[0] = half[1] = b->s[0], half[2] = b->s[1] + (b->kind == CYLINDER ? 0 : b->s[0]);
+  if (b->kind != BOX && b->kind < MESH) half[0] = half[1] = b->s[0], half[2] = b->s[1] + (b->kind == CYLINDER ? 0 : b->s[0]);
   long behind = 0, size[2] = {width, height};
   for (int corner = 0; corner < 8; corner++) {
     double d[3], along[3];
@@ -213,6 +287,21 @@ static void lower_depths(const primitive *b, const float *o, const float *d, con
       float x = 1 / d0, y = 1 / d1, z = 1 / d2, mx = -o[0] * x, my = -o[1] * y, mz = -o[2] * z;
       float wx = fabsf(x) * b->s[0], wy = fabsf(y) * b->s[1], wz = fabsf(z) * b->s[2];
       float near = most(most(mx - wx, my - wy), mz - wz), far = least(least(mx + wx, my + wy), mz + wz);
+      HIT(i, near, far)
+    }
+    return;
+  }
+  if (b->kind >= MESH) {
+    EACH(i, first, last) {
+      RAY(i, 0) RAY(i, 1) RAY(i, 2)
+      float near = -INFINITY, far = INFINITY;
+      for (long k = 0; k < b->planes; k++) {
+        const float *c = b->plane + 4 * k;
+        float speed = c[0] * d0 + c[1] * d1 + c[2] * d2, height = c[0] * o[0] + c[1] * o[1] + c[2] * o[2] + c[3];
+        float crossing = -height / (fabsf(speed) < 1e-9f ? 1e-9f : speed);
+        near = speed < 0 ? most(near, crossing) : near;
+        far = speed < 0 ? far : least(far, crossing);
+      }
       HIT(i, near, far)
     }
     return;

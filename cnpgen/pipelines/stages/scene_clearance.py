@@ -29,7 +29,7 @@ class _SceneChecker(CollisionChecker):
         """Set the obstacles that all scenes have."""
         numbers = place_obstacles(obstacles)
         self.place(obstacles, numbers)
-        self._fixed, _, boxes = obstacle_bodies(obstacles, numbers, len(self._vertices))
+        self._fixed, _, boxes = obstacle_bodies(obstacles, numbers, len(self.vertices))
         self._fixed_boxes = boxes[:, : len(obstacles)]
 
     def prepare_scenes(self, scenes: BatchScenes) -> None:

@@ -42,7 +42,7 @@ def observe(
         Name -> array with a first axis of length N; see the kinds of observations.
 
     Raises:
-        UsageError: There is no such observation, an obstacle is a mesh, or there are no scenes.
+        UsageError: There is no such observation, an obstacle is a mesh file, or there are no scenes.
     """
     from cnpgen.kernels.observation.compiled_observations import observation_backend
 
@@ -58,7 +58,7 @@ def scene_bodies(scenes: Scenes) -> Primitives:
         scenes: See ``observe``.
 
     Raises:
-        UsageError: An obstacle is a mesh, or there are no scenes.
+        UsageError: An obstacle is a mesh file, or there are no scenes.
     """
     if isinstance(scenes, Primitives):
         return scenes

@@ -15,7 +15,7 @@ from cnpgen.robots.observation.primitives import KINDS, primitives_of
 from cnpgen.robots.observation.signed_distance import signed_distances
 from cnpgen.robots.obstacle import Obstacle, invalid_obstacle
 from cnpgen.robots.shape.hull import MAX_COORDINATE_M, check_solid, hull_corners
-from cnpgen.robots.shape.inline import address_of, corners_of, is_inline
+from cnpgen.robots.shape.inline import address_of, is_inline
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.schema.argument_types import check_fields
 from cnpgen.schema.units import PLAUSIBLE_MAX
@@ -242,14 +242,8 @@ def checked_scene(scene: SceneProblem) -> SceneProblem:
 
 def _depth_of_base(obstacle: Obstacle) -> float:
     """Return the depth of the base, the origin, in an obstacle [m]; negative outside."""
-    numbers = place_obstacles([obstacle])
-    if obstacle.kind != "mesh":
-        return -float(signed_distances(primitives_of([obstacle], numbers), np.zeros((1, 3)))[0, 0])
-    from scipy.spatial import ConvexHull
-
-    origin = numbers[3:].reshape(3, 3).T @ -numbers[:3]
-    faces = ConvexHull(corners_of(obstacle.mesh)).equations  # normals and offsets: n x + d <= 0 inside
-    return float(-(faces[:, :3] @ origin + faces[:, 3]).max())
+    bodies = primitives_of([obstacle], place_obstacles([obstacle]))
+    return -float(signed_distances(bodies, np.zeros((1, 3)))[0, 0])
 
 
 def _uniquely_named(obstacles: tuple[Obstacle, ...]) -> tuple[Obstacle, ...]:

@@ -84,7 +84,9 @@ def depth_image(primitives: Primitives, camera: Camera) -> Array:
     for index in range(len(primitives)):
         rotation, size = primitives.rotations[index], primitives.sizes[index]
         origin = (np.array(camera.position) - primitives.centers[index]) @ rotation
-        for hit in _hits(KINDS[primitives.kinds[index]], size, origin, rays @ rotation):
+        mesh, local = primitives.mesh(index), rays @ rotation
+        hits = [mesh.entries(origin, local)] if mesh else _hits(KINDS[primitives.kinds[index]], size, origin, local)
+        for hit in hits:
             depth = np.where((hit > 0) & (hit < depth), hit, depth)
     return depth.reshape(camera.height, camera.width)
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError, nearest
 from cnpgen.robots.observation.camera import Camera
-from cnpgen.robots.observation.primitives import KINDS, Primitives
+from cnpgen.robots.observation.primitives import KINDS, MESH, Primitives
 from cnpgen.robots.observation.reference import ObservationBackend
 from cnpgen.robots.observation.surface_points import Seeds
 from cnpgen.schema.argument_types import check_fields
@@ -168,7 +168,8 @@ class ObjectTokens(Observation):
     """A row per body: ``tokens``, shape (N, capacity, 16), float32, and ``mask``, shape (N, capacity).
 
     The numbers of a row are the kind (one of box, sphere, cylinder and capsule is 1), the center [m], the first two
-    columns of the rotation matrix, and the sizes [m] as in ``Primitives``. Rows without a body are 0.
+    columns of the rotation matrix, and the sizes [m] as in ``Primitives``. A mesh is its bounding box. Rows without a
+    body are 0.
 
     Attributes:
         capacity: Number of rows; by default the largest number of bodies.
@@ -192,7 +193,8 @@ class ObjectTokens(Observation):
         if most > capacity:
             raise UsageError(f"must be at least {most}, the largest number of bodies", argument="capacity")
         axes = bodies.rotations[..., :2].swapaxes(2, 3).reshape(*real.shape, 6)
-        kinds = bodies.kinds[..., None] == np.arange(len(KINDS))
+        shapes = np.where(bodies.kinds >= MESH, KINDS.index("box"), bodies.kinds)
+        kinds = shapes[..., None] == np.arange(len(KINDS))
         rows: Array = np.concatenate([kinds, bodies.centers, axes, bodies.sizes], axis=2).astype(np.float32)
         rows[~real] = 0
         padding = ((0, 0), (0, max(capacity - real.shape[1], 0)), (0, 0))

@@ -1,4 +1,4 @@
-"""Obstacles of samples as arrays of boxes, spheres, cylinders and capsules with poses."""
+"""Obstacles of samples as arrays of boxes, spheres, cylinders, capsules and convex meshes with poses."""
 
 from __future__ import annotations
 
@@ -11,15 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
+from cnpgen.robots.observation.convex_mesh import ConvexMesh, convex_mesh
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.convex_part import PRISM_SIDES
 from cnpgen.robots.shape.hull import frames_along
+from cnpgen.robots.shape.inline import is_inline
 from cnpgen.robots.solid import UNBOUNDED_OBSTACLE_HEIGHT_M, number_slices
 from cnpgen.schema.keys import Range
 
 Array = NDArray[np.float64]
 
 KINDS = ("box", "sphere", "cylinder", "capsule")  # index: the code of a kind
+MESH = len(KINDS)  # the code of the first mesh, followed by those of the others
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,23 +30,30 @@ class Primitives:
     """M bodies of simple shapes in the world frame; or those of N scenes, with a first axis of length N.
 
     Attributes:
-        kinds: Index of each shape in ``KINDS``, shape (M,); -1 where a scene has fewer bodies.
+        kinds: Index of each shape in ``KINDS``, shape (M,); ``MESH`` plus the index of its mesh for others; -1 where
+            a scene has fewer bodies.
         centers: Centers [m], shape (M, 3).
         rotations: Rotation matrices; columns are the axes of a body, shape (M, 3, 3).
-        sizes: Sizes [m], shape (M, 3): half the edge lengths of a box; otherwise the radius, half the length along z
-            (of a capsule without its round ends; 0 for a sphere), and 0.
+        sizes: Sizes [m], shape (M, 3): half the edge lengths of a box, or of the bounding box of a mesh; otherwise the
+            radius, half the length along z (of a capsule without its round ends; 0 for a sphere), and 0.
+        meshes: The meshes of all bodies.
     """
 
     kinds: NDArray[np.int64]
     centers: Array
     rotations: Array
     sizes: Array
+    meshes: tuple[ConvexMesh, ...] = ()
 
     def __len__(self) -> int:
         return len(self.kinds)
 
     def __getitem__(self, which: int | slice | NDArray[Any]) -> Primitives:
-        return Primitives(self.kinds[which], self.centers[which], self.rotations[which], self.sizes[which])
+        return Primitives(self.kinds[which], self.centers[which], self.rotations[which], self.sizes[which], self.meshes)
+
+    def mesh(self, index: int) -> ConvexMesh | None:
+        """Return the mesh of a body; None for other shapes."""
+        return self.meshes[self.kinds[index] - MESH] if self.kinds[index] >= MESH else None
 
 
 def primitives_of(obstacles: Sequence[Obstacle], numbers: Array) -> Primitives:
@@ -55,18 +65,35 @@ def primitives_of(obstacles: Sequence[Obstacle], numbers: Array) -> Primitives:
             (N, pose_width), which gives arrays with a first axis of length N.
 
     Raises:
-        UsageError: An obstacle is a mesh.
+        UsageError: An obstacle is a mesh file, not its corners.
     """
     shape, rows, count = numbers.shape[:-1], np.atleast_2d(numbers), len(obstacles)
     kinds, centers = np.empty((len(rows), count), np.int64), np.empty((len(rows), count, 3))
     rotations, sizes = np.tile(np.eye(3), (len(rows), count, 1, 1)), np.zeros((len(rows), count, 3))
+    meshes: list[ConvexMesh] = []
     for index, (obstacle, part) in enumerate(zip(obstacles, number_slices(obstacles), strict=True)):
-        if obstacle.kind not in KINDS:
-            raise UsageError(f"obstacle {obstacle.name!r} is a {obstacle.kind}, expected one of {', '.join(KINDS)}")
-        kinds[:, index] = KINDS.index(obstacle.kind)
-        _fill(obstacle, rows[:, part], centers[:, index], rotations[:, index], sizes[:, index])
+        of_body = centers[:, index], rotations[:, index], sizes[:, index]
+        if obstacle.kind in KINDS:
+            kinds[:, index] = KINDS.index(obstacle.kind)
+            _fill(obstacle, rows[:, part], *of_body)
+        else:
+            kinds[:, index] = MESH + len(meshes)
+            meshes.append(_mesh_of(obstacle))
+            _fill_mesh(meshes[-1], rows[:, part], *of_body)
     arrays = (array.reshape(*shape, *array.shape[1:]) for array in (kinds, centers, rotations, sizes))
-    return Primitives(*arrays)  # type: ignore[arg-type]
+    return Primitives(*arrays, meshes=tuple(meshes))  # type: ignore[misc,arg-type]
+
+
+def _mesh_of(obstacle: Obstacle) -> ConvexMesh:
+    if not is_inline(obstacle.mesh):
+        raise UsageError(f"obstacle {obstacle.name!r} is a mesh file, expected its corners: see make_mesh")
+    return convex_mesh(obstacle.mesh)
+
+
+def _fill_mesh(mesh: ConvexMesh, numbers: Array, center: Array, rotation: Array, size: Array) -> None:
+    """Fill in the arrays of a mesh as ``_fill`` does."""
+    rotation[:] = numbers[:, 3:].reshape(-1, 3, 3)
+    center[:], size[:] = numbers[:, :3] + rotation @ mesh.center, mesh.half
 
 
 def _fill(obstacle: Obstacle, numbers: Array, center: Array, rotation: Array, size: Array) -> None:

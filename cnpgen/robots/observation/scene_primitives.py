@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from cnpgen.robots.observation.primitives import Primitives, primitives_of
+from cnpgen.robots.observation.convex_mesh import ConvexMesh
+from cnpgen.robots.observation.primitives import MESH, Primitives, primitives_of
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.scene import PARKED_POSITION_M, Scene
 from cnpgen.robots.solid import place_obstacles, pose_width
@@ -21,11 +22,11 @@ def scene_primitives(scenes: Scene | Sequence[Sequence[Obstacle]]) -> Primitives
         scenes: Obstacles of N samples, those that are parked below the robot omitted; or the obstacles of N scenes.
 
     Raises:
-        UsageError: An obstacle is a mesh.
+        UsageError: An obstacle is a mesh file, not its corners.
     """
     if isinstance(scenes, Scene):
         bodies = primitives_of(scenes.obstacles, scenes.poses[:, : pose_width(scenes.obstacles)])
-        bodies.kinds[bodies.centers[:, :, 2] <= PARKED_POSITION_M[2]] = NO_BODY
+        bodies.kinds[bodies.centers[:, :, 2] <= PARKED_POSITION_M[2] / 2] = NO_BODY  # meshes have another center
         return bodies
     known: dict[int, Primitives] = {}  # problems of one scene share its obstacles
     for obstacles in scenes:
@@ -39,11 +40,14 @@ def padded(scenes: Sequence[Primitives]) -> Primitives:
     shape = len(scenes), max(map(len, scenes), default=0)
     kinds, centers = np.full(shape, NO_BODY, np.int64), np.zeros((*shape, 3))
     rotations, sizes = np.tile(np.eye(3), (*shape, 1, 1)), np.zeros((*shape, 3))
+    meshes: dict[ConvexMesh, int] = {}  # mesh -> index
     for index, scene in enumerate(scenes):
         count = len(scene)
-        kinds[index, :count], centers[index, :count] = scene.kinds, scene.centers
+        codes = [MESH + meshes.setdefault(mesh, len(meshes)) for mesh in scene.meshes]
+        kinds[index, :count] = np.array([*range(MESH), *codes, NO_BODY])[scene.kinds]
+        centers[index, :count] = scene.centers
         rotations[index, :count], sizes[index, :count] = scene.rotations, scene.sizes
-    return Primitives(kinds, centers, rotations, sizes)
+    return Primitives(kinds, centers, rotations, sizes, tuple(meshes))
 
 
 def bodies_of(scenes: Primitives, index: int) -> Primitives:

@@ -1,4 +1,4 @@
-"""Exact signed distances of points from boxes, spheres, cylinders and capsules."""
+"""Exact signed distances of points from boxes, spheres, cylinders, capsules and convex meshes."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,12 +21,12 @@ def signed_distances(primitives: Primitives, points: Array) -> Array:
         Distances [m], negative inside, shape (M, P).
     """
     distances = np.empty((len(primitives), len(points)))
-    for index, (kind, center, rotation, size) in enumerate(
-        zip(primitives.kinds, primitives.centers, primitives.rotations, primitives.sizes, strict=True)
-    ):
+    for index in range(len(primitives)):
+        mesh, kind, size = primitives.mesh(index), int(primitives.kinds[index]), primitives.sizes[index]
         for first in range(0, len(points), POINTS_PER_CHUNK):
             part = slice(first, first + POINTS_PER_CHUNK)
-            distances[index, part] = _distance(int(kind), size, (points[part] - center) @ rotation)
+            local = (points[part] - primitives.centers[index]) @ primitives.rotations[index]
+            distances[index, part] = mesh.distances(local) if mesh else _distance(kind, size, local)
     return distances
 
 

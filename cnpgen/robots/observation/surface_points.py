@@ -35,13 +35,13 @@ def unit_offset(seed: np.uint64) -> float:
 
 @dataclass(frozen=True)
 class _Patch:
-    """Part of a surface: a rectangle, or a surface of revolution.
+    """Part of a surface: a rectangle, a triangle, or a surface of revolution.
 
     Attributes:
-        form: "flat", "side", "disc" or "ball".
+        form: "flat", "triangle", "side", "disc" or "ball".
         area: Its area [m^2].
         base: Corner, or center of the lower end [m], shape (3,).
-        axes: Rows: edges of a rectangle [m], or unit axes, the last one that of revolution.
+        axes: Rows: edges of a rectangle or triangle [m], or unit axes, the last one that of revolution.
         radius: Radius [m].
         height: Height along the axis at its end [m].
     """
@@ -55,7 +55,10 @@ class _Patch:
 
     def points(self, u: Array, v: Array) -> Array:
         """Return points from coordinates in [0, 1), shape (P, 3)."""
-        if self.form == "flat":
+        if self.form == "triangle":
+            far = u > 1 - v  # in the other half of the parallelogram
+            u, v = np.where(far, 1 - u, u), np.where(far, 1 - v, v)
+        if self.form in ("flat", "triangle"):
             return np.asarray(self.base + u[:, None] * self.axes[0] + v[:, None] * self.axes[1])
         angle = 2 * np.pi * (u - 0.5)
         scale = {"side": np.ones_like(v), "disc": np.sqrt(v), "ball": np.sqrt(1 - v * v)}[self.form]
@@ -101,6 +104,10 @@ def surface_points(primitives: Primitives, count: int, seed: np.uint64) -> Array
 def _patches(primitives: Primitives, index: int) -> list[_Patch]:
     """Return the parts of the surface of one body."""
     center, axes = primitives.centers[index], primitives.rotations[index].T
+    if mesh := primitives.mesh(index):
+        corners, edges = center + mesh.triangles[:, 0] @ axes, mesh.triangles[:, 1:] @ axes
+        areas = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) / 2
+        return [_Patch("triangle", *patch) for patch in zip(areas.tolist(), corners, edges, strict=True)]
     size, kind = primitives.sizes[index], KINDS[primitives.kinds[index]]
     if kind == "box":
         edges, patches = axes * size[:, None], []

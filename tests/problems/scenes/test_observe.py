@@ -8,6 +8,7 @@ from cnpgen.loader.batch import Batch
 from cnpgen.loader.load import load_dataset
 from cnpgen.problems.obstacles import scene_of
 from cnpgen.problems.problem_record import as_problem
+from cnpgen.problems.scenes.scene_problem import make_mesh
 from cnpgen.recipes import Obstacle
 from cnpgen.robots.observation.camera import depth_image
 from cnpgen.robots.observation.observations import OBSERVATIONS, Observation
@@ -15,6 +16,8 @@ from cnpgen.robots.observation.primitives import KINDS
 from cnpgen.robots.observation.scene_primitives import bodies_of
 from cnpgen.robots.observation.signed_distance import signed_distances
 from cnpgen.robots.scene import PARKED_POSITION_M, Scene
+from cnpgen.robots.shape.convex_part import turned
+from cnpgen.robots.shape.hull import coal_hull
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.scenes import (
     BasisPoints,
@@ -42,19 +45,23 @@ SMALL = (
 
 def obstacle(index: int, random: np.random.Generator) -> Obstacle:
     """Return a random obstacle; its kind follows from the index."""
-    kind, place = KINDS[index % 4], tuple(random.uniform([-0.6, -0.6, 0], [0.6, 0.6, 0.8]))
+    kind, place = (*KINDS, "mesh")[index % 5], tuple(random.uniform([-0.6, -0.6, 0], [0.6, 0.6, 0.8]))
     turn, radius, length = tuple(random.uniform(-3, 3, 3)), random.uniform(0.03, 0.15), random.uniform(0.05, 0.4)
     if kind == "box":
         size = tuple(random.uniform(0.05, 0.5, 3))
         return Obstacle(name=f"{index}", kind=kind, position=place, size=size, rotation=turn)
     if kind == "sphere":
         return Obstacle(name=f"{index}", kind=kind, position=place, radius=radius)
+    if kind == "mesh":
+        return make_mesh(
+            f"{index}", radius * random.normal(size=(12, 3)) + 0.1, np.array(place), turned(*turn), place=""
+        )
     return Obstacle(name=f"{index}", kind=kind, position=place, radius=radius, length=length, rotation=turn)
 
 
 def scenes() -> list[tuple[Obstacle, ...]]:
     random = np.random.default_rng(1)
-    return [tuple(obstacle(index, random) for index in range(count)) for count in (4, 11, 0, 1)]
+    return [tuple(obstacle(index, random) for index in range(count)) for count in (5, 11, 0, 1)]
 
 
 @needs_compiler
@@ -91,7 +98,7 @@ def test_cloud_points_lie_on_surfaces_in_proportion_to_their_areas() -> None:
 def test_distances_agree_with_coal() -> None:
     import coal
 
-    items, kind = scenes()[1], BasisPoints(points=200)
+    items, kind = scenes()[1], BasisPoints(points=200, low=(-0.7, -0.7, -0.1), high=(0.7, 0.7, 0.9))
     points, distances = kind.positions, observe([items], kind)["basis"][0]
     bodies = bodies_of(scene_bodies([items]), 0)
     shapes = {
@@ -100,10 +107,13 @@ def test_distances_agree_with_coal() -> None:
         "cylinder": lambda size: coal.Cylinder(size[0], 2 * size[1]),
         "capsule": lambda size: coal.Capsule(size[0], 2 * size[1]),
     }
+    solids = [
+        coal_hull(mesh.corners) if (mesh := bodies.mesh(k)) else shapes[KINDS[bodies.kinds[k]]](bodies.sizes[k])
+        for k in range(len(bodies))
+    ]
     for point, distance in zip(points, distances, strict=True):
         smallest = np.inf
-        for index in range(len(bodies)):
-            shape = shapes[KINDS[bodies.kinds[index]]](bodies.sizes[index])
+        for index, shape in enumerate(solids):
             place = coal.Transform3s(bodies.rotations[index], bodies.centers[index])
             result = coal.DistanceResult()
             coal.distance(
@@ -144,8 +154,8 @@ def test_a_wall_hides_what_is_behind_it() -> None:
 def test_tokens_describe_every_body_and_mask_the_rest() -> None:
     values = observe(scenes(), ObjectTokens(capacity=12))
     assert values["tokens"].shape == (4, 12, 16)
-    assert values["mask"].sum(axis=1).tolist() == [4, 11, 0, 1]
-    np.testing.assert_array_equal(values["tokens"][0, :4, :4], np.eye(4))
+    assert values["mask"].sum(axis=1).tolist() == [5, 11, 0, 1]
+    np.testing.assert_array_equal(values["tokens"][0, :5, :4], [*np.eye(4), [1, 0, 0, 0]])  # a mesh is a box
     assert not values["tokens"][~values["mask"]].any()
     with pytest.raises(UsageError, match="at least 11"):
         observe(scenes(), ObjectTokens(capacity=10))
@@ -177,7 +187,7 @@ def test_wrong_observations_are_refused() -> None:
     for arguments, message in (
         ((scenes(), "clouds"), "did you mean 'cloud'"),
         (([], "cloud"), "no scenes"),
-        (([(mesh,)], "cloud"), "'rock' is a mesh"),
+        (([(mesh,)], "cloud"), "'rock' is a mesh file"),
     ):
         with pytest.raises(UsageError, match=message):
             observe(*arguments)
