@@ -33,16 +33,18 @@ from cnpgen.plans.scene_plans import (
 )
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
-from cnpgen.problems.problem_record import as_problem
+from cnpgen.problems.problem_record import as_problem, open_problem
 from cnpgen.problems.scene_capacity import Capacity
 from cnpgen.problems.scenes.scene_problem import GoalPose, SceneError, SceneProblem, check_scenes, checked_scene
 from cnpgen.refine.goal_options import Progress
 from cnpgen.refine.options import DEFAULT_OPTIONS, RefineOptions
-from cnpgen.refine.proof.explain import Explanation, Feasibility, explain_plans
+from cnpgen.refine.proof.explain import Explanation, Feasibility, explain_failure
 from cnpgen.refine.refine_plans import solve_plans
 from cnpgen.refine.refinement import Refinement
 from cnpgen.refine.task import Attempt
 from cnpgen.robots.robot import Robot
+from cnpgen.robots.scene import PARKED_POSITION_M, Scene
+from cnpgen.robots.solid import place_obstacles
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.store.dataset_spec import StoredProblem
 from cnpgen.world.pose_ik import PoseKinematics
@@ -79,14 +81,21 @@ class SolvedScenes:
     def summary(self) -> dict[str, Any]:
         """Return a summary for JSON; unsolved scenes have a name, a reason and an explanation."""
         facts = Refinement(self.plans, self.plans, self.results, self.times).summary()
-        explanations = explain_plans(self.plans, np.flatnonzero(~self.valid).tolist())
         for failure in facts["not_valid"]:
-            scene, explanation = self.scenes[failure["plan"]], explanations[failure["plan"]]
-            if failure["reason"] == POSE_REASON:
-                explanation = Explanation(Feasibility.UNKNOWN, POSE_EXPLANATION)
+            scene, explanation = self.scenes[failure["plan"]], Explanation(Feasibility.UNKNOWN, POSE_EXPLANATION)
+            if failure["reason"] != POSE_REASON:
+                explanation = self._explain(failure["plan"])
             failure |= {"scene": scene.name, "file": scene.source}
             failure |= {"finding": str(explanation.kind), "explanation": explanation.text}
         return facts
+
+    def _explain(self, index: int) -> Explanation:
+        """Explain why a scene is not solved; obstacles have the names of the scene, not those of the plans' problem."""
+        problem, robot = open_problem(self.plans.problem)
+        own = (obstacle for obstacle in problem.obstacle if obstacle.position != PARKED_POSITION_M)
+        problem = replace(problem, obstacle=(*own, *self.scenes[index].obstacles))
+        scene = Scene(problem.obstacle, place_obstacles(problem.obstacle)[None])
+        return explain_failure(problem, robot, self.plans.boundary[index : index + 1], scene)
 
 
 @checked_arguments

@@ -119,7 +119,7 @@ def test_scenes_are_solved_and_judged(crane: Path, tmp_path: Path) -> None:
     (failure,) = solved.summary()["not_valid"]
     assert failure["scene"] == "inside"
     assert failure["finding"] == "infeasible"
-    assert "at the goal robot clearance" in failure["explanation"]
+    assert "at the goal robot clearance of fore, post is" in failure["explanation"]  # as the scene names it
     model = cnpgen.RobotModel(solved.plans.problem)
     states = solved.plans.motion.at(np.linspace(0, 1, 300))
     for index in np.flatnonzero(solved.valid):
