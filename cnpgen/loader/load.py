@@ -10,7 +10,7 @@ from cnpgen.loader.scene_columns import problem_obstacles
 from cnpgen.loader.shard_reader import ShardReader
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import flag
-from cnpgen.store.checked_shard import Shard, recorded_shard, shard_of_record
+from cnpgen.store.checked_shard import Shard
 from cnpgen.store.dataset_spec import DatasetSpec, shards
 from cnpgen.store.dataset_summary import (
     STATS_FORMAT,
@@ -70,7 +70,7 @@ def _recorded(folder: Path, summary: DatasetSummary) -> dict[str, list[Shard]]:
     """Return the shards of an unfinished dataset, from their sidecars."""
     spec = summary.spec
     return {
-        split: [shard_of_record(folder, spec, task, record) for task, record in summary.of_split(split)]
+        split: [Shard(folder, spec, task, record.bytes, record.sha256) for task, record in summary.of_split(split)]
         for split in spec.splits
     }
 
@@ -80,8 +80,7 @@ def _listed(folder: Path, spec: DatasetSpec, manifest: Mapping[str, Any]) -> dic
     tasks = {task.file: task for task in shards(spec)}
     return {
         split: [
-            recorded_shard(folder, spec, tasks[entry["file"]], size=entry["bytes"], sha256=entry["sha256"])
-            for entry in content["shards"]
+            Shard(folder, spec, tasks[entry["file"]], entry["bytes"], entry["sha256"]) for entry in content["shards"]
         ]
         for split, content in manifest["splits"].items()
     }

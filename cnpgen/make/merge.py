@@ -14,7 +14,7 @@ from cnpgen.make.recipe import recipe_digest
 from cnpgen.make.recipe_file import load_dataset_recipe, load_notes
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.catalogue import list_recipes
-from cnpgen.store.checked_shard import read_rows, shard_of_record
+from cnpgen.store.checked_shard import Shard, read_rows
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, load_dataset_spec, shards
 from cnpgen.store.files.atomic import committing, file_sha256, read_file, write_file
 from cnpgen.store.intact import COPY_HINT, OUTSIDE, outside_links
@@ -130,7 +130,7 @@ def _copy(folder: Path, out: Path, task: ShardTask, spec: DatasetSpec) -> None:
         shutil.copyfile(folder / task.file, temporary)
         if file_sha256(temporary) != record.sha256:
             raise DatasetError(f"{folder / task.file} was changed: its sha256 is not the recorded one")
-        read_rows(shard_of_record(folder, spec, task, record))
+        read_rows(Shard(folder, spec, task))
     write_file(out / task.sidecar, read_file(folder / task.sidecar), work=out / WORK)
 
 

@@ -7,11 +7,11 @@ from functools import partial
 from pathlib import Path
 
 from cnpgen.errors import DatasetError
-from cnpgen.store.checked_shard import read_rows, shard_of_record
+from cnpgen.store.checked_shard import Shard, read_rows
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask
 from cnpgen.store.files.atomic import machine_error
 from cnpgen.store.layout import MANIFEST
-from cnpgen.store.shard_record import check_committed, load_record
+from cnpgen.store.shard_record import check_committed
 
 MAX_THREADS = 8
 
@@ -63,7 +63,7 @@ def _problem(folder: Path, spec: DatasetSpec, task: ShardTask) -> str:
     """Return a description of the damage of a shard; empty for an intact shard."""
     try:
         check_committed(folder, spec, task)
-        read_rows(shard_of_record(folder, spec, task, load_record(folder, task)))
+        read_rows(Shard(folder, spec, task))
     except DatasetError as error:
         return str(error)
     return ""

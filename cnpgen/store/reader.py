@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, lacks
-from cnpgen.store.checked_shard import Shard, read_rows, read_scenes, recorded_shard
+from cnpgen.store.checked_shard import Shard, read_rows, read_scenes
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, load_dataset_spec, shards
 from cnpgen.store.dataset_summary import summarize_dataset, unfinished
 from cnpgen.store.intact import require_intact
@@ -132,8 +132,7 @@ class StoredDataset:
         if (recorded := self._recorded.get(task.file)) is None:
             record = load_record(self.folder, task)
             recorded = record.bytes, record.sha256
-        size, sha256 = recorded
-        shard = recorded_shard(self.folder, self.spec, task, size=size, sha256=sha256)
+        shard = Shard(self.folder, self.spec, task, *recorded)
         require_intact(shard.path, size=shard.size, sha256=shard.sha256)
         return shard
 
@@ -150,7 +149,7 @@ class StoredDataset:
 
     def _no_rows(self, name: str) -> NDArray[Any]:
         field = self.spec.field_named(name)
-        return np.empty((0, field.width) if field.width else (0,), storage_dtype(field, self.spec.dtype))
+        return np.empty(field.shape(0), storage_dtype(field, self.spec.dtype))
 
 
 def open_dataset(folder: str | Path, *, allow_incomplete: bool = False) -> StoredDataset:

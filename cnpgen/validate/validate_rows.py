@@ -20,7 +20,7 @@ from cnpgen.make.recipe_file import restored
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.robots.scene_arrays import scene_poses
 from cnpgen.store.check import DELETE_HINT, Finding
-from cnpgen.store.checked_shard import read_checked, read_scenes, shard_of_record
+from cnpgen.store.checked_shard import Shard, read_checked, read_scenes
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask
 from cnpgen.store.scene_table import SCENE_ID
 from cnpgen.store.shard_record import load_record
@@ -103,7 +103,7 @@ def _verify_shard(folder: Path, spec: DatasetSpec, task: ShardTask) -> _ShardChe
     """Verify one shard; a shard that cannot be read is a finding, not an exception."""
     try:
         record = load_record(folder, task)
-        shard = shard_of_record(folder, spec, task, record)
+        shard = Shard(folder, spec, task, record.bytes, record.sha256)
         columns = read_checked(shard)
         scenes = read_scenes(shard) if spec.scene_obstacles else None
     except CnpgenError as error:
