@@ -47,9 +47,7 @@ class BatchPartition:
     def check_ranks(self, rows: int, *, first: int = 0) -> None:
         """Raise an error if the last batch has no row for some ranks, since their mean loss would be nan.
 
-        Args:
-            rows: Number of rows.
-            first: Position of the first batch.
+        The batches begin at position ``first``.
 
         Raises:
             UsageError: The last batch has fewer rows than there are ranks.

@@ -28,10 +28,7 @@ class InMemoryRows:
         self.packed: Packed = empty_packed(source.rows, row_format)
 
     def load(self, shards: Sequence[int]) -> NDArray[np.int64]:
-        """Load shards that are not in memory yet.
-
-        Args:
-            shards: Indices of the shards within the split.
+        """Load shards, by their indices within the split, that are not in memory yet.
 
         Returns:
             Positions of their rows in ``packed``, in the order of the shards, shape (rows,).

@@ -100,14 +100,10 @@ def _with_type_of(values: Any, result: Any) -> Any:
 
 
 def make_normalization(statistics: Mapping[str, FieldStatistics], fields: Sequence[Field]) -> Normalization:
-    """Make the normalization of the float fields from statistics.
+    """Make the normalization of the float fields from statistics of the training rows.
 
     A column counts as constant if its standard deviation is below the float32 resolution of its largest value.
     Otherwise its rounding errors would be scaled to size 1, such as those of the height of a tip on a table.
-
-    Args:
-        statistics: Field name -> statistics of the training rows.
-        fields: Fields of the dataset.
     """
     mean, std = {}, {}
     for field in fields:

@@ -52,12 +52,8 @@ def make_row_format(
 ) -> RowFormat:
     """Make the format of loaded rows from the options of a user.
 
-    Args:
-        spec: Specification of the dataset.
-        own: Normalization of the dataset; None without training rows.
-        fields: Names of the fields; by default all float fields except for diagnostics.
-        normalize: Whether to normalize, or the normalization of another dataset.
-        dtype: Type of the float fields; None for the stored type.
+    ``own`` is the normalization of the dataset, None without training rows. By default, rows have all float fields
+    except for diagnostics, in the stored type.
 
     Raises:
         DatasetError: There is no such field, or there are no statistics for its normalization.

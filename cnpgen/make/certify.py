@@ -104,9 +104,7 @@ class CertifiedPlan(Stage):
 def certified(recipe: DatasetRecipe, *, model: str | Path | None = None) -> DatasetRecipe:
     """Return the recipe of the certified dataset, with one more stage and the name ``NAME-certified``.
 
-    Args:
-        recipe: Recipe of the samples; the recipe of a certified dataset is returned unchanged.
-        model: Planner of the initial guesses; by default there is none.
+    The model plans the initial guesses. The recipe of a certified dataset is returned unchanged.
 
     Raises:
         UsageError: There is no such model.

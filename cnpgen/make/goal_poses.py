@@ -66,14 +66,9 @@ def states_of_pose(
     pose: GoalPose,
     random: np.random.Generator,
 ) -> tuple[Array, Array]:
-    """Return joint positions with a goal pose.
+    """Return joint positions with a goal pose of a frame.
 
-    Args:
-        kinematics: Kinematics of the frame that has the pose.
-        states: Checks of states of rest in the scene; None if the robot has no link geometry.
-        conditions: Checks of the other conditions.
-        pose: The pose with its tolerances.
-        random: Random numbers for the seeds.
+    Robots without link geometry have no ``states`` of rest in a scene. ``random`` draws the seeds.
 
     Returns:
         Joint positions that can end a motion, and all with this pose [rad], shape (G, n) and (H, n).

@@ -72,11 +72,7 @@ def prepare(job: Job) -> PreparedPipeline:
 
 
 def make_shards(job: Job, tasks: Sequence[ShardTask]) -> Iterator[tuple[int, SamplingStatistics]]:
-    """Generate, check and commit shards of one split; the operation is idempotent.
-
-    Args:
-        job: Job of the dataset.
-        tasks: Shards, in order; shared blocks are computed once.
+    """Generate, check and commit shards of one split, in order; the operation is idempotent.
 
     Yields:
         Number of rows and sampling statistics of every committed shard.
@@ -116,11 +112,6 @@ def shard_columns(
     prepared: PreparedPipeline, spec: DatasetSpec, tasks: Sequence[ShardTask]
 ) -> Iterator[tuple[dict[str, NDArray[Any]], SamplingStatistics, SceneTable | None]]:
     """Compute the rows of shards of one split; every block is computed once.
-
-    Args:
-        prepared: Prepared pipeline.
-        spec: Specification of the dataset.
-        tasks: Shards, in order.
 
     Yields:
         ``(columns, sampling, scenes)`` of every shard: field name -> values as stored, shape (rows, width) or (rows,),
@@ -171,14 +162,7 @@ def spot_check(
     task: ShardTask,
     scenes: SceneTable | None = None,
 ) -> dict[str, float]:
-    """Recompute some rows with Pinocchio and Coal, to detect errors of the compiler or backend.
-
-    Args:
-        prepared: Prepared pipeline.
-        columns: Rows of the shard.
-        spec: Specification of the dataset.
-        task: The shard.
-        scenes: Scenes of the rows.
+    """Recompute some rows of a shard with Pinocchio and Coal, to detect errors of the compiler or backend.
 
     Returns:
         Largest violation of every check, in its unit.

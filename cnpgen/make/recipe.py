@@ -84,11 +84,9 @@ def recipe_digest(recipe: Pipeline | DatasetRecipe) -> str:
 
 
 def resolved_digest(pipeline: Mapping[str, Any], urdf: bytes) -> str:
-    """Hash a resolved pipeline, for example from the specification of a dataset; see ``recipe_digest``.
+    """Hash the result of ``resolved`` for a pipeline, for example from the specification of a dataset, and its URDF.
 
-    Args:
-        pipeline: Result of ``resolved``.
-        urdf: Content of the robot's URDF file.
+    See ``recipe_digest``.
     """
     content = {key: value for key, value in pipeline.items() if key != "title"}
     content |= {"problem": without_labels(pipeline["problem"]), "urdf_sha256": hashlib.sha256(urdf).hexdigest()}

@@ -32,13 +32,7 @@ def find_damaged(
     *,
     progress: Callable[[ShardTask], None] | None = None,
 ) -> dict[ShardTask, str]:
-    """Compare the bytes of shards with their sidecars, and their content with the specification.
-
-    Args:
-        folder: Folder of the dataset.
-        spec: Specification of the dataset.
-        tasks: Existing shards.
-        progress: Called with every compared shard.
+    """Compare the bytes of existing shards with their sidecars, and their content with the specification.
 
     Returns:
         Damaged shard -> description of the damage, in order.

@@ -81,14 +81,7 @@ class PreparedPipeline:
             self._accept = acceptance(self.context, written)
 
     def block(self, seed: int, split: str, index: int, *, first: int = 0, stop: int | None = None) -> Block:
-        """Compute rows ``first`` to ``stop`` of one block.
-
-        Args:
-            seed: Root seed of the dataset.
-            split: Name of the split.
-            index: Index of the block in the split.
-            first: First row.
-            stop: End of the rows, exclusive; ``block_rows`` by default and at most.
+        """Compute rows ``first`` to ``stop``, exclusive, of a block of a split; all rows by default.
 
         Raises:
             RecipeError: The accepted fraction of the candidates is below ``MIN_ACCEPTANCE``.
@@ -99,11 +92,7 @@ class PreparedPipeline:
     def chunks(self, seed: int, split: str, index: int, ranges: Sequence[tuple[int, int]]) -> Iterator[Block]:
         """Compute several ranges of rows of one block and sample the block only once.
 
-        Args:
-            seed: Root seed of the dataset.
-            split: Name of the split.
-            index: Index of the block in the split.
-            ranges: Row range (first, exclusive end) of every chunk, ascending, without overlap.
+        The ranges (first, exclusive end) ascend without overlap.
 
         Yields:
             The rows of every chunk, as soon as they are complete.
@@ -193,11 +182,7 @@ class BlockChunk:
         self._scenes: list[SceneTable] = []
 
     def take(self, candidates: CandidateBatch, accepted: int) -> bool:
-        """Append the rows of a batch that belong to the chunk.
-
-        Args:
-            candidates: Batch of candidates.
-            accepted: Number of rows of the block that were accepted before the batch.
+        """Append the rows of a batch that belong to the chunk; ``accepted`` rows of the block came before the batch.
 
         Returns:
             Whether the chunk is complete; the batch may contain rows of the next chunk.
@@ -226,11 +211,7 @@ class BlockChunk:
         self._scenes.append(replace(table[scene[rows][index]], scene_ids=ids))
 
     def block(self, first_row: int) -> Block:
-        """Return the rows of a complete chunk.
-
-        Args:
-            first_row: Index, within the split, of the first row of the block.
-        """
+        """Return the rows of a complete chunk of a block whose first row has the index ``first_row`` in the split."""
         columns = {name: np.concatenate([part[name] for part in self._parts], axis=1) for name in self._parts[0]}
         columns["sample_id"] = first_row + np.arange(self.first, self.stop, dtype=np.int64)[None]
         if not self._scenes:

@@ -63,9 +63,6 @@ class Finding:
 def check_dataset(folder: Path) -> list[Finding]:
     """Check the files of a dataset against its manifest, sidecars and specification.
 
-    Args:
-        folder: Folder of the dataset.
-
     Returns:
         The findings; empty if there is no problem. Of a dataset without manifest, the existing shards are checked.
     """

@@ -53,12 +53,7 @@ class ParquetFile:
 
 
 def croissant_document(summary: DatasetSummary, *, created: str) -> dict[str, Any]:
-    """Return the content of ``croissant.json`` of a dataset.
-
-    Args:
-        summary: The finished shards.
-        created: Creation time of the dataset, ISO 8601.
-    """
+    """Return the content of ``croissant.json`` of a dataset, created at an ISO 8601 time."""
     files = [_file(item.file, item.bytes, item.sha256, "x-hdf5") for _, item in summary.records]
     return _document(summary, created) | {"distribution": files}
 
@@ -66,14 +61,7 @@ def croissant_document(summary: DatasetSummary, *, created: str) -> dict[str, An
 def croissant_of_tables(
     summary: DatasetSummary, tables: Mapping[str, Iterable[ParquetFile]], *, created: str, url: str
 ) -> dict[str, Any]:
-    """Return the content of ``croissant.json`` of a repository of Parquet tables, with a record set for each split.
-
-    Args:
-        summary: The finished shards.
-        tables: Split -> its tables.
-        created: Creation time of the dataset, ISO 8601.
-        url: Address of the repository.
-    """
+    """Return the content of ``croissant.json`` of a repository of Parquet tables, with a record set for each split."""
     distribution, records = [], []
     for split, files in tables.items():
         objects = [_file(item.path, item.bytes, item.sha256, "x-parquet") for item in files]

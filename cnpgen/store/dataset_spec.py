@@ -276,10 +276,6 @@ def default_shard_size(rows: int, block_rows: int = 4096) -> int:
 
     Blocks have fewer than 4096 rows if samples are expensive. Shards then have 1 to 16 blocks, because an interruption
     loses the unfinished shard.
-
-    Args:
-        rows: Rows of the whole dataset.
-        block_rows: Rows per block.
     """
     low, high = (8192, 65536) if block_rows >= 4096 else (block_rows, 16 * block_rows)
     return int(min(max(1 << max(round(math.log2(max(rows, 1) / 16)), 0), low), high))

@@ -83,12 +83,7 @@ class DatasetSummary:
 
 
 def summarize_dataset(folder: Path, spec: DatasetSpec, *, allow_incomplete: bool = False) -> DatasetSummary:
-    """Read the sidecars of a dataset.
-
-    Args:
-        folder: Folder of the dataset.
-        spec: Specification of the dataset.
-        allow_incomplete: Whether to summarize the finished shards of an incomplete dataset.
+    """Read the sidecars of a dataset; of an incomplete one only with ``allow_incomplete``.
 
     Raises:
         DatasetError: A shard is missing, damaged or of another specification; the message names it.

@@ -39,15 +39,8 @@ MANIFEST_STRUCTURE = {
 def finalize(folder: Path, spec: DatasetSpec, *, notes: str = "") -> dict[str, Any]:
     """Summarize the shards of a dataset: write statistics, card, Croissant description and, last, the manifest.
 
-    The same shards give the same files, so several processes may do it at the same time.
-
-    Args:
-        folder: Folder of the dataset.
-        spec: Specification of the dataset.
-        notes: Text about the dataset for its card, in Markdown.
-
-    Returns:
-        The manifest.
+    The same shards give the same files, so several processes may do it at the same time. ``notes`` is Markdown for the
+    card.
 
     Raises:
         DatasetError: Shards are missing, damaged or of another specification; the message names them.
@@ -158,10 +151,9 @@ def _manifest(folder: Path, summary: DatasetSummary, *, created: str) -> dict[st
 
 
 def data_fingerprint(files: Iterable[tuple[str, str]]) -> str:
-    """Compute the fingerprint of the samples, as ``sha256sum */shard-*.h5 | sha256sum`` does in the dataset folder.
+    """Compute the fingerprint of the samples from path and sha256 of every shard.
 
-    Args:
-        files: Path and sha256 of every shard.
+    ``sha256sum */shard-*.h5 | sha256sum`` prints it in the dataset folder.
     """
     lines = "".join(f"{sha256}  {file}\n" for file, sha256 in sorted(files))
     return hashlib.sha256(lines.encode()).hexdigest()

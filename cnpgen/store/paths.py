@@ -18,11 +18,7 @@ HDF5_KINDS = (ANY_HDF5, *_KIND_OF_FORMAT.values())
 
 
 def require_folder(folder: str | Path, *, argument: str = "folder") -> Path:
-    """Return the path of a folder that exists.
-
-    Args:
-        folder: Folder of a dataset.
-        argument: Name of the argument, for the error.
+    """Return the path of a folder that exists; errors name the argument.
 
     Raises:
         UsageError: It is no text or path, or the folder is missing or is a file.
@@ -80,12 +76,7 @@ def require_file(
 
 
 def require_path(path: Path, expected: str, *, argument: str = "path") -> None:
-    """Raise an error if a path does not exist.
-
-    Args:
-        path: The path.
-        expected: Expected content.
-        argument: Name of the argument, for the error.
+    """Raise an error if a path, with some expected content, does not exist; it names the argument.
 
     Raises:
         UsageError: It does not exist.

@@ -54,11 +54,7 @@ class StoredDataset:
     def iter_shards(
         self, split: str, *, fields: Sequence[str] | None = None
     ) -> Iterator[tuple[ShardTask, dict[str, NDArray[Any]]]]:
-        """Read the shards of a split one by one.
-
-        Args:
-            split: Name of the split.
-            fields: Names of the fields; by default all, in the order of the specification.
+        """Read the shards of a split one by one, by default all fields in the order of the specification.
 
         Yields:
             The shard and field name -> values, shape (rows, width) or (rows,).
@@ -75,11 +71,7 @@ class StoredDataset:
     ) -> dict[str, NDArray[Any]]:
         """Read rows ``start`` to ``stop`` of a split; of an unfinished dataset, only the existing ones of them.
 
-        Args:
-            split: Name of the split.
-            fields: Names of the fields; by default all, in the order of the specification.
-            start: First row.
-            stop: Row after the last one; by default the end of the split.
+        By default, all fields are read, in the order of the specification, and all rows.
 
         Returns:
             Field name -> values, shape (rows, width) or (rows,).
@@ -106,11 +98,6 @@ class StoredDataset:
         """Read the scenes of rows ``start`` to ``stop`` of a split, and those of other rows in the same shards.
 
         ``table.rows_of(scene_id)`` returns the index of the scene of each row.
-
-        Args:
-            split: Name of the split.
-            start: First row.
-            stop: Row after the last one; by default the end of the split.
 
         Raises:
             DatasetError: The dataset has no scenes, or a shard is missing or damaged.
@@ -153,11 +140,7 @@ class StoredDataset:
 
 
 def open_dataset(folder: str | Path, *, allow_incomplete: bool = False) -> StoredDataset:
-    """Open a dataset for reading.
-
-    Args:
-        folder: Folder of the dataset.
-        allow_incomplete: Whether to open an unfinished dataset, too.
+    """Open a dataset for reading; an unfinished one only with ``allow_incomplete``.
 
     Raises:
         UsageError: The folder does not exist or contains no dataset.

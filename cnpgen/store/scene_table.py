@@ -135,11 +135,7 @@ def distinct_scenes(tables: Sequence[SceneTable]) -> SceneTable:
 
 
 def scene_attributes(families: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Return the HDF5 attributes of the arrays.
-
-    Args:
-        families: Names of the families, in the order of their indices.
-    """
+    """Return the HDF5 attributes of the arrays for families in the order of their indices."""
     return {
         item.name: {
             "units": item.unit,

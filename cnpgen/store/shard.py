@@ -26,11 +26,7 @@ _STORAGE = {"float64": "<f8", "float32": "<f4", "int64": "<i8"}
 
 
 def storage_dtype(field: Field, dtype: str) -> np.dtype[Any]:
-    """Return the little-endian type that a field is stored in.
-
-    Args:
-        field: The field.
-        dtype: Float type of the dataset, "float64" or "float32".
+    """Return the little-endian type of a field in a dataset of the float type "float64" or "float32".
 
     Raises:
         DatasetError: The type is not supported.
@@ -146,11 +142,7 @@ def _encode(
 
 
 def read_shard(path: Path, fields: Sequence[str] | None = None) -> dict[str, NDArray[Any]]:
-    """Read whole fields of a shard.
-
-    Args:
-        path: File of the shard.
-        fields: Names of the fields; all fields by default.
+    """Read whole fields of a shard, by default all.
 
     Returns:
         Field name -> values, shape (rows, width) or (rows,).
@@ -167,14 +159,7 @@ def read_shard(path: Path, fields: Sequence[str] | None = None) -> dict[str, NDA
 
 
 def read_attributes(path: Path, names: Sequence[str] | None = None) -> dict[str, str | int]:
-    """Read the attributes of a shard.
-
-    Args:
-        path: File of the shard.
-        names: Names of the attributes; all attributes by default.
-
-    Returns:
-        Name -> value.
+    """Read attributes of a shard, by default all.
 
     Raises:
         DatasetError: The file is missing, damaged or cut off, or has no such attribute.

@@ -103,10 +103,7 @@ _HISTOGRAM_STRUCTURE = {"low": [NUMBER], "high": [NUMBER], "counts": [[WHOLE]]}
 
 
 def statistics_from_json(content: Mapping[str, Any]) -> FieldStatistics:
-    """Rebuild statistics from a dict.
-
-    Args:
-        content: Dict with the structure ``STATISTICS_STRUCTURE``.
+    """Rebuild statistics from a dict with the structure ``STATISTICS_STRUCTURE``.
 
     Raises:
         ValueError: Shapes or counts are inconsistent.

@@ -112,12 +112,7 @@ def open_workspace(folder: Path, spec: DatasetSpec, *, force: bool = False) -> D
     """Create the folder with its specification, or check that it already contains the same specification.
 
     The folder is inspected again, because another process may have started the dataset while kernels were compiled. A
-    specification without shards is replaced.
-
-    Args:
-        folder: The folder.
-        spec: Specification of the new dataset.
-        force: Whether to delete an existing dataset in the folder.
+    specification without shards is replaced; ``force`` deletes an existing dataset.
 
     Returns:
         The specification in the folder (see ``started_spec``).

@@ -39,13 +39,7 @@ class Regeneration:
 
 
 def regenerate_blocks(folder: Path, spec: DatasetSpec, tasks: list[ShardTask], count: int) -> Regeneration:
-    """Regenerate random blocks and compare them with the stored rows.
-
-    Args:
-        folder: Folder of the dataset.
-        spec: Specification of the dataset.
-        tasks: Shards to choose blocks from.
-        count: Number of blocks; all of them if there are fewer.
+    """Regenerate ``count`` random blocks of some shards, or all, and compare them with the stored rows.
 
     Raises:
         MachineError: The backend of the dataset does not work on this machine.

@@ -49,15 +49,7 @@ class DeepCheck:
 def check_rows(
     folder: Path, spec: DatasetSpec, tasks: list[ShardTask], engine: Engine, progress: Callable[[int], None] | None
 ) -> DeepCheck:
-    """Recompute every row, shard by shard, and judge every plan.
-
-    Args:
-        folder: Folder of the dataset.
-        spec: Specification of the dataset.
-        tasks: The shards to read.
-        engine: Engine of the worker processes.
-        progress: Called with the number of rows of every shard that was read.
-    """
+    """Recompute every row, shard by shard, and judge every plan; report the rows of every shard that was read."""
     checks, findings = [], []
     with assembled(engine, len(tasks)) as pool:
         verify = partial(_verify_shard, folder.absolute() if pool.is_remote else folder, spec)

@@ -146,10 +146,7 @@ def _rates(kin: Kinematics, rate: Vec) -> tuple[list[Vec], list[Vec]]:
 
 
 def newton_step(robot: Robot) -> Any:
-    """Build one Newton step as an SX function ``(q, p, d, q0) -> (next q, |step|)``.
-
-    Args:
-        robot: Robot with revolute joints only.
+    """Build one Newton step of an arm of revolute joints as an SX function ``(q, p, d, q0) -> (next q, |step|)``.
 
     Returns:
         A ``casadi.Function`` with arguments of width n, 3, 2 or 3, n.

@@ -30,16 +30,7 @@ _DENIED = {errno.EACCES, errno.EPERM}
 
 
 def machine_error(verb: str, path: Path, error: OSError) -> MachineError:
-    """Convert an error of a system call to an error message with a hint.
-
-    Args:
-        verb: The failed operation: "read", "write".
-        path: The file.
-        error: The error of the system call.
-
-    Returns:
-        The error to raise from ``error``.
-    """
+    """Return the error to raise, with a hint, after a system call failed to "read" or "write" a file."""
     hint = _HINTS.get(error.errno or 0, "check the disk and try again")
     if verb == "read" and error.errno in _DENIED:
         hint = "its owner can permit reading it (chmod)"
@@ -65,10 +56,7 @@ def check_readable(path: Path) -> None:
 
 
 def check_writable(path: Path) -> None:
-    """Check that a file, or files in a folder, can be written before they are computed.
-
-    Args:
-        path: The file or the folder, which may be missing.
+    """Check that a file, or files in a folder, can be written before they are computed; the path may be missing.
 
     Raises:
         MachineError: An existing file is read-only, or no file can be created in its folder or in the next one above.

@@ -46,11 +46,7 @@ class CsvTable:
 
 
 def read_csv_table(path: Path, *, example: str) -> CsvTable:
-    """Read a CSV table.
-
-    Args:
-        path: The file.
-        example: Columns that such a table has, for messages.
+    """Read a CSV table; messages name the columns of ``example``.
 
     Raises:
         DatasetError: It is too large, not UTF-8, has no columns or equal ones, or rows of another length.

@@ -62,11 +62,7 @@ class StructureError(ValueError):
 
 
 def check_structure(value: Any, structure: Structure) -> None:
-    """Raise an error if a value does not have a structure.
-
-    Args:
-        value: Result of ``json.loads``.
-        structure: The expected structure.
+    """Raise an error if a result of ``json.loads`` does not have a structure.
 
     Raises:
         StructureError: The value has another structure; the message contains key, expected structure and value.

@@ -33,11 +33,7 @@ def unlock(file: IO[bytes]) -> None:
 
 @contextmanager
 def output_lock(out: Path, lock: Path) -> Iterator[None]:
-    """Refuse a second process that writes the same output, while the block runs.
-
-    Args:
-        out: The output, for the message.
-        lock: The lock file, which exists while the block runs.
+    """Refuse a second process that writes the same output, while the block runs and the lock file exists.
 
     Raises:
         UsageError: Another process writes the output.

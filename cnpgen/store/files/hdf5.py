@@ -184,11 +184,9 @@ def _type_text(dataset: Any) -> str:
 
 @contextmanager
 def opened_hdf5(path: Path, content: bytes | None = None) -> Iterator[Hdf5]:
-    """Open an HDF5 file for reading. All handles are closed at the end of the block, so processes cannot share them.
+    """Open an HDF5 file for reading, or its content if that has been read already.
 
-    Args:
-        path: The file.
-        content: Content of the file, if it has been read already.
+    All handles are closed at the end of the block, so processes cannot share them.
 
     Raises:
         DatasetError: The file is missing, not an HDF5 file, too large, damaged or cut off; also raised for errors

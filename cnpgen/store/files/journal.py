@@ -76,11 +76,9 @@ class JournalFile:
 
 
 def open_journal_file(path: Path, magic: bytes) -> JournalFile:
-    """Open a journal for reading and appending, and remove an incomplete last record.
+    """Open a journal for reading and appending, or create it, and remove an incomplete last record.
 
-    Args:
-        path: Path of the file; it is created if it is missing.
-        magic: First line of the file, with format name and version, in ASCII with its newline.
+    ``magic`` is the first line of the file, with format name and version, in ASCII with its newline.
 
     Raises:
         DatasetError: The file does not start with ``magic``.

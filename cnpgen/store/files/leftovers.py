@@ -22,11 +22,7 @@ def temporary_name(name: str) -> str:
 
 
 def remove_leftovers(work: Path) -> None:
-    """Remove temporary files of dead processes of this machine.
-
-    Args:
-        work: Folder of temporary files. Other files are kept. A symbolic link is not followed.
-    """
+    """Remove temporary files of dead processes of this machine from their folder, if that is no symbolic link."""
     for path in _temporary(work):
         if _is_dead(path.name.split(".")[-3]):
             with suppress(OSError):
