@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from cnpgen.errors import UsageError
 from cnpgen.loader.batch import Batch
 from cnpgen.loader.batch_partition import BatchPartition
-from cnpgen.loader.columns import tail
 from cnpgen.loader.in_memory_rows import InMemoryRows, make_in_memory_rows
 from cnpgen.loader.order import Order
 from cnpgen.loader.position import Position, position_from_json, position_to_json
@@ -89,11 +88,8 @@ class Batches:
     @property
     def signature(self) -> dict[str, tuple[tuple[int, ...], np.dtype[Any]]]:
         """Field name -> shape in one row and type."""
-        integer_type, row_format = np.dtype(np.int64), self._row_format
-        return {
-            field.name: (tail(field), row_format.dtype if field.name in row_format.layout.slices else integer_type)
-            for field in row_format.layout.fields
-        }
+        types = {"float": self._row_format.dtype, "int64": np.dtype(np.int64)}
+        return {field.name: (field.shape(0)[1:], types[field.dtype]) for field in self._row_format.layout.fields}
 
     def __len__(self) -> int:
         """Return the number of batches per epoch."""

@@ -56,11 +56,6 @@ class Columns:
         return sum(max(field.width, 1) for field in self.floats)
 
 
-def tail(field: Field) -> tuple[int, ...]:
-    """Return the shape of a field in one row: (width,), or () for a scalar."""
-    return (field.width,) if field.width else ()
-
-
 def select_columns(spec: DatasetSpec, names: Iterable[str] | None) -> Columns:
     """Select fields by name.
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
-from cnpgen.loader.columns import Columns, tail
+from cnpgen.loader.columns import Columns
 from cnpgen.loader.shard_reader import SplitShards
 from cnpgen.schema.arguments import reject_masked
 from cnpgen.store.shard import storage_dtype
@@ -39,7 +39,7 @@ def gather(source: SplitShards, indices: ArrayLike, layout: Columns) -> Rows:
         DatasetError: A shard is missing or damaged.
     """
     rows = _checked(indices, source)
-    columns = {f.name: np.empty((len(rows), *tail(f)), storage_dtype(f, source.stored)) for f in layout.fields}
+    columns = {f.name: np.empty(f.shape(len(rows)), storage_dtype(f, source.stored)) for f in layout.fields}
     for shard, positions, local in _by_shard(rows, source):
         file = source.shards[shard]
         dense = MAX_READ_ROWS_PER_ROW * len(local) >= file.rows

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.loader.columns import tail
 from cnpgen.loader.row_format import RowFormat
 from cnpgen.loader.shard_reader import ShardReader
 from cnpgen.store.checked_shard import Shard
@@ -42,7 +41,7 @@ def row_bytes(row_format: RowFormat) -> int:
 def empty_packed(rows: int, row_format: RowFormat) -> Packed:
     """Allocate memory for rows."""
     layout = row_format.layout
-    integers = {field.name: np.empty((rows, *tail(field)), np.int64) for field in layout.integers}
+    integers = {field.name: np.empty(field.shape(rows), np.int64) for field in layout.integers}
     return Packed(np.empty((rows, layout.width), row_format.dtype), integers)
 
 
@@ -89,11 +88,7 @@ def _fill(
 
 
 def _opaque_rows(values: NDArray[Any]) -> NDArray[Any]:
-    """View float64 values as one opaque item per row, which NumPy copies twice as fast as rows of six numbers.
-
-    Args:
-        values: Values of a field, shape (rows, width) or (rows,).
-    """
+    """View float64 values as one opaque item per row, which NumPy copies twice as fast as rows of six numbers."""
     rows = np.ascontiguousarray(values, np.float64).reshape(len(values), -1)
     return rows.view(f"V{8 * rows.shape[1]}")[:, 0]
 

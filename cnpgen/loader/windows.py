@@ -18,8 +18,6 @@ from cnpgen.loader.row_format import RowFormat
 from cnpgen.loader.shard_reader import SplitShards
 
 Loaded = tuple[Packed, NDArray[np.int64]]
-
-
 T = TypeVar("T")
 
 
@@ -57,9 +55,8 @@ class Windows:
         self._source, self._row_format, self._order, self._in_memory = source, row_format, order, in_memory
         self._firsts = [window.first for window in order.windows]
         self._futures: dict[int, Future[Loaded]] = {}
-        self._memory: dict[
-            int, Packed
-        ] = {}  # of two windows, reused in turn, because allocating it takes as long as packing
+        # Memory of two windows, reused in turn, because allocating it takes as long as packing.
+        self._memory: dict[int, Packed] = {}
         self._process = os.getpid()
 
     def batch(self, first: int, last: int, *, rank: int = 0, world: int = 1) -> Batch:

@@ -145,21 +145,21 @@ def carry_out(
 
     The arguments are those of ``make_dataset``; ``notes`` is the text of the data card.
     """
-    tasks = _part(shards(job.spec), part)
+    every, (k, m) = shards(job.spec), part or (0, 1)
+    tasks = every[k * len(every) // m : (k + 1) * len(every) // m]  # consecutive shards may share a block
     missing, damaged = _missing_shards(job, tasks, begin, progress)
     if begin is not None:
         rows = sum(task.rows for task in tasks)
         begin("making", job.folder, rows, rows - sum(task.rows for task in missing))
-    made = _make(job, missing, engine, progress)
+    made = 0
+    with closing(_results(job, missing, engine)) as results:
+        for rows, sampling in results:
+            made += rows
+            if progress is not None:
+                progress(rows, sampling)
     complete, documents = finish(job.folder, job.spec, notes, made=made, exclusive=part is None)
     rows_of = {split: sum(task.rows for task in tasks if task.split == split) for split in job.spec.splits}
     return MadeDataset(job.folder, job.spec, made, complete, rows_of, (*damaged, *documents))
-
-
-def _part(tasks: list[ShardTask], part: tuple[int, int] | None) -> list[ShardTask]:
-    """Return one part of the shards; consecutive shards, which may share a block, stay together."""
-    k, m = part or (0, 1)
-    return tasks[k * len(tasks) // m : (k + 1) * len(tasks) // m]
 
 
 def _missing_shards(
@@ -169,12 +169,7 @@ def _missing_shards(
     existing = existing_shards(job.folder, tasks)
     if existing and begin is not None:
         begin("checking", job.folder, sum(task.rows for task in existing), 0)
-    damaged = find_damaged(
-        job.folder,
-        job.spec,
-        existing,
-        progress=lambda task: progress(task.rows, None) if progress is not None else None,
-    )
+    damaged = find_damaged(job.folder, job.spec, existing, progress=progress)
     if damaged:
         first = next(iter(damaged.values()))
         count = f"{len(damaged)} shards are damaged and are" if len(damaged) > 1 else "a shard is damaged and is"
@@ -182,17 +177,6 @@ def _missing_shards(
         delete_shards(job.folder, list(damaged))
     intact = set(existing) - set(damaged)
     return [task for task in tasks if task not in intact], [task.file for task in damaged]
-
-
-def _make(job: Job, tasks: list[ShardTask], engine: Engine, progress: Progress | None) -> int:
-    """Generate the shards and return their number of rows."""
-    made = 0
-    with closing(_results(job, tasks, engine)) as results:
-        for rows, sampling in results:
-            made += rows
-            if progress is not None:
-                progress(rows, sampling)
-    return made
 
 
 def _results(job: Job, tasks: list[ShardTask], engine: Engine) -> Generator[tuple[int, SamplingStatistics], None, None]:
@@ -205,16 +189,12 @@ def _results(job: Job, tasks: list[ShardTask], engine: Engine) -> Generator[tupl
             for group in groups:
                 yield from make_shards(job, group)
             return
-        worker_job = _without_local_paths(job) if pool.is_remote else job
+        if pool.is_remote:  # remote machines share only the folder of the dataset
+            job = replace(job, folder=job.folder.absolute(), pipeline=None, cache_folder=None)
         hint = f": the shards that are finished are safe in {job.folder}; {RERUN_HINT} to go on"
-        with closing(pool.distribute(partial(_make_run, worker_job), groups, hint=hint)) as results:
+        with closing(pool.distribute(partial(_make_run, job), groups, hint=hint)) as results:
             for made in results:
                 yield from made
-
-
-def _without_local_paths(job: Job) -> Job:
-    """Return the job for a remote machine, which shares only the folder of the dataset."""
-    return replace(job, folder=job.folder.absolute(), pipeline=None, cache_folder=None)
 
 
 def _make_run(job: Job, tasks: Sequence[ShardTask]) -> list[tuple[int, SamplingStatistics]]:
@@ -233,9 +213,8 @@ def runs(spec: DatasetSpec, tasks: list[ShardTask], workers: int) -> list[list[S
         return [[task] for task in tasks]  # no shared blocks
     blocks = MAX_BLOCKS_PER_RUN
     if workers > 1:
-        blocks = min(
-            max(sum(task.rows for task in tasks) // (MIN_RUNS_PER_WORKER * workers * spec.block_rows), 1), blocks
-        )
+        rows = sum(task.rows for task in tasks)
+        blocks = min(max(rows // (MIN_RUNS_PER_WORKER * workers * spec.block_rows), 1), blocks)
     rows = spec.block_rows * blocks
     return [list(group) for _, group in groupby(tasks, key=lambda task: (task.split, task.first_row // rows))]
 
@@ -261,20 +240,15 @@ def finish(folder: Path, spec: DatasetSpec, notes: str, *, made: int, exclusive:
 
 def _check(part: tuple[int, int] | None, *, force: bool) -> None:
     """Raise UsageError for invalid arguments or environment variables before anything is written."""
-    if part is not None:
-        _check_part(part)
-    if force and part is not None:
-        lost = "what the other parts have made"
-        raise UsageError(
-            f"{{force}} would delete {lost}: remove the folder, then start the parts", remedies={"force": True}
-        )
     source_date()
-
-
-def _check_part(part: tuple[int, int]) -> None:
+    if part is None:
+        return
     try:
         k, m = map(operator.index, part)
     except (TypeError, ValueError) as error:
         raise UsageError(f"must be two integers (K, M) with 0 <= K < M, got {part!r}", argument="part") from error
     if not 0 <= k < m:
         raise UsageError(f"must be K/M with 0 <= K < M, got {k}/{m}", argument="part")
+    if force:
+        text = "{force} would delete what the other parts have made: remove the folder, then start the parts"
+        raise UsageError(text, remedies={"force": True})

@@ -30,7 +30,7 @@ def find_damaged(
     spec: DatasetSpec,
     tasks: Sequence[ShardTask],
     *,
-    progress: Callable[[ShardTask], None] | None = None,
+    progress: Callable[[int, None], None] | None = None,
 ) -> dict[ShardTask, str]:
     """Compare the bytes of existing shards with their sidecars, and their content with the specification.
 
@@ -47,7 +47,7 @@ def find_damaged(
             if problem:
                 damaged[task] = problem
             if progress is not None:
-                progress(task)
+                progress(task.rows, None)
     finally:
         pool.shutdown(cancel_futures=True)
     return damaged

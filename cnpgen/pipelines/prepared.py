@@ -285,8 +285,6 @@ class BlockStatistics:
         """Return the present counts."""
         maps = {}
         for field in self._maps:
-            assert field.valid_min is not None
-            assert field.valid_max is not None
             shape = (DENSITY_CELLS, DENSITY_CELLS)
             (x, y), drawn, kept = _extent(field), self._drawn[field.name], self._kept[field.name]
             maps[field.name] = DensityMap(x, y, drawn.reshape(shape), kept.reshape(shape))

@@ -13,9 +13,8 @@ RERUN_HINT = "run make_dataset or 'cnpgen make-dataset' again with the same argu
 
 OUTSIDE = "is a link that leads outside the folder of the dataset"
 
-_verified: set[tuple[Path, int, int, str]] = (
-    set()
-)  # path, mtime [ns], size and sha256 of the shards that this process has verified
+# Path, mtime [ns], size and sha256 of the shards that this process has verified.
+_verified: set[tuple[Path, int, int, str]] = set()
 
 
 def leads_outside(path: Path, folder: Path | None = None) -> bool:

@@ -133,9 +133,7 @@ def _manifest(folder: Path, summary: DatasetSummary, *, created: str) -> dict[st
     return {
         "format": MANIFEST_FORMAT,
         "format_version": MANIFEST_VERSION,
-        "name": spec.name,
-        "version": spec.version,
-        "title": spec.title,
+        **{name: getattr(spec, name) for name in ("name", "version", "title")},
         "created": created,
         "license": spec.license,
         "fingerprint": data_fingerprint((item.file, item.sha256) for _, item in summary.records),
@@ -165,16 +163,10 @@ def _origin(summary: DatasetSummary) -> dict[str, Any]:
     pipeline = spec.recipe.get("pipeline")
     return {
         "pipeline": pipeline.get("name", "") if isinstance(pipeline, dict) else pipeline,
-        "recipe_sha256": spec.recipe_sha256,
-        "recipe": spec.recipe,
+        **{name: getattr(spec, name) for name in ("recipe_sha256", "recipe")},
         "seed": str(spec.seed),
-        "generator": spec.generator,
-        "backend": spec.backend,
-        "dtype": spec.dtype,
-        "block_rows": spec.block_rows,
-        "shard_size": spec.shard_size,
-        "robot": spec.robot,
-        "versions": spec.versions,
+        **{name: getattr(spec, name) for name in ("generator", "backend", "dtype", "block_rows", "shard_size")},
+        **{name: getattr(spec, name) for name in ("robot", "versions")},
         "environments": summary.environments,
         "seconds": summary.seconds,
     }
@@ -187,11 +179,7 @@ def _feature(field: Field, spec: DatasetSpec) -> dict[str, Any]:
         "shape": [field.width] if field.width else [],
         "names": field.names,
         "units": field.unit,
-        "long_name": field.long_name,
-        "role": field.role,
-        "frame": field.frame,
-        "valid_min": field.valid_min,
-        "valid_max": field.valid_max,
+        **{name: getattr(field, name) for name in ("long_name", "role", "frame", "valid_min", "valid_max")},
     }
 
 
@@ -199,11 +187,7 @@ def _split(folder: Path, summary: DatasetSummary, split: str) -> dict[str, Any]:
     """List the shards of a split."""
     entries = [
         {
-            "file": record.file,
-            "rows": record.rows,
-            "first_sample_id": record.first_sample_id,
-            "bytes": record.bytes,
-            "sha256": record.sha256,
+            **{name: getattr(record, name) for name in ("file", "rows", "first_sample_id", "bytes", "sha256")},
             "sidecar": {"file": task.sidecar, "sha256": file_sha256(folder / task.sidecar)},
         }
         for task, record in summary.of_split(split)

@@ -118,8 +118,7 @@ def _hdf5_kind(path: Path) -> str:
         return ANY_HDF5
     if isinstance(format_name, bytes):
         format_name = format_name.decode(errors="replace")
-    if (
-        format_name is None and {"path_control_points", "rate_control_points"} <= names
-    ):  # files of other software may have no format
+    # Files of other software may have no format.
+    if format_name is None and {"path_control_points", "rate_control_points"} <= names:
         return PLANS
     return _KIND_OF_FORMAT.get(str(format_name), ANY_HDF5)

@@ -114,12 +114,16 @@ class StoredDataset:
             raise DatasetError(f"split {split!r} of {self.folder} has no rows {start} to {end}")
         return distinct_scenes(tables)
 
-    def _checked(self, task: ShardTask) -> Shard:
-        """Verify a shard and return it."""
+    def shard(self, task: ShardTask) -> Shard:
+        """Return a shard with its record in the manifest or, without a manifest, in its sidecar."""
         if (recorded := self._recorded.get(task.file)) is None:
             record = load_record(self.folder, task)
             recorded = record.bytes, record.sha256
-        shard = Shard(self.folder, self.spec, task, *recorded)
+        return Shard(self.folder, self.spec, task, *recorded)
+
+    def _checked(self, task: ShardTask) -> Shard:
+        """Verify a shard and return it."""
+        shard = self.shard(task)
         require_intact(shard.path, size=shard.size, sha256=shard.sha256)
         return shard
 

@@ -140,9 +140,8 @@ def field_statistics(values: NDArray[Any], field: Field) -> FieldStatistics:
     Returns:
         The statistics of the columns.
     """
-    columns = np.ascontiguousarray(
-        np.asarray(values, np.float64).reshape(len(values), -1).T
-    )  # sums over long contiguous rows are fast
+    # Sums over long contiguous rows are fast.
+    columns = np.ascontiguousarray(np.asarray(values, np.float64).reshape(len(values), -1).T)
     mean = columns.mean(axis=1)
     low, high = _limits(field, len(columns))
     return FieldStatistics(
@@ -180,9 +179,7 @@ def column_statistics(columns: Mapping[str, NDArray[Any]], fields: Sequence[Fiel
     return {field.name: field_statistics(columns[field.name], field) for field in fields}
 
 
-def merge_statistics(
-    parts: Sequence[Mapping[str, FieldStatistics]],
-) -> dict[str, FieldStatistics]:
+def merge_statistics(parts: Sequence[Mapping[str, FieldStatistics]]) -> dict[str, FieldStatistics]:
     """Merge the statistics of shards, in order.
 
     Raises:

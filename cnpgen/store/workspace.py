@@ -71,14 +71,9 @@ def check_place(workspace: Workspace) -> None:
         UsageError: It is a file, contains files that are not a dataset of cnpgen, or a link out of it.
     """
     if workspace.content == "a file":
-        raise UsageError(
-            f"{workspace.existing} is a file, not a folder; choose another {{out}}", remedies={"out": None}
-        )
+        raise _other_folder(f"{workspace.existing} is a file, not a folder")
     if workspace.content == "something else":
-        raise UsageError(
-            f"{workspace.folder} is not empty and not a dataset of cnpgen; choose another {{out}}",
-            remedies={"out": None},
-        )
+        raise _other_folder(f"{workspace.folder} is not empty and not a dataset of cnpgen")
     splits = () if workspace.spec is None else tuple(workspace.spec.splits)
     if workspace.content == "a dataset" and (outside := outside_links(workspace.folder, (WORK, *splits))):
         raise UsageError(f"{workspace.folder / outside[0]} {OUTSIDE}; {COPY_HINT}")
@@ -103,9 +98,8 @@ def started_spec(workspace: Workspace, wanted: DatasetSpec) -> DatasetSpec | Non
         return None
     if existing is None:
         raise DatasetError(f"{workspace.damage}; {{force}} replaces the whole dataset", remedies={"force": True})
-    raise UsageError(
-        f"{workspace.folder} {_describe_conflict(existing, wanted)}", remedies={"out": None, "force": True}
-    )
+    text = f"{workspace.folder} {_describe_conflict(existing, wanted)}"
+    raise UsageError(text, remedies={"out": None, "force": True})
 
 
 def open_workspace(folder: Path, spec: DatasetSpec, *, force: bool = False) -> DatasetSpec:
@@ -148,14 +142,14 @@ def require_dataset_spec(folder: Path, spec: DatasetSpec) -> None:
         is_unchanged = spec.fingerprint.encode() in read_file(folder / SPECIFICATION)
     except DatasetError as error:
         missing = f"its {SPECIFICATION}" if folder.is_dir() else "it"
-        raise MachineError(
-            f"{folder}: {missing} was deleted or moved while the dataset was made; make it again"
-        ) from error
+        text = f"{folder}: {missing} was deleted or moved while the dataset was made; make it again"
+        raise MachineError(text) from error
     if not is_unchanged:
-        raise UsageError(
-            f"{folder} was replaced by another dataset while this one was made; choose another {{out}}",
-            remedies={"out": None},
-        )
+        raise _other_folder(f"{folder} was replaced by another dataset while this one was made")
+
+
+def _other_folder(text: str) -> UsageError:
+    return UsageError(f"{text}; choose another {{out}}", remedies={"out": None})
 
 
 def is_dataset(folder: Path) -> bool:
@@ -230,11 +224,8 @@ def _cleared(workspace: Workspace) -> Workspace:
                 path.unlink()
             split.rmdir()
         shutil.rmtree(folder / WORK, ignore_errors=True)
-        for name in (
-            *_SUMMARIES,
-            OLD_SPECIFICATION,
-            SPECIFICATION,
-        ):  # last: a partially deleted dataset must still be recognized
+        # Last: a partially deleted dataset must still be recognized.
+        for name in (*_SUMMARIES, OLD_SPECIFICATION, SPECIFICATION):
             (folder / name).unlink(missing_ok=True)
     except OSError as error:
         raise machine_error("delete from", folder, error) from error

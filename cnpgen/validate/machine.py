@@ -179,15 +179,11 @@ def _try_library(module: str, project: str) -> tuple[str, str]:
     install = f"{sys.executable} -m pip install"
     try:
         imported = importlib.import_module(module)
-    except ModuleNotFoundError as error:
-        if error.name == module:
-            return "missing", f"{project} is not installed: run '{install} {project}'"
-        return "broken", f"{project} cannot be imported ({error}): run '{install} --force-reinstall {project}'"
     except Exception as error:  # noqa: BLE001 - a broken library may raise anything
-        return (
-            "broken",
-            f"{project} cannot be imported ({_one_line(error)}): run '{install} --force-reinstall {project}'",
-        )
+        if isinstance(error, ModuleNotFoundError) and error.name == module:
+            return "missing", f"{project} is not installed: run '{install} {project}'"
+        reason = str(error) if isinstance(error, ModuleNotFoundError) else _one_line(error)
+        return "broken", f"{project} cannot be imported ({reason}): run '{install} --force-reinstall {project}'"
     attribute = _DISTINCTIVE_ATTRIBUTES.get(module)
     if attribute and not hasattr(imported, attribute):
         remedy = f"run '{sys.executable} -m pip uninstall {module}', then '{install} --force-reinstall {project}'"

@@ -8,15 +8,19 @@ from typing import Any
 from cnpgen.errors import DatasetError, counted
 from cnpgen.judges.rows.row_report import RowReport
 from cnpgen.machine.engine import Engine
+from cnpgen.make.recipe import resolved_digest
 from cnpgen.make.recipe_file import restored
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
-from cnpgen.store.check import Finding, check_dataset
+from cnpgen.store.check import REPLACE_HINT, Finding, check_dataset
 from cnpgen.store.dataset_spec import DatasetSpec, load_dataset_spec, shards
+from cnpgen.store.dataset_summary import load_stats_document, stats_document, summarize_dataset
+from cnpgen.store.files.documents import plain
+from cnpgen.store.intact import RERUN_HINT
+from cnpgen.store.layout import SPECIFICATION, STATS
 from cnpgen.store.paths import require_dataset
 from cnpgen.store.shard_record import is_committed
 from cnpgen.validate.blocks import Regeneration, backend_of, regenerate_blocks
-from cnpgen.validate.validate_documents import check_recipe, check_statistics
 from cnpgen.validate.validate_rows import DeepCheck, check_rows
 
 
@@ -160,3 +164,26 @@ def _check_requirements(folder: Path, spec: DatasetSpec, *, deep: bool, regenera
     if deep or regenerate:
         with restored(spec):
             pass
+
+
+def check_recipe(spec: DatasetSpec) -> list[Finding]:
+    """Check that the recipe in a specification has the recorded sha256."""
+    try:
+        digest = resolved_digest(spec.recipe["pipeline"], str(spec.robot["urdf"]).encode())
+    except (KeyError, TypeError, AttributeError):
+        return [Finding(SPECIFICATION, "its recipe cannot be read", hint=REPLACE_HINT)]
+    text = f"its recipe has the sha256 {digest}, not the recorded {spec.recipe_sha256}"
+    return [] if digest == spec.recipe_sha256 else [Finding(SPECIFICATION, text, hint=REPLACE_HINT)]
+
+
+def check_statistics(folder: Path, spec: DatasetSpec) -> list[Finding]:
+    """Check that ``stats.json`` is the summary of the records of all shards; these must exist."""
+    try:
+        document = load_stats_document(folder)
+        expected = plain(stats_document(summarize_dataset(folder, spec)))
+    except DatasetError:  # missing or damaged files are findings already
+        return []
+    different = [key for key in expected if document.get(key) != expected[key]]
+    text = f"is not the summary of the records of the shards: {', '.join(different)} differ"
+    hint = f"delete {STATS} and {RERUN_HINT}: it writes the file again"
+    return [Finding(STATS, text, hint=hint)] if different else []

@@ -73,19 +73,8 @@ def place_furniture(random: np.random.Generator, family: SceneFamily, z: float =
     return Furniture((distance * math.cos(bearing), distance * math.sin(bearing), z), yaw)
 
 
-@dataclass(frozen=True)
-class Objects:
-    """Sizes of objects.
-
-    Attributes:
-        count: Number of objects.
-        width: Edge lengths of the bases of boxes, and diameters of cylinders [m].
-        height: Heights [m].
-    """
-
-    count: Range
-    width: Range
-    height: Range
+Objects = tuple[Range, Range, Range]
+"""Number of objects; widths, of boxes or diameters of cylinders [m]; and heights [m]."""
 
 
 def place_objects(
@@ -110,8 +99,9 @@ def place_objects(
         prefix: Beginning of their names.
     """
     circles: list[tuple[float, float, float]] = []
-    for index in range(whole(random, objects.count)):
-        a, b, height = (uniform(random, size) for size in (objects.width, objects.width, objects.height))
+    count, widths, heights = objects
+    for index in range(whole(random, count)):
+        a, b, height = (uniform(random, size) for size in (widths, widths, heights))
         is_box = bool(random.random() < 0.5)
         radius = math.hypot(a, b) / 2 if is_box else a / 2
         for _ in range(MAX_PLACEMENTS):

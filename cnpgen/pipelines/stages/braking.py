@@ -76,9 +76,8 @@ def overshoot(
     Returns:
         Distance outside the edge [m], shape (n,); -inf if a straight line stays inside by the margin for 80 ms.
     """
-    position, velocity = (
-        np.repeat(values[:2], 2, axis=0) for values in tip(q, dq)
-    )  # for both edges across x and across y
+    # for both edges across x and across y
+    position, velocity = (np.repeat(values[:2], 2, axis=0) for values in tip(q, dq))
     edges = np.array([table.x.high, table.x.low, table.y.high, table.y.low])[:, None]
     ahead = EDGE_SIDES * (position + LOOKAHEAD_S * velocity - edges)
     suspects = (ahead > -margin) & (EDGE_SIDES * velocity > 0)

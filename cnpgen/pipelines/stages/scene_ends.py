@@ -14,7 +14,7 @@ from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.batch_scenes import BatchScenes
 from cnpgen.pipelines.stages.draw import position_field
 from cnpgen.pipelines.stages.draw_scenes import scenes_of
-from cnpgen.pipelines.stages.pose_ik import MAX_POSE_IK_STEPS, POSE_TOLERANCE, pose_ik_step
+from cnpgen.pipelines.stages.ik import MAX_POSE_IK_STEPS, POSE_TOLERANCE, pose_ik_step
 from cnpgen.pipelines.stages.scene_clearance import SceneClearance
 from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Stage, StageFunction, leave
 from cnpgen.pipelines.stages.torque import torque_ratio

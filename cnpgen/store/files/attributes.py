@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 from cnpgen.errors import DatasetError
@@ -47,7 +48,7 @@ class Attributes:
             raise DatasetError(f"{self.path}: the attribute {name!r} must be a text, a number or a list of numbers")
         if count * kind.get_size() > MAX_ATTRIBUTE_BYTES:
             raise DatasetError(f"{self.path}: the attribute {name!r} is larger than {MAX_ATTRIBUTE_BYTES:,} bytes")
-        return AttributeManager(_Parent(self._item))[name]
+        return AttributeManager(SimpleNamespace(id=self._item))[name]
 
     def some(self, names: Iterable[str]) -> dict[str, Any]:
         """Return the existing attributes among ``names``."""
@@ -56,13 +57,6 @@ class Attributes:
     def all(self) -> dict[str, Any]:
         """Return all attributes."""
         return {name: self[name] for name in self}
-
-
-@dataclass(frozen=True)
-class _Parent:
-    """The owner of attributes, as ``h5py.AttributeManager`` requires it."""
-
-    id: Any
 
 
 def decoded(path: Path, name: bytes) -> str:

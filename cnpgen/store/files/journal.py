@@ -99,8 +99,9 @@ def open_journal_file(path: Path, magic: bytes) -> JournalFile:
 
 
 def _recover(path: Path, file: IO[bytes], magic: bytes) -> JournalFile:
-    """Lock the file, read its records and remove what follows them."""
-    _lock(path, file)
+    """Lock the file if the system has locks, read its records and remove what follows them."""
+    if not try_lock(file):
+        raise UsageError(f"{path} is in use by another process")
     head = file.read(len(magic))
     if not magic.startswith(head):
         raise DatasetError(f"{path} does not start with {magic!r}")
@@ -125,9 +126,3 @@ def _read_records(file: IO[bytes]) -> list[bytes]:
         end = file.tell()
     file.seek(end)
     return records
-
-
-def _lock(path: Path, file: IO[bytes]) -> None:
-    """Lock the file for this process, if the system supports it."""
-    if not try_lock(file):
-        raise UsageError(f"{path} is in use by another process")
