@@ -15,12 +15,9 @@ LIBRARIES = ("polars", "pandas")
 
 
 def make_frame(rows: Mapping[str, NDArray[Any]], fields: Sequence[Field], *, library: str | None) -> Any:
-    """Convert rows to a table.
+    """Convert rows, of shape (rows, width) or (rows,) each, to a table with columns in the order of the fields.
 
-    Args:
-        rows: Field name -> values, shape (rows, width) or (rows,).
-        fields: The fields, in the order of the table's columns.
-        library: "polars" or "pandas"; None for the installed one, polars if both are.
+    The library is "polars" or "pandas"; by default the installed one, polars if both are.
 
     Returns:
         A ``DataFrame``; with pandas, ``attrs["units"]`` contains the units of the columns.

@@ -13,12 +13,9 @@ MAX_IN_MEMORY_BYTES = 1 << 28
 
 
 class InMemoryRows:
-    """All rows of a split; each shard is read when it is needed for the first time.
+    """All rows of a split, in their stored order; each shard is read when it is needed for the first time.
 
     Two threads may load at the same time, since both write the same values.
-
-    Attributes:
-        packed: Memory for all rows, in their stored order.
     """
 
     def __init__(self, source: SplitShards, row_format: RowFormat) -> None:

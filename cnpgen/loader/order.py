@@ -76,12 +76,7 @@ def permutation(size: int, *, seed: int, key: tuple[int, ...]) -> NDArray[np.int
 
     NumPy guarantees the raw output of bit generators, but not that of ``Generator.permutation``. The rows are sorted by
     raw random numbers, the last bits of which are replaced by the row index. For up to 2^20 rows, 44 bits remain
-    random, so ties are negligible.
-
-    Args:
-        size: Number of rows.
-        seed: Seed, not negative.
-        key: Key of the permutation of this seed; integers that are not negative.
+    random, so ties are negligible. Seed and key are not negative.
 
     Returns:
         Permutation of 0 to ``size - 1``, shape (size,).

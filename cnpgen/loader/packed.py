@@ -17,12 +17,7 @@ _CHUNK_VALUES = 1 << 15  # float64 numbers that fit into the L2 cache of a proce
 
 @dataclass(frozen=True, eq=False)
 class Packed:
-    """The concatenated rows of some shards.
-
-    Attributes:
-        table: The float fields side by side, shape (rows, D).
-        integers: Field name -> values, shape (rows, width) or (rows,).
-    """
+    """The concatenated rows of some shards: a table of float fields, shape (rows, D), and integer fields by name."""
 
     table: NDArray[Any]
     integers: dict[str, NDArray[Any]]

@@ -17,24 +17,14 @@ DTYPES = ("float32", "float64")
 
 @dataclass(frozen=True, eq=False)
 class RowFormat:
-    """The format of loaded rows.
-
-    Attributes:
-        layout: Fields and their columns in the packed table.
-        normalization: Normalization of the float fields; None to keep their units.
-        dtype: Type of the float fields.
-    """
+    """The format of loaded rows; without a normalization, float fields keep their units."""
 
     layout: Columns
     normalization: Normalization | None
     dtype: np.dtype[Any]
 
     def convert(self, rows: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-        """Convert stored rows to this format.
-
-        Args:
-            rows: Field name -> values, shape (k, width) or (k,).
-        """
+        """Convert stored rows, of shape (k, width) or (k,) each, to this format."""
         values = dict(rows)
         if self.normalization is not None:  # in float64, as for batches
             values |= {name: values[name].astype(np.float64, copy=False) for name in self.layout.slices}

@@ -148,15 +148,7 @@ def _mapped(shard: Shard) -> mmap.mmap | None:
 
 @dataclass(frozen=True, eq=False)
 class SplitShards:
-    """The shards of a split.
-
-    Attributes:
-        split: Name of the split.
-        shards: Existing shards, in order.
-        reader: Reader of the shards.
-        fingerprint: Fingerprint of the rows of the whole dataset.
-        stored: Stored type of float fields, "float64" or "float32".
-    """
+    """The existing shards of a split, in order; the fingerprint is that of the whole dataset."""
 
     split: str
     shards: tuple[Shard, ...]

@@ -22,11 +22,7 @@ T = TypeVar("T")
 
 
 def start(task: Callable[[], T]) -> "Future[T]":
-    """Run a task in a new thread. Unlike a pool, the thread ends with its task and does not disturb forks or exits.
-
-    Returns:
-        The future of the task; ``result()`` raises the exception of the task.
-    """
+    """Run a task in a new thread. Unlike a pool, the thread ends with its task and does not disturb forks or exits."""
     future: Future[T] = Future()
 
     def run() -> None:
@@ -40,14 +36,7 @@ def start(task: Callable[[], T]) -> "Future[T]":
 
 
 class Windows:
-    """Access to the rows of an epoch by position. At most two windows are in memory, unless the whole split is.
-
-    Args:
-        source: Shards of the split.
-        row_format: Format of the rows.
-        order: Order of the rows.
-        in_memory: Rows of the split that stay in memory; None for a large split.
-    """
+    """Access to the rows of an epoch by position. At most two windows are in memory, unless the whole split is."""
 
     def __init__(
         self, source: SplitShards, row_format: RowFormat, order: Order, in_memory: InMemoryRows | None

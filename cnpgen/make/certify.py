@@ -127,8 +127,7 @@ def certified(recipe: DatasetRecipe, *, model: str | Path | None = None) -> Data
 class SceneSolver:
     """Solvers of a problem for different numbers of obstacles; residuals of absent obstacles would take most time.
 
-    Args:
-        context: Loaded problem, whose parked obstacles are the places of those of scenes.
+    The parked obstacles of the problem are the places of those of scenes.
     """
 
     def __init__(self, context: Context) -> None:

@@ -56,10 +56,7 @@ def problem_of_poses(recipe: object) -> Problem | None:
 
 
 class PoseTasks:
-    """Tasks of a problem whose goals are poses of the tip.
-
-    Args:
-        problem: The problem; its obstacles are avoided.
+    """Tasks of a problem, with its obstacles, whose goals are poses of the tip.
 
     Attributes:
         robot: Its robot.

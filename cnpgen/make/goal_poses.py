@@ -27,13 +27,7 @@ MIN_DIFFERENCE_RAD = 0.3  # rad or m, of two goal states with one pose in their 
 
 
 class EndConditions:
-    """Conditions of a problem on states at rest, except for distances of links, which ``RestingStates`` checks.
-
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        obstacles: Further obstacles.
-    """
+    """Conditions of a problem on states at rest, except for distances of links, which ``RestingStates`` checks."""
 
     def __init__(self, problem: Problem, robot: Robot, obstacles: Sequence[Obstacle] = ()) -> None:
         placed = problem.with_obstacles((*problem.obstacle, *obstacles)) if obstacles else problem
@@ -85,13 +79,10 @@ def states_of_pose(
 
 
 def nearest_states(states: Array, start: Array, robot: Robot, *, min_difference: float = 0.0) -> Array:
-    """Return at most ``MAX_GOAL_STATES`` states in the order of the straight line's duration at full speed.
+    """Return at most ``MAX_GOAL_STATES`` states [rad], shape (G, n), the nearest to the start, shape (n,), first.
 
-    Args:
-        states: Joint positions [rad], shape (G, n).
-        start: Joint positions at the start [rad], shape (n,).
-        robot: The robot.
-        min_difference: Difference of the farthest joint from a nearer state, below which a state is left out.
+    The distance is the duration of the straight line at full speed. A state is left out if its farthest joint differs
+    less than ``min_difference`` from a nearer state.
     """
     duration = (np.abs(states - start) / robot.velocity_limit).max(axis=1)
     chosen = list[Array]()

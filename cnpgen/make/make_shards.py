@@ -72,10 +72,9 @@ def prepare(job: Job) -> PreparedPipeline:
 
 
 def make_shards(job: Job, tasks: Sequence[ShardTask]) -> Iterator[tuple[int, SamplingStatistics]]:
-    """Generate, check and commit shards of one split, in order; the operation is idempotent.
+    """Generate, check and commit shards of one split, in order; yield rows and sampling statistics of each.
 
-    Yields:
-        Number of rows and sampling statistics of every committed shard.
+    The operation is idempotent.
 
     Raises:
         RecipeError: The accepted fraction of the candidates is too small.

@@ -70,14 +70,11 @@ def split_rows(recipe: DatasetRecipe, n: int) -> dict[str, int]:
 
 
 def recipe_digest(recipe: Pipeline | DatasetRecipe) -> str:
-    """Hash everything that determines the rows of a seed.
+    """Hash everything that determines the rows of a seed, as 64 hexadecimal digits (sha256).
 
     The hash covers the resolved pipeline and problem, the code of plug-ins and the content of the URDF. It does not
     cover titles, comments, paths, the seed or the splits. Writing "5 mm" for 0.005, or a default explicitly, does not
     change it. Another name, trajectory or objective changes it, although the rows stay the same.
-
-    Returns:
-        sha256, as 64 hexadecimal digits.
     """
     pipeline = recipe.pipeline if isinstance(recipe, DatasetRecipe) else recipe
     return resolved_digest(resolved(pipeline), pipeline.problem.urdf_text.encode())

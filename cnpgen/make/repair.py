@@ -32,10 +32,7 @@ def find_damaged(
     *,
     progress: Callable[[int, None], None] | None = None,
 ) -> dict[ShardTask, str]:
-    """Compare the bytes of existing shards with their sidecars, and their content with the specification.
-
-    Returns:
-        Damaged shard -> description of the damage, in order.
+    """Compare existing shards with their sidecars and the specification; return damaged shard -> description, in order.
 
     Raises:
         MachineError: A file cannot be read.

@@ -19,13 +19,10 @@ Array = NDArray[np.float64]
 
 
 def read_tasks(path: Path, fields: Mapping[str, Field], *, flat: bool) -> dict[str, Array]:
-    """Read tasks from a table.
+    """Read tasks with known fields from a table; on a table (``flat``), positions need no z.
 
-    Args:
-        path: CSV file with column names in the first line, or HDF5 file whose datasets are columns or whole fields of
-            shape (N, width); values in SI units.
-        fields: Columns that tasks may have: name -> field.
-        flat: Whether positions are on a table and need no z.
+    The file is CSV with column names in the first line, or HDF5 whose datasets are columns or whole fields of shape (N,
+    width), in SI units.
 
     Returns:
         Name -> values, shape (N,) or (N, width); (N, 2) for positions without z.

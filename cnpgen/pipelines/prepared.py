@@ -45,13 +45,7 @@ class Block:
 
 
 class PreparedPipeline:
-    """Stages with loaded kernels.
-
-    Args:
-        pipeline: Pipeline to prepare.
-        backend: Backend of the kernels.
-        cache_folder: Folder of compiled kernels.
-        dtype: Float type in which rows are stored and checked, "float64" or "float32".
+    """Stages with loaded kernels; rows are stored and checked in the float type ``dtype``.
 
     Attributes:
         context: Problem, robot and kernels.

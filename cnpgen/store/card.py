@@ -62,12 +62,8 @@ independently of the code that made the dataset.
 def card_text(summary: DatasetSummary, *, folder: str, notes: str = "", shards: str = "") -> str:
     """Return the card of a finished dataset; it depends on its rows and specification only, not on time or place.
 
-    Args:
-        summary: The finished shards.
-        folder: Name of the folder of the dataset, or of its repository on the Hugging Face Hub.
-        notes: Text about the dataset to include, in Markdown.
-        shards: Folder of the shards with a slash at its end, of a repository with a Parquet view in ``PARQUET``; empty
-            for the card of the dataset itself.
+    The folder is that of the dataset or its repository on the Hugging Face Hub, the notes are Markdown. A repository
+    with a Parquet view in ``PARQUET`` has the shards in a folder, with a slash at its end.
     """
     spec = summary.spec
     source = f'"{folder}"' if shards else f'"./{folder}"'

@@ -61,10 +61,9 @@ class Finding:
 
 
 def check_dataset(folder: Path) -> list[Finding]:
-    """Check the files of a dataset against its manifest, sidecars and specification.
+    """Return the findings about the files of a dataset, its manifest, sidecars and specification.
 
-    Returns:
-        The findings; empty if there is no problem. Of a dataset without manifest, the existing shards are checked.
+    Of a dataset without manifest, the existing shards are checked.
     """
     links = [Finding(name, OUTSIDE, hint=COPY_HINT) for name in outside_links(folder)]
     try:
@@ -184,12 +183,9 @@ def _check_sidecar(
 
 
 def check_content(folder: Path, spec: DatasetSpec, task: ShardTask) -> list[Finding]:
-    """Compare the attributes and fields of a shard with the specification.
+    """Return the differences of attributes, fields and values of a shard from the specification.
 
     Verify the sha256 of the shard before, because HDF5 can hang on a damaged file.
-
-    Returns:
-        The findings about attributes, fields, shapes, types, units, values that are not finite, and sample IDs.
     """
     path = folder / task.file
     try:

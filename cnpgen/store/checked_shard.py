@@ -88,10 +88,7 @@ def read_scenes(shard: Shard, placements: Mapping[str, StoredField] | None = Non
 
 
 def check_header(shard: Shard) -> dict[str, StoredField]:
-    """Compare position, fields, shapes, types and sample IDs of a shard with the specification.
-
-    Returns:
-        Field name -> location of its values.
+    """Compare position, fields, shapes, types and sample IDs with the specification; return the stored fields.
 
     Raises:
         DatasetError: They differ, or the file is damaged.

@@ -39,13 +39,7 @@ _CONTEXT: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class ParquetFile:
-    """A Parquet table of a split.
-
-    Attributes:
-        path: Path in the repository.
-        bytes: Size [B].
-        sha256: Checksum.
-    """
+    """A Parquet table of a split: its path in the repository, size [B] and sha256."""
 
     path: str
     bytes: int

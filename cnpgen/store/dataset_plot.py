@@ -27,11 +27,7 @@ _COLORS = {"start": "tab:blue", "goal": "tab:red"}
 
 
 def plot_dataset(inspection: Inspection, path: str | Path) -> None:
-    """Draw a dataset.
-
-    Args:
-        inspection: The dataset; it may be unfinished.
-        path: Figure file, ``.png``, ``.pdf`` or ``.svg``; replaced if it exists.
+    """Draw a dataset, possibly unfinished, to a ``.png``, ``.pdf`` or ``.svg`` file, which is replaced if it exists.
 
     Raises:
         DatasetError: There are no rows, or a shard is damaged.

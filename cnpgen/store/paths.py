@@ -51,14 +51,10 @@ def require_dataset(folder: str | Path, *, argument: str = "folder") -> Path:
 def require_file(
     path: Path, expected: str, *, kinds: Collection[str] = (), of_dataset: str = "", argument: str = "path"
 ) -> None:
-    """Raise an error if a path is not a file.
+    """Raise an error that names the argument if a path is not a file with some expected content: "a file of plans".
 
-    Args:
-        path: The path.
-        expected: Expected content: "a file of plans".
-        kinds: Kinds of files that may have this content, as ``file_kind`` returns them; any by default.
-        of_dataset: Hint in the case of the folder of a dataset.
-        argument: Name of the argument, for the error.
+    Files of other ``kinds``, as of ``file_kind``, are refused, if any are listed. ``of_dataset`` is a hint for the
+    folder of a dataset.
 
     Raises:
         UsageError: The path does not exist, is a folder, a device or a pipe, or a file of another kind.

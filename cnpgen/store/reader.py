@@ -27,11 +27,6 @@ class StoredDataset:
     """A dataset on disk. It has no open files, so it can be pickled and used in any process.
 
     The sha256 of every shard is verified before its rows are read for the first time.
-
-    Attributes:
-        folder: Folder of the dataset.
-        spec: Specification of the dataset.
-        manifest: Manifest of the dataset; None if it is unfinished.
     """
 
     folder: Path

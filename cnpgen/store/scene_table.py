@@ -150,13 +150,9 @@ def scene_attributes(families: Sequence[str]) -> dict[str, dict[str, Any]]:
 
 
 def check_scenes(table: SceneTable, obstacles: int, scene_id: NDArray[np.int64], families: int) -> None:
-    """Check the scenes of a shard.
+    """Check the scenes of a shard with a capacity of obstacles and a number of families.
 
-    Args:
-        table: Scenes of the shard.
-        obstacles: Capacity of the dataset.
-        scene_id: Scene IDs of its samples, shape (rows,).
-        families: Number of families.
+    The samples have scene IDs of shape (rows,).
 
     Raises:
         DatasetError: IDs are not those of the samples, or numbers, kinds, sizes or quaternions are invalid.

@@ -61,20 +61,10 @@ def write_shard(
     families: Sequence[str] = (),
     work: Path | None = None,
 ) -> int:
-    """Write a shard atomically, and read it back before it is renamed.
+    """Write a shard atomically, and read it back before it is renamed; return the size of the file [bytes].
 
-    Args:
-        path: The file.
-        columns: Field name -> finite values in their stored type, shape (rows, width) or (rows,).
-        fields: The fields, in order; each must have a column.
-        attributes: Attributes of the file; "rows" must be the number of rows.
-        dtype: Float type of the dataset, "float64" or "float32".
-        scenes: Scenes of the rows in their stored types; None for a dataset without scenes.
-        families: Names of the families of the scenes.
-        work: Folder of the temporary file.
-
-    Returns:
-        Size of the file [bytes].
+    Columns are finite, in their stored type, of shape (rows, width) or (rows,). Every field must have one. The
+    attribute "rows" must be their number. Scenes are in their stored types, too. The temporary file is in ``work``.
 
     Raises:
         DatasetError: The columns do not fit the fields, or are not finite.

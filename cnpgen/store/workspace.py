@@ -108,9 +108,6 @@ def open_workspace(folder: Path, spec: DatasetSpec, *, force: bool = False) -> D
     The folder is inspected again, because another process may have started the dataset while kernels were compiled. A
     specification without shards is replaced; ``force`` deletes an existing dataset.
 
-    Returns:
-        The specification in the folder (see ``started_spec``).
-
     Raises:
         UsageError: The folder contains another dataset or other files.
         DatasetError: The specification in the folder is damaged.

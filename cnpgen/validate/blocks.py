@@ -23,14 +23,7 @@ MAX_REGENERATION_ERROR_FLOAT32 = 1e-5  # in SI units; accepted difference of row
 
 @dataclass(frozen=True)
 class Regeneration:
-    """Result of the regeneration of blocks.
-
-    Attributes:
-        made: Number of regenerated blocks.
-        blocks: Number of blocks of the dataset.
-        identical: Number of regenerated blocks that are bitwise identical.
-        findings: Differences above the tolerance.
-    """
+    """Numbers of regenerated blocks, of all, and of bitwise identical ones, and differences above the tolerance."""
 
     made: int = 0
     blocks: int = 0

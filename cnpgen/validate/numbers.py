@@ -18,17 +18,7 @@ MAX_RELATIVE_SUM_ERROR = 1e-9  # accepted relative difference of sums of the sam
 
 
 def check_numbers(spec: DatasetSpec, task: ShardTask, columns: Columns, record: ShardRecord) -> list[str]:
-    """Check the rows of a shard against its specification and its record.
-
-    Args:
-        spec: Specification of the dataset.
-        task: The shard.
-        columns: All fields of the shard, shape (rows, width) or (rows,).
-        record: Record of the shard.
-
-    Returns:
-        Descriptions of the problems.
-    """
+    """Describe the problems of all rows of a shard, shape (rows, width) or (rows,), by specification and record."""
     problems = [text for field in spec.fields for text in _check_range(field, columns[field.name], task, spec.dtype)]
     problems += [text for field in spec.fields for text in _check_statistics(field, columns[field.name], record)]
     if {"hit_speed", "hit_speed_max"} <= columns.keys():

@@ -31,14 +31,7 @@ _ODD_MULTIPLIERS = np.random.default_rng(0).integers(0, 2**63, 64, dtype=np.uint
 
 @dataclass(frozen=True)
 class DeepCheck:
-    """Result of the deep check of a dataset.
-
-    Attributes:
-        rows: Report of Pinocchio and Coal on all rows; None if none could be read.
-        judged: Number of judged plans; 0 unless the dataset is certified.
-        valid: Number of valid plans.
-        findings: Problems, by file.
-    """
+    """Report of Pinocchio and Coal on all rows, numbers of judged and valid plans, and problems by file."""
 
     rows: RowReport | None = None
     judged: int = 0

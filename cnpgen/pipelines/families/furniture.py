@@ -87,16 +87,10 @@ def place_objects(
     from_above: bool,
     prefix: str = "object",
 ) -> None:
-    """Place boxes and cylinders on a rectangle without overlap, with grasps at each.
+    """Place boxes and cylinders on a rectangle without overlap, with grasps at each, from above or along x.
 
-    Args:
-        random: Random numbers.
-        furniture: Furniture in whose frame they stand.
-        area: Rectangle: lowest and highest x, lowest and highest y [m].
-        z: Height of the surface in the frame [m].
-        objects: Their number and sizes.
-        from_above: Whether the grasps approach downwards; otherwise along x.
-        prefix: Beginning of their names.
+    The area is the lowest and highest x and the lowest and highest y, at the height z, in the frame of the furniture
+    [m].
     """
     circles: list[tuple[float, float, float]] = []
     count, widths, heights = objects

@@ -183,12 +183,8 @@ def velocity_of_tip(robot: Robot) -> Any:
 def onto_table(robot: Robot, *, height: float) -> Any:
     """Build the projection ``(q, dq, ddq) -> (q, dq, ddq)`` onto states whose tip moves and accelerates on the table.
 
-    Use it for deviations as small as those of plans: three Newton steps for q, then two projections. Velocities
-    slightly above their limits are scaled to the limits.
-
-    Args:
-        robot: Robot.
-        height: Height of the table [m].
+    The table has a height [m]. Use it for deviations as small as those of plans: three Newton steps for q, then two
+    projections. Velocities slightly above their limits are scaled to the limits.
     """
     import casadi as ca
 

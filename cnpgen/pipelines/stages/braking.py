@@ -107,11 +107,7 @@ def braking_step(robot: Robot, *, height: float) -> Any:
     """Build one step of braking: ``((q, dq, overshoot), (nx, ny, edge)) -> (next state, still running)``.
 
     ``still running`` is 1 until the tip stops along the normal within the step. ``overshoot`` is then its distance
-    outside ``n . p = edge`` [m].
-
-    Args:
-        robot: Robot.
-        height: Height to which the roll-out is stabilized [m].
+    outside ``n . p = edge`` [m]. The roll-out is stabilized to a height [m].
     """
     import casadi as ca
 

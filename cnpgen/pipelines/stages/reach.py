@@ -67,8 +67,7 @@ class BallisticReach(Stage):
 def over_table(*, sides: list[list[float]] | None) -> Any:
     """Build ``(p, d) -> (ahead, both)``: whether p + d is over the table, and whether p + d and p - d both are.
 
-    Args:
-        sides: Lower and upper bound of the table along x and along y [m]; None for a third argument, both corners.
+    The sides are the bounds of the table along x and y [m]; without them, both corners are a third argument.
     """
     import casadi as ca
 

@@ -68,11 +68,7 @@ class _SceneChecker(CollisionChecker):
 
 
 class SceneClearance:
-    """Clearance of states from the obstacles of their scene and of links from each other.
-
-    Args:
-        context: Loaded problem, with link geometry.
-    """
+    """Clearance of states from the obstacles of their scene and of links from each other, for robots with geometry."""
 
     def __init__(self, context: Context) -> None:
         problem, robot = context.problem, context.robot

@@ -113,12 +113,9 @@ class SceneEnds(Stage):
 
 
 class _Pool(NamedTuple):
-    """Valid states by scene and group, such as those of one grasp.
+    """Valid joint positions q [rad], shape (n, M), by scene and group, such as those of one grasp.
 
-    Attributes:
-        q: Joint positions [rad], shape (n, M).
-        first_state: First state of each group, shape (groups + 1,).
-        first_group: First group of each scene, shape (S + 1,).
+    The first state of each group has shape (groups + 1,), the first group of each scene (S + 1,).
     """
 
     q: Array
@@ -156,12 +153,7 @@ def _make_pool(q: Array, key: Indices, scenes: int, groups: int) -> _Pool:
 
 
 class _EndStates:
-    """Valid states of the scenes of a batch, and pairs of them.
-
-    Args:
-        context: Loaded problem.
-        stage: The stage.
-    """
+    """Valid states of the scenes of a batch, and pairs of them."""
 
     def __init__(self, context: Context, stage: SceneEnds) -> None:
         self._robot: Robot = context.robot
@@ -288,16 +280,7 @@ def _is_first(key: Indices) -> NDArray[np.bool_]:
 
 
 def _rotations(approach: Array, tilt: Array, u: Array) -> Array:
-    """Return rotations whose z axis is within the tilt of an approach, by rows.
-
-    Args:
-        approach: Unit vectors, shape (K, 3).
-        tilt: Largest angles [rad], shape (K,).
-        u: Random numbers in [0, 1), shape (3, K).
-
-    Returns:
-        Shape (9, K).
-    """
+    """Return rotations, by rows, whose z axis is within a tilt of the approach; u are random numbers, shape (3, K)."""
     cosine = 1 - u[0] * (1 - np.cos(tilt))
     sine, angle, roll = np.sqrt(1 - cosine**2), 2 * np.pi * u[1], 2 * np.pi * u[2]
     first, second = _across(approach)

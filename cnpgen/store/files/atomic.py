@@ -76,11 +76,8 @@ def check_writable(path: Path) -> None:
 def committing(path: Path, work: Path | None = None) -> Iterator[Path]:
     """Yield a temporary path to write to, and rename it to ``path`` if the block ends without an error.
 
-    Several processes may write the same ``path`` at once: each has its own temporary file and the last rename wins.
-
-    Args:
-        path: The file to write; its folder is created.
-        work: Folder of the temporary file, on the same file system as ``path``; the folder of ``path`` by default.
+    Several processes may write the same ``path`` at once: each has its own temporary file and the last rename wins. The
+    temporary file is in ``work``, on the same file system, or in the folder of ``path``. Both folders are created.
 
     Yields:
         The temporary path; the block must create this file.
@@ -127,11 +124,7 @@ def write_file(path: Path, content: bytes | str, *, work: Path | None = None) ->
 
 
 def read_file(path: Path, *, max_bytes: int | None = None) -> bytes:
-    """Read a whole file.
-
-    Args:
-        path: The file.
-        max_bytes: Maximum size of the file [bytes]; unlimited by default.
+    """Read a whole file of at most ``max_bytes``, by default of any size.
 
     Raises:
         DatasetError: The file is missing, too large, or a device or a pipe, whose size is unknown.

@@ -29,12 +29,7 @@ _CHANGED = f"{{}} is damaged: its first {HEADER_BYTES} bytes were changed"
 
 @dataclass(frozen=True)
 class Content:
-    """The content of a file with a checksum.
-
-    Attributes:
-        arrays: Dataset name -> numbers.
-        texts: Dataset name -> text, stored as UTF-8 bytes.
-    """
+    """Numbers, and texts as UTF-8 bytes, in a file with a checksum, by the name of their dataset."""
 
     arrays: Mapping[str, NDArray[Any]]
     texts: Mapping[str, str]

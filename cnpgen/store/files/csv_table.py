@@ -13,13 +13,7 @@ from cnpgen.store.files.size_limits import MAX_TABLE_BYTES, MAX_TABLE_COLUMNS
 
 @dataclass(frozen=True)
 class CsvTable:
-    """Table with column names in its first line.
-
-    Attributes:
-        path: The file, for messages.
-        names: Names of the columns, all different.
-        lines: Number of the line in the file and its cells, for every row.
-    """
+    """Table with different column names in its first line; the other lines have their number in the file."""
 
     path: Path
     names: tuple[str, ...]

@@ -38,11 +38,7 @@ def create_hdf5(buffer: io.BytesIO, *, userblock: int = 0, alignment: int = 64) 
     """Create an HDF5 file in ``buffer``; wrap it in ``h5py.File``.
 
     The file format is pinned. The root group stores no times; older versions of ``h5py.File`` cannot switch them off.
-
-    Args:
-        buffer: Buffer of the file.
-        userblock: Size of the user block at the beginning [bytes].
-        alignment: Alignment of datasets, which allows to map them into memory as aligned arrays [bytes].
+    The file begins with a user block [bytes]. The alignment [bytes] allows to map datasets into memory as arrays.
     """
     from h5py import h5f, h5fd, h5p
 
@@ -86,12 +82,7 @@ class Column:
 
 @dataclass(eq=False)
 class Hdf5:
-    """An open file: a mapping from names at its root to datasets of plain numbers; groups are skipped.
-
-    Attributes:
-        path: Path of the file, for messages.
-        attributes: Attributes of the file.
-    """
+    """An open file: a mapping from names at its root to datasets of plain numbers; groups are skipped."""
 
     path: Path
     attributes: Attributes

@@ -35,12 +35,7 @@ def append_line(path: Path, line: str) -> None:
 
 @dataclass
 class JournalFile:
-    """An open journal, locked for this process.
-
-    Attributes:
-        path: Path of the file.
-        records: Valid records of the file, in order.
-    """
+    """An open journal with the valid records of the file in order, locked for this process."""
 
     path: Path
     records: list[bytes]
