@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from cnpgen.errors import UsageError
 from cnpgen.loader.batch import Batch
 from cnpgen.loader.batch_partition import BatchPartition
-from cnpgen.loader.in_memory_rows import InMemoryRows, make_in_memory_rows
 from cnpgen.loader.order import Order
+from cnpgen.loader.packed import InMemoryRows, make_in_memory_rows
 from cnpgen.loader.position import Position, position_from_json, position_to_json
 from cnpgen.loader.row_format import RowFormat
 from cnpgen.loader.shard_reader import SplitShards

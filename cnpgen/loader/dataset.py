@@ -17,13 +17,12 @@ from cnpgen.loader.batch_partition import BatchPartition
 from cnpgen.loader.batches import Batches, Observe
 from cnpgen.loader.columns import select_columns
 from cnpgen.loader.frame import make_frame
-from cnpgen.loader.gather import Rows, gather
+from cnpgen.loader.gather import Rows, Split, gather
 from cnpgen.loader.normalization import Normalization, make_normalization
 from cnpgen.loader.position import checked_position
 from cnpgen.loader.row_format import RowFormat, make_row_format
 from cnpgen.loader.scene_columns import OBSTACLE_POSES, problem_obstacles, scene_fields
 from cnpgen.loader.shard_reader import ShardReader, SplitShards
-from cnpgen.loader.split import Split
 from cnpgen.robots.observation.observations import Observation
 from cnpgen.robots.scene import Scene
 from cnpgen.schema.argument_types import checked_arguments

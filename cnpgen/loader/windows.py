@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.loader.batch import Batch
-from cnpgen.loader.in_memory_rows import InMemoryRows
 from cnpgen.loader.order import Order
-from cnpgen.loader.packed import Packed, empty_packed, pack
+from cnpgen.loader.packed import InMemoryRows, Packed, empty_packed, pack
 from cnpgen.loader.row_format import RowFormat
 from cnpgen.loader.shard_reader import SplitShards
 

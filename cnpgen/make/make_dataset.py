@@ -145,8 +145,7 @@ def carry_out(
 
     The arguments are those of ``make_dataset``; ``notes`` is the text of the data card.
     """
-    every, (k, m) = shards(job.spec), part or (0, 1)
-    tasks = every[k * len(every) // m : (k + 1) * len(every) // m]  # consecutive shards may share a block
+    tasks = _part(shards(job.spec), part)
     missing, damaged = _missing_shards(job, tasks, begin, progress)
     if begin is not None:
         rows = sum(task.rows for task in tasks)
@@ -160,6 +159,12 @@ def carry_out(
     complete, documents = finish(job.folder, job.spec, notes, made=made, exclusive=part is None)
     rows_of = {split: sum(task.rows for task in tasks if task.split == split) for split in job.spec.splits}
     return MadeDataset(job.folder, job.spec, made, complete, rows_of, (*damaged, *documents))
+
+
+def _part(tasks: list[ShardTask], part: tuple[int, int] | None) -> list[ShardTask]:
+    """Return one part of the shards; consecutive shards, which may share a block, stay together."""
+    k, m = part or (0, 1)
+    return tasks[k * len(tasks) // m : (k + 1) * len(tasks) // m]
 
 
 def _missing_shards(
@@ -189,12 +194,16 @@ def _results(job: Job, tasks: list[ShardTask], engine: Engine) -> Generator[tupl
             for group in groups:
                 yield from make_shards(job, group)
             return
-        if pool.is_remote:  # remote machines share only the folder of the dataset
-            job = replace(job, folder=job.folder.absolute(), pipeline=None, cache_folder=None)
+        worker_job = _without_local_paths(job) if pool.is_remote else job
         hint = f": the shards that are finished are safe in {job.folder}; {RERUN_HINT} to go on"
-        with closing(pool.distribute(partial(_make_run, job), groups, hint=hint)) as results:
+        with closing(pool.distribute(partial(_make_run, worker_job), groups, hint=hint)) as results:
             for made in results:
                 yield from made
+
+
+def _without_local_paths(job: Job) -> Job:
+    """Return the job for a remote machine, which shares only the folder of the dataset."""
+    return replace(job, folder=job.folder.absolute(), pipeline=None, cache_folder=None)
 
 
 def _make_run(job: Job, tasks: Sequence[ShardTask]) -> list[tuple[int, SamplingStatistics]]:

@@ -61,13 +61,13 @@ def _problem(folder: Path, spec: DatasetSpec, task: ShardTask) -> str:
 
 
 def delete_shards(folder: Path, tasks: Sequence[ShardTask]) -> None:
-    """Delete shards of a dataset, which is unfinished from then on.
+    """Delete shards and the manifest of a dataset, which is unfinished from then on.
 
     Raises:
         MachineError: A file cannot be deleted.
     """
-    names = [MANIFEST, *(name for task in tasks for name in (task.sidecar, task.file))] if tasks else []
-    for name in names:  # first the manifest and the sidecars, which mark data as complete
+    # First the manifest and the sidecars, which mark data as complete.
+    for name in (MANIFEST, *(name for task in tasks for name in (task.sidecar, task.file))):
         try:
             (folder / name).unlink(missing_ok=True)
         except OSError as error:

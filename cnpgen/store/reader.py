@@ -1,6 +1,6 @@
 """Reading the rows of a dataset as they are stored."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -45,21 +45,6 @@ class StoredDataset:
         if self.manifest is None:
             return [task for task in tasks if is_committed(self.folder, self.spec, task)]
         return tasks
-
-    def iter_shards(
-        self, split: str, *, fields: Sequence[str] | None = None
-    ) -> Iterator[tuple[ShardTask, dict[str, NDArray[Any]]]]:
-        """Read the shards of a split one by one, by default all fields in the order of the specification.
-
-        Yields:
-            The shard and field name -> values, shape (rows, width) or (rows,).
-
-        Raises:
-            DatasetError: There is no such split or field, or a shard is damaged.
-        """
-        names = self._names(fields)
-        for task in self.tasks(split):
-            yield task, read_rows(self._checked(task), names)
 
     def read(
         self, split: str, *, fields: Sequence[str] | None = None, start: int = 0, stop: int | None = None

@@ -27,7 +27,6 @@ class BehindPuck(Stage):
     )
 
     def describe(self) -> str:
-        """Describe the stage in one sentence."""
         return f"take the goal for the puck's centre: the tip meets it {1e3 * self.distance:g} mm behind, along the hit"
 
     def outputs(self, context: Context) -> tuple[Field, ...]:

@@ -38,7 +38,6 @@ class BrakingReach(Stage):
     )
 
     def describe(self) -> str:
-        """Describe the stage in one sentence."""
         return (
             f"require that full braking ends at least {1e3 * self.margin:g} mm before every edge of the table, from"
             " the start forwards and from the goal backwards in time (loses about 0.15 % of the solvable problems,"
@@ -46,7 +45,6 @@ class BrakingReach(Stage):
         )
 
     def prepare(self, context: Context) -> StageFunction:
-        """Load the kernels."""
         table = context.constraint(Table)
         tip = context.kernels.load(tip_state)
         brake = context.kernels.load(braking_step, Loop(0.5, MAX_BRAKING_STEPS), height=table.z)

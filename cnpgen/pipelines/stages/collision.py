@@ -45,7 +45,6 @@ class Collision(Stage):
         return (*(f"{end}_q" for end in self._ends()), "start_xyz", "goal_xyz")
 
     def describe(self) -> str:
-        """Describe the stage in one sentence."""
         ends = "both ends" if self.end == "both" else f"the {self.end} configuration"
         how = "by an exact segment-to-box test" if self.judge == "segments" else "checked by Coal with arm and object"
         return f"require {ends} to be free of collision, {how}"

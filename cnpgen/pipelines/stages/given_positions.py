@@ -49,7 +49,6 @@ class GivenPositions(Stage):
         return len(self.goal) or math.prod(self.counts)
 
     def describe(self) -> str:
-        """Describe the stage in one sentence."""
         goals = "goals in a list" if self.goal else f"goals on a grid of {' x '.join(map(str, self.counts))}"
         origin = "listed start positions" if self.start else "the base configuration"
         return f"take {self.tasks:,} {goals}, one after the other, from {origin}"

@@ -42,7 +42,6 @@ class HittingVelocity(Stage):
     min_speed: float = field("minimum of the maximum speed of a hit", unit="m/s", default=1e-3, low=1e-9)
 
     def describe(self) -> str:
-        """Describe the stage in one sentence."""
         slower = (
             f"; scale it uniformly in [0, 1) in {1 - self.full_speed:.4g} of the cases" if self.full_speed < 1 else ""
         )
@@ -63,8 +62,6 @@ class HittingVelocity(Stage):
         )
 
     def prepare(self, context: Context) -> StageFunction:
-        """Load the kernel."""
-
         def draw_share(candidates: CandidateBatch, random: np.random.Generator, _speed: Array) -> Array:
             factor, choice = candidates.draw(random, 1), candidates.draw(random, 1)
             return np.where(choice < self.full_speed, 1.0, factor)
@@ -166,10 +163,8 @@ def maximise(a: Vec, b: list[Vec], limit: list[float]) -> tuple[Vec, Scalar]:
         usable = ca.fabs(det) > PARALLEL_TOLERANCE * size
         inverse = 1.0 / ca.if_else(usable, det, 1.0)
         candidate = [(a[i] * b[j][1] - b[i][1] * a[j]) * inverse, (b[i][0] * a[j] - a[i] * b[j][0]) * inverse]
-        value: Scalar = 0.0
-        for k in range(n):
-            if k not in (i, j):
-                value = value + limit[k] * ca.fabs(a[k] - dot(b[k], candidate))
+        others = (k for k in range(n) if k not in (i, j))
+        value = sum((limit[k] * ca.fabs(a[k] - dot(b[k], candidate)) for k in others), 0.0)
         better = ca.logic_and(usable, value < best)
         best = ca.if_else(better, value, best)
         y = [ca.if_else(better, new, old) for new, old in zip(candidate, y, strict=True)]
@@ -191,10 +186,7 @@ def _smallest_ratio(b: list[Vec], limit: list[float], target: Vec) -> Vec:
     pivot: Vec = [ca.SX(0), ca.SX(0)]
     for j in range(n):
         normal = [-b[j][1], b[j][0]]
-        weight: Scalar = 0.0
-        for k in range(n):
-            if k != j:
-                weight = weight + limit[k] * ca.fabs(dot(b[k], normal))
+        weight = sum((limit[k] * ca.fabs(dot(b[k], normal)) for k in range(n) if k != j), 0.0)
         size = dot(normal, normal)
         usable = weight > PARALLEL_TOLERANCE * ca.sqrt(size) * 1e-3
         value = dot(target, normal) / ca.if_else(usable, weight, 1.0)
@@ -212,9 +204,7 @@ def _smallest_ratio(b: list[Vec], limit: list[float], target: Vec) -> Vec:
     ]
     left = [target[c] - dot([x[c] for x in b], v) for c in range(2)]
     shares = [ca.if_else(same, bound * dot(x, pivot), 0.0) for same, bound, x in zip(parallel, limit, b, strict=True)]
-    total: Scalar = 0.0
-    for share in shares:
-        total = total + ca.fabs(share)
+    total = sum(map(ca.fabs, shares), 0.0)
     amount = dot(left, pivot) / ca.if_else(total > 0, total, 1.0)
     along = [
         ca.if_else(same, amount * bound * ca.sign(dot(x, pivot)), 0.0)

@@ -131,15 +131,12 @@ class StartIK(GuessedIK):
     inputs = ("start_xyz",)
 
     def describe(self) -> str:
-        """Describe the stage in one sentence."""
         return f"solve the start configuration{self._how()} from {self._origin()}"
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
-        """List the field of the start configuration."""
         return (context.joint_field("start_q", "rad", "joint positions at the start"),)
 
     def prepare(self, context: Context) -> StageFunction:
-        """Load the kernel."""
         return self._solve_guessed(context, "start")
 
 
@@ -173,7 +170,6 @@ class GoalIK(GuessedIK):
                 yield name, "needs random guesses: give guess, too"
 
     def describe(self) -> str:
-        """Describe the stage in one sentence."""
         origin = self._origin() if self.guess else "the start configuration"
         if self.from_start:
             origin += f", but in {100 * self.from_start:.4g} % of the cases from the start configuration"
@@ -182,11 +178,9 @@ class GoalIK(GuessedIK):
         return f"solve the goal configuration{self._how()} from {origin}"
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
-        """List the field of the goal configuration."""
         return (context.joint_field("goal_q", "rad", "joint positions at the goal", "target"),)
 
     def prepare(self, context: Context) -> StageFunction:
-        """Load the kernel."""
         search, max_change = self._search(context), self.max_change
         if max_change is None:
             return search

@@ -68,7 +68,6 @@ class SceneEnds(Stage):
             yield "random", f"the shares of starts must add up to 1, got {total:g}"
 
     def describe(self) -> str:
-        """Describe the stage in one sentence."""
         kinds = f"near the base configuration {100 * self.neutral:.3g} %, at other grasps {100 * self.grasp:.3g} %"
         return (
             f"choose collision-free goals at grasps and starts ({kinds}, random {100 * self.random:.3g} %) that a"
@@ -92,7 +91,6 @@ class SceneEnds(Stage):
 
     def complete(self, context: Context, given: Collection[str]) -> StageFunction:
         """Keep the joint positions of tasks."""
-        del context, given
         return leave
 
     def prepare(self, context: Context) -> StageFunction:

@@ -186,7 +186,6 @@ class TaskBatch(CandidateBatch):
 
     def draw(self, random: np.random.Generator, width: int) -> Array:
         """Return 0.5 for every remaining task, shape (width, n)."""
-        del random
         return np.full((width, len(self.alive)), 0.5)
 
     def why(self) -> tuple[str, ...]:
