@@ -48,7 +48,6 @@ class CertifiedPlan(Stage):
     )
 
     def describe(self) -> str:
-        """Describe the stage in one sentence."""
         origin = f"from the plan of {self.model!r}" if self.model else "from nothing"
         return (
             f"plan every sample {origin} (sequential quadratic programming, several starts) and keep those whose"
@@ -78,11 +77,9 @@ class CertifiedPlan(Stage):
 
     def task_inputs(self, context: Context) -> tuple[Field, ...]:
         """Return no fields: tasks have no plans."""
-        del context
         return ()
 
     def prepare(self, context: Context) -> StageFunction:
-        """Load the refiner."""
         if context.dtype != "float64":
             raise RecipeError([f"plans meet their boundary conditions in float64 only: needs it, got {context.dtype}"])
         solver = load_solver(context.problem, context.robot, context.kernels)

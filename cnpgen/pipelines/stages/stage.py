@@ -131,7 +131,6 @@ class Stage(ABC):
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
         """List the stored fields that this stage writes, in order; by default none."""
-        del context
         return ()
 
     def writes(self, context: Context) -> tuple[str, ...]:
