@@ -145,9 +145,8 @@ class Batches:
         if epoch is not None or batch is not None:
             used = integer("batch", batch or 0, least=0)
             if used > len(self):
-                raise UsageError(
-                    f"must be at most {len(self)}, the number of batches of an epoch, got {used}", argument="batch"
-                )
+                text = f"must be at most {len(self)}, the number of batches of an epoch, got {used}"
+                raise UsageError(text, argument="batch")
             row = min(used * self._partition.batch_size, self._source.rows)
             epoch = position.epoch if epoch is None else integer("epoch", epoch, least=0)
             position = self._forward(replace(position, epoch=epoch, row=row))

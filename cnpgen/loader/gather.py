@@ -25,12 +25,7 @@ class RowError(UsageError, IndexError):
 
 
 def gather(source: SplitShards, indices: ArrayLike, layout: Columns) -> Rows:
-    """Read single rows.
-
-    Args:
-        source: Shards of the split.
-        indices: Indices of the rows, shape (k,); negative ones count from the end.
-        layout: The fields.
+    """Read single rows by their indices, shape (k,); negative ones count from the end.
 
     Returns:
         Field name -> values as stored, shape (k, width) or (k,), in the order of the indices.
@@ -64,9 +59,8 @@ def _checked(indices: ArrayLike, source: SplitShards) -> Indices:
         raise UsageError(f"must be a list of integers, got {rows.dtype} of shape {rows.shape}", argument="indices")
     wrong = (rows < -source.rows) | (rows >= source.rows)
     if wrong.any():
-        raise RowError(
-            f"split {source.split!r} has {source.rows} rows, there is no row {rows[wrong][0]}", concerns="indices"
-        )
+        text = f"split {source.split!r} has {source.rows} rows, there is no row {rows[wrong][0]}"
+        raise RowError(text, concerns="indices")
     return np.where(rows < 0, rows + source.rows, rows).astype(np.int64)
 
 

@@ -80,9 +80,8 @@ def _check_rows(spec: DatasetSpec, shards: Iterable[Shard]) -> None:
     width = sum(max(field.width, 1) * storage_dtype(field, spec.dtype).itemsize for field in spec.fields)
     for shard in shards:
         if shard.rows * width > max(MAX_EXPANSION * shard.size, MIN_EXPANSION_LIMIT_BYTES):
-            raise DatasetError(
-                f"{shard.path} has {shard.size:,} bytes, too few for the {shard.rows:,} rows of {SPECIFICATION}"
-            )
+            text = f"{shard.path} has {shard.size:,} bytes, too few for the {shard.rows:,} rows of {SPECIFICATION}"
+            raise DatasetError(text)
 
 
 def _present(
@@ -92,7 +91,6 @@ def _present(
     problems = [problem for part in shards.values() for shard in part if (problem := shard.problem())]
     if problems and not allow_incomplete:
         more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
-        raise DatasetError(
-            f"{folder} is damaged: {problems[0]}{more}; {RERUN_HINT}, or omit the shard with allow_incomplete=True"
-        )
+        text = f"{folder} is damaged: {problems[0]}{more}; {RERUN_HINT}, or omit the shard with allow_incomplete=True"
+        raise DatasetError(text)
     return {split: tuple(shard for shard in part if not shard.problem()) for split, part in shards.items()}

@@ -58,9 +58,8 @@ def make_row_format(
 
 def _own(spec: DatasetSpec, own: Normalization | None, normalize: object) -> Normalization | None:
     if not isinstance(normalize, bool | np.bool_):
-        raise UsageError(
-            f"must be True, False or the normalization of a dataset, got {normalize!r:.100}", argument="normalize"
-        )
+        text = f"must be True, False or the normalization of a dataset, got {normalize!r:.100}"
+        raise UsageError(text, argument="normalize")
     if normalize and own is None:
         raise DatasetError(
             f"{spec.name} has no training rows for the normalization; pass normalize=False, or the normalization of"

@@ -28,11 +28,7 @@ class ShardReader:
     """Reader of fields of shards; every shard and every field is checked when it is read for the first time.
 
     Its only open files are the memory maps of the last shards. It can be used by several threads, forked, and pickled
-    without its maps.
-
-    Args:
-        verify: Whether to verify the sha256 of each shard; otherwise its size, header and values are checked.
-        obstacles: Obstacles of the problem of a dataset with scenes.
+    without its maps. Without ``verify``, size, header and values of a shard are checked, but not its sha256.
     """
 
     def __init__(self, *, verify: bool, obstacles: Sequence[Obstacle] = ()) -> None:

@@ -59,19 +59,12 @@ class CertifiedPlan(Stage):
         spec, joints = context.problem.trajectory, context.robot.joint_names
         points, rates = spec.path_control_points, spec.rate_control_points
         path_names = tuple(f"C{point}.{joint}" for point in range(points) for joint in joints)
-        shape = f"({points}, {len(joints)})"
-        text = f"control points of the path p(s) of a valid plan, reshape to {shape}"
-        units = context.robot.units("rad")
+        rate_names = tuple(f"R{point}" for point in range(rates))
+        text = f"control points of the path p(s) of a valid plan, reshape to ({points}, {len(joints)})"
+        units, rate_text = context.robot.units("rad"), "control points of its rate r(s) = ds/dt"
         return (
             Field("path_control_points", units, text, points * len(joints), path_names, role="target"),
-            Field(
-                "rate_control_points",
-                "1/s",
-                "control points of its rate r(s) = ds/dt",
-                rates,
-                tuple(f"R{point}" for point in range(rates)),
-                role="target",
-            ),
+            Field("rate_control_points", "1/s", rate_text, rates, rate_names, role="target"),
             Field("duration", "s", "its motion time", role="target"),
         )
 

@@ -93,9 +93,8 @@ def _extended(folder: Path, begun: DatasetSpec, recipe: DatasetRecipe, n: int) -
     if splits == begun.splits:
         return begun
     if any(splits.get(split, 0) < rows for split, rows in begun.splits.items()):
-        raise UsageError(
-            f"{folder} has {sum(begun.splits.values()):,} rows: choose a larger {{n}}, got {n:,}", remedies={"n": None}
-        )
+        text = f"{folder} has {sum(begun.splits.values()):,} rows: choose a larger {{n}}, got {n:,}"
+        raise UsageError(text, remedies={"n": None})
     if not makes_its_rows(recipe, begun):
         raise UsageError(
             f"{folder} was made by another version of cnpgen or of its plug-ins, and this version generates other rows"

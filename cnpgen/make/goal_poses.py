@@ -58,6 +58,8 @@ def states_of_pose(
     states: RestingStates | None,
     conditions: EndConditions,
     pose: GoalPose,
+    *,
+    start: Array,
     random: np.random.Generator,
 ) -> tuple[Array, Array]:
     """Return joint positions with a goal pose of a frame.
@@ -65,7 +67,8 @@ def states_of_pose(
     Robots without link geometry have no ``states`` of rest in a scene. ``random`` draws the seeds.
 
     Returns:
-        Joint positions that can end a motion, and all with this pose [rad], shape (G, n) and (H, n).
+        Joint positions that can end a motion, the nearest to the start (n,) first, and all with this pose [rad], shape
+        (G, n) and (H, n).
     """
     positions, rotations = np.tile(pose.position, (POSE_SEEDS, 1)), np.tile(pose.rotation, (POSE_SEEDS, 1, 1))
     tolerances = [np.tile(np.broadcast_to(each, 3), (POSE_SEEDS, 1)) for each in pose.tolerances]
@@ -75,7 +78,7 @@ def states_of_pose(
     found = q[:, met]
     valid = found if states is None else found[:, states.are_ends(found)]
     valid = valid[:, conditions.met(valid)]
-    return valid.T.copy(), found.T.copy()
+    return nearest_states(valid.T, start, kinematics.robot, min_difference=MIN_DIFFERENCE_RAD), found.T.copy()
 
 
 def nearest_states(states: Array, start: Array, robot: Robot, *, min_difference: float = 0.0) -> Array:

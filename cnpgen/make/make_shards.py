@@ -121,9 +121,7 @@ def shard_columns(
         parts: list[Block] = []
         while sum(part.columns["sample_id"].shape[1] for part in parts) < task.rows:
             parts.append(next(chunks))
-        columns = {
-            field.name: _stored([part.columns[field.name] for part in parts], field, spec) for field in spec.fields
-        }
+        columns = stored_columns(parts, spec.fields, spec.dtype)
         tables = [part.scenes.astype(spec.dtype) for part in parts if part.scenes is not None]
         scenes = concatenate_scenes(tables) if tables else None
         yield columns, merge_sampling([part.sampling for part in parts]), scenes
@@ -148,10 +146,13 @@ def blocks_of(task: ShardTask, size: int) -> range:
     return range(task.first_row // size, (task.first_row + task.rows - 1) // size + 1)
 
 
-def _stored(parts: list[NDArray[Any]], field: Field, spec: DatasetSpec) -> NDArray[Any]:
-    """Concatenate chunks of shape (width, rows) to the stored values of a field, shape (rows, width) or (rows,)."""
-    rows = np.concatenate(parts, axis=1).T
-    return np.ascontiguousarray(rows if field.width else rows[:, 0], storage_dtype(field, spec.dtype))
+def stored_columns(parts: Sequence[Block], fields: Sequence[Field], dtype: str) -> dict[str, NDArray[Any]]:
+    """Concatenate chunks to the stored values of their fields, shape (rows, width) or (rows,) each."""
+    columns = {}
+    for item in fields:
+        rows = np.concatenate([part.columns[item.name] for part in parts], axis=1).T
+        columns[item.name] = np.ascontiguousarray(rows if item.width else rows[:, 0], storage_dtype(item, dtype))
+    return columns
 
 
 def spot_check(

@@ -29,11 +29,7 @@ MAX_LISTED_SHARDS = 3  # in an error message
 
 @checked_arguments
 def merge_datasets(
-    parts: Sequence[str | Path],
-    out: str | Path,
-    *,
-    begin: Begin | None = None,
-    progress: Progress | None = None,
+    parts: Sequence[str | Path], out: str | Path, *, begin: Begin | None = None, progress: Progress | None = None
 ) -> MadeDataset:
     """Merge parts that ``make_dataset(..., part=(k, m))`` generated in separate folders, or continue a merge.
 

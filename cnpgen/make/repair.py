@@ -26,11 +26,7 @@ def existing_shards(folder: Path, tasks: Sequence[ShardTask]) -> list[ShardTask]
 
 
 def find_damaged(
-    folder: Path,
-    spec: DatasetSpec,
-    tasks: Sequence[ShardTask],
-    *,
-    progress: Callable[[int, None], None] | None = None,
+    folder: Path, spec: DatasetSpec, tasks: Sequence[ShardTask], *, progress: Callable[[int, None], None] | None = None
 ) -> dict[ShardTask, str]:
     """Compare existing shards with their sidecars and the specification; return damaged shard -> description, in order.
 

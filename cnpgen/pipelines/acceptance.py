@@ -102,11 +102,8 @@ def boundary_unmet(
             if condition.sufficient:
                 continue
             if symbolic_needs(condition, *columns[1:3]) <= needs and (exact or condition.name in along):
-                tolerance = (
-                    condition.tolerance(dtype)
-                    if exact
-                    else np.maximum(along[condition.name], condition.tolerance(dtype))
-                )
+                tolerance = condition.tolerance(dtype)
+                tolerance = tolerance if exact else np.maximum(along[condition.name], tolerance)
                 count = count + unmet(condition, tolerance)
         rows.append(count)
     miss = subtract(p, state.kinematics.tip)

@@ -84,12 +84,9 @@ class PreparedPipeline:
         return block
 
     def chunks(self, seed: int, split: str, index: int, ranges: Sequence[tuple[int, int]]) -> Iterator[Block]:
-        """Compute several ranges of rows of one block and sample the block only once.
+        """Compute several ranges of rows of one block, sampled only once, and yield each as soon as it is complete.
 
         The ranges (first, exclusive end) ascend without overlap.
-
-        Yields:
-            The rows of every chunk, as soon as they are complete.
 
         Raises:
             RecipeError: The accepted fraction of the candidates is below ``MIN_ACCEPTANCE``.
@@ -174,10 +171,9 @@ class BlockChunk:
         self._cells = {field.name: np.zeros((2, DENSITY_CELLS**2), np.int64) for field in self._maps}
 
     def take(self, candidates: CandidateBatch, accepted: int) -> bool:
-        """Append the rows of a batch that belong to the chunk; ``accepted`` rows of the block came before the batch.
+        """Append the rows of a batch, after ``accepted`` rows of the block; return whether the chunk is complete.
 
-        Returns:
-            Whether the chunk is complete; the batch may contain rows of the next chunk.
+        The batch may contain rows of the next chunk.
         """
         taken = candidates.alive[: self.stop - accepted]
         end = accepted + len(taken)

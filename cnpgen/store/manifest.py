@@ -55,20 +55,15 @@ def finalize(folder: Path, spec: DatasetSpec, *, notes: str = "") -> dict[str, A
     write_file(folder / CROISSANT, render(croissant) + "\n")
     manifest = _manifest(folder, summary, created=created)
     save_document(folder / MANIFEST, manifest)
-    _remove_work(folder / WORK)
+    remove_all_temporary(folder / WORK)
+    with suppress(OSError):  # other files in it are kept
+        (folder / WORK).rmdir()
     return cast(dict[str, Any], plain(manifest))
 
 
 def _name(folder: Path) -> str:
     """Return the name of a folder as text; bytes that are not UTF-8 are replaced by question marks."""
     return os.fsencode(folder.resolve().name).decode(errors="replace")
-
-
-def _remove_work(work: Path) -> None:
-    """Remove the folder of temporary files after all shards are committed; other files in it are kept."""
-    remove_all_temporary(work)
-    with suppress(OSError):
-        work.rmdir()
 
 
 def load_manifest(folder: Path) -> dict[str, Any]:
@@ -85,7 +80,7 @@ def lists_shards_of(manifest: dict[str, Any], spec: DatasetSpec) -> bool:
 
     Only these file names are opened: no path in a manifest can lead outside the folder of the dataset.
     """
-    listed = {split: [_location(entry) for entry in content["shards"]] for split, content in manifest["splits"].items()}
+    listed = {split: [_location(item) for item in part["shards"]] for split, part in manifest["splits"].items()}
     expected: dict[str, list[tuple[str, str, int, int]]] = {split: [] for split in spec.splits}
     for task in shards(spec):
         expected[task.split].append((task.file, task.sidecar, task.first_row, task.rows))
@@ -122,9 +117,8 @@ def _created(summary: DatasetSummary) -> str:
         instant = datetime.fromtimestamp(int(last), UTC) if fixed is None else fixed
         return instant.strftime("%Y-%m-%dT%H:%M:%SZ")
     except (ValueError, OverflowError, OSError) as error:
-        raise DatasetError(
-            f"the creation time of the dataset is unknown: the record of a shard has no valid start time ({error})"
-        ) from error
+        text = f"the creation time of the dataset is unknown: the record of a shard has no valid start time ({error})"
+        raise DatasetError(text) from error
 
 
 def _manifest(folder: Path, summary: DatasetSummary, *, created: str) -> dict[str, Any]:

@@ -26,15 +26,9 @@ _SIZES_TEXT = "edge lengths of a box; otherwise radius, length along the z axis 
 
 @dataclass(frozen=True)
 class SceneArray:
-    """Description of one array of a scene table.
+    """Description of one array of a scene table; its convention is the order of the values, or their code.
 
-    Attributes:
-        name: Name of the HDF5 dataset.
-        unit: SI unit.
-        long_name: Description in a few words.
-        dtype: "float" or "int64".
-        per_obstacle: Number of values of each obstacle, 0 for one value; None for one value of each scene.
-        convention: Order of the values, or their code.
+    ``per_obstacle`` is the number of values of each obstacle, 0 for one value; None for one value of each scene.
     """
 
     name: str
@@ -102,10 +96,7 @@ class SceneTable:
         return ((item.name, getattr(self, item.name)) for item in fields(self))
 
     def rows_of(self, scene_id: NDArray[np.int64]) -> NDArray[np.intp]:
-        """Return the index of the scene of each sample.
-
-        Args:
-            scene_id: Scene IDs of N samples, shape (N,).
+        """Return the index of the scene of each of N samples with scene IDs, shape (N,).
 
         Raises:
             DatasetError: There is no such scene.

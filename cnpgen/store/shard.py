@@ -161,14 +161,9 @@ def read_attributes(path: Path, names: Sequence[str] | None = None) -> dict[str,
 
 @dataclass(frozen=True, eq=False)
 class StoredField:
-    """Description of an HDF5 dataset in a shard.
+    """Shape, stored type and attributes of an HDF5 dataset in a shard; without attributes if they were not read.
 
-    Attributes:
-        shape: Shape of the dataset.
-        dtype: Stored type.
-        offset: Position of the first value in the file [bytes]; None if they are stored in chunks or compressed, which
-            cnpgen does not do.
-        attributes: HDF5 attributes; empty if they were not read.
+    The offset is the position of the first value in the file [bytes]; None for chunks, which cnpgen does not write.
     """
 
     shape: tuple[int, ...]

@@ -187,9 +187,8 @@ def load_committed(folder: Path, spec: DatasetSpec, task: ShardTask) -> ShardRec
     """
     record = load_record(folder, task)
     if record.specification_fingerprint != spec.version_with(task).fingerprint:
-        raise DatasetError(
-            f"{folder / task.sidecar} belongs to another specification ({record.specification_fingerprint[:12]}...)"
-        )
+        text = f"{folder / task.sidecar} belongs to another specification ({record.specification_fingerprint[:12]}...)"
+        raise DatasetError(text)
     path = folder / task.file
     size = path.stat().st_size if path.is_file() else None
     if size != record.bytes:

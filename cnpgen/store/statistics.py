@@ -131,14 +131,9 @@ def are_of(statistics: Mapping[str, FieldStatistics], fields: Sequence[Field]) -
 
 
 def field_statistics(values: NDArray[Any], field: Field) -> FieldStatistics:
-    """Compute the statistics of one field.
+    """Compute the statistics of the columns of one field from at least one row, shape (rows, width) or (rows,).
 
-    Args:
-        values: Values of the field, shape (rows, width) or (rows,), at least one row.
-        field: The field; histograms need two finite limits.
-
-    Returns:
-        The statistics of the columns.
+    Histograms need two finite limits.
     """
     # Sums over long contiguous rows are fast.
     columns = np.ascontiguousarray(np.asarray(values, np.float64).reshape(len(values), -1).T)

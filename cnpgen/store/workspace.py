@@ -243,9 +243,8 @@ def check_clearable(workspace: Workspace) -> list[Path]:
         named = [folder / split for split in spec.splits]
     splits = [split for split in named if split.is_dir()]
     if foreign := _foreign(folder, splits):
-        raise UsageError(
-            f"{folder} holds {foreign.relative_to(folder)}, which is not part of the dataset: move it away first"
-        )
+        text = f"{folder} holds {foreign.relative_to(folder)}, which is not part of the dataset: move it away first"
+        raise UsageError(text)
     return splits
 
 

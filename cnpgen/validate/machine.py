@@ -25,16 +25,9 @@ OPTIONAL_MODULES = ("matplotlib",)
 PROJECTS = {"pinocchio": "pin"}  # on PyPI, where it is not called like its module
 
 VARIABLES = (
-    "OMP_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "VECLIB_MAXIMUM_THREADS",
-    "LOKY_MAX_CPU_COUNT",
-    "CC",
-    "CNPGEN_CACHE",
-    "XDG_CACHE_HOME",
-    "PYTHONPATH",
-)
+    "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS", "LOKY_MAX_CPU_COUNT",
+    "CC", "CNPGEN_CACHE", "XDG_CACHE_HOME", "PYTHONPATH",
+)  # fmt: skip
 
 MIN_DISK_BYTES = 10**9
 
@@ -285,9 +278,8 @@ def _check_recipes(findings: _Findings) -> str:
                 missing.append(name)
     except Exception as error:  # noqa: BLE001 - broken libraries raise anything
         text = _one_line(error)
-        findings.problems += (
-            [] if findings.problems else [f"the shipped recipes cannot be loaded ({text}): reinstall cnpgen"]
-        )
+        if not findings.problems:
+            findings.problems.append(f"the shipped recipes cannot be loaded ({text}): reinstall cnpgen")
         return f"cannot be loaded: {text}"
     if not names:
         findings.problems.append(f"there are no recipes in {recipes_root()}: reinstall cnpgen")

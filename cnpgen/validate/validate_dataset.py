@@ -88,14 +88,11 @@ class ValidationReport:
         if self.plans:
             lines.append(f"  judged at all times: {counted(self.plans[0], 'plan')}, {self.plans[1]:,} valid")
         if self.wanted:
-            lines.append(f"  made again: {self._blocks_text()}, {self.identical:,} identical to the bit")
+            requested = f" ({self.wanted:,} were requested)" if self.wanted > self.blocks else ""
+            text = f"{self.regenerated:,} of {counted(self.blocks, 'block')}{requested}"
+            lines.append(f"  made again: {text}, {self.identical:,} identical to the bit")
         hints = dict.fromkeys(finding.hint for finding in self.findings if finding.hint and not finding.note)
         return "\n".join([*lines, *(f"  hint: {text}" for text in hints)])
-
-    def _blocks_text(self) -> str:
-        """Describe the number of regenerated blocks."""
-        text = f"{self.regenerated:,} of {counted(self.blocks, 'block')}"
-        return f"{text} ({self.wanted:,} were requested)" if self.wanted > self.blocks else text
 
 
 @checked_arguments
@@ -137,7 +134,11 @@ def validate_dataset(
         spec = load_dataset_spec(folder)
     except DatasetError:
         return ValidationReport(folder, 0, tuple(findings))
-    _check_requirements(folder, spec, deep=deep, regenerate=regenerate)
+    if regenerate:  # missing packages and backends are reported before the expensive checks
+        backend_of(folder, spec)
+    if deep or regenerate:
+        with restored(spec):
+            pass
     existing = [task for task in shards(spec) if is_committed(folder, spec, task)]
     damaged = {finding.file for finding in findings if not finding.note}
     undamaged = [task for task in existing if task.file not in damaged]
@@ -155,15 +156,6 @@ def validate_dataset(
         regenerated=again.made,
         identical=again.identical,
     )
-
-
-def _check_requirements(folder: Path, spec: DatasetSpec, *, deep: bool, regenerate: int) -> None:
-    """Raise an error for missing packages or backends before the expensive checks."""
-    if regenerate:
-        backend_of(folder, spec)
-    if deep or regenerate:
-        with restored(spec):
-            pass
 
 
 def check_recipe(spec: DatasetSpec) -> list[Finding]:

@@ -68,15 +68,10 @@ def check_rows(
 
 @dataclass(frozen=True)
 class _ShardCheck:
-    """Result of the deep check of one shard.
+    """Result of the deep check of one shard, without a report if it cannot be read.
 
-    Attributes:
-        report: Report of Pinocchio and Coal; None if the shard cannot be read.
-        problems: Problems of the shard.
-        keys: Hash of the boundary states of every row, shape (rows,).
-        plans: Numbers of judged and valid plans, and their problems.
-        fractions: Hit speeds as fractions of the maximum hit speed, shape (rows,); empty if the rows are no hits.
-        goals: Hash of the goal of each of these hits.
+    The keys are hashes of the boundary states of its rows, the goals those of its hits. Hit speeds are fractions of the
+    maximum speed, and empty if the rows are no hits. All have shape (rows,).
     """
 
     report: RowReport | None
@@ -128,11 +123,7 @@ def _check_speed_fractions(spec: DatasetSpec, checks: list[_ShardCheck]) -> list
 
 
 def row_keys(values: NDArray[Any]) -> NDArray[np.uint64]:
-    """Hash every row of numbers to 64 bits; equal rows have equal keys.
-
-    Args:
-        values: Shape (rows, width).
-    """
+    """Hash every row of numbers, shape (rows, width), to 64 bits; equal rows have equal keys."""
     bits = np.ascontiguousarray(values, np.float64).view(np.uint64)
     bits = bits ^ (bits >> np.uint64(32))  # float32 values have zero low bits, which products would not mix
     bits *= np.resize(_ODD_MULTIPLIERS, bits.shape[1])

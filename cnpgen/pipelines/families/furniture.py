@@ -22,9 +22,7 @@ GRASP_GAP_M = 0.015  # between an object and the tip
 class Furniture:
     """Obstacles and grasps that are placed in a frame: x away from the base of the robot, z up.
 
-    Attributes:
-        origin: Origin of the frame in the frame of the robot's base [m].
-        yaw: Rotation of the frame about z [rad].
+    The frame has an origin [m] and a yaw about z [rad] in the frame of the robot's base.
     """
 
     origin: Point

@@ -20,10 +20,7 @@ class BehindPuck(Stage):
 
     inputs = ("goal_xyz", "hit_angle")
     distance: float = field(
-        "distance of the centres of puck and mallet at contact: sum of the radii",
-        unit="m",
-        low=0.0,
-        plausible=1.0,
+        "distance of the centres of puck and mallet at contact: sum of the radii", unit="m", low=0.0, plausible=1.0
     )
 
     def describe(self) -> str:

@@ -61,15 +61,10 @@ class BrakingReach(Stage):
 def overshoot(
     tip: Kernel, brake: Kernel, table: Table, q: Array, dq: Array, *, margin: float = 0.0
 ) -> NDArray[np.float64]:
-    """Return the overshoot of full braking over the worst edge of the table.
+    """Return the overshoot of full braking, by both kernels, over the worst edge of the table.
 
-    Args:
-        tip: Kernel of ``tip_state``.
-        brake: Iterated kernel of ``braking_step``.
-        table: Table.
-        q: Joint positions [rad], shape (joints, n).
-        dq: Joint velocities [rad/s], reversed for the goal, shape (joints, n).
-        margin: Distance from the edges below which the roll-out is computed [m].
+    It is computed for states (q, dq) [rad, rad/s], shape (joints, n) each, reversed for the goal, that come closer to
+    an edge than the margin [m].
 
     Returns:
         Distance outside the edge [m], shape (n,); -inf if a straight line stays inside by the margin for 80 ms.

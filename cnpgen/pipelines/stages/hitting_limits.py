@@ -82,9 +82,6 @@ def held_step(robot: Robot) -> Any:
 
     ``held`` is 1 for joints that stay constant. ``pull`` is the gradient of the Lagrangian, an output that the step
     does not use.
-
-    Returns:
-        A ``casadi.Function`` with arguments of width 2 n, 3, 2 or 3, n, n.
     """
     import casadi as ca
 

@@ -49,16 +49,11 @@ class HittingVelocity(Stage):
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
         """List the joint velocity and the speeds."""
+        text = "highest possible speed along the hit at the goal configuration"
         return (
             context.joint_field("goal_dq", "rad/s", "joint velocities at the goal", "target"),
             Field("hit_speed", "m/s", "speed of the tip along the hit at the goal", role="context", frame="world"),
-            Field(
-                "hit_speed_max",
-                "m/s",
-                "highest possible speed along the hit at the goal configuration",
-                role="diagnostic",
-                frame="world",
-            ),
+            Field("hit_speed_max", "m/s", text, role="diagnostic", frame="world"),
         )
 
     def prepare(self, context: Context) -> StageFunction:
@@ -119,9 +114,7 @@ class HittingVelocity(Stage):
 def hitting_velocity(robot: Robot, *, min_speed: float) -> Any:
     """Build the linear program as an SX function ``(q, d) -> (dq, speed, found)``, or of (q, d, normal).
 
-    Args:
-        robot: Robot.
-        min_speed: Minimum speed of a hit [m/s].
+    Hits are at least as fast as ``min_speed`` [m/s].
 
     Returns:
         A ``casadi.Function`` with arguments of width n, 2; dq [rad/s] maximizes the tip's speed [m/s] along d. If
@@ -149,8 +142,7 @@ def hitting_velocity(robot: Robot, *, min_speed: float) -> Any:
 def maximise(a: Vec, b: list[Vec], limit: list[float]) -> tuple[Vec, Scalar]:
     """Solve ``max a . v, sum_i b_i v_i = 0, |v_i| <= limit_i`` without branches; n >= 2, b_i in R^2.
 
-    Returns:
-        ``(v, value)`` as SX scalars.
+    Return ``(v, value)``.
     """
     import casadi as ca
 

@@ -156,11 +156,7 @@ class GoalIK(GuessedIK):
         since_version=2,
     )
     max_change: float | None = field(
-        "maximum difference of a joint between start and goal",
-        unit="rad",
-        low=1e-3,
-        default=None,
-        since_version=2,
+        "maximum difference of a joint between start and goal", unit="rad", low=1e-3, default=None, since_version=2
     )
 
     def find_mistakes(self) -> Iterator[tuple[str, str]]:
@@ -218,14 +214,9 @@ def ik_step(robot: Robot, *, vertical: bool, max_step: float, hold: bool = False
     """Build one step of inverse kinematics as an SX function ``(q, p) -> (next q, |error|)``.
 
     A joint that would leave its limits is set to the limit. The rest of the step is redistributed once over the other
-    joints.
-
-    Args:
-        robot: Robot.
-        vertical: Whether the tip's z axis must be vertical, too. If parameters of the problem turn the upright
-            direction, the last argument has three axes, of which the last is the direction, shape (9,).
-        max_step: Maximum change of a joint [rad].
-        hold: Whether there is a third argument, 1 for joints that stay constant and 0 for the others.
+    joints; no joint changes more than ``max_step`` [rad]. With ``hold``, a third argument is 1 for joints that stay
+    constant, otherwise 0. With ``vertical``, the tip's z axis must be vertical, too. If parameters of the problem turn
+    the upright direction, the last argument then has three axes, of which the last is the direction, shape (9,).
     """
     import casadi as ca
 

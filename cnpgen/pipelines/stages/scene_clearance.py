@@ -49,12 +49,10 @@ class _SceneChecker(CollisionChecker):
         self._first, self._stride = address_of(self._arrays["obstacles"]), together.strides[0]
 
     def clear_of_scenes(self, q: Array, runs: list[tuple[int, int, int]], limits: tuple[float, float]) -> Mask:
-        """Return a mask of the states with sufficient distances from the obstacles of their scene, shape (K,).
+        """Return a mask of the states q [rad], shape (n, K), with sufficient distances in their scene, shape (K,).
 
-        Args:
-            q: Joint positions [rad], shape (n, K).
-            runs: Scene, first state and end of every run of states in one scene.
-            limits: Required distances from obstacles and of links from each other [m]; -inf for no check.
+        Runs are scene, first state and end of states in one scene; limits are required distances from obstacles and of
+        links from each other [m], -inf for no check.
         """
         states, clear = np.ascontiguousarray(q.T), np.empty(q.shape[1], np.uint8)
         native, check, address = self._scene, self.library.clear_states, self.address
@@ -87,14 +85,10 @@ class SceneClearance:
     def are_clear(
         self, q: Array, scene: NDArray[np.int64], scenes: BatchScenes, margin: float = 0.0, self_margin: float = 0.0
     ) -> Mask:
-        """Return a mask of the states with sufficient distances, shape (K,).
+        """Return a mask of the states q [rad], shape (n, K), with sufficient distances in their scene, shape (K,).
 
-        Args:
-            q: Joint positions [rad], shape (n, K).
-            scene: Index of the scene of each state, ascending, shape (K,).
-            scenes: The scenes.
-            margin: Distance from obstacles in addition to the problem's clearance [m].
-            self_margin: Distance of links from each other in addition to the required one [m].
+        The scenes of the states ascend. Margins are added to the required distances from obstacles and between links
+        [m].
         """
         if not len(scene):
             return np.zeros(0, bool)

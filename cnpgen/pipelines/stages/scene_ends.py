@@ -42,11 +42,7 @@ class SceneEnds(Stage):
     grasp: float = field("share of starts at another grasp", default=0.4, low=0.0, high=1.0)
     random: float = field("share of random starts", default=0.2, low=0.0, high=1.0)
     spread: float = field(
-        "standard deviation of starts around the base configuration",
-        unit="rad",
-        default=0.1,
-        low=0.0,
-        plausible=np.pi,
+        "standard deviation of starts around the base configuration", unit="rad", default=0.1, low=0.0, plausible=np.pi
     )
     margin: float = field(
         "distance of both ends from obstacles, in addition to that of the problem",
@@ -121,13 +117,9 @@ class _Pool(NamedTuple):
     first_group: Indices
 
     def choose(self, scene: Indices, u: Array, v: Array, other_than: Indices | None = None) -> tuple[Indices, Indices]:
-        """Choose a group of each scene and one of its states; both are -1 where there is none.
+        """Choose a group of each scene and one of its states by random numbers u and v, -1 where there is none.
 
-        Args:
-            scene: Scenes, shape (P,).
-            u: Random numbers in [0, 1) for the groups, shape (P,).
-            v: Random numbers for the states, shape (P,).
-            other_than: Groups that are not chosen, -1 for none, shape (P,).
+        All arguments have shape (P,); groups in ``other_than`` are not chosen, -1 excludes none.
         """
         first = self.first_group[scene]
         count = self.first_group[scene + 1] - first

@@ -46,11 +46,7 @@ class Nullable:
 class StructureError(ValueError):
     """A value that does not have the expected structure.
 
-    Args:
-        text: The expected structure and the value.
-
-    Attributes:
-        key_path: Keys of the value, the innermost one first; each level appends its own.
+    Each level appends the key of the value to ``key_path``, which begins with the innermost one.
     """
 
     def __init__(self, text: str) -> None:

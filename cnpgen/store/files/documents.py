@@ -58,12 +58,9 @@ def canonical_sha256(value: Any) -> str:
 
 @dataclass(frozen=True)
 class Difference:
-    """A difference between two JSON-able values; its text contains the values if they are short.
+    """A difference between two JSON-able values at a dotted key; a missing value is None.
 
-    Attributes:
-        key: Dotted key, ``"robot.name"``.
-        old: Value of the first one; None if it is missing.
-        new: Value of the second one; None if it is missing.
+    Its text contains the values if they are short.
     """
 
     key: str

@@ -115,13 +115,9 @@ def _decoded(path: Path, name: bytes) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Column:
-    """A dataset of plain numbers.
+    """A dataset of plain numbers, integers or floats.
 
-    Attributes:
-        shape: Shape of the dataset.
-        dtype: Stored type: integers or floats.
-        offset: Position of the first number in the file [bytes]; None if the storage is not contiguous.
-        attributes: Attributes of the dataset.
+    The offset is the position of the first number in the file [bytes]; None if the storage is not contiguous.
     """
 
     shape: tuple[int, ...]
@@ -261,9 +257,8 @@ def opened_hdf5(path: Path, content: bytes | None = None) -> Iterator[Hdf5]:
         if isinstance(error, OSError) and error.errno in _SYSTEM_ERRORS:
             raise machine_error("read", path, error) from error
         if content is None and not h5py.is_hdf5(path):
-            raise DatasetError(
-                f"{path} is not an HDF5 file, or its beginning is damaged{apparent_kind(path)}"
-            ) from error
+            text = f"{path} is not an HDF5 file, or its beginning is damaged{apparent_kind(path)}"
+            raise DatasetError(text) from error
         raise DatasetError(f"{path} is damaged or cut off: {error}") from error
 
 
