@@ -11,7 +11,7 @@ import numpy as np
 from common import arguments, median, progress, report, table
 
 from cnpgen.machine.threads import one_thread
-from cnpgen.pipelines.families.scene_generator import FAMILIES, load_family
+from cnpgen.pipelines.families.catalog import FAMILIES, load_family
 from cnpgen.scenes import (
     BasisPoints,
     CameraCloud,

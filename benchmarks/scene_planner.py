@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from cnpgen.kernels.collision.collision_checker import CollisionChecker, load_collision_library
 from cnpgen.kernels.library import KernelLibrary, choose_backend
 from cnpgen.machine.threads import one_thread
-from cnpgen.pipelines.families.scene_generator import FAMILIES
+from cnpgen.pipelines.families.catalog import FAMILIES
 from cnpgen.planner.planner import Planner
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.plans import Plans

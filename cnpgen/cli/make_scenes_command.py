@@ -105,7 +105,7 @@ def _listing(*, as_json: bool) -> str:
     """Return the families with their parameters."""
     from dataclasses import fields
 
-    from cnpgen.pipelines.families.scene_generator import FAMILIES
+    from cnpgen.pipelines.families.catalog import FAMILIES
 
     table: dict[str, Any] = {}
     for name, family in FAMILIES.items():

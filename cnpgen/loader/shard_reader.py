@@ -3,6 +3,7 @@
 import mmap
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -152,7 +153,7 @@ class SplitShards:
     fingerprint: str
     stored: str
 
-    @property
+    @cached_property
     def rows(self) -> int:
         """Number of rows."""
         return sum(shard.rows for shard in self.shards)

@@ -87,8 +87,7 @@ def place_objects(
 ) -> None:
     """Place boxes and cylinders on a rectangle without overlap, with grasps at each, from above or along x.
 
-    The area is the lowest and highest x and the lowest and highest y, at the height z, in the frame of the furniture
-    [m].
+    The area is the lowest and highest x and the lowest and highest y, at the height z, in the furniture's frame [m].
     """
     circles: list[tuple[float, float, float]] = []
     count, widths, heights = objects

@@ -23,7 +23,7 @@ LINE_SPACING_RAD = 0.02  # rad or m, between checked states of a line
 
 
 class RestingStates:
-    """States of rest of a robot in one scene of the problem's and further obstacles.
+    """States of rest of a robot among the obstacles of its problem and further ones.
 
     It reuses Coal's memory: use it in one thread only.
 

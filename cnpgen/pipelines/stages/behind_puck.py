@@ -27,7 +27,6 @@ class BehindPuck(Stage):
         return f"take the goal for the puck's centre: the tip meets it {1e3 * self.distance:g} mm behind, along the hit"
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
-        """List the field of the goal position, anywhere on the table."""
         table = context.constraint(Table)
         low, high = (table.x.low, table.y.low, table.z), (table.x.high, table.y.high, table.z)
         return (position_field("goal", low, high),)

@@ -47,7 +47,6 @@ class AtRest(Stage):
         return f"set velocity and acceleration of the {self.end} to zero{kept}"
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
-        """List the fields of the velocity and of a prescribed acceleration."""
         fields = _motion_fields(context, self.end)
         return fields if self.end == "start" or self.acceleration == "zero" else fields[:1]
 

@@ -50,7 +50,6 @@ class Collision(Stage):
         return f"require {ends} to be free of collision, {how}"
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
-        """List the fields of the clearance if the segment test computes it."""
         if self.judge == "coal" or context.robot.shape is not None:
             return ()
         text = "distance of the arm's capsule axes from the nearest obstacle at the {}, less the capsules' radius"

@@ -24,7 +24,6 @@ class Home(GuessedIK):
     position: tuple[Range, Range, Range] = field("box of tip positions of the other homes: x, y, z", unit="m")
 
     def find_mistakes(self) -> Iterator[tuple[str, str]]:
-        """Yield (key, mistake) pairs."""
         if self.at_start + self.at_base > 1:
             yield "at_base", f"the fractions must not be more than 1 together, got {self.at_start + self.at_base:g}"
 

@@ -160,7 +160,6 @@ class GoalIK(GuessedIK):
     )
 
     def find_mistakes(self) -> Iterator[tuple[str, str]]:
-        """Yield (key, mistake) pairs."""
         for name in ("from_start", "at_limit"):
             if getattr(self, name) and not self.guess:
                 yield name, "needs random guesses: give guess, too"

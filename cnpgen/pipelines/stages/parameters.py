@@ -20,7 +20,6 @@ class DrawParameters(Stage):
         return "draw the parameters of the problem uniformly in their ranges"
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
-        """List the field of all parameters."""
         ranges = context.problem.parameters
         if not ranges:
             raise RecipeError([f"needs [parameters], which the problem {context.problem.path} does not have"])

@@ -87,8 +87,7 @@ class SceneClearance:
     ) -> Mask:
         """Return a mask of the states q [rad], shape (n, K), with sufficient distances in their scene, shape (K,).
 
-        The scenes of the states ascend. Margins are added to the required distances from obstacles and between links
-        [m].
+        The scenes of the states ascend. Margins [m] are added to the required distances from obstacles and of links.
         """
         if not len(scene):
             return np.zeros(0, bool)

@@ -58,7 +58,6 @@ class SceneEnds(Stage):
     poses: int = field("random poses at each grasp", default=12, low=1, high=100)
 
     def find_mistakes(self) -> Iterator[tuple[str, str]]:
-        """Yield (key, mistake) pairs."""
         if abs(self.neutral + self.grasp + self.random - 1) > 1e-9:
             total = self.neutral + self.grasp + self.random
             yield "random", f"the shares of starts must add up to 1, got {total:g}"
@@ -71,7 +70,6 @@ class SceneEnds(Stage):
         )
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
-        """List the fields of joint positions and tip positions."""
         center, reach = context.robot.chain.joints[0].translation, context.robot.chain.reach
         low, high = (np.asarray(center) - reach).tolist(), (np.asarray(center) + reach).tolist()
         return (

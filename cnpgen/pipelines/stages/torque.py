@@ -31,7 +31,6 @@ class GravityTorque(Stage):
         )
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
-        """List the field of the largest torque as a fraction of its limit."""
         text = f"largest holding torque at the {self.end}, as a fraction of its planning limit"
         return (Field(f"{self.end}_torque_ratio", "1", text, role="diagnostic", valid_min=(0.0,), valid_max=(1.0,)),)
 
