@@ -1,5 +1,7 @@
 """Random access to rows: many rows of a shard are read, single rows come from its memory map."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
