@@ -4,9 +4,8 @@ from cnpgen.judges.plans.verdict import Margin, Metrics, PaperRule, Reason, Verd
 from cnpgen.judges.rows.row_report import Check, RowReport
 from cnpgen.loader.batch import Batch
 from cnpgen.loader.batches import Batches
-from cnpgen.loader.gather import RowError
+from cnpgen.loader.gather import RowError, Split
 from cnpgen.loader.normalization import Normalization
-from cnpgen.loader.split import Split
 from cnpgen.machine.times import Times
 from cnpgen.make.complete import Completed
 from cnpgen.make.make_dataset import MadeDataset

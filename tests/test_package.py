@@ -23,7 +23,7 @@ from cnpgen.benchmark.simulator import rendering
 from cnpgen.benchmark.simulator.execute import load_mujoco
 from cnpgen.cli.view import page
 from cnpgen.errors import MissingExtraError
-from cnpgen.loader.frame import make_frame
+from cnpgen.loader.dataset import make_frame
 from cnpgen.machine.clusters import joined
 from cnpgen.machine.versions import DOCUMENTATION_URL
 from cnpgen.make.publish import upload_folder

@@ -48,9 +48,8 @@ def observer_of(spec: DatasetSpec, kind: str | Observation, *, seed: int) -> Bat
         DatasetError: The dataset has no scenes.
     """
     if not spec.scene_obstacles:
-        raise DatasetError(
-            f"{spec.name} has no scenes to observe: expected a dataset such as panda-scenes, or a BatchObserver"
-        )
+        text = f"{spec.name} has no scenes to observe: expected a dataset such as panda-scenes, or a BatchObserver"
+        raise DatasetError(text)
     return BatchObserver(kind, partial(_scenes_of, problem_obstacles(spec)), seed)
 
 

@@ -8,15 +8,10 @@ from cnpgen.schema.arguments import flag, integer
 
 @dataclass(frozen=True, kw_only=True)
 class BatchPartition:
-    """Batches of a fixed number of rows; the rows of a batch are distributed over the ranks.
+    """Batches of a fixed number of rows over all ranks; the rows of a batch are distributed over the ranks.
 
-    Attributes:
-        batch_size: Rows of a batch over all ranks.
-        rank: Index of this rank; it reads the rows ``rank::world`` of every batch.
-        world: Number of ranks; the batch size is a multiple of it.
-        drop_last: Whether to omit an incomplete last batch of an epoch.
-        worker: Index of this worker of the rank; it reads the batches ``worker::workers``.
-        workers: Number of workers of the rank.
+    A rank reads the rows ``rank::world`` of every batch, one of its workers the batches ``worker::workers``. An
+    incomplete last batch of an epoch is omitted by default.
     """
 
     batch_size: int
@@ -47,9 +42,7 @@ class BatchPartition:
     def check_ranks(self, rows: int, *, first: int = 0) -> None:
         """Raise an error if the last batch has no row for some ranks, since their mean loss would be nan.
 
-        Args:
-            rows: Number of rows.
-            first: Position of the first batch.
+        The batches begin at position ``first``.
 
         Raises:
             UsageError: The last batch has fewer rows than there are ranks.

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from cnpgen.errors import UsageError
 from cnpgen.loader.batch import Batch
 from cnpgen.loader.batch_partition import BatchPartition
-from cnpgen.loader.columns import tail
-from cnpgen.loader.in_memory_rows import InMemoryRows, make_in_memory_rows
 from cnpgen.loader.order import Order
+from cnpgen.loader.packed import InMemoryRows, make_in_memory_rows
 from cnpgen.loader.position import Position, position_from_json, position_to_json
 from cnpgen.loader.row_format import RowFormat
 from cnpgen.loader.shard_reader import SplitShards
@@ -89,11 +88,8 @@ class Batches:
     @property
     def signature(self) -> dict[str, tuple[tuple[int, ...], np.dtype[Any]]]:
         """Field name -> shape in one row and type."""
-        integer_type, row_format = np.dtype(np.int64), self._row_format
-        return {
-            field.name: (tail(field), row_format.dtype if field.name in row_format.layout.slices else integer_type)
-            for field in row_format.layout.fields
-        }
+        types = {"float": self._row_format.dtype, "int64": np.dtype(np.int64)}
+        return {field.name: (field.shape(0)[1:], types[field.dtype]) for field in self._row_format.layout.fields}
 
     def __len__(self) -> int:
         """Return the number of batches per epoch."""
@@ -149,9 +145,8 @@ class Batches:
         if epoch is not None or batch is not None:
             used = integer("batch", batch or 0, least=0)
             if used > len(self):
-                raise UsageError(
-                    f"must be at most {len(self)}, the number of batches of an epoch, got {used}", argument="batch"
-                )
+                text = f"must be at most {len(self)}, the number of batches of an epoch, got {used}"
+                raise UsageError(text, argument="batch")
             row = min(used * self._partition.batch_size, self._source.rows)
             epoch = position.epoch if epoch is None else integer("epoch", epoch, least=0)
             position = self._forward(replace(position, epoch=epoch, row=row))

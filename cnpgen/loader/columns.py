@@ -13,11 +13,7 @@ from cnpgen.store.field import Field
 
 @dataclass(frozen=True)
 class Columns:
-    """The fields to load. Float fields share a table; integer fields are separate arrays.
-
-    Attributes:
-        fields: The fields, in order.
-    """
+    """The fields to load, in order. Float fields share a table; integer fields are separate arrays."""
 
     fields: tuple[Field, ...]
 
@@ -56,18 +52,11 @@ class Columns:
         return sum(max(field.width, 1) for field in self.floats)
 
 
-def tail(field: Field) -> tuple[int, ...]:
-    """Return the shape of a field in one row: (width,), or () for a scalar."""
-    return (field.width,) if field.width else ()
-
-
 def select_columns(spec: DatasetSpec, names: Iterable[str] | None) -> Columns:
-    """Select fields by name.
+    """Select fields by name, in the requested order.
 
-    Args:
-        spec: Specification of the dataset.
-        names: Names in the requested order; by default all float fields except for diagnostics, in the order of the
-            specification. Fields of scenes have to be named.
+    By default these are all float fields except for diagnostics, in the order of the specification. Fields of scenes
+    have to be named.
 
     Raises:
         DatasetError: There is no such field.

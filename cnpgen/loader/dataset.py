@@ -2,28 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from cnpgen.errors import DatasetError, lacks
+from cnpgen.errors import DatasetError, MissingExtraError, UsageError, lacks
 from cnpgen.loader.batch_observer import observer_of
 from cnpgen.loader.batch_partition import BatchPartition
 from cnpgen.loader.batches import Batches, Observe
 from cnpgen.loader.columns import select_columns
-from cnpgen.loader.frame import make_frame
-from cnpgen.loader.gather import Rows, gather
+from cnpgen.loader.gather import Rows, Split, gather
 from cnpgen.loader.normalization import Normalization, make_normalization
 from cnpgen.loader.position import checked_position
 from cnpgen.loader.row_format import RowFormat, make_row_format
 from cnpgen.loader.scene_columns import OBSTACLE_POSES, problem_obstacles, scene_fields
 from cnpgen.loader.shard_reader import ShardReader, SplitShards
-from cnpgen.loader.split import Split
 from cnpgen.robots.observation.observations import Observation
 from cnpgen.robots.scene import Scene
 from cnpgen.schema.argument_types import checked_arguments
@@ -31,6 +31,8 @@ from cnpgen.store.checked_shard import Shard
 from cnpgen.store.dataset_spec import DatasetSpec, StoredProblem
 from cnpgen.store.field import Field
 from cnpgen.store.statistics import FieldStatistics
+
+LIBRARIES = ("polars", "pandas")  # of frames
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,3 +251,39 @@ class Dataset:
         dtype: DTypeLike | None = None,
     ) -> RowFormat:
         return make_row_format(self.spec, self.normalization, fields=fields, normalize=normalize, dtype=dtype)
+
+
+def make_frame(rows: Mapping[str, NDArray[Any]], fields: Sequence[Field], *, library: str | None) -> Any:
+    """Convert rows, of shape (rows, width) or (rows,) each, to a table with columns in the order of the fields.
+
+    The library is "polars" or "pandas"; by default the installed one, polars if both are.
+
+    Returns:
+        A ``DataFrame``; with pandas, ``attrs["units"]`` contains the units of the columns.
+
+    Raises:
+        UsageError: The library is not supported.
+        MissingExtraError: The library is not installed.
+    """
+    name = _installed(library)
+    columns = {
+        column: np.ascontiguousarray(values)
+        for field in fields
+        for column, values in zip(field.columns, np.atleast_2d(rows[field.name].T), strict=True)
+    }
+    frame = import_module(name).DataFrame(columns)
+    if name == "pandas":
+        frame.attrs["units"] = dict(pair for field in fields for pair in zip(field.columns, field.units, strict=True))
+    return frame
+
+
+def _installed(library: str | None) -> str:
+    """Return the requested library, or the installed one."""
+    if library is not None and library not in LIBRARIES:
+        raise UsageError(f"must be one of {', '.join(LIBRARIES)}, got {library!r}", argument="library")
+    candidates = LIBRARIES if library is None else (library,)
+    installed = next((name for name in candidates if find_spec(name) is not None), None)
+    if installed is None:
+        text = f"a frame needs {' or '.join(candidates)}, not installed here: pip install 'cnpgen[{candidates[0]}]'"
+        raise MissingExtraError(text)
+    return installed

@@ -1,13 +1,17 @@
 """Random access to rows: many rows of a shard are read, single rows come from its memory map."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
-from cnpgen.loader.columns import Columns, tail
+from cnpgen.loader.columns import Columns
+from cnpgen.loader.row_format import RowFormat
 from cnpgen.loader.shard_reader import SplitShards
 from cnpgen.schema.arguments import reject_masked
 from cnpgen.store.shard import storage_dtype
@@ -23,12 +27,7 @@ class RowError(UsageError, IndexError):
 
 
 def gather(source: SplitShards, indices: ArrayLike, layout: Columns) -> Rows:
-    """Read single rows.
-
-    Args:
-        source: Shards of the split.
-        indices: Indices of the rows, shape (k,); negative ones count from the end.
-        layout: The fields.
+    """Read single rows by their indices, shape (k,); negative ones count from the end.
 
     Returns:
         Field name -> values as stored, shape (k, width) or (k,), in the order of the indices.
@@ -39,7 +38,7 @@ def gather(source: SplitShards, indices: ArrayLike, layout: Columns) -> Rows:
         DatasetError: A shard is missing or damaged.
     """
     rows = _checked(indices, source)
-    columns = {f.name: np.empty((len(rows), *tail(f)), storage_dtype(f, source.stored)) for f in layout.fields}
+    columns = {f.name: np.empty(f.shape(len(rows)), storage_dtype(f, source.stored)) for f in layout.fields}
     for shard, positions, local in _by_shard(rows, source):
         file = source.shards[shard]
         dense = MAX_READ_ROWS_PER_ROW * len(local) >= file.rows
@@ -62,9 +61,8 @@ def _checked(indices: ArrayLike, source: SplitShards) -> Indices:
         raise UsageError(f"must be a list of integers, got {rows.dtype} of shape {rows.shape}", argument="indices")
     wrong = (rows < -source.rows) | (rows >= source.rows)
     if wrong.any():
-        raise RowError(
-            f"split {source.split!r} has {source.rows} rows, there is no row {rows[wrong][0]}", concerns="indices"
-        )
+        text = f"split {source.split!r} has {source.rows} rows, there is no row {rows[wrong][0]}"
+        raise RowError(text, concerns="indices")
     return np.where(rows < 0, rows + source.rows, rows).astype(np.int64)
 
 
@@ -77,3 +75,34 @@ def _by_shard(rows: Indices, source: SplitShards) -> Iterator[tuple[int, Indices
         if len(positions):
             shard = int(shards[positions[0]])
             yield shard, positions, rows[positions] - (ends[shard] - source.shards[shard].rows)
+
+
+@dataclass(frozen=True, eq=False)
+class Split:
+    """The rows of a split: ``split[i]`` is one row, ``split[a:b]`` and ``split[[i, j]]`` are several rows.
+
+    A row contains all float fields except for diagnostics, in their units and stored type.
+
+    Attributes:
+        source: Shards of the split.
+        row_format: Format of the rows.
+    """
+
+    source: SplitShards
+    row_format: RowFormat
+
+    def __repr__(self) -> str:
+        return f"<{self.source.rows:,} rows of split {self.source.split!r}: {self.row_format.layout.summary}>"
+
+    def __len__(self) -> int:
+        return self.source.rows
+
+    def __iter__(self) -> Iterator[Rows]:
+        return (self[row] for row in range(len(self)))
+
+    def __getitem__(self, index: slice | ArrayLike) -> Rows:
+        if isinstance(index, slice):
+            return self.__getitem__(np.arange(*index.indices(len(self))))
+        indices = np.asarray(index)
+        rows = gather(self.source, np.atleast_1d(indices), self.row_format.layout)
+        return {name: values[0] for name, values in rows.items()} if indices.ndim == 0 else rows

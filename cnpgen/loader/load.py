@@ -1,8 +1,7 @@
 """Opening a dataset for training; incomplete and damaged datasets are refused."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
 
 from cnpgen.errors import DatasetError
 from cnpgen.loader.dataset import Dataset
@@ -10,16 +9,9 @@ from cnpgen.loader.scene_columns import problem_obstacles
 from cnpgen.loader.shard_reader import ShardReader
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import flag
-from cnpgen.store.checked_shard import Shard, recorded_shard, shard_of_record
+from cnpgen.store.checked_shard import Shard
 from cnpgen.store.dataset_spec import DatasetSpec, shards
-from cnpgen.store.dataset_summary import (
-    STATS_FORMAT,
-    STATS_STRUCTURE,
-    STATS_VERSION,
-    DatasetSummary,
-    summarize_dataset,
-)
-from cnpgen.store.files.documents import load_document
+from cnpgen.store.dataset_summary import load_stats_document, summarize_dataset
 from cnpgen.store.files.size_limits import MAX_EXPANSION, MIN_EXPANSION_LIMIT_BYTES
 from cnpgen.store.intact import RERUN_HINT
 from cnpgen.store.layout import SPECIFICATION, STATS
@@ -51,13 +43,13 @@ def load_dataset(folder: str | Path, *, allow_incomplete: bool = False, verify: 
     stored = open_dataset(folder, allow_incomplete=flag("allow_incomplete", allow_incomplete))
     if stored.manifest is None:
         summary = summarize_dataset(folder, stored.spec, allow_incomplete=True)
-        listed, statistics = _recorded(folder, summary), summary.statistics
+        statistics, made = summary.statistics, summary.records
+        recorded = [Shard(folder, stored.spec, task, record.bytes, record.sha256) for task, record in made]
     else:
-        listed, statistics = (
-            _listed(folder, stored.spec, stored.manifest),
-            _load_statistics(folder, stored.spec),
-        )
-    _check_rows(stored.spec, listed)
+        statistics = _load_statistics(folder, stored.spec)
+        recorded = [stored.shard(task) for task in shards(stored.spec)]
+    listed = {split: [shard for shard in recorded if shard.task.split == split] for split in stored.spec.splits}
+    _check_rows(stored.spec, recorded)
     present = _present(folder, listed, allow_incomplete=allow_incomplete)
     fingerprint = data_fingerprint(
         (shard.path.relative_to(folder).as_posix(), shard.sha256) for part in present.values() for shard in part
@@ -66,31 +58,9 @@ def load_dataset(folder: str | Path, *, allow_incomplete: bool = False, verify: 
     return Dataset(folder, stored.spec, fingerprint, present, statistics, reader)
 
 
-def _recorded(folder: Path, summary: DatasetSummary) -> dict[str, list[Shard]]:
-    """Return the shards of an unfinished dataset, from their sidecars."""
-    spec = summary.spec
-    return {
-        split: [shard_of_record(folder, spec, task, record) for task, record in summary.of_split(split)]
-        for split in spec.splits
-    }
-
-
-def _listed(folder: Path, spec: DatasetSpec, manifest: Mapping[str, Any]) -> dict[str, list[Shard]]:
-    """Return the shards of a finished dataset, from its manifest."""
-    tasks = {task.file: task for task in shards(spec)}
-    return {
-        split: [
-            recorded_shard(folder, spec, tasks[entry["file"]], size=entry["bytes"], sha256=entry["sha256"])
-            for entry in content["shards"]
-        ]
-        for split, content in manifest["splits"].items()
-    }
-
-
 def _load_statistics(folder: Path, spec: DatasetSpec) -> Statistics:
     """Read the statistics of a finished dataset."""
-    path = folder / STATS
-    document = load_document(path, STATS_FORMAT, version=STATS_VERSION, structure=STATS_STRUCTURE)
+    path, document = folder / STATS, load_stats_document(folder)
     if document["specification_fingerprint"] != spec.fingerprint:
         raise DatasetError(f"{path} is of another specification than {SPECIFICATION}; {RERUN_HINT}")
     try:
@@ -105,14 +75,13 @@ def _load_statistics(folder: Path, spec: DatasetSpec) -> Statistics:
     return statistics
 
 
-def _check_rows(spec: DatasetSpec, shards: Mapping[str, list[Shard]]) -> None:
+def _check_rows(spec: DatasetSpec, shards: Iterable[Shard]) -> None:
     """Raise an error, before memory is allocated, if shards are too small for their recorded number of rows."""
     width = sum(max(field.width, 1) * storage_dtype(field, spec.dtype).itemsize for field in spec.fields)
-    for shard in (shard for part in shards.values() for shard in part):
+    for shard in shards:
         if shard.rows * width > max(MAX_EXPANSION * shard.size, MIN_EXPANSION_LIMIT_BYTES):
-            raise DatasetError(
-                f"{shard.path} has {shard.size:,} bytes, too few for the {shard.rows:,} rows of {SPECIFICATION}"
-            )
+            text = f"{shard.path} has {shard.size:,} bytes, too few for the {shard.rows:,} rows of {SPECIFICATION}"
+            raise DatasetError(text)
 
 
 def _present(
@@ -122,7 +91,6 @@ def _present(
     problems = [problem for part in shards.values() for shard in part if (problem := shard.problem())]
     if problems and not allow_incomplete:
         more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
-        raise DatasetError(
-            f"{folder} is damaged: {problems[0]}{more}; {RERUN_HINT}, or omit the shard with allow_incomplete=True"
-        )
+        text = f"{folder} is damaged: {problems[0]}{more}; {RERUN_HINT}, or omit the shard with allow_incomplete=True"
+        raise DatasetError(text)
     return {split: tuple(shard for shard in part if not shard.problem()) for split, part in shards.items()}

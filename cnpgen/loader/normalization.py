@@ -47,7 +47,7 @@ class Normalization:
             rows: Field name -> values in the unit of the field, shape (..., width), or (...) for a scalar field. They
                 may be arrays of NumPy or JAX or tensors of torch; gradients are propagated.
         """
-        return {name: self._scaled(name, values) for name, values in rows.items()}
+        return {name: self._scaled(name, values) if name in self.mean else values for name, values in rows.items()}
 
     def denormalize(self, rows: Mapping[str, Any]) -> dict[str, Any]:
         """Return mean + std x, the inverse of :meth:`normalize`; a constant column returns to its value.
@@ -55,21 +55,15 @@ class Normalization:
         Args:
             rows: Field name -> normalized values, otherwise as for :meth:`normalize`.
         """
-        return {name: self._unscaled(name, values) for name, values in rows.items()}
+        return {name: self._unscaled(name, values) if name in self.mean else values for name, values in rows.items()}
 
     def _scaled(self, name: str, values: Any) -> Any:
-        if name not in self.mean:
-            return values
-        return _with_type_of(
-            values, (values - _as_type_of(values, self.mean[name])) * _as_type_of(values, self.scale[name])
-        )
+        mean, scale = _as_type_of(values, self.mean[name]), _as_type_of(values, self.scale[name])
+        return _with_type_of(values, (values - mean) * scale)
 
     def _unscaled(self, name: str, values: Any) -> Any:
-        if name not in self.mean:
-            return values
-        return _with_type_of(
-            values, values * _as_type_of(values, self.std[name]) + _as_type_of(values, self.mean[name])
-        )
+        mean, std = _as_type_of(values, self.mean[name]), _as_type_of(values, self.std[name])
+        return _with_type_of(values, values * std + mean)
 
     def side_by_side(self, fields: Sequence[Field]) -> tuple[Floats, Floats]:
         """Return mean and scale of the columns of fields in the packed table, shape (columns,) each.
@@ -100,14 +94,10 @@ def _with_type_of(values: Any, result: Any) -> Any:
 
 
 def make_normalization(statistics: Mapping[str, FieldStatistics], fields: Sequence[Field]) -> Normalization:
-    """Make the normalization of the float fields from statistics.
+    """Make the normalization of the float fields from statistics of the training rows.
 
     A column counts as constant if its standard deviation is below the float32 resolution of its largest value.
     Otherwise its rounding errors would be scaled to size 1, such as those of the height of a tip on a table.
-
-    Args:
-        statistics: Field name -> statistics of the training rows.
-        fields: Fields of the dataset.
     """
     mean, std = {}, {}
     for field in fields:

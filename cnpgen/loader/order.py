@@ -17,13 +17,7 @@ WINDOW_ROWS = 1 << 18
 
 @dataclass(frozen=True)
 class Window:
-    """Shards whose rows are shuffled together.
-
-    Attributes:
-        first: Position of its first row in the epoch.
-        rows: Number of rows.
-        shards: Indices of its shards within the split, in the order of their rows.
-    """
+    """Shards, by their index in the split, whose rows are shuffled together, from a position in the epoch on."""
 
     first: int
     rows: int
@@ -32,15 +26,7 @@ class Window:
 
 @dataclass(frozen=True)
 class Order:
-    """The order of one epoch.
-
-    Attributes:
-        split: Name of the split; splits are shuffled independently.
-        shard_rows: Rows of every shard of the split.
-        seed: Seed of all epochs, not negative.
-        epoch: Epoch, not negative.
-        shuffle: Whether to shuffle; otherwise rows are in their stored order.
-    """
+    """The order of one epoch of a split with shards of some rows; splits are shuffled independently."""
 
     split: str
     shard_rows: tuple[int, ...]
@@ -76,12 +62,7 @@ def permutation(size: int, *, seed: int, key: tuple[int, ...]) -> NDArray[np.int
 
     NumPy guarantees the raw output of bit generators, but not that of ``Generator.permutation``. The rows are sorted by
     raw random numbers, the last bits of which are replaced by the row index. For up to 2^20 rows, 44 bits remain
-    random, so ties are negligible.
-
-    Args:
-        size: Number of rows.
-        seed: Seed, not negative.
-        key: Key of the permutation of this seed; integers that are not negative.
+    random, so ties are negligible. Seed and key are not negative.
 
     Returns:
         Permutation of 0 to ``size - 1``, shape (size,).

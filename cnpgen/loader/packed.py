@@ -1,4 +1,4 @@
-"""Packing the rows of whole shards into one table, with conversion and normalization."""
+"""Packing the rows of shards into one table, with conversion and normalization; small splits stay in memory."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -8,22 +8,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.loader.columns import tail
 from cnpgen.loader.row_format import RowFormat
-from cnpgen.loader.shard_reader import ShardReader
+from cnpgen.loader.shard_reader import ShardReader, SplitShards
 from cnpgen.store.checked_shard import Shard
 
+MAX_IN_MEMORY_BYTES = 1 << 28
 _CHUNK_VALUES = 1 << 15  # float64 numbers that fit into the L2 cache of a processor
 
 
 @dataclass(frozen=True, eq=False)
 class Packed:
-    """The concatenated rows of some shards.
-
-    Attributes:
-        table: The float fields side by side, shape (rows, D).
-        integers: Field name -> values, shape (rows, width) or (rows,).
-    """
+    """The concatenated rows of some shards: a table of float fields, shape (rows, D), and integer fields by name."""
 
     table: NDArray[Any]
     integers: dict[str, NDArray[Any]]
@@ -42,7 +37,7 @@ def row_bytes(row_format: RowFormat) -> int:
 def empty_packed(rows: int, row_format: RowFormat) -> Packed:
     """Allocate memory for rows."""
     layout = row_format.layout
-    integers = {field.name: np.empty((rows, *tail(field)), np.int64) for field in layout.integers}
+    integers = {field.name: np.empty(field.shape(rows), np.int64) for field in layout.integers}
     return Packed(np.empty((rows, layout.width), row_format.dtype), integers)
 
 
@@ -89,11 +84,7 @@ def _fill(
 
 
 def _opaque_rows(values: NDArray[Any]) -> NDArray[Any]:
-    """View float64 values as one opaque item per row, which NumPy copies twice as fast as rows of six numbers.
-
-    Args:
-        values: Values of a field, shape (rows, width) or (rows,).
-    """
+    """View float64 values as one opaque item per row, which NumPy copies twice as fast as rows of six numbers."""
     rows = np.ascontiguousarray(values, np.float64).reshape(len(values), -1)
     return rows.view(f"V{8 * rows.shape[1]}")[:, 0]
 
@@ -106,3 +97,41 @@ def _targets(buffer: NDArray[np.float64], columns: Mapping[str, NDArray[Any]]) -
         targets[name] = np.ndarray(len(buffer), f"V{size}", buffer, start, buffer.strides[:1])
         start += size
     return targets
+
+
+class InMemoryRows:
+    """All rows of a split, in their stored order; each shard is read when it is needed for the first time.
+
+    Two threads may load at the same time, since both write the same values.
+    """
+
+    def __init__(self, source: SplitShards, row_format: RowFormat) -> None:
+        self._source, self._row_format = source, row_format
+        self._firsts = np.cumsum([0, *(shard.rows for shard in source.shards)]).tolist()
+        self._loaded: set[int] = set()
+        self.packed = empty_packed(source.rows, row_format)
+
+    def load(self, shards: Sequence[int]) -> NDArray[np.int64]:
+        """Load shards, by their indices within the split, that are not in memory yet.
+
+        Returns:
+            Positions of their rows in ``packed``, in the order of the shards, shape (rows,).
+
+        Raises:
+            DatasetError: A shard is missing or damaged, or the normalization has no statistics of a field.
+            MachineError: A shard cannot be read.
+        """
+        positions = [np.empty(0, np.int64)]
+        for index in shards:
+            shard, first = self._source.shards[index], self._firsts[index]
+            if index not in self._loaded:
+                out = self.packed.part(first, first + shard.rows)
+                pack([shard], self._row_format, self._source.reader, out=out)
+                self._loaded.add(index)
+            positions.append(np.arange(first, first + shard.rows))
+        return np.concatenate(positions)
+
+
+def make_in_memory_rows(source: SplitShards, row_format: RowFormat) -> InMemoryRows | None:
+    """Allocate memory for a whole split if it needs at most 256 MiB; otherwise return None."""
+    return InMemoryRows(source, row_format) if source.rows * row_bytes(row_format) <= MAX_IN_MEMORY_BYTES else None

@@ -14,14 +14,7 @@ LOADER_STATE_VERSION = 1  # also raised if the computation of the order changes
 
 @dataclass(frozen=True)
 class Position:
-    """A position in the order of an epoch.
-
-    Attributes:
-        seed: Seed of the order.
-        shuffle: Whether rows are shuffled.
-        epoch: Epoch.
-        row: Rows of the epoch that were read by all ranks together.
-    """
+    """A position in the order of an epoch: the number of rows that all ranks together have read."""
 
     seed: int
     shuffle: bool
@@ -58,9 +51,8 @@ def position_from_json(state: Mapping[str, Any], source: SplitShards) -> Positio
         raise UsageError(f"a loader's state must be what state() returned, got {state!r:.100}")
     if state.get("format_version") != LOADER_STATE_VERSION:
         version = state.get("format_version")
-        raise DatasetError(
-            f"the loader's state has format version {version!r}, this cnpgen reads {LOADER_STATE_VERSION}"
-        )
+        text = f"the loader's state has format version {version!r}, this cnpgen reads {LOADER_STATE_VERSION}"
+        raise DatasetError(text)
     for name, value in (("fingerprint", source.fingerprint), ("split", source.split)):
         if state.get(name) != value:
             raise DatasetError(f"the loader's state is of another dataset: {name} {state.get(name)!r}, here {value!r}")

@@ -17,24 +17,14 @@ DTYPES = ("float32", "float64")
 
 @dataclass(frozen=True, eq=False)
 class RowFormat:
-    """The format of loaded rows.
-
-    Attributes:
-        layout: Fields and their columns in the packed table.
-        normalization: Normalization of the float fields; None to keep their units.
-        dtype: Type of the float fields.
-    """
+    """The format of loaded rows; without a normalization, float fields keep their units."""
 
     layout: Columns
     normalization: Normalization | None
     dtype: np.dtype[Any]
 
     def convert(self, rows: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-        """Convert stored rows to this format.
-
-        Args:
-            rows: Field name -> values, shape (k, width) or (k,).
-        """
+        """Convert stored rows, of shape (k, width) or (k,) each, to this format."""
         values = dict(rows)
         if self.normalization is not None:  # in float64, as for batches
             values |= {name: values[name].astype(np.float64, copy=False) for name in self.layout.slices}
@@ -52,12 +42,8 @@ def make_row_format(
 ) -> RowFormat:
     """Make the format of loaded rows from the options of a user.
 
-    Args:
-        spec: Specification of the dataset.
-        own: Normalization of the dataset; None without training rows.
-        fields: Names of the fields; by default all float fields except for diagnostics.
-        normalize: Whether to normalize, or the normalization of another dataset.
-        dtype: Type of the float fields; None for the stored type.
+    ``own`` is the normalization of the dataset, None without training rows. By default, rows have all float fields
+    except for diagnostics, in the stored type.
 
     Raises:
         DatasetError: There is no such field, or there are no statistics for its normalization.
@@ -72,9 +58,8 @@ def make_row_format(
 
 def _own(spec: DatasetSpec, own: Normalization | None, normalize: object) -> Normalization | None:
     if not isinstance(normalize, bool | np.bool_):
-        raise UsageError(
-            f"must be True, False or the normalization of a dataset, got {normalize!r:.100}", argument="normalize"
-        )
+        text = f"must be True, False or the normalization of a dataset, got {normalize!r:.100}"
+        raise UsageError(text, argument="normalize")
     if normalize and own is None:
         raise DatasetError(
             f"{spec.name} has no training rows for the normalization; pass normalize=False, or the normalization of"

@@ -49,12 +49,7 @@ def scene_fields(spec: DatasetSpec) -> tuple[Field, ...]:
 class SceneColumn:
     """A field of the scenes of the rows of a shard; indexing computes the values of the selected rows only.
 
-    Attributes:
-        name: Name of the field.
-        table: Scenes of the shard.
-        index: Index of the scene of each row, shape (rows,).
-        obstacles: Obstacles of the problem.
-        dtype: Stored type.
+    The index of the scene of each row has shape (rows,).
     """
 
     name: str

@@ -3,6 +3,7 @@
 import mmap
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from cnpgen.store.field import Field
 from cnpgen.store.files.atomic import file_sha256
 from cnpgen.store.intact import RERUN_HINT, digest_problem
 from cnpgen.store.scene_table import SCENE_ID, SceneTable
-from cnpgen.store.shard import Placement, storage_dtype
+from cnpgen.store.shard import StoredField, storage_dtype
 
 Rows = dict[str, NDArray[Any]]
 
@@ -28,17 +29,13 @@ class ShardReader:
     """Reader of fields of shards; every shard and every field is checked when it is read for the first time.
 
     Its only open files are the memory maps of the last shards. It can be used by several threads, forked, and pickled
-    without its maps.
-
-    Args:
-        verify: Whether to verify the sha256 of each shard; otherwise its size, header and values are checked.
-        obstacles: Obstacles of the problem of a dataset with scenes.
+    without its maps. Without ``verify``, size, header and values of a shard are checked, but not its sha256.
     """
 
     def __init__(self, *, verify: bool, obstacles: Sequence[Obstacle] = ()) -> None:
         self._verify, self._obstacles = verify, tuple(obstacles)
         self._scenes: tuple[Path, SceneTable] | None = None  # of the last shard whose scenes were read
-        self._placements: dict[Path, dict[str, Placement]] = {}  # of the checked shards
+        self._placements: dict[Path, dict[str, StoredField]] = {}  # of the checked shards
         self._checked: dict[Path, dict[str, Field]] = {}  # name -> field whose shape, type and values are checked
         self._maps: dict[Path, mmap.mmap] = {}
 
@@ -92,26 +89,26 @@ class ShardReader:
     @staticmethod
     def _split(shard: Shard, fields: Sequence[Field]) -> tuple[list[Field], list[Field]]:
         """Separate the fields of rows from those of scenes."""
-        if not shard.scene_obstacles:
+        if not shard.spec.scene_obstacles:
             return list(fields), []
-        stored = {field.name for field in shard.fields}
+        stored = {field.name for field in shard.spec.fields}
         return [f for f in fields if f.name in stored], [f for f in fields if f.name not in stored]
 
     def _scene_columns(self, shard: Shard, fields: Sequence[Field]) -> dict[str, SceneColumn]:
         """Return fields of the scenes of a shard."""
         if not fields:
             return {}
-        scene_id = next(field for field in shard.fields if field.name == SCENE_ID)
+        scene_id = next(field for field in shard.spec.fields if field.name == SCENE_ID)
         index = self.read(shard, [scene_id])[SCENE_ID]
         last = self._scenes  # other threads may replace it
         if last is None or last[0] != shard.path:
             last = self._scenes = shard.path, read_scenes(shard, self._placements[shard.path])
         table = last[1]
         rows = table.rows_of(index)
-        dtypes = {field.name: storage_dtype(field, shard.dtype) for field in fields}
+        dtypes = {field.name: storage_dtype(field, shard.spec.dtype) for field in fields}
         return {name: SceneColumn(name, table, rows, self._obstacles, dtype) for name, dtype in dtypes.items()}
 
-    def _header(self, shard: Shard, fields: Sequence[Field]) -> dict[str, Placement]:
+    def _header(self, shard: Shard, fields: Sequence[Field]) -> dict[str, StoredField]:
         """Check a shard; return the locations of its fields."""
         if problem := shard.problem():
             raise DatasetError(f"{problem}; {RERUN_HINT}")
@@ -148,15 +145,7 @@ def _mapped(shard: Shard) -> mmap.mmap | None:
 
 @dataclass(frozen=True, eq=False)
 class SplitShards:
-    """The shards of a split.
-
-    Attributes:
-        split: Name of the split.
-        shards: Existing shards, in order.
-        reader: Reader of the shards.
-        fingerprint: Fingerprint of the rows of the whole dataset.
-        stored: Stored type of float fields, "float64" or "float32".
-    """
+    """The existing shards of a split, in order; the fingerprint is that of the whole dataset."""
 
     split: str
     shards: tuple[Shard, ...]
@@ -164,7 +153,7 @@ class SplitShards:
     fingerprint: str
     stored: str
 
-    @property
+    @cached_property
     def rows(self) -> int:
         """Number of rows."""
         return sum(shard.rows for shard in self.shards)

@@ -11,24 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.loader.batch import Batch
-from cnpgen.loader.in_memory_rows import InMemoryRows
 from cnpgen.loader.order import Order
-from cnpgen.loader.packed import Packed, empty_packed, pack
+from cnpgen.loader.packed import InMemoryRows, Packed, empty_packed, pack
 from cnpgen.loader.row_format import RowFormat
 from cnpgen.loader.shard_reader import SplitShards
 
 Loaded = tuple[Packed, NDArray[np.int64]]
-
-
 T = TypeVar("T")
 
 
 def start(task: Callable[[], T]) -> "Future[T]":
-    """Run a task in a new thread. Unlike a pool, the thread ends with its task and does not disturb forks or exits.
-
-    Returns:
-        The future of the task; ``result()`` raises the exception of the task.
-    """
+    """Run a task in a new thread. Unlike a pool, the thread ends with its task and does not disturb forks or exits."""
     future: Future[T] = Future()
 
     def run() -> None:
@@ -42,14 +35,7 @@ def start(task: Callable[[], T]) -> "Future[T]":
 
 
 class Windows:
-    """Access to the rows of an epoch by position. At most two windows are in memory, unless the whole split is.
-
-    Args:
-        source: Shards of the split.
-        row_format: Format of the rows.
-        order: Order of the rows.
-        in_memory: Rows of the split that stay in memory; None for a large split.
-    """
+    """Access to the rows of an epoch by position. At most two windows are in memory, unless the whole split is."""
 
     def __init__(
         self, source: SplitShards, row_format: RowFormat, order: Order, in_memory: InMemoryRows | None
@@ -57,9 +43,8 @@ class Windows:
         self._source, self._row_format, self._order, self._in_memory = source, row_format, order, in_memory
         self._firsts = [window.first for window in order.windows]
         self._futures: dict[int, Future[Loaded]] = {}
-        self._memory: dict[
-            int, Packed
-        ] = {}  # of two windows, reused in turn, because allocating it takes as long as packing
+        # Memory of two windows, reused in turn, because allocating it takes as long as packing.
+        self._memory: dict[int, Packed] = {}
         self._process = os.getpid()
 
     def batch(self, first: int, last: int, *, rank: int = 0, world: int = 1) -> Batch:

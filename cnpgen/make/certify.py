@@ -1,5 +1,6 @@
 """Stage: certified samples, each with a plan that Pinocchio and Coal verify as valid."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
@@ -8,16 +9,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import RecipeError
+from cnpgen.kernels.library import problem_kernels
 from cnpgen.machine.threads import one_thread
 from cnpgen.make.recipe import DatasetRecipe
-from cnpgen.make.scene_solver import SceneSolver
 from cnpgen.make.stage_planner import SHA256, load_stage_planner, model_sha256, planner_boundary
 from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.stage import CandidateBatch, Stage, StageFunction
 from cnpgen.plans.format import BOUNDARY, OBSTACLE_POSES
-from cnpgen.robots.scene_arrays import scene_poses
+from cnpgen.problems.problem import Problem
+from cnpgen.refine.refine_engine import Solver, load_solver
+from cnpgen.robots.scene_arrays import sample_obstacles, scene_poses
 from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
+from cnpgen.store.scene_table import OBSTACLE_KINDS, SceneTable
+from cnpgen.trajectory.spline_motion import Motion
+
+Array = NDArray[np.float64]
+Counts = tuple[int, ...]  # obstacles of each kind
+
+PLACES_PER_STEP = 2  # numbers of places are multiples of it, so that scenes share solvers
 
 NO_PLAN = "no plan found"
 
@@ -38,7 +48,6 @@ class CertifiedPlan(Stage):
     )
 
     def describe(self) -> str:
-        """Describe the stage in one sentence."""
         origin = f"from the plan of {self.model!r}" if self.model else "from nothing"
         return (
             f"plan every sample {origin} (sequential quadratic programming, several starts) and keep those whose"
@@ -50,40 +59,29 @@ class CertifiedPlan(Stage):
         spec, joints = context.problem.trajectory, context.robot.joint_names
         points, rates = spec.path_control_points, spec.rate_control_points
         path_names = tuple(f"C{point}.{joint}" for point in range(points) for joint in joints)
-        shape = f"({points}, {len(joints)})"
-        text = f"control points of the path p(s) of a valid plan, reshape to {shape}"
-        units = context.robot.units("rad")
+        rate_names = tuple(f"R{point}" for point in range(rates))
+        text = f"control points of the path p(s) of a valid plan, reshape to ({points}, {len(joints)})"
+        units, rate_text = context.robot.units("rad"), "control points of its rate r(s) = ds/dt"
         return (
             Field("path_control_points", units, text, points * len(joints), path_names, role="target"),
-            Field(
-                "rate_control_points",
-                "1/s",
-                "control points of its rate r(s) = ds/dt",
-                rates,
-                tuple(f"R{point}" for point in range(rates)),
-                role="target",
-            ),
+            Field("rate_control_points", "1/s", rate_text, rates, rate_names, role="target"),
             Field("duration", "s", "its motion time", role="target"),
         )
 
     def task_inputs(self, context: Context) -> tuple[Field, ...]:
         """Return no fields: tasks have no plans."""
-        del context
         return ()
 
     def prepare(self, context: Context) -> StageFunction:
-        """Load the refiner."""
         if context.dtype != "float64":
             raise RecipeError([f"plans meet their boundary conditions in float64 only: needs it, got {context.dtype}"])
-        from cnpgen.refine.refine_engine import load_solver
-
         solver = load_solver(context.problem, context.robot, context.kernels)
         solver_of_scenes = SceneSolver(context)
         planner = load_stage_planner(self.model, self.sha256, context) if self.model else None
 
         def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
             columns = {name: np.ascontiguousarray(values.T) for name, values in candidates.columns.items()}
-            scenes, poses = None, dict[str, NDArray[np.float64]]()
+            scenes, poses = None, dict[str, Array]()
             if candidates.scenes is not None:
                 scenes = candidates.scenes.table[candidates.scene]
                 poses = {OBSTACLE_POSES: scene_poses(context.problem.obstacle, scenes)}
@@ -104,9 +102,7 @@ class CertifiedPlan(Stage):
 def certified(recipe: DatasetRecipe, *, model: str | Path | None = None) -> DatasetRecipe:
     """Return the recipe of the certified dataset, with one more stage and the name ``NAME-certified``.
 
-    Args:
-        recipe: Recipe of the samples; the recipe of a certified dataset is returned unchanged.
-        model: Planner of the initial guesses; by default there is none.
+    The model plans the initial guesses. The recipe of a certified dataset is returned unchanged.
 
     Raises:
         UsageError: There is no such model.
@@ -116,3 +112,47 @@ def certified(recipe: DatasetRecipe, *, model: str | Path | None = None) -> Data
     stage = CertifiedPlan() if model is None else CertifiedPlan(model=str(model), sha256=model_sha256(str(model)))
     pipeline = replace(recipe.pipeline, stage=(*recipe.pipeline.stage, stage))
     return replace(recipe, name=f"{recipe.name}-certified", pipeline=pipeline)
+
+
+class SceneSolver:
+    """Solvers of a problem for different numbers of obstacles; residuals of absent obstacles would take most time.
+
+    The parked obstacles of the problem are the places of those of scenes.
+    """
+
+    def __init__(self, context: Context) -> None:
+        self._context = context
+        self._solvers: dict[Counts, tuple[Problem, Solver]] = {}
+        capacity = {kind: len(places) for kind, places in sample_obstacles(context.problem.obstacle).items()}
+        self._capacity = np.array([capacity[kind] for kind in OBSTACLE_KINDS])
+
+    def __call__(
+        self, columns: Mapping[str, Array], scenes: SceneTable, guess: Motion | None = None
+    ) -> tuple[Motion, NDArray[np.bool_]]:
+        """Plan N rows with columns of shape (N, width), N scenes and N initial guesses; see ``load_solver``."""
+        spec, robot, count = self._context.problem.trajectory, self._context.robot, len(scenes)
+        path = np.empty((count, spec.path_control_points, robot.n))
+        rate, valid = np.empty((count, spec.rate_control_points)), np.zeros(count, bool)
+        numbers = np.stack([(scenes.obstacle_kind == code).sum(axis=1) for code in range(len(OBSTACLE_KINDS))], axis=1)
+        numbers = np.minimum(-(-numbers // PLACES_PER_STEP) * PLACES_PER_STEP, self._capacity)
+        groups, group_of = np.unique(numbers, axis=0, return_inverse=True)
+        for index, group in enumerate(groups.tolist()):
+            rows = np.flatnonzero(group_of.ravel() == index)
+            problem, solve = self._solver(tuple(group))
+            own = {name: values[rows] for name, values in columns.items()}
+            own[OBSTACLE_POSES] = scene_poses(problem.obstacle, scenes[rows])
+            motion, valid[rows] = solve(own, None if guess is None else guess[rows])
+            path[rows], rate[rows] = motion.path, motion.rate
+        return Motion(path, rate, spec.degree), valid
+
+    def _solver(self, counts: Counts) -> tuple[Problem, Solver]:
+        """Return the problem with places for some numbers of obstacles, and its solver."""
+        if counts not in self._solvers:
+            context, places = self._context, sample_obstacles(self._context.problem.obstacle)
+            kept = zip(OBSTACLE_KINDS, counts, strict=True)
+            removed = {index for kind, count in kept for index in places[kind][count:]}
+            obstacles = [each for index, each in enumerate(context.problem.obstacle) if index not in removed]
+            problem = context.problem.with_obstacles(obstacles)
+            kernels = problem_kernels(problem, context.robot, context.kernels.backend, context.kernels.cache_folder)
+            self._solvers[counts] = problem, load_solver(problem, context.robot, kernels)
+        return self._solvers[counts]

@@ -141,9 +141,8 @@ def _given(
     count = max(map(len, given.values()))
     for name, values in given.items():
         if len(values) not in {1, count}:
-            raise UsageError(
-                f"is given for {counted(len(values), 'task')}, another column for {count:,}", argument=name
-            )
+            text = f"is given for {counted(len(values), 'task')}, another column for {count:,}"
+            raise UsageError(text, argument=name)
     check_plausible(robot, given, {name: field.unit for name, field in fields.items()}, noun="task")
     return given
 

@@ -9,14 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError, lacks
-from cnpgen.make.goal_poses import (
-    MIN_DIFFERENCE_RAD,
-    POSE_REASON,
-    POSE_SEEDS,
-    EndConditions,
-    nearest_states,
-    states_of_pose,
-)
+from cnpgen.make.goal_poses import POSE_REASON, POSE_SEEDS, EndConditions, states_of_pose
 from cnpgen.pipelines.families.resting_states import RestingStates
 from cnpgen.plans.format import GOAL_OPTION
 from cnpgen.plans.plans import Plans, make_plans
@@ -56,10 +49,7 @@ def problem_of_poses(recipe: object) -> Problem | None:
 
 
 class PoseTasks:
-    """Tasks of a problem whose goals are poses of the tip.
-
-    Args:
-        problem: The problem; its obstacles are avoided.
+    """Tasks of a problem, with its obstacles, whose goals are poses of the tip.
 
     Attributes:
         robot: Its robot.
@@ -128,12 +118,11 @@ class PoseTasks:
         if not (clear and self._conditions.met(start[:, None])[0]):
             return START_REASON
         random = np.random.default_rng(POSE_SEEDS)
-        valid, found = states_of_pose(self._kinematics, self._states, self._conditions, pose, random)
+        checks = self._states, self._conditions
+        goals, found = states_of_pose(self._kinematics, *checks, pose, start=start, random=random)
         if not len(found):
             return POSE_REASON
-        return (
-            nearest_states(valid, start, self.robot, min_difference=MIN_DIFFERENCE_RAD) if len(valid) else GOAL_REASON
-        )
+        return goals if len(goals) else GOAL_REASON
 
     def _pose(self, task: int, given: Mapping[str, Array]) -> GoalPose:
         """Return the goal pose of a task; without an orientation, any is accepted."""

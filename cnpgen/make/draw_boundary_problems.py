@@ -2,8 +2,6 @@
 
 from pathlib import Path
 
-import numpy as np
-
 from cnpgen.kernels.library import choose_backend
 from cnpgen.make.recipe import MAX_SEED, DatasetRecipe
 from cnpgen.make.recipe_file import as_dataset_recipe
@@ -35,6 +33,7 @@ def draw_boundary_problems(recipe: str | Path | DatasetRecipe, n: int, *, seed: 
             not a recipe.
         MachineError: No backend works.
     """
+    from cnpgen.make.make_shards import stored_columns
     from cnpgen.pipelines.prepared import PreparedPipeline
 
     n = integer("n", n, least=1)
@@ -48,11 +47,7 @@ def draw_boundary_problems(recipe: str | Path | DatasetRecipe, n: int, *, seed: 
     blocks = [
         prepared.block(root, SPLIT, index, first=0, stop=min(n - index * rows, rows)) for index in range(-(-n // rows))
     ]
-    parts = [block.columns for block in blocks]
-    columns = {}
-    for field in prepared.fields:
-        values = np.concatenate([part[field.name] for part in parts], axis=1).T
-        columns[field.name] = np.ascontiguousarray(values if field.width else values[:, 0])
+    columns = stored_columns(blocks, prepared.fields, "float64")
     if tables := [block.scenes for block in blocks if block.scenes is not None]:
         scenes = concatenate_scenes(tables)
         table = scenes[scenes.rows_of(columns[SCENE_ID])]

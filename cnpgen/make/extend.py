@@ -12,16 +12,17 @@ from cnpgen.make.make_dataset import Begin, MadeDataset, Progress, carry_out
 from cnpgen.make.make_shards import Job, prepare
 from cnpgen.make.recipe import DatasetRecipe, split_rows
 from cnpgen.make.recipe_file import makes_its_rows, restored
+from cnpgen.make.repair import delete_shards
 from cnpgen.make.resolve_spec import MAX_ROWS
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
 from cnpgen.schema.texts import read_own, utf8_text
 from cnpgen.store.card import card_notes
 from cnpgen.store.dataset_spec import DatasetSpec, write_dataset_spec
-from cnpgen.store.files.atomic import check_writable, machine_error
+from cnpgen.store.files.atomic import check_writable
 from cnpgen.store.files.leftovers import remove_leftovers
 from cnpgen.store.intact import RERUN_HINT
-from cnpgen.store.layout import CARD, MANIFEST, SPECIFICATION, WORK
+from cnpgen.store.layout import CARD, SPECIFICATION, WORK
 from cnpgen.store.paths import require_dataset
 from cnpgen.store.shard_record import pending
 from cnpgen.store.workspace import check_place, find_workspace
@@ -71,7 +72,8 @@ def extend_dataset(
         if extended is not begun:
             check_writable(folder)
             prepare(job)  # raises errors of this machine before anything is written
-            _replace_spec(folder, extended)
+            delete_shards(folder, ())
+            write_dataset_spec(folder, extended)
         remove_leftovers(folder / WORK)
         return carry_out(job, notes, engine=where, begin=begin, progress=progress)
 
@@ -91,9 +93,8 @@ def _extended(folder: Path, begun: DatasetSpec, recipe: DatasetRecipe, n: int) -
     if splits == begun.splits:
         return begun
     if any(splits.get(split, 0) < rows for split, rows in begun.splits.items()):
-        raise UsageError(
-            f"{folder} has {sum(begun.splits.values()):,} rows: choose a larger {{n}}, got {n:,}", remedies={"n": None}
-        )
+        text = f"{folder} has {sum(begun.splits.values()):,} rows: choose a larger {{n}}, got {n:,}"
+        raise UsageError(text, remedies={"n": None})
     if not makes_its_rows(recipe, begun):
         raise UsageError(
             f"{folder} was made by another version of cnpgen or of its plug-ins, and this version generates other rows"
@@ -109,12 +110,3 @@ def _notes(folder: Path) -> str:
         return card_notes(utf8_text(read_own(folder / CARD, folder / SPECIFICATION, "a card")))
     except (OSError, ValueError):
         return ""
-
-
-def _replace_spec(folder: Path, spec: DatasetSpec) -> None:
-    """Write the new specification.json after deleting the manifest of the old one."""
-    try:
-        (folder / MANIFEST).unlink(missing_ok=True)
-    except OSError as error:
-        raise machine_error("delete", folder / MANIFEST, error) from error
-    write_dataset_spec(folder, spec)

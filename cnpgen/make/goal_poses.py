@@ -27,13 +27,7 @@ MIN_DIFFERENCE_RAD = 0.3  # rad or m, of two goal states with one pose in their 
 
 
 class EndConditions:
-    """Conditions of a problem on states at rest, except for distances of links, which ``RestingStates`` checks.
-
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        obstacles: Further obstacles.
-    """
+    """Conditions of a problem on states at rest, except for distances of links, which ``RestingStates`` checks."""
 
     def __init__(self, problem: Problem, robot: Robot, obstacles: Sequence[Obstacle] = ()) -> None:
         placed = problem.with_obstacles((*problem.obstacle, *obstacles)) if obstacles else problem
@@ -64,19 +58,17 @@ def states_of_pose(
     states: RestingStates | None,
     conditions: EndConditions,
     pose: GoalPose,
+    *,
+    start: Array,
     random: np.random.Generator,
 ) -> tuple[Array, Array]:
-    """Return joint positions with a goal pose.
+    """Return joint positions with a goal pose of a frame.
 
-    Args:
-        kinematics: Kinematics of the frame that has the pose.
-        states: Checks of states of rest in the scene; None if the robot has no link geometry.
-        conditions: Checks of the other conditions.
-        pose: The pose with its tolerances.
-        random: Random numbers for the seeds.
+    Robots without link geometry have no ``states`` of rest in a scene. ``random`` draws the seeds.
 
     Returns:
-        Joint positions that can end a motion, and all with this pose [rad], shape (G, n) and (H, n).
+        Joint positions that can end a motion, the nearest to the start (n,) first, and all with this pose [rad], shape
+        (G, n) and (H, n).
     """
     positions, rotations = np.tile(pose.position, (POSE_SEEDS, 1)), np.tile(pose.rotation, (POSE_SEEDS, 1, 1))
     tolerances = [np.tile(np.broadcast_to(each, 3), (POSE_SEEDS, 1)) for each in pose.tolerances]
@@ -86,17 +78,14 @@ def states_of_pose(
     found = q[:, met]
     valid = found if states is None else found[:, states.are_ends(found)]
     valid = valid[:, conditions.met(valid)]
-    return valid.T.copy(), found.T.copy()
+    return nearest_states(valid.T, start, kinematics.robot, min_difference=MIN_DIFFERENCE_RAD), found.T.copy()
 
 
 def nearest_states(states: Array, start: Array, robot: Robot, *, min_difference: float = 0.0) -> Array:
-    """Return at most ``MAX_GOAL_STATES`` states in the order of the straight line's duration at full speed.
+    """Return at most ``MAX_GOAL_STATES`` states [rad], shape (G, n), the nearest to the start, shape (n,), first.
 
-    Args:
-        states: Joint positions [rad], shape (G, n).
-        start: Joint positions at the start [rad], shape (n,).
-        robot: The robot.
-        min_difference: Difference of the farthest joint from a nearer state, below which a state is left out.
+    The distance is the duration of the straight line at full speed. A state is left out if its farthest joint differs
+    less than ``min_difference`` from a nearer state.
     """
     duration = (np.abs(states - start) / robot.velocity_limit).max(axis=1)
     chosen = list[Array]()

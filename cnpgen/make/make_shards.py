@@ -72,14 +72,9 @@ def prepare(job: Job) -> PreparedPipeline:
 
 
 def make_shards(job: Job, tasks: Sequence[ShardTask]) -> Iterator[tuple[int, SamplingStatistics]]:
-    """Generate, check and commit shards of one split; the operation is idempotent.
+    """Generate, check and commit shards of one split, in order; yield rows and sampling statistics of each.
 
-    Args:
-        job: Job of the dataset.
-        tasks: Shards, in order; shared blocks are computed once.
-
-    Yields:
-        Number of rows and sampling statistics of every committed shard.
+    The operation is idempotent.
 
     Raises:
         RecipeError: The accepted fraction of the candidates is too small.
@@ -117,11 +112,6 @@ def shard_columns(
 ) -> Iterator[tuple[dict[str, NDArray[Any]], SamplingStatistics, SceneTable | None]]:
     """Compute the rows of shards of one split; every block is computed once.
 
-    Args:
-        prepared: Prepared pipeline.
-        spec: Specification of the dataset.
-        tasks: Shards, in order.
-
     Yields:
         ``(columns, sampling, scenes)`` of every shard: field name -> values as stored, shape (rows, width) or (rows,),
         the sampling statistics, and the scenes of the rows, None without scenes.
@@ -131,9 +121,7 @@ def shard_columns(
         parts: list[Block] = []
         while sum(part.columns["sample_id"].shape[1] for part in parts) < task.rows:
             parts.append(next(chunks))
-        columns = {
-            field.name: _stored([part.columns[field.name] for part in parts], field, spec) for field in spec.fields
-        }
+        columns = stored_columns(parts, spec.fields, spec.dtype)
         tables = [part.scenes.astype(spec.dtype) for part in parts if part.scenes is not None]
         scenes = concatenate_scenes(tables) if tables else None
         yield columns, merge_sampling([part.sampling for part in parts]), scenes
@@ -158,10 +146,13 @@ def blocks_of(task: ShardTask, size: int) -> range:
     return range(task.first_row // size, (task.first_row + task.rows - 1) // size + 1)
 
 
-def _stored(parts: list[NDArray[Any]], field: Field, spec: DatasetSpec) -> NDArray[Any]:
-    """Concatenate chunks of shape (width, rows) to the stored values of a field, shape (rows, width) or (rows,)."""
-    rows = np.concatenate(parts, axis=1).T
-    return np.ascontiguousarray(rows if field.width else rows[:, 0], storage_dtype(field, spec.dtype))
+def stored_columns(parts: Sequence[Block], fields: Sequence[Field], dtype: str) -> dict[str, NDArray[Any]]:
+    """Concatenate chunks to the stored values of their fields, shape (rows, width) or (rows,) each."""
+    columns = {}
+    for item in fields:
+        rows = np.concatenate([part.columns[item.name] for part in parts], axis=1).T
+        columns[item.name] = np.ascontiguousarray(rows if item.width else rows[:, 0], storage_dtype(item, dtype))
+    return columns
 
 
 def spot_check(
@@ -171,14 +162,7 @@ def spot_check(
     task: ShardTask,
     scenes: SceneTable | None = None,
 ) -> dict[str, float]:
-    """Recompute some rows with Pinocchio and Coal, to detect errors of the compiler or backend.
-
-    Args:
-        prepared: Prepared pipeline.
-        columns: Rows of the shard.
-        spec: Specification of the dataset.
-        task: The shard.
-        scenes: Scenes of the rows.
+    """Recompute some rows of a shard with Pinocchio and Coal, to detect errors of the compiler or backend.
 
     Returns:
         Largest violation of every check, in its unit.

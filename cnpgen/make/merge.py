@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -14,11 +14,11 @@ from cnpgen.make.recipe import recipe_digest
 from cnpgen.make.recipe_file import load_dataset_recipe, load_notes
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.catalogue import list_recipes
-from cnpgen.store.checked_shard import read_rows, shard_of_record
+from cnpgen.store.checked_shard import Shard, read_rows
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, load_dataset_spec, shards
 from cnpgen.store.files.atomic import committing, file_sha256, read_file, write_file
 from cnpgen.store.intact import COPY_HINT, OUTSIDE, outside_links
-from cnpgen.store.layout import WORK
+from cnpgen.store.layout import DOCUMENTS, WORK
 from cnpgen.store.manifest import source_date
 from cnpgen.store.paths import require_dataset
 from cnpgen.store.shard_record import is_committed, load_committed
@@ -29,11 +29,7 @@ MAX_LISTED_SHARDS = 3  # in an error message
 
 @checked_arguments
 def merge_datasets(
-    parts: Sequence[str | Path],
-    out: str | Path,
-    *,
-    begin: Begin | None = None,
-    progress: Progress | None = None,
+    parts: Sequence[str | Path], out: str | Path, *, begin: Begin | None = None, progress: Progress | None = None
 ) -> MadeDataset:
     """Merge parts that ``make_dataset(..., part=(k, m))`` generated in separate folders, or continue a merge.
 
@@ -76,11 +72,9 @@ def merge_datasets(
 
 def _common_spec(folders: Sequence[Path]) -> DatasetSpec:
     """Return the common specification of all parts."""
-    if not folders:
-        raise UsageError("must name at least one folder, got none", argument="parts")
     for folder in folders:
         require_dataset(folder, argument="parts")
-        _require_inside(folder, outside_links(folder))
+        _require_inside(folder)
     first, *rest = folders
     spec = load_dataset_spec(first)
     for folder in rest:
@@ -91,9 +85,9 @@ def _common_spec(folders: Sequence[Path]) -> DatasetSpec:
     return spec
 
 
-def _require_inside(folder: Path, links: Sequence[str]) -> None:
-    """Raise an error for links that lead outside the folder of a part."""
-    if links:
+def _require_inside(folder: Path, names: Sequence[str] = (*DOCUMENTS, WORK)) -> None:
+    """Raise an error for documents, or other files, that are links that lead outside the folder of a part."""
+    if links := outside_links(folder, names):
         raise DatasetError(f"{folder / links[0]} {OUTSIDE}; {COPY_HINT}")
 
 
@@ -114,7 +108,7 @@ def _owners(folders: Sequence[Path], out: Path, spec: DatasetSpec) -> dict[Shard
             if holders and read_file(holders[0] / task.sidecar) != read_file(out / task.sidecar):
                 raise UsageError(f"{holders[0]} and {out} both have {task.file}: parts must not overlap")
         elif holders:
-            _require_inside(holders[0], outside_links(holders[0], (task.file, task.sidecar)))
+            _require_inside(holders[0], (task.file, task.sidecar))
             owners[task] = holders[0]
         else:
             missing.append(task.file)
@@ -130,15 +124,14 @@ def _copy(folder: Path, out: Path, task: ShardTask, spec: DatasetSpec) -> None:
         shutil.copyfile(folder / task.file, temporary)
         if file_sha256(temporary) != record.sha256:
             raise DatasetError(f"{folder / task.file} was changed: its sha256 is not the recorded one")
-        read_rows(shard_of_record(folder, spec, task, record))
+        read_rows(Shard(folder, spec, task))
     write_file(out / task.sidecar, read_file(folder / task.sidecar), work=out / WORK)
 
 
 def _shipped_notes(spec: DatasetSpec) -> str:
     """Return the data card of a shipped recipe with the same rows; empty for other recipes."""
-    known: Mapping[str, Path] = list_recipes("dataset")
     model = spec.stages[-1].get("model")
-    for name in known:
+    for name in list_recipes("dataset"):
         with suppress(RecipeError, UsageError):
             recipe = load_dataset_recipe(name)
             for variant in (recipe, certified(recipe, model=model)):

@@ -42,7 +42,6 @@ class StartOnPlan(Stage):
     times: Range = field("time on the plan as a fraction of its duration")
 
     def describe(self) -> str:
-        """Describe the stage in one sentence."""
         return (
             f"plan with {self.model!r} and move {100 * self.moved:.4g} % of the starts to a time between"
             f" {self.times.low:g} and {self.times.high:g} of the motion time, {100 * self.refined:.4g} % of them"
@@ -65,7 +64,6 @@ class StartOnPlan(Stage):
         return (*(field.name for field in self.outputs(context)), "start_tip_velocity", *map(of_plan, GOAL))
 
     def prepare(self, context: Context) -> StageFunction:
-        """Load the planner, the refiner and the kernels."""
         height = context.constraint(Table).z
         load = context.kernels.load
         exact, tip, speed = load(onto_table, height=height), load(tip_position), load(velocity_of_tip)
@@ -89,7 +87,6 @@ class StartOnPlan(Stage):
 
     def complete(self, context: Context, given: Collection[str]) -> StageFunction:
         """Keep the start of tasks."""
-        del context, given
         return leave
 
     def _maker(
@@ -124,12 +121,9 @@ class GoalOfPlan(Stage):
     share: float = field("fraction of the plans that are refined", low=0.0, high=1.0)
 
     def describe(self) -> str:
-        """Describe the stage in one sentence."""
         return f"in {100 * self.share:.4g} % of the cases take the goal of the motion that the start is on"
 
     def prepare(self, context: Context) -> StageFunction:
-        """Return the stage function."""
-        del context
 
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
             same = candidates.draw(random, 1)[0] < self.share
@@ -140,7 +134,6 @@ class GoalOfPlan(Stage):
 
     def complete(self, context: Context, given: Collection[str]) -> StageFunction:
         """Keep the goal of tasks."""
-        del context, given
         return leave
 
 

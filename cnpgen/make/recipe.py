@@ -70,25 +70,20 @@ def split_rows(recipe: DatasetRecipe, n: int) -> dict[str, int]:
 
 
 def recipe_digest(recipe: Pipeline | DatasetRecipe) -> str:
-    """Hash everything that determines the rows of a seed.
+    """Hash everything that determines the rows of a seed, as 64 hexadecimal digits (sha256).
 
     The hash covers the resolved pipeline and problem, the code of plug-ins and the content of the URDF. It does not
     cover titles, comments, paths, the seed or the splits. Writing "5 mm" for 0.005, or a default explicitly, does not
     change it. Another name, trajectory or objective changes it, although the rows stay the same.
-
-    Returns:
-        sha256, as 64 hexadecimal digits.
     """
     pipeline = recipe.pipeline if isinstance(recipe, DatasetRecipe) else recipe
     return resolved_digest(resolved(pipeline), pipeline.problem.urdf_text.encode())
 
 
 def resolved_digest(pipeline: Mapping[str, Any], urdf: bytes) -> str:
-    """Hash a resolved pipeline, for example from the specification of a dataset; see ``recipe_digest``.
+    """Hash the result of ``resolved`` for a pipeline, for example from the specification of a dataset, and its URDF.
 
-    Args:
-        pipeline: Result of ``resolved``.
-        urdf: Content of the robot's URDF file.
+    See ``recipe_digest``.
     """
     content = {key: value for key, value in pipeline.items() if key != "title"}
     content |= {"problem": without_labels(pipeline["problem"]), "urdf_sha256": hashlib.sha256(urdf).hexdigest()}

@@ -64,12 +64,7 @@ def as_dataset_recipe(recipe: object) -> DatasetRecipe:
 
 
 def restore_dataset_recipe(content: dict[str, Any], urdf: str, folder: Path) -> DatasetRecipe:
-    """Rebuild a recipe from its resolved form in the specification of a dataset.
-
-    Args:
-        content: Resolved recipe.
-        urdf: Text of the robot's URDF file.
-        folder: Folder for the URDF file.
+    """Rebuild a recipe from its resolved form in a specification; its URDF file belongs into ``folder``.
 
     Raises:
         RecipeError: This version of cnpgen does not support the content.

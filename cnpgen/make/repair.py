@@ -7,11 +7,11 @@ from functools import partial
 from pathlib import Path
 
 from cnpgen.errors import DatasetError
-from cnpgen.store.checked_shard import read_rows, shard_of_record
+from cnpgen.store.checked_shard import Shard, read_rows
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask
 from cnpgen.store.files.atomic import machine_error
 from cnpgen.store.layout import MANIFEST
-from cnpgen.store.shard_record import check_committed, load_record
+from cnpgen.store.shard_record import check_committed
 
 MAX_THREADS = 8
 
@@ -26,22 +26,9 @@ def existing_shards(folder: Path, tasks: Sequence[ShardTask]) -> list[ShardTask]
 
 
 def find_damaged(
-    folder: Path,
-    spec: DatasetSpec,
-    tasks: Sequence[ShardTask],
-    *,
-    progress: Callable[[ShardTask], None] | None = None,
+    folder: Path, spec: DatasetSpec, tasks: Sequence[ShardTask], *, progress: Callable[[int, None], None] | None = None
 ) -> dict[ShardTask, str]:
-    """Compare the bytes of shards with their sidecars, and their content with the specification.
-
-    Args:
-        folder: Folder of the dataset.
-        spec: Specification of the dataset.
-        tasks: Existing shards.
-        progress: Called with every compared shard.
-
-    Returns:
-        Damaged shard -> description of the damage, in order.
+    """Compare existing shards with their sidecars and the specification; return damaged shard -> description, in order.
 
     Raises:
         MachineError: A file cannot be read.
@@ -53,7 +40,7 @@ def find_damaged(
             if problem:
                 damaged[task] = problem
             if progress is not None:
-                progress(task)
+                progress(task.rows, None)
     finally:
         pool.shutdown(cancel_futures=True)
     return damaged
@@ -63,20 +50,20 @@ def _problem(folder: Path, spec: DatasetSpec, task: ShardTask) -> str:
     """Return a description of the damage of a shard; empty for an intact shard."""
     try:
         check_committed(folder, spec, task)
-        read_rows(shard_of_record(folder, spec, task, load_record(folder, task)))
+        read_rows(Shard(folder, spec, task))
     except DatasetError as error:
         return str(error)
     return ""
 
 
 def delete_shards(folder: Path, tasks: Sequence[ShardTask]) -> None:
-    """Delete shards of a dataset, which is unfinished from then on.
+    """Delete shards and the manifest of a dataset, which is unfinished from then on.
 
     Raises:
         MachineError: A file cannot be deleted.
     """
-    names = [MANIFEST, *(name for task in tasks for name in (task.sidecar, task.file))] if tasks else []
-    for name in names:  # first the manifest and the sidecars, which mark data as complete
+    # First the manifest and the sidecars, which mark data as complete.
+    for name in (MANIFEST, *(name for task in tasks for name in (task.sidecar, task.file))):
         try:
             (folder / name).unlink(missing_ok=True)
         except OSError as error:

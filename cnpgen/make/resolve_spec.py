@@ -49,18 +49,10 @@ def draw_up(
     backend: str | None = None,
     force: bool = False,
 ) -> Job:
-    """Resolve the job of ``make_dataset``: build its kernels but write no file of the dataset.
+    """Resolve the job of ``make_dataset``, whose arguments these are; build its kernels but write no file.
 
-    Args:
-        recipe: Recipe of the dataset.
-        workspace: Folder of the dataset. If it holds an unfinished dataset of the recipe, that one determines the
-            default backend and shard size.
-        n: Number of rows over all splits; default the recipe's.
-        seed: Root seed; default the recipe's.
-        shard_size: Rows per shard.
-        dtype: Float type of stored rows.
-        backend: Backend of the kernels; default the fastest working one.
-        force: Whether the present content of the folder will be deleted.
+    An unfinished dataset of the recipe in the folder determines the default backend and shard size, unless ``force``
+    deletes it.
 
     Raises:
         RecipeError: The recipe has mistakes.

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from cnpgen.machine.times import NO_TIME, Times
 from cnpgen.make.goal_poses import (
     MAX_GOAL_STATES,
-    MIN_DIFFERENCE_RAD,
     POSE_REASON,
     POSE_SEEDS,
     EndConditions,
@@ -24,13 +23,7 @@ from cnpgen.pipelines.families.resting_states import RestingStates
 from cnpgen.plans.concatenate import concatenate
 from cnpgen.plans.format import GOAL_OPTION
 from cnpgen.plans.plans import Plans
-from cnpgen.plans.scene_plans import (
-    capacity_of,
-    goal_states,
-    joint_order,
-    scene_plans,
-    with_wider_capacity,
-)
+from cnpgen.plans.scene_plans import capacity_of, goal_states, joint_order, scene_plans, with_wider_capacity
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import as_problem, open_problem
@@ -131,15 +124,38 @@ def solve_scenes(
     loaded, scenes = as_problem(problem), [checked_scene(scene) for scene in scenes]
     robot = load_robot(loaded)
     goals = [_goals(loaded, robot, scene, index) for index, scene in enumerate(scenes)]
-    run = _SceneRun(loaded, scenes, options, (workers, engine, address), progress)
     if begin is not None:
         begin(len(scenes), 0)
-    journals = list[Path]()
+
+    def report(finished: int, valid: int) -> None:
+        if progress is not None and finished:
+            progress(finished, valid)
+
+    capacity = capacity_of(scenes)
+    found, times, journals = dict[int, tuple[Plans, Attempt]](), NO_TIME, list[Path]()
     for own, indices in _groups(scenes):
         file = None if journal is None else Path(f"{journal}.{len(journals)}")
         journals += [] if file is None else [file]
-        run.solve(indices, [goals[index] for index in indices], own, file, discard=discard)
-    solved = run.result()
+        refinement = solve_plans(
+            _plans_of(loaded, scenes, [(index, goals[index]) for index in indices], own),
+            options=options,
+            workers=workers,
+            engine=engine,
+            address=address,
+            journal=file,
+            discard=discard,
+            begin=lambda _, finished: report(finished, finished),
+            progress=report,
+        )
+        times += refinement.times
+        columns = {name: values for name, values in refinement.plans.columns.items() if name != GOAL_OPTION}
+        chosen = replace(refinement.plans, columns=columns)
+        wide = with_wider_capacity(chosen, loaded, own, capacity)
+        for row, (index, attempt) in enumerate(zip(indices, refinement.results, strict=True)):
+            without_goal = np.isnan(goals[index]).all()
+            found[index] = wide[row], replace(attempt, reason=POSE_REASON) if without_goal else attempt
+    every, results = zip(*(found[index] for index in range(len(scenes))), strict=True)
+    solved = SolvedScenes(tuple(scenes), concatenate(every), results, times)
     for file in journals:
         file.unlink(missing_ok=True)
     return solved
@@ -153,59 +169,14 @@ def _groups(scenes: Sequence[SceneProblem]) -> list[tuple[dict[str, int], list[i
     return [(dict(capacity), members) for capacity, members in groups.items()]
 
 
-@dataclass(eq=False)
-class _SceneRun:
-    """Plans and attempts of the scenes so far."""
-
-    problem: Problem
-    scenes: Sequence[SceneProblem]
-    options: RefineOptions
-    engine: tuple[int | None, str | None, str | None]
-    progress: Progress | None
-
-    def __post_init__(self) -> None:
-        self._found: dict[int, tuple[Plans, Attempt]] = {}
-        self._capacity = capacity_of(self.scenes)
-        self._times = NO_TIME
-
-    def solve(
-        self, indices: Sequence[int], goals: Sequence[Array], own: Capacity, journal: Path | None, *, discard: bool
-    ) -> None:
-        """Plan scenes of one capacity, each to any of its goal states, shape (G, n) each."""
-        options = [(index, option, goal) for index, states in zip(indices, goals, strict=True)
-                   for option, goal in enumerate(states)]  # fmt: skip
-        rows, numbers, states = zip(*options, strict=True)
-        plans = scene_plans(self.problem, [self.scenes[i] for i in rows], goals=states, capacity=own, sample_id=rows)
-        if any(numbers):
-            plans = replace(plans, columns={**plans.columns, GOAL_OPTION: np.array(numbers, float)})
-        workers, engine, address = self.engine
-        refinement = solve_plans(
-            plans,
-            options=self.options,
-            workers=workers,
-            engine=engine,
-            address=address,
-            journal=journal,
-            discard=discard,
-            begin=lambda _, finished: self._report(finished, finished),
-            progress=self._report,
-        )
-        self._times += refinement.times
-        columns = {name: values for name, values in refinement.plans.columns.items() if name != GOAL_OPTION}
-        chosen = replace(refinement.plans, columns=columns)
-        wide = with_wider_capacity(chosen, self.problem, own, self._capacity)
-        for row, (index, attempt) in enumerate(zip(indices, refinement.results, strict=True)):
-            without_goal = np.isnan(goals[row]).all()
-            self._found[index] = wide[row], replace(attempt, reason=POSE_REASON) if without_goal else attempt
-
-    def _report(self, finished: int, valid: int) -> None:
-        if self.progress is not None and finished:
-            self.progress(finished, valid)
-
-    def result(self) -> SolvedScenes:
-        """Return all plans, those of all capacities in one set."""
-        plans, results = zip(*(self._found[index] for index in range(len(self.scenes))), strict=True)
-        return SolvedScenes(tuple(self.scenes), concatenate(plans), results, self._times)
+def _plans_of(
+    problem: Problem, scenes: Sequence[SceneProblem], goals: Sequence[tuple[int, Array]], capacity: Capacity
+) -> Plans:
+    """Return boundary problems of scenes of one capacity, by index, one for each goal state, shape (G, n) each."""
+    options = [(index, option, goal) for index, states in goals for option, goal in enumerate(states)]
+    rows, numbers, states = zip(*options, strict=True)
+    plans = scene_plans(problem, [scenes[i] for i in rows], goals=states, capacity=capacity, sample_id=rows)
+    return replace(plans, columns={**plans.columns, GOAL_OPTION: np.array(numbers, float)}) if any(numbers) else plans
 
 
 def _goals(problem: Problem, robot: Robot, scene: SceneProblem, index: int) -> Array:
@@ -231,12 +202,12 @@ def _states_of_pose(problem: Problem, robot: Robot, scene: SceneProblem, index: 
     kinematics = PoseKinematics(robot, _frame_of(robot, scene, pose))
     states = RestingStates(problem, robot, scene.obstacles)
     conditions = EndConditions(problem, robot, scene.obstacles)
-    valid, found = states_of_pose(kinematics, states, conditions, pose, np.random.default_rng([index, POSE_SEEDS]))
+    random = np.random.default_rng([index, POSE_SEEDS])
+    start = _start(scene, robot)
+    goals, found = states_of_pose(kinematics, states, conditions, pose, start=start, random=random)
     if not len(found):
         return np.full((1, robot.n), np.nan)
-    if not len(valid):
-        return found[:1]  # in collision: the explanation of the unsolved scene names it
-    return nearest_states(valid, _start(scene, robot), robot, min_difference=MIN_DIFFERENCE_RAD)
+    return goals if len(goals) else found[:1]  # in collision: the explanation of the unsolved scene names it
 
 
 def _frame_of(robot: Robot, scene: SceneProblem, pose: GoalPose) -> int | None:

@@ -33,12 +33,7 @@ def model_sha256(model: str) -> str:
 
 
 def load_stage_planner(model: str, sha256: str, context: Context) -> "Planner":
-    """Load the planner of a stage.
-
-    Args:
-        model: Name of a shipped model, or path of a model file.
-        sha256: Digest of its file.
-        context: Problem and kernels of the stage.
+    """Load the planner of a stage, a shipped model or a model file with the digest ``sha256``.
 
     Raises:
         RecipeError: The file has another sha256, or the model is for another problem.

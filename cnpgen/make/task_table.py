@@ -19,13 +19,10 @@ Array = NDArray[np.float64]
 
 
 def read_tasks(path: Path, fields: Mapping[str, Field], *, flat: bool) -> dict[str, Array]:
-    """Read tasks from a table.
+    """Read tasks with known fields from a table; on a table (``flat``), positions need no z.
 
-    Args:
-        path: CSV file with column names in the first line, or HDF5 file whose datasets are columns or whole fields of
-            shape (N, width); values in SI units.
-        fields: Columns that tasks may have: name -> field.
-        flat: Whether positions are on a table and need no z.
+    The file is CSV with column names in the first line, or HDF5 whose datasets are columns or whole fields of shape (N,
+    width), in SI units.
 
     Returns:
         Name -> values, shape (N,) or (N, width); (N, 2) for positions without z.
@@ -45,7 +42,9 @@ def read_tasks(path: Path, fields: Mapping[str, Field], *, flat: bool) -> dict[s
     known = {**fields, **{column: field for field in fields.values() for column in field.columns}}
     for name, values in columns.items():
         if name not in known:
-            raise DatasetError(_unknown(path, name, fields))
+            hint = nearest(name, [column for field in fields.values() for column in field.columns])
+            text = f"tasks of this pipeline cannot give {name!r}{hint or ', only ' + ', '.join(fields)}"
+            raise DatasetError(f"{path}: {text}")
         if not np.isfinite(values).all():
             row = int(np.argmin(np.isfinite(values).reshape(len(values), -1).all(axis=1)))
             raise DatasetError(f"{path}: {name} must be a finite number in every task, got {values[row]} in task {row}")
@@ -55,11 +54,6 @@ def read_tasks(path: Path, fields: Mapping[str, Field], *, flat: bool) -> dict[s
         if parts:
             found[field.name] = _joined(path, field, parts, columns, flat=flat)
     return found
-
-
-def _unknown(path: Path, name: str, fields: Mapping[str, Field]) -> str:
-    hint = nearest(name, [column for field in fields.values() for column in field.columns])
-    return f"{path}: tasks of this pipeline cannot give {name!r}{hint or ', only ' + ', '.join(fields)}"
 
 
 def _joined(path: Path, field: Field, parts: list[str], columns: Mapping[str, Array], *, flat: bool) -> Array:

@@ -26,14 +26,10 @@ ZERO_VELOCITY_ROUNDING_M_S = 1e-14  # rounding error of a velocity that is zero 
 
 
 def acceptance(context: Context, written: set[str], *, given: Collection[End] = ()) -> StageFunction:
-    """Prepare the acceptance check.
+    """Prepare the acceptance check of the columns that the stages write.
 
-    Args:
-        context: Loaded problem.
-        written: Columns that the stages write. Accelerations and torques of the goal are checked if ``goal_ddq`` is
-            among them.
-        given: Ends with a state from the user, for example a measurement. The tolerances of motions apply to them, not
-            those of boundary states.
+    Accelerations and torques of the goal are checked if ``goal_ddq`` is among them. The tolerances of motions apply to
+    ``given`` ends, whose state is from the user, for example a measurement; to others those of boundary states.
 
     Returns:
         A stage function that rejects candidates under the reason of the first violated constraint.
@@ -87,19 +83,9 @@ def boundary_unmet(
     """Build ``(q, dq, ddq, obstacle_poses, position) -> unmet``, positive for violations above tolerance and for nan.
 
     For a hit it is ``(q, dq, ddq, obstacle_poses, position, angle, speed) -> unmet``: the tip velocity must be
-    horizontal, along the angle, at the speed.
-
+    horizontal, along the angle, at the speed. Conditions on derivatives of q higher than ``needs`` are omitted. Unless
+    the state is ``exact``, the tolerances of motions apply, and conditions for boundary states only are omitted.
     ``cnpgen.pipelines.stages.narrow_phase`` checks conservative conditions.
-
-    Args:
-        robot: Robot.
-        problem: Problem.
-        end: End of the motion.
-        needs: Highest known derivative of q; conditions on higher derivatives are omitted.
-        dtype: Key of the tolerances in ``BOUNDARY_TOLERANCES``.
-        exact: Whether the tolerances of boundary states apply. Otherwise those of motions apply, and conditions for
-            boundary states only are omitted.
-        hitting: Whether the end is a hit.
 
     Returns:
         A function whose result has one row per constraint, one for the tip position, and one for a hit.
@@ -116,11 +102,8 @@ def boundary_unmet(
             if condition.sufficient:
                 continue
             if symbolic_needs(condition, *columns[1:3]) <= needs and (exact or condition.name in along):
-                tolerance = (
-                    condition.tolerance(dtype)
-                    if exact
-                    else np.maximum(along[condition.name], condition.tolerance(dtype))
-                )
+                tolerance = condition.tolerance(dtype)
+                tolerance = tolerance if exact else np.maximum(along[condition.name], tolerance)
                 count = count + unmet(condition, tolerance)
         rows.append(count)
     miss = subtract(p, state.kinematics.tip)

@@ -26,11 +26,6 @@ class Completion:
     A task without start columns starts at rest at the base configuration. Tip positions follow from given joint
     positions.
 
-    Args:
-        pipeline: Pipeline of the tasks.
-        context: Problem, robot and kernels of the pipeline.
-        given: Names of the columns of the tasks.
-
     Attributes:
         context: Problem, robot and kernels.
         given: Columns of the tasks: name -> field.
@@ -54,7 +49,9 @@ class Completion:
         with context.kernels.compile_in_parallel():
             self._tip = context.kernels.load(tip_position)
             self._stages = prepare_steps(_of_tasks(steps, context), lambda stage: stage.complete(context, known))
-            self._accept = acceptance(context, written, given=_given_ends(given))
+            ends: tuple[End, ...] = ("start", "goal")  # those with given joint states need not be exact
+            stated = [end for end in ends if {f"{end}_q", f"{end}_dq", f"{end}_ddq"} & set(given)]
+            self._accept = acceptance(context, written, given=stated)
         self._random = np.random.default_rng(0)  # for plug-ins that bypass candidates.draw
 
     @property
@@ -174,12 +171,6 @@ def _derived(given: Collection[str]) -> tuple[str, ...]:
     """List the columns that are derived from the given columns before the first stage, in order."""
     start = () if "start_xyz" in given else ("start_xyz",) if "start_q" in given else ("start_q", "start_xyz")
     return start if "goal_xyz" in given else (*start, "goal_xyz")
-
-
-def _given_ends(given: Collection[str]) -> list[End]:
-    """List the ends with given joint states; ends with a given tip position only are solved exactly."""
-    ends: tuple[End, ...] = ("start", "goal")
-    return [end for end in ends if {f"{end}_q", f"{end}_dq", f"{end}_ddq"} & set(given)]
 
 
 def _of_tasks(steps: Iterable[PipelineStep], context: Context) -> list[PipelineStep]:

@@ -66,11 +66,6 @@ def _with_places(pipeline: Pipeline, where: RecipeLocation, mistakes: list[str])
 def restore_pipeline(name: str, stages: Sequence[Mapping[str, Any]], problem: Problem) -> Pipeline:
     """Rebuild a pipeline from the resolved stages of a dataset or model specification.
 
-    Args:
-        name: Name of the pipeline.
-        stages: Tables of the stages.
-        problem: Problem of the pipeline.
-
     Raises:
         RecipeError: This version of cnpgen does not support the stages.
         PluginError: A required package is not installed.

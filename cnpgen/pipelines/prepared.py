@@ -45,13 +45,7 @@ class Block:
 
 
 class PreparedPipeline:
-    """Stages with loaded kernels.
-
-    Args:
-        pipeline: Pipeline to prepare.
-        backend: Backend of the kernels.
-        cache_folder: Folder of compiled kernels.
-        dtype: Float type in which rows are stored and checked, "float64" or "float32".
+    """Stages with loaded kernels; rows are stored and checked in the float type ``dtype``.
 
     Attributes:
         context: Problem, robot and kernels.
@@ -81,14 +75,7 @@ class PreparedPipeline:
             self._accept = acceptance(self.context, written)
 
     def block(self, seed: int, split: str, index: int, *, first: int = 0, stop: int | None = None) -> Block:
-        """Compute rows ``first`` to ``stop`` of one block.
-
-        Args:
-            seed: Root seed of the dataset.
-            split: Name of the split.
-            index: Index of the block in the split.
-            first: First row.
-            stop: End of the rows, exclusive; ``block_rows`` by default and at most.
+        """Compute rows ``first`` to ``stop``, exclusive, of a block of a split; all rows by default.
 
         Raises:
             RecipeError: The accepted fraction of the candidates is below ``MIN_ACCEPTANCE``.
@@ -97,16 +84,9 @@ class PreparedPipeline:
         return block
 
     def chunks(self, seed: int, split: str, index: int, ranges: Sequence[tuple[int, int]]) -> Iterator[Block]:
-        """Compute several ranges of rows of one block and sample the block only once.
+        """Compute several ranges of rows of one block, sampled only once, and yield each as soon as it is complete.
 
-        Args:
-            seed: Root seed of the dataset.
-            split: Name of the split.
-            index: Index of the block in the split.
-            ranges: Row range (first, exclusive end) of every chunk, ascending, without overlap.
-
-        Yields:
-            The rows of every chunk, as soon as they are complete.
+        The ranges (first, exclusive end) ascend without overlap.
 
         Raises:
             RecipeError: The accepted fraction of the candidates is below ``MIN_ACCEPTANCE``.
@@ -177,30 +157,23 @@ class PreparedPipeline:
 
 
 class BlockChunk:
-    """Rows ``first`` to ``stop`` of a block, collected batch by batch.
-
-    Args:
-        fields: Fields of a row, bookkeeping fields included.
-        first: First row.
-        stop: End of the rows, exclusive.
-    """
+    """Rows ``first`` to ``stop``, exclusive, of a block, collected batch by batch, with counts of all candidates."""
 
     def __init__(self, fields: tuple[Field, ...], first: int, stop: int) -> None:
         self.first, self.stop = first, stop
         self._fields = [field for field in fields if field.name not in BOOKKEEPING]
-        self._statistics = BlockStatistics(fields)
         self._parts: list[dict[str, NDArray[Any]]] = []
         self._scenes: list[SceneTable] = []
+        self._tried, self._waiting = 0, 0  # candidates, and those since the last accepted one
+        self._rejections: dict[str, int] = {}
+        self._stages: dict[str, str] = {}
+        self._maps = [field for field in fields if field.name.endswith("_xyz")]
+        self._cells = {field.name: np.zeros((2, DENSITY_CELLS**2), np.int64) for field in self._maps}
 
     def take(self, candidates: CandidateBatch, accepted: int) -> bool:
-        """Append the rows of a batch that belong to the chunk.
+        """Append the rows of a batch, after ``accepted`` rows of the block; return whether the chunk is complete.
 
-        Args:
-            candidates: Batch of candidates.
-            accepted: Number of rows of the block that were accepted before the batch.
-
-        Returns:
-            Whether the chunk is complete; the batch may contain rows of the next chunk.
+        The batch may contain rows of the next chunk.
         """
         taken = candidates.alive[: self.stop - accepted]
         end = accepted + len(taken)
@@ -209,9 +182,9 @@ class BlockChunk:
         skip = min(max(self.first - accepted, 0), len(taken))
         # No later chunk counts the candidates after the last row.
         final = candidates.last and end == accepted + len(candidates.alive)
-        attempts = self._statistics.count(candidates, taken, first=skip, last=end == self.stop and not final)
+        attempts = self._count(candidates, taken, first=skip, last=end == self.stop and not final)
         if final:
-            attempts[-1:] += self._statistics.waiting
+            attempts[-1:] += self._waiting
         part = {field.name: candidates[field.name][:, skip : len(taken)] for field in self._fields}
         self._parts.append({**part, "attempts": attempts[None]})
         if candidates.scenes is not None:
@@ -225,97 +198,49 @@ class BlockChunk:
         self._parts[-1][SCENE_ID] = first_rows[rows][None]
         self._scenes.append(replace(table[scene[rows][index]], scene_ids=ids))
 
-    def block(self, first_row: int) -> Block:
-        """Return the rows of a complete chunk.
-
-        Args:
-            first_row: Index, within the split, of the first row of the block.
-        """
-        columns = {name: np.concatenate([part[name] for part in self._parts], axis=1) for name in self._parts[0]}
-        columns["sample_id"] = first_row + np.arange(self.first, self.stop, dtype=np.int64)[None]
-        if not self._scenes:
-            return Block(columns, self._statistics.sampling())
-        columns[SCENE_ID] = first_row + columns[SCENE_ID]
-        scenes = concatenate_scenes(self._scenes)
-        return Block(
-            columns,
-            self._statistics.sampling(),
-            replace(scenes, scene_ids=(first_row + scenes.scene_ids).astype(np.int64)),
-        )
-
-
-class BlockStatistics:
-    """Running counts of one block.
-
-    Args:
-        fields: Fields of the dataset; each position field gets a density map over its range.
-
-    Attributes:
-        tried: Number of candidates counted so far.
-        accepted: Number of rows accepted so far.
-        waiting: Number of candidates since the last accepted one.
-    """
-
-    def __init__(self, fields: tuple[Field, ...]) -> None:
-        self.tried = 0
-        self.accepted = 0
-        self.waiting = 0
-        self._rejections: dict[str, int] = {}
-        self._stages: dict[str, str] = {}
-        self._maps = [field for field in fields if field.name.endswith("_xyz")]
-        self._drawn = {field.name: np.zeros(DENSITY_CELLS * DENSITY_CELLS, np.int64) for field in self._maps}
-        self._kept = {field.name: np.zeros(DENSITY_CELLS * DENSITY_CELLS, np.int64) for field in self._maps}
-
-    def count(
+    def _count(
         self, candidates: CandidateBatch, taken: NDArray[np.intp], *, first: int, last: bool
     ) -> NDArray[np.int64]:
-        """Count the candidates of a finished batch that belong to the requested rows.
-
-        Args:
-            candidates: Batch of candidates.
-            taken: Indices of its accepted candidates, ascending, shape (k,).
-            first: Number of entries of ``taken`` before the first requested row; these candidates are not counted.
-            last: Whether ``taken`` ends at the last requested row; later candidates are then not counted.
-
-        Returns:
-            Number of candidates per counted row, including the accepted one.
-        """
+        """Count the candidates after the ``first`` rows, up to the last row or all; return the candidates per row."""
         rows = taken[first:]
         start = int(taken[first - 1]) + 1 if first else 0
         stop = int(taken[-1]) + 1 if last else candidates.size
         if first:
-            self.waiting = 0
-        sampling = np.bincount(candidates.outcome[start:stop], minlength=1 + len(candidates.reasons))
-        for reason, number in zip(candidates.reasons, sampling[1:].tolist(), strict=True):
+            self._waiting = 0
+        outcomes = np.bincount(candidates.outcome[start:stop], minlength=1 + len(candidates.reasons))
+        for reason, number in zip(candidates.reasons, outcomes[1:].tolist(), strict=True):
             self._rejections[reason] = self._rejections.get(reason, 0) + number
         self._stages.update(candidates.origins)
-        self.tried += stop - start
-        self.accepted += len(rows)
+        self._tried += stop - start
         self._maps = [field for field in self._maps if field.name in candidates.drawn]  # not those of scenes
         for field in self._maps:
             cells = _cells(candidates.drawn[field.name][:, start:stop], field)
-            self._drawn[field.name] += np.bincount(cells, minlength=DENSITY_CELLS * DENSITY_CELLS)
-            self._kept[field.name] += np.bincount(cells[rows - start], minlength=DENSITY_CELLS * DENSITY_CELLS)
-        attempts = np.diff(rows, prepend=start - 1 - self.waiting).astype(np.int64)
-        self.waiting = stop - 1 - int(rows[-1]) if len(rows) else self.waiting + stop - start
+            counts = (np.bincount(x, minlength=DENSITY_CELLS**2) for x in (cells, cells[rows - start]))
+            self._cells[field.name] += np.stack(list(counts))
+        attempts = np.diff(rows, prepend=start - 1 - self._waiting).astype(np.int64)
+        self._waiting = stop - 1 - int(rows[-1]) if len(rows) else self._waiting + stop - start
         return attempts
 
-    def sampling(self) -> SamplingStatistics:
-        """Return the present counts."""
-        maps = {}
-        for field in self._maps:
-            assert field.valid_min is not None
-            assert field.valid_max is not None
-            shape = (DENSITY_CELLS, DENSITY_CELLS)
-            (x, y), drawn, kept = _extent(field), self._drawn[field.name], self._kept[field.name]
-            maps[field.name] = DensityMap(x, y, drawn.reshape(shape), kept.reshape(shape))
-        return SamplingStatistics(
-            tried=self.tried,
-            accepted=self.accepted,
+    def block(self, first_row: int) -> Block:
+        """Return the rows of a complete chunk of a block whose first row has the index ``first_row`` in the split."""
+        columns = {name: np.concatenate([part[name] for part in self._parts], axis=1) for name in self._parts[0]}
+        columns["sample_id"] = first_row + np.arange(self.first, self.stop, dtype=np.int64)[None]
+        shape = (2, DENSITY_CELLS, DENSITY_CELLS)
+        maps = {
+            field.name: DensityMap(*_extent(field), *self._cells[field.name].reshape(shape)) for field in self._maps
+        }
+        sampling = SamplingStatistics(
+            tried=self._tried,
+            accepted=self.stop - self.first,
             rejections=self._rejections,
             stages=self._stages,
             densities=maps,
         )
+        if not self._scenes:
+            return Block(columns, sampling)
+        columns[SCENE_ID] = first_row + columns[SCENE_ID]
+        scenes = concatenate_scenes(self._scenes)
+        return Block(columns, sampling, replace(scenes, scene_ids=(first_row + scenes.scene_ids).astype(np.int64)))
 
 
 def _extent(field: Field) -> tuple[tuple[float, float], tuple[float, float]]:

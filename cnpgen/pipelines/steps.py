@@ -26,14 +26,7 @@ _CONFIG = ("unit", "width", "dtype", "names", "frame")
 
 @dataclass(frozen=True)
 class PipelineStep:
-    """Stage at a position in a pipeline.
-
-    Attributes:
-        path: File of the pipeline.
-        number: Position of the stage, counted from 1.
-        kind: Registered name of the kind of stage.
-        stage: The stage.
-    """
+    """Stage of a registered kind at a position, counted from 1, in the file of a pipeline."""
 
     path: Path
     number: int

@@ -16,7 +16,7 @@ from cnpgen.plans.plan_file import stored_problem
 from cnpgen.plans.plausible import check_boundary_units
 from cnpgen.problems.problem_record import ProblemRecord, as_record, open_problem
 from cnpgen.robots.robot import Robot
-from cnpgen.store.checked_shard import read_rows, recorded_shard
+from cnpgen.store.checked_shard import Shard, read_rows
 from cnpgen.store.dataset_spec import DatasetSpec, load_dataset_spec, shards
 from cnpgen.store.files.checksum_file import verify_checksum
 from cnpgen.store.files.hdf5 import opened_hdf5
@@ -78,7 +78,7 @@ class BoundaryFile:
             folder, name = self.path.absolute().parents[1], "/".join(self.path.absolute().parts[-2:])
             for task in shards(spec):
                 if task.file == name:
-                    read_rows(recorded_shard(folder, spec, task, size=0, sha256=""))
+                    read_rows(Shard(folder, spec, task))
 
     def problem(self, *, required: bool = True) -> ProblemRecord | None:
         """Return the problem named by the file or by the dataset that contains it; None if neither names one.

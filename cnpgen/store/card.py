@@ -12,15 +12,8 @@ from cnpgen.store.field import Field
 from cnpgen.store.scene_table import SCENE_ARRAYS
 from cnpgen.store.statistics import FieldStatistics
 
-_SIZES = (
-    (10**3, "n<1K"),
-    (10**4, "1K<n<10K"),
-    (10**5, "10K<n<100K"),
-    (10**6, "100K<n<1M"),
-    (10**7, "1M<n<10M"),
-    (10**8, "10M<n<100M"),
-    (10**9, "100M<n<1B"),
-)
+# Size categories of Hugging Face: below 10^3 rows, below 10^4 rows, and so on.
+_SIZES = ("n<1K", "1K<n<10K", "10K<n<100K", "100K<n<1M", "1M<n<10M", "10M<n<100M", "100M<n<1B", "n>1B")
 
 PARQUET = "parquet"  # folder of the Parquet view in a repository
 
@@ -69,12 +62,8 @@ independently of the code that made the dataset.
 def card_text(summary: DatasetSummary, *, folder: str, notes: str = "", shards: str = "") -> str:
     """Return the card of a finished dataset; it depends on its rows and specification only, not on time or place.
 
-    Args:
-        summary: The finished shards.
-        folder: Name of the folder of the dataset, or of its repository on the Hugging Face Hub.
-        notes: Text about the dataset to include, in Markdown.
-        shards: Folder of the shards with a slash at its end, of a repository with a Parquet view in ``PARQUET``; empty
-            for the card of the dataset itself.
+    The folder is that of the dataset or its repository on the Hugging Face Hub, the notes are Markdown. A repository
+    with a Parquet view in ``PARQUET`` has the shards in a folder, with a slash at its end.
     """
     spec = summary.spec
     source = f'"{folder}"' if shards else f'"./{folder}"'
@@ -114,15 +103,10 @@ def _origin(recipe: Mapping[str, Any]) -> str:
 
 
 def _front_matter(summary: DatasetSummary, files: str) -> str:
-    """Return the YAML header that makes the folder a Hugging Face dataset; JSON strings are valid YAML.
-
-    Args:
-        summary: The finished shards.
-        files: Pattern of the files of a split; empty if Hugging Face cannot read them.
-    """
+    """Return the YAML header for Hugging Face, with JSON strings; without a pattern of files, there are no splits."""
     spec = summary.spec
-    rows = sum(spec.splits.values())
-    size = next((name for limit, name in _SIZES if rows < limit), "n>1B")
+    digits = len(str(sum(spec.splits.values())))
+    size = _SIZES[min(max(digits - 3, 0), len(_SIZES) - 1)]
     lines = [f"license: {json.dumps(spec.license.lower())}"] if spec.license else []
     lines += [f"pretty_name: {json.dumps(spec.title or spec.name, ensure_ascii=False)}"]
     lines += ["task_categories:", "- robotics", "tags:", "- robotics", "- motion-planning", "- trajectory-optimization"]

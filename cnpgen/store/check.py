@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from cnpgen.errors import DatasetError
-from cnpgen.store.checked_shard import read_rows, recorded_shard
+from cnpgen.store.checked_shard import Shard, read_rows
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, load_dataset_spec, shard_attributes, shards
 from cnpgen.store.dataset_summary import summarize_dataset, unfinished
 from cnpgen.store.field import Field
@@ -61,13 +61,9 @@ class Finding:
 
 
 def check_dataset(folder: Path) -> list[Finding]:
-    """Check the files of a dataset against its manifest, sidecars and specification.
+    """Return the findings about the files of a dataset, its manifest, sidecars and specification.
 
-    Args:
-        folder: Folder of the dataset.
-
-    Returns:
-        The findings; empty if there is no problem. Of a dataset without manifest, the existing shards are checked.
+    Of a dataset without manifest, the existing shards are checked.
     """
     links = [Finding(name, OUTSIDE, hint=COPY_HINT) for name in outside_links(folder)]
     try:
@@ -136,17 +132,7 @@ def _check_digest(folder: Path, name: str, sha256: str) -> list[Finding]:
 
 
 def check_shard(folder: Path, spec: DatasetSpec, task: ShardTask, entry: dict[str, Any] | None = None) -> list[Finding]:
-    """Check one shard and its sidecar.
-
-    Args:
-        folder: Folder of the dataset.
-        spec: Specification of the dataset.
-        task: The shard.
-        entry: Entry of the shard in the manifest; None without a manifest.
-
-    Returns:
-        The findings.
-    """
+    """Check one shard and its sidecar; ``entry`` is the entry of the shard in the manifest, None without a manifest."""
     path = folder / task.file
     findings, expected = _check_sidecar(folder, spec, task, entry)
     if not path.is_file():
@@ -197,12 +183,9 @@ def _check_sidecar(
 
 
 def check_content(folder: Path, spec: DatasetSpec, task: ShardTask) -> list[Finding]:
-    """Compare the attributes and fields of a shard with the specification.
+    """Return the differences of attributes, fields and values of a shard from the specification.
 
     Verify the sha256 of the shard before, because HDF5 can hang on a damaged file.
-
-    Returns:
-        The findings about attributes, fields, shapes, types, units, values that are not finite, and sample IDs.
     """
     path = folder / task.file
     try:
@@ -231,7 +214,7 @@ def check_content(folder: Path, spec: DatasetSpec, task: ShardTask) -> list[Find
 def _check_rows(folder: Path, spec: DatasetSpec, task: ShardTask) -> list[str]:
     """Check the values of a shard whose description is that of the specification."""
     try:
-        read_rows(recorded_shard(folder, spec, task, size=0, sha256=""))
+        read_rows(Shard(folder, spec, task))
     except DatasetError as error:
         return [_reason(error, folder / task.file)]
     return []
@@ -239,8 +222,7 @@ def _check_rows(folder: Path, spec: DatasetSpec, task: ShardTask) -> list[str]:
 
 def _check_field(field: Field, stored: StoredField, spec: DatasetSpec, task: ShardTask) -> list[str]:
     """Compare the description of a field in a shard with the specification."""
-    shape = (task.rows, field.width) if field.width else (task.rows,)
-    dtype = storage_dtype(field, spec.dtype)
+    shape, dtype = field.shape(task.rows), storage_dtype(field, spec.dtype)
     problems = []
     if stored.shape != shape or stored.dtype != dtype:
         problems.append(f"field {field.name!r} is {stored.dtype} of shape {stored.shape}, not {dtype} of shape {shape}")

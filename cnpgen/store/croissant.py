@@ -13,12 +13,16 @@ from cnpgen.store.dataset_summary import DatasetSummary
 from cnpgen.store.field import Field
 from cnpgen.store.scene_table import SCENE_ARRAYS
 
+
+def _terms(names: str) -> dict[str, str]:
+    """Return the terms of a vocabulary that Croissant defines under their own names."""
+    return {name: f"cr:{name}" for name in names.split()}
+
+
 _CONTEXT: dict[str, Any] = {
     "@language": "en",
     "@vocab": "https://schema.org/",
-    "arrayShape": "cr:arrayShape",
-    "citeAs": "cr:citeAs",
-    "column": "cr:column",
+    **_terms("arrayShape citeAs column"),
     "conformsTo": "dct:conformsTo",
     "cr": "http://mlcommons.org/croissant/",
     "rai": "http://mlcommons.org/croissant/RAI/",
@@ -26,42 +30,16 @@ _CONTEXT: dict[str, Any] = {
     "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
     "dct": "http://purl.org/dc/terms/",
     "examples": {"@id": "cr:examples", "@type": "@json"},
-    "extract": "cr:extract",
-    "field": "cr:field",
-    "fileProperty": "cr:fileProperty",
-    "fileObject": "cr:fileObject",
-    "fileSet": "cr:fileSet",
-    "format": "cr:format",
-    "includes": "cr:includes",
-    "isArray": "cr:isArray",
-    "isLiveDataset": "cr:isLiveDataset",
-    "jsonPath": "cr:jsonPath",
-    "key": "cr:key",
-    "md5": "cr:md5",
-    "parentField": "cr:parentField",
-    "path": "cr:path",
-    "recordSet": "cr:recordSet",
-    "references": "cr:references",
-    "regex": "cr:regex",
-    "repeated": "cr:repeated",
-    "replace": "cr:replace",
+    **_terms("extract field fileProperty fileObject fileSet format includes isArray isLiveDataset jsonPath key md5"),
+    **_terms("parentField path recordSet references regex repeated replace"),
     "sc": "https://schema.org/",
-    "separator": "cr:separator",
-    "source": "cr:source",
-    "subField": "cr:subField",
-    "transform": "cr:transform",
+    **_terms("separator source subField transform"),
 }
 
 
 @dataclass(frozen=True)
 class ParquetFile:
-    """A Parquet table of a split.
-
-    Attributes:
-        path: Path in the repository.
-        bytes: Size [B].
-        sha256: Checksum.
-    """
+    """A Parquet table of a split: its path in the repository, size [B] and sha256."""
 
     path: str
     bytes: int
@@ -69,12 +47,7 @@ class ParquetFile:
 
 
 def croissant_document(summary: DatasetSummary, *, created: str) -> dict[str, Any]:
-    """Return the content of ``croissant.json`` of a dataset.
-
-    Args:
-        summary: The finished shards.
-        created: Creation time of the dataset, ISO 8601.
-    """
+    """Return the content of ``croissant.json`` of a dataset, created at an ISO 8601 time."""
     files = [_file(item.file, item.bytes, item.sha256, "x-hdf5") for _, item in summary.records]
     return _document(summary, created) | {"distribution": files}
 
@@ -82,14 +55,7 @@ def croissant_document(summary: DatasetSummary, *, created: str) -> dict[str, An
 def croissant_of_tables(
     summary: DatasetSummary, tables: Mapping[str, Iterable[ParquetFile]], *, created: str, url: str
 ) -> dict[str, Any]:
-    """Return the content of ``croissant.json`` of a repository of Parquet tables, with a record set for each split.
-
-    Args:
-        summary: The finished shards.
-        tables: Split -> its tables.
-        created: Creation time of the dataset, ISO 8601.
-        url: Address of the repository.
-    """
+    """Return the content of ``croissant.json`` of a repository of Parquet tables, with a record set for each split."""
     distribution, records = [], []
     for split, files in tables.items():
         objects = [_file(item.path, item.bytes, item.sha256, "x-parquet") for item in files]

@@ -27,11 +27,7 @@ _COLORS = {"start": "tab:blue", "goal": "tab:red"}
 
 
 def plot_dataset(inspection: Inspection, path: str | Path) -> None:
-    """Draw a dataset.
-
-    Args:
-        inspection: The dataset; it may be unfinished.
-        path: Figure file, ``.png``, ``.pdf`` or ``.svg``; replaced if it exists.
+    """Draw a dataset, possibly unfinished, to a ``.png``, ``.pdf`` or ``.svg`` file, which is replaced if it exists.
 
     Raises:
         DatasetError: There are no rows, or a shard is damaged.
@@ -105,8 +101,9 @@ def _some_rows(inspection: Inspection) -> dict[str, NDArray[Any]]:
     names = ("start_xyz", "goal_xyz", "hit_angle", "hit_speed")
     fields = [field.name for field in inspection.spec.fields if field.name in names]
     split = next(split for split, rows in inspection.rows.items() if rows)
-    _, columns = next(dataset.iter_shards(split, fields=fields))
-    return {name: values[:MAX_DRAWN_ROWS] for name, values in columns.items()}
+    first = dataset.tasks(split)[0]
+    end = first.first_row + min(first.rows, MAX_DRAWN_ROWS)
+    return dataset.read(split, fields=fields, start=first.first_row, stop=end)
 
 
 def _draw_motions(axis: "Axes", rows: dict[str, NDArray[Any]]) -> None:

@@ -258,9 +258,8 @@ def _check_sizes(spec: DatasetSpec) -> None:
 def _check_names(spec: DatasetSpec) -> None:
     for split in spec.splits:
         if not SPLIT_NAME.fullmatch(split):
-            raise UsageError(
-                f"the name of a split must have letters, digits and '_' and start with a letter, got {split!r}"
-            )
+            text = f"the name of a split must have letters, digits and '_' and start with a letter, got {split!r}"
+            raise UsageError(text)
     names = [item.name for item in spec.fields]
     if not names or len(set(names)) != len(names) or len(names) > MAX_FIELDS:
         raise UsageError(f"the fields must have different names, from 1 to {MAX_FIELDS:,}, got {names!s:.200}")
@@ -276,10 +275,6 @@ def default_shard_size(rows: int, block_rows: int = 4096) -> int:
 
     Blocks have fewer than 4096 rows if samples are expensive. Shards then have 1 to 16 blocks, because an interruption
     loses the unfinished shard.
-
-    Args:
-        rows: Rows of the whole dataset.
-        block_rows: Rows per block.
     """
     low, high = (8192, 65536) if block_rows >= 4096 else (block_rows, 16 * block_rows)
     return int(min(max(1 << max(round(math.log2(max(rows, 1) / 16)), 0), low), high))

@@ -10,8 +10,9 @@ from typing import Any
 from cnpgen.errors import DatasetError
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, shards
 from cnpgen.store.files.document_structure import ANY_KEY, TEXT
+from cnpgen.store.files.documents import load_document
 from cnpgen.store.intact import RERUN_HINT
-from cnpgen.store.layout import SPECIFICATION
+from cnpgen.store.layout import SPECIFICATION, STATS
 from cnpgen.store.sampling_statistics import DENSITIES_STRUCTURE, SamplingStatistics, densities_to_json, merge_sampling
 from cnpgen.store.shard_record import ShardRecord, load_committed
 from cnpgen.store.statistics import STATISTICS_STRUCTURE, FieldStatistics, are_of, merge_statistics
@@ -83,12 +84,7 @@ class DatasetSummary:
 
 
 def summarize_dataset(folder: Path, spec: DatasetSpec, *, allow_incomplete: bool = False) -> DatasetSummary:
-    """Read the sidecars of a dataset.
-
-    Args:
-        folder: Folder of the dataset.
-        spec: Specification of the dataset.
-        allow_incomplete: Whether to summarize the finished shards of an incomplete dataset.
+    """Read the sidecars of a dataset; of an incomplete one only with ``allow_incomplete``.
 
     Raises:
         DatasetError: A shard is missing, damaged or of another specification; the message names it.
@@ -135,3 +131,12 @@ def stats_document(summary: DatasetSummary) -> dict[str, Any]:
         },
         "densities": {split: densities_to_json(item.densities) for split, item in summary.sampling_by_split.items()},
     }
+
+
+def load_stats_document(folder: Path) -> dict[str, Any]:
+    """Read ``stats.json``.
+
+    Raises:
+        DatasetError: It is missing, damaged or of another format version.
+    """
+    return load_document(folder / STATS, STATS_FORMAT, version=STATS_VERSION, structure=STATS_STRUCTURE)

@@ -40,6 +40,10 @@ class Field:
             if limits is not None:
                 object.__setattr__(self, name, tuple(map(float, limits)))
 
+    def shape(self, rows: int) -> tuple[int, ...]:
+        """Shape of the values of ``rows`` rows."""
+        return (rows, self.width) if self.width else (rows,)
+
     @property
     def units(self) -> tuple[str, ...]:
         """Unit of every column."""

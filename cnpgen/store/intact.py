@@ -13,17 +13,14 @@ RERUN_HINT = "run make_dataset or 'cnpgen make-dataset' again with the same argu
 
 OUTSIDE = "is a link that leads outside the folder of the dataset"
 
-_verified: set[tuple[Path, int, int, str]] = (
-    set()
-)  # path, mtime [ns], size and sha256 of the shards that this process has verified
+# Path, mtime [ns], size and sha256 of the shards that this process has verified.
+_verified: set[tuple[Path, int, int, str]] = set()
 
 
 def leads_outside(path: Path, folder: Path | None = None) -> bool:
     """Return whether a file, or its folder, is a link that leads outside the folder of the dataset.
 
-    Args:
-        path: The file.
-        folder: Folder of the dataset; by default, the file is in the folder of a split.
+    By default, the file is in the folder of a split.
     """
     folder = path.parents[1] if folder is None else folder
     if not (path.is_symlink() or (path.parent != folder and path.parent.is_symlink())):
@@ -52,12 +49,7 @@ def digest_problem(path: Path) -> str:
 
 
 def require_intact(path: Path, *, size: int, sha256: str) -> None:
-    """Raise an error if a shard is not the recorded one; an unchanged shard is verified once per process.
-
-    Args:
-        path: File of the shard.
-        size: Recorded size [bytes].
-        sha256: Recorded sha256.
+    """Raise an error if a shard has not its recorded size [bytes] and sha256; verify it once per process.
 
     Raises:
         DatasetError: The shard is missing, cut off or changed.

@@ -19,11 +19,6 @@ def units_of_joints(revolute_unit: str, is_prismatic: tuple[bool, ...]) -> str:
 
 
 def unit_of(units: str, index: int) -> str:
-    """Return the unit of one column.
-
-    Args:
-        units: Result of ``units_of_joints``, or one unit.
-        index: Index of the column; units repeat for several values per joint.
-    """
+    """Return the unit of one column; the units of joints repeat for several values per joint."""
     names = units.split(_SEPARATOR)
     return names[index % len(names)]

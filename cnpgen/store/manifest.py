@@ -39,15 +39,8 @@ MANIFEST_STRUCTURE = {
 def finalize(folder: Path, spec: DatasetSpec, *, notes: str = "") -> dict[str, Any]:
     """Summarize the shards of a dataset: write statistics, card, Croissant description and, last, the manifest.
 
-    The same shards give the same files, so several processes may do it at the same time.
-
-    Args:
-        folder: Folder of the dataset.
-        spec: Specification of the dataset.
-        notes: Text about the dataset for its card, in Markdown.
-
-    Returns:
-        The manifest.
+    The same shards give the same files, so several processes may do it at the same time. ``notes`` is Markdown for the
+    card.
 
     Raises:
         DatasetError: Shards are missing, damaged or of another specification; the message names them.
@@ -62,20 +55,15 @@ def finalize(folder: Path, spec: DatasetSpec, *, notes: str = "") -> dict[str, A
     write_file(folder / CROISSANT, render(croissant) + "\n")
     manifest = _manifest(folder, summary, created=created)
     save_document(folder / MANIFEST, manifest)
-    _remove_work(folder / WORK)
+    remove_all_temporary(folder / WORK)
+    with suppress(OSError):  # other files in it are kept
+        (folder / WORK).rmdir()
     return cast(dict[str, Any], plain(manifest))
 
 
 def _name(folder: Path) -> str:
     """Return the name of a folder as text; bytes that are not UTF-8 are replaced by question marks."""
     return os.fsencode(folder.resolve().name).decode(errors="replace")
-
-
-def _remove_work(work: Path) -> None:
-    """Remove the folder of temporary files after all shards are committed; other files in it are kept."""
-    remove_all_temporary(work)
-    with suppress(OSError):
-        work.rmdir()
 
 
 def load_manifest(folder: Path) -> dict[str, Any]:
@@ -92,7 +80,7 @@ def lists_shards_of(manifest: dict[str, Any], spec: DatasetSpec) -> bool:
 
     Only these file names are opened: no path in a manifest can lead outside the folder of the dataset.
     """
-    listed = {split: [_location(entry) for entry in content["shards"]] for split, content in manifest["splits"].items()}
+    listed = {split: [_location(item) for item in part["shards"]] for split, part in manifest["splits"].items()}
     expected: dict[str, list[tuple[str, str, int, int]]] = {split: [] for split in spec.splits}
     for task in shards(spec):
         expected[task.split].append((task.file, task.sidecar, task.first_row, task.rows))
@@ -129,9 +117,8 @@ def _created(summary: DatasetSummary) -> str:
         instant = datetime.fromtimestamp(int(last), UTC) if fixed is None else fixed
         return instant.strftime("%Y-%m-%dT%H:%M:%SZ")
     except (ValueError, OverflowError, OSError) as error:
-        raise DatasetError(
-            f"the creation time of the dataset is unknown: the record of a shard has no valid start time ({error})"
-        ) from error
+        text = f"the creation time of the dataset is unknown: the record of a shard has no valid start time ({error})"
+        raise DatasetError(text) from error
 
 
 def _manifest(folder: Path, summary: DatasetSummary, *, created: str) -> dict[str, Any]:
@@ -140,9 +127,7 @@ def _manifest(folder: Path, summary: DatasetSummary, *, created: str) -> dict[st
     return {
         "format": MANIFEST_FORMAT,
         "format_version": MANIFEST_VERSION,
-        "name": spec.name,
-        "version": spec.version,
-        "title": spec.title,
+        **{name: getattr(spec, name) for name in ("name", "version", "title")},
         "created": created,
         "license": spec.license,
         "fingerprint": data_fingerprint((item.file, item.sha256) for _, item in summary.records),
@@ -158,10 +143,9 @@ def _manifest(folder: Path, summary: DatasetSummary, *, created: str) -> dict[st
 
 
 def data_fingerprint(files: Iterable[tuple[str, str]]) -> str:
-    """Compute the fingerprint of the samples, as ``sha256sum */shard-*.h5 | sha256sum`` does in the dataset folder.
+    """Compute the fingerprint of the samples from path and sha256 of every shard.
 
-    Args:
-        files: Path and sha256 of every shard.
+    ``sha256sum */shard-*.h5 | sha256sum`` prints it in the dataset folder.
     """
     lines = "".join(f"{sha256}  {file}\n" for file, sha256 in sorted(files))
     return hashlib.sha256(lines.encode()).hexdigest()
@@ -173,16 +157,10 @@ def _origin(summary: DatasetSummary) -> dict[str, Any]:
     pipeline = spec.recipe.get("pipeline")
     return {
         "pipeline": pipeline.get("name", "") if isinstance(pipeline, dict) else pipeline,
-        "recipe_sha256": spec.recipe_sha256,
-        "recipe": spec.recipe,
+        **{name: getattr(spec, name) for name in ("recipe_sha256", "recipe")},
         "seed": str(spec.seed),
-        "generator": spec.generator,
-        "backend": spec.backend,
-        "dtype": spec.dtype,
-        "block_rows": spec.block_rows,
-        "shard_size": spec.shard_size,
-        "robot": spec.robot,
-        "versions": spec.versions,
+        **{name: getattr(spec, name) for name in ("generator", "backend", "dtype", "block_rows", "shard_size")},
+        **{name: getattr(spec, name) for name in ("robot", "versions")},
         "environments": summary.environments,
         "seconds": summary.seconds,
     }
@@ -195,11 +173,7 @@ def _feature(field: Field, spec: DatasetSpec) -> dict[str, Any]:
         "shape": [field.width] if field.width else [],
         "names": field.names,
         "units": field.unit,
-        "long_name": field.long_name,
-        "role": field.role,
-        "frame": field.frame,
-        "valid_min": field.valid_min,
-        "valid_max": field.valid_max,
+        **{name: getattr(field, name) for name in ("long_name", "role", "frame", "valid_min", "valid_max")},
     }
 
 
@@ -207,11 +181,7 @@ def _split(folder: Path, summary: DatasetSummary, split: str) -> dict[str, Any]:
     """List the shards of a split."""
     entries = [
         {
-            "file": record.file,
-            "rows": record.rows,
-            "first_sample_id": record.first_sample_id,
-            "bytes": record.bytes,
-            "sha256": record.sha256,
+            **{name: getattr(record, name) for name in ("file", "rows", "first_sample_id", "bytes", "sha256")},
             "sidecar": {"file": task.sidecar, "sha256": file_sha256(folder / task.sidecar)},
         }
         for task, record in summary.of_split(split)

@@ -18,11 +18,7 @@ HDF5_KINDS = (ANY_HDF5, *_KIND_OF_FORMAT.values())
 
 
 def require_folder(folder: str | Path, *, argument: str = "folder") -> Path:
-    """Return the path of a folder that exists.
-
-    Args:
-        folder: Folder of a dataset.
-        argument: Name of the argument, for the error.
+    """Return the path of a folder that exists; errors name the argument.
 
     Raises:
         UsageError: It is no text or path, or the folder is missing or is a file.
@@ -55,14 +51,10 @@ def require_dataset(folder: str | Path, *, argument: str = "folder") -> Path:
 def require_file(
     path: Path, expected: str, *, kinds: Collection[str] = (), of_dataset: str = "", argument: str = "path"
 ) -> None:
-    """Raise an error if a path is not a file.
+    """Raise an error that names the argument if a path is not a file with some expected content: "a file of plans".
 
-    Args:
-        path: The path.
-        expected: Expected content: "a file of plans".
-        kinds: Kinds of files that may have this content, as ``file_kind`` returns them; any by default.
-        of_dataset: Hint in the case of the folder of a dataset.
-        argument: Name of the argument, for the error.
+    Files of other ``kinds``, as of ``file_kind``, are refused, if any are listed. ``of_dataset`` is a hint for the
+    folder of a dataset.
 
     Raises:
         UsageError: The path does not exist, is a folder, a device or a pipe, or a file of another kind.
@@ -80,12 +72,7 @@ def require_file(
 
 
 def require_path(path: Path, expected: str, *, argument: str = "path") -> None:
-    """Raise an error if a path does not exist.
-
-    Args:
-        path: The path.
-        expected: Expected content.
-        argument: Name of the argument, for the error.
+    """Raise an error if a path, with some expected content, does not exist; it names the argument.
 
     Raises:
         UsageError: It does not exist.
@@ -127,8 +114,7 @@ def _hdf5_kind(path: Path) -> str:
         return ANY_HDF5
     if isinstance(format_name, bytes):
         format_name = format_name.decode(errors="replace")
-    if (
-        format_name is None and {"path_control_points", "rate_control_points"} <= names
-    ):  # files of other software may have no format
+    # Files of other software may have no format.
+    if format_name is None and {"path_control_points", "rate_control_points"} <= names:
         return PLANS
     return _KIND_OF_FORMAT.get(str(format_name), ANY_HDF5)

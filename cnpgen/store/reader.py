@@ -1,6 +1,6 @@
 """Reading the rows of a dataset as they are stored."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, lacks
-from cnpgen.store.checked_shard import Shard, read_rows, read_scenes, recorded_shard
+from cnpgen.store.checked_shard import Shard, read_rows, read_scenes
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, load_dataset_spec, shards
 from cnpgen.store.dataset_summary import summarize_dataset, unfinished
 from cnpgen.store.intact import require_intact
@@ -27,11 +27,6 @@ class StoredDataset:
     """A dataset on disk. It has no open files, so it can be pickled and used in any process.
 
     The sha256 of every shard is verified before its rows are read for the first time.
-
-    Attributes:
-        folder: Folder of the dataset.
-        spec: Specification of the dataset.
-        manifest: Manifest of the dataset; None if it is unfinished.
     """
 
     folder: Path
@@ -51,35 +46,12 @@ class StoredDataset:
             return [task for task in tasks if is_committed(self.folder, self.spec, task)]
         return tasks
 
-    def iter_shards(
-        self, split: str, *, fields: Sequence[str] | None = None
-    ) -> Iterator[tuple[ShardTask, dict[str, NDArray[Any]]]]:
-        """Read the shards of a split one by one.
-
-        Args:
-            split: Name of the split.
-            fields: Names of the fields; by default all, in the order of the specification.
-
-        Yields:
-            The shard and field name -> values, shape (rows, width) or (rows,).
-
-        Raises:
-            DatasetError: There is no such split or field, or a shard is damaged.
-        """
-        names = self._names(fields)
-        for task in self.tasks(split):
-            yield task, read_rows(self._checked(task), names)
-
     def read(
         self, split: str, *, fields: Sequence[str] | None = None, start: int = 0, stop: int | None = None
     ) -> dict[str, NDArray[Any]]:
         """Read rows ``start`` to ``stop`` of a split; of an unfinished dataset, only the existing ones of them.
 
-        Args:
-            split: Name of the split.
-            fields: Names of the fields; by default all, in the order of the specification.
-            start: First row.
-            stop: Row after the last one; by default the end of the split.
+        By default, all fields are read, in the order of the specification, and all rows.
 
         Returns:
             Field name -> values, shape (rows, width) or (rows,).
@@ -107,11 +79,6 @@ class StoredDataset:
 
         ``table.rows_of(scene_id)`` returns the index of the scene of each row.
 
-        Args:
-            split: Name of the split.
-            start: First row.
-            stop: Row after the last one; by default the end of the split.
-
         Raises:
             DatasetError: The dataset has no scenes, or a shard is missing or damaged.
         """
@@ -127,13 +94,16 @@ class StoredDataset:
             raise DatasetError(f"split {split!r} of {self.folder} has no rows {start} to {end}")
         return distinct_scenes(tables)
 
-    def _checked(self, task: ShardTask) -> Shard:
-        """Verify a shard and return it."""
+    def shard(self, task: ShardTask) -> Shard:
+        """Return a shard with its record in the manifest or, without a manifest, in its sidecar."""
         if (recorded := self._recorded.get(task.file)) is None:
             record = load_record(self.folder, task)
             recorded = record.bytes, record.sha256
-        size, sha256 = recorded
-        shard = recorded_shard(self.folder, self.spec, task, size=size, sha256=sha256)
+        return Shard(self.folder, self.spec, task, *recorded)
+
+    def _checked(self, task: ShardTask) -> Shard:
+        """Verify a shard and return it."""
+        shard = self.shard(task)
         require_intact(shard.path, size=shard.size, sha256=shard.sha256)
         return shard
 
@@ -150,15 +120,11 @@ class StoredDataset:
 
     def _no_rows(self, name: str) -> NDArray[Any]:
         field = self.spec.field_named(name)
-        return np.empty((0, field.width) if field.width else (0,), storage_dtype(field, self.spec.dtype))
+        return np.empty(field.shape(0), storage_dtype(field, self.spec.dtype))
 
 
 def open_dataset(folder: str | Path, *, allow_incomplete: bool = False) -> StoredDataset:
-    """Open a dataset for reading.
-
-    Args:
-        folder: Folder of the dataset.
-        allow_incomplete: Whether to open an unfinished dataset, too.
+    """Open a dataset for reading; an unfinished one only with ``allow_incomplete``.
 
     Raises:
         UsageError: The folder does not exist or contains no dataset.

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError
 from cnpgen.store.files.document_structure import ANY_KEY, NUMBER, TEXT, WHOLE
+from cnpgen.store.files.documents import plain
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,15 +113,7 @@ def _merged_order(first: Sequence[str], second: Sequence[str]) -> list[str]:
 
 def densities_to_json(densities: Mapping[str, DensityMap]) -> dict[str, Any]:
     """Return density maps as a JSON-able dict."""
-    return {
-        name: {
-            "x": list(item.x),
-            "y": list(item.y),
-            "candidates": item.candidates.tolist(),
-            "accepted": item.accepted.tolist(),
-        }
-        for name, item in densities.items()
-    }
+    return {name: plain(vars(item)) for name, item in densities.items()}
 
 
 DENSITIES_STRUCTURE = {ANY_KEY: {"x": [NUMBER], "y": [NUMBER], "candidates": [[WHOLE]], "accepted": [[WHOLE]]}}

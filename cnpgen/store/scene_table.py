@@ -26,15 +26,9 @@ _SIZES_TEXT = "edge lengths of a box; otherwise radius, length along the z axis 
 
 @dataclass(frozen=True)
 class SceneArray:
-    """Description of one array of a scene table.
+    """Description of one array of a scene table; its convention is the order of the values, or their code.
 
-    Attributes:
-        name: Name of the HDF5 dataset.
-        unit: SI unit.
-        long_name: Description in a few words.
-        dtype: "float" or "int64".
-        per_obstacle: Number of values of each obstacle, 0 for one value; None for one value of each scene.
-        convention: Order of the values, or their code.
+    ``per_obstacle`` is the number of values of each obstacle, 0 for one value; None for one value of each scene.
     """
 
     name: str
@@ -102,10 +96,7 @@ class SceneTable:
         return ((item.name, getattr(self, item.name)) for item in fields(self))
 
     def rows_of(self, scene_id: NDArray[np.int64]) -> NDArray[np.intp]:
-        """Return the index of the scene of each sample.
-
-        Args:
-            scene_id: Scene IDs of N samples, shape (N,).
+        """Return the index of the scene of each of N samples with scene IDs, shape (N,).
 
         Raises:
             DatasetError: There is no such scene.
@@ -135,11 +126,7 @@ def distinct_scenes(tables: Sequence[SceneTable]) -> SceneTable:
 
 
 def scene_attributes(families: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Return the HDF5 attributes of the arrays.
-
-    Args:
-        families: Names of the families, in the order of their indices.
-    """
+    """Return the HDF5 attributes of the arrays for families in the order of their indices."""
     return {
         item.name: {
             "units": item.unit,
@@ -154,13 +141,9 @@ def scene_attributes(families: Sequence[str]) -> dict[str, dict[str, Any]]:
 
 
 def check_scenes(table: SceneTable, obstacles: int, scene_id: NDArray[np.int64], families: int) -> None:
-    """Check the scenes of a shard.
+    """Check the scenes of a shard with a capacity of obstacles and a number of families.
 
-    Args:
-        table: Scenes of the shard.
-        obstacles: Capacity of the dataset.
-        scene_id: Scene IDs of its samples, shape (rows,).
-        families: Number of families.
+    The samples have scene IDs of shape (rows,).
 
     Raises:
         DatasetError: IDs are not those of the samples, or numbers, kinds, sizes or quaternions are invalid.

@@ -26,11 +26,7 @@ _STORAGE = {"float64": "<f8", "float32": "<f4", "int64": "<i8"}
 
 
 def storage_dtype(field: Field, dtype: str) -> np.dtype[Any]:
-    """Return the little-endian type that a field is stored in.
-
-    Args:
-        field: The field.
-        dtype: Float type of the dataset, "float64" or "float32".
+    """Return the little-endian type of a field in a dataset of the float type "float64" or "float32".
 
     Raises:
         DatasetError: The type is not supported.
@@ -65,20 +61,10 @@ def write_shard(
     families: Sequence[str] = (),
     work: Path | None = None,
 ) -> int:
-    """Write a shard atomically, and read it back before it is renamed.
+    """Write a shard atomically, and read it back before it is renamed; return the size of the file [bytes].
 
-    Args:
-        path: The file.
-        columns: Field name -> finite values in their stored type, shape (rows, width) or (rows,).
-        fields: The fields, in order; each must have a column.
-        attributes: Attributes of the file; "rows" must be the number of rows.
-        dtype: Float type of the dataset, "float64" or "float32".
-        scenes: Scenes of the rows in their stored types; None for a dataset without scenes.
-        families: Names of the families of the scenes.
-        work: Folder of the temporary file.
-
-    Returns:
-        Size of the file [bytes].
+    Columns are finite, in their stored type, of shape (rows, width) or (rows,). Every field must have one. The
+    attribute "rows" must be their number. Scenes are in their stored types, too. The temporary file is in ``work``.
 
     Raises:
         DatasetError: The columns do not fit the fields, or are not finite.
@@ -94,14 +80,10 @@ def write_shard(
         temporary.write_bytes(content)
         with opened_hdf5(temporary) as file:
             shapes = {name: item.shape for name, item in file.columns().items()}
-        expected = {field.name: _shape(field, rows) for field in fields}
+        expected = {field.name: field.shape(rows) for field in fields}
         if shapes != expected | {name: values.shape for name, values in arrays.items()}:
             raise DatasetError(f"{path} was not written correctly: it has the shapes {shapes}")
     return len(content)
-
-
-def _shape(field: Field, rows: int) -> tuple[int, ...]:
-    return (rows, field.width) if field.width else (rows,)
 
 
 def _check_columns(columns: Mapping[str, NDArray[Any]], fields: Sequence[Field], rows: int, dtype: str) -> None:
@@ -111,25 +93,33 @@ def _check_columns(columns: Mapping[str, NDArray[Any]], fields: Sequence[Field],
         missing, extra = sorted(names - columns.keys()), sorted(columns.keys() - names)
         raise DatasetError(f"a shard needs rows and every field: {rows} rows, missing {missing}, unknown {extra}")
     for field in fields:
-        values, shape, stored = columns[field.name], _shape(field, rows), storage_dtype(field, dtype)
+        values, shape, stored = columns[field.name], field.shape(rows), storage_dtype(field, dtype)
         if values.shape != shape or values.dtype != stored:
             actual = f"{values.dtype} of shape {values.shape}"
             raise DatasetError(f"field {field.name!r} must be {stored} of shape {shape}, got {actual}")
-        finite = np.isfinite(values)
-        if not finite.all():
-            bad = ~finite.reshape(rows, -1).all(axis=1)
-            raise DatasetError(f"field {field.name!r} is not finite in {bad.sum()} rows, first in row {bad.argmax()}")
+    if problem := finite_problem({field.name: columns[field.name] for field in fields}):
+        raise DatasetError(problem)
+
+
+def finite_problem(columns: Mapping[str, NDArray[Any]]) -> str:
+    """Describe the first column with a value that is not finite; empty if there is none."""
+    for name, values in columns.items():
+        if values.dtype.kind == "f" and not _is_finite(values):
+            bad = ~np.isfinite(values).reshape(len(values), -1).all(axis=1)
+            return f"field {name!r} is not finite in {bad.sum()} rows, first in row {bad.argmax()}"
+    return ""
+
+
+def _is_finite(values: NDArray[Any]) -> bool:
+    """Return whether all values are finite; their sum, which needs no memory, is infinite only by overflow."""
+    with np.errstate(all="ignore"):
+        return bool(np.isfinite(values.sum(dtype=np.float64)) or np.isfinite(values).all())
 
 
 def _encode(
     parts: Sequence[tuple[str, NDArray[Any], dict[str, Any]]], attributes: Mapping[str, str | int]
 ) -> memoryview:
-    """Build the file in memory: a full disk then causes a plain system error, and no partial file.
-
-    Args:
-        parts: Name, values and attributes of every dataset.
-        attributes: Attributes of the file.
-    """
+    """Build the file in memory: a full disk then causes a plain system error, and no partial file."""
     import h5py
 
     buffer = io.BytesIO()
@@ -142,11 +132,7 @@ def _encode(
 
 
 def read_shard(path: Path, fields: Sequence[str] | None = None) -> dict[str, NDArray[Any]]:
-    """Read whole fields of a shard.
-
-    Args:
-        path: File of the shard.
-        fields: Names of the fields; all fields by default.
+    """Read whole fields of a shard, by default all.
 
     Returns:
         Field name -> values, shape (rows, width) or (rows,).
@@ -163,14 +149,7 @@ def read_shard(path: Path, fields: Sequence[str] | None = None) -> dict[str, NDA
 
 
 def read_attributes(path: Path, names: Sequence[str] | None = None) -> dict[str, str | int]:
-    """Read the attributes of a shard.
-
-    Args:
-        path: File of the shard.
-        names: Names of the attributes; all attributes by default.
-
-    Returns:
-        Name -> value.
+    """Read attributes of a shard, by default all.
 
     Raises:
         DatasetError: The file is missing, damaged or cut off, or has no such attribute.
@@ -182,16 +161,14 @@ def read_attributes(path: Path, names: Sequence[str] | None = None) -> dict[str,
 
 @dataclass(frozen=True, eq=False)
 class StoredField:
-    """Description of an HDF5 dataset in a shard.
+    """Shape, stored type and attributes of an HDF5 dataset in a shard; without attributes if they were not read.
 
-    Attributes:
-        shape: Shape of the dataset.
-        dtype: Stored type.
-        attributes: HDF5 attributes.
+    The offset is the position of the first value in the file [bytes]; None for chunks, which cnpgen does not write.
     """
 
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
+    offset: int | None
     attributes: dict[str, Any]
 
 
@@ -202,28 +179,12 @@ def read_schema(path: Path) -> dict[str, StoredField]:
         DatasetError: The file is missing, damaged or cut off.
     """
     with opened_hdf5(path) as file:
-        columns = file.columns()
-        return {name: StoredField(item.shape, item.dtype, item.attributes.all()) for name, item in columns.items()}
+        columns = file.columns().items()
+        return {name: StoredField(item.shape, item.dtype, item.offset, item.attributes.all()) for name, item in columns}
 
 
-@dataclass(frozen=True)
-class Placement:
-    """Location of the values of a field in a shard.
-
-    Attributes:
-        shape: Shape of the values.
-        dtype: Stored type.
-        offset: Position of the first value in the file [bytes]; None if they are stored in chunks or compressed, which
-            cnpgen does not do.
-    """
-
-    shape: tuple[int, ...]
-    dtype: np.dtype[Any]
-    offset: int | None
-
-
-def read_placements(path: Path) -> tuple[dict[str, Placement], dict[str, int]]:
-    """Read the locations of the fields of a shard, for memory mapping, and the identity of the shard.
+def read_placements(path: Path) -> tuple[dict[str, StoredField], dict[str, int]]:
+    """Read the locations of the fields of a shard, without attributes, and the identity of the shard.
 
     Returns:
         Field name -> location; and the attributes ``specification_key``, ``first_sample_id`` and ``rows`` of the file.
@@ -232,7 +193,8 @@ def read_placements(path: Path) -> tuple[dict[str, Placement], dict[str, int]]:
         DatasetError: The file is missing, damaged or cut off.
     """
     with opened_hdf5(path) as file:
-        placements = {name: Placement(item.shape, item.dtype, item.offset) for name, item in file.columns().items()}
+        columns = file.columns().items()
+        placements = {name: StoredField(item.shape, item.dtype, item.offset, {}) for name, item in columns}
         return placements, {
             name: int(file.attributes[name]) for name in ("specification_key", "first_sample_id", "rows")
         }

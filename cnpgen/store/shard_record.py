@@ -120,21 +120,10 @@ def commit_shard(
     seconds: float = 0.0,
     versions: Mapping[str, str] | None = None,
 ) -> ShardRecord:
-    """Write a shard and then its sidecar; a committed shard is not written again.
+    """Write a shard and then its sidecar; a committed shard is not written again. Return the record of the shard.
 
-    Args:
-        folder: Folder of the dataset.
-        spec: Specification of the dataset.
-        task: The shard.
-        columns: Field name -> values in their stored type, shape (rows, width) or (rows,).
-        sampling: Sampling statistics of the shard.
-        scenes: Scenes of the rows, in their stored types; None for a dataset without scenes.
-        started: Start time of the computation, ISO 8601 in UTC.
-        seconds: Computing time [s].
-        versions: Versions of cnpgen, Python and libraries that made the shard.
-
-    Returns:
-        The record of the shard.
+    The columns are in their stored type, of shape (rows, width) or (rows,), the scenes, too. Other arguments become
+    attributes of the record.
 
     Raises:
         DatasetError: The columns do not fit the specification, or are not finite.
@@ -198,9 +187,8 @@ def load_committed(folder: Path, spec: DatasetSpec, task: ShardTask) -> ShardRec
     """
     record = load_record(folder, task)
     if record.specification_fingerprint != spec.version_with(task).fingerprint:
-        raise DatasetError(
-            f"{folder / task.sidecar} belongs to another specification ({record.specification_fingerprint[:12]}...)"
-        )
+        text = f"{folder / task.sidecar} belongs to another specification ({record.specification_fingerprint[:12]}...)"
+        raise DatasetError(text)
     path = folder / task.file
     size = path.stat().st_size if path.is_file() else None
     if size != record.bytes:

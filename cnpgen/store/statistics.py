@@ -103,10 +103,7 @@ _HISTOGRAM_STRUCTURE = {"low": [NUMBER], "high": [NUMBER], "counts": [[WHOLE]]}
 
 
 def statistics_from_json(content: Mapping[str, Any]) -> FieldStatistics:
-    """Rebuild statistics from a dict.
-
-    Args:
-        content: Dict with the structure ``STATISTICS_STRUCTURE``.
+    """Rebuild statistics from a dict with the structure ``STATISTICS_STRUCTURE``.
 
     Raises:
         ValueError: Shapes or counts are inconsistent.
@@ -134,18 +131,12 @@ def are_of(statistics: Mapping[str, FieldStatistics], fields: Sequence[Field]) -
 
 
 def field_statistics(values: NDArray[Any], field: Field) -> FieldStatistics:
-    """Compute the statistics of one field.
+    """Compute the statistics of the columns of one field from at least one row, shape (rows, width) or (rows,).
 
-    Args:
-        values: Values of the field, shape (rows, width) or (rows,), at least one row.
-        field: The field; histograms need two finite limits.
-
-    Returns:
-        The statistics of the columns.
+    Histograms need two finite limits.
     """
-    columns = np.ascontiguousarray(
-        np.asarray(values, np.float64).reshape(len(values), -1).T
-    )  # sums over long contiguous rows are fast
+    # Sums over long contiguous rows are fast.
+    columns = np.ascontiguousarray(np.asarray(values, np.float64).reshape(len(values), -1).T)
     mean = columns.mean(axis=1)
     low, high = _limits(field, len(columns))
     return FieldStatistics(
@@ -183,9 +174,7 @@ def column_statistics(columns: Mapping[str, NDArray[Any]], fields: Sequence[Fiel
     return {field.name: field_statistics(columns[field.name], field) for field in fields}
 
 
-def merge_statistics(
-    parts: Sequence[Mapping[str, FieldStatistics]],
-) -> dict[str, FieldStatistics]:
+def merge_statistics(parts: Sequence[Mapping[str, FieldStatistics]]) -> dict[str, FieldStatistics]:
     """Merge the statistics of shards, in order.
 
     Raises:

@@ -71,14 +71,9 @@ def check_place(workspace: Workspace) -> None:
         UsageError: It is a file, contains files that are not a dataset of cnpgen, or a link out of it.
     """
     if workspace.content == "a file":
-        raise UsageError(
-            f"{workspace.existing} is a file, not a folder; choose another {{out}}", remedies={"out": None}
-        )
+        raise _other_folder(f"{workspace.existing} is a file, not a folder")
     if workspace.content == "something else":
-        raise UsageError(
-            f"{workspace.folder} is not empty and not a dataset of cnpgen; choose another {{out}}",
-            remedies={"out": None},
-        )
+        raise _other_folder(f"{workspace.folder} is not empty and not a dataset of cnpgen")
     splits = () if workspace.spec is None else tuple(workspace.spec.splits)
     if workspace.content == "a dataset" and (outside := outside_links(workspace.folder, (WORK, *splits))):
         raise UsageError(f"{workspace.folder / outside[0]} {OUTSIDE}; {COPY_HINT}")
@@ -103,24 +98,15 @@ def started_spec(workspace: Workspace, wanted: DatasetSpec) -> DatasetSpec | Non
         return None
     if existing is None:
         raise DatasetError(f"{workspace.damage}; {{force}} replaces the whole dataset", remedies={"force": True})
-    raise UsageError(
-        f"{workspace.folder} {_describe_conflict(existing, wanted)}", remedies={"out": None, "force": True}
-    )
+    text = f"{workspace.folder} {_describe_conflict(existing, wanted)}"
+    raise UsageError(text, remedies={"out": None, "force": True})
 
 
 def open_workspace(folder: Path, spec: DatasetSpec, *, force: bool = False) -> DatasetSpec:
     """Create the folder with its specification, or check that it already contains the same specification.
 
     The folder is inspected again, because another process may have started the dataset while kernels were compiled. A
-    specification without shards is replaced.
-
-    Args:
-        folder: The folder.
-        spec: Specification of the new dataset.
-        force: Whether to delete an existing dataset in the folder.
-
-    Returns:
-        The specification in the folder (see ``started_spec``).
+    specification without shards is replaced; ``force`` deletes an existing dataset.
 
     Raises:
         UsageError: The folder contains another dataset or other files.
@@ -153,14 +139,14 @@ def require_dataset_spec(folder: Path, spec: DatasetSpec) -> None:
         is_unchanged = spec.fingerprint.encode() in read_file(folder / SPECIFICATION)
     except DatasetError as error:
         missing = f"its {SPECIFICATION}" if folder.is_dir() else "it"
-        raise MachineError(
-            f"{folder}: {missing} was deleted or moved while the dataset was made; make it again"
-        ) from error
+        text = f"{folder}: {missing} was deleted or moved while the dataset was made; make it again"
+        raise MachineError(text) from error
     if not is_unchanged:
-        raise UsageError(
-            f"{folder} was replaced by another dataset while this one was made; choose another {{out}}",
-            remedies={"out": None},
-        )
+        raise _other_folder(f"{folder} was replaced by another dataset while this one was made")
+
+
+def _other_folder(text: str) -> UsageError:
+    return UsageError(f"{text}; choose another {{out}}", remedies={"out": None})
 
 
 def is_dataset(folder: Path) -> bool:
@@ -235,11 +221,8 @@ def _cleared(workspace: Workspace) -> Workspace:
                 path.unlink()
             split.rmdir()
         shutil.rmtree(folder / WORK, ignore_errors=True)
-        for name in (
-            *_SUMMARIES,
-            OLD_SPECIFICATION,
-            SPECIFICATION,
-        ):  # last: a partially deleted dataset must still be recognized
+        # Last: a partially deleted dataset must still be recognized.
+        for name in (*_SUMMARIES, OLD_SPECIFICATION, SPECIFICATION):
             (folder / name).unlink(missing_ok=True)
     except OSError as error:
         raise machine_error("delete from", folder, error) from error
@@ -260,9 +243,8 @@ def check_clearable(workspace: Workspace) -> list[Path]:
         named = [folder / split for split in spec.splits]
     splits = [split for split in named if split.is_dir()]
     if foreign := _foreign(folder, splits):
-        raise UsageError(
-            f"{folder} holds {foreign.relative_to(folder)}, which is not part of the dataset: move it away first"
-        )
+        text = f"{folder} holds {foreign.relative_to(folder)}, which is not part of the dataset: move it away first"
+        raise UsageError(text)
     return splits
 
 

@@ -25,16 +25,9 @@ OPTIONAL_MODULES = ("matplotlib",)
 PROJECTS = {"pinocchio": "pin"}  # on PyPI, where it is not called like its module
 
 VARIABLES = (
-    "OMP_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "VECLIB_MAXIMUM_THREADS",
-    "LOKY_MAX_CPU_COUNT",
-    "CC",
-    "CNPGEN_CACHE",
-    "XDG_CACHE_HOME",
-    "PYTHONPATH",
-)
+    "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS", "LOKY_MAX_CPU_COUNT",
+    "CC", "CNPGEN_CACHE", "XDG_CACHE_HOME", "PYTHONPATH",
+)  # fmt: skip
 
 MIN_DISK_BYTES = 10**9
 
@@ -179,15 +172,11 @@ def _try_library(module: str, project: str) -> tuple[str, str]:
     install = f"{sys.executable} -m pip install"
     try:
         imported = importlib.import_module(module)
-    except ModuleNotFoundError as error:
-        if error.name == module:
-            return "missing", f"{project} is not installed: run '{install} {project}'"
-        return "broken", f"{project} cannot be imported ({error}): run '{install} --force-reinstall {project}'"
     except Exception as error:  # noqa: BLE001 - a broken library may raise anything
-        return (
-            "broken",
-            f"{project} cannot be imported ({_one_line(error)}): run '{install} --force-reinstall {project}'",
-        )
+        if isinstance(error, ModuleNotFoundError) and error.name == module:
+            return "missing", f"{project} is not installed: run '{install} {project}'"
+        reason = str(error) if isinstance(error, ModuleNotFoundError) else _one_line(error)
+        return "broken", f"{project} cannot be imported ({reason}): run '{install} --force-reinstall {project}'"
     attribute = _DISTINCTIVE_ATTRIBUTES.get(module)
     if attribute and not hasattr(imported, attribute):
         remedy = f"run '{sys.executable} -m pip uninstall {module}', then '{install} --force-reinstall {project}'"
@@ -289,9 +278,8 @@ def _check_recipes(findings: _Findings) -> str:
                 missing.append(name)
     except Exception as error:  # noqa: BLE001 - broken libraries raise anything
         text = _one_line(error)
-        findings.problems += (
-            [] if findings.problems else [f"the shipped recipes cannot be loaded ({text}): reinstall cnpgen"]
-        )
+        if not findings.problems:
+            findings.problems.append(f"the shipped recipes cannot be loaded ({text}): reinstall cnpgen")
         return f"cannot be loaded: {text}"
     if not names:
         findings.problems.append(f"there are no recipes in {recipes_root()}: reinstall cnpgen")

@@ -8,15 +8,19 @@ from typing import Any
 from cnpgen.errors import DatasetError, counted
 from cnpgen.judges.rows.row_report import RowReport
 from cnpgen.machine.engine import Engine
+from cnpgen.make.recipe import resolved_digest
 from cnpgen.make.recipe_file import restored
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import integer
-from cnpgen.store.check import Finding, check_dataset
+from cnpgen.store.check import REPLACE_HINT, Finding, check_dataset
 from cnpgen.store.dataset_spec import DatasetSpec, load_dataset_spec, shards
+from cnpgen.store.dataset_summary import load_stats_document, stats_document, summarize_dataset
+from cnpgen.store.files.documents import plain
+from cnpgen.store.intact import RERUN_HINT
+from cnpgen.store.layout import SPECIFICATION, STATS
 from cnpgen.store.paths import require_dataset
 from cnpgen.store.shard_record import is_committed
 from cnpgen.validate.blocks import Regeneration, backend_of, regenerate_blocks
-from cnpgen.validate.validate_documents import check_recipe, check_statistics
 from cnpgen.validate.validate_rows import DeepCheck, check_rows
 
 
@@ -84,14 +88,11 @@ class ValidationReport:
         if self.plans:
             lines.append(f"  judged at all times: {counted(self.plans[0], 'plan')}, {self.plans[1]:,} valid")
         if self.wanted:
-            lines.append(f"  made again: {self._blocks_text()}, {self.identical:,} identical to the bit")
+            requested = f" ({self.wanted:,} were requested)" if self.wanted > self.blocks else ""
+            text = f"{self.regenerated:,} of {counted(self.blocks, 'block')}{requested}"
+            lines.append(f"  made again: {text}, {self.identical:,} identical to the bit")
         hints = dict.fromkeys(finding.hint for finding in self.findings if finding.hint and not finding.note)
         return "\n".join([*lines, *(f"  hint: {text}" for text in hints)])
-
-    def _blocks_text(self) -> str:
-        """Describe the number of regenerated blocks."""
-        text = f"{self.regenerated:,} of {counted(self.blocks, 'block')}"
-        return f"{text} ({self.wanted:,} were requested)" if self.wanted > self.blocks else text
 
 
 @checked_arguments
@@ -133,7 +134,11 @@ def validate_dataset(
         spec = load_dataset_spec(folder)
     except DatasetError:
         return ValidationReport(folder, 0, tuple(findings))
-    _check_requirements(folder, spec, deep=deep, regenerate=regenerate)
+    if regenerate:  # missing packages and backends are reported before the expensive checks
+        backend_of(folder, spec)
+    if deep or regenerate:
+        with restored(spec):
+            pass
     existing = [task for task in shards(spec) if is_committed(folder, spec, task)]
     damaged = {finding.file for finding in findings if not finding.note}
     undamaged = [task for task in existing if task.file not in damaged]
@@ -153,10 +158,24 @@ def validate_dataset(
     )
 
 
-def _check_requirements(folder: Path, spec: DatasetSpec, *, deep: bool, regenerate: int) -> None:
-    """Raise an error for missing packages or backends before the expensive checks."""
-    if regenerate:
-        backend_of(folder, spec)
-    if deep or regenerate:
-        with restored(spec):
-            pass
+def check_recipe(spec: DatasetSpec) -> list[Finding]:
+    """Check that the recipe in a specification has the recorded sha256."""
+    try:
+        digest = resolved_digest(spec.recipe["pipeline"], str(spec.robot["urdf"]).encode())
+    except (KeyError, TypeError, AttributeError):
+        return [Finding(SPECIFICATION, "its recipe cannot be read", hint=REPLACE_HINT)]
+    text = f"its recipe has the sha256 {digest}, not the recorded {spec.recipe_sha256}"
+    return [] if digest == spec.recipe_sha256 else [Finding(SPECIFICATION, text, hint=REPLACE_HINT)]
+
+
+def check_statistics(folder: Path, spec: DatasetSpec) -> list[Finding]:
+    """Check that ``stats.json`` is the summary of the records of all shards; these must exist."""
+    try:
+        document = load_stats_document(folder)
+        expected = plain(stats_document(summarize_dataset(folder, spec)))
+    except DatasetError:  # missing or damaged files are findings already
+        return []
+    different = [key for key in expected if document.get(key) != expected[key]]
+    text = f"is not the summary of the records of the shards: {', '.join(different)} differ"
+    hint = f"delete {STATS} and {RERUN_HINT}: it writes the file again"
+    return [Finding(STATS, text, hint=hint)] if different else []

@@ -1,6 +1,6 @@
 """Deep check of a dataset: recomputation of every row with Pinocchio and Coal, and detection of duplicate rows."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
@@ -17,28 +17,24 @@ from cnpgen.judges.rows.row_report import RowReport, merge
 from cnpgen.judges.rows.verify import OBSTACLE_POSES, verify_rows
 from cnpgen.machine.engine import Engine, assembled
 from cnpgen.make.recipe_file import restored
+from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.robots.scene_arrays import scene_poses
 from cnpgen.store.check import DELETE_HINT, Finding
-from cnpgen.store.checked_shard import read_checked, read_scenes, shard_of_record
+from cnpgen.store.checked_shard import Shard, read_checked, read_scenes
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask
+from cnpgen.store.field import Field
 from cnpgen.store.scene_table import SCENE_ID
-from cnpgen.store.shard_record import load_record
-from cnpgen.validate.numbers import check_numbers
+from cnpgen.store.shard_record import ShardRecord, load_record
+from cnpgen.store.statistics import FieldStatistics, field_statistics
 
+MAX_RELATIVE_SUM_ERROR = 1e-9  # accepted relative difference of sums of the same numbers between versions of NumPy
 _ODD_MULTIPLIERS = np.random.default_rng(0).integers(0, 2**63, 64, dtype=np.uint64) * np.uint64(2) + np.uint64(1)
 
 
 @dataclass(frozen=True)
 class DeepCheck:
-    """Result of the deep check of a dataset.
-
-    Attributes:
-        rows: Report of Pinocchio and Coal on all rows; None if none could be read.
-        judged: Number of judged plans; 0 unless the dataset is certified.
-        valid: Number of valid plans.
-        findings: Problems, by file.
-    """
+    """Report of Pinocchio and Coal on all rows, numbers of judged and valid plans, and problems by file."""
 
     rows: RowReport | None = None
     judged: int = 0
@@ -49,15 +45,7 @@ class DeepCheck:
 def check_rows(
     folder: Path, spec: DatasetSpec, tasks: list[ShardTask], engine: Engine, progress: Callable[[int], None] | None
 ) -> DeepCheck:
-    """Recompute every row, shard by shard, and judge every plan.
-
-    Args:
-        folder: Folder of the dataset.
-        spec: Specification of the dataset.
-        tasks: The shards to read.
-        engine: Engine of the worker processes.
-        progress: Called with the number of rows of every shard that was read.
-    """
+    """Recompute every row, shard by shard, and judge every plan; report the rows of every shard that was read."""
     checks, findings = [], []
     with assembled(engine, len(tasks)) as pool:
         verify = partial(_verify_shard, folder.absolute() if pool.is_remote else folder, spec)
@@ -80,15 +68,10 @@ def check_rows(
 
 @dataclass(frozen=True)
 class _ShardCheck:
-    """Result of the deep check of one shard.
+    """Result of the deep check of one shard, without a report if it cannot be read.
 
-    Attributes:
-        report: Report of Pinocchio and Coal; None if the shard cannot be read.
-        problems: Problems of the shard.
-        keys: Hash of the boundary states of every row, shape (rows,).
-        plans: Numbers of judged and valid plans, and their problems.
-        fractions: Hit speeds as fractions of the maximum hit speed, shape (rows,); empty if the rows are no hits.
-        goals: Hash of the goal of each of these hits.
+    The keys are hashes of the boundary states of its rows, the goals those of its hits. Hit speeds are fractions of the
+    maximum speed, and empty if the rows are no hits. All have shape (rows,).
     """
 
     report: RowReport | None
@@ -103,7 +86,7 @@ def _verify_shard(folder: Path, spec: DatasetSpec, task: ShardTask) -> _ShardChe
     """Verify one shard; a shard that cannot be read is a finding, not an exception."""
     try:
         record = load_record(folder, task)
-        shard = shard_of_record(folder, spec, task, record)
+        shard = Shard(folder, spec, task, record.bytes, record.sha256)
         columns = read_checked(shard)
         scenes = read_scenes(shard) if spec.scene_obstacles else None
     except CnpgenError as error:
@@ -140,13 +123,66 @@ def _check_speed_fractions(spec: DatasetSpec, checks: list[_ShardCheck]) -> list
 
 
 def row_keys(values: NDArray[Any]) -> NDArray[np.uint64]:
-    """Hash every row of numbers to 64 bits; equal rows have equal keys.
-
-    Args:
-        values: Shape (rows, width).
-    """
+    """Hash every row of numbers, shape (rows, width), to 64 bits; equal rows have equal keys."""
     bits = np.ascontiguousarray(values, np.float64).view(np.uint64)
     bits = bits ^ (bits >> np.uint64(32))  # float32 values have zero low bits, which products would not mix
     bits *= np.resize(_ODD_MULTIPLIERS, bits.shape[1])
     bits ^= bits >> np.uint64(29)
     return np.asarray((bits * np.resize(_ODD_MULTIPLIERS[::-1], bits.shape[1])).sum(axis=1, dtype=np.uint64))
+
+
+def check_numbers(
+    spec: DatasetSpec, task: ShardTask, columns: Mapping[str, NDArray[Any]], record: ShardRecord
+) -> list[str]:
+    """Describe the problems of all rows of a shard, shape (rows, width) or (rows,), by specification and record."""
+    problems = [text for field in spec.fields for text in _check_range(field, columns[field.name], task, spec.dtype)]
+    problems += [text for field in spec.fields for text in _check_statistics(field, columns[field.name], record)]
+    if {"hit_speed", "hit_speed_max"} <= columns.keys():
+        faster = np.flatnonzero(~(columns["hit_speed"] <= columns["hit_speed_max"]))
+        if len(faster):
+            problems.append(f"hit_speed is above hit_speed_max: {_rows_text(faster, task)}")
+    if not np.array_equal(columns["sample_id"], task.first_row + np.arange(task.rows)):
+        problems.append("sample_id is not the index of the row in the split")
+    if int(columns["attempts"].sum()) != record.sampling.tried:
+        problems.append(
+            f"attempts sum to {columns['attempts'].sum()}, but {record.sampling.tried} candidates are recorded"
+        )
+    return problems
+
+
+def _check_range(field: Field, values: NDArray[Any], task: ShardTask, dtype: str) -> Iterator[str]:
+    for name, bound, sign in (("valid_min", field.valid_min, 1.0), ("valid_max", field.valid_max, -1.0)):
+        if bound is not None:
+            violation = sign * (np.array(bound) - values.reshape(len(values), -1))
+            rows = np.flatnonzero((violation > tolerance(np.array(bound), dtype)).any(axis=1))
+            if len(rows):
+                unit = field.units[int(np.argmax(violation.max(axis=0)))]
+                text = f"{field.name} is outside its {name} by up to {violation.max():.3g} {unit}"
+                yield f"{text}: {_rows_text(rows, task)}"
+
+
+def _check_statistics(field: Field, values: NDArray[Any], record: ShardRecord) -> Iterator[str]:
+    recorded = record.statistics.get(field.name)
+    if np.isfinite(values).all() and not (recorded and _agree(recorded, field_statistics(values, field))):
+        yield f"the recorded statistics of {field.name} are not those of its values"
+
+
+def tolerance(bound: NDArray[np.float64], dtype: str) -> NDArray[np.float64]:
+    """Return the accepted violation of a bound by a stored number: the tolerance of limits plus float32 rounding."""
+    size = np.abs(bound)
+    rounding = np.spacing(size.astype(np.float32)).astype(float) if dtype == "float32" else 0.0
+    return BOUNDARY_TOLERANCES[dtype]["limit"] * np.maximum(size, 1.0) + rounding
+
+
+def _rows_text(rows: NDArray[np.intp], task: ShardTask) -> str:
+    return f"{len(rows)} of {task.rows} rows, the first one is row {task.first_row + int(rows[0])}"
+
+
+def _agree(a: FieldStatistics, b: FieldStatistics) -> bool:
+    """Return whether two statistics are of the same numbers: equal up to rounding errors of their sums."""
+    exact = ("count", "minimum", "maximum", "low", "high", "histogram")
+    if not all(np.array_equal(getattr(a, name), getattr(b, name)) for name in exact):
+        return False
+    spread = np.maximum(np.abs(a.minimum), np.abs(a.maximum))
+    mean, m2 = MAX_RELATIVE_SUM_ERROR * spread, MAX_RELATIVE_SUM_ERROR * a.count * spread**2
+    return bool((np.abs(a.mean - b.mean) <= mean).all() and (np.abs(a.m2 - b.m2) <= m2).all())

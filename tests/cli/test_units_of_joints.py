@@ -11,7 +11,7 @@ import cnpgen
 from cnpgen.cli.describe import describe_problem, recipe_to_dict, with_units
 from cnpgen.judges.plans.judge import judge
 from cnpgen.kernels.library import problem_kernels
-from cnpgen.loader.frame import make_frame
+from cnpgen.loader.dataset import make_frame
 from cnpgen.pipelines.context import Context
 from cnpgen.plans.plans import Plans, make_plans
 from cnpgen.problems.load_robot import load_robot

@@ -9,7 +9,7 @@ import pytest
 
 import cnpgen
 from cnpgen.errors import DatasetError, MachineError, UsageError
-from cnpgen.loader import frame, shard_reader
+from cnpgen.loader import shard_reader
 from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.gather import RowError
 from cnpgen.loader.load import load_dataset
@@ -117,7 +117,7 @@ def test_a_frame_of_pandas_contains_its_units(dataset: Dataset) -> None:
 def test_a_frame_of_another_library_or_of_none_is_refused(dataset: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(UsageError, match="library must be one of polars, pandas, got 'spark'"):
         dataset.frame("train", library="spark")
-    monkeypatch.setattr(frame, "find_spec", lambda name: None)
+    monkeypatch.setattr("cnpgen.loader.dataset.find_spec", lambda name: None)
     with pytest.raises(MachineError, match=r"a frame needs polars or pandas, .* pip install 'cnpgen\[polars\]'"):
         dataset.frame("train")
     with pytest.raises(MachineError, match=r"a frame needs pandas, .* pip install 'cnpgen\[pandas\]'"):

@@ -174,7 +174,7 @@ def test_shards_are_compared_by_several_threads_and_an_interruption_cancels_the_
     check = repair.check_committed
     monkeypatch.setattr(repair, "check_committed", lambda *x: (compared.append(x), check(*x))[1])
 
-    def interrupt(_task: object) -> None:
+    def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):

@@ -14,7 +14,7 @@ from cnpgen.pipelines.families.resting_states import RestingStates
 from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.pipeline_file import load_pipeline
 from cnpgen.pipelines.stages.draw_scenes import TOO_MANY, base_depths
-from cnpgen.pipelines.stages.pose_ik import MAX_POSE_IK_STEPS, POSE_TOLERANCE, pose_ik_step
+from cnpgen.pipelines.stages.ik import MAX_POSE_IK_STEPS, POSE_TOLERANCE, pose_ik_step
 from cnpgen.pipelines.stages.scene_clearance import SceneClearance
 from cnpgen.pipelines.stages.scene_ends import NO_ENDS
 from cnpgen.pipelines.stages.stage import CandidateBatch

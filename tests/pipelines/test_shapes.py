@@ -62,7 +62,7 @@ def test_convex_parts_decide_states_without_capsule_clearance_only(context, draw
     obstacle_poses, still = poses_of(context, drawn.shape[1]), np.zeros_like(drawn)
     real = PathWorld.set_path
     monkeypatch.setattr(PathWorld, "set_path", lambda *x: (checked_counts.append(x[1].shape[1]), real(*x))[1])
-    broken = decide((drawn, still, still), obstacle_poses, np.ones(drawn.shape[1], bool))
+    broken = decide((drawn, still, still), obstacle_poses, np.ones(drawn.shape[1], bool), None)
     assert all(0.1 < states / drawn.shape[1] < 0.9 for states in checked_counts)
     assert len(checked_counts) == 2  # obstacles, and the robot itself
     monkeypatch.undo()
@@ -82,9 +82,9 @@ def test_states_with_different_obstacle_poses_are_checked_one_by_one(context, dr
     other = obstacle_poses.copy()
     other[1, 0] += 1.0
     all_states = np.ones(60, bool)
-    together = narrow_phase_of(context, "start")((few, still, still), obstacle_poses, all_states)
+    together = narrow_phase_of(context, "start")((few, still, still), obstacle_poses, all_states, None)
     monkeypatch.setattr(PathWorld, "clear_of_obstacles", None)
-    alone = narrow_phase_of(context, "start")((few, still, still), other, all_states)
+    alone = narrow_phase_of(context, "start")((few, still, still), other, all_states, None)
     np.testing.assert_array_equal(alone[:, 1:], together[:, 1:])
     assert alone.any()
 
@@ -92,7 +92,7 @@ def test_states_with_different_obstacle_poses_are_checked_one_by_one(context, dr
 def test_states_outside_the_mask_are_not_checked(context, drawn):
     obstacle_poses, still = poses_of(context, drawn.shape[1]), np.zeros_like(drawn)
     assert not narrow_phase_of(context, "goal")(
-        (drawn, still, still), obstacle_poses, np.zeros(drawn.shape[1], bool)
+        (drawn, still, still), obstacle_poses, np.zeros(drawn.shape[1], bool), None
     ).any()
 
 

@@ -18,7 +18,7 @@ from cnpgen.make.make_dataset import make_dataset
 from cnpgen.make.merge import merge_datasets
 from cnpgen.planner.plan_requests import read_rows
 from cnpgen.plans.boundary_problems import load_boundary_problems
-from cnpgen.store.checked_shard import check_values, read_checked, shard_of_record
+from cnpgen.store.checked_shard import Shard, check_values, read_checked
 from cnpgen.store.dataset_spec import ShardTask, load_dataset_spec, shards
 from cnpgen.store.reader import open_dataset
 from cnpgen.store.shard_record import load_record
@@ -162,7 +162,7 @@ def test_extend_makes_a_modified_shard_again(damaged: Path, original: np.ndarray
 def test_a_sum_that_overflows_is_not_taken_for_infinity(damaged: Path) -> None:
     spec = load_dataset_spec(damaged)
     task = next(task for task in shards(spec) if task.file == FILE)
-    shard = shard_of_record(damaged, spec, task, load_record(damaged, task))
+    shard = Shard(damaged, spec, task)
     check_values(shard, {"start_q": np.full((250, 6), 1e308)})
     with pytest.raises(DatasetError, match="not finite in 1 rows, first in row 9"):
         check_values(shard, {"start_q": put((9, 5), np.nan)(np.zeros((250, 6)))})
@@ -248,5 +248,6 @@ def test_links_are_refused_by_every_reader(damaged: Path, tmp_path: Path) -> Non
             with pytest.raises(DatasetError, match="is a link that leads outside the folder of the dataset"):
                 read(damaged)
     spec = load_dataset_spec(damaged)
+    record = load_record(damaged, task)
     with pytest.raises(DatasetError, match="is a link"):
-        read_checked(shard_of_record(damaged, spec, task, load_record(damaged, task)))
+        read_checked(Shard(damaged, spec, task, record.bytes, record.sha256))

@@ -38,12 +38,11 @@ def test_a_range_of_rows_equals_the_slice(dataset: Path, start: int, stop: int |
         assert np.array_equal(values, np.concatenate([part[name] for part in TRAIN])[start:stop])
 
 
-def test_shards_are_read_one_by_one(dataset: Path) -> None:
+def test_shards_are_listed_and_read_by_a_copy(dataset: Path) -> None:
     opened = pickle.loads(pickle.dumps(open_dataset(dataset)))
-    found = [
-        (task.index, list(rows), len(rows["start_q"])) for task, rows in opened.iter_shards("train", fields=["start_q"])
-    ]
-    assert found == [(0, ["start_q"], 32), (1, ["start_q"], 18)]
+    assert [(task.index, task.first_row, task.rows) for task in opened.tasks("train")] == [(0, 0, 32), (1, 32, 18)]
+    rows = opened.read("train", fields=["start_q"], start=32)
+    assert (list(rows), len(rows["start_q"])) == (["start_q"], 18)
 
 
 @pytest.mark.parametrize(("start", "stop"), [(-1, 5), (6, 5), (0, 51)])
@@ -106,7 +105,7 @@ def test_all_readers_refuse_changed_values_with_the_same_message(dataset: Path, 
     with pytest.raises(DatasetError) as by_rows:
         opened.read("train", start=40)
     with pytest.raises(DatasetError) as by_shards:
-        list(opened.iter_shards("train"))
+        opened.read("train", fields=["start_q"])
     with pytest.raises(DatasetError) as by_loader:
         load_dataset(dataset, allow_incomplete=not finished).arrays("train")
     assert str(by_rows.value) == str(by_shards.value) == str(by_loader.value)

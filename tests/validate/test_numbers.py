@@ -13,7 +13,7 @@ from cnpgen.store.dataset_spec import DatasetSpec, ShardTask, load_dataset_spec,
 from cnpgen.store.shard import read_shard
 from cnpgen.store.shard_record import ShardRecord, load_record
 from cnpgen.store.statistics import column_statistics
-from cnpgen.validate.numbers import check_numbers
+from cnpgen.validate.validate_rows import check_numbers
 from tests.conftest import SHIPPED, TINY_SHARD, some, tiny_recipe
 
 Columns = dict[str, np.ndarray]

@@ -10,8 +10,7 @@ from cnpgen.store.dataset_summary import STATS_FORMAT, STATS_VERSION
 from cnpgen.store.files.documents import load_document, save_document
 from cnpgen.store.layout import STATS
 from cnpgen.store.manifest import finalize
-from cnpgen.validate.validate_dataset import validate_dataset
-from cnpgen.validate.validate_documents import check_recipe, check_statistics
+from cnpgen.validate.validate_dataset import check_recipe, check_statistics, validate_dataset
 
 
 def test_the_recipe_in_a_specification_must_have_the_recorded_digest(damaged):

@@ -81,11 +81,8 @@ class Cage(SceneFamily):
         cage.grasp((x - 0.06, y, 0.15), (1, 0, -0.6), tilt=0.4)
         for _ in range(5):
             center_z = low + opening * random.uniform(0.4, 0.6)
-            cage.grasp(
-                (float(random.uniform(0.08, 0.22)), float(random.uniform(-0.18, 0.18)), float(center_z)),
-                (1, 0, 0),
-                tilt=0.4,
-            )
+            position = random.uniform(0.08, 0.22), random.uniform(-0.18, 0.18), center_z
+            cage.grasp(position, (1, 0, 0), tilt=0.4)
         return cage.layout()
 
 

@@ -22,9 +22,7 @@ GRASP_GAP_M = 0.015  # between an object and the tip
 class Furniture:
     """Obstacles and grasps that are placed in a frame: x away from the base of the robot, z up.
 
-    Attributes:
-        origin: Origin of the frame in the frame of the robot's base [m].
-        yaw: Rotation of the frame about z [rad].
+    The frame has an origin [m] and a yaw about z [rad] in the frame of the robot's base.
     """
 
     origin: Point
@@ -73,19 +71,8 @@ def place_furniture(random: np.random.Generator, family: SceneFamily, z: float =
     return Furniture((distance * math.cos(bearing), distance * math.sin(bearing), z), yaw)
 
 
-@dataclass(frozen=True)
-class Objects:
-    """Sizes of objects.
-
-    Attributes:
-        count: Number of objects.
-        width: Edge lengths of the bases of boxes, and diameters of cylinders [m].
-        height: Heights [m].
-    """
-
-    count: Range
-    width: Range
-    height: Range
+Objects = tuple[Range, Range, Range]
+"""Number of objects; widths, of boxes or diameters of cylinders [m]; and heights [m]."""
 
 
 def place_objects(
@@ -98,20 +85,14 @@ def place_objects(
     from_above: bool,
     prefix: str = "object",
 ) -> None:
-    """Place boxes and cylinders on a rectangle without overlap, with grasps at each.
+    """Place boxes and cylinders on a rectangle without overlap, with grasps at each, from above or along x.
 
-    Args:
-        random: Random numbers.
-        furniture: Furniture in whose frame they stand.
-        area: Rectangle: lowest and highest x, lowest and highest y [m].
-        z: Height of the surface in the frame [m].
-        objects: Their number and sizes.
-        from_above: Whether the grasps approach downwards; otherwise along x.
-        prefix: Beginning of their names.
+    The area is the lowest and highest x and the lowest and highest y, at the height z, in the furniture's frame [m].
     """
     circles: list[tuple[float, float, float]] = []
-    for index in range(whole(random, objects.count)):
-        a, b, height = (uniform(random, size) for size in (objects.width, objects.width, objects.height))
+    count, widths, heights = objects
+    for index in range(whole(random, count)):
+        a, b, height = (uniform(random, size) for size in (widths, widths, heights))
         is_box = bool(random.random() < 0.5)
         radius = math.hypot(a, b) / 2 if is_box else a / 2
         for _ in range(MAX_PLACEMENTS):

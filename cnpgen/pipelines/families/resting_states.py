@@ -23,12 +23,9 @@ LINE_SPACING_RAD = 0.02  # rad or m, between checked states of a line
 
 
 class RestingStates:
-    """States of rest of a robot in one scene. It reuses Coal's memory: use it in one thread only.
+    """States of rest of a robot among the obstacles of its problem and further ones.
 
-    Args:
-        problem: The robot's problem; its own obstacles are part of the scene.
-        robot: The robot, with link geometry.
-        obstacles: Further obstacles.
+    It reuses Coal's memory: use it in one thread only.
 
     Raises:
         UsageError: The robot has no link geometry.

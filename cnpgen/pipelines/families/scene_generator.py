@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -123,10 +123,9 @@ class _Generator:
 
     def problems(self, random: np.random.Generator, name: str, count: int) -> Iterator[SceneProblem]:
         """Yield up to ``count`` problems in one scene."""
-        layout = self.family.draw(random)
-        scene = SceneProblem(
-            name=name, obstacles=layout.obstacles, start_q=np.zeros(self.robot.n), goal_q=np.zeros((0, self.robot.n))
-        )
+        layout, names = self.family.draw(random), self.robot.joint_names
+        start, goal = np.zeros(self.robot.n), np.zeros((0, self.robot.n))
+        scene = SceneProblem(name=name, obstacles=layout.obstacles, start_q=start, goal_q=goal, joint_names=names)
         try:
             scene = checked_scene(scene)
         except SceneError:  # an obstacle contains the base
@@ -139,13 +138,7 @@ class _Generator:
             pair = self._pair(states, grasps, random)
             if pair is not None:
                 start, goal = pair
-                yield SceneProblem(
-                    name=f"{name} {number}",
-                    obstacles=scene.obstacles,
-                    start_q=start,
-                    goal_q=goal[None],
-                    joint_names=self.robot.joint_names,
-                )
+                yield replace(scene, name=f"{name} {number}", start_q=start, goal_q=goal[None])
 
     def _grasp_states(self, states: RestingStates, layout: Layout, random: np.random.Generator) -> list[Array]:
         """Return collision-free states at grasps, a few for each grasp, shape (G, n) each."""

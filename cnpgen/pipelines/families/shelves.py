@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cnpgen.pipelines.families.family import Layout, SceneFamily, length, uniform, whole
-from cnpgen.pipelines.families.furniture import Furniture, Objects, place_furniture, place_objects
+from cnpgen.pipelines.families.furniture import Furniture, place_furniture, place_objects
 from cnpgen.schema.keys import Range, field
 
 SHELF_BOARD_M = 0.03
@@ -38,7 +38,7 @@ class Bookshelf(SceneFamily):
         for name, side in (("left side", 0.5), ("right side", -0.5)):
             center = (depth / 2, side * (width - SHELF_BOARD_M), height / 2)
             shelf.box(name, center, (depth, SHELF_BOARD_M, height - SHELF_BOARD_M))
-        objects = Objects(self.objects, self.object_width, self.object_height)
+        objects = self.objects, self.object_width, self.object_height
         for level in range(levels):
             z, area = level * spacing + SHELF_BOARD_M / 2, (0.12, depth - 0.08, -width / 2 + 0.12, width / 2 - 0.12)
             place_objects(random, shelf, area, z, objects, from_above=False, prefix=f"object {level + 1}")
@@ -127,7 +127,6 @@ def _cell_grasps(
     for low_y, high_y in columns:
         for low_z, high_z in rows:
             for _ in range(2):
-                y, z = (
-                    low + (high - low) * random.uniform(0.35, 0.65) for low, high in ((low_y, high_y), (low_z, high_z))
-                )
-                cubby.grasp((float(depth * random.uniform(0.2, 0.6)), float(y), float(z)), (1, 0, 0), tilt=0.35)
+                y = low_y + (high_y - low_y) * random.uniform(0.35, 0.65)
+                z = low_z + (high_z - low_z) * random.uniform(0.35, 0.65)
+                cubby.grasp((depth * random.uniform(0.2, 0.6), y, z), (1, 0, 0), tilt=0.35)

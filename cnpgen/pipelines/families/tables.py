@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cnpgen.pipelines.families.family import Layout, SceneFamily, length, uniform, whole
-from cnpgen.pipelines.families.furniture import Furniture, Objects, place_furniture, place_objects
+from cnpgen.pipelines.families.furniture import Furniture, place_furniture, place_objects
 from cnpgen.schema.keys import Range, field
 
 BOARD_M = 0.04  # thickness of table boards
@@ -40,7 +40,7 @@ class Tabletop(SceneFamily):
             table = Furniture(origin, bearing)
             table.box(f"table {index + 1}", (depth / 2, 0, -BOARD_M / 2), (depth, width, BOARD_M))
             area = (0.08, depth - 0.08, -width / 2 + 0.08, width / 2 - 0.08)
-            objects = Objects(self.objects, self.object_width, self.object_height)
+            objects = self.objects, self.object_width, self.object_height
             place_objects(random, table, area, 0.0, objects, from_above=True, prefix=f"object {index + 1}")
             for _ in range(2):  # free places
                 x, y = random.uniform(area[0], area[1]), random.uniform(area[2], area[3])
@@ -64,7 +64,7 @@ class TablePick(SceneFamily):
         table = place_furniture(random, self, uniform(random, self.height))
         depth, width = 0.55, 0.9
         table.box("table", (depth / 2, 0, -BOARD_M / 2), (depth, width, BOARD_M))
-        objects = Objects(self.objects, self.object_width, self.object_height)
+        objects = self.objects, self.object_width, self.object_height
         place_objects(random, table, (0.08, 0.47, -0.37, 0.37), 0.0, objects, from_above=True)
         for obstacle in list(table.obstacles[1:]):  # low places beside the objects
             x, y, _ = obstacle.position or (0.0, 0.0, 0.0)
@@ -95,7 +95,7 @@ class TableUnderPick(SceneFamily):
         for index, (x, y) in enumerate([(0, -1), (0, 1), (1, -1), (1, 1)], 1):
             center = (leg / 2 + x * (depth - leg), y * (width - leg) / 2, (floor + top) / 2)
             table.box(f"leg {index}", center, (leg, leg, top - floor - BOARD_M))
-        objects = Objects(self.objects, self.object_width, self.object_height)
+        objects = self.objects, self.object_width, self.object_height
         place_objects(random, table, (0.15, 0.4, -0.3, 0.3), floor, objects, from_above=False)
         center_z = (floor + top) / 2
         for _ in range(3):

@@ -70,15 +70,7 @@ class BatchScenes:
 def batch_scenes(
     layouts: Sequence[Layout], families: Sequence[int], obstacles: Sequence[Obstacle], capacity: int, dtype: str
 ) -> BatchScenes:
-    """Return scenes of a batch.
-
-    Args:
-        layouts: Obstacles and grasps of each scene, within the capacity of each kind.
-        families: Family of each scene.
-        obstacles: Obstacles of the problem.
-        capacity: Largest number of obstacles of a scene.
-        dtype: Stored float type.
-    """
+    """Return scenes of a batch with at most ``capacity`` obstacles each, in the stored float type."""
     table = make_scene_table([layout.obstacles for layout in layouts], families, capacity).astype(dtype)
     count = np.array([len(layout.grasps) for layout in layouts], np.int64)
     real = np.arange(max(count.max(initial=0), 1)) < count[:, None]

@@ -20,18 +20,13 @@ class BehindPuck(Stage):
 
     inputs = ("goal_xyz", "hit_angle")
     distance: float = field(
-        "distance of the centres of puck and mallet at contact: sum of the radii",
-        unit="m",
-        low=0.0,
-        plausible=1.0,
+        "distance of the centres of puck and mallet at contact: sum of the radii", unit="m", low=0.0, plausible=1.0
     )
 
     def describe(self) -> str:
-        """Describe the stage in one sentence."""
         return f"take the goal for the puck's centre: the tip meets it {1e3 * self.distance:g} mm behind, along the hit"
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
-        """List the field of the goal position, anywhere on the table."""
         table = context.constraint(Table)
         low, high = (table.x.low, table.y.low, table.z), (table.x.high, table.y.high, table.z)
         return (position_field("goal", low, high),)

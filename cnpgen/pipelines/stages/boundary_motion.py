@@ -43,22 +43,18 @@ class AtRest(Stage):
     )
 
     def describe(self) -> str:
-        """Describe the stage in one sentence."""
         kept = ", which motions must end with" if self.end == "goal" and self.acceleration == "zero" else ""
         return f"set velocity and acceleration of the {self.end} to zero{kept}"
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
-        """List the fields of the velocity and of a prescribed acceleration."""
         fields = _motion_fields(context, self.end)
         return fields if self.end == "start" or self.acceleration == "zero" else fields[:1]
 
     def writes(self, context: Context) -> tuple[str, ...]:
         """List velocity and acceleration; the checks use an acceleration that is not stored, too."""
-        del context
         return f"{self.end}_dq", f"{self.end}_ddq"
 
     def prepare(self, context: Context) -> StageFunction:
-        """Return the stage function."""
         n = context.robot.n
 
         def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
@@ -89,23 +85,18 @@ class TableVelocity(Stage):
     at_rest: float = field("fraction of the starts at rest", low=0.0, high=1.0, default=0.0)
 
     def describe(self) -> str:
-        """Describe the stage in one sentence."""
         return (
             "draw a start velocity: direction uniform in the box of the limits, projected on the table manifold, length"
             f" uniform between 0 and the first limit that it meets; zero in {100 * self.at_rest:.4g} % of the cases"
         )
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
-        """List the field of the velocity."""
         return _motion_fields(context, "start")[:1]
 
     def writes(self, context: Context) -> tuple[str, ...]:
-        """List the outputs and the velocity of the tip."""
-        del context
         return "start_dq", "start_tip_velocity"
 
     def prepare(self, context: Context) -> StageFunction:
-        """Load the kernel."""
         context.constraint(Table)
         kernel, n = context.kernels.load(table_velocity), context.robot.n
 
@@ -145,18 +136,15 @@ class TableAcceleration(Stage):
         return f"{self.end}_q", f"{self.end}_dq"
 
     def describe(self) -> str:
-        """Describe the stage in one sentence."""
         return (
             f"draw an acceleration of the {self.end} on the table manifold, uniform between the acceleration and torque"
             " limits that it meets along a random direction"
         )
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
-        """List the field of the acceleration."""
         return _motion_fields(context, self.end)[1:]
 
     def prepare(self, context: Context) -> StageFunction:
-        """Load the kernel."""
         context.constraint(Table)
         kernel, n = context.kernels.load(table_acceleration), context.robot.n
 
@@ -183,12 +171,8 @@ def velocity_of_tip(robot: Robot) -> Any:
 def onto_table(robot: Robot, *, height: float) -> Any:
     """Build the projection ``(q, dq, ddq) -> (q, dq, ddq)`` onto states whose tip moves and accelerates on the table.
 
-    Use it for deviations as small as those of plans: three Newton steps for q, then two projections. Velocities
-    slightly above their limits are scaled to the limits.
-
-    Args:
-        robot: Robot.
-        height: Height of the table [m].
+    The table has a height [m]. Use it for deviations as small as those of plans: three Newton steps for q, then two
+    projections. Velocities slightly above their limits are scaled to the limits.
     """
     import casadi as ca
 
@@ -240,9 +224,7 @@ def table_acceleration(robot: Robot) -> Any:
     kin = forward_kinematics(robot.chain, q)
     limit = [float(x) for x in robot.acceleration_limit]
     row = [column[2] for column in kin.jacobian]
-    size: Scalar = 0.0
-    for bound, x in zip(limit, row, strict=True):
-        size = size + bound * ca.fabs(x)
+    size = sum((bound * ca.fabs(x) for bound, x in zip(limit, row, strict=True)), 0.0)
     share = -bias_acceleration(kin, dq)[2] / size
     particular = [share * bound * ca.sign(x) for bound, x in zip(limit, row, strict=True)]
     direction = _project([x * bound for x, bound in zip(u, limit, strict=True)], row, limit)

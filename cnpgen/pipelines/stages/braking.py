@@ -38,7 +38,6 @@ class BrakingReach(Stage):
     )
 
     def describe(self) -> str:
-        """Describe the stage in one sentence."""
         return (
             f"require that full braking ends at least {1e3 * self.margin:g} mm before every edge of the table, from"
             " the start forwards and from the goal backwards in time (loses about 0.15 % of the solvable problems,"
@@ -46,7 +45,6 @@ class BrakingReach(Stage):
         )
 
     def prepare(self, context: Context) -> StageFunction:
-        """Load the kernels."""
         table = context.constraint(Table)
         tip = context.kernels.load(tip_state)
         brake = context.kernels.load(braking_step, Loop(0.5, MAX_BRAKING_STEPS), height=table.z)
@@ -63,22 +61,16 @@ class BrakingReach(Stage):
 def overshoot(
     tip: Kernel, brake: Kernel, table: Table, q: Array, dq: Array, *, margin: float = 0.0
 ) -> NDArray[np.float64]:
-    """Return the overshoot of full braking over the worst edge of the table.
+    """Return the overshoot of full braking, by both kernels, over the worst edge of the table.
 
-    Args:
-        tip: Kernel of ``tip_state``.
-        brake: Iterated kernel of ``braking_step``.
-        table: Table.
-        q: Joint positions [rad], shape (joints, n).
-        dq: Joint velocities [rad/s], reversed for the goal, shape (joints, n).
-        margin: Distance from the edges below which the roll-out is computed [m].
+    It is computed for states (q, dq) [rad, rad/s], shape (joints, n) each, reversed for the goal, that come closer to
+    an edge than the margin [m].
 
     Returns:
         Distance outside the edge [m], shape (n,); -inf if a straight line stays inside by the margin for 80 ms.
     """
-    position, velocity = (
-        np.repeat(values[:2], 2, axis=0) for values in tip(q, dq)
-    )  # for both edges across x and across y
+    # for both edges across x and across y
+    position, velocity = (np.repeat(values[:2], 2, axis=0) for values in tip(q, dq))
     edges = np.array([table.x.high, table.x.low, table.y.high, table.y.low])[:, None]
     ahead = EDGE_SIDES * (position + LOOKAHEAD_S * velocity - edges)
     suspects = (ahead > -margin) & (EDGE_SIDES * velocity > 0)
@@ -108,11 +100,7 @@ def braking_step(robot: Robot, *, height: float) -> Any:
     """Build one step of braking: ``((q, dq, overshoot), (nx, ny, edge)) -> (next state, still running)``.
 
     ``still running`` is 1 until the tip stops along the normal within the step. ``overshoot`` is then its distance
-    outside ``n . p = edge`` [m].
-
-    Args:
-        robot: Robot.
-        height: Height to which the roll-out is stabilized [m].
+    outside ``n . p = edge`` [m]. The roll-out is stabilized to a height [m].
     """
     import casadi as ca
 

@@ -8,6 +8,7 @@ For a robot with a shape, candidates with clearance of all capsules are kept. Co
 parts of the links.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -44,13 +45,11 @@ class Collision(Stage):
         return (*(f"{end}_q" for end in self._ends()), "start_xyz", "goal_xyz")
 
     def describe(self) -> str:
-        """Describe the stage in one sentence."""
         ends = "both ends" if self.end == "both" else f"the {self.end} configuration"
         how = "by an exact segment-to-box test" if self.judge == "segments" else "checked by Coal with arm and object"
         return f"require {ends} to be free of collision, {how}"
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
-        """List the fields of the clearance if the segment test computes it."""
         if self.judge == "coal" or context.robot.shape is not None:
             return ()
         text = "distance of the arm's capsule axes from the nearest obstacle at the {}, less the capsules' radius"
@@ -137,34 +136,29 @@ def candidate_poses(problem: Problem, candidates: CandidateBatch) -> Array:
 
 def capsule_axes_distance(robot: Robot, problem: Problem) -> Any:
     """Build ``(q, obstacle_poses) -> minimum distance of a capsule axis from an obstacle`` [m]."""
-    import casadi as ca
-
-    columns, state = _rest_state(robot, problem)
-    nearest = ca.SX(np.inf)
-    for first, second in state.segments:
-        for solid in symbolic_solids(state):
-            nearest = ca.fmin(nearest, solid.distance(first, second))
-    return ca.Function("capsule_axes_distance", columns, [nearest])
+    return _minimum_distance("capsule_axes_distance", robot, problem, lambda state: [(*x, 0.0) for x in state.segments])
 
 
 def capsule_clearance(robot: Robot, problem: Problem) -> Any:
     """Build ``(q, obstacle_poses) -> minimum distance of link capsules from obstacles`` [m], at least -radius."""
+    links = [capsule.link for capsule in robot.shape.moving_capsules] if robot.shape else []
+    return _minimum_distance(
+        "capsule_clearance", robot, problem, lambda state: [state.capsules[link] for link in links]
+    )
+
+
+def _minimum_distance(name: str, robot: Robot, problem: Problem, capsules: Callable[[SymbolicState], list[Any]]) -> Any:
+    """Build the minimum distance of capsules (first point, second point, radius) from the obstacles [m]."""
     import casadi as ca
 
-    columns, state = _rest_state(robot, problem)
-    moving = robot.shape.moving_capsules if robot.shape else ()
-    nearest = ca.SX(np.inf)
-    for first, second, radius in (state.capsules[capsule.link] for capsule in moving):
-        for solid in symbolic_solids(state):
-            nearest = ca.fmin(nearest, solid.distance(first, second) - radius)
-    return ca.Function("capsule_clearance", columns, [nearest])
-
-
-def _rest_state(robot: Robot, problem: Problem) -> tuple[list[Any], SymbolicState]:
-    """Return the columns of joint positions and obstacle poses, and the state of the robot at rest."""
     (q_sx, q), (poses_sx, poses) = symbols("q", robot.n), symbols("obstacle_poses", problem.scene_width)
     zero = [0.0] * robot.n
-    return [q_sx, poses_sx], SymbolicState(robot, q, zero, zero, poses, problem.obstacle, None)
+    state = SymbolicState(robot, q, zero, zero, poses, problem.obstacle, None)
+    nearest = ca.SX(np.inf)
+    for first, second, radius in capsules(state):
+        for solid in symbolic_solids(state):
+            nearest = ca.fmin(nearest, solid.distance(first, second) - radius)
+    return ca.Function(name, [q_sx, poses_sx], [nearest])
 
 
 def coal_judge(problem: Problem, robot: Robot, radius: float, depth: float) -> Any:

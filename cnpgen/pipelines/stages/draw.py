@@ -27,12 +27,10 @@ class DrawPositions(Stage):
     )
 
     def describe(self) -> str:
-        """Describe the stage in one sentence."""
         text = f"draw a start position in {_box(self.start)} m and a goal position in {_box(self.goal)} m"
         return f"{text}, horizontal distance at least {self.min_distance:g} m" if self.min_distance else text
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
-        """List the fields of both positions."""
         return tuple(
             position_field(end, *in_world_box(context, [axis.low for axis in box], [axis.high for axis in box]))
             for end, box in (("start", self.start), ("goal", self.goal))
@@ -64,13 +62,10 @@ class DrawGoal(Stage):
     )
 
     def describe(self) -> str:
-        """Describe the stage in one sentence."""
         text = f"draw a goal position in {_box(self.goal)} m"
         return f"{text}, at least {self.min_distance:g} m from the start horizontally" if self.min_distance else text
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
-        """List the field of the position."""
-        del context
         return (position_field("goal", [axis.low for axis in self.goal], [axis.high for axis in self.goal]),)
 
     def prepare(self, context: Context) -> StageFunction:

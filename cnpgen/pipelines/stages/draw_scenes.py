@@ -45,14 +45,12 @@ class DrawScenes(Stage):
         return tuple(registry.name_of(registry.FAMILIES, type(family)) for family in self.family)
 
     def describe(self) -> str:
-        """Describe the stage in one sentence."""
         shares = self._shares()
         each = (f"{name} {100 * share:.3g} %" for name, share in zip(self.family_names, shares, strict=True))
         return f"draw scenes for {self.per_scene} candidates each ({', '.join(each)})"
 
     def writes(self, context: Context) -> tuple[str, ...]:
         """List the index of the scene."""
-        del context
         return ("scene",)
 
     def prepare(self, context: Context) -> StageFunction:
@@ -83,7 +81,6 @@ class DrawScenes(Stage):
         Raises:
             UsageError: Always.
         """
-        del given
         name = context.problem.name
         raise UsageError(
             f"tasks have no scenes: complete poses among the obstacles of the problem {name!r}, or use a scene file",

@@ -29,7 +29,6 @@ class GivenPositions(Stage):
     )
 
     def find_mistakes(self) -> Iterator[tuple[str, str]]:
-        """Yield (key, mistake) pairs."""
         if bool(self.goal) == bool(self.grid):
             yield "goal", "either a list of goals or a grid must be given, and not both"
         for key in ("grid", "counts"):
@@ -49,13 +48,11 @@ class GivenPositions(Stage):
         return len(self.goal) or math.prod(self.counts)
 
     def describe(self) -> str:
-        """Describe the stage in one sentence."""
         goals = "goals in a list" if self.goal else f"goals on a grid of {' x '.join(map(str, self.counts))}"
         origin = "listed start positions" if self.start else "the base configuration"
         return f"take {self.tasks:,} {goals}, one after the other, from {origin}"
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
-        """List the fields of both positions, and of the start configuration if it is the base."""
         boxes = (("start", self._starts(context)), ("goal", self._goals()))
         positions = tuple(
             position_field(end, points.min(axis=0).tolist(), points.max(axis=0).tolist()) for end, points in boxes

@@ -11,19 +11,22 @@ from cnpgen.schema.keys import field
 from cnpgen.store.field import Field
 
 
-def _angle_field() -> Field:
-    low, high = (-float(np.pi),), (float(np.pi),)
-    return Field("hit_angle", "rad", "direction of the hit about world z, from world x", role="context", frame="world",
-                 valid_min=low, valid_max=high)  # fmt: skip
-
-
 def wrap(angle: Array) -> Array:
     """Map angles to [-pi, pi)."""
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
+class _HitAngle(Stage):
+    """Base class: hit direction on the table."""
+
+    def outputs(self, context: Context) -> tuple[Field, ...]:
+        low, high = (-float(np.pi),), (float(np.pi),)
+        text = "direction of the hit about world z, from world x"
+        return (Field("hit_angle", "rad", text, role="context", frame="world", valid_min=low, valid_max=high),)
+
+
 @dataclass(frozen=True, kw_only=True)
-class HitAngleToGoal(Stage):
+class HitAngleToGoal(_HitAngle):
     """Stage: hit direction from the goal position towards a target of the puck, with uniform noise."""
 
     inputs = ("goal_xyz",)
@@ -31,19 +34,11 @@ class HitAngleToGoal(Stage):
     noise: float = field("maximum deviation to either side", unit="rad", default=0.0, low=0.0, high=np.pi)
 
     def describe(self) -> str:
-        """Describe the stage in one sentence."""
         x, y = self.target
         noise = f", plus uniform noise of +-{self.noise:g} rad" if self.noise else ""
         return f"aim from the goal position at ({x:g}, {y:g}) m{noise}"
 
-    def outputs(self, context: Context) -> tuple[Field, ...]:
-        """List the field of the angle."""
-        del context
-        return (_angle_field(),)
-
     def prepare(self, context: Context) -> StageFunction:
-        """Return the stage function."""
-
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
             x, y = on_table(context, candidates, candidates["goal_xyz"])[:2]
             noise = self.noise * (2 * candidates.draw(random, 1) - 1)
@@ -53,7 +48,7 @@ class HitAngleToGoal(Stage):
 
 
 @dataclass(frozen=True, kw_only=True)
-class HitAngleInCone(Stage):
+class HitAngleInCone(_HitAngle):
     """Stage: hit direction uniform in a cone about the line from start to goal.
 
     The distribution equals that of uniform directions with rejection outside the cone.
@@ -73,18 +68,10 @@ class HitAngleInCone(Stage):
         return f"{self.origin}_xyz", "goal_xyz"
 
     def describe(self) -> str:
-        """Describe the stage in one sentence."""
         line = f"the line from {self.origin} to goal"
         return f"draw the hit direction uniformly within {self.half_angle:.4g} rad of {line}"
 
-    def outputs(self, context: Context) -> tuple[Field, ...]:
-        """List the field of the angle."""
-        del context
-        return (_angle_field(),)
-
     def prepare(self, context: Context) -> StageFunction:
-        """Return the stage function."""
-        del context
 
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:
             x, y = (candidates["goal_xyz"] - candidates[f"{self.origin}_xyz"])[:2]

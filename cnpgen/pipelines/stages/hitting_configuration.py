@@ -44,18 +44,15 @@ class HittingConfiguration(Stage):
         return ("goal_xyz", "hit_angle", "home_q") if self.near == "home" else ("goal_xyz", "hit_angle")
 
     def describe(self) -> str:
-        """Describe the stage in one sentence."""
         return (
             "find the goal configuration within the joint limits from which the tip moves fastest along the hit, near"
             f" the {self.near} configuration"
         )
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
-        """List the field of the goal configuration."""
         return (context.joint_field("goal_q", "rad", "joint positions at the goal", "target"),)
 
     def prepare(self, context: Context) -> StageFunction:
-        """Load the kernels."""
         robot = context.robot
         if robot.n < 3 or any(joint.prismatic for joint in robot.chain.joints):
             raise RecipeError(["needs three or more planned joints, all of them revolute"])

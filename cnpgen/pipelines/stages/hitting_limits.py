@@ -41,16 +41,11 @@ CONSTRAINT_WEIGHT = 1e3  # weight of J_F^T J_F relative to -H: both are in m^2/r
 
 
 def within_limits(robot: Robot, kernel: Kernel, q: Array, *parameters: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Move optima outside joint limits to nearby optima within, by an active-set method.
+    """Move optima outside joint limits to nearby optima within, by an active-set method with ``held_step``.
 
     Joints outside their limits are set to the limit and held. Joints that leave their limits after a solve for the
-    others are held, too. Of the held joints with an inward gradient, the one with the largest is released.
-
-    Args:
-        robot: Robot.
-        kernel: Iterated kernel of ``held_step``.
-        q: Optima of the search without limits [rad], shape (n, N).
-        parameters: Positions, directions and homes, in the order of the kernel's arguments.
+    others are held, too. Of the held joints with an inward gradient, the one with the largest is released. The optima q
+    have shape (n, N) [rad]; positions, directions and homes are further arguments of the kernel.
 
     Returns:
         ``(q, found)``: configurations within the limits [rad], shape (n, N), and a mask of the optima, shape (N,).
@@ -87,12 +82,6 @@ def held_step(robot: Robot) -> Any:
 
     ``held`` is 1 for joints that stay constant. ``pull`` is the gradient of the Lagrangian, an output that the step
     does not use.
-
-    Args:
-        robot: Robot with revolute joints only.
-
-    Returns:
-        A ``casadi.Function`` with arguments of width 2 n, 3, 2 or 3, n, n.
     """
     import casadi as ca
 

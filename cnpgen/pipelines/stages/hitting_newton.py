@@ -102,14 +102,7 @@ class Expansion:
 
 
 def expand(robot: Robot, q: Vec, d: Vec, home: Vec) -> Expansion:
-    """Expand objective and constraint at q.
-
-    Args:
-        robot: Robot with revolute joints only.
-        q: Joint positions [rad], n scalars.
-        d: Unit hitting direction in the table plane, 2, or 3 for tables that samples tilt.
-        home: Home configuration [rad], n.
-    """
+    """Expand objective and constraint of an arm of revolute joints at q [rad], near home [rad], for a direction d."""
     kin = forward_kinematics(robot.chain, q)
     direction = [*d, 0.0] if len(d) == 2 else d
     weight = [1.0 / float(value) ** 2 for value in robot.rated_velocity]
@@ -146,14 +139,7 @@ def _rates(kin: Kinematics, rate: Vec) -> tuple[list[Vec], list[Vec]]:
 
 
 def newton_step(robot: Robot) -> Any:
-    """Build one Newton step as an SX function ``(q, p, d, q0) -> (next q, |step|)``.
-
-    Args:
-        robot: Robot with revolute joints only.
-
-    Returns:
-        A ``casadi.Function`` with arguments of width n, 3, 2 or 3, n.
-    """
+    """Build one Newton step of an arm of revolute joints as an SX function ``(q, p, d, q0) -> (next q, |step|)``."""
     import casadi as ca
 
     (q_sx, q), (p_sx, p), (home_sx, home) = symbols("q", robot.n), symbols("p", 3), symbols("q0", robot.n)

@@ -42,7 +42,6 @@ class HittingVelocity(Stage):
     min_speed: float = field("minimum of the maximum speed of a hit", unit="m/s", default=1e-3, low=1e-9)
 
     def describe(self) -> str:
-        """Describe the stage in one sentence."""
         slower = (
             f"; scale it uniformly in [0, 1) in {1 - self.full_speed:.4g} of the cases" if self.full_speed < 1 else ""
         )
@@ -50,21 +49,14 @@ class HittingVelocity(Stage):
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
         """List the joint velocity and the speeds."""
+        text = "highest possible speed along the hit at the goal configuration"
         return (
             context.joint_field("goal_dq", "rad/s", "joint velocities at the goal", "target"),
             Field("hit_speed", "m/s", "speed of the tip along the hit at the goal", role="context", frame="world"),
-            Field(
-                "hit_speed_max",
-                "m/s",
-                "highest possible speed along the hit at the goal configuration",
-                role="diagnostic",
-                frame="world",
-            ),
+            Field("hit_speed_max", "m/s", text, role="diagnostic", frame="world"),
         )
 
     def prepare(self, context: Context) -> StageFunction:
-        """Load the kernel."""
-
         def draw_share(candidates: CandidateBatch, random: np.random.Generator, _speed: Array) -> Array:
             factor, choice = candidates.draw(random, 1), candidates.draw(random, 1)
             return np.where(choice < self.full_speed, 1.0, factor)
@@ -122,9 +114,7 @@ class HittingVelocity(Stage):
 def hitting_velocity(robot: Robot, *, min_speed: float) -> Any:
     """Build the linear program as an SX function ``(q, d) -> (dq, speed, found)``, or of (q, d, normal).
 
-    Args:
-        robot: Robot.
-        min_speed: Minimum speed of a hit [m/s].
+    Hits are at least as fast as ``min_speed`` [m/s].
 
     Returns:
         A ``casadi.Function`` with arguments of width n, 2; dq [rad/s] maximizes the tip's speed [m/s] along d. If
@@ -152,8 +142,7 @@ def hitting_velocity(robot: Robot, *, min_speed: float) -> Any:
 def maximise(a: Vec, b: list[Vec], limit: list[float]) -> tuple[Vec, Scalar]:
     """Solve ``max a . v, sum_i b_i v_i = 0, |v_i| <= limit_i`` without branches; n >= 2, b_i in R^2.
 
-    Returns:
-        ``(v, value)`` as SX scalars.
+    Return ``(v, value)``.
     """
     import casadi as ca
 
@@ -166,10 +155,8 @@ def maximise(a: Vec, b: list[Vec], limit: list[float]) -> tuple[Vec, Scalar]:
         usable = ca.fabs(det) > PARALLEL_TOLERANCE * size
         inverse = 1.0 / ca.if_else(usable, det, 1.0)
         candidate = [(a[i] * b[j][1] - b[i][1] * a[j]) * inverse, (b[i][0] * a[j] - a[i] * b[j][0]) * inverse]
-        value: Scalar = 0.0
-        for k in range(n):
-            if k not in (i, j):
-                value = value + limit[k] * ca.fabs(a[k] - dot(b[k], candidate))
+        others = (k for k in range(n) if k not in (i, j))
+        value = sum((limit[k] * ca.fabs(a[k] - dot(b[k], candidate)) for k in others), 0.0)
         better = ca.logic_and(usable, value < best)
         best = ca.if_else(better, value, best)
         y = [ca.if_else(better, new, old) for new, old in zip(candidate, y, strict=True)]
@@ -191,10 +178,7 @@ def _smallest_ratio(b: list[Vec], limit: list[float], target: Vec) -> Vec:
     pivot: Vec = [ca.SX(0), ca.SX(0)]
     for j in range(n):
         normal = [-b[j][1], b[j][0]]
-        weight: Scalar = 0.0
-        for k in range(n):
-            if k != j:
-                weight = weight + limit[k] * ca.fabs(dot(b[k], normal))
+        weight = sum((limit[k] * ca.fabs(dot(b[k], normal)) for k in range(n) if k != j), 0.0)
         size = dot(normal, normal)
         usable = weight > PARALLEL_TOLERANCE * ca.sqrt(size) * 1e-3
         value = dot(target, normal) / ca.if_else(usable, weight, 1.0)
@@ -212,9 +196,7 @@ def _smallest_ratio(b: list[Vec], limit: list[float], target: Vec) -> Vec:
     ]
     left = [target[c] - dot([x[c] for x in b], v) for c in range(2)]
     shares = [ca.if_else(same, bound * dot(x, pivot), 0.0) for same, bound, x in zip(parallel, limit, b, strict=True)]
-    total: Scalar = 0.0
-    for share in shares:
-        total = total + ca.fabs(share)
+    total = sum(map(ca.fabs, shares), 0.0)
     amount = dot(left, pivot) / ca.if_else(total > 0, total, 1.0)
     along = [
         ca.if_else(same, amount * bound * ca.sign(dot(x, pivot)), 0.0)

@@ -24,12 +24,10 @@ class Home(GuessedIK):
     position: tuple[Range, Range, Range] = field("box of tip positions of the other homes: x, y, z", unit="m")
 
     def find_mistakes(self) -> Iterator[tuple[str, str]]:
-        """Yield (key, mistake) pairs."""
         if self.at_start + self.at_base > 1:
             yield "at_base", f"the fractions must not be more than 1 together, got {self.at_start + self.at_base:g}"
 
     def describe(self) -> str:
-        """Describe the stage in one sentence."""
         elsewhere = max(1 - self.at_start - self.at_base, 0.0)
         return (
             f"choose a home: the start configuration in {100 * self.at_start:.4g} % of the cases, the base in"
@@ -38,17 +36,14 @@ class Home(GuessedIK):
         )
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
-        """List the field of the home configuration."""
         text = "joint positions that those at the goal are chosen close to"
         return (context.joint_field("home_q", "rad", text, "diagnostic"),)
 
     def writes(self, context: Context) -> tuple[str, ...]:
         """List the home configuration and its tip position."""
-        del context
         return "home_q", "home_xyz"
 
     def prepare(self, context: Context) -> StageFunction:
-        """Load the kernels."""
         check_reach(context, (("position", self.position),))
         guess_home, tip = self._solve_guessed(context, "home"), context.kernels.load(tip_position)
         base = context.robot.base[:, None]
@@ -66,7 +61,6 @@ class Home(GuessedIK):
 
     def complete(self, context: Context, given: Collection[str]) -> StageFunction:
         """Use the start: goals of tasks are chosen near the start configuration."""
-        del context, given
 
         def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:
             candidates["home_q"], candidates["home_xyz"] = candidates["start_q"], candidates["start_xyz"]

@@ -1,4 +1,4 @@
-"""Stages: inverse kinematics of start and goal, for the position alone or with a vertical orientation."""
+"""Inverse kinematics: stages for positions of start and goal, free or vertical, and a step for poses of the tip."""
 
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
@@ -27,6 +27,13 @@ IK_DAMPING = 1e-9
 # The damping vanishes with the error e, so convergence stays quadratic.
 MAX_LIMIT_DAMPING = 1e-2
 LIMIT_DAMPING_RATE = 1e-1
+# Inverse kinematics of poses
+METERS_PER_RADIAN = 0.3  # weight of an angle against a distance
+POSE_TOLERANCE = 1e-9  # m and weighted rad, before the last step
+MAX_POSE_IK_STEPS = 30
+MAX_POSE_IK_STEP_RAD = 0.5  # of any joint
+POSE_DAMPING = 1e-3  # relative to the squared error (Sugihara 2011)
+MIN_DAMPING = 1e-12
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,15 +131,12 @@ class StartIK(GuessedIK):
     inputs = ("start_xyz",)
 
     def describe(self) -> str:
-        """Describe the stage in one sentence."""
         return f"solve the start configuration{self._how()} from {self._origin()}"
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
-        """List the field of the start configuration."""
         return (context.joint_field("start_q", "rad", "joint positions at the start"),)
 
     def prepare(self, context: Context) -> StageFunction:
-        """Load the kernel."""
         return self._solve_guessed(context, "start")
 
 
@@ -152,21 +156,15 @@ class GoalIK(GuessedIK):
         since_version=2,
     )
     max_change: float | None = field(
-        "maximum difference of a joint between start and goal",
-        unit="rad",
-        low=1e-3,
-        default=None,
-        since_version=2,
+        "maximum difference of a joint between start and goal", unit="rad", low=1e-3, default=None, since_version=2
     )
 
     def find_mistakes(self) -> Iterator[tuple[str, str]]:
-        """Yield (key, mistake) pairs."""
         for name in ("from_start", "at_limit"):
             if getattr(self, name) and not self.guess:
                 yield name, "needs random guesses: give guess, too"
 
     def describe(self) -> str:
-        """Describe the stage in one sentence."""
         origin = self._origin() if self.guess else "the start configuration"
         if self.from_start:
             origin += f", but in {100 * self.from_start:.4g} % of the cases from the start configuration"
@@ -175,11 +173,9 @@ class GoalIK(GuessedIK):
         return f"solve the goal configuration{self._how()} from {origin}"
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
-        """List the field of the goal configuration."""
         return (context.joint_field("goal_q", "rad", "joint positions at the goal", "target"),)
 
     def prepare(self, context: Context) -> StageFunction:
-        """Load the kernel."""
         search, max_change = self._search(context), self.max_change
         if max_change is None:
             return search
@@ -217,14 +213,9 @@ def ik_step(robot: Robot, *, vertical: bool, max_step: float, hold: bool = False
     """Build one step of inverse kinematics as an SX function ``(q, p) -> (next q, |error|)``.
 
     A joint that would leave its limits is set to the limit. The rest of the step is redistributed once over the other
-    joints.
-
-    Args:
-        robot: Robot.
-        vertical: Whether the tip's z axis must be vertical, too. If parameters of the problem turn the upright
-            direction, the last argument has three axes, of which the last is the direction, shape (9,).
-        max_step: Maximum change of a joint [rad].
-        hold: Whether there is a third argument, 1 for joints that stay constant and 0 for the others.
+    joints; no joint changes more than ``max_step`` [rad]. With ``hold``, a third argument is 1 for joints that stay
+    constant, otherwise 0. With ``vertical``, the tip's z axis must be vertical, too. If parameters of the problem turn
+    the upright direction, the last argument then has three axes, of which the last is the direction, shape (9,).
     """
     import casadi as ca
 
@@ -293,3 +284,29 @@ def _clip(x: Scalar, robot: Robot, i: int) -> Scalar:
     import casadi as ca
 
     return ca.fmin(ca.fmax(x, float(robot.position_lower[i])), float(robot.position_upper[i]))
+
+
+def pose_ik_step(robot: Robot) -> Any:
+    """Build ``(q, position, rotation by rows) -> (next q, |error|)``; steps end at the joint limits.
+
+    The error is the distance from the position, and the rotation vector to the rotation times ``METERS_PER_RADIAN``,
+    stretched to twice the tangent of half the angle, so that rotations by 180 degrees are no fixed point.
+    """
+    import casadi as ca
+
+    (q_sx, q), (p_sx, p), (r_sx, r) = symbols("q", robot.n), symbols("p", 3), symbols("r", 9)
+    kin = forward_kinematics(robot.chain, q)
+    target = [r[0:3], r[3:6], r[6:9]]
+    relative = [[dot(a, b) for b in kin.rotation] for a in target]  # target times the transposed rotation
+    trace = relative[0][0] + relative[1][1] + relative[2][2]
+    stretch = METERS_PER_RADIAN * 2.0 / ca.fmax(1.0 + trace, 1e-2)
+    turn = [relative[2][1] - relative[1][2], relative[0][2] - relative[2][0], relative[1][0] - relative[0][1]]
+    error = [*subtract(p, kin.tip), *scale(turn, stretch)]
+    axes = [axis if turns else [0.0] * 3 for axis, turns in zip(kin.axes, kin.turning, strict=True)]
+    rows = [[column[row] for column in kin.jacobian] for row in range(3)]
+    rows += [[METERS_PER_RADIAN * axis[row] for axis in axes] for row in range(3)]
+    square = dot(error, error)
+    step, _ = clipped_step(rows, error, MAX_POSE_IK_STEP_RAD, POSE_DAMPING * square + MIN_DAMPING)
+    moved = add(q, step)
+    following = [_clip(x, robot, i) for i, x in enumerate(moved)]
+    return ca.Function("pose_ik", [q_sx, p_sx, r_sx], [ca.vertcat(*following), ca.sqrt(square)])

@@ -5,7 +5,7 @@ checked.
 """
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,32 +24,19 @@ from cnpgen.world.path import PathWorld
 from cnpgen.world.world import World
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 States = tuple[Array, Array, Array]
 
+Decide = Callable[[States, Array, Mask, CandidateBatch | None], Mask]
+"""Function of the narrow phase, see ``narrow_phase_of``."""
+
 MIN_SCENE_MARGIN_M = 1e-6  # of distances in compiled code, above which Coal does not measure them again
-
-
-class Decide(Protocol):
-    """Function of the narrow phase, see ``narrow_phase_of``."""
-
-    def __call__(
-        self,
-        state: States,
-        obstacle_poses: Array,
-        mask: NDArray[np.bool_],
-        candidates: CandidateBatch | None = None,
-        /,
-    ) -> NDArray[np.bool_]:
-        """Return a mask of the violated constraints, shape (constraints, N)."""
 
 
 def narrow_phase_of(context: Context, end: End, *, exact: bool = True) -> Decide | None:
     """Prepare the narrow phase of one end; return None if the problem never needs it.
 
-    Args:
-        context: Loaded problem.
-        end: End of the motion.
-        exact: Whether the tolerances of boundary states apply; otherwise those of motions apply.
+    The tolerances of boundary states apply if it is ``exact``, otherwise those of motions.
 
     Returns:
         A function of states ``(q, dq, ddq)``, shape (n, N) each, obstacle poses, shape (width, N), a mask of the states
@@ -61,9 +48,7 @@ def narrow_phase_of(context: Context, end: End, *, exact: bool = True) -> Decide
     kernel = context.kernels.load_by_structure(narrow_phase, end=end, dtype=context.dtype)
     path = PathWorld(robot, problem.obstacle, problem.object_size)
 
-    def decide_states(
-        state: States, obstacle_poses: Array, mask: NDArray[np.bool_], _candidates: CandidateBatch | None = None
-    ) -> NDArray[np.bool_]:
+    def decide_states(state: States, obstacle_poses: Array, mask: Mask, _candidates: CandidateBatch | None) -> Mask:
         (unmet_counts,) = kernel(*state, obstacle_poses)
         remaining, violated = (unmet_counts > 0) & mask, np.zeros(unmet_counts.shape, bool)
         one_scene = bool(np.all(obstacle_poses == obstacle_poses[:, :1]))
@@ -90,19 +75,15 @@ def narrow_phase_of_scenes(context: Context, end: End, *, exact: bool = True) ->
     ones; Coal measures the others.
     """
     problem, clearance = context.problem, SceneClearance(context)
-    kinds = [isinstance(constraint, RobotClearance | SelfClearance) for constraint in problem.constraint]
-    by_distance = np.array(kinds, bool)
+    by_distance = np.array([isinstance(each, RobotClearance | SelfClearance) for each in problem.constraint], bool)
     measure_one_by_one = _one_by_one(context, end, exact=exact)
     conservative = _conservative(context, end) & ~by_distance
 
-    def decide_states(
-        state: States, obstacle_poses: Array, mask: NDArray[np.bool_], candidates: CandidateBatch | None = None
-    ) -> NDArray[np.bool_]:
+    def decide_states(state: States, obstacle_poses: Array, mask: Mask, candidates: CandidateBatch | None) -> Mask:
         q, remaining = np.ascontiguousarray(state[0], float), np.zeros((len(by_distance), len(mask)), bool)
         clear = np.zeros(len(mask), bool)
         if candidates is not None and candidates.scenes is not None:
-            margins = MIN_SCENE_MARGIN_M, MIN_SCENE_MARGIN_M
-            clear = clearance.are_clear(q, candidates.scene, candidates.scenes, *margins)
+            clear = clearance.are_clear(q, candidates.scene, candidates.scenes, MIN_SCENE_MARGIN_M, MIN_SCENE_MARGIN_M)
         remaining[by_distance] = ~clear & mask
         remaining[conservative] = mask
         return measure_one_by_one(state, obstacle_poses, remaining)
@@ -110,7 +91,7 @@ def narrow_phase_of_scenes(context: Context, end: End, *, exact: bool = True) ->
     return decide_states
 
 
-def _conservative(context: Context, end: End) -> NDArray[np.bool_]:
+def _conservative(context: Context, end: End) -> Mask:
     """Return which constraints have conservative conditions at an end, shape (constraints,)."""
     robot, problem = context.robot, context.problem
     _, state = SymbolicState.of_symbols(robot, problem.obstacle, problem.object_size, problem.scene_width)
@@ -121,14 +102,12 @@ def _conservative(context: Context, end: End) -> NDArray[np.bool_]:
     return np.array([any(condition.sufficient for condition in conditions) for conditions in each], bool)
 
 
-def _one_by_one(
-    context: Context, end: End, *, exact: bool
-) -> Callable[[States, Array, NDArray[np.bool_]], NDArray[np.bool_]]:
+def _one_by_one(context: Context, end: End, *, exact: bool) -> Callable[[States, Array, Mask], Mask]:
     """Return a function that measures chosen constraints of states, one by one, with Pinocchio and Coal."""
     problem = context.problem
     world = World(context.robot, problem.obstacle, problem.object_size)
 
-    def measure(state: States, obstacle_poses: Array, remaining: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def measure(state: States, obstacle_poses: Array, remaining: Mask) -> Mask:
         violated = np.zeros(remaining.shape, bool)
         for candidate in np.flatnonzero(remaining.any(axis=0)):
             q, dq, ddq = (np.ascontiguousarray(values[:, candidate]) for values in state)

@@ -17,11 +17,9 @@ class DrawParameters(Stage):
     """Stage: parameters of the problem, uniform in the ranges of its ``[parameters]``."""
 
     def describe(self) -> str:
-        """Describe the stage in one sentence."""
         return "draw the parameters of the problem uniformly in their ranges"
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
-        """List the field of all parameters."""
         ranges = context.problem.parameters
         if not ranges:
             raise RecipeError([f"needs [parameters], which the problem {context.problem.path} does not have"])
@@ -30,7 +28,6 @@ class DrawParameters(Stage):
         return (Field("parameters", ranges.units, text, len(ranges), ranges.names, valid_min=low, valid_max=high),)
 
     def prepare(self, context: Context) -> StageFunction:
-        """Return the stage function."""
         ranges = context.problem.parameters.ranges
 
         def work(candidates: CandidateBatch, random: np.random.Generator) -> None:

@@ -28,7 +28,6 @@ class BallisticReach(Stage):
         return start + (("goal_xyz", "hit_angle", "hit_speed") if self.goal_time else ())
 
     def describe(self) -> str:
-        """Describe the stage in one sentence."""
         rules = []
         if self.start_time:
             rules.append(f"the start's position + velocity x {1e3 * self.start_time:g} ms")
@@ -37,12 +36,10 @@ class BallisticReach(Stage):
         return "require over the table: " + " and ".join(rules) + " (fast; braking-reach rejects far fewer problems)"
 
     def prepare(self, context: Context) -> StageFunction:
-        """Load the kernel."""
         return self._require(context, "leaves the table")
 
     def complete(self, context: Context, given: Collection[str]) -> StageFunction:
         """Load the kernel; unlike candidates, tasks may also start or end off the table."""
-        del given
         return self._require(context, "is off the table, or leaves it")
 
     def _require(self, context: Context, reason: str) -> StageFunction:
@@ -67,8 +64,7 @@ class BallisticReach(Stage):
 def over_table(*, sides: list[list[float]] | None) -> Any:
     """Build ``(p, d) -> (ahead, both)``: whether p + d is over the table, and whether p + d and p - d both are.
 
-    Args:
-        sides: Lower and upper bound of the table along x and along y [m]; None for a third argument, both corners.
+    The sides are the bounds of the table along x and y [m]; without them, both corners are a third argument.
     """
     import casadi as ca
 

@@ -48,45 +48,31 @@ class _SceneChecker(CollisionChecker):
         self._set("obstacles", together)
         self._first, self._stride = address_of(self._arrays["obstacles"]), together.strides[0]
 
-    def clear_of_scenes(
-        self, q: Array, runs: list[tuple[int, int, int]], limits: tuple[float | None, float | None]
-    ) -> Mask:
-        """Return a mask of the states with sufficient distances from the obstacles of their scene, shape (K,).
+    def clear_of_scenes(self, q: Array, runs: list[tuple[int, int, int]], limits: tuple[float, float]) -> Mask:
+        """Return a mask of the states q [rad], shape (n, K), with sufficient distances in their scene, shape (K,).
 
-        Args:
-            q: Joint positions [rad], shape (n, K).
-            runs: Scene, first state and end of every run of states in one scene.
-            limits: Required distances from obstacles and of links from each other [m]; None for no check.
+        Runs are scene, first state and end of states in one scene; limits are required distances from obstacles and of
+        links from each other [m], -inf for no check.
         """
         states, clear = np.ascontiguousarray(q.T), np.empty(q.shape[1], np.uint8)
         native, check, address = self._scene, self.library.clear_states, self.address
-        obstacle_limit, self_limit = _finite(limits)
         first_state, first_flag, stride = address_of(states), address_of(clear), states.strides[0]
         for scene, first, end in runs:
             native.obstacles, native.n_obstacles = self._first + scene * self._stride, self._counts[scene]
             native.boxes, native.lanes = self._places[scene]
             place = first_state + first * stride
-            check(address, place, end - first, obstacle_limit, self_limit, first_flag + first)
+            check(address, place, end - first, *limits, first_flag + first)
         return clear.astype(bool)
 
 
-def _finite(limits: tuple[float | None, float | None]) -> tuple[float, float]:
-    """Return limits for functions in C, where minus infinity stands for no check."""
-    obstacle_limit, self_limit = (-np.inf if limit is None else limit for limit in limits)
-    return obstacle_limit, self_limit
-
-
 class SceneClearance:
-    """Clearance of states from the obstacles of their scene and of links from each other.
-
-    Args:
-        context: Loaded problem, with link geometry.
-    """
+    """Clearance of states from the obstacles of their scene and of links from each other, for robots with geometry."""
 
     def __init__(self, context: Context) -> None:
         problem, robot = context.problem, context.robot
         self._obstacles = problem.obstacle
-        self.obstacle_distance, self.self_distance = required_distances(problem)
+        self._obstacle_distance = _required_distance(problem, RobotClearance)
+        self._self_distance = _required_distance(problem, SelfClearance)
         library = load_collision_library(context.kernels) if robot.n <= MAX_JOINTS else None
         self._checker: _SceneChecker | None = None
         self._prepared: BatchScenes | None = None
@@ -99,14 +85,9 @@ class SceneClearance:
     def are_clear(
         self, q: Array, scene: NDArray[np.int64], scenes: BatchScenes, margin: float = 0.0, self_margin: float = 0.0
     ) -> Mask:
-        """Return a mask of the states with sufficient distances, shape (K,).
+        """Return a mask of the states q [rad], shape (n, K), with sufficient distances in their scene, shape (K,).
 
-        Args:
-            q: Joint positions [rad], shape (n, K).
-            scene: Index of the scene of each state, ascending, shape (K,).
-            scenes: The scenes.
-            margin: Distance from obstacles in addition to the problem's clearance [m].
-            self_margin: Distance of links from each other in addition to the required one [m].
+        The scenes of the states ascend. Margins [m] are added to the required distances from obstacles and of links.
         """
         if not len(scene):
             return np.zeros(0, bool)
@@ -119,7 +100,7 @@ class SceneClearance:
         if self._prepared is not scenes:
             self._checker.prepare_scenes(scenes)
             self._prepared = scenes
-        limits = _plus(self.obstacle_distance, margin), _plus(self.self_distance, self_margin)
+        limits = self._obstacle_distance + margin, self._self_distance + self_margin
         return self._checker.clear_of_scenes(q, runs, limits)
 
     def _by_coal(self, q: Array, scenes: BatchScenes, scene: int, margin: float) -> Mask:
@@ -127,14 +108,6 @@ class SceneClearance:
         return self._states.are_clear(q, margin=margin)
 
 
-def _plus(distance: float | None, margin: float) -> float | None:
-    return None if distance is None else distance + margin
-
-
-def required_distances(problem: Problem) -> tuple[float | None, float | None]:
-    """Return the required distances from obstacles and of links from each other [m]; None without a constraint."""
-    of = [
-        [item.distance for item in problem.constraint if isinstance(item, kind)]
-        for kind in (RobotClearance, SelfClearance)
-    ]
-    return max(of[0], default=None), max(of[1], default=None)
+def _required_distance(problem: Problem, kind: type[RobotClearance | SelfClearance]) -> float:
+    """Return the distance that the constraints of a kind require [m]; -inf without such a constraint."""
+    return max((item.distance for item in problem.constraint if isinstance(item, kind)), default=-np.inf)

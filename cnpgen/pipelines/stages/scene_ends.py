@@ -14,7 +14,7 @@ from cnpgen.pipelines.context import Context
 from cnpgen.pipelines.stages.batch_scenes import BatchScenes
 from cnpgen.pipelines.stages.draw import position_field
 from cnpgen.pipelines.stages.draw_scenes import scenes_of
-from cnpgen.pipelines.stages.pose_ik import MAX_POSE_IK_STEPS, POSE_TOLERANCE, pose_ik_step
+from cnpgen.pipelines.stages.ik import MAX_POSE_IK_STEPS, POSE_TOLERANCE, pose_ik_step
 from cnpgen.pipelines.stages.scene_clearance import SceneClearance
 from cnpgen.pipelines.stages.stage import Array, CandidateBatch, Stage, StageFunction, leave
 from cnpgen.pipelines.stages.torque import torque_ratio
@@ -42,11 +42,7 @@ class SceneEnds(Stage):
     grasp: float = field("share of starts at another grasp", default=0.4, low=0.0, high=1.0)
     random: float = field("share of random starts", default=0.2, low=0.0, high=1.0)
     spread: float = field(
-        "standard deviation of starts around the base configuration",
-        unit="rad",
-        default=0.1,
-        low=0.0,
-        plausible=np.pi,
+        "standard deviation of starts around the base configuration", unit="rad", default=0.1, low=0.0, plausible=np.pi
     )
     margin: float = field(
         "distance of both ends from obstacles, in addition to that of the problem",
@@ -62,13 +58,11 @@ class SceneEnds(Stage):
     poses: int = field("random poses at each grasp", default=12, low=1, high=100)
 
     def find_mistakes(self) -> Iterator[tuple[str, str]]:
-        """Yield (key, mistake) pairs."""
         if abs(self.neutral + self.grasp + self.random - 1) > 1e-9:
             total = self.neutral + self.grasp + self.random
             yield "random", f"the shares of starts must add up to 1, got {total:g}"
 
     def describe(self) -> str:
-        """Describe the stage in one sentence."""
         kinds = f"near the base configuration {100 * self.neutral:.3g} %, at other grasps {100 * self.grasp:.3g} %"
         return (
             f"choose collision-free goals at grasps and starts ({kinds}, random {100 * self.random:.3g} %) that a"
@@ -76,7 +70,6 @@ class SceneEnds(Stage):
         )
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
-        """List the fields of joint positions and tip positions."""
         center, reach = context.robot.chain.joints[0].translation, context.robot.chain.reach
         low, high = (np.asarray(center) - reach).tolist(), (np.asarray(center) + reach).tolist()
         return (
@@ -92,7 +85,6 @@ class SceneEnds(Stage):
 
     def complete(self, context: Context, given: Collection[str]) -> StageFunction:
         """Keep the joint positions of tasks."""
-        del context, given
         return leave
 
     def prepare(self, context: Context) -> StageFunction:
@@ -113,12 +105,9 @@ class SceneEnds(Stage):
 
 
 class _Pool(NamedTuple):
-    """Valid states by scene and group, such as those of one grasp.
+    """Valid joint positions q [rad], shape (n, M), by scene and group, such as those of one grasp.
 
-    Attributes:
-        q: Joint positions [rad], shape (n, M).
-        first_state: First state of each group, shape (groups + 1,).
-        first_group: First group of each scene, shape (S + 1,).
+    The first state of each group has shape (groups + 1,), the first group of each scene (S + 1,).
     """
 
     q: Array
@@ -126,13 +115,9 @@ class _Pool(NamedTuple):
     first_group: Indices
 
     def choose(self, scene: Indices, u: Array, v: Array, other_than: Indices | None = None) -> tuple[Indices, Indices]:
-        """Choose a group of each scene and one of its states; both are -1 where there is none.
+        """Choose a group of each scene and one of its states by random numbers u and v, -1 where there is none.
 
-        Args:
-            scene: Scenes, shape (P,).
-            u: Random numbers in [0, 1) for the groups, shape (P,).
-            v: Random numbers for the states, shape (P,).
-            other_than: Groups that are not chosen, -1 for none, shape (P,).
+        All arguments have shape (P,); groups in ``other_than`` are not chosen, -1 excludes none.
         """
         first = self.first_group[scene]
         count = self.first_group[scene + 1] - first
@@ -156,12 +141,7 @@ def _make_pool(q: Array, key: Indices, scenes: int, groups: int) -> _Pool:
 
 
 class _EndStates:
-    """Valid states of the scenes of a batch, and pairs of them.
-
-    Args:
-        context: Loaded problem.
-        stage: The stage.
-    """
+    """Valid states of the scenes of a batch, and pairs of them."""
 
     def __init__(self, context: Context, stage: SceneEnds) -> None:
         self._robot: Robot = context.robot
@@ -288,16 +268,7 @@ def _is_first(key: Indices) -> NDArray[np.bool_]:
 
 
 def _rotations(approach: Array, tilt: Array, u: Array) -> Array:
-    """Return rotations whose z axis is within the tilt of an approach, by rows.
-
-    Args:
-        approach: Unit vectors, shape (K, 3).
-        tilt: Largest angles [rad], shape (K,).
-        u: Random numbers in [0, 1), shape (3, K).
-
-    Returns:
-        Shape (9, K).
-    """
+    """Return rotations, by rows, whose z axis is within a tilt of the approach; u are random numbers, shape (3, K)."""
     cosine = 1 - u[0] * (1 - np.cos(tilt))
     sine, angle, roll = np.sqrt(1 - cosine**2), 2 * np.pi * u[1], 2 * np.pi * u[2]
     first, second = _across(approach)

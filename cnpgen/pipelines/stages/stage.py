@@ -131,7 +131,6 @@ class Stage(ABC):
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
         """List the stored fields that this stage writes, in order; by default none."""
-        del context
         return ()
 
     def writes(self, context: Context) -> tuple[str, ...]:
@@ -186,7 +185,6 @@ class TaskBatch(CandidateBatch):
 
     def draw(self, random: np.random.Generator, width: int) -> Array:
         """Return 0.5 for every remaining task, shape (width, n)."""
-        del random
         return np.full((width, len(self.alive)), 0.5)
 
     def why(self) -> tuple[str, ...]:

@@ -26,19 +26,15 @@ class GravityTorque(Stage):
         return (f"{self.end}_q",)
 
     def describe(self) -> str:
-        """Describe the stage in one sentence."""
         return (
             f"require that the torque that holds the {self.end} configuration, payload included, is within its limits"
         )
 
     def outputs(self, context: Context) -> tuple[Field, ...]:
-        """List the field of the largest torque as a fraction of its limit."""
-        del context
         text = f"largest holding torque at the {self.end}, as a fraction of its planning limit"
         return (Field(f"{self.end}_torque_ratio", "1", text, role="diagnostic", valid_min=(0.0,), valid_max=(1.0,)),)
 
     def prepare(self, context: Context) -> StageFunction:
-        """Load the kernel."""
         kernel = context.kernels.load(torque_ratio)
 
         def work(candidates: CandidateBatch, _random: np.random.Generator) -> None:

@@ -30,16 +30,7 @@ _DENIED = {errno.EACCES, errno.EPERM}
 
 
 def machine_error(verb: str, path: Path, error: OSError) -> MachineError:
-    """Convert an error of a system call to an error message with a hint.
-
-    Args:
-        verb: The failed operation: "read", "write".
-        path: The file.
-        error: The error of the system call.
-
-    Returns:
-        The error to raise from ``error``.
-    """
+    """Return the error to raise, with a hint, after a system call failed to "read" or "write" a file."""
     hint = _HINTS.get(error.errno or 0, "check the disk and try again")
     if verb == "read" and error.errno in _DENIED:
         hint = "its owner can permit reading it (chmod)"
@@ -65,10 +56,7 @@ def check_readable(path: Path) -> None:
 
 
 def check_writable(path: Path) -> None:
-    """Check that a file, or files in a folder, can be written before they are computed.
-
-    Args:
-        path: The file or the folder, which may be missing.
+    """Check that a file, or files in a folder, can be written before they are computed; the path may be missing.
 
     Raises:
         MachineError: An existing file is read-only, or no file can be created in its folder or in the next one above.
@@ -88,11 +76,8 @@ def check_writable(path: Path) -> None:
 def committing(path: Path, work: Path | None = None) -> Iterator[Path]:
     """Yield a temporary path to write to, and rename it to ``path`` if the block ends without an error.
 
-    Several processes may write the same ``path`` at once: each has its own temporary file and the last rename wins.
-
-    Args:
-        path: The file to write; its folder is created.
-        work: Folder of the temporary file, on the same file system as ``path``; the folder of ``path`` by default.
+    Several processes may write the same ``path`` at once: each has its own temporary file and the last rename wins. The
+    temporary file is in ``work``, on the same file system, or in the folder of ``path``. Both folders are created.
 
     Yields:
         The temporary path; the block must create this file.
@@ -139,11 +124,7 @@ def write_file(path: Path, content: bytes | str, *, work: Path | None = None) ->
 
 
 def read_file(path: Path, *, max_bytes: int | None = None) -> bytes:
-    """Read a whole file.
-
-    Args:
-        path: The file.
-        max_bytes: Maximum size of the file [bytes]; unlimited by default.
+    """Read a whole file of at most ``max_bytes``, by default of any size.
 
     Raises:
         DatasetError: The file is missing, too large, or a device or a pipe, whose size is unknown.

@@ -145,10 +145,7 @@ def trust_problem(folder: Path) -> str:
         if problem := _permission_problem(path, writable=sticky or path.is_symlink()):
             return problem
     subfolders = (folder / name for name in (LIBRARIES, TAPES))
-    return next(
-        (problem for path in subfolders if os.path.lexists(path) and (problem := _entry_problem(path))),
-        "",
-    )
+    return next((problem for path in subfolders if os.path.lexists(path) and (problem := _entry_problem(path))), "")
 
 
 def is_trusted(path: Path) -> bool:

@@ -29,12 +29,7 @@ _CHANGED = f"{{}} is damaged: its first {HEADER_BYTES} bytes were changed"
 
 @dataclass(frozen=True)
 class Content:
-    """The content of a file with a checksum.
-
-    Attributes:
-        arrays: Dataset name -> numbers.
-        texts: Dataset name -> text, stored as UTF-8 bytes.
-    """
+    """Numbers, and texts as UTF-8 bytes, in a file with a checksum, by the name of their dataset."""
 
     arrays: Mapping[str, NDArray[Any]]
     texts: Mapping[str, str]
@@ -43,11 +38,7 @@ class Content:
 def write_with_checksum(path: Path, content: Content, *, kind: str, version: int) -> None:
     """Write a file with a checksum atomically; equal content gives equal bytes.
 
-    Args:
-        path: The file; an existing one is replaced.
-        content: The content.
-        kind: Kind of the file: ``cnpgen-`` and one word.
-        version: Version of the format.
+    The kind is ``cnpgen-`` and one word, the version that of the format. An existing file is replaced.
     """
     write_file(path, encode_with_checksum(content, kind=kind, version=version))
 
@@ -66,13 +57,7 @@ def encode_with_checksum(content: Content, *, kind: str, version: int) -> bytes:
 
 
 def with_checksum(content: bytes, *, kind: str, version: int) -> bytes:
-    """Put the checksum into the user block of an HDF5 file.
-
-    Args:
-        content: The bytes of the file, with a user block of ``HEADER_BYTES``.
-        kind: Kind of the file: ``cnpgen-`` and one word.
-        version: Version of the format.
-    """
+    """Put the checksum into the user block, of ``HEADER_BYTES``, of an HDF5 file; see ``write_with_checksum``."""
     body = content[HEADER_BYTES:]
     head = f"{kind} {version}\nsha256 {hashlib.sha256(body).hexdigest()}\n"
     return head.encode().ljust(HEADER_BYTES, b"\0") + body

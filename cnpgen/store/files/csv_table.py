@@ -13,13 +13,7 @@ from cnpgen.store.files.size_limits import MAX_TABLE_BYTES, MAX_TABLE_COLUMNS
 
 @dataclass(frozen=True)
 class CsvTable:
-    """Table with column names in its first line.
-
-    Attributes:
-        path: The file, for messages.
-        names: Names of the columns, all different.
-        lines: Number of the line in the file and its cells, for every row.
-    """
+    """Table with different column names in its first line; the other lines have their number in the file."""
 
     path: Path
     names: tuple[str, ...]
@@ -46,11 +40,7 @@ class CsvTable:
 
 
 def read_csv_table(path: Path, *, example: str) -> CsvTable:
-    """Read a CSV table.
-
-    Args:
-        path: The file.
-        example: Columns that such a table has, for messages.
+    """Read a CSV table; messages name the columns of ``example``.
 
     Raises:
         DatasetError: It is too large, not UTF-8, has no columns or equal ones, or rows of another length.
@@ -74,7 +64,6 @@ def read_csv_table(path: Path, *, example: str) -> CsvTable:
         raise DatasetError(f"{path}: the column {twice[0]!r} is there more than once")
     for number, row in lines[1:]:
         if len(row) != len(names):
-            raise DatasetError(
-                f"{path}: line {number} has {len(row)} values, the first line names {len(names)} columns"
-            )
+            text = f"{path}: line {number} has {len(row)} values, the first line names {len(names)} columns"
+            raise DatasetError(text)
     return CsvTable(path, tuple(names), tuple(lines[1:]))

@@ -46,11 +46,7 @@ class Nullable:
 class StructureError(ValueError):
     """A value that does not have the expected structure.
 
-    Args:
-        text: The expected structure and the value.
-
-    Attributes:
-        key_path: Keys of the value, the innermost one first; each level appends its own.
+    Each level appends the key of the value to ``key_path``, which begins with the innermost one.
     """
 
     def __init__(self, text: str) -> None:
@@ -62,11 +58,7 @@ class StructureError(ValueError):
 
 
 def check_structure(value: Any, structure: Structure) -> None:
-    """Raise an error if a value does not have a structure.
-
-    Args:
-        value: Result of ``json.loads``.
-        structure: The expected structure.
+    """Raise an error if a result of ``json.loads`` does not have a structure.
 
     Raises:
         StructureError: The value has another structure; the message contains key, expected structure and value.

@@ -58,12 +58,9 @@ def canonical_sha256(value: Any) -> str:
 
 @dataclass(frozen=True)
 class Difference:
-    """A difference between two JSON-able values; its text contains the values if they are short.
+    """A difference between two JSON-able values at a dotted key; a missing value is None.
 
-    Attributes:
-        key: Dotted key, ``"robot.name"``.
-        old: Value of the first one; None if it is missing.
-        new: Value of the second one; None if it is missing.
+    Its text contains the values if they are short.
     """
 
     key: str
@@ -100,29 +97,14 @@ def render(value: Any, indent: str = "") -> str:
 
 
 def save_document(path: Path, document: Mapping[str, Any], *, work: Path | None = None) -> None:
-    """Write a document with its checksum, atomically.
-
-    Args:
-        path: The file.
-        document: JSON-able content; the keys "format" and "format_version" come first.
-        work: Folder of the temporary file.
-    """
+    """Write a document with its checksum, atomically; the keys "format" and "format_version" come first."""
     text = render(plain({**document, "self_sha256": _BLANK})) + "\n"
     digest = hashlib.sha256(text.encode()).hexdigest()
     write_file(path, _CHECKSUM.sub(f'"self_sha256": "{digest}"\n}}\n', text), work=work)
 
 
 def load_document(path: Path, kind: str, *, version: int, structure: Structure) -> dict[str, Any]:
-    """Read a document and verify its checksum.
-
-    Args:
-        path: The file.
-        kind: The expected "format".
-        version: The expected "format_version".
-        structure: The expected structure, see ``cnpgen.store.files.document_structure``.
-
-    Returns:
-        The content without the checksum.
+    """Read a document with the "format" ``kind``, a "format_version" and a structure, and verify its checksum.
 
     Raises:
         DatasetError: The file is missing, too large, cut off or changed, or has another format, version or structure.

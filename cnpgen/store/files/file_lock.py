@@ -33,11 +33,7 @@ def unlock(file: IO[bytes]) -> None:
 
 @contextmanager
 def output_lock(out: Path, lock: Path) -> Iterator[None]:
-    """Refuse a second process that writes the same output, while the block runs.
-
-    Args:
-        out: The output, for the message.
-        lock: The lock file, which exists while the block runs.
+    """Refuse a second process that writes the same output, while the block runs and the lock file exists.
 
     Raises:
         UsageError: Another process writes the output.
@@ -49,9 +45,8 @@ def output_lock(out: Path, lock: Path) -> Iterator[None]:
         raise machine_error("write", lock, error) from error
     with file:
         if not try_lock(file) or not _is_present(file, lock):
-            raise UsageError(
-                f"another process is writing {out}: wait for it, or choose another {{out}}", remedies={"out": None}
-            )
+            text = f"another process is writing {out}: wait for it, or choose another {{out}}"
+            raise UsageError(text, remedies={"out": None})
         try:
             yield
         finally:

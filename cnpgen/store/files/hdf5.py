@@ -7,10 +7,11 @@ files, references, variable-length texts and filters that are loaded as code.
 import errno
 import io
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,10 +19,10 @@ from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, MachineError
 from cnpgen.store.files.atomic import machine_error
-from cnpgen.store.files.attributes import Attributes, decoded
 from cnpgen.store.files.heaps import check_heaps
 from cnpgen.store.files.kind import apparent_kind
 from cnpgen.store.files.size_limits import (
+    MAX_ATTRIBUTE_BYTES,
     MAX_DIMENSIONS,
     MAX_EXPANSION,
     MAX_HDF5_BYTES,
@@ -38,11 +39,7 @@ def create_hdf5(buffer: io.BytesIO, *, userblock: int = 0, alignment: int = 64) 
     """Create an HDF5 file in ``buffer``; wrap it in ``h5py.File``.
 
     The file format is pinned. The root group stores no times; older versions of ``h5py.File`` cannot switch them off.
-
-    Args:
-        buffer: Buffer of the file.
-        userblock: Size of the user block at the beginning [bytes].
-        alignment: Alignment of datasets, which allows to map them into memory as aligned arrays [bytes].
+    The file begins with a user block [bytes]. The alignment [bytes] allows to map datasets into memory as arrays.
     """
     from h5py import h5f, h5fd, h5p
 
@@ -56,14 +53,71 @@ def create_hdf5(buffer: io.BytesIO, *, userblock: int = 0, alignment: int = 64) 
 
 
 @dataclass(frozen=True, eq=False)
-class Column:
-    """A dataset of plain numbers.
+class Attributes:
+    """The attributes of a file or of a dataset: texts, numbers and short lists of numbers."""
 
-    Attributes:
-        shape: Shape of the dataset.
-        dtype: Stored type: integers or floats.
-        offset: Position of the first number in the file [bytes]; None if the storage is not contiguous.
-        attributes: Attributes of the dataset.
+    path: Path
+    _item: Any  # an identifier of the low-level API of h5py
+
+    def __iter__(self) -> Iterator[str]:
+        from h5py import h5a
+
+        if (count := h5a.get_num_attrs(self._item)) > MAX_NAMES:
+            raise DatasetError(f"{self.path} has {count:,} attributes, expected at most {MAX_NAMES:,}")
+        names: list[bytes] = []
+        h5a.iterate(self._item, names.append)
+        return (_decoded(self.path, name) for name in names)
+
+    def __contains__(self, name: str) -> bool:
+        from h5py import h5a
+
+        return bool(h5a.exists(self._item, name.encode()))
+
+    def __getitem__(self, name: str) -> Any:
+        """Return a text, a number or an array of numbers.
+
+        Raises:
+            DatasetError: The attribute has another type or is too large.
+        """
+        from h5py import AttributeManager, h5a, h5s, h5t
+
+        attribute = h5a.open(self._item, name.encode())
+        kind, space = attribute.get_type(), attribute.get_space()
+        text, count = kind.get_class() == h5t.STRING, space.get_simple_extent_npoints()
+        scalar = space.get_simple_extent_type() == h5s.SCALAR
+        plain = scalar if text else kind.get_class() in {h5t.INTEGER, h5t.FLOAT} and count > 0
+        if not plain:
+            raise DatasetError(f"{self.path}: the attribute {name!r} must be a text, a number or a list of numbers")
+        if count * kind.get_size() > MAX_ATTRIBUTE_BYTES:
+            raise DatasetError(f"{self.path}: the attribute {name!r} is larger than {MAX_ATTRIBUTE_BYTES:,} bytes")
+        return AttributeManager(SimpleNamespace(id=self._item))[name]
+
+    def some(self, names: Iterable[str]) -> dict[str, Any]:
+        """Return the existing attributes among ``names``."""
+        return {name: self[name] for name in names if name in self}
+
+    def all(self) -> dict[str, Any]:
+        """Return all attributes."""
+        return {name: self[name] for name in self}
+
+
+def _decoded(path: Path, name: bytes) -> str:
+    """Decode a name in a file.
+
+    Raises:
+        DatasetError: The name is not UTF-8.
+    """
+    try:
+        return name.decode()
+    except UnicodeDecodeError as error:
+        raise DatasetError(f"{path} is damaged: it has the name {name!r}, which is not UTF-8") from error
+
+
+@dataclass(frozen=True, eq=False)
+class Column:
+    """A dataset of plain numbers, integers or floats.
+
+    The offset is the position of the first number in the file [bytes]; None if the storage is not contiguous.
     """
 
     shape: tuple[int, ...]
@@ -86,12 +140,7 @@ class Column:
 
 @dataclass(eq=False)
 class Hdf5:
-    """An open file: a mapping from names at its root to datasets of plain numbers; groups are skipped.
-
-    Attributes:
-        path: Path of the file, for messages.
-        attributes: Attributes of the file.
-    """
+    """An open file: a mapping from names at its root to datasets of plain numbers; groups are skipped."""
 
     path: Path
     attributes: Attributes
@@ -123,7 +172,7 @@ class Hdf5:
         """Return the names of all objects at the root, including groups and links."""
         if (count := len(self._root)) > MAX_NAMES:
             raise DatasetError(f"{self.path} has {count:,} datasets, expected at most {MAX_NAMES:,}")
-        return [decoded(self.path, name) for name in self._root]
+        return [_decoded(self.path, name) for name in self._root]
 
     def columns(self) -> Mapping[str, Column]:
         """Return all datasets; see ``__getitem__``."""
@@ -184,11 +233,9 @@ def _type_text(dataset: Any) -> str:
 
 @contextmanager
 def opened_hdf5(path: Path, content: bytes | None = None) -> Iterator[Hdf5]:
-    """Open an HDF5 file for reading. All handles are closed at the end of the block, so processes cannot share them.
+    """Open an HDF5 file for reading, or its content if that has been read already.
 
-    Args:
-        path: The file.
-        content: Content of the file, if it has been read already.
+    All handles are closed at the end of the block, so processes cannot share them.
 
     Raises:
         DatasetError: The file is missing, not an HDF5 file, too large, damaged or cut off; also raised for errors
@@ -210,9 +257,8 @@ def opened_hdf5(path: Path, content: bytes | None = None) -> Iterator[Hdf5]:
         if isinstance(error, OSError) and error.errno in _SYSTEM_ERRORS:
             raise machine_error("read", path, error) from error
         if content is None and not h5py.is_hdf5(path):
-            raise DatasetError(
-                f"{path} is not an HDF5 file, or its beginning is damaged{apparent_kind(path)}"
-            ) from error
+            text = f"{path} is not an HDF5 file, or its beginning is damaged{apparent_kind(path)}"
+            raise DatasetError(text) from error
         raise DatasetError(f"{path} is damaged or cut off: {error}") from error
 
 

@@ -35,12 +35,7 @@ def append_line(path: Path, line: str) -> None:
 
 @dataclass
 class JournalFile:
-    """An open journal, locked for this process.
-
-    Attributes:
-        path: Path of the file.
-        records: Valid records of the file, in order.
-    """
+    """An open journal with the valid records of the file in order, locked for this process."""
 
     path: Path
     records: list[bytes]
@@ -76,11 +71,9 @@ class JournalFile:
 
 
 def open_journal_file(path: Path, magic: bytes) -> JournalFile:
-    """Open a journal for reading and appending, and remove an incomplete last record.
+    """Open a journal for reading and appending, or create it, and remove an incomplete last record.
 
-    Args:
-        path: Path of the file; it is created if it is missing.
-        magic: First line of the file, with format name and version, in ASCII with its newline.
+    ``magic`` is the first line of the file, with format name and version, in ASCII with its newline.
 
     Raises:
         DatasetError: The file does not start with ``magic``.
@@ -101,8 +94,9 @@ def open_journal_file(path: Path, magic: bytes) -> JournalFile:
 
 
 def _recover(path: Path, file: IO[bytes], magic: bytes) -> JournalFile:
-    """Lock the file, read its records and remove what follows them."""
-    _lock(path, file)
+    """Lock the file if the system has locks, read its records and remove what follows them."""
+    if not try_lock(file):
+        raise UsageError(f"{path} is in use by another process")
     head = file.read(len(magic))
     if not magic.startswith(head):
         raise DatasetError(f"{path} does not start with {magic!r}")
@@ -127,9 +121,3 @@ def _read_records(file: IO[bytes]) -> list[bytes]:
         end = file.tell()
     file.seek(end)
     return records
-
-
-def _lock(path: Path, file: IO[bytes]) -> None:
-    """Lock the file for this process, if the system supports it."""
-    if not try_lock(file):
-        raise UsageError(f"{path} is in use by another process")

@@ -10,7 +10,7 @@ import hashlib
 import os
 import platform
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -22,30 +22,25 @@ def temporary_name(name: str) -> str:
 
 
 def remove_leftovers(work: Path) -> None:
-    """Remove temporary files of dead processes of this machine.
-
-    Args:
-        work: Folder of temporary files. Other files are kept. A symbolic link is not followed.
-    """
-    for path in _temporary(work):
-        if _is_dead(path.name.split(".")[-3]):
-            with suppress(OSError):
-                path.unlink(missing_ok=True)
+    """Remove temporary files of dead processes of this machine from their folder, if that is no symbolic link."""
+    _remove(path for path in _temporary(work) if _is_dead(path))
 
 
 def remove_all_temporary(work: Path) -> None:
     """Remove the temporary files of all processes from their folder."""
-    for path in _temporary(work):
-        with suppress(OSError):
-            path.unlink(missing_ok=True)
+    _remove(_temporary(work))
 
 
 def remove_leftovers_of(path: Path) -> None:
     """Remove temporary files for ``path`` of dead processes of this machine."""
     with suppress(OSError):
-        for leftover in path.parent.glob(f".{glob.escape(path.name)}.*.tmp"):
-            if _is_dead(leftover.name.split(".")[-3]):
-                leftover.unlink(missing_ok=True)
+        _remove(filter(_is_dead, path.parent.glob(f".{glob.escape(path.name)}.*.tmp")))
+
+
+def _remove(paths: Iterable[Path]) -> None:
+    for path in paths:
+        with suppress(OSError):
+            path.unlink(missing_ok=True)
 
 
 def _temporary(work: Path) -> Iterator[Path]:
@@ -54,9 +49,9 @@ def _temporary(work: Path) -> Iterator[Path]:
             yield from [path for path in work.glob(".*.tmp") if path.name.count(".") > 3]
 
 
-def _is_dead(owner: str) -> bool:
-    """Return whether the owner of a file was a process of this machine that has ended."""
-    machine, _, process = owner.partition("-")
+def _is_dead(path: Path) -> bool:
+    """Return whether the owner of a temporary file was a process of this machine that has ended."""
+    machine, _, process = path.name.split(".")[-3].partition("-")
     return machine == _machine() and process.isdigit() and not _is_alive(int(process))
 
 
