@@ -65,7 +65,7 @@ def require_compiler() -> str:
         return compiler
     if configured := os.environ.get("CC"):
         raise MachineError(f"no C compiler found: CC is {configured!r}, which names no program here (set or unset it)")
-    raise MachineError("no C compiler found (looked for cc, gcc, clang): install one, or pip install 'cnpgen[compiler]'")
+    raise MachineError("no C compiler found (no cc, gcc or clang): install one, or pip install 'cnpgen[compiler]'")
 
 
 @cache
