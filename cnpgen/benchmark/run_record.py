@@ -6,12 +6,11 @@ import platform
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from cnpgen.errors import DatasetError
-from cnpgen.machine.versions import versions
+from cnpgen.machine.versions import installed_version, versions
 from cnpgen.store.files.atomic import read_file, write_file
 from cnpgen.store.files.document_structure import ANY_KEY, TEXT, WHOLE, check_structure
 from cnpgen.store.files.documents import parse_json
@@ -62,7 +61,7 @@ def describe_run(seed: int, planners: Sequence[str]) -> RunRecord:
         seed: Seed of random planners.
         planners: Names of the planners.
     """
-    libraries = {name: number for name in LIBRARIES if (number := _version(name))}
+    libraries = {name: number for name in LIBRARIES if (number := installed_version(name))}
     date = datetime.now(UTC).isoformat(timespec="seconds")
     return RunRecord(date, _processor(), os.cpu_count() or 1, seed, tuple(planners), {**versions(), **libraries})
 
@@ -105,10 +104,3 @@ def _processor() -> str:
         lines = []
     names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
     return next(names, platform.machine())
-
-
-def _version(project: str) -> str:
-    try:
-        return version(project)
-    except PackageNotFoundError:
-        return ""

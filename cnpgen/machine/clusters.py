@@ -186,9 +186,8 @@ class _Ray(Cluster):
     def finished(self, tickets: Sequence[Any], seconds: float) -> Sequence[Any]:
         import ray
 
-        if (
-            time.monotonic() - self._checked_at > POLL_INTERVAL_S
-        ):  # without its head, ray ends this process after a minute
+        # Without its head, ray ends this process after a minute.
+        if time.monotonic() - self._checked_at > POLL_INTERVAL_S:
             _check_reachable(ray.get_runtime_context().gcs_address, self._name)
             self._checked_at = time.monotonic()
         done, _ = ray.wait(list(tickets), num_returns=1, timeout=seconds)

@@ -8,7 +8,6 @@ environment simulates no contact of mallet and table.
 import importlib
 import sys
 from functools import lru_cache
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ from cnpgen.benchmark.simulator.plant import Plant, rated_torque
 from cnpgen.benchmark.simulator.reference import Reference
 from cnpgen.benchmark.simulator.simulator_scene import SimulatorScene
 from cnpgen.errors import MachineError, UsageError
+from cnpgen.machine.versions import installed_version
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
@@ -146,18 +146,11 @@ def _tick_record(scene: SimulatorScene, reference: Reference, environment: Any) 
 
 def _unsupported(folder: str, error: Exception) -> MachineError:
     """Return the error for a version of the environment or of its libraries that does not work."""
+    installed = ", ".join(f"{name} {installed_version(name) or 'missing'}" for name in LIBRARIES)
     return MachineError(
         f"{folder} has a version that cnpgen does not support, or its libraries have: {type(error).__name__}: {error};"
-        f" installed: {', '.join(f'{name} {_version(name)}' for name in LIBRARIES)};"
-        " 'cnpgen docs benchmark' lists versions that work"
+        f" installed: {installed}; 'cnpgen docs benchmark' lists versions that work"
     )
-
-
-def _version(project: str) -> str:
-    try:
-        return version(project)
-    except PackageNotFoundError:
-        return "missing"
 
 
 @lru_cache(maxsize=1)
