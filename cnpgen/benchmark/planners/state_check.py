@@ -71,10 +71,7 @@ def tip_and_violation(robot: Robot, problem: Problem) -> Any:
     violation += [low - value for value, low in zip(state.q, robot.position_lower.tolist(), strict=True)]
     violation += [value - high for value, high in zip(state.q, robot.position_upper.tolist(), strict=True)]
     violation += _table_violations(table, tip) if table is not None else _obstacle_violations(state)
-    worst: Scalar = violation[0]
-    for value in violation[1:]:
-        worst = ca.fmax(worst, value)
-    return ca.Function("tip_and_violation", columns, [ca.vertcat(*tip), worst])
+    return ca.Function("tip_and_violation", columns, [ca.vertcat(*tip), ca.mmax(ca.vertcat(*violation))])
 
 
 def _table_violations(table: Table, tip: Vec) -> list[Scalar]:
