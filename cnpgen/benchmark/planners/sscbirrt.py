@@ -16,6 +16,7 @@ from cnpgen.benchmark.benchmark_planner import Answer, BenchmarkPlanner, Plan, S
 from cnpgen.benchmark.planners.cbirrt import MANIFOLD_TOLERANCE, MAX_PROJECTIONS, SEEDS, Search
 from cnpgen.benchmark.planners.free_search import FreeSearch, has_manifold
 from cnpgen.errors import requires_extra
+from cnpgen.pipelines.families.resting_states import RestingStates
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.robots.robot import Robot
@@ -38,12 +39,12 @@ class SSCBiRRT(BenchmarkPlanner):
         """Import the package."""
         load_sscbirrt()
         problem, robot = open_problem(setting.problem)
-        free = None if has_manifold(problem, robot) else FreeSearch(problem, robot)
+        states = None if has_manifold(problem, robot) else RestingStates(problem, robot)
 
         def plan(task: Plans) -> Answer:
-            if free is not None:
-                free.place_obstacles(task)
-                return self._plan(setting, robot, task, is_valid=free.is_valid, manifold=None)
+            if states is not None:
+                is_valid = FreeSearch(states, robot, task).is_valid
+                return self._plan(setting, robot, task, is_valid=is_valid, manifold=None)
             search = Search(problem, robot, task)
             return self._plan(setting, robot, task, is_valid=search.is_valid, manifold=ManifoldSet(search))
 
