@@ -16,7 +16,7 @@ from cnpgen.errors import UsageError, counted, nearest
 from cnpgen.kernels.grid_kernel import GridKernel
 from cnpgen.kernels.library import Backend, choose_backend, problem_kernels
 from cnpgen.kernels.tape import DTYPES, Dtype
-from cnpgen.losses.hull_loss import HullLoss, make_hull_loss
+from cnpgen.losses.hull_loss import HullLoss
 from cnpgen.losses.integrand import (
     grid_specs,
     loss_gradient,
@@ -296,7 +296,7 @@ class PlanLoss:
     def _hulls(self) -> HullLoss | None:
         if not self.problem.has_sample_obstacles:
             return None
-        return make_hull_loss(self.problem, self._robot, self._kernels, self.tightening)
+        return HullLoss(self.problem, self._robot, self._kernels, self.tightening)
 
     @cached_property
     def _time_varying(self) -> list[tuple[Constraint, Condition]]:
