@@ -4,7 +4,7 @@ import json
 import os
 import platform
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -80,11 +80,8 @@ def load_runs(folder: Path) -> tuple[RunRecord, ...]:
         check_structure(documents, [_STRUCTURE])
     except ValueError as error:
         raise DatasetError(f"{path} is damaged: {error}; delete it") from error
-    names = [field.name for field in fields(RunRecord)]
-    return tuple(
-        RunRecord(**{**{name: document[name] for name in names}, "planners": tuple(document["planners"])})
-        for document in documents
-    )
+    known = ({name: document[name] for name in _STRUCTURE} for document in documents)
+    return tuple(RunRecord(**{**values, "planners": tuple(values["planners"])}) for values in known)
 
 
 def save_runs(folder: Path, runs: Sequence[RunRecord]) -> None:
