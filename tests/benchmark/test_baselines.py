@@ -24,10 +24,10 @@ from cnpgen.benchmark.planners.table_plane import (
     stopping_path,
     striking_path,
 )
-from cnpgen.benchmark.planners.tip import Tip
 from cnpgen.benchmark.planners.trajopt import TrajOpt, TrajOptTranscription
 from cnpgen.benchmark.process import PlannerProcess
 from cnpgen.benchmark.results_file import answer_from_dict
+from cnpgen.benchmark.simulator.tip import Tip
 from cnpgen.benchmark.suite import load_suite
 from cnpgen.errors import UsageError
 from cnpgen.plans import Plans, open_problem, record_problem

@@ -11,7 +11,7 @@ from cnpgen.benchmark.judging import judge_answer
 from cnpgen.benchmark.planners.cbirrt import MANIFOLD_TOLERANCE, Search
 from cnpgen.benchmark.planners.crocoddyl import are_small, cubic_states, min_duration
 from cnpgen.benchmark.planners.crocoddyl_costs import ObjectViolation, load_crocoddyl
-from cnpgen.benchmark.planners.drake_arm import model_text
+from cnpgen.benchmark.planners.drake import model_text
 from cnpgen.benchmark.planners.knots import knot_constraints
 from cnpgen.benchmark.planners.obstacle_boxes import boxes_of
 from cnpgen.benchmark.planners.sscbirrt import ManifoldSet

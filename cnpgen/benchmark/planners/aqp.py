@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.benchmark.benchmark_planner import Answer, BenchmarkPlanner, Plan, Setting
+from cnpgen.benchmark.benchmark_planner import BenchmarkPlanner, Plan, Setting
 from cnpgen.benchmark.planners.table_plane import PlanePath, stopping_path, striking_path
-from cnpgen.benchmark.planners.tip import Tip
+from cnpgen.benchmark.simulator.tip import Tip
 from cnpgen.errors import UsageError
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.constraints.table import Table
@@ -44,11 +44,7 @@ class AQP(BenchmarkPlanner):
         table = problem.first(Table)
         if table is None or robot.n > len(JOINT_WEIGHTS):
             raise UsageError(f"aqp plans hits on a table with up to 7 joints, {problem.name!r} is another problem")
-
-        def plan(task: Plans) -> Answer:
-            return _Follower(robot, task, self).plan(table.z)
-
-        return plan
+        return lambda task: _Follower(robot, task, self).plan(table.z)
 
 
 class _Follower:

@@ -21,7 +21,7 @@ from cnpgen.benchmark.planners.obstacle_boxes import (
     distance,
     require_table_or_transport,
 )
-from cnpgen.benchmark.planners.tip import Tip
+from cnpgen.benchmark.simulator.tip import Tip
 from cnpgen.errors import requires_extra
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.constraints.table import Table

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from cnpgen.benchmark.planners.knots import MIN_CENTER_DISTANCE_M
 from cnpgen.benchmark.planners.obstacle_boxes import Box, boxes_of
-from cnpgen.benchmark.planners.tip import Tip
+from cnpgen.benchmark.simulator.tip import Tip
 from cnpgen.errors import MachineError, requires_extra
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.constraints.table import Table

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.benchmark.planners.obstacle_boxes import Box, boxes_of, depth, distance
-from cnpgen.benchmark.planners.tip import Tip
+from cnpgen.benchmark.simulator.tip import Tip
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot

@@ -18,6 +18,7 @@ from cnpgen.benchmark.simulator.outcome import TickRecord, puck_is_done
 from cnpgen.benchmark.simulator.plant import Plant, rated_torque
 from cnpgen.benchmark.simulator.reference import Reference
 from cnpgen.benchmark.simulator.simulator_scene import SimulatorScene
+from cnpgen.benchmark.simulator.tip import Tip
 from cnpgen.errors import MachineError, UsageError
 from cnpgen.machine.versions import installed_version
 from cnpgen.problems.constraints.table import Table
@@ -125,17 +126,12 @@ def _action(scene: SimulatorScene, reference: Reference, tick: int) -> Array:
 
 def _tick_record(scene: SimulatorScene, reference: Reference, environment: Any) -> TickRecord:
     """Return the recorded states in the robot's frame."""
-    import pinocchio as pin
-
     robot, planned = scene.robot, [JOINTS.index(name) for name in scene.robot.joint_names]
     q, torque, puck, velocity, touched = (np.array(column) for column in zip(*environment.recorded, strict=True))
-    q, data, tips = q[:, planned], robot.model.createData(), []
-    for positions in q:
-        pin.framesForwardKinematics(robot.model, data, positions)
-        tips.append(data.oMf[robot.tip_frame].copy())
+    q, evaluated = q[:, planned], Tip(robot)
+    tip, rotation, _ = (np.array(part) for part in zip(*map(evaluated.at, q), strict=True))
     desired = reference.q[np.minimum(np.arange(len(q)), len(reference.q) - 1)]
     torque_use = torque[:, planned] / rated_torque(scene.problem, robot)
-    tip, rotation = np.array([tip.translation for tip in tips]), np.array([tip.rotation for tip in tips])
     unknown_force = np.full((len(q), 2), np.nan)
     steps = dict(environment.violated_steps)
     penalty = sum(PENALTY_POINTS.get(name, 0.0) for name, count in steps.items() if count)
