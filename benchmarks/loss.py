@@ -9,14 +9,12 @@ repetitions, ratios are medians of the ratios within one repetition.
 """
 
 import argparse
-import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 from unittest import mock
 
 import numpy as np
-from common import arguments, median, progress, report, table, verdict
+from common import arguments, cpu_of, median, progress, report, table, verdict
 
 from cnpgen.losses import quadrature as rules
 from cnpgen.losses.plan_loss import PlanLoss
@@ -79,9 +77,9 @@ class Case:
         """Time a call with gradient, the kernel in it, and a call without gradient."""
         kernel = Timed(self.loss._gradient)
         with mock.patch.dict(vars(self.loss), {"_gradient": kernel}):
-            self.calls.append(seconds(self.call))
+            self.calls.append(cpu_of(self.call))
         self.kernels.append(kernel.seconds)
-        self.values.append(seconds(lambda: self.call(gradient=False)))
+        self.values.append(cpu_of(lambda: self.call(gradient=False)))
 
 
 class Timed:
@@ -92,15 +90,7 @@ class Timed:
 
     def __call__(self, *inputs: Array, out: Any) -> None:
         """Run the kernel."""
-        start = time.process_time()
-        self.kernel(*inputs, out=out)
-        self.seconds += time.process_time() - start
-
-
-def seconds(function: Callable[[], None]) -> float:
-    start = time.process_time()
-    function()
-    return time.process_time() - start
+        self.seconds += cpu_of(lambda: self.kernel(*inputs, out=out))
 
 
 def prepare(problem: str, backend: str, dtype: str, options: argparse.Namespace) -> Case:
@@ -144,7 +134,7 @@ def torch_row(case: Case, repeat: int) -> tuple[str, ...]:
         total, _ = loss(path, rate, weights=weights, obstacle_poses=case.plans.obstacle_poses)
         return torch.autograd.grad(total.sum(), [path])[0].numpy()
 
-    times = [(seconds(gradient), seconds(case.call)) for _ in range(repeat)]
+    times = [(cpu_of(gradient), cpu_of(case.call)) for _ in range(repeat)]
     poses = case.plans.obstacle_poses
     expected = case.loss(case.plans.path, case.plans.rate, weights=weights, obstacle_poses=poses).path_gradient
     error = np.abs(gradient() - expected).max() / np.abs(expected).max()
