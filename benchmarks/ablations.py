@@ -11,14 +11,14 @@ import argparse
 import json
 import math
 import statistics
-import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import arguments, progress, report, table
+from common import arguments, cpu_of, median, progress, report, table
 
 import cnpgen
 from cnpgen.benchmark.hypothesis_tests import wilson
@@ -151,13 +151,9 @@ def result_of(variant: Variant, seed: int, test: Test, options: argparse.Namespa
 
 def planning_time(planner: cnpgen.Planner, test: Test) -> float:
     """Measure the median CPU time of single plans [ms]."""
-    times = []
-    for index in range(min(TIMED_PLANS, len(test.refined))):
-        boundary = test.problems.boundary[index : index + 1]
-        started = time.process_time()
-        planner.plan_batch(boundary)
-        times.append(time.process_time() - started)
-    return 1e3 * statistics.median(times)
+    count = min(TIMED_PLANS, len(test.refined))
+    boundaries = [test.problems.boundary[index : index + 1] for index in range(count)]
+    return 1e3 * median(cpu_of(partial(planner.plan_batch, boundary)) for boundary in boundaries)
 
 
 def key_of(variant: Variant, seed: int) -> str:

@@ -108,9 +108,9 @@ def measure_hit(environment: Any, plant: Plant, problem: Plans, content: dict[st
         type(environment).record(environment, torque)
 
     environment.record = record
-    _, reference, execution = execution_of((problem, content, None), plant)
+    execution = execution_of((problem, content, None), plant)
     del environment.record
-    planned = problem.problem.tip_positions(reference.q)[:, :2]
+    planned = problem.problem.tip_positions(execution.reference.q)[:, :2]
     puck, first = execution.puck[0], round(1e3 * execution.executed.hit_time)
     ahead = np.array([2.478, 0.0]) - puck
     across = np.array([-ahead[1], ahead[0]]) / np.linalg.norm(ahead)

@@ -6,12 +6,12 @@ import os
 import platform
 import statistics
 import sys
+import time
 from collections.abc import Callable, Iterable, Sequence
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-import cnpgen
+from cnpgen.machine.versions import __version__, installed_version
 
 LIBRARIES = ("numpy", "scipy", "casadi", "pin", "coal", "h5py", "joblib")
 ROBOT_RECIPES = ("panda-cup", "panda-scenes", "ur5-wipe")  # recipes of robots that come with the extra cnpgen[robots]
@@ -38,20 +38,13 @@ def machine() -> dict[str, Any]:
         "instructions": next((name for name in INSTRUCTION_SETS if name in flags), platform.machine()),
         "load": round(os.getloadavg()[0], 2),
         "python": platform.python_version(),
-        "versions": {"cnpgen": cnpgen.__version__, **{name: _version(name) for name in LIBRARIES}},
+        "versions": {"cnpgen": __version__} | {name: installed_version(name) or "not installed" for name in LIBRARIES},
     }
 
 
 def _cpuinfo() -> list[str]:
     path = Path("/proc/cpuinfo")
     return path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []
-
-
-def _version(name: str) -> str:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return "not installed"
 
 
 def machine_line() -> str:
@@ -65,10 +58,17 @@ def machine_line() -> str:
 def installed_recipes(names: Iterable[str]) -> list[str]:
     """Return the recipes whose robots are installed; report the others on stderr."""
     recipes = list(names)
-    if _version("example-robot-data") != "not installed":
+    if installed_version("example-robot-data"):
         return recipes
     progress(f"without {', '.join(ROBOT_RECIPES)}, which need pip install 'cnpgen[robots]'")
     return [name for name in recipes if name not in ROBOT_RECIPES]
+
+
+def cpu_of(function: Callable[[], object]) -> float:
+    """Return the CPU time of a call [s]."""
+    start = time.process_time()
+    function()
+    return time.process_time() - start
 
 
 def median(values: Iterable[float]) -> float:

@@ -153,18 +153,9 @@ def case_table(cases: list[Case]) -> str:
             )
         )
     head = (
-        "dataset",
-        "rows",
-        "workers",
-        "cache",
-        "wall [s]",
-        "best",
-        "CPU [s]",
-        "rows/s",
-        "wall / 1 worker",
-        "target",
+        "dataset", "rows", "workers", "cache", "wall [s]", "best", "CPU [s]", "rows/s", "wall / 1 worker", "target",
         "",
-    )
+    )  # fmt: skip
     return table("Whole processes, wall time (median)", head, rows)
 
 

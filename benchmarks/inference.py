@@ -17,11 +17,12 @@ import argparse
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import arguments, installed_recipes, median, progress, report, table, verdict
+from common import arguments, cpu_of, installed_recipes, median, progress, report, table, verdict
 
 from cnpgen.machine.threads import one_thread
 from cnpgen.make.make_dataset import make_dataset
@@ -52,9 +53,7 @@ def measure(model: str, folder: Path, repeat: int) -> list[dict[str, Any]]:
             for index in range(repeat if size == 1 else max(repeat // 10, 3)):
                 rows = boundary[index % BATCH : index % BATCH + 1] if size == 1 else boundary
                 for variant, planner in planners.items():
-                    start = time.process_time()
-                    planner.plan_batch(rows)
-                    times[variant].append(time.process_time() - start)
+                    times[variant].append(cpu_of(partial(planner.plan_batch, rows)))
             for variant, seconds in times.items():
                 results.append(
                     {"model": model, "variant": variant, "batch": size, "ms_per_plan": 1e3 * median(seconds) / size}

@@ -9,14 +9,12 @@ are medians over the repetitions, ratios are medians of the ratios within one re
 """
 
 import argparse
-import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 from unittest import mock
 
 import numpy as np
-from common import arguments, median, progress, report, table, verdict
+from common import arguments, cpu_of, median, progress, report, table, verdict
 
 from cnpgen.losses import quadrature as rules
 from cnpgen.losses.plan_loss import PlanLoss
@@ -79,9 +77,9 @@ class Case:
         """Time a call with gradient, the kernel in it, and a call without gradient."""
         kernel = Timed(self.loss._gradient)
         with mock.patch.dict(vars(self.loss), {"_gradient": kernel}):
-            self.calls.append(seconds(self.call))
+            self.calls.append(cpu_of(self.call))
         self.kernels.append(kernel.seconds)
-        self.values.append(seconds(lambda: self.call(gradient=False)))
+        self.values.append(cpu_of(lambda: self.call(gradient=False)))
 
 
 class Timed:
@@ -92,15 +90,13 @@ class Timed:
 
     def __call__(self, *inputs: Array, out: Any) -> None:
         """Run the kernel."""
-        start = time.process_time()
-        self.kernel(*inputs, out=out)
-        self.seconds += time.process_time() - start
+        self.seconds += cpu_of(lambda: self.kernel(*inputs, out=out))
 
 
-def seconds(function: Callable[[], Any], clock: Callable[[], float] = time.process_time) -> float:
-    start = clock()
+def elapsed(function: Callable[[], Any]) -> float:
+    start = time.perf_counter()
     function()
-    return clock() - start
+    return time.perf_counter() - start
 
 
 def prepare(problem: str, backend: str, dtype: str, options: argparse.Namespace) -> Case:
@@ -147,9 +143,8 @@ def torch_row(case: Case, options: argparse.Namespace) -> tuple[str, ...]:
     def gradient() -> Any:
         return torch.autograd.grad(loss(path, rate, **fixed)[0].sum(), [path])[0].cpu().numpy()  # waits for the GPU
 
-    first = seconds(gradient, time.perf_counter)
-    clock = time.process_time if device == "cpu" else time.perf_counter
-    times = [(seconds(gradient, clock), seconds(case.call)) for _ in range(options.repeat)]
+    first, seconds = elapsed(gradient), cpu_of if device == "cpu" else elapsed
+    times = [(seconds(gradient), cpu_of(case.call)) for _ in range(options.repeat)]
     expected = case.loss(case.plans.path, case.plans.rate, weights=weights, obstacle_poses=poses).path_gradient
     error = np.abs(gradient() - expected).max() / np.abs(expected).max()
     slower = median(a / b for a, b in times)

@@ -5,10 +5,11 @@ Scenes are those of a family with their own numbers of bodies; each is observed 
 
 import argparse
 import time
+from functools import partial
 from typing import Any
 
 import numpy as np
-from common import arguments, median, progress, report, table
+from common import arguments, cpu_of, median, progress, report, table
 
 from cnpgen.machine.threads import one_thread
 from cnpgen.pipelines.families.catalog import FAMILIES, load_family
@@ -33,12 +34,8 @@ def measure(family: str, count: int, reference_count: int, seed: int) -> list[di
     bodies = scene_bodies([drawer.draw(random).obstacles for _ in range(count)])
     results = []
     for kind in KINDS:
-        times = []
         compiled = observe(bodies, kind)
-        for _ in range(REPETITIONS):
-            begun = time.process_time()
-            observe(bodies, kind)
-            times.append(time.process_time() - begun)
+        times = [cpu_of(partial(observe, bodies, kind)) for _ in range(REPETITIONS)]
         few = bodies[: min(reference_count, count)]
         begun = time.process_time()
         reference = observe(few, kind, backend="numpy")

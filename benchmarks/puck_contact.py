@@ -17,11 +17,12 @@ With ``--reference``, hits of the first planner that are not valid after refinin
 import argparse
 import time
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from common import arguments, median, progress, report, table, verdict
+from common import arguments, cpu_of, median, progress, report, table, verdict
 from scipy.interpolate import BSpline
 
 from cnpgen.benchmark.simulator.simulate import simulate_plans
@@ -137,11 +138,9 @@ def planning_ratio(name: str, count: int, seed: int) -> float:
     (q, dq, ddq), pucks = moving_tasks(count, seed)
     ratios = []
     for index in range(count):
-        row, seconds = slice(index, index + 1), []
-        for planner in planners:
-            begin = time.process_time()
-            plan_hits(planner, (q[row], dq[row], ddq[row]), pucks[row], TARGET)
-            seconds.append(time.process_time() - begin)
+        row = slice(index, index + 1)
+        state = q[row], dq[row], ddq[row]
+        seconds = [cpu_of(partial(plan_hits, planner, state, pucks[row], TARGET)) for planner in planners]
         ratios.append(seconds[0] / seconds[1])
     return median(ratios)
 

@@ -237,13 +237,8 @@ def speed_table(comparisons: list[Comparison]) -> str:
         for comparison in comparisons
     ]
     head = (
-        "pipeline",
-        "samples",
-        "ours [us/row]",
-        "reference [us/sample]",
-        "times slower",
-        "failures of the reference",
-    )
+        "pipeline", "samples", "ours [us/row]", "reference [us/sample]", "times slower", "failures of the reference",
+    )  # fmt: skip
     return table("CPU time per sample", head, rows)
 
 

@@ -89,16 +89,9 @@ def grid(_: dict[str, Any], options: argparse.Namespace) -> Result:
         times = f"{median(medians):.1f}", *target, *statistics(results), f"{judging:.1f}"
         rows.append((guess, str(valid), *verdict(valid, 81), *times))
     head = (
-        "initial guess",
-        "valid",
-        "target",
-        "",
-        "median",
-        "target",
-        "",
-        *(f"{name} of minima" for name in STATISTICS),
+        "initial guess", "valid", "target", "", "median", "target", "", *(f"{name} of minima" for name in STATISTICS),
         "verdict",
-    )
+    )  # fmt: skip
     title = f"81 hits from rest, CPU time per plan [ms]: median of {GRID_RUNS} runs, and minimum times"
     return {"grid": facts}, [table(title, head, rows)]
 
@@ -158,20 +151,9 @@ def planned(sizes: dict[str, Any], options: argparse.Namespace) -> Result:
             "valid": valid,
         }
     head = (
-        "plans",
-        "n",
-        "median",
-        "target",
-        "",
-        "p95",
-        "target",
-        "",
-        "verdict",
-        "median, NumPy",
-        "valid",
-        "valid, NumPy",
-        "T ratio",
-    )
+        "plans", "n", "median", "target", "", "p95", "target", "", "verdict", "median, NumPy", "valid",
+        "valid, NumPy", "T ratio",
+    )  # fmt: skip
     return {"planned": facts}, [table("plans of the shipped planners, CPU time per plan [ms]", head, rows)]
 
 
@@ -202,17 +184,9 @@ def ipopt(sizes: dict[str, Any], options: argparse.Namespace) -> Result:
         rows.append((name, *map(str, counts), *target, spread(times), spread(costs), f"{speed:.0f}"))
         facts[name] = {"time": times.tolist(), "objective": costs.tolist(), "rows": both, "times_faster": speed}
     head = (
-        "problems",
-        "n",
-        "valid",
-        "valid, Ipopt",
-        "within 0.5 %",
-        "target",
-        "",
-        "motion time",
-        "objective",
+        "problems", "n", "valid", "valid, Ipopt", "within 0.5 %", "target", "", "motion time", "objective",
         "times faster",
-    )
+    )  # fmt: skip
     tables = [table("ratios to Ipopt from the same initial guess, median and maximum", head, rows)]
     if worse:
         tables.append("\n".join(["", "motion times more than 0.5 % above those of Ipopt", *worse]))
@@ -234,17 +208,8 @@ def height(sizes: dict[str, Any], options: argparse.Namespace) -> Result:
         rows.append((name, str(len(pairs)), *worst, f"{within:.1%}", *target, f"{time_costs.mean():.3%}", *cost_target))
         facts[name] = {"errors_m": errors, "loss": time_costs.tolist()}
     head = (
-        "problems",
-        "n",
-        "z error [mm]",
-        "whole band",
-        "within 0.1 mm",
-        "target",
-        "",
-        "time lost [%]",
-        "target",
-        "",
-    )
+        "problems", "n", "z error [mm]", "whole band", "within 0.1 mm", "target", "", "time lost [%]", "target", "",
+    )  # fmt: skip
     return {"height": facts}, [table("maximum height error of all plans and times", head, rows)]
 
 
@@ -269,17 +234,9 @@ def slsqp(sizes: dict[str, Any], options: argparse.Namespace) -> Result:
             rows.append((name, guess, *counts, f"{median(seconds):.2f}", f"{ratio:.0f}", *verdict(ratio, target)))
             facts[f"{name}, {guess}"] = {"seconds": seconds, "valid": valid, "ratio": ratio}
     head = (
-        "problems",
-        "initial guess",
-        "n",
-        "valid",
-        "valid, SLSQP",
+        "problems", "initial guess", "n", "valid", "valid, SLSQP", "", "SLSQP, median [s]", "times faster", "target",
         "",
-        "SLSQP, median [s]",
-        "times faster",
-        "target",
-        "",
-    )
+    )  # fmt: skip
     return {"slsqp": facts}, [table(f"comparison with SLSQP, stopped after {options.cap:g} s", head, rows, left=2)]
 
 

@@ -11,12 +11,11 @@ import argparse
 import resource
 import tempfile
 import time
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from common import arguments, progress, report, table
+from common import arguments, cpu_of, progress, report, table
 
 import cnpgen
 from cnpgen.cli.dry_run import row_bytes
@@ -87,24 +86,17 @@ def measure(name: str, rows: int, sample: int, **options: Any) -> Costs:
             name, folder, n=sample, begin=lambda *_: start_times.append(time.process_time()), **settings
         )
         make = time.process_time() - start_times[-1]
-        deep = seconds(lambda: cnpgen.validate_dataset(folder, deep=True, workers=1))
+        deep = cpu_of(lambda: cnpgen.validate_dataset(folder, deep=True, workers=1))
         spec = load_dataset_spec(folder)
         tasks = shards(spec)
-        check = seconds(lambda: find_damaged(folder, spec, tasks))
-        summed = seconds(lambda: finish(folder, spec, "", made=1, exclusive=True))
+        check = cpu_of(lambda: find_damaged(folder, spec, tasks))
+        summed = cpu_of(lambda: finish(folder, spec, "", made=1, exclusive=True))
         size = sum(path.stat().st_size for path in folder.glob("*/*"))
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     title = f"{name}, certified" if options.get("certify") else f"{name}, {options.get('dtype', 'float64')}"
     per_row, width = (make / sample, check / sample, deep / sample), row_bytes(spec)
     overhead = (size - sample * width) / len(tasks)
     return Costs(title, rows, *per_row, summed / len(tasks), width, overhead, shard_rows, memory)
-
-
-def seconds(run: Callable[[], object]) -> float:
-    """Return the CPU time of a function [s]."""
-    start = time.process_time()
-    run()
-    return time.process_time() - start
 
 
 def rows_of(costs: list[Costs]) -> list[list[str]]:
@@ -127,18 +119,9 @@ def rows_of(costs: list[Costs]) -> list[list[str]]:
 
 
 HEAD = (
-    "dataset",
-    "rows",
-    "rows per core-second",
-    "core-hours to make",
-    "for --deep",
-    "core-minutes to compare",
-    "for the manifest",
-    "disk [GB]",
-    "rows per shard",
-    "files",
-    "memory per worker [MB]",
-)
+    "dataset", "rows", "rows per core-second", "core-hours to make", "for --deep", "core-minutes to compare",
+    "for the manifest", "disk [GB]", "rows per shard", "files", "memory per worker [MB]",
+)  # fmt: skip
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 from common import arguments, progress, report, table
 from numpy.typing import NDArray
+from scenes import make_checker
 
-from cnpgen.kernels.collision.collision_checker import CollisionChecker, load_collision_library
-from cnpgen.kernels.library import KernelLibrary, choose_backend
+from cnpgen.kernels.collision.collision_checker import CollisionChecker
 from cnpgen.machine.threads import one_thread
 from cnpgen.pipelines.families.catalog import FAMILIES
 from cnpgen.planner.planner import Planner
@@ -29,7 +29,6 @@ from cnpgen.problems.problem_record import as_problem
 from cnpgen.refine.options import DEFAULT_OPTIONS
 from cnpgen.refine.refine_engine import refine_serially
 from cnpgen.refine.task import Attempt, Outcome
-from cnpgen.robots.robot import Robot
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.scenes import SceneProblem, load_scenes, make_scenes, plan_scenes
 
@@ -37,13 +36,6 @@ Array = NDArray[np.float64]
 
 DEFAULT_FAMILIES = ("tabletop", "table-pick")
 LINE_SPACING_RAD = 0.05
-
-
-def make_checker(robot: Robot) -> CollisionChecker:
-    """Return the compiled collision checks of a robot."""
-    library = load_collision_library(KernelLibrary(*choose_backend("compiled"), "", {}))
-    assert library is not None
-    return CollisionChecker(library, robot)
 
 
 def is_line_clear(checker: CollisionChecker, start: Array, goal: Array) -> bool:
@@ -54,7 +46,8 @@ def is_line_clear(checker: CollisionChecker, start: Array, goal: Array) -> bool:
 
 def colliding_lines(problem: str, scenes: Sequence[SceneProblem]) -> list[SceneProblem]:
     """Return the scenes whose straight line collides."""
-    checker, chosen = make_checker(load_robot(as_problem(problem))), []
+    robot_problem, chosen = as_problem(problem), []
+    checker = make_checker(robot_problem, load_robot(robot_problem))
     for scene in scenes:
         checker.place(scene.obstacles, place_obstacles(scene.obstacles))
         if not is_line_clear(checker, scene.start_q, scene.goal_q[0]):

@@ -21,7 +21,7 @@ from typing import Any
 import coal
 import numpy as np
 import pinocchio as pin
-from common import arguments, median, progress, report, table
+from common import arguments, cpu_of, median, progress, report, table
 from numpy.typing import NDArray
 from scene_datasets import Meshes, plan_states
 
@@ -498,13 +498,6 @@ def checks(states: int) -> dict[str, float]:
         "equal results": float(equal),
         "close bodies of 100 states [ms]": 1e3 * close,
     }
-
-
-def cpu_of(function: Callable[[], Any]) -> float:
-    """Return the CPU time of a call [s]."""
-    begun = time.process_time()
-    function()
-    return time.process_time() - begun
 
 
 def loaded(name: str) -> tuple[Problem, Robot, CollisionChecker]:

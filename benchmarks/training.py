@@ -20,7 +20,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from common import arguments, median, progress, report, table, verdict
+from common import arguments, cpu_of, median, progress, report, table, verdict
 
 from cnpgen.machine.threads import one_thread
 from cnpgen.make.make_dataset import make_dataset
@@ -76,7 +76,7 @@ class Clock:
 def time_steps(folder: Path, hidden: int, batch: int, *, steps: int, backend: str) -> dict[str, Any]:
     """Measure steps of one network: the time [ms] and the fraction of every part."""
     settings = TrainingSettings(hidden=hidden, batch_size=batch)
-    source, clock, times = open_training_data(folder), Clock({}), []
+    source, clock = open_training_data(folder), Clock({})
     with one_thread(), loaded_problem(as_record(source.problem), backend) as loaded:
         run, _ = prepare_run(source, loaded, settings, check_rows=1)
         state = begin_run(run, Length(steps=10**6))
@@ -84,10 +84,7 @@ def time_steps(folder: Path, hidden: int, batch: int, *, steps: int, backend: st
         for _ in range(3):
             run.step(state, gradient)
         with patched(clock, run):
-            for _ in range(steps):
-                start = time.process_time()
-                run.step(state, gradient)
-                times.append(time.process_time() - start)
+            times = [cpu_of(lambda: run.step(state, gradient)) for _ in range(steps)]
     total = sum(times)
     shares = {name: clock.spent.get(name, 0.0) / total for name in PARTS[:-1]}
     return {"ms": 1e3 * median(times), "shares": shares | {"rest": 1 - sum(shares.values())}}

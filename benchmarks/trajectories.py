@@ -259,17 +259,9 @@ def refined(
 def import_all(given: argparse.Namespace) -> None:
     """Import and refine the plans of all files in all cases."""
     head = (
-        "problem",
-        "samples",
-        "plans",
-        "valid before",
-        "valid after",
-        "share",
-        "fit [rad]",
-        "ends moved [rad]",
-        "refined from [rad]",
-        "reasons",
-    )
+        "problem", "samples", "plans", "valid before", "valid after", "share", "fit [rad]", "ends moved [rad]",
+        "refined from [rad]", "reasons",
+    )  # fmt: skip
     rows = []
     for file in given.files:
         plans = load_plans(file)

@@ -208,14 +208,9 @@ def main() -> None:
     tables = [table("transports", ("planner", "problems", "figure", "value", "target", ""), rows, left=3)]
     if again_rows:
         head = (
-            "planner",
-            "problems",
-            "plans",
-            "valid",
-            "valid later",
-            "2 % shorter if refined again",
+            "planner", "problems", "plans", "valid", "valid later", "2 % shorter if refined again",
             "2 % above the fastest",
-        )
+        )  # fmt: skip
         tables.append(table(f"{chosen.again} problems of each set, refined again", head, again_rows, left=3))
     report({"transports": results}, tables, as_json=chosen.json)
 

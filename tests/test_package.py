@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 
 import cnpgen
-from cnpgen.benchmark.planners import cbirrt, crocoddyl_costs, drake_arm, rrtconnect, ruckig, sscbirrt
+from cnpgen.benchmark.planners import cbirrt, crocoddyl, drake, rrtconnect, ruckig, sscbirrt
 from cnpgen.benchmark.simulator import rendering
 from cnpgen.benchmark.simulator.execute import load_mujoco
 from cnpgen.cli.view import page
@@ -221,8 +221,8 @@ OPTIONAL = {  # package that cnpgen imports -> extra that installs it, function 
     "toppra": ("benchmark", rrtconnect.load_toppra),
     "ruckig": ("benchmark", ruckig.load_ruckig),
     "sscbirrt": ("planners", sscbirrt.load_sscbirrt),
-    "pydrake": ("planners", drake_arm.load_drake),
-    "crocoddyl": ("crocoddyl", crocoddyl_costs.load_crocoddyl),
+    "pydrake": ("planners", drake.load_drake),
+    "crocoddyl": ("crocoddyl", crocoddyl.load_crocoddyl),
     "meshcat": ("view", page._viewer),
     "distributed": ("dask", lambda: cluster("dask")),
     "ray": ("ray", lambda: cluster("ray")),

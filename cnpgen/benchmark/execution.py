@@ -10,9 +10,8 @@ from cnpgen.benchmark.results_file import answer_from_dict
 from cnpgen.benchmark.simulator.execute import Execution
 from cnpgen.benchmark.simulator.executed import Executed
 from cnpgen.benchmark.simulator.plant import Plant
-from cnpgen.benchmark.simulator.reference import Reference, StatesAt, states_of
+from cnpgen.benchmark.simulator.reference import StatesAt, states_of
 from cnpgen.benchmark.simulator.simulate import execute_states
-from cnpgen.benchmark.simulator.simulator_scene import SimulatorScene
 from cnpgen.errors import UsageError
 from cnpgen.plans.plans import Plans
 from cnpgen.trajectory.sampled_trajectory import Trajectory
@@ -30,20 +29,17 @@ def execute_answer(task: Task, *, plant: Plant) -> Executed:
         plant: The robot.
     """
     try:
-        return execution_of(task, plant)[2].executed
+        return execution_of(task, plant).executed
     except UsageError as error:
         return Executed(failure=str(error))
 
 
-def execution_of(task: Task, plant: Plant) -> tuple[SimulatorScene, Reference, Execution]:
+def execution_of(task: Task, plant: Plant) -> Execution:
     """Execute an answer.
 
     Args:
         task: The problem and the answer; of a replanning scenario, the first motion is executed up to the switch.
         plant: The robot.
-
-    Returns:
-        The simulated world, the reference of the controller, and the execution.
 
     Raises:
         UsageError: The answer is invalid or cannot be executed.

@@ -110,14 +110,14 @@ def _was_executed(row: dict[str, Any], plant: str) -> bool:
 
 def _render(task: Task, plant: Plant, *, video: bool) -> tuple[str, str]:
     """Execute a plan; return an image or a film, and its caption."""
-    scene, reference, execution = execution_of(task, plant)
+    execution = execution_of(task, plant)
     with tempfile.TemporaryDirectory() as folder:
         picture, film = Path(folder) / "end.png", Path(folder) / "plan.mp4"
-        save_picture(picture, scene, execution, reference.ticks)
+        save_picture(picture, execution)
         image, caption = _embedded(picture, "image/png"), "at the end of its plan"
         if video:
             try:
-                save_film(film, scene, execution, reference.ticks, max_frames=MAX_FILM_FRAMES)
+                save_film(film, execution, max_frames=MAX_FILM_FRAMES)
             except MachineError as error:
                 caption += f"; no film: {escape(str(error))}"
                 film.unlink(missing_ok=True)

@@ -32,6 +32,7 @@ from cnpgen.trajectory.sampled_trajectory import Trajectory
 
 RESULTS_FORMAT = "cnpgen-benchmark"
 RESULTS_VERSION = 2
+_FORMAT = {"format": RESULTS_FORMAT, "format_version": RESULTS_VERSION}
 _POINTS = [Nullable(FINITE)]
 _PLAN = {"degree": WHOLE, "path_control_points": [_POINTS], "rate_control_points": _POINTS}
 _REQUIRED = {"t": _POINTS, "q": [_POINTS]}
@@ -100,7 +101,7 @@ def open_results(path: Path, identity: dict[str, Any], *, overwrite: bool = Fals
         DatasetError: The file is damaged.
         MachineError: The file cannot be read or written.
     """
-    head = json.dumps({"format": RESULTS_FORMAT, "format_version": RESULTS_VERSION, **identity})
+    head = json.dumps({**_FORMAT, **identity})
     results = Results(path)
     lines: list[str] = []
     if path.exists():
@@ -134,11 +135,9 @@ def read_results(path: Path, shared: dict[str, Any]) -> tuple[dict[str, Any], Re
     """
     lines = _complete_lines(path)
     head = json.loads(lines[0]) if lines else None
-    common = {"format": RESULTS_FORMAT, "format_version": RESULTS_VERSION, **shared}
-    if not isinstance(head, dict) or any(head.get(key) != value for key, value in common.items()):
+    if not isinstance(head, dict) or any(head.get(key) != value for key, value in {**_FORMAT, **shared}.items()):
         return None
-    identity = {key: value for key, value in head.items() if key not in {"format", "format_version"}}
-    return identity, _read_rows(Results(path), lines[1:])
+    return head, _read_rows(Results(path), lines[1:])
 
 
 def holds_results(path: Path) -> bool:

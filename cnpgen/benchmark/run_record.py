@@ -4,14 +4,13 @@ import json
 import os
 import platform
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from cnpgen.errors import DatasetError
-from cnpgen.machine.versions import versions
+from cnpgen.machine.versions import installed_version, versions
 from cnpgen.store.files.atomic import read_file, write_file
 from cnpgen.store.files.document_structure import ANY_KEY, TEXT, WHOLE, check_structure
 from cnpgen.store.files.documents import parse_json
@@ -62,7 +61,7 @@ def describe_run(seed: int, planners: Sequence[str]) -> RunRecord:
         seed: Seed of random planners.
         planners: Names of the planners.
     """
-    libraries = {name: number for name in LIBRARIES if (number := _version(name))}
+    libraries = {name: number for name in LIBRARIES if (number := installed_version(name))}
     date = datetime.now(UTC).isoformat(timespec="seconds")
     return RunRecord(date, _processor(), os.cpu_count() or 1, seed, tuple(planners), {**versions(), **libraries})
 
@@ -81,11 +80,8 @@ def load_runs(folder: Path) -> tuple[RunRecord, ...]:
         check_structure(documents, [_STRUCTURE])
     except ValueError as error:
         raise DatasetError(f"{path} is damaged: {error}; delete it") from error
-    names = [field.name for field in fields(RunRecord)]
-    return tuple(
-        RunRecord(**{**{name: document[name] for name in names}, "planners": tuple(document["planners"])})
-        for document in documents
-    )
+    known = ({name: document[name] for name in _STRUCTURE} for document in documents)
+    return tuple(RunRecord(**{**values, "planners": tuple(values["planners"])}) for values in known)
 
 
 def save_runs(folder: Path, runs: Sequence[RunRecord]) -> None:
@@ -105,10 +101,3 @@ def _processor() -> str:
         lines = []
     names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
     return next(names, platform.machine())
-
-
-def _version(project: str) -> str:
-    try:
-        return version(project)
-    except PackageNotFoundError:
-        return ""

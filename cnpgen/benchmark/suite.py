@@ -115,10 +115,9 @@ def list_suites() -> dict[str, Path]:
     return list_recipes("suite")
 
 
-def _located(scenes: SceneFileProblems, folder: Path) -> SceneFileProblems:
-    """Return the problems of a scene file with paths that do not depend on the working directory."""
-    robot = folder / scenes.robot
-    return replace(scenes, file=str(folder / scenes.file), robot=str(robot) if robot.is_file() else scenes.robot)
+def _beside(folder: Path, name: str) -> str:
+    """Return the path of a recipe beside the suite, from any working directory; the name if there is none."""
+    return str(folder / name) if (folder / name).is_file() else name
 
 
 def _read_planners(tables: Any, where: RecipeLocation, mistakes: list[str]) -> PlannerFields | None:
@@ -159,9 +158,10 @@ def _read(path: Path, mistakes: list[str]) -> Suite | None:
         PlannerFields: _read_planners,
     }
     suite = parse(Suite, table, where=RecipeLocation(str(path)), mistakes=mistakes, readers=readers)
+    folder = path.parent
     if suite is not None and suite.scenes is not None:
-        return replace(suite, scenes=_located(suite.scenes, path.parent))
-    if suite is None or suite.samples is None:
-        return suite
-    beside = path.parent / suite.samples.recipe
-    return replace(suite, samples=replace(suite.samples, recipe=str(beside))) if beside.is_file() else suite
+        file, robot = str(folder / suite.scenes.file), _beside(folder, suite.scenes.robot)
+        return replace(suite, scenes=SceneFileProblems(file=file, robot=robot))
+    if suite is not None and suite.samples is not None:
+        return replace(suite, samples=replace(suite.samples, recipe=_beside(folder, suite.samples.recipe)))
+    return suite

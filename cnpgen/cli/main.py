@@ -44,7 +44,7 @@ from cnpgen.cli.shell import shell_spelling
 from cnpgen.cli.terminal import printing_safely
 from cnpgen.errors import CnpgenError, MachineError, RecipeError
 from cnpgen.machine.threads import prefer_one_thread
-from cnpgen.machine.versions import DOCUMENTATION_URL
+from cnpgen.machine.versions import DOCUMENTATION_URL, installed_version
 
 _COMMANDS = (
     make_command,
@@ -127,12 +127,7 @@ class _Version(argparse.Action):
     """Print the version; looking it up takes milliseconds, so it is done on demand."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
-        from importlib.metadata import PackageNotFoundError, version
-
-        found = "(not installed)"
-        with suppress(PackageNotFoundError):
-            found = version("cnpgen")
-        print(f"cnpgen {found}")
+        print(f"cnpgen {installed_version('cnpgen') or '(not installed)'}")
         parser.exit()
 
 

@@ -138,10 +138,10 @@ def _draw(arguments: argparse.Namespace, plan: "Plans", plant: "Plant") -> None:
 
     if not (arguments.image or arguments.video):
         return
-    scene, reference, execution = execute_plan(plan, plant)
+    execution = execute_plan(plan, plant)
     if arguments.image:
-        save_picture(Path(arguments.image), scene, execution, reference.ticks)
+        save_picture(Path(arguments.image), execution)
         print(f"drawn: plan {arguments.plan} in {arguments.image}", file=sys.stderr)
     if arguments.video:
-        save_film(Path(arguments.video), scene, execution, reference.ticks)
+        save_film(Path(arguments.video), execution)
         print(f"filmed: plan {arguments.plan} in {arguments.video}", file=sys.stderr)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -25,21 +24,29 @@ NODE_STRIDE, SHIFTS = 4, 16  # every fourth node; which ones depends on 16ths of
 TRAINING_DISTANCE_M = 0.02  # in addition to the required one, so that plans keep it after training
 
 
-@dataclass(frozen=True)
 class HullLoss:
     """Loss of the first constraint ``robot-clearance``, which the kernels of the loss omit.
 
-    Attributes:
-        problem: The problem.
-        losses: Losses of states.
-        term: Index of the constraint among the terms, the task loss first.
-        required: Distance below which a convex part and an obstacle have a loss [m].
+    Args:
+        problem: A problem whose samples place obstacles.
+        robot: Its robot.
+        kernels: Library of its kernels.
+        tightening: Factors, then insets of all constraints, shape (2 m,).
+
+    Raises:
+        UsageError: The problem has no constraint ``robot-clearance``, or its robot no link geometry.
+        MachineError: Kernels are not compiled on this machine.
     """
 
-    problem: Problem
-    losses: ClearanceLoss
-    term: int
-    required: float
+    def __init__(self, problem: Problem, robot: Robot, kernels: KernelLibrary, tightening: Array) -> None:
+        constraint = problem.first(RobotClearance)
+        if constraint is None:
+            raise UsageError(f"the problem {problem.name!r} has no constraint robot-clearance", concerns="problem")
+        index = problem.constraint.index(constraint)
+        inset = float(tightening[len(problem.constraint) + index])
+        self._problem, self._losses = problem, ClearanceLoss(kernels, robot)
+        self._term = 1 + index  # the task loss is the first one
+        self._required = constraint.distance + TRAINING_DISTANCE_M + inset  # m
 
     def add(
         self, results: tuple[Array, Array, Array], batch: PlanBatch, weights: Array, table: BasisTable, *, shift: float
@@ -62,32 +69,10 @@ class HullLoss:
         node_weights /= node_weights.sum()
         q = np.moveaxis(values @ path, 0, -1)
         r = rates @ batch.rate.T
-        bodies = scene_primitives(Scene(self.problem.obstacle, batch.obstacle_poses.astype(float)))
-        losses, gradients = self.losses(q, bodies, self.required)
-        step, weight = node_weights[:, None] / r, float(weights[self.term - 1])
-        terms[self.term, :count] += (step * losses).sum(axis=0)
+        bodies = scene_primitives(Scene(self._problem.obstacle, batch.obstacle_poses.astype(float)))
+        losses, gradients = self._losses(q, bodies, self._required)
+        step, weight = node_weights[:, None] / r, float(weights[self._term - 1])
+        terms[self._term, :count] += (step * losses).sum(axis=0)
         if by_path.size:
             by_path[..., :count] += weight * np.einsum("kc,kjs->cjs", values, step[:, None] * gradients)
             by_rate[..., :count] -= weight * (rates.T @ (step / r * losses))
-
-
-def make_hull_loss(problem: Problem, robot: Robot, kernels: KernelLibrary, tightening: Array) -> HullLoss:
-    """Load the loss of a problem whose samples place obstacles.
-
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        kernels: Library of its kernels.
-        tightening: Factors, then insets of all constraints, shape (2 m,).
-
-    Raises:
-        UsageError: The problem has no constraint ``robot-clearance``, or its robot no link geometry.
-        MachineError: Kernels are not compiled on this machine.
-    """
-    constraint = problem.first(RobotClearance)
-    if constraint is None:
-        raise UsageError(f"the problem {problem.name!r} has no constraint robot-clearance", concerns="problem")
-    index = problem.constraint.index(constraint)
-    inset = float(tightening[len(problem.constraint) + index])
-    required = constraint.distance + TRAINING_DISTANCE_M + inset
-    return HullLoss(problem, ClearanceLoss(kernels, robot), 1 + index, required)

@@ -4,10 +4,14 @@ Terms are the task loss and one per constraint of the problem, all times ``dt/ds
 functions) and the quadrature weight of the node.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.errors import UsageError
 from cnpgen.kernels.symbolic.symbolic_state import FrozenState, SymbolicState, time_derivatives
 from cnpgen.kernels.tape import Axes, GridSpec
 from cnpgen.losses.published_conditions import published_conditions
@@ -15,6 +19,8 @@ from cnpgen.losses.terms import Term, constraint_term, task_term
 from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
+
+Array = NDArray[Any]
 
 
 def grid_specs(problem: Problem) -> tuple[GridSpec, GridSpec]:
@@ -95,6 +101,41 @@ def penalized_conditions(
 def has_time_varying_bound(constraint: Constraint) -> bool:
     """Return whether the bounds of a constraint depend on the phase."""
     return type(constraint).bound_relaxation is not Constraint.bound_relaxation
+
+
+def time_varying_conditions(problem: Problem, robot: Robot, form: str) -> list[tuple[Constraint, Condition]]:
+    """Return the conditions with time-varying bounds, in the order of the kernel argument, with their constraints."""
+    _, state = SymbolicState.of_symbols(robot, problem.obstacle, problem.object_size, problem.scene_width)
+    pairs = penalized_conditions(filter(has_time_varying_bound, problem.constraint), state, form)
+    return [(constraint, condition) for constraint, conditions in pairs for condition in conditions]
+
+
+def relaxation_of(
+    time_varying: Sequence[tuple[Constraint, Condition]], s: NDArray[np.float64], start_tip: Array
+) -> Array:
+    """Return the relaxation of time-varying bounds, of motions that may start outside a constraint.
+
+    Args:
+        time_varying: The conditions of ``time_varying_conditions``.
+        s: Phases, shape (K,).
+        start_tip: Positions of the tip at the start [m], shape (N, 3).
+
+    Returns:
+        Relaxation of every value in its unit, shape (values, K, N).
+
+    Raises:
+        UsageError: ``bound_relaxation`` of a constraint returns another shape than its contract states.
+    """
+    rows = []
+    for constraint, condition in time_varying:
+        relaxation = constraint.bound_relaxation(condition, s, start_tip)
+        if relaxation.shape != (expected := (len(start_tip), len(s))):
+            raise UsageError(
+                f"{type(constraint).__name__}.bound_relaxation must return an array of shape {expected}"
+                f" for {len(start_tip)} motions and {len(s)} phases, got {relaxation.shape}"
+            )
+        rows += [relaxation.T] * len(condition.g)
+    return np.stack(rows)
 
 
 def _stage(robot: Robot, problem: Problem, form: str) -> tuple[Inputs, FrozenState, list[Term]]:

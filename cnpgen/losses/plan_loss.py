@@ -16,13 +16,20 @@ from cnpgen.errors import UsageError, counted, nearest
 from cnpgen.kernels.grid_kernel import GridKernel
 from cnpgen.kernels.library import Backend, choose_backend, problem_kernels
 from cnpgen.kernels.tape import DTYPES, Dtype
-from cnpgen.losses.hull_loss import HullLoss, make_hull_loss
-from cnpgen.losses.integrand import grid_specs, loss_gradient, loss_values, relaxation_argument
+from cnpgen.losses.hull_loss import HullLoss
+from cnpgen.losses.integrand import (
+    grid_specs,
+    loss_gradient,
+    loss_values,
+    relaxation_argument,
+    relaxation_of,
+    time_varying_conditions,
+)
 from cnpgen.losses.margins import Margins, constraint_terms
 from cnpgen.losses.plan_batch import MAX_VECTOR_LANES, PLANS_PER_BLOCK, PlanBatch, check_batch, check_shapes
 from cnpgen.losses.quadrature import BasisTable, basis_table, check_quadrature
-from cnpgen.losses.time_varying_bound import TimeVaryingBound, make_time_varying_bound
 from cnpgen.machine.threads import one_thread
+from cnpgen.problems.constraints.constraint import Condition, Constraint
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import as_problem
@@ -34,7 +41,7 @@ from cnpgen.store.dataset_spec import StoredProblem
 Array = NDArray[Any]
 FORMS = ("signed", "paper")
 MAX_LOSS_THREADS = 1024
-_BUILT = {"_gradient", "_values", "_time_varying_bound", "_hulls"}
+_BUILT = {"_gradient", "_values", "_time_varying", "_hulls"}
 
 
 @dataclass(frozen=True)
@@ -171,7 +178,7 @@ class PlanLoss:
         self._hulls  # noqa: B018 - a cached property, loaded before threads start, as are the kernel and the bound
         kernel = self._gradient if gradient else self._values
         if kernel.tape.inputs[relaxation_argument(self.problem)] and batch.start_tip is not None:
-            self._time_varying_bound  # noqa: B018 - a cached property
+            self._time_varying  # noqa: B018 - a cached property
         self._run(evaluate_block, n)
         with np.errstate(all="ignore"):
             total = terms[:, 0] + terms[:, 1:] @ checked
@@ -220,7 +227,7 @@ class PlanLoss:
         kernel = self._gradient if gradient else self._values
         out = np.zeros((kernel.tape.inputs[relaxation_argument(self.problem)], len(table.s), lanes), self.dtype)
         if batch.start_tip is not None and len(out):
-            out[..., : len(batch)] = self._time_varying_bound.relaxation(table.s, batch.start_tip)
+            out[..., : len(batch)] = relaxation_of(self._time_varying, table.s, batch.start_tip)
         return out
 
     def check_shapes(self, **shapes: tuple[int, ...]) -> None:
@@ -289,11 +296,11 @@ class PlanLoss:
     def _hulls(self) -> HullLoss | None:
         if not self.problem.has_sample_obstacles:
             return None
-        return make_hull_loss(self.problem, self._robot, self._kernels, self.tightening)
+        return HullLoss(self.problem, self._robot, self._kernels, self.tightening)
 
     @cached_property
-    def _time_varying_bound(self) -> TimeVaryingBound:
-        return make_time_varying_bound(self.problem, self._robot, self.form)
+    def _time_varying(self) -> list[tuple[Constraint, Condition]]:
+        return time_varying_conditions(self.problem, self._robot, self.form)
 
 
 def _check_choice(name: str, value: object, known: Sequence[str]) -> None:

@@ -41,7 +41,8 @@ def published_conditions(constraint: Constraint, state: SymbolicState) -> tuple[
         violations = (radius - _distance(point, boxes) for point in _points(state))
         return _zero("robot clearance", "m", sum(ca.fmax(x, 0) for x in violations))
     if isinstance(constraint, ObjectContact):
-        violations = (-_face_distance(corner, box) - constraint.depth for corner in _corners(state) for box in boxes)
+        depths = (-ca.mmax(ca.vertcat(*_gaps(corner, box))) for corner in _corners(state) for box in boxes)
+        violations = (depth - constraint.depth for depth in depths)
         return _zero("object contact", "m", sum(ca.fmax(x, 0) for x in violations))
     return constraint.penalized(state)
 
@@ -67,21 +68,11 @@ def _distance(point: Vec, boxes: list[Any]) -> Any:
     """Return the distance of a point from the closest box, 0 inside."""
     import casadi as ca
 
-    distance: Any = np.inf
+    distances = []
     for box in boxes:
         gaps = [ca.fmax(gap, 0) for gap in _gaps(point, box)]
-        distance = ca.fmin(ca.sqrt(sum(gap * gap for gap in gaps) + SMOOTHING_M2), distance)
-    return distance
-
-
-def _face_distance(point: Vec, box: Any) -> Any:
-    """Return the largest signed distance of a point from a face of a box: minus the depth inside."""
-    import casadi as ca
-
-    largest: Any = -np.inf
-    for gap in _gaps(point, box):
-        largest = ca.fmax(gap, largest)
-    return largest
+        distances.append(ca.sqrt(sum(gap * gap for gap in gaps) + SMOOTHING_M2))
+    return ca.mmin(ca.vertcat(*distances))
 
 
 def _gaps(point: Vec, box: Any) -> list[Any]:

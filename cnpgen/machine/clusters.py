@@ -115,8 +115,11 @@ class _Dask(Cluster):
         self._client = client
 
     def present(self) -> int:
-        with _connection_errors(self._name):
+        lost: tuple[type[BaseException], ...] = (OSError, ValueError, *_lost_of_dask())
+        try:
             return sum(self._client.nthreads().values())
+        except lost as error:  # includes time-outs and closed connections
+            raise MachineError(f"the connection to {self._name} is lost: {error}") from error
 
     def prepared(self, function: Callable[[T], R]) -> Callable[[T], Any]:
         return partial(self._client.submit, function, pure=False)
@@ -159,15 +162,6 @@ def _lost_of_dask() -> tuple[type[BaseException], ...]:
     return CancelledError, AsyncioCancelledError, CommClosedError, *cancelled
 
 
-@contextmanager
-def _connection_errors(name: str) -> Iterator[None]:
-    lost: tuple[type[BaseException], ...] = (OSError, ValueError, *_lost_of_dask())
-    try:
-        yield
-    except lost as error:  # includes time-outs and closed connections
-        raise MachineError(f"the connection to {name} is lost: {error}") from error
-
-
 class _Ray(Cluster):
     _checked_at = 0.0  # time of the last check of the head [s]
 
@@ -186,9 +180,8 @@ class _Ray(Cluster):
     def finished(self, tickets: Sequence[Any], seconds: float) -> Sequence[Any]:
         import ray
 
-        if (
-            time.monotonic() - self._checked_at > POLL_INTERVAL_S
-        ):  # without its head, ray ends this process after a minute
+        # Without its head, ray ends this process after a minute.
+        if time.monotonic() - self._checked_at > POLL_INTERVAL_S:
             _check_reachable(ray.get_runtime_context().gcs_address, self._name)
             self._checked_at = time.monotonic()
         done, _ = ray.wait(list(tickets), num_returns=1, timeout=seconds)
@@ -340,11 +333,7 @@ def _on_loopback() -> Iterator[None]:
 
 
 def _prepare_ray() -> None:
-    """Let local ray clusters of this process accept only processes with its token; ray reads it on import.
-
-    Raises:
-        MachineError: This version of ray has no tokens, or ray is already imported without a token.
-    """
+    """Let local ray clusters of this process accept only processes with its token; ray reads it on import."""
     version = importlib.metadata.version("ray")
     if tuple(int(part) for part in version.split(".")[:2]) < MIN_RAY_VERSION:
         least = ".".join(map(str, MIN_RAY_VERSION))
@@ -372,11 +361,7 @@ def check_address(name: str, address: str) -> None:
 
 
 def _check_reachable(address: str, what: str) -> None:
-    """Connect once to the host and port of an address; the libraries wait longer, and report less.
-
-    Raises:
-        MachineError: Nobody listens there.
-    """
+    """Connect once to the host and port of an address; the libraries wait longer, and report less."""
     found = re.search(r"(?:^|//)([^/]+):(\d+)$", address)
     if found is None:
         return

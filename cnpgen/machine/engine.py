@@ -3,11 +3,14 @@
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
 from cnpgen.errors import UsageError, nearest
 from cnpgen.machine.workers import distribute, worker_count
 from cnpgen.schema.arguments import integer
+
+if TYPE_CHECKING:
+    from cnpgen.machine.clusters import Cluster
 
 CLUSTERS = ("dask", "ray")
 ENGINES = ("loky", *CLUSTERS)
@@ -52,26 +55,14 @@ class Engine:
             check_address(self.name, self.address)
 
 
-class WorkerPool(Protocol):
-    """Workers that share the tasks."""
-
-    @property
-    def size(self) -> int:
-        """Number of tasks that run at once."""
-
-    @property
-    def is_remote(self) -> bool:
-        """Whether workers may be on other machines, with other working directories and caches."""
-
-    def distribute(
-        self, function: Callable[[T], R], tasks: Iterable[T], *, ordered: bool = False, hint: str = ""
-    ) -> Generator[R, None, None]:
-        """Run a function on every task and yield the results; see ``cnpgen.machine.workers.distribute``."""
-
-
 @dataclass(frozen=True)
-class _LocalPool:
-    """Processes of this machine, or a backend of joblib."""
+class LocalPool:
+    """Processes of this machine, or a backend of joblib.
+
+    Attributes:
+        size: Number of tasks that run at once.
+        is_remote: Whether workers may be on other machines, with other working directories and caches.
+    """
 
     size: int
     is_remote: bool = False
@@ -79,7 +70,11 @@ class _LocalPool:
     def distribute(
         self, function: Callable[[T], R], tasks: Iterable[T], *, ordered: bool = False, hint: str = ""
     ) -> Generator[R, None, None]:
+        """Run a function on every task and yield the results; see ``cnpgen.machine.workers.distribute``."""
         return distribute(function, tasks, self.size, ordered=ordered, hint=hint)
+
+
+WorkerPool: TypeAlias = "LocalPool | Cluster"
 
 
 @contextmanager
@@ -103,7 +98,7 @@ def assembled(engine: Engine, tasks: int, *, quick: bool = False) -> Iterator[Wo
             yield cluster
         return
     with _on_loky() if engine.name == "loky" else nullcontext():
-        yield _LocalPool(worker_count(1 if quick and engine.workers is None else engine.workers, tasks))
+        yield LocalPool(worker_count(1 if quick and engine.workers is None else engine.workers, tasks))
 
 
 def _on_loky() -> AbstractContextManager[object]:

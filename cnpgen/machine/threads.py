@@ -49,11 +49,8 @@ class _Limit:
                 _set_threads(library, count)
 
 
-class _OwnLimit(threading.local):
+class _OwnLimit(threading.local, _Limit):
     """Limit per Python thread."""
-
-    def __init__(self) -> None:
-        self.limit = _Limit()
 
 
 class OneThread(ContextDecorator):
@@ -66,10 +63,10 @@ class OneThread(ContextDecorator):
         shared, own = _libraries()
         with self._lock:
             self._limit.enter(shared)
-        self._own.limit.enter(own)
+        self._own.enter(own)
 
     def __exit__(self, *_: object) -> None:
-        self._own.limit.leave()
+        self._own.leave()
         with self._lock:
             self._limit.leave()
 

@@ -11,14 +11,18 @@ DOCUMENTATION_URL = "https://cnpgen.example.org/"  # the only place of the addre
 def versions() -> dict[str, str]:
     """Return the versions of cnpgen, Python and the numerical libraries."""
     import platform
-    from importlib.metadata import PackageNotFoundError, version
 
     names = ("numpy", "casadi", "pin", "coal", "h5py", "joblib")
     machine = f"{platform.system()} {platform.machine()}"
     found = {"cnpgen": __version__, "python": platform.python_version(), "platform": machine}
-    for name in names:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+    return found | {name: installed_version(name) or "not installed" for name in names}
+
+
+def installed_version(project: str) -> str:
+    """Return the version of an installed distribution, or an empty text."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version(project)
+    except PackageNotFoundError:
+        return ""

@@ -1,58 +1,88 @@
 """Training data: a dataset on disk, or the problems of a scene file."""
 
+from __future__ import annotations
+
+import hashlib
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.load import load_dataset
 from cnpgen.planner.control_points import ControlPoints
 from cnpgen.plans.format import CONDITIONS, OBSTACLE_POSES
+from cnpgen.plans.scene_plans import scene_plans
+from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import as_problem
 from cnpgen.problems.scenes.scene_files import holds_scenes, load_scenes
+from cnpgen.problems.scenes.scene_problem import SceneProblem
 from cnpgen.schema.arguments import concerning
 from cnpgen.store.dataset_spec import StoredProblem
-from cnpgen.training.scene_rows import make_scene_rows
 from cnpgen.training.training_rows import TrainingProblems, boundary_columns
+from cnpgen.trajectory.boundary import Boundary
+
+Array = NDArray[np.float64]
 
 DEMONSTRATION = ("path_control_points", "rate_control_points")  # columns of a certified dataset
-
-
-class TrainingData(Protocol):
-    """Rows to train on and to validate with."""
-
-    @property
-    def problem(self) -> StoredProblem:
-        """The problem of all rows."""
-
-    @property
-    def place(self) -> str:
-        """Folder or file, for messages."""
-
-    @property
-    def stages(self) -> list[dict[str, Any]]:
-        """Stages of the pipeline that made the rows; empty for other rows."""
-
-    def training(self) -> TrainingProblems:
-        """Read all training rows."""
-
-    def checked(self, rows: int) -> TrainingProblems:
-        """Read the validation rows that compare models: the first ones, at most half of all."""
-
-    def judged(self, rows: int, *, after: int) -> TrainingProblems:
-        """Read the validation rows for the final score: those that follow the ones of ``checked(after)``."""
-
-    def demonstrations(self, joints: int) -> ControlPoints | None:
-        """Read the plans of the training rows; None if there are none."""
-
-    def describe(self) -> dict[str, Any]:
-        """Return the identity of the rows, for the model's file."""
+VALIDATION_SHARE = 0.05  # of the problems of scenes, the last ones
+MAX_VALIDATION_ROWS = 200  # verdicts among obstacles take a quarter of a second
+MIN_SCENE_ROWS = 40
 
 
 @dataclass(frozen=True)
-class DatasetRows:
-    """A dataset to train on; see ``TrainingData``.
+class TrainingData(ABC):
+    """Rows to train on and to validate with.
+
+    Attributes:
+        problem: The problem of all rows.
+        place: Folder or file, for messages.
+        stages: Stages of the pipeline that made the rows; empty for other rows.
+        n_validation: Number of validation rows.
+    """
+
+    problem: StoredProblem
+    place: str
+    stages: list[dict[str, Any]]
+    n_validation: int
+
+    @abstractmethod
+    def training(self) -> TrainingProblems:
+        """Read all training rows."""
+
+    @abstractmethod
+    def describe(self) -> dict[str, Any]:
+        """Return the identity of the rows, for the model's file."""
+
+    def demonstrations(self, joints: int) -> ControlPoints | None:  # noqa: ARG002 - used by datasets
+        """Read the plans of the training rows; None if there are none."""
+        return None
+
+    def checked(self, rows: int) -> TrainingProblems:
+        """Read the validation rows that compare models: the first ones, at most half of all."""
+        return self._validation(0, self._checks(rows))
+
+    def judged(self, rows: int, *, after: int) -> TrainingProblems:
+        """Read the validation rows for the final score: those that follow the ones of ``checked(after)``."""
+        first = self._checks(after)
+        return self._validation(first, min(first + rows, self.n_validation))
+
+    def _checks(self, rows: int) -> int:
+        return min(rows, self.n_validation // 2)
+
+    @abstractmethod
+    def _validation(self, first: int, stop: int) -> TrainingProblems:
+        """Read a range of the validation rows."""
+
+
+@dataclass(frozen=True)
+class DatasetRows(TrainingData):
+    """A dataset to train on.
 
     Attributes:
         dataset: The dataset.
@@ -64,42 +94,13 @@ class DatasetRows:
     train: str
     validation: str
 
-    @property
-    def problem(self) -> StoredProblem:
-        """See ``TrainingData``."""
-        return self.dataset.problem
-
-    @property
-    def place(self) -> str:
-        """See ``TrainingData``."""
-        return str(self.dataset.folder)
-
-    @property
-    def stages(self) -> list[dict[str, Any]]:
-        """See ``TrainingData``."""
-        return self.dataset.spec.stages
-
     def training(self) -> TrainingProblems:
-        """See ``TrainingData``."""
-        columns = self.dataset.arrays(self.train, fields=self._names, dtype="float64")
-        return TrainingProblems(boundary_columns(columns), columns.get(OBSTACLE_POSES))
-
-    def checked(self, rows: int) -> TrainingProblems:
-        """See ``TrainingData``."""
-        return self._validation(0, self._checks(rows))
-
-    def judged(self, rows: int, *, after: int) -> TrainingProblems:
-        """See ``TrainingData``."""
-        first = self._checks(after)
-        return self._validation(first, first + rows)
-
-    def _checks(self, rows: int) -> int:
-        return min(rows, self.dataset.splits[self.validation] // 2)
+        """Read all training rows."""
+        return _problems(self.dataset.arrays(self.train, fields=self._names, dtype="float64"))
 
     def _validation(self, first: int, stop: int) -> TrainingProblems:
-        rows = list(range(first, min(stop, self.dataset.splits[self.validation])))
-        columns = self.dataset.rows(self.validation, rows, fields=self._names, dtype="float64")
-        return TrainingProblems(boundary_columns(columns), columns.get(OBSTACLE_POSES))
+        rows = list(range(first, stop))
+        return _problems(self.dataset.rows(self.validation, rows, fields=self._names, dtype="float64"))
 
     @property
     def _names(self) -> list[str]:
@@ -107,7 +108,7 @@ class DatasetRows:
         return [*names, OBSTACLE_POSES] if self.dataset.spec.scene_obstacles else names
 
     def demonstrations(self, joints: int) -> ControlPoints | None:
-        """See ``TrainingData``."""
+        """Read the plans of the training rows of a certified dataset; None for another one."""
         if not set(DEMONSTRATION) <= set(self.dataset.fields):
             return None
         columns = self.dataset.arrays(self.train, fields=DEMONSTRATION, dtype="float32")
@@ -115,7 +116,7 @@ class DatasetRows:
         return ControlPoints(path.reshape(len(path), -1, joints), rate)
 
     def describe(self) -> dict[str, Any]:
-        """See ``TrainingData``."""
+        """Return the identity of the dataset."""
         spec = self.dataset.spec
         return {
             "name": spec.name,
@@ -125,6 +126,67 @@ class DatasetRows:
             "fingerprint": self.dataset.fingerprint,
             "rows": dict(self.dataset.splits),
         }
+
+
+def _problems(columns: dict[str, Array]) -> TrainingProblems:
+    return TrainingProblems(boundary_columns(columns), columns.get(OBSTACLE_POSES))
+
+
+@dataclass(frozen=True)
+class SceneRows(TrainingData):
+    """Problems of scenes to train on; exact symmetries multiply the training rows.
+
+    The training rows are the problems and their reverses, from the goal to the start.
+
+    Attributes:
+        boundary: Boundary conditions of all problems, shape (N, n) each; the last ones are the validation rows.
+        obstacle_poses: Poses and sizes of their obstacles, shape (N, width).
+    """
+
+    boundary: Boundary
+    obstacle_poses: Array
+
+    def training(self) -> TrainingProblems:
+        """Return all training rows."""
+        training = slice(0, len(self.boundary) - self.n_validation)
+        start, goal = self.boundary.start_q[training], self.boundary.goal_q[training]
+        zero = np.zeros((2 * len(start), start.shape[1]))
+        there, back = np.concatenate([start, goal]), np.concatenate([goal, start])
+        return TrainingProblems(Boundary(there, zero, zero, back, zero), np.tile(self.obstacle_poses[training], (2, 1)))
+
+    def _validation(self, first: int, stop: int) -> TrainingProblems:
+        offset = len(self.boundary) - self.n_validation
+        rows = slice(offset + first, offset + stop)
+        return TrainingProblems(self.boundary[rows], self.obstacle_poses[rows])
+
+    def describe(self) -> dict[str, Any]:
+        """Return the identity of the problems."""
+        digest = hashlib.sha256()
+        for values in (self.boundary.start_q, self.boundary.goal_q, self.obstacle_poses):
+            digest.update(np.ascontiguousarray(values).tobytes())
+        return {"name": self.place, "fingerprint": digest.hexdigest(), "rows": {"scenes": len(self.boundary)}}
+
+
+def make_scene_rows(problem: Problem, scenes: Sequence[SceneProblem], place: str) -> SceneRows:
+    """Make training rows of scenes.
+
+    Args:
+        problem: The robot's problem.
+        scenes: The scenes; the last ones validate models, so that they should be of other scenes than the others.
+        place: File of the scenes.
+
+    Raises:
+        SceneError: A scene does not fit the robot.
+        UsageError: There are too few scenes, or the problem has no constraint ``robot-clearance``.
+    """
+    if len(scenes) < MIN_SCENE_ROWS:
+        raise UsageError(
+            f"{place} has {len(scenes)} problems, expected at least {MIN_SCENE_ROWS} to train and validate",
+            concerns="folder",
+        )
+    plans = scene_plans(problem, scenes)
+    n_validation = min(round(VALIDATION_SHARE * len(plans)), MAX_VALIDATION_ROWS)
+    return SceneRows(plans.problem, place, [], n_validation, plans.boundary, plans.columns[OBSTACLE_POSES])
 
 
 def open_training_data(folder: str | Path, robot: str | Path | None = None) -> TrainingData:
@@ -152,8 +214,11 @@ def open_training_data(folder: str | Path, robot: str | Path | None = None) -> T
     train = "train" if "train" in names else names[0]
     others = [name for name in names if name != train]
     validation = "validation" if "validation" in others else others[0]
-    if dataset.splits[validation] < 2:
+    n_validation = dataset.splits[validation]
+    if n_validation < 2:
         raise DatasetError(
             f"{folder} has 1 row in {validation!r}: models are compared on some rows and scored on others"
         )
-    return DatasetRows(dataset, train, validation)
+    return DatasetRows(
+        dataset.problem, str(dataset.folder), dataset.spec.stages, n_validation, dataset, train, validation
+    )

@@ -58,19 +58,24 @@ def prepare_run(
     """
     problems = source.training()
     boundary = problems.boundary
-    zero, spec = zero_conditions(boundary), loaded.problem.trajectory
-    fixed = boundary.fixed_at_goal
+    zero, fixed = zero_conditions(boundary), boundary.fixed_at_goal
     config = settings.config
-    if initial_model is not None:
+    features: Features | None = None
+    if initial_model is None:
+        placed, iterated = loaded.problem.has_sample_obstacles, settings.iterations > 1
+        blocks = feature_blocks(boundary, settings.features, placed=placed, iterated=iterated)
+        if settings.features == "paper":
+            features = published_features(blocks, loaded.robot.velocity_limit, loaded.robot.acceleration_limit)
+    else:
         config = replace(config, via_points=initial_model.config.via_points)
-    observed = settings.features == "full" if initial_model is None else SCENE in initial_model.features.blocks
+        blocks, features = initial_model.features.blocks, initial_model.features
     inference = make_inference_pipeline(
-        loaded, config, scale_time=is_rest_to_rest(zero, fixed), fixed_at_goal=fixed, observed=observed
+        loaded, config, scale_time=is_rest_to_rest(zero, fixed), fixed_at_goal=fixed, observed=SCENE in blocks
     )
-    architecture = _architecture(loaded, settings, boundary, initial_model)
+    architecture = _architecture(loaded, settings, blocks, boundary)
     if initial_model is not None:
         _check_initial_model(initial_model, architecture, settings, loaded, zero)
-    rows, features = _rows(problems, inference, loaded, settings, initial_model)
+    rows, features = _rows(problems, inference, features, blocks, initial_model)
     if settings.imitation:
         rows = _with_demonstrations(rows, source, loaded)
     loss = _loss(loaded, settings)
@@ -83,7 +88,9 @@ def prepare_run(
         within_limits=settings.within_limits,
     )
     run = Run(
-        learner=Learner(architecture, spec, loss, settings, projection, inference.prepare.along, features),
+        learner=Learner(
+            architecture, loaded.problem.trajectory, loss, settings, projection, inference.prepare.along, features
+        ),
         names=loss.terms,
         budgets=dict(zip(loss.terms[1:], loss.budgets.tolist(), strict=True)),
         rows=rows,
@@ -102,22 +109,17 @@ def prepare_run(
 def _rows(
     problems: TrainingProblems,
     inference: InferencePipeline,
-    loaded: LoadedProblem,
-    settings: TrainingSettings,
+    features: Features | None,
+    blocks: tuple[str, ...],
     initial_model: Model | None,
 ) -> tuple[Rows, Features]:
     """Prepare the rows, with the lines of the initial model's plans."""
     boundary, poses = problems.boundary, problems.obstacle_poses
-    if initial_model is None:
-        robot = loaded.robot
-        placed = loaded.problem.has_sample_obstacles
-        blocks = feature_blocks(boundary, settings.features, placed=placed, iterated=settings.iterations > 1)
-        features = None
-        if settings.features == "paper":
-            features = published_features(blocks, robot.velocity_limit, robot.acceleration_limit)
+    if initial_model is None or inference.via_points is None:
         return prepare_rows(boundary, inference.prepare, features=features, blocks=blocks, obstacle_poses=poses)
-    lines = None if inference.via_points is None else lambda some: inference.planned(initial_model, some)[0]
-    return prepare_rows(boundary, inference.prepare, features=initial_model.features, lines=lines, obstacle_poses=poses)
+    return prepare_rows(
+        boundary, inference.prepare, features=features, lines=lambda some: inference.planned(initial_model, some)[0]
+    )
 
 
 def identity(source: TrainingData, settings: TrainingSettings) -> dict[str, Any]:
@@ -163,17 +165,11 @@ def _parameter_definition(architecture: Architecture, config: ModelConfig, zero:
 
 
 def _architecture(
-    loaded: LoadedProblem, settings: TrainingSettings, boundary: Boundary, initial_model: Model | None
+    loaded: LoadedProblem, settings: TrainingSettings, blocks: tuple[str, ...], boundary: Boundary
 ) -> Architecture:
     check_memory("hidden", settings.hidden, settings.layers * settings.hidden**2)
     check_memory("batch_size", settings.batch_size, settings.batch_size * settings.nodes)
     spec = loaded.problem.trajectory
-    placed = loaded.problem.has_sample_obstacles
-    blocks = (
-        feature_blocks(boundary, settings.features, placed=placed, iterated=settings.iterations > 1)
-        if initial_model is None
-        else initial_model.features.blocks
-    )
     outputs = loaded.robot.n * (spec.path_control_points - 3 - boundary.fixed_at_goal)
     return Architecture(
         inputs=count_features(blocks, loaded.robot.n, len(loaded.problem.parameters), line=outputs),
@@ -185,14 +181,13 @@ def _architecture(
 
 
 def _loss(loaded: LoadedProblem, settings: TrainingSettings) -> PlanLoss:
-    backend = loaded.kernels.backend
     usual = suggested_margins(loaded.problem) if settings.usual_margins else Margins()
     margins = replace(usual, factors={**usual.factors, **settings.margins})
     loss = PlanLoss(
         loaded.problem,
         nodes=settings.nodes,
         form=settings.form,
-        backend=backend,
+        backend=loaded.kernels.backend,
         margins=margins,
         dtype=settings.precision,
     )

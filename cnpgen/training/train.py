@@ -4,26 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.machine.threads import one_thread
 from cnpgen.machine.times import NO_TIME, Stopwatch, Times
-from cnpgen.planner.inference_pipeline import InferencePipeline, loaded_problem
+from cnpgen.planner.inference_pipeline import loaded_problem
 from cnpgen.planner.model import Model
 from cnpgen.planner.model_file import find_model, load_model, save_model
 from cnpgen.problems.problem_record import as_record, with_control_points, with_objective
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import concerning, integer
-from cnpgen.store.files.atomic import file_sha256
+from cnpgen.store.files.atomic import check_writable, file_sha256
 from cnpgen.store.files.documents import differences, plain
 from cnpgen.store.files.file_lock import output_lock
+from cnpgen.store.files.leftovers import remove_leftovers_of
 from cnpgen.training.checkpoint import Checkpoints
-from cnpgen.training.data import TrainingData, open_training_data
-from cnpgen.training.log import TrainingLog
-from cnpgen.training.output_files import CHECKPOINT, LOCK, LOG, check_beside, check_out, remove_temporary_files
+from cnpgen.training.data import open_training_data
+from cnpgen.training.log import TrainingLog, is_log
 from cnpgen.training.prepare import begin_run, identity, prepare_run
 from cnpgen.training.score import validate
 from cnpgen.training.settings import Length, TrainingSettings
@@ -31,6 +30,7 @@ from cnpgen.training.training_run import Run, Watcher
 from cnpgen.training.training_state import State
 
 DEFAULT_CPU_TIME_S = 120.0
+CHECKPOINT, LOG, PICTURE, LOCK = ".checkpoint", ".jsonl", ".png", ".lock"  # in place of .h5
 MAX_SCORED_ROWS = 2000  # validation rows for the final score
 
 
@@ -103,77 +103,44 @@ def train_model(
         MachineError: The disk is full, or the loss is not finite any more.
     """
     clock = Stopwatch()
+    out, settings = Path(out), settings or TrainingSettings()
     lengths = {"steps": steps, "epochs": epochs, "cpu_seconds": cpu_seconds}
-    settings = settings or TrainingSettings()
-    source = partial(open_training_data, folder, robot)
-    job = _job(source, Path(out), settings, lengths, check_rows=check_rows, start_from=start_from)
-    if not force:
-        if job.out.exists() and not job.checkpoints.path.exists():
-            return _finished(job)
-        check_beside(job.out)
-    lock = output_lock(job.out, job.out.with_suffix(LOCK))
-    record = with_control_points(
-        as_record(job.source.problem), settings.path_control_points, settings.rate_control_points
-    )
-    with lock, one_thread(), loaded_problem(with_objective(record, settings.objective)) as loaded:
-        run, inference = prepare_run(
-            job.source,
-            loaded,
-            job.settings,
-            initial_model=job.initial_model,
-            check_rows=job.check_rows,
-            command=command,
-        )
-        state = job.checkpoints.load(discard=force) or begin_run(run, job.length)
-        clock.prepared()
-        if begin is not None:
-            begin(state, run)
-        log = TrainingLog(job.out.with_suffix(LOG), state.log)
-        run.train(state, job.checkpoints, log, watch)
-        job.checkpoints.save(state)
-        trained = _saved(job, run, state, inference=inference, log=log, workers=workers)
-    clock.computed_here()
-    return replace(trained, times=clock.times())
-
-
-@dataclass(frozen=True)
-class _Job:
-    """Inputs and outputs of a run."""
-
-    source: TrainingData
-    initial_model: Model | None
-    out: Path
-    settings: TrainingSettings
-    length: Length
-    check_rows: int
-    checkpoints: Checkpoints
-
-
-def _job(
-    open_source: Callable[[], TrainingData],
-    out: Path,
-    settings: TrainingSettings,
-    lengths: Mapping[str, Any],
-    *,
-    check_rows: int,
-    start_from: str | Path | None,
-) -> _Job:
-    """Check the arguments, open the dataset, and read the initial model."""
-    passed = {name: value for name, value in lengths.items() if value is not None} or {
-        "cpu_seconds": DEFAULT_CPU_TIME_S
-    }
+    passed: dict[str, Any] = {name: value for name, value in lengths.items() if value is not None}
+    passed = passed or {"cpu_seconds": DEFAULT_CPU_TIME_S}
     length, check_rows = Length(**passed), integer("check_rows", check_rows, least=1)
     check_out(out)
     remove_temporary_files(out)
-    source = open_source()
+    source = open_training_data(folder, robot)
     initial_model, digest = _read_initial_model(start_from)
-    run_identity = identity(source, settings) | {
-        "length": plain(passed),
-        "check_rows": check_rows,
-        "start_from": digest,
-    }
-    checkpoints = Checkpoints(out.with_suffix(CHECKPOINT), run_identity)
-    return _Job(source, initial_model, out, settings, length, check_rows, checkpoints)
+    run_identity = {"length": plain(passed), "check_rows": check_rows, "start_from": digest}
+    checkpoints = Checkpoints(out.with_suffix(CHECKPOINT), identity(source, settings) | run_identity)
+    if not force:
+        if out.exists() and not checkpoints.path.exists():
+            return _finished(out, checkpoints.identity)
+        check_beside(out)
+    record = with_control_points(as_record(source.problem), settings.path_control_points, settings.rate_control_points)
+    record = with_objective(record, settings.objective)
+    with output_lock(out, out.with_suffix(LOCK)), one_thread(), loaded_problem(record) as loaded:
+        run, inference = prepare_run(
+            source, loaded, settings, initial_model=initial_model, check_rows=check_rows, command=command
+        )
+        state = checkpoints.load(discard=force) or begin_run(run, length)
+        clock.prepared()
+        if begin is not None:
+            begin(state, run)
+        log = TrainingLog(out.with_suffix(LOG), state.log)
+        run.train(state, checkpoints, log, watch)
+        checkpoints.save(state)
+        best = run.model(state.best.parameters)
+        score = validate(best, inference, source.judged(MAX_SCORED_ROWS, after=check_rows), workers=workers)
+        # The checkpoint lacks this line, so that it is written once.
+        log.write({"step": state.adam.step, "best": state.best.step, "final": score})
+        training = {**best.training, **checkpoints.identity, **_outcome(state, score)}
+        model = replace(best, log=log.text, training=training)
+        save_model(out, model)
+        checkpoints.remove()
+    clock.computed_here()
+    return Trained(model, out, score, times=clock.times())
 
 
 def _read_initial_model(start_from: str | Path | None) -> tuple[Model | None, str | None]:
@@ -184,23 +151,9 @@ def _read_initial_model(start_from: str | Path | None) -> tuple[Model | None, st
         return load_model(start_from), file_sha256(find_model(start_from))
 
 
-def _saved(
-    job: _Job, run: Run, state: State, *, inference: InferencePipeline, log: TrainingLog, workers: int | None
-) -> Trained:
-    """Score the best model and write it; the log's last line is not in the checkpoint, so it is written once."""
-    best = run.model(state.best.parameters)
-    score = validate(best, inference, job.source.judged(MAX_SCORED_ROWS, after=job.check_rows), workers=workers)
-    log.write({"step": state.adam.step, "best": state.best.step, "final": score})
-    training = {**best.training, **job.checkpoints.identity, **_outcome(state, score)}
-    model = replace(best, log=log.text, training=training)
-    save_model(job.out, model)
-    job.checkpoints.remove()
-    return Trained(model, job.out, score)
-
-
-def _finished(job: _Job) -> Trained:
+def _finished(path: Path, identity: Mapping[str, Any]) -> Trained:
     """Return the existing model if it is of the same run."""
-    path, identity, hint = job.out, job.checkpoints.identity, "train another file, or replace it with {force}"
+    hint = "train another file, or replace it with {force}"
     try:
         model = load_model(path)
     except (DatasetError, UsageError) as error:
@@ -223,3 +176,33 @@ def _outcome(state: State, score: Mapping[str, Any]) -> dict[str, Any]:
         "validation_cpu_seconds": round(state.checking, 1),
         "score": {key: value for key, value in score.items() if key != "score"},
     }
+
+
+def check_out(out: Path) -> None:
+    """Raise an error if the path is no possible model file, or cannot be written."""
+    if out.suffix != ".h5" or out.is_dir() or not out.parent.is_dir():
+        raise UsageError(f"{out} must be a file that ends in .h5, in a folder that exists", concerns="out")
+    check_writable(out)
+
+
+def check_beside(out: Path) -> None:
+    """Raise an error if a log or a picture of another origin would be replaced.
+
+    Args:
+        out: The model's file.
+
+    Raises:
+        UsageError: There is such a file.
+    """
+    log, picture = out.with_suffix(LOG), out.with_suffix(PICTURE)
+    hint, remedies = "choose another {out}, or replace it with {force}", {"out": None, "force": True}
+    if log.exists() and not is_log(log):
+        raise UsageError(f"{log} exists and is no training log: {hint}", remedies=remedies)
+    if picture.exists() and not log.exists():
+        raise UsageError(f"{picture} exists and is of no training run: {hint}", remedies=remedies)
+
+
+def remove_temporary_files(out: Path) -> None:
+    """Remove the temporary files of killed runs."""
+    for path in (out, *(out.with_suffix(suffix) for suffix in (CHECKPOINT, LOG))):
+        remove_leftovers_of(path)

@@ -16,6 +16,7 @@ from cnpgen.training.adam import Adam, start_adam
 from cnpgen.training.clipping import Clipping
 
 Array = NDArray[Any]
+_ADAM_ARRAYS = ("parameters", "average", "first", "second")
 
 
 @dataclass
@@ -44,9 +45,7 @@ class Sums:
     def add(self, terms: Array) -> None:
         """Add the terms of a batch, shape (N, 1 + m); plans without a finite loss are counted and omitted."""
         finite: NDArray[np.bool_] = np.asarray(np.isfinite(terms).all(axis=1))
-        if finite.all():
-            self.terms += terms.mean(axis=0, dtype=np.float64)
-        elif finite.any():
+        if finite.any():
             self.terms += terms[finite].mean(axis=0, dtype=np.float64)
         self.lost += int(len(finite) - finite.sum())
         self.steps += 1
@@ -116,7 +115,7 @@ def start_state(parameters: Array, *, terms: int, steps: int, imitation: float =
 def to_content(state: State) -> Content:
     """Convert a state to arrays and texts."""
     adam, best = state.adam, state.best
-    arrays = {name: getattr(adam, name) for name in ("parameters", "average", "first", "second")}
+    arrays = {name: getattr(adam, name) for name in _ADAM_ARRAYS}
     numbers = {
         "step": adam.step,
         "steps": state.steps,
@@ -152,12 +151,11 @@ def from_content(content: Content) -> State:
     """
     numbers, arrays = parse_json(content.texts["numbers"]), content.arrays
     check_structure(numbers, _FORM)
-    names, best = ("parameters", "average", "first", "second"), numbers["best"]
-    shapes = {arrays[name].shape for name in (*names, "best")}
+    best, shapes = numbers["best"], {arrays[name].shape for name in (*_ADAM_ARRAYS, "best")}
     if len(shapes) > 1 or len(shapes.pop()) != 1 or arrays["terms"].ndim != 1:
         raise ValueError("its arrays do not belong to one network")
     return State(
-        Adam(**{name: np.array(arrays[name]) for name in names}, step=numbers["step"]),
+        Adam(**{name: np.array(arrays[name]) for name in _ADAM_ARRAYS}, step=numbers["step"]),
         Clipping(**numbers["clipping"]),
         Sums(np.array(arrays["terms"]), **numbers["sums"]),
         Best(best["score"], best["step"], np.array(arrays["best"])),

@@ -4,7 +4,6 @@ A library is imported only within its check, so that a broken library is reporte
 """
 
 import importlib
-import importlib.metadata
 import os
 import platform
 import shutil
@@ -17,6 +16,7 @@ from typing import Any
 
 from cnpgen.errors import PluginError
 from cnpgen.machine.threads import users_environment
+from cnpgen.machine.versions import installed_version
 
 REQUIRED_MODULES = (
     "numpy", "scipy", "casadi", "pinocchio", "coal", "h5py", "joblib", "psutil", "tqdm", "daqp", "threadpoolctl",
@@ -149,10 +149,7 @@ def _one_line(error: Exception) -> str:
 
 
 def _version_of(project: str) -> str:
-    try:
-        return importlib.metadata.version(project)
-    except importlib.metadata.PackageNotFoundError:
-        return "not installed, run from its source"
+    return installed_version(project) or "not installed, run from its source"
 
 
 def _check_libraries(findings: _Findings) -> dict[str, str]:

@@ -11,23 +11,23 @@ from scipy.optimize import LinearConstraint, minimize
 
 from cnpgen.benchmark.benchmark_planner import BenchmarkPlanner, Setting
 from cnpgen.benchmark.judging import judge_answer
-from cnpgen.benchmark.planners.aqp import AQP, nearest_in_null_space
-from cnpgen.benchmark.planners.cbirrt import CBiRRT
-from cnpgen.benchmark.planners.knots import knot_constraints
-from cnpgen.benchmark.planners.obstacle_boxes import boxes_of
-from cnpgen.benchmark.planners.rrtconnect import RRTConnect, timed_by_toppra
-from cnpgen.benchmark.planners.ruckig import Ruckig, time_optimal_motion
-from cnpgen.benchmark.planners.table_plane import (
+from cnpgen.benchmark.planners.aqp import (
+    AQP,
     MAX_MALLET_XY_M,
     MIN_MALLET_XY_M,
     PlanePath,
+    nearest_in_null_space,
     stopping_path,
     striking_path,
 )
-from cnpgen.benchmark.planners.tip import Tip
-from cnpgen.benchmark.planners.trajopt import TrajOpt, TrajOptTranscription
+from cnpgen.benchmark.planners.cbirrt import CBiRRT
+from cnpgen.benchmark.planners.obstacle_boxes import boxes_of
+from cnpgen.benchmark.planners.rrtconnect import RRTConnect, timed_by_toppra
+from cnpgen.benchmark.planners.ruckig import Ruckig, time_optimal_motion
+from cnpgen.benchmark.planners.trajopt import TrajOpt, TrajOptTranscription, knot_constraints
 from cnpgen.benchmark.process import PlannerProcess
 from cnpgen.benchmark.results_file import answer_from_dict
+from cnpgen.benchmark.simulator.tip import Tip
 from cnpgen.benchmark.suite import load_suite
 from cnpgen.errors import UsageError
 from cnpgen.plans import Plans, open_problem, record_problem

@@ -9,12 +9,11 @@ import pytest
 from cnpgen.benchmark.benchmark_planner import Setting, load_planner
 from cnpgen.benchmark.judging import judge_answer
 from cnpgen.benchmark.planners.cbirrt import MANIFOLD_TOLERANCE, Search
-from cnpgen.benchmark.planners.crocoddyl import are_small, cubic_states, min_duration
-from cnpgen.benchmark.planners.crocoddyl_costs import ObjectViolation, load_crocoddyl
-from cnpgen.benchmark.planners.drake_arm import model_text
-from cnpgen.benchmark.planners.knots import knot_constraints
+from cnpgen.benchmark.planners.crocoddyl import ObjectViolation, are_small, cubic_states, load_crocoddyl, min_duration
+from cnpgen.benchmark.planners.drake import model_text
 from cnpgen.benchmark.planners.obstacle_boxes import boxes_of
 from cnpgen.benchmark.planners.sscbirrt import ManifoldSet
+from cnpgen.benchmark.planners.trajopt import knot_constraints
 from cnpgen.errors import MachineError, UsageError
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import open_problem

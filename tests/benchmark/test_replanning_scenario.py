@@ -41,7 +41,8 @@ def test_only_the_opposite_puck_is_hit() -> None:
     problems, prefix = suite.problems(1)
     assert prefix is not None
     plan = refine_plans(Planner(suite.model).plan_batch(problems.boundary, columns=problems.columns), workers=1).plans
-    scene, reference, execution = execution_of((problems, answer_to_dict(plan), prefix[0]), PLANTS["nominal"])
+    execution = execution_of((problems, answer_to_dict(plan), prefix[0]), PLANTS["nominal"])
+    scene, reference = execution.scene, execution.reference
     assert suite.replanning is not None
     np.testing.assert_allclose(scene.puck, suite.replanning.pucks.positions()[:, -1], atol=1e-6)
     assert reference.duration == pytest.approx(0.15 + plan.duration[0])

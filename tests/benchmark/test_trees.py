@@ -1,6 +1,7 @@
 """SST and MPC-MPNet: validity of states, steering and the network, compared with Pinocchio and SciPy."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from cnpgen.benchmark.benchmark_planner import Setting
 from cnpgen.benchmark.planners.cbirrt import Search
-from cnpgen.benchmark.planners.mpc_mpnet import MPCMPNet, ProposedExtension
+from cnpgen.benchmark.planners.mpc_mpnet import STEERING_STEP_S, MPCMPNet, ProposedExtension, Steering, spread_of
 from cnpgen.benchmark.planners.proposals import (
     MIN_PROPOSAL_DEVIATION,
     Proposals,
@@ -21,9 +22,8 @@ from cnpgen.benchmark.planners.proposals import (
     shipped_proposals,
     train_proposals,
 )
-from cnpgen.benchmark.planners.sst import CONTROL_STEP_S, SST, RandomExtension
+from cnpgen.benchmark.planners.sst import CONTROL_STEP_S, SST
 from cnpgen.benchmark.planners.state_check import MAX_TIP_HEIGHT_ERROR_M, MAX_UPRIGHT_ERROR, StateCheck
-from cnpgen.benchmark.planners.steering import STEERING_STEP_S, Steering, spread_of
 from cnpgen.benchmark.planners.tree import Radii, Tree, radii_of
 from cnpgen.benchmark.suite import load_suite
 from cnpgen.errors import DatasetError, UsageError
@@ -92,7 +92,7 @@ def test_sst_stays_within_limits_and_approaches_the_goal() -> None:
     check = StateCheck(problem, robot)
     tree = Tree(np.concatenate([task.boundary.start_q[0], task.boundary.start_dq[0]]), start_xyz, RADII, CONTROL_STEP_S)
     random = np.random.default_rng(0)
-    extend = RandomExtension(tree, robot, check, task.scene.poses[0], goal, random, SST())
+    extend = partial(SST().extend, tree, check, task.scene.poses[0], goal, random)
     trajectory = tree.grow(extend, goal, time_limit=60, max_iterations=3000)
     assert trajectory is not None
     check_constant_accelerations(trajectory, CONTROL_STEP_S, robot.acceleration_limit)
@@ -112,13 +112,13 @@ def test_fields_of_sst_change_the_length_of_controls_the_share_of_goals_and_the_
         lengths.append(len(q))
         return check(q, *others)
 
+    recorded.robot = robot
     start = np.concatenate([task.boundary.start_q[0], task.boundary.start_dq[0]])
     tree = Tree(start, task.columns["start_xyz"][0], RADII, CONTROL_STEP_S)
     always_goal = SST(max_steps=7, goal_bias=1.0)  # no random position is sampled
-    arguments = task.scene.poses[0], task.columns["goal_xyz"][0], np.random.default_rng(0), always_goal
-    extend = RandomExtension(tree, robot, recorded, *arguments)  # type: ignore[arg-type]
+    goal, random = task.columns["goal_xyz"][0], np.random.default_rng(0)
     for _ in range(100):
-        extend()
+        always_goal.extend(tree, recorded, task.scene.poses[0], goal, random)  # type: ignore[arg-type]
     assert set(lengths) == set(range(1, 8))
     assert radii_of(problem, 0.05) == Radii(0.05, 0.05, 0.02)
 

@@ -9,7 +9,7 @@ import pytest
 from cnpgen.cli.main import main
 from cnpgen.cli.shell import shell_spelling
 from cnpgen.errors import CnpgenError, DatasetError, RecipeError, UsageError
-from cnpgen.training.output_files import check_beside
+from cnpgen.training.train import check_beside
 
 OPTIONS = ("force", "workers", "learning_rate", "other_rows", "out", "problem")
 

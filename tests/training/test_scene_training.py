@@ -40,8 +40,8 @@ from cnpgen.robots.shape.inline import address_of
 from cnpgen.robots.solid import number_slices, place_obstacles
 from cnpgen.scenes import SceneProblem, save_scenes
 from cnpgen.training.clipping import Clipping
+from cnpgen.training.data import make_scene_rows
 from cnpgen.training.prepare import prepare_run
-from cnpgen.training.scene_rows import make_scene_rows
 from cnpgen.training.settings import TrainingSettings
 from cnpgen.training.train import train_model
 from cnpgen.trajectory.spline import clamped_knots
@@ -148,12 +148,12 @@ def test_training_rows_are_problems_and_their_reverses(problem):
 
 def test_the_next_iteration_starts_from_the_path_of_the_last_one(problem):
     items = scenes(problem, 5)
-    rows = make_scene_rows(problem, items * 8, "here")._rows(0, 5)
+    rows = make_scene_rows(problem, items * 8, "here")
     random, spec = np.random.default_rng(6), problem.trajectory
-    with loaded_problem(make_scene_rows(problem, items * 8, "here").problem, "numpy") as loaded:
+    with loaded_problem(rows.problem, "numpy") as loaded:
         config = replace(TINY, iterations=2).config
         inference = make_inference_pipeline(loaded, config, scale_time=False)
-    tasks = inference.prepare(rows.boundary, obstacle_poses=rows.obstacle_poses)
+    tasks = inference.prepare(rows.boundary[:5], obstacle_poses=rows.obstacle_poses[:5])
     assert tasks.correction.shape == (5, 10, 4)
     assert not tasks.correction.any()
     outputs = [random.uniform(-0.5, 0.5, (5, width)) for width in (40, 20)]
@@ -167,16 +167,17 @@ def test_the_next_iteration_starts_from_the_path_of_the_last_one(problem):
 
 
 def test_control_points_stay_within_the_limits(problem):
-    rows = make_scene_rows(problem, scenes(problem, 40), "here")._rows(0, 5)
-    with loaded_problem(make_scene_rows(problem, scenes(problem, 40), "here").problem, "numpy") as loaded:
+    rows = make_scene_rows(problem, scenes(problem, 40), "here")
+    with loaded_problem(rows.problem, "numpy") as loaded:
         config = replace(TINY, within_limits=True).config
         inference, robot = make_inference_pipeline(loaded, config, scale_time=False), loaded.robot
     offsets = np.random.default_rng(7).uniform(-9, 9, (40, 5))
-    (path,) = inference.path(ends_of(rows.boundary), offsets, np.ones((20, 5)), np.empty((0, 5)))
+    boundary = rows.boundary[:5]
+    (path,) = inference.path(ends_of(boundary), offsets, np.ones((20, 5)), np.empty((0, 5)))
     points = path.T.reshape(5, 15, 4)
     assert (points >= robot.position_lower).all()
     assert (points <= robot.position_upper).all()
-    np.testing.assert_allclose(points[:, :3], np.repeat(rows.boundary.start_q[:, None], 3, axis=1))
+    np.testing.assert_allclose(points[:, :3], np.repeat(boundary.start_q[:, None], 3, axis=1))
 
 
 @needs_compiler

@@ -4,6 +4,7 @@ The constraint has one dimension: the height of the tip or the tilt of the objec
 velocities and accelerations. The path is timed by the velocity limits and followed linearly, as in the paper.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -20,7 +21,7 @@ from cnpgen.benchmark.planners.obstacle_boxes import (
     distance,
     require_table_or_transport,
 )
-from cnpgen.benchmark.planners.tip import Tip
+from cnpgen.benchmark.simulator.tip import Tip
 from cnpgen.errors import requires_extra
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.constraints.table import Table
@@ -55,8 +56,8 @@ class CBiRRT(BenchmarkPlanner):
 
         def plan(task: Plans) -> Answer:
             seed_ompl(ompl, setting, task)
-            search = Search(problem, robot, task)
-            path = search.solve(ompl, setting.time_limit, step_size=self.step_size, delta=self.delta)
+            search = Search(problem, robot, task, self.delta)
+            path = search.solve(ompl, setting.time_limit, step_size=self.step_size)
             return None if path is None else timed(path, robot.velocity_limit)
 
         return plan
@@ -81,29 +82,14 @@ def seed_ompl(ompl: Any, setting: Setting, task: Plans) -> None:
     ompl.util.RNG.setSeed(int(setting.random(task).integers(1, SEEDS)))
 
 
-def joint_bounds(base: Any, robot: Robot) -> Any:
-    """Return the position limits of a robot as bounds of OMPL."""
-    bounds = base.RealVectorBounds(robot.n)
+def joint_space(base: Any, robot: Robot) -> Any:
+    """Return OMPL's space of joint positions within the limits of a robot."""
+    space, bounds = base.RealVectorStateSpace(robot.n), base.RealVectorBounds(robot.n)
     for index, (low, high) in enumerate(zip(robot.position_lower.tolist(), robot.position_upper.tolist(), strict=True)):
         bounds.setLow(index, low)
         bounds.setHigh(index, high)
-    return bounds
-
-
-def found_path(setup: Any, n: int, time_limit: float, simplify_time: float) -> Array | None:
-    """Search with OMPL's ``SimpleSetup`` and simplify the path; return joint positions [rad], (K, n), or None.
-
-    Times are in s; a simplification of 0 s keeps the path as it was found.
-    """
-    setup.setup()
-    setup.solve(time_limit)
-    if not setup.haveExactSolutionPath():
-        return None
-    if simplify_time > 0:
-        setup.simplifySolution(simplify_time)
-    path = setup.getSolutionPath()
-    path.interpolate()
-    return np.array([[state[index] for index in range(n)] for state in path.getStates()])
+    space.setBounds(bounds)
+    return space
 
 
 def timed(path: Array, velocity_limit: Array) -> Trajectory:
@@ -117,14 +103,75 @@ def timed(path: Array, velocity_limit: Array) -> Trajectory:
     return Trajectory(np.append(0.0, np.cumsum(steps)), path)
 
 
-class Search:
-    """Search for a path of one boundary problem."""
+class PathSearch(ABC):
+    """Search for a path of one boundary problem by OMPL's RRTConnect.
 
-    def __init__(self, problem: Problem, robot: Robot, task: Plans) -> None:
-        self._robot, self._tip = robot, Tip(robot)
-        self._ends = task.boundary.start_q[0], task.boundary.goal_q[0]
+    Args:
+        robot: The robot.
+        task: The boundary problem.
+    """
+
+    max_goal_error = float(np.finfo(float).eps)  # rad
+
+    def __init__(self, robot: Robot, task: Plans) -> None:
+        self._robot, self._ends = robot, (task.boundary.start_q[0], task.boundary.goal_q[0])
+
+    @abstractmethod
+    def is_valid(self, q: Array) -> bool:
+        """Return whether joint positions q [rad], shape (n,), are valid."""
+
+    @abstractmethod
+    def space(self, ompl: Any) -> tuple[Any, list[Any]]:
+        """Return OMPL's information about the space, and its states at start and goal."""
+
+    def solve(
+        self, ompl: Any, time_limit: float, *, simplify_time: float = 0.0, step_size: float = 0.0
+    ) -> Array | None:
+        """Search for a path and simplify it.
+
+        Args:
+            ompl: The modules of OMPL.
+            time_limit: Time for the search [s].
+            simplify_time: Time for simplifying the path [s]; 0 keeps it as it was found.
+            step_size: Largest step of the trees [rad]; 0 is the automatic value of OMPL.
+
+        Returns:
+            Joint positions [rad], shape (K, n), or None.
+        """
+        information, ends = self.space(ompl)
+        setup, planner = ompl.geometric.SimpleSetup(information), ompl.geometric.RRTConnect(information)
+        joints = range(self._robot.n)
+        setup.setStateValidityChecker(lambda state: self.is_valid(np.array([state[index] for index in joints])))
+        setup.setStartAndGoalStates(*ends, self.max_goal_error)
+        planner.setRange(step_size)
+        setup.setPlanner(planner)
+        setup.setup()
+        setup.solve(time_limit)
+        if not setup.haveExactSolutionPath():
+            return None
+        if simplify_time > 0:
+            setup.simplifySolution(simplify_time)
+        path = setup.getSolutionPath()
+        path.interpolate()
+        return np.array([[state[index] for index in joints] for state in path.getStates()])
+
+
+class Search(PathSearch):
+    """Search on the constraint manifold.
+
+    Args:
+        problem: The problem.
+        robot: Its robot.
+        task: The boundary problem.
+        delta: Distance of projected states along an edge [rad].
+    """
+
+    max_goal_error = MAX_GOAL_ERROR_RAD
+
+    def __init__(self, problem: Problem, robot: Robot, task: Plans, delta: float = 0.05) -> None:
+        super().__init__(robot, task)
+        self._tip, self._data, self._delta = Tip(robot), robot.model.createData(), delta
         self._table = problem.first(Table)
-        self._data = robot.model.createData()
         if self._table is None:
             self._size, self._boxes = boxes_of(problem, task.scene)
 
@@ -153,39 +200,16 @@ class Search:
             for box in self._boxes
         )
 
-    def solve(
-        self, ompl: Any, time_limit: float, *, simplify_time: float = 0.0, step_size: float = 0.0, delta: float = 0.05
-    ) -> Array | None:
-        """Search for a path.
-
-        Args:
-            ompl: The modules of OMPL.
-            time_limit: Time for the search [s].
-            simplify_time: Time for simplifying the path [s]; 0 keeps it as it was found.
-            step_size: Largest step of the trees [rad]; 0 is the automatic value of OMPL.
-            delta: Distance of projected states along an edge [rad].
-
-        Returns:
-            Joint positions [rad], shape (K, n), or None.
-        """
-        base, n = ompl.base, self._robot.n
-        space = base.RealVectorStateSpace(n)
-        space.setBounds(joint_bounds(base, self._robot))
-        constraint = _constraint(base, n, self.residual)
-        manifold = base.ProjectedStateSpace(space, constraint)
-        manifold.setDelta(delta)
+    def space(self, ompl: Any) -> tuple[Any, list[Any]]:
+        """Return OMPL's information about the manifold, and its states at start and goal."""
+        constraint = _constraint(ompl.base, self._robot.n, self.residual)
+        manifold = ompl.base.ProjectedStateSpace(joint_space(ompl.base, self._robot), constraint)
+        manifold.setDelta(self._delta)
         manifold.setLambda(LAMBDA)
-        information = base.ConstrainedSpaceInformation(manifold)
-        setup = ompl.geometric.SimpleSetup(information)
-        setup.setStateValidityChecker(lambda state: self.is_valid(np.array([state[index] for index in range(n)])))
         ends = [manifold.allocState() for _ in self._ends]
         for state, q in zip(ends, self._ends, strict=True):
             state.copy(q.tolist())
-        setup.setStartAndGoalStates(*ends, MAX_GOAL_ERROR_RAD)
-        planner = ompl.geometric.RRTConnect(information)
-        planner.setRange(step_size)
-        setup.setPlanner(planner)
-        return found_path(setup, n, time_limit, simplify_time)
+        return ompl.base.ConstrainedSpaceInformation(manifold), ends
 
 
 def _constraint(base: Any, n: int, residual: Callable[[Array], tuple[float, Array]]) -> Any:

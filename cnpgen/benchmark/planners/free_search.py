@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.benchmark.planners.cbirrt import found_path, joint_bounds
+from cnpgen.benchmark.planners.cbirrt import PathSearch, joint_space
 from cnpgen.pipelines.families.resting_states import RestingStates
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem import Problem
@@ -29,54 +29,31 @@ def has_manifold(problem: Problem, robot: Robot) -> bool:
     return any(bool(np.any(np.asarray(item.lower) == np.asarray(item.upper))) for item in conditions)
 
 
-class FreeSearch:
-    """Search for a path of boundary problems of one problem.
+class FreeSearch(PathSearch):
+    """Search among obstacles.
 
     Args:
-        problem: The problem.
-        robot: Its robot, with link geometry.
+        states: States of the robot, which has link geometry; the obstacles of the boundary problem are placed.
+        robot: The robot.
+        task: The boundary problem.
     """
 
-    def __init__(self, problem: Problem, robot: Robot) -> None:
-        self._robot, self._states = robot, RestingStates(problem, robot)
-
-    def place_obstacles(self, task: Plans) -> None:
-        """Place the obstacles of a boundary problem."""
-        self._states.place_solids(task.scene.bodies(0))
+    def __init__(self, states: RestingStates, robot: Robot, task: Plans) -> None:
+        super().__init__(robot, task)
+        self._states = states
+        states.place_solids(task.scene.bodies(0))
 
     def is_valid(self, q: Array) -> bool:
         """Return whether the robot can hold joint positions q [rad], shape (n,), without collision."""
         return bool(self._states.can_hold(q[:, None])[0] and self._states.are_clear(q[:, None])[0])
 
-    def solve(
-        self, ompl: Any, task: Plans, time_limit: float, simplify_time: float, step_size: float = 0.0
-    ) -> Array | None:
-        """Search for a path and simplify it.
-
-        Args:
-            ompl: The modules of OMPL.
-            task: The boundary problem.
-            time_limit: Time for the search [s].
-            simplify_time: Time for simplifying the path [s].
-            step_size: Largest step of the trees [rad]; 0 is the automatic value of OMPL.
-
-        Returns:
-            Joint positions [rad], shape (K, n), or None.
-        """
-        base, n = ompl.base, self._robot.n
-        self.place_obstacles(task)
-        space = base.RealVectorStateSpace(n)
-        space.setBounds(joint_bounds(base, self._robot))
-        information = base.SpaceInformation(space)
+    def space(self, ompl: Any) -> tuple[Any, list[Any]]:
+        """Return OMPL's information about the joint positions, and its states at start and goal."""
+        space = joint_space(ompl.base, self._robot)
+        information = ompl.base.SpaceInformation(space)
         information.setStateValidityCheckingResolution(STATE_DISTANCE_RAD / space.getMaximumExtent())
-        setup = ompl.geometric.SimpleSetup(information)
-        setup.setStateValidityChecker(lambda state: self.is_valid(np.array([state[index] for index in range(n)])))
-        ends = [space.allocState() for _ in range(2)]
-        for state, q in zip(ends, (task.boundary.start_q[0], task.boundary.goal_q[0]), strict=True):
-            for index in range(n):
-                state[index] = float(q[index])
-        setup.setStartAndGoalStates(*ends)
-        planner = ompl.geometric.RRTConnect(information)
-        planner.setRange(step_size)
-        setup.setPlanner(planner)
-        return found_path(setup, n, time_limit, simplify_time)
+        ends = [space.allocState() for _ in self._ends]
+        for state, q in zip(ends, self._ends, strict=True):
+            for index, position in enumerate(q.tolist()):
+                state[index] = position
+        return information, ends

@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.benchmark.benchmark_planner import Answer, BenchmarkPlanner, Plan, Setting
-from cnpgen.benchmark.planners.cbirrt import Search, load_ompl, seed_ompl
+from cnpgen.benchmark.planners.cbirrt import PathSearch, Search, load_ompl, seed_ompl
 from cnpgen.benchmark.planners.free_search import FreeSearch, has_manifold
 from cnpgen.errors import requires_extra
+from cnpgen.pipelines.families.resting_states import RestingStates
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.constraints.joint import JointTorque
-from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import field
@@ -43,28 +43,20 @@ class RRTConnect(BenchmarkPlanner):
         ompl = load_ompl()
         load_toppra()
         problem, robot = open_problem(setting.problem)
-        if not has_manifold(problem, robot):
-            return self._plan_freely(ompl, setting, problem, robot)
+        states = None if has_manifold(problem, robot) else RestingStates(problem, robot)
+        torque_limited = problem.first(JointTorque) is not None
 
         def plan(task: Plans) -> Answer:
             seed_ompl(ompl, setting, task)
             simplify_time = min(self.simplify_time, setting.time_limit / 2)
+            search: PathSearch = Search(problem, robot, task) if states is None else FreeSearch(states, robot, task)
             search_time = setting.time_limit - simplify_time
-            search = Search(problem, robot, task)
             path = search.solve(ompl, search_time, simplify_time=simplify_time, step_size=self.step_size)
-            return None if path is None else timed_by_toppra(path, robot, task.boundary.goal_dq[0])
-
-        return plan
-
-    def _plan_freely(self, ompl: Any, setting: Setting, problem: Problem, robot: Robot) -> Plan:
-        """Return a function that plans among obstacles, without equality constraints."""
-        search, torque_limited = FreeSearch(problem, robot), problem.first(JointTorque) is not None
-
-        def plan(task: Plans) -> Answer:
-            seed_ompl(ompl, setting, task)
-            simplify_time = min(self.simplify_time, setting.time_limit / 2)
-            path = search.solve(ompl, task, setting.time_limit - simplify_time, simplify_time, self.step_size)
-            return None if path is None else timed_by_toppra(path, robot, np.zeros(robot.n), torque=torque_limited)
+            if path is None:
+                return None
+            if states is None:
+                return timed_by_toppra(path, robot, task.boundary.goal_dq[0])
+            return timed_by_toppra(path, robot, np.zeros(robot.n), torque=torque_limited)
 
         return plan
 

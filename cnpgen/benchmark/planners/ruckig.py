@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.benchmark.benchmark_planner import Answer, BenchmarkPlanner, Plan, Setting
+from cnpgen.benchmark.benchmark_planner import BenchmarkPlanner, Plan, Setting
 from cnpgen.errors import requires_extra
-from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.boundary import Boundary
@@ -30,11 +29,7 @@ class Ruckig(BenchmarkPlanner):
         """Import Ruckig."""
         ruckig = load_ruckig()
         _, robot = open_problem(setting.problem)
-
-        def plan(task: Plans) -> Answer:
-            return time_optimal_motion(ruckig, robot, task.boundary)
-
-        return plan
+        return lambda task: time_optimal_motion(ruckig, robot, task.boundary)
 
 
 def load_ruckig() -> Any:

@@ -18,11 +18,7 @@ class Solve(BenchmarkPlanner):
     def prepare(self, setting: Setting) -> Plan:
         """Load the kernels."""
         solve_plans(near_base(setting.problem), workers=1)
-
-        def plan(problem: Plans) -> Plans:
-            return solve_plans(problem, workers=1).plans
-
-        return plan
+        return lambda problem: solve_plans(problem, workers=1).plans
 
 
 def near_base(record: ProblemRecord) -> Plans:

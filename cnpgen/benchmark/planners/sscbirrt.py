@@ -7,6 +7,7 @@ ends, which are at rest.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from cnpgen.benchmark.benchmark_planner import Answer, BenchmarkPlanner, Plan, S
 from cnpgen.benchmark.planners.cbirrt import MANIFOLD_TOLERANCE, MAX_PROJECTIONS, SEEDS, Search
 from cnpgen.benchmark.planners.free_search import FreeSearch, has_manifold
 from cnpgen.errors import requires_extra
+from cnpgen.pipelines.families.resting_states import RestingStates
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.robots.robot import Robot
@@ -38,12 +40,12 @@ class SSCBiRRT(BenchmarkPlanner):
         """Import the package."""
         load_sscbirrt()
         problem, robot = open_problem(setting.problem)
-        free = None if has_manifold(problem, robot) else FreeSearch(problem, robot)
+        states = None if has_manifold(problem, robot) else RestingStates(problem, robot)
 
         def plan(task: Plans) -> Answer:
-            if free is not None:
-                free.place_obstacles(task)
-                return self._plan(setting, robot, task, is_valid=free.is_valid, manifold=None)
+            if states is not None:
+                is_valid = FreeSearch(states, robot, task).is_valid
+                return self._plan(setting, robot, task, is_valid=is_valid, manifold=None)
             search = Search(problem, robot, task)
             return self._plan(setting, robot, task, is_valid=search.is_valid, manifold=ManifoldSet(search))
 
@@ -60,9 +62,10 @@ class SSCBiRRT(BenchmarkPlanner):
     ) -> Trajectory | None:
         """Search for a path and time it; return None without a path in time."""
         package = load_sscbirrt()
-        validity = _Validity(is_valid)
+        joints = SimpleNamespace(dof=robot.n, joint_limits=(robot.position_lower, robot.position_upper))
+        validity = SimpleNamespace(is_valid=is_valid)
         config = package.CBiRRTConfig(timeout=setting.time_limit, step_size=self.step_size)
-        planner = package.CBiRRT(_Joints(robot), collision_checker=validity, config=config)
+        planner = package.CBiRRT(joints, collision_checker=validity, config=config)
         start, goal = (
             package.FiniteSet([q[0]], metric=planner.space.distance)
             for q in (task.boundary.start_q, task.boundary.goal_q)
@@ -130,21 +133,3 @@ def sampled(motion: Any) -> Trajectory | None:
         return None
     q, dq, _ = motion.evaluate(t)
     return Trajectory(t, q, dq)
-
-
-class _Joints:
-    """Joint limits in the interface of the package, which needs no kinematics here."""
-
-    def __init__(self, robot: Robot) -> None:
-        self.dof = robot.n
-        self.joint_limits = robot.position_lower, robot.position_upper
-
-    def forward_kinematics(self, q: Array) -> Array:
-        raise NotImplementedError
-
-
-class _Validity:
-    """Validity of states in the interface of the package."""
-
-    def __init__(self, is_valid: Callable[[Array], bool]) -> None:
-        self.is_valid = is_valid

@@ -7,6 +7,7 @@ nearest state is the result. Random torques would exceed a velocity limit within
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,6 @@ from cnpgen.benchmark.planners.state_check import StateCheck
 from cnpgen.benchmark.planners.tree import Tree, radii_of
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import open_problem
-from cnpgen.robots.robot import Robot
 from cnpgen.schema.keys import field
 
 Array = NDArray[np.float64]
@@ -44,44 +44,32 @@ class SST(BenchmarkPlanner):
             boundary = task.boundary
             start_xyz, goal_xyz = task.columns["start_xyz"][0], task.columns["goal_xyz"][0]
             tree = Tree(np.concatenate([boundary.start_q[0], boundary.start_dq[0]]), start_xyz, radii, CONTROL_STEP_S)
-            random = setting.random(task)
-            extend = RandomExtension(tree, robot, check, task.scene.poses[0], goal_xyz, random, self)
+            extend = partial(self.extend, tree, check, task.scene.poses[0], goal_xyz, setting.random(task))
             return tree.grow(extend, goal_xyz, time_limit=setting.time_limit, max_iterations=MAX_TREE_ITERATIONS)
 
         return plan
 
+    def extend(
+        self, tree: Tree, check: StateCheck, obstacle_poses: Array, goal: Array, random: np.random.Generator
+    ) -> int:
+        """Apply a random acceleration for a random time at a node near a random position.
 
-@dataclass(frozen=True)
-class RandomExtension:
-    """Extension of a tree by random accelerations, from nodes near random positions.
+        Args:
+            tree: The tree, which gets the new node.
+            check: Check of states.
+            obstacle_poses: Poses and sizes of the obstacles, shape (width,).
+            goal: Goal position of the tip [m], shape (3,).
+            random: Random generator.
 
-    Attributes:
-        tree: The tree.
-        robot: The robot.
-        check: Check of states.
-        obstacle_poses: Poses and sizes of the obstacles, shape (width,).
-        goal: Goal position of the tip [m], shape (3,).
-        random: Random generator.
-        settings: Fields of the planner.
-    """
-
-    tree: Tree
-    robot: Robot
-    check: StateCheck
-    obstacle_poses: Array
-    goal: Array
-    random: np.random.Generator
-    settings: SST
-
-    def __call__(self) -> int:
-        """Apply a random acceleration for a random time; return the new node, or 0 if a state is invalid."""
-        to_goal = self.random.random() < self.settings.goal_bias
-        position = self.goal if to_goal else self.check.random_position(self.obstacle_poses, self.random)
-        parent = self.tree.select(position)
-        q, dq = np.split(self.tree.state(parent), 2)
-        limit = self.robot.acceleration_limit
-        ddq = self.random.uniform(-limit, limit) * self.random.random()  # often small: 12 kg need much torque
-        t = CONTROL_STEP_S * np.arange(1.0, self.random.integers(1, self.settings.max_steps + 1) + 1)[:, None]
+        Returns:
+            The new node, or 0 if a state is invalid.
+        """
+        position = goal if random.random() < self.goal_bias else check.random_position(obstacle_poses, random)
+        parent = tree.select(position)
+        q, dq = np.split(tree.state(parent), 2)
+        limit = check.robot.acceleration_limit
+        ddq = random.uniform(-limit, limit) * random.random()  # often small: 12 kg need much torque
+        t = CONTROL_STEP_S * np.arange(1.0, random.integers(1, self.max_steps + 1) + 1)[:, None]
         path_q, path_dq = q + t * (dq + t / 2 * ddq), dq + t * ddq
-        tips, valid = self.check(path_q, path_dq, np.broadcast_to(ddq, path_q.shape), self.obstacle_poses)
-        return self.tree.add(parent, np.concatenate([path_q, path_dq], axis=1), tips[-1]) if valid.all() else 0
+        tips, valid = check(path_q, path_dq, np.broadcast_to(ddq, path_q.shape), obstacle_poses)
+        return tree.add(parent, np.concatenate([path_q, path_dq], axis=1), tips[-1]) if valid.all() else 0

@@ -5,7 +5,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.benchmark.planners.obstacle_boxes import MAX_CORNER_PENETRATION_M, MIN_OBJECT_DISTANCE_M, require_transport
+from cnpgen.benchmark.planners.obstacle_boxes import (
+    MAX_CORNER_PENETRATION_M,
+    MIN_OBJECT_DISTANCE_M,
+    require_table_or_transport,
+)
 from cnpgen.kernels.library import choose_backend, problem_kernels
 from cnpgen.kernels.symbolic.linalg import Scalar, Vec, dot
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
@@ -28,9 +32,8 @@ class StateCheck:
     """
 
     def __init__(self, problem: Problem, robot: Robot) -> None:
-        if problem.first(Table) is None:
-            require_transport(problem)
-        self._robot = robot
+        require_table_or_transport(problem)
+        self.robot = robot
         self._kernel = problem_kernels(problem, robot, *choose_backend(None)).load(tip_and_violation)
 
     def __call__(self, q: Array, dq: Array, ddq: Array, obstacle_poses: Array) -> tuple[Array, NDArray[np.bool_]]:
@@ -53,7 +56,7 @@ class StateCheck:
 
     def random_position(self, obstacle_poses: Array, random: np.random.Generator) -> Array:
         """Return the tip position of a random configuration [m], shape (3,)."""
-        q = random.uniform(self._robot.position_lower, self._robot.position_upper)[None]
+        q = random.uniform(self.robot.position_lower, self.robot.position_upper)[None]
         still = np.zeros_like(q)
         return np.asarray(self(q, still, still, obstacle_poses)[0][0])
 
@@ -71,10 +74,7 @@ def tip_and_violation(robot: Robot, problem: Problem) -> Any:
     violation += [low - value for value, low in zip(state.q, robot.position_lower.tolist(), strict=True)]
     violation += [value - high for value, high in zip(state.q, robot.position_upper.tolist(), strict=True)]
     violation += _table_violations(table, tip) if table is not None else _obstacle_violations(state)
-    worst: Scalar = violation[0]
-    for value in violation[1:]:
-        worst = ca.fmax(worst, value)
-    return ca.Function("tip_and_violation", columns, [ca.vertcat(*tip), worst])
+    return ca.Function("tip_and_violation", columns, [ca.vertcat(*tip), ca.mmax(ca.vertcat(*violation))])
 
 
 def _table_violations(table: Table, tip: Vec) -> list[Scalar]:

@@ -8,7 +8,6 @@ environment simulates no contact of mallet and table.
 import importlib
 import sys
 from functools import lru_cache
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,9 @@ from cnpgen.benchmark.simulator.outcome import TickRecord, puck_is_done
 from cnpgen.benchmark.simulator.plant import Plant, rated_torque
 from cnpgen.benchmark.simulator.reference import Reference
 from cnpgen.benchmark.simulator.simulator_scene import SimulatorScene
+from cnpgen.benchmark.simulator.tip import Tip
 from cnpgen.errors import MachineError, UsageError
+from cnpgen.machine.versions import installed_version
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.robot import Robot
@@ -125,17 +126,12 @@ def _action(scene: SimulatorScene, reference: Reference, tick: int) -> Array:
 
 def _tick_record(scene: SimulatorScene, reference: Reference, environment: Any) -> TickRecord:
     """Return the recorded states in the robot's frame."""
-    import pinocchio as pin
-
     robot, planned = scene.robot, [JOINTS.index(name) for name in scene.robot.joint_names]
     q, torque, puck, velocity, touched = (np.array(column) for column in zip(*environment.recorded, strict=True))
-    q, data, tips = q[:, planned], robot.model.createData(), []
-    for positions in q:
-        pin.framesForwardKinematics(robot.model, data, positions)
-        tips.append(data.oMf[robot.tip_frame].copy())
+    q, evaluated = q[:, planned], Tip(robot)
+    tip, rotation, _ = (np.array(part) for part in zip(*map(evaluated.at, q), strict=True))
     desired = reference.q[np.minimum(np.arange(len(q)), len(reference.q) - 1)]
     torque_use = torque[:, planned] / rated_torque(scene.problem, robot)
-    tip, rotation = np.array([tip.translation for tip in tips]), np.array([tip.rotation for tip in tips])
     unknown_force = np.full((len(q), 2), np.nan)
     steps = dict(environment.violated_steps)
     penalty = sum(PENALTY_POINTS.get(name, 0.0) for name, count in steps.items() if count)
@@ -146,18 +142,11 @@ def _tick_record(scene: SimulatorScene, reference: Reference, environment: Any) 
 
 def _unsupported(folder: str, error: Exception) -> MachineError:
     """Return the error for a version of the environment or of its libraries that does not work."""
+    installed = ", ".join(f"{name} {installed_version(name) or 'missing'}" for name in LIBRARIES)
     return MachineError(
         f"{folder} has a version that cnpgen does not support, or its libraries have: {type(error).__name__}: {error};"
-        f" installed: {', '.join(f'{name} {_version(name)}' for name in LIBRARIES)};"
-        " 'cnpgen docs benchmark' lists versions that work"
+        f" installed: {installed}; 'cnpgen docs benchmark' lists versions that work"
     )
-
-
-def _version(project: str) -> str:
-    try:
-        return version(project)
-    except PackageNotFoundError:
-        return "missing"
 
 
 @lru_cache(maxsize=1)

@@ -27,12 +27,16 @@ class Execution:
     """Record of an execution and its result.
 
     Attributes:
+        scene: The simulated world.
+        reference: Reference of the controller.
         executed: The result.
         states: Positions of all simulated joints, including the puck, shape (K, nq), for rendering.
         tip: Positions of the tip [m], shape (K, 3).
         puck: Positions of the puck over the table [m], shape (K, 2); nan without one.
     """
 
+    scene: SimulatorScene
+    reference: Reference
     executed: Executed
     states: Array
     tip: Array
@@ -88,7 +92,8 @@ def execute(scene: SimulatorScene, reference: Reference, goal_xyz: Array, start_
     else:
         record = _Run(scene, reference).simulate(start_dq)
     states = record.q if scene.puck is None else np.concatenate([record.q, record.puck], axis=1)
-    return Execution(outcome_of(scene, reference, goal_xyz, record), states, record.tip, record.puck)
+    executed = outcome_of(scene, reference, goal_xyz, record)
+    return Execution(scene, reference, executed, states, record.tip, record.puck)
 
 
 class _Run:

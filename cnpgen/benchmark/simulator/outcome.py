@@ -10,6 +10,7 @@ from cnpgen.benchmark.simulator import hockey
 from cnpgen.benchmark.simulator.executed import Executed
 from cnpgen.benchmark.simulator.reference import TICK_S, Reference
 from cnpgen.benchmark.simulator.simulator_scene import SimulatorScene
+from cnpgen.benchmark.simulator.tip import Tip
 from cnpgen.judges.plans.paper import tilt
 
 Array = NDArray[np.float64]
@@ -92,24 +93,13 @@ def outcome_of(scene: SimulatorScene, reference: Reference, goal_xyz: Array, rec
         violated_steps=record.violated_steps,
         penalty=record.penalty,
     )
-    planned_tip = scene.on_table(_tip_positions(scene, reference.q[: reference.ticks]))
+    planned = Tip(scene.robot)
+    planned_tip = scene.on_table(np.array([planned.at(q)[0] for q in reference.q[: reference.ticks]]))
     if height is not None:
         executed = _with_table(executed, record, planned_tip[:, 2] - height, tip[during, 2] - height)
     if scene.puck is None:
         return replace(executed, collided=record.max_penetration > MAX_LEGAL_PENETRATION_M)
     return _with_puck(executed, record, planned_tip)
-
-
-def _tip_positions(scene: SimulatorScene, q: Array) -> Array:
-    """Return the positions of the tip [m] at K joint positions [rad] of shape (K, n), shape (K, 3)."""
-    import pinocchio as pin
-
-    robot, positions = scene.robot, []
-    data = robot.model.createData()
-    for joints in q:
-        pin.framesForwardKinematics(robot.model, data, joints)
-        positions.append(data.oMf[robot.tip_frame].translation.copy())
-    return np.array(positions)
 
 
 def _with_table(executed: Executed, record: TickRecord, commanded_height: Array, height: Array) -> Executed:

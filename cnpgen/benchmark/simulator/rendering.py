@@ -1,6 +1,6 @@
 """Images and films of executed plans, rendered by MuJoCo without a screen."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from cnpgen.benchmark.simulator import hockey
 from cnpgen.benchmark.simulator.execute import Execution, compile_scene, load_mujoco
 from cnpgen.benchmark.simulator.reference import TICK_S
-from cnpgen.benchmark.simulator.simulator_scene import SimulatorScene
 from cnpgen.errors import MachineError, MissingExtraError, requires_extra
 from cnpgen.store.files.atomic import machine_error
 
@@ -25,48 +24,42 @@ OBJECT_VIEW = (0.3, 0.0, 0.35, 2.4, 180.0, -20.0)
 Image = NDArray[np.uint8]
 
 
-def save_picture(path: Path, scene: SimulatorScene, execution: Execution, tick: int) -> None:
-    """Render the world at a tick.
+def save_picture(path: Path, execution: Execution) -> None:
+    """Render the world at the end of a plan.
 
     Args:
         path: Image file, ``.png``; replaced if it exists.
-        scene: Simulated world.
         execution: The execution.
-        tick: The tick.
 
     Raises:
         MachineError: This machine cannot render, or the file cannot be written.
     """
     imageio = _imageio()
-    with _renderer(scene) as draw:
-        image = draw(execution, min(tick, len(execution.states) - 1))
+    with _renderer(execution) as draw:
+        image = draw(min(execution.reference.ticks, len(execution.states) - 1))
     try:
         imageio.imwrite(path, image)
     except OSError as error:
         raise machine_error("write", path, error) from error
 
 
-def save_film(
-    path: Path, scene: SimulatorScene, execution: Execution, ticks: int, *, max_frames: int | None = None
-) -> None:
+def save_film(path: Path, execution: Execution, *, max_frames: int | None = None) -> None:
     """Render a film of a plan and of the second after it, in slow motion.
 
     Args:
         path: Film file, ``.mp4`` or ``.gif``; replaced if it exists.
-        scene: Simulated world.
         execution: The execution.
-        ticks: Duration of the plan in ticks.
         max_frames: Maximum number of frames; longer motions are shown faster. Unlimited by default.
 
     Raises:
         MachineError: As ``save_picture``, or ffmpeg is missing.
     """
     imageio = _imageio()
-    last = min(ticks + round(FILM_TAIL_S / TICK_S), len(execution.states))
+    last = min(execution.reference.ticks + round(FILM_TAIL_S / TICK_S), len(execution.states))
     step = round(1 / (FILM_FRAMES_PER_S * SLOW_MOTION_FACTOR * TICK_S))
     ticks_shown = range(0, last, step if max_frames is None else max(step, -(-last // max_frames)))
-    with _renderer(scene) as draw:
-        images = [draw(execution, tick) for tick in ticks_shown]
+    with _renderer(execution) as draw:
+        images = [draw(tick) for tick in ticks_shown]
     options = (
         {"duration": 1000 / FILM_FRAMES_PER_S, "loop": 0}
         if path.suffix == ".gif"
@@ -90,9 +83,9 @@ def _imageio() -> Any:
 
 
 @contextmanager
-def _renderer(scene: SimulatorScene) -> Iterator[Any]:
+def _renderer(execution: Execution) -> Iterator[Callable[[int], Image]]:
     """Open a renderer of the ticks of an execution."""
-    mujoco, model = load_mujoco(), compile_scene(scene)
+    mujoco, scene, model = load_mujoco(), execution.scene, compile_scene(execution.scene)
     try:
         renderer = mujoco.Renderer(model, IMAGE_HEIGHT, IMAGE_WIDTH)
     except Exception as error:  # MuJoCo, EGL and OSMesa raise different exceptions
@@ -105,7 +98,7 @@ def _renderer(scene: SimulatorScene) -> Iterator[Any]:
     view = OBJECT_VIEW if scene.height is None else HOCKEY_VIEW
     camera.lookat[:], (camera.distance, camera.azimuth, camera.elevation) = view[:3], view[3:]
 
-    def draw(execution: Execution, tick: int) -> Image:
+    def draw(tick: int) -> Image:
         data.qpos[:] = execution.states[tick]
         if model.nmocap and scene.height is not None:
             data.mocap_pos[0] = execution.tip[tick] - hockey.MALLET_HEIGHT_M * scene.table_rotation[:, 2]

@@ -15,14 +15,14 @@ from cnpgen.benchmark.simulator.execute import Execution, execute, load_mujoco
 from cnpgen.benchmark.simulator.executed import Executed
 from cnpgen.benchmark.simulator.hockey import puck_of
 from cnpgen.benchmark.simulator.plant import Plant, as_plant
-from cnpgen.benchmark.simulator.reference import Reference, StatesAt, make_reference, states_of
+from cnpgen.benchmark.simulator.reference import StatesAt, make_reference, states_of
 from cnpgen.benchmark.simulator.simulator_scene import SimulatorScene
+from cnpgen.benchmark.simulator.tip import Tip
 from cnpgen.errors import UsageError, counted
 from cnpgen.machine.workers import distribute, worker_count
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.tips import correct_tips
 from cnpgen.problems.problem_record import open_problem, with_payload_of
-from cnpgen.robots.robot import Robot
 from cnpgen.robots.table_frame import table_frame, upright_axes
 from cnpgen.schema.argument_types import checked_arguments
 
@@ -125,20 +125,17 @@ def simulate_plans(
 
 def _simulate(plan: Plans, *, plant: Plant) -> Executed:
     try:
-        return execute_plan(plan, plant)[2].executed
+        return execute_plan(plan, plant).executed
     except UsageError as error:
         return Executed(failure=str(error))
 
 
-def execute_plan(plan: Plans, plant: Plant) -> tuple[SimulatorScene, Reference, Execution]:
+def execute_plan(plan: Plans, plant: Plant) -> Execution:
     """Execute one plan.
 
     Args:
         plan: One plan.
         plant: The robot.
-
-    Returns:
-        The simulated world, the reference of the controller, and the execution.
 
     Raises:
         UsageError: The plan cannot be executed: it is not finite, never arrives, or takes too long.
@@ -149,7 +146,7 @@ def execute_plan(plan: Plans, plant: Plant) -> tuple[SimulatorScene, Reference, 
 
 def execute_states(
     problem: Plans, states: StatesAt, duration: float, plant: Plant, start_dq: Array | None = None
-) -> tuple[SimulatorScene, Reference, Execution]:
+) -> Execution:
     """Execute a trajectory for one boundary problem.
 
     Args:
@@ -159,16 +156,12 @@ def execute_states(
         plant: The robot.
         start_dq: See ``execute``.
 
-    Returns:
-        As ``execute_plan``.
-
     Raises:
         UsageError, RecipeError, MachineError: As ``execute_plan``.
     """
     _, robot = open_problem(problem.problem)
     reference = make_reference(states, duration, acceleration_limit=robot.acceleration_limit)
-    scene = simulator_scene(problem, plant)
-    return scene, reference, execute(scene, reference, problem.columns["goal_xyz"][0], start_dq)
+    return execute(simulator_scene(problem, plant), reference, problem.columns["goal_xyz"][0], start_dq)
 
 
 def simulator_scene(problem: Plans, plant: Plant) -> SimulatorScene:
@@ -193,15 +186,6 @@ def simulator_scene(problem: Plans, plant: Plant) -> SimulatorScene:
     if "puck_xy" in problem.columns:
         puck, (vx, vy) = problem.columns["puck_xy"][0], problem.columns["puck_velocity"][0].tolist()
         return replace(scene, puck=puck, puck_velocity=(vx, vy))
-    velocity = _tip_velocity(robot, problem.boundary.goal_q[0], problem.boundary.goal_dq[0])
+    velocity = Tip(robot).at(problem.boundary.goal_q[0])[2][:3] @ problem.boundary.goal_dq[0]
     goal_xyz = scene.on_table(problem.columns["goal_xyz"][0])
     return replace(scene, puck=puck_of(goal_xyz, velocity @ scene.table_rotation))
-
-
-def _tip_velocity(robot: Robot, q: Array, dq: Array) -> Array:
-    """Return the velocity of the tip [m/s], shape (3,)."""
-    import pinocchio as pin
-
-    data, frame = robot.model.createData(), robot.tip_frame
-    J = pin.computeFrameJacobian(robot.model, data, q, frame, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
-    return np.asarray(J[:3] @ dq)

@@ -35,26 +35,17 @@ _SOFT = 'condim="3" solref="0.004 1" solimp="0.95 0.99 0.001"'  # contact of obj
 _TABLE = (
     'condim="3" friction="0.08 0.08" solref="0.0125 0.5" solimp="0.9 0.999 0.001"'  # as in the Air Hockey Challenge
 )
+_CENTER_M, _HALF_SIDE_M = hockey.HOME_M + hockey.LENGTH_M / 2, (hockey.WIDTH_M - hockey.GOAL_WIDTH_M) / 4
+_SIDES = (("left", 1), ("right", -1))
 _RIMS = {  # the bands and the four halves of both goals' sides: centre and half sizes over the table [m]
-    "left": (
-        hockey.HOME_M + hockey.LENGTH_M / 2,
-        hockey.WIDTH_M / 2 + hockey.BAND_M,
-        hockey.LENGTH_M / 2,
-        hockey.BAND_M,
-    ),
-    "right": (
-        hockey.HOME_M + hockey.LENGTH_M / 2,
-        -hockey.WIDTH_M / 2 - hockey.BAND_M,
-        hockey.LENGTH_M / 2,
-        hockey.BAND_M,
-    ),
     **{
-        f"{end} {side}": (x, sign * (hockey.GOAL_WIDTH_M + hockey.WIDTH_M) / 4, hockey.BAND_M, half)
+        side: (_CENTER_M, sign * (hockey.WIDTH_M / 2 + hockey.BAND_M), hockey.LENGTH_M / 2, hockey.BAND_M)
+        for side, sign in _SIDES
+    },
+    **{
+        f"{end} {side}": (x, sign * (hockey.GOAL_WIDTH_M + hockey.WIDTH_M) / 4, hockey.BAND_M, _HALF_SIDE_M)
         for end, x in (("home", hockey.HOME_M - hockey.BAND_M), ("far", hockey.GOAL_LINE_M + hockey.BAND_M))
-        for side, sign, half in (
-            ("left", 1, (hockey.WIDTH_M - hockey.GOAL_WIDTH_M) / 4),
-            ("right", -1, (hockey.WIDTH_M - hockey.GOAL_WIDTH_M) / 4),
-        )
+        for side, sign in _SIDES
     },
 }
 
@@ -170,11 +161,10 @@ def _environment(scene: SimulatorScene) -> Iterator[str]:
     surface = scene.height - hockey.MALLET_HEIGHT_M
     place = f'pos="{_numbers(scene.table_position)}" quat="{quaternion(scene.table_rotation)}"'
     yield f'<body name="table" {place}>'
-    center = hockey.HOME_M + hockey.LENGTH_M / 2
-    yield f'<geom type="box" pos="{center} 0 {surface - 0.02}" size="{hockey.LENGTH_M / 2} {hockey.WIDTH_M / 2} 0.02"'
-    yield ' rgba="0.97 0.97 1 1"/>'
+    yield f'<geom type="box" pos="{_CENTER_M} 0 {surface - 0.02}" rgba="0.97 0.97 1 1"'
+    yield f' size="{hockey.LENGTH_M / 2} {hockey.WIDTH_M / 2} 0.02"/>'
     support = scene.height - MALLET_POINT_RADIUS_M - SUPPORT_DEPTH_M
-    yield f'<geom name="support" type="box" pos="{center} 0 {support}" rgba="0 0 0 0"'
+    yield f'<geom name="support" type="box" pos="{_CENTER_M} 0 {support}" rgba="0 0 0 0"'
     yield f' size="{hockey.LENGTH_M / 2} {hockey.WIDTH_M / 2} {SUPPORT_DEPTH_M}"/>'
     for name, (x, y, half_x, half_y) in _RIMS.items():
         yield f'<geom name="{name}" type="box" pos="{x} {y} {surface}" size="{half_x} {half_y} 0.015"'

@@ -12,10 +12,9 @@ from cnpgen.errors import UsageError
 from cnpgen.interop.torch.tensor_tape import TensorTape
 from cnpgen.interop.torch.torch_plans import real_tensor
 from cnpgen.kernels.library import choose_backend, problem_kernels
-from cnpgen.losses.integrand import loss_values, relaxation_argument
+from cnpgen.losses.integrand import loss_values, relaxation_argument, relaxation_of, time_varying_conditions
 from cnpgen.losses.plan_loss import PlanLoss
 from cnpgen.losses.quadrature import BasisTable, basis_table
-from cnpgen.losses.time_varying_bound import make_time_varying_bound
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import number
@@ -51,7 +50,7 @@ class TensorLoss:
         kernels = problem_kernels(loss.problem, robot, *choose_backend("numpy"))
         tape = kernels.tape(loss_values, form=loss.form)
         self._tape, self._relaxed_values = TensorTape(tape), tape.inputs[relaxation_argument(loss.problem)]
-        self._time_varying_bound = make_time_varying_bound(loss.problem, robot, loss.form)
+        self._time_varying = time_varying_conditions(loss.problem, robot, loss.form)
         self._tables: dict[tuple[Any, ...], tuple[torch.Tensor, ...]] = {}  # the latest
         self._integrate = torch.compile(self._terms) if compiled else self._terms
 
@@ -97,7 +96,7 @@ class TensorLoss:
         relaxation, shift = path.new_zeros((self._relaxed_values, 1, 1)), number("shift", shift)
         if start_tip is not None and self._relaxed_values:
             tip = tensors["start_tip"].detach().to("cpu", torch.float64).numpy()
-            bound = self._time_varying_bound.relaxation(self._basis(shift).s, tip)
+            bound = relaxation_of(self._time_varying, self._basis(shift).s, tip)
             relaxation = torch.tensor(bound, **kind)
         tightening = torch.tensor(self.loss.tightening, **kind)
         arguments = (poses, relaxation, *self._table(shift, kind), tightening, weights)

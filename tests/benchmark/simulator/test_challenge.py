@@ -45,7 +45,8 @@ def test_outcomes_in_the_challenge_differ_only_by_its_controller(plans: Plans) -
 
 
 def test_records_are_in_the_robots_frame(plans: Plans) -> None:
-    scene, reference, execution = execute_plan(plans[0], challenge_plant(CLONE))
+    execution = execute_plan(plans[0], challenge_plant(CLONE))
+    scene, reference = execution.scene, execution.reference
     assert scene.puck is not None
     np.testing.assert_allclose(execution.puck[0], scene.puck, atol=1e-12)
     np.testing.assert_allclose(execution.states[0, :6], reference.q[0], atol=1e-12)

@@ -7,13 +7,13 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cnpgen.benchmark.planners.tip import Tip
 from cnpgen.benchmark.simulator.execute import _Run, execute
 from cnpgen.benchmark.simulator.executed import succeeded
 from cnpgen.benchmark.simulator.plant import PLANTS, as_plant, joint_friction, rated_torque
 from cnpgen.benchmark.simulator.reference import TICK_S, Reference
 from cnpgen.benchmark.simulator.simulate import execute_plan, simulate_plans, simulator_scene
 from cnpgen.benchmark.simulator.simulator_scene import SimulatorScene
+from cnpgen.benchmark.simulator.tip import Tip
 from cnpgen.errors import UsageError
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.plans import Plans, make_plans
@@ -80,7 +80,8 @@ def raised(reference: Reference, height: float) -> Reference:
 
 
 def test_a_motion_5_cm_too_high_misses_the_puck(hit: Plans) -> None:
-    scene, reference, execution = execute_plan(hit, PLANTS["nominal"])
+    execution = execute_plan(hit, PLANTS["nominal"])
+    scene, reference = execution.scene, execution.reference
     goal = hit.columns["goal_xyz"][0]
     for change in (-0.08, 0.08):
         lifted = execute(scene, raised(reference, change), goal)
@@ -101,7 +102,8 @@ def test_the_puck_is_placed_by_the_tip_frame_if_a_joint_has_the_same_name(hit: P
 
 
 def test_a_puck_on_the_path_is_touched_early(hit: Plans) -> None:
-    scene, reference, execution = execute_plan(hit, PLANTS["nominal"])
+    execution = execute_plan(hit, PLANTS["nominal"])
+    scene, reference = execution.scene, execution.reference
     goal = hit.columns["goal_xyz"][0]
     halfway = execution.tip[reference.ticks // 2, :2]
     executed = execute(replace(scene, puck=halfway), reference, goal).executed
@@ -122,7 +124,8 @@ def test_an_object_is_carried_without_collision(plant: str) -> None:
 
 
 def test_an_object_dragged_through_a_pedestal_collides() -> None:
-    scene, reference, _ = execute_plan(stored("transport"), PLANTS["nominal"])
+    execution = execute_plan(stored("transport"), PLANTS["nominal"])
+    scene, reference = execution.scene, execution.reference
     higher = replace(scene, obstacle_poses=scene.obstacle_poses + 0.1)
     executed = execute(higher, reference, stored("transport").columns["goal_xyz"][0]).executed
     assert executed.collided
@@ -150,7 +153,8 @@ def lowered(reference: Reference, scene: SimulatorScene, depth: float) -> Refere
 
 
 def test_a_mallet_commanded_below_the_table_is_supported_and_fails_by_the_plane(hit: Plans) -> None:
-    scene, reference, execution = execute_plan(hit, PLANTS["nominal"])
+    execution = execute_plan(hit, PLANTS["nominal"])
+    scene, reference = execution.scene, execution.reference
     goal = hit.columns["goal_xyz"][0]
     low = execute(scene, lowered(reference, scene, 0.03), goal).executed
     assert low.commanded_plane_error == pytest.approx(0.03, abs=1e-4)
@@ -206,7 +210,7 @@ def test_an_unknown_plant_is_refused_by_name() -> None:
 
 
 def test_the_robot_stops_after_a_hit_within_its_limits(hit: Plans) -> None:
-    _, reference, _ = execute_plan(hit, PLANTS["nominal"])
+    reference = execute_plan(hit, PLANTS["nominal"]).reference
     limit = ROBOTS["airhockey"].acceleration_limit
     after = slice(reference.ticks, None)
     assert np.abs(reference.dq[-1]).max() == 0
@@ -217,7 +221,8 @@ def test_the_robot_stops_after_a_hit_within_its_limits(hit: Plans) -> None:
 
 def test_holding_torque_has_priority_if_a_motor_saturates() -> None:
     """Follow a jump of 0.1 rad, which exceeds the motors: the robot arrives late and does not fall."""
-    scene, reference, _ = execute_plan(stored("transport"), PLANTS["nominal"])
+    execution = execute_plan(stored("transport"), PLANTS["nominal"])
+    scene, reference = execution.scene, execution.reference
     q = np.vstack([reference.q[-1:] - 0.1, np.repeat(reference.q[-1:], 2000, axis=0)])
     jump = Reference(q, np.zeros_like(q), np.zeros_like(q), 2.0)
     without_obstacles = replace(scene, obstacle_poses=scene.obstacle_poses - 2)
