@@ -9,6 +9,8 @@ are medians over the repetitions, ratios are medians of the ratios within one re
 """
 
 import argparse
+import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 from unittest import mock
