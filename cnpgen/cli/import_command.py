@@ -25,13 +25,8 @@ def add(commands: "Commands[Parser]") -> None:
     parser = add_command(commands, "import", run, title="make plans of sampled trajectories", text=_TEXT)
     option = parser.add_argument
     option("file", metavar="FILE", type=recipe_names.present, help="file of trajectories, or a folder of them")
-    option(
-        "--problem",
-        metavar="NAME|FILE",
-        type=recipe_names.problem,
-        required=True,
-        help="the problem of the trajectories",
-    )
+    text = "the problem of the trajectories"
+    option("--problem", metavar="NAME|FILE", type=recipe_names.problem, required=True, help=text)
     option("-o", "--out", metavar="PLANS", type=Path, required=True, help="plan file to write, .h5")
     option("--force", action="store_true", help="replace PLANS")
     add_trajectory_options(parser)
@@ -59,11 +54,10 @@ def run(arguments: argparse.Namespace) -> int:
     check_place(out, force=arguments.force)
     problem = problem_of(arguments)
     loaded = load_file(arguments, problem)
-    noise = arguments.noise or (0.0,)
     imported = import_trajectories(
         problem,
         loaded.trajectories,
-        noise=noise[0] if len(noise) == 1 else noise,
+        noise=arguments.noise or 0.0,
         at_rest=arguments.at_rest,
         source=f"imported from {arguments.file.name}",
     )

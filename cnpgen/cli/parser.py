@@ -87,12 +87,20 @@ def add_debug(parser: Parser, *, default: Any = False) -> None:
     parser.add_argument("--debug", action="store_true", default=default, help="show the traceback of an error")
 
 
+ENGINE = ("workers", "engine", "address")
+
+
 def add_engine(parser: Options) -> None:
     """Add ``--engine`` and ``--address``."""
     text = "engine of the workers: local processes (loky, default), or a cluster ('cnpgen docs scale')"
     parser.add_argument("--engine", choices=("loky", "dask", "ray"), help=text)
     text = "address of the cluster, such as tcp://host:8786; without it a local cluster is started"
     parser.add_argument("--address", metavar="A", help=text)
+
+
+def options_of(arguments: argparse.Namespace, *names: str) -> dict[str, Any]:
+    """Return options of a command as keyword arguments."""
+    return {name: getattr(arguments, name) for name in names}
 
 
 def add_json(parser: Parser) -> None:

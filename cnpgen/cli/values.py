@@ -3,9 +3,11 @@
 import math
 import re
 from argparse import ArgumentTypeError
+from collections.abc import Sequence
 from contextlib import suppress
 from decimal import Decimal
 from pathlib import Path
+from typing import Any
 
 from cnpgen.errors import either
 
@@ -87,6 +89,16 @@ def part(text: str) -> tuple[int, int]:
     return k, m
 
 
+def toml_value(text: str) -> Any:
+    """Read a value as in a recipe, or as plain text."""
+    import tomllib
+
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
 def plot_file(text: str) -> str:
     """Read the name of a picture file in an existing folder."""
     return picture_file(text, ".png", ".pdf", ".svg")
@@ -162,6 +174,10 @@ def names(text: str) -> tuple[str, ...]:
     return found
 
 
+def _one_or_several(found: Sequence[float]) -> float | tuple[float, ...]:
+    return found[0] if len(found) == 1 else tuple(found)
+
+
 def _numbers(text: str) -> tuple[float, ...]:
     """Read numbers separated by commas; none if one of them is no number."""
     try:
@@ -170,17 +186,17 @@ def _numbers(text: str) -> tuple[float, ...]:
         return ()
 
 
-def errors(text: str) -> tuple[float, ...]:
+def errors(text: str) -> float | tuple[float, ...]:
     """Read one number or three, at least 0: ``1e-3`` or ``1e-3,1e-2,0.5``."""
     found = _numbers(text)
     if len(found) not in {1, 3} or not all(0 <= value < math.inf for value in found):
         raise ArgumentTypeError(
             f"expected one number or three, at least 0, such as 1e-3 or 1e-3,1e-2,0.5; got {text[:60]!r}"
         )
-    return found
+    return _one_or_several(found)
 
 
-def tracking_errors(text: str) -> tuple[float, ...]:
+def tracking_errors(text: str) -> float | tuple[float, ...]:
     """Read angles or lengths of at least 0, separated by commas: ``2deg`` or ``1deg,1deg,5mm``."""
     from cnpgen.schema.units import parse_number
 
@@ -194,7 +210,7 @@ def tracking_errors(text: str) -> tuple[float, ...]:
         raise ArgumentTypeError(f"expected angles of at least 0, such as 2deg or 1deg,1deg,0.01; got {text[:60]!r}")
     if max(found) > MAX_ERROR:
         raise ArgumentTypeError(f"expected at most {MAX_ERROR:g} rad or m, such as 2deg; got {text[:60]!r}")
-    return tuple(found)
+    return _one_or_several(found)
 
 
 def parameters(text: str) -> dict[str, float]:
@@ -227,14 +243,14 @@ def payload(text: str) -> tuple[float, ...]:
 def angle(text: str) -> float:
     """Read an angle or a length above 0: ``2deg``, ``0.035`` or ``5mm``."""
     found = tracking_errors(text)
-    if len(found) != 1 or not found[0] > 0:
+    if isinstance(found, tuple) or not found > 0:
         raise ArgumentTypeError(f"expected one angle above 0, such as 2deg; got {text[:60]!r}")
-    return found[0]
+    return found
 
 
-def amounts(text: str) -> tuple[float, ...]:
+def amounts(text: str) -> float | tuple[float, ...]:
     """Read positive numbers separated by commas: ``500`` or ``7500,3750,5000``."""
     found = _numbers(text)
     if not found or not all(0 < value < math.inf for value in found):
         raise ArgumentTypeError(f"expected numbers above 0, such as 500 or 7500,3750; got {text[:60]!r}")
-    return found
+    return _one_or_several(found)
