@@ -36,12 +36,13 @@ def spec_text(recipe: DatasetRecipe, out: str | None, *, force: bool, **settings
     files = shards(spec)
     splits = [f"{split} {rows:,}" for split, rows in spec.splits.items()]
     counts = [f"{split} {sum(task.split == split for task in files)}" for split in spec.splits]
+    size = sum(spec.splits.values()) * row_bytes(spec) + len(files) * SHARD_OVERHEAD + DOCUMENTS
     facts = [
         ("folder", workspace.folder),
         ("state", folder_state(workspace, spec, force=force)),
         ("rows", f"{sum(spec.splits.values()):,}: {', '.join(splits)}"),
         ("shards", f"{len(files)} of at most {spec.shard_size:,} rows: {', '.join(counts)}"),
-        ("size", f"about {size_text(estimate_bytes(spec))}, {row_bytes(spec)} bytes per row"),
+        ("size", f"about {size_text(size)}, {row_bytes(spec)} bytes per row"),
         ("seed", str(spec.seed)),
         ("backend", spec.backend),
         ("dtype", spec.dtype),
@@ -49,24 +50,13 @@ def spec_text(recipe: DatasetRecipe, out: str | None, *, force: bool, **settings
     ]
     fields = [("field", "columns", "unit", "what")]
     fields += [(item.name, str(item.width or "-"), item.unit, item.long_name) for item in spec.fields]
-    return "\n".join(
-        [
-            f"{spec.name} {spec.version}",
-            *table(facts, indent="  "),
-            "",
-            *table(fields, indent="  ", right=(1,)),
-        ]
-    )
+    head = f"{spec.name} {spec.version}"
+    return "\n".join([head, *table(facts, indent="  "), "", *table(fields, indent="  ", right=(1,))])
 
 
 def row_bytes(spec: DatasetSpec) -> int:
     """Return the size of a row in bytes."""
     return sum(max(field.width, 1) * storage_dtype(field, spec.dtype).itemsize for field in spec.fields)
-
-
-def estimate_bytes(spec: DatasetSpec) -> int:
-    """Estimate the size of the finished dataset in bytes."""
-    return sum(spec.splits.values()) * row_bytes(spec) + len(shards(spec)) * SHARD_OVERHEAD + DOCUMENTS
 
 
 def folder_state(workspace: Workspace, spec: DatasetSpec, *, force: bool) -> str:
