@@ -55,18 +55,9 @@ def add(commands: "Commands[Parser]") -> None:
     option("--workers", metavar="W", type=values.positive, help="processes; default one per available core")
     option("--list", action="store_true", help="also list the plans, one per line")
     option("--plan", metavar="I", type=values.natural, default=0, help="plan to draw (default: 0)")
-    option(
-        "--image",
-        metavar="PICTURE",
-        type=lambda text: values.picture_file(text, ".png"),
-        help="draw the world at the end of one plan: .png",
-    )
-    option(
-        "--video",
-        metavar="FILM",
-        type=lambda text: values.picture_file(text, ".mp4", ".gif"),
-        help="film one plan: .mp4 or .gif",
-    )
+    text = "draw the world at the end of one plan: .png"
+    option("--image", metavar="PICTURE", type=values.file_in(".png"), help=text)
+    option("--video", metavar="FILM", type=values.file_in(".mp4", ".gif"), help="film one plan: .mp4 or .gif")
     add_json(parser)
 
 

@@ -3,7 +3,7 @@
 import math
 import re
 from argparse import ArgumentTypeError
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from decimal import Decimal
 from pathlib import Path
@@ -99,21 +99,23 @@ def toml_value(text: str) -> Any:
         return text
 
 
-def plot_file(text: str) -> str:
-    """Read the name of a picture file in an existing folder."""
-    return picture_file(text, ".png", ".pdf", ".svg")
+def file_in(*endings: str) -> Callable[[str], str]:
+    """Return a reader of the name of a file with one of some endings, in a folder that is there and can be written."""
+
+    def read(text: str) -> str:
+        from cnpgen.store.files.atomic import check_writable
+
+        if not text.lower().endswith(endings):
+            raise ArgumentTypeError(f"expected a file that ends in {either(endings)}, got {text!r}")
+        if not Path(text).absolute().parent.is_dir():
+            raise ArgumentTypeError(f"expected a file in a folder that is there, got {text!r}")
+        check_writable(Path(text))
+        return text
+
+    return read
 
 
-def picture_file(text: str, *endings: str) -> str:
-    """Read the name of a file with one of some endings, in a folder that is there and can be written."""
-    from cnpgen.store.files.atomic import check_writable
-
-    if not text.lower().endswith(endings):
-        raise ArgumentTypeError(f"expected a file that ends in {either(endings)}, got {text!r}")
-    if not Path(text).absolute().parent.is_dir():
-        raise ArgumentTypeError(f"expected a file in a folder that is there, got {text!r}")
-    check_writable(Path(text))
-    return text
+plot_file = file_in(".png", ".pdf", ".svg")
 
 
 def seconds(text: str) -> float:

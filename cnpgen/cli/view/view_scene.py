@@ -112,8 +112,6 @@ def scene_of_plans(
     verdicts: Sequence[Verdict | None],
     *,
     with_meshes: bool,
-    first_row: int = 0,
-    n_rows: int = 1,
 ) -> ViewScene:
     """Show motions or, of rows without a plan, their starts and goals.
 
@@ -124,14 +122,12 @@ def scene_of_plans(
         titles: Title of each plan.
         verdicts: Verdict on each plan; None for rows without a plan.
         with_meshes: Whether the URDF's visual meshes are read.
-        first_row: Row of the first plan in its source.
-        n_rows: Number of rows of the source.
     """
     scene = plans.scene
     views = [
         _view(problem, robot, plans[i : i + 1], titles[i], verdicts[i], scene[i : i + 1]) for i in range(len(plans))
     ]
-    return _scene(problem, robot, views, with_meshes=with_meshes, first_row=first_row, n_rows=n_rows)
+    return _scene(problem, robot, views, with_meshes=with_meshes)
 
 
 def scene_of_trajectories(
@@ -140,9 +136,6 @@ def scene_of_trajectories(
     trajectories: Sequence[Trajectory],
     titles: Sequence[str],
     verdicts: Sequence[TrajectoryVerdict],
-    *,
-    first_row: int = 0,
-    n_rows: int = 1,
 ) -> ViewScene:
     """Show sampled trajectories, by the interpolation that their derivatives determine.
 
@@ -152,8 +145,6 @@ def scene_of_trajectories(
         trajectories: The trajectories.
         titles: Title of each.
         verdicts: Verdict on each.
-        first_row: Index of the first trajectory in its source.
-        n_rows: Number of trajectories of the source.
     """
     views = []
     for trajectory, title, verdict in zip(trajectories, titles, verdicts, strict=True):
@@ -165,7 +156,7 @@ def scene_of_trajectories(
             )
             shown = Verdict(Reason.OK if verdict.valid else str(verdict), margins)
             views.append(_moving(problem, robot, world, s, times, scene, title, shown))
-    return _scene(problem, robot, views, with_meshes=True, first_row=first_row, n_rows=n_rows)
+    return _scene(problem, robot, views, with_meshes=True)
 
 
 def _view(  # noqa: PLR0917 - all of them are shown
@@ -223,33 +214,22 @@ def _still(  # noqa: PLR0917 - all of them are shown
     return View(title, labels, times, q, _poses(robot, q), world, (), {}, (), verdict)
 
 
-def _scene(
-    problem: Problem,
-    robot: Robot,
-    views: list[View],
-    *,
-    with_meshes: bool,
-    first_row: int = 0,
-    n_rows: int = 1,
-) -> ViewScene:
+def _scene(problem: Problem, robot: Robot, views: list[View], *, with_meshes: bool) -> ViewScene:
     bodies, kind = robot_bodies(problem, robot, with_meshes=with_meshes)
     size, contact, tip = problem.object_size, problem.first(PuckContact), robot.n + 1
+    disc = None if contact is None else _disc_corners(np.zeros(3), contact.mallet_radius, MALLET_HEIGHT_M)
     return ViewScene(
         robot=robot,
         bodies=tuple(bodies),
         kind=kind,
         capsules=tuple(capsule_bodies(robot)),
         held=() if size is None else (wrapped("object", tip, CUBE * np.array(size), 0.0),),
-        mallet=()
-        if contact is None
-        else (wrapped("mallet", tip, _disc_corners(np.zeros(3), contact.mallet_radius, MALLET_HEIGHT_M), 0.0),),
+        mallet=() if disc is None else (wrapped("mallet", tip, disc, 0.0),),
         triad=tuple(
             wrapped(f"axis {name}", tip, np.array([np.zeros(3), TRIAD_LENGTH_M * axis]), TRIAD_RADIUS_M)
             for name, axis in zip("xyz", np.eye(3), strict=True)
         ),
         views=tuple(views),
-        first_row=first_row,
-        n_rows=n_rows,
     )
 
 
