@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from cnpgen.cli.view.view_bodies import Body
 from cnpgen.cli.view.view_scene import View, ViewScene
-from cnpgen.cli.view.view_verdict import ViewVerdict
 from cnpgen.errors import requires_extra
 from cnpgen.judges.plans.condition_curves import ConditionCurve
 from cnpgen.robots.robot import Robot
@@ -82,13 +81,8 @@ def _view(view: View) -> dict[str, Any]:
         "path": [_body(body, smooth=True) for body in view.path],
         "curves": [{"name": name, "shares": share.round(SHARE_DIGITS).tolist()} for name, share in view.shares.items()],
         "conditions": [_condition(curve) for curve in view.conditions],
-        "verdict": None if view.verdict is None else _verdict(view.verdict),
+        "verdict": view.verdict,
     }
-
-
-def _verdict(verdict: ViewVerdict) -> dict[str, Any]:
-    causes = [vars(cause) | {"point": cause.point.tolist()} for cause in verdict.causes]
-    return {"valid": verdict.valid, "reason": verdict.reason, "causes": causes}
 
 
 def _condition(curve: ConditionCurve) -> dict[str, Any]:

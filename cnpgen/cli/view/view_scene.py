@@ -2,12 +2,13 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.cli.view.view_bodies import Body, capsule_bodies, robot_bodies, tube, wrapped
-from cnpgen.cli.view.view_verdict import ViewVerdict, view_verdict
+from cnpgen.cli.view.view_verdict import view_verdict
 from cnpgen.judges.plans.condition_curves import ConditionCurve, condition_curves
 from cnpgen.judges.plans.plan_plot import along, shares_of_limits
 from cnpgen.judges.plans.verdict import Reason, Verdict
@@ -51,7 +52,7 @@ class View:
         path: Path of the tip, of a motion.
         shares: Quantity -> share of the limits, shape (n, K); empty without a motion.
         conditions: Curves of the other conditions; empty without a motion.
-        verdict: The verdict; None without a motion.
+        verdict: The verdict for JSON; None without a motion.
     """
 
     title: str
@@ -63,7 +64,7 @@ class View:
     path: tuple[Body, ...]
     shares: dict[str, Array]
     conditions: tuple[ConditionCurve, ...]
-    verdict: ViewVerdict | None
+    verdict: dict[str, Any] | None
 
 
 @dataclass(frozen=True)
@@ -166,7 +167,7 @@ def _view(  # noqa: PLR0917 - all of them are shown
     if verdict is None or not verdict.margins:
         boundary = plan.boundary
         q = np.array([boundary.start_q[0], boundary.goal_q[0]]).T
-        rejected = None if verdict is None else ViewVerdict(valid=False, reason=str(verdict.reason), causes=())
+        rejected = None if verdict is None else {"valid": False, "reason": str(verdict.reason), "causes": ()}
         return _still(problem, robot, title, q, ("start", "goal"), scene, rejected)
     extra = [margin.time for margin in verdict.margins.values() if not margin.ok]
     world, s, times = along(problem, robot, plan.motion, 0, samples=FRAMES_PER_MOTION, extra_times=extra, scene=scene)
@@ -207,7 +208,7 @@ def _still(  # noqa: PLR0917 - all of them are shown
     q: Array,
     labels: tuple[str, ...],
     scene: Scene,
-    verdict: ViewVerdict | None = None,
+    verdict: dict[str, Any] | None = None,
 ) -> View:
     """Show configurations without a motion."""
     times, world = np.arange(float(len(labels))), tuple(_world(problem, scene))
