@@ -215,23 +215,34 @@ def recipe_to_dict(recipe: Recipe) -> dict[str, Any]:
 
 
 def table(
-    rows: Sequence[Sequence[Any]], *, indent: str = "", right: Sequence[int] = (), one_line: bool = False
+    rows: Sequence[Sequence[Any]],
+    *,
+    indent: str = "",
+    right: Sequence[int] = (),
+    one_line: bool = False,
+    width: int = LINE_WIDTH,
 ) -> list[str]:
-    """Lay out rows as aligned columns that fit into ``LINE_WIDTH``.
+    """Lay out rows as aligned columns.
 
     Args:
         rows: The cells, in rows of the same length. A path in the last column stays in one piece, for scripts.
         indent: Put before every line.
         right: The columns that are aligned to the right.
         one_line: Whether to cut what does not fit into the last column; it is wrapped by default.
+        width: Maximum length of a line.
 
     Returns:
         The lines.
     """
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]) - 1)]
     hanging = indent + " " * (sum(widths) + 2 * len(widths))
-    width, count = max(LINE_WIDTH - len(hanging), 30), 1 if one_line else None
-    wrapper = TextWrapper(width, break_on_hyphens=False, break_long_words=one_line, max_lines=count, placeholder=" ...")
+    wrapper = TextWrapper(
+        max(width - len(hanging), 30),
+        break_on_hyphens=False,
+        break_long_words=one_line,
+        max_lines=1 if one_line else None,
+        placeholder=" ...",
+    )
     lines = []
     for *cells, last in rows:
         pairs = enumerate(zip(cells, widths, strict=True))
