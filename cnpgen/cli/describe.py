@@ -236,13 +236,8 @@ def table(
     """
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]) - 1)]
     hanging = indent + " " * (sum(widths) + 2 * len(widths))
-    wrapper = TextWrapper(
-        max(width - len(hanging), 30),
-        break_on_hyphens=False,
-        break_long_words=one_line,
-        max_lines=1 if one_line else None,
-        placeholder=" ...",
-    )
+    space, count = max(width - len(hanging), 30), 1 if one_line else None
+    wrapper = TextWrapper(space, break_on_hyphens=False, break_long_words=one_line, max_lines=count, placeholder=" ...")
     lines = []
     for *cells, last in rows:
         pairs = enumerate(zip(cells, widths, strict=True))

@@ -1,6 +1,7 @@
 """Arguments that name a recipe or a path; one that does not exist or is of another kind is refused."""
 
 import os
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -124,17 +125,7 @@ def tasks_of(text: str) -> str:
     return text
 
 
-def problem(text: str) -> str:
-    """Read the name or the file of a problem, or of a pipeline or a dataset with it."""
-    return _recipe(text, "problem", "pipeline", "dataset")
-
-
-def suite(text: str) -> str:
-    """Read the name or the file of a suite, a dataset or a pipeline."""
-    return _recipe(text, "suite", "dataset", "pipeline")
-
-
-def _recipe(text: str, *kinds: "Kind") -> str:
+def _recipe(kinds: "tuple[Kind, ...]", text: str) -> str:
     """Read the name or the file of a recipe of one of several kinds."""
     from cnpgen.schema.catalogue import find_recipe
     from cnpgen.store.files.atomic import check_readable
@@ -142,6 +133,10 @@ def _recipe(text: str, *kinds: "Kind") -> str:
     check_recipe(text)
     check_readable(find_recipe(kinds, text))
     return text
+
+
+problem = partial(_recipe, ("problem", "pipeline", "dataset"))  # or a recipe with the problem
+suite = partial(_recipe, ("suite", "dataset", "pipeline"))
 
 
 def family(text: str) -> str:

@@ -177,11 +177,15 @@ def _plain(value: Any, label: Callable[[Any], Mapping[str, Any]]) -> Any:
     return dict(value) if isinstance(value, dict) else value
 
 
+def alternatives(hint: Any) -> tuple[Any, ...]:
+    """Return the alternatives of an annotation without None."""
+    options = get_args(hint) if get_origin(hint) in {Union, UnionType} else (hint,)
+    return tuple(option for option in options if option is not type(None))
+
+
 def _present(hint: Any) -> Any:
     """Return ``X`` for ``X | None``, since TOML has no null."""
-    if get_origin(hint) not in (Union, UnionType):
-        return hint
-    options = [option for option in get_args(hint) if option is not type(None)]
+    options = alternatives(hint)
     return options[0] if len(options) == 1 else hint
 
 

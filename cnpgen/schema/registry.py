@@ -153,14 +153,21 @@ def load(group: str, name: str) -> type[Any]:
     sources = _sources(group, name)
     noun = noun_of(group)
     if not sources:
-        known = names(group)
-        hint = name_hint(group, name)
-        known_names = f"known: {', '.join(known)}, and those of packages with the entry point group {group!r}"
-        raise RecipeError([f"unknown {noun} {name!r}{hint}; {known_names}"])
+        known = f"known: {', '.join(names(group))}, and those of packages with the entry point group {group!r}"
+        raise RecipeError([f"unknown {noun} {name!r}{name_hint(group, name)}; {known}"])
     if len(sources) > 1:
         raise RecipeError([f"{noun} {name!r} is defined more than once: by {' and by '.join(sources)}"])
     source, importer = next(iter(sources.items()))
-    return _imported(importer, f"{noun} {name!r} of {source}", base=contract(group))
+    what, base = f"{noun} {name!r} of {source}", contract(group)
+    try:
+        kind: type[Any] = importer()
+    except Exception as error:  # imported modules may raise any exception
+        raise RecipeError([f"{what} cannot be imported: {type(error).__name__}: {error}"]) from error
+    if not (inspect.isclass(kind) and issubclass(kind, base)):
+        raise RecipeError([f"{what} is not a subclass of {base.__module__}.{base.__name__}, got {kind!r}"])
+    if faults := list(_faults(kind)):
+        raise RecipeError([f"{what}: {fault}" for fault in faults])
+    return kind
 
 
 def name_hint(group: str, name: str) -> str:
@@ -221,9 +228,7 @@ def package_digest(package: str) -> str:
     files = [file for folder in folders for file in sorted(folder.rglob("*.py"))]
     if not folders and source:
         files = [Path(source)]
-    if not files:
-        return ""
-    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest() if files else ""
 
 
 def package_of(group: str, kind: type) -> str:
@@ -274,20 +279,6 @@ def _named(spec: str) -> Any:
     """Import the object ``"module:name"``."""
     module, _, attribute = spec.partition(":")
     return getattr(importlib.import_module(module), attribute)
-
-
-def _imported(importer: Callable[[], Any], what: str, *, base: type) -> type[Any]:
-    """Import a class and check that it is a concrete kind of ``base``."""
-    try:
-        kind = importer()
-    except Exception as error:  # imported modules may raise any exception
-        raise RecipeError([f"{what} cannot be imported: {type(error).__name__}: {error}"]) from error
-    if not (inspect.isclass(kind) and issubclass(kind, base)):
-        raise RecipeError([f"{what} is not a subclass of {base.__module__}.{base.__name__}, got {kind!r}"])
-    faults = list(_faults(kind))
-    if faults:
-        raise RecipeError([f"{what}: {fault}" for fault in faults])
-    return kind
 
 
 def _faults(kind: type[Any]) -> Iterator[str]:
