@@ -19,17 +19,7 @@ DOCUMENTS = 90_000  # bytes: specification.json, manifest, card and statistics
 
 
 def spec_text(recipe: DatasetRecipe, out: str | None, *, force: bool, **settings: Any) -> str:
-    """Resolve the specification of a dataset without making anything, and describe it.
-
-    Args:
-        recipe: The recipe.
-        out: Its folder; None for the default.
-        force: Whether another dataset in the folder would be replaced.
-        settings: Arguments of ``draw_up``.
-
-    Raises:
-        CnpgenError: The dataset cannot be made like this.
-    """
+    """Resolve the specification of a dataset by ``draw_up`` without making anything, and describe it."""
     load_notes(recipe)
     workspace = find_workspace(dataset_folder(recipe, out))
     spec = draw_up(recipe, workspace, **settings, force=force).spec

@@ -41,11 +41,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def list_all(what: str) -> list[dict[str, Any]]:
-    """List the recipes of one kind, the models, or a group of kinds, with name, title and size.
-
-    Args:
-        what: One of ``WHAT``.
-    """
+    """List the recipes of one kind, the models, or a group of kinds, of ``WHAT``, with name, title and size."""
     from cnpgen.planner.model_file import shipped_models
     from cnpgen.schema import registry
     from cnpgen.schema.catalogue import list_recipes

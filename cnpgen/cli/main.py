@@ -137,14 +137,7 @@ class _Version(argparse.Action):
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line.
-
-    Args:
-        argv: The arguments; those of the process by default.
-
-    Returns:
-        The exit code, as ``cnpgen --help`` lists them.
-    """
+    """Run the command line with arguments, by default those of the process; return the exit code."""
     words, given = list(sys.argv[1:] if argv is None else argv), argparse.Namespace()
     prefer_one_thread()
     _prepare_streams()
@@ -227,9 +220,7 @@ def _explain(error: BaseException, options: Container[str]) -> tuple[Sequence[st
 def shell_spelling(options: Container[str]) -> Spelling:
     """Return a spelling for ``CnpgenError.text``: ``force=True`` becomes ``--force``, ``workers=2`` ``--workers 2``.
 
-    Args:
-        options: Options of the command, as argparse names them: ``"learning_rate"``. Other arguments keep the Python
-            spelling.
+    Arguments that are no options of the command, as argparse names them, keep the Python spelling.
     """
 
     def spell(name: str, value: object) -> str:

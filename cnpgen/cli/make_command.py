@@ -88,11 +88,7 @@ def make_metered(
 ) -> None:
     """Make a dataset with progress and a summary on stderr, and print its folder.
 
-    Args:
-        make: Takes ``begin`` and ``progress``, as ``make_dataset`` does.
-        quiet: Whether to print nothing on stderr.
-        part: Which part of the dataset is made.
-        verb: Past participle of the action.
+    ``make`` takes ``begin`` and ``progress``, as ``make_dataset`` does; the verb of the summary is a past participle.
     """
     meter = Meter(quiet=quiet)
 

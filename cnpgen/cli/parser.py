@@ -64,18 +64,7 @@ Options = argparse._ActionsContainer  # a parser or a group of its options: opti
 
 
 def add_command(commands: "Commands[Parser]", name: str, run: Command, *, title: str, text: str = "") -> Parser:
-    """Add a command.
-
-    Args:
-        commands: The commands of the parser.
-        name: Name of the command.
-        run: Function that runs it.
-        title: Summary for the list of commands.
-        text: Details for its own help.
-
-    Returns:
-        The parser of its own arguments.
-    """
+    """Add a command with a title for the list of commands and a text for its help; return the parser of its options."""
     parser = commands.add_parser(name, help=title, description=f"{title[0].upper()}{title[1:]}.", epilog=text or None)
     add_debug(parser, default=argparse.SUPPRESS)  # keep an option before the command
     parser.set_defaults(run=run, parser=parser)

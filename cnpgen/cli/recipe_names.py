@@ -23,12 +23,7 @@ _HINTS = {  # what a file is -> what to do with it
 def check_recipe(recipe: str, *, of_dataset: str = DATASET) -> None:
     """Refuse the folder of a dataset, tables and HDF5 files, before they are looked for, or read, as recipes.
 
-    Args:
-        recipe: Name or path.
-        of_dataset: What to do with a dataset; "{0}" is its folder.
-
-    Raises:
-        UsageError: It is one of these.
+    ``of_dataset`` is the hint for a dataset, in whose folder "{0}" stands.
     """
     from cnpgen.store.files.atomic import check_readable
     from cnpgen.store.paths import file_kind
@@ -58,16 +53,7 @@ def is_recipe(what: str) -> bool:
 
 
 def check_there(what: str, *kinds: str) -> None:
-    """Refuse an argument that is neither a path nor the name of a recipe.
-
-    Args:
-        what: Name or path of a recipe, or the folder of a dataset.
-        *kinds: Kinds of recipes, datasets and pipelines by default.
-
-    Raises:
-        UsageError: No recipe has this name.
-        MachineError: The path cannot be read.
-    """
+    """Refuse an argument that is neither a path nor the name of a recipe, by default of a dataset or a pipeline."""
     from cnpgen.store.files.atomic import check_readable
     from cnpgen.store.files.kind import kind_of_content
     from cnpgen.store.paths import similar_path

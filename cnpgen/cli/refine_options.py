@@ -75,12 +75,7 @@ def refine_and_save(
 ) -> int:
     """Refine plans, save them, print a summary; return the exit code.
 
-    Args:
-        arguments: What ``add_options`` added.
-        plans: The plans; None if ``make`` has them.
-        out: Where they go.
-        title: What is going on.
-        make: ``refine_plans`` by default, ``solve_plans``, or a function that solves scenes.
+    ``make`` is ``refine_plans`` by default, ``solve_plans``, or a function that solves scenes and has no plans.
     """
     from cnpgen.plans import save_plans
     from cnpgen.refine.options import RefineOptions

@@ -127,11 +127,7 @@ def add_settings(parser: Parser) -> None:
 
 
 def changed_settings(settings: "TrainingSettings", arguments: argparse.Namespace) -> "TrainingSettings":
-    """Return settings with the options that were passed.
-
-    Raises:
-        UsageError: A value is invalid, or an option has no effect on the metric.
-    """
+    """Return settings with the options that were passed; refuse those without effect on the metric."""
     from cnpgen.training.settings import METRICS
 
     changes = {name: value for name, value in options_of(arguments, *_OPTIONS).items() if value is not None}

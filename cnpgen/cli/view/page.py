@@ -25,11 +25,7 @@ _PROBE = 0.5  # joint displacement from which the axis of a joint is computed
 
 
 def page_of(scene: ViewScene, *, stamp: str = "") -> str:
-    """Write a scene as a page.
-
-    Args:
-        scene: The scene.
-        stamp: State of the files behind it; a served page reloads when the server has another one.
+    """Write a scene as a page; a served one reloads when the server has another stamp of the files behind it.
 
     Raises:
         MissingExtraError: MeshCat is not installed.

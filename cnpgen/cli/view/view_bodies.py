@@ -46,10 +46,7 @@ class Body:
 def robot_bodies(problem: Problem, robot: Robot, *, with_meshes: bool = True) -> tuple[list[Body], str]:
     """Return the bodies of a robot, and their kind: "meshes", "convex parts" or "line".
 
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        with_meshes: Whether to read the visual meshes that its URDF names; false for untrusted files.
+    ``with_meshes`` reads the visual meshes that the URDF names; it is false for untrusted files.
     """
     try:
         visual = list(_visual_bodies(problem, robot)) if with_meshes else []

@@ -114,16 +114,7 @@ def scene_of_plans(
     *,
     with_meshes: bool,
 ) -> ViewScene:
-    """Show motions or, of rows without a plan, their starts and goals.
-
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        plans: The plans.
-        titles: Title of each plan.
-        verdicts: Verdict on each plan; None for rows without a plan.
-        with_meshes: Whether the URDF's visual meshes are read.
-    """
+    """Show motions or, of rows without a plan, which have no verdict, their starts and goals."""
     scene = plans.scene
     views = [
         _view(problem, robot, plans[i : i + 1], titles[i], verdicts[i], scene[i : i + 1]) for i in range(len(plans))
@@ -138,15 +129,7 @@ def scene_of_trajectories(
     titles: Sequence[str],
     verdicts: Sequence[TrajectoryVerdict],
 ) -> ViewScene:
-    """Show sampled trajectories, by the interpolation that their derivatives determine.
-
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        trajectories: The trajectories.
-        titles: Title of each.
-        verdicts: Verdict on each.
-    """
+    """Show sampled trajectories, by the interpolation that their derivatives determine."""
     views = []
     for trajectory, title, verdict in zip(trajectories, titles, verdicts, strict=True):
         margins = {name: entry.margin for name, entry in verdict.conditions.items()}
