@@ -96,11 +96,9 @@ def run(arguments: argparse.Namespace) -> int:
         return 0
     if arguments.suite is None:
         raise UsageError("the argument SUITE is missing; 'cnpgen benchmark --list' lists suites")
-    if (arguments.plant or arguments.environment) and not arguments.simulate:
-        option = "--plant" if arguments.plant else "--environment"
-        raise UsageError(f"{option} needs --simulate")
-    if arguments.video and not arguments.simulate:
-        raise UsageError("--video needs --simulate")
+    for name in ("plant", "environment", "video"):
+        if getattr(arguments, name) and not arguments.simulate:
+            raise UsageError(f"--{name} needs --simulate")
     if arguments.search:
         return _search(arguments)
     folder = arguments.out or Path(f"{Path(arguments.suite).stem}-results")

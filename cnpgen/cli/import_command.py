@@ -48,10 +48,9 @@ def run(arguments: argparse.Namespace) -> int:
     from cnpgen.store.files.kind import PLANS
     from cnpgen.store.paths import file_kind
 
-    out = arguments.out
     if file_kind(arguments.file) == PLANS:
         raise UsageError(f"{arguments.file} is {PLANS} already: 'cnpgen refine' optimizes them")
-    check_place(out, force=arguments.force)
+    check_place(arguments.out, force=arguments.force)
     problem = problem_of(arguments)
     loaded = load_file(arguments, problem)
     imported = import_trajectories(
@@ -62,7 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
         source=f"imported from {arguments.file.name}",
     )
     plans = imported.plans if arguments.stay_within is None else _refined(imported.plans, arguments.stay_within)
-    save_plans(out, plans)
+    save_plans(arguments.out, plans)
     points = imported.plans.path_control_points.shape[1]
     print(
         f"imported {counted(len(imported.plans), 'plan')} with {points} control points of the path;"
@@ -74,7 +73,7 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"plan {index}: the ends cannot be moved onto the constraints by a small change", file=sys.stderr)
     largest = float(np.nanmax(imported.snapped)) if len(failed) < len(imported.plans) else 0.0
     print(f"ends moved by at most {largest:.2g} rad to meet the constraints", file=sys.stderr)
-    print(out)
+    print(arguments.out)
     return 0
 
 

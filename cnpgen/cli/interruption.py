@@ -24,12 +24,7 @@ def exit_code(interruption: KeyboardInterrupt) -> int:
 
 
 def raise_if_interrupted() -> None:
-    """Raise the interruption again, because libraries that call back into Python may have dropped it.
-
-    Raises:
-        KeyboardInterrupt: The process was interrupted.
-        Terminated: The process was asked to end.
-    """
+    """Raise the interruption again, because libraries that call back into Python may have dropped it."""
     if _interruptions:
         raise Terminated if _interruptions[0] == signal.SIGTERM else KeyboardInterrupt
 

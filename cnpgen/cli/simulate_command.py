@@ -90,16 +90,10 @@ def _text(file: Path, found: "Simulation") -> str:
 
     summary, count = found.summary(), len(found.executed)
     head = f"{file}: {counted(count, 'plan')} of {found.plans.problem.name}, executed by the {found.plant.name} plant"
-    tallies = [
-        (text, f"{summary[name]:,} of {count:,}", f"{summary[name] / count:.2%}")
-        for name, text in _NAMES.items()
-        if name in summary
-    ]
-    figures = [
-        (text, form.format(summary["medians"][name]))
-        for name, (text, form) in _figures(found).items()
-        if name in summary["medians"]
-    ]
+    counts = {text: summary[name] for name, text in _NAMES.items() if name in summary}
+    tallies = [(text, f"{number:,} of {count:,}", f"{number / count:.2%}") for text, number in counts.items()]
+    shown = {name: figure for name, figure in _figures(found).items() if name in summary["medians"]}
+    figures = [(text, form.format(summary["medians"][name])) for name, (text, form) in shown.items()]
     lines = [head, "", *table(tallies, indent="  ", right=(1, 2)), "", "  medians", *table(figures, indent="    ")]
     refused = [(index, each.failure) for index, each in enumerate(found.executed) if each.failure]
     return "\n".join(lines + [f"  plan {index} was not executed: {why}" for index, why in refused])

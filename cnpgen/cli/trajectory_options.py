@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -58,8 +59,6 @@ def problem_of(arguments: argparse.Namespace) -> "str | Problem":
 
 def load_file(arguments: argparse.Namespace, problem: "str | Problem") -> "LoadedTrajectories":
     """Load the trajectories of a command, and list the columns that are not used on stderr."""
-    import sys
-
     from cnpgen.plans.load_trajectories import load_trajectories
 
     given = options_of(arguments, *TRAJECTORY_OPTIONS)

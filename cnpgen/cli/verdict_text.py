@@ -52,7 +52,7 @@ def _reasons(found: "Evaluation", summary: dict[str, Any]) -> list[tuple[str, ..
     rows: list[tuple[str, ...]] = [("not valid because", "plans", "the worst of them")]
     for reason, number in summary["reasons"].items():
         plans = [(index, verdict) for index, verdict in enumerate(found.verdicts) if str(verdict.reason) == reason]
-        index, worst = max(plans, key=lambda plan: _severity(plan[1]))
+        index, worst = max(plans, key=lambda plan: plan[1].worst.severity if plan[1].worst else -math.inf)
         if not worst.valid:
             why = _why(worst)
             rows.append((reason, f"{number:,}", f"plan {index}{why and f': {why}'}"))
@@ -72,10 +72,6 @@ def _why(verdict: "Verdict") -> str:
     if verdict.reason == Reason.TOO_LONG:
         return f"{verdict.metrics.duration:.3g} s are more than {MAX_DURATION_S:,.0f} s"
     return str(verdict.worst or "")
-
-
-def _severity(verdict: "Verdict") -> float:
-    return verdict.worst.severity if verdict.worst else -math.inf
 
 
 def _figures(summary: dict[str, Any]) -> list[tuple[str, ...]]:
