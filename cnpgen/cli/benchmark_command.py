@@ -119,10 +119,9 @@ def _search(arguments: argparse.Namespace) -> int:
     if others or arguments.planners not in (None, [planner]) or arguments.set or arguments.repeat != 1:
         raise UsageError("--search has fields of one planner, without --planners, --set and --repeat")
     folder = arguments.out or Path(f"{Path(arguments.suite).stem}-search")
+    options = {"trials": arguments.trials, **_options(arguments)}
     with resumable(folder):
-        trials = search_parameters(
-            arguments.suite, folder, planner, ranges, trials=arguments.trials, **_options(arguments)
-        )
+        trials = search_parameters(arguments.suite, folder, planner, ranges, **options)
     documents = json.dumps([asdict(trial) for trial in trials], indent=2) + "\n"
     sys.stdout.write(documents if arguments.json else csv_of(trials, list(ranges)))
     print(f"trials: {folder / SEARCH_FILE}", file=sys.stderr)
@@ -194,9 +193,8 @@ def _text(found: "Benchmark") -> str:
 
     head = f"{found.suite.name} {found.suite.version}: {len(found.problems)} problems"
     tables = [table([(*row, "") for row in table_rows(found, plant)], indent="  ") for plant in found.executions]
-    return "\n\n".join(
-        [head, *("\n".join(lines) for lines in tables), "\n".join([*failure_summaries(found), *notes(found)])]
-    )
+    sections = [[head], *tables, [*failure_summaries(found), *notes(found)]]
+    return "\n\n".join("\n".join(lines) for lines in sections)
 
 
 def _listing(*, as_json: bool) -> str:

@@ -158,9 +158,8 @@ def title_lines(title: str) -> list[str]:
 def numbers(obj: Any, *, leave_out: Sequence[str] = ()) -> str:
     """List the keys of an object that was read from a table, with values and units, without those left at nothing."""
     values = [(key, getattr(obj, key.name)) for key in keys(type(obj)) if key.name not in leave_out]
-    return ", ".join(
-        f"{key.name} {quantity(value, key.unit)}" for key, value in values if value != key.default or value
-    )
+    shown = [(key, value) for key, value in values if value != key.default or value]
+    return ", ".join(f"{key.name} {quantity(value, key.unit)}" for key, value in shown)
 
 
 def quantity(value: Any, unit: str = "1") -> str:

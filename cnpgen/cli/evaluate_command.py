@@ -45,10 +45,8 @@ def add(commands: "Commands[Parser]") -> None:
     option("--problem", metavar="NAME|FILE", type=recipe_names.problem, help=text)
     text = "time between two samples (default: 1ms, at most 10ms)"
     option("--step", metavar="S", type=values.seconds, default=1e-3, help=text)
-    text = (
-        "largest tracking error of the joints, such as 2deg: position limits, clearances and the manifold hold within"
-    )
-    text += " it; one number, or one per joint (default: exact tracking)"
+    text = "largest tracking error of the joints, such as 2deg: position limits, clearances and the manifold hold"
+    text += " within it; one number, or one per joint (default: exact tracking)"
     option("--tracking-error", metavar="E,...", type=values.tracking_errors, help=text)
     option("--workers", metavar="W", type=values.positive, help="processes; default one per available core")
     option("--list", action="store_true", help="also list the plans, one per line, invalid ones first")

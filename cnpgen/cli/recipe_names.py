@@ -47,9 +47,7 @@ def check_recipe(recipe: str, *, of_dataset: str = DATASET) -> None:
 def is_recipe(what: str) -> bool:
     """Return whether an argument is a recipe file, or the name of a shipped dataset or pipeline and no path."""
     path = Path(what)
-    return (
-        path.suffix == ".toml" if path.exists() else path.suffix == ".toml" or what in _shipped("dataset", "pipeline")
-    )
+    return path.suffix == ".toml" or (not path.exists() and what in _shipped("dataset", "pipeline"))
 
 
 def check_there(what: str, *kinds: str) -> None:

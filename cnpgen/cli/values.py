@@ -6,6 +6,7 @@ from argparse import ArgumentTypeError
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from decimal import Decimal
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +21,7 @@ MAX_SELECTED = 10**7  # of the numbers in a range
 
 
 def whole(text: str) -> int:
-    """Read a whole number: ``120000``, ``120_000``, or ``1e6`` if it is exact.
-
-    Raises:
-        ValueError: The text is no whole number.
-    """
+    """Read a whole number: ``120000``, ``120_000``, or ``1e6`` if it is exact; raise ValueError for other texts."""
     if len(text) <= _MAX_DIGITS and _PLAIN.fullmatch(text):
         return int(text)
     if len(text) <= _MAX_DIGITS and _SCIENTIFIC.fullmatch(text):
@@ -34,7 +31,7 @@ def whole(text: str) -> int:
     raise ValueError(f"no whole number: {text[:_MAX_DIGITS]!r}")
 
 
-def _at_least(low: int, text: str, example: str) -> int:
+def _at_least(low: int, example: str, text: str) -> int:
     try:
         number = whole(text)
     except ValueError:
@@ -44,22 +41,16 @@ def _at_least(low: int, text: str, example: str) -> int:
     return number
 
 
+positive = partial(_at_least, 1, "4")
+natural = partial(_at_least, 0, "7")
+
+
 def rows(text: str) -> int:
     """Read a number of rows, 1 to 10^12."""
-    number = _at_least(1, text, "120000, 120_000 or 1e6")
+    number = _at_least(1, "120000, 120_000 or 1e6", text)
     if number > MAX_ROWS_ARGUMENT:
         raise ArgumentTypeError(f"expected at most {MAX_ROWS_ARGUMENT:.0e} rows, got {text!r}")
     return number
-
-
-def positive(text: str) -> int:
-    """Read a whole number, at least 1."""
-    return _at_least(1, text, "4")
-
-
-def natural(text: str) -> int:
-    """Read a whole number, at least 0."""
-    return _at_least(0, text, "7")
 
 
 def port(text: str) -> int:
@@ -118,32 +109,17 @@ def file_in(*endings: str) -> Callable[[str], str]:
 plot_file = file_in(".png", ".pdf", ".svg")
 
 
-def seconds(text: str) -> float:
-    """Read a time above 0: ``0.001`` or ``1ms``."""
-    return _quantity(text, "s", "a time above 0, such as 0.001 or 1ms")
-
-
 def seconds_with_unit(text: str) -> float:
     """Read a time above 0 with its unit, where a number alone is probably meant in another one: ``10ms``."""
     time = seconds(text)
     if text.strip()[-1:].isdigit() or text.strip().endswith("."):
-        raise ArgumentTypeError(
-            f"expected a time with its unit, such as 10ms; got {text!r}, is it {text}ms or {text}s?"
-        )
+        text = f"expected a time with its unit, such as 10ms; got {text!r}, is it {text}ms or {text}s?"
+        raise ArgumentTypeError(text)
     return time
 
 
-def meters(text: str) -> float:
-    """Read a length above 0: ``0.02`` or ``20mm``."""
-    return _quantity(text, "m", "a length above 0, such as 0.02 or 20mm")
-
-
-def hertz(text: str) -> float:
-    """Read a rate above 0: ``1000`` or ``1000Hz``."""
-    return _quantity(text, "1/s", "a rate above 0, such as 1000 or 1000Hz")
-
-
-def _quantity(text: str, unit: str, expected: str) -> float:
+def _quantity(unit: str, expected: str, text: str) -> float:
+    """Read a number above 0, in SI or with its unit."""
     from cnpgen.schema.units import parse_number
 
     try:
@@ -154,6 +130,11 @@ def _quantity(text: str, unit: str, expected: str) -> float:
     if number <= 0:
         raise ArgumentTypeError(f"expected {expected}; got {text!r}")
     return number
+
+
+seconds = partial(_quantity, "s", "a time above 0, such as 0.001 or 1ms")
+meters = partial(_quantity, "m", "a length above 0, such as 0.02 or 20mm")
+hertz = partial(_quantity, "1/s", "a rate above 0, such as 1000 or 1000Hz")
 
 
 def numbers(text: str) -> tuple[int, ...]:
@@ -192,9 +173,8 @@ def errors(text: str) -> float | tuple[float, ...]:
     """Read one number or three, at least 0: ``1e-3`` or ``1e-3,1e-2,0.5``."""
     found = _numbers(text)
     if len(found) not in {1, 3} or not all(0 <= value < math.inf for value in found):
-        raise ArgumentTypeError(
-            f"expected one number or three, at least 0, such as 1e-3 or 1e-3,1e-2,0.5; got {text[:60]!r}"
-        )
+        expected = "one number or three, at least 0, such as 1e-3 or 1e-3,1e-2,0.5"
+        raise ArgumentTypeError(f"expected {expected}; got {text[:60]!r}")
     return _one_or_several(found)
 
 
@@ -236,9 +216,8 @@ def payload(text: str) -> tuple[float, ...]:
     """Read a mass [kg], or a mass and the centre of mass in the tip frame [m]: ``2`` or ``2,0,0,0.1``."""
     found = _numbers(text)
     if len(found) not in {1, 4} or not all(map(math.isfinite, found)) or found[0] <= 0:
-        raise ArgumentTypeError(
-            f"expected a mass above 0, with or without the centre of mass, such as 2 or 2,0,0,0.1; got {text[:60]!r}"
-        )
+        expected = "a mass above 0, with or without the centre of mass, such as 2 or 2,0,0,0.1"
+        raise ArgumentTypeError(f"expected {expected}; got {text[:60]!r}")
     return found
 
 
