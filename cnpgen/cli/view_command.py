@@ -88,6 +88,7 @@ def _scene(arguments: argparse.Namespace) -> "ViewScene":
     """Build the scene of a problem, of samples or of plans."""
     from cnpgen.cli.view.view_scene import scene_of_plans, scene_of_problem
     from cnpgen.plans import open_problem
+    from cnpgen.plans.evaluate import evaluate_plans
     from cnpgen.plans.trajectory_tables import holds_trajectories, is_trajectory_file
     from cnpgen.problems.load_robot import load_robot
     from cnpgen.problems.problem_file import load_problem_behind
@@ -114,7 +115,10 @@ def _scene(arguments: argparse.Namespace) -> "ViewScene":
         problem, robot = open_problem(plans.problem)
     noun = "row" if what.is_dir() else "plan"
     titles = [f"{problem.name}: {what.name}, {noun} {row}" for row in rows]
-    verdicts = _verdicts(plans, of_samples=what.is_dir())
+    verdicts: list[Verdict | None] = list(evaluate_plans(plans, workers=1).verdicts)
+    if what.is_dir():  # samples without a plan have a duration of nan and no verdict
+        pairs = zip(plans.duration.tolist(), verdicts, strict=True)
+        verdicts = [None if math.isnan(duration) else verdict for duration, verdict in pairs]
     scene = scene_of_plans(problem, robot, plans, titles, verdicts, with_meshes=bool(arguments.problem))
     return replace(scene, first_row=rows[0], n_rows=count)
 
@@ -138,15 +142,6 @@ def _scene_of_trajectories(arguments: argparse.Namespace, rows: Sequence[int]) -
     verdicts = evaluate_trajectories(problem, chosen).verdicts
     scene = scene_of_trajectories(problem, load_robot(problem), chosen, titles, verdicts)
     return replace(scene, first_row=rows[0], n_rows=count)
-
-
-def _verdicts(plans: "Plans", *, of_samples: bool) -> "list[Verdict | None]":
-    """Judge plans; None for samples without a plan, whose durations are nan."""
-    from cnpgen.plans.evaluate import evaluate_plans
-
-    verdicts = evaluate_plans(plans, workers=1).verdicts
-    pairs = zip(plans.duration.tolist(), verdicts, strict=True)
-    return [None if of_samples and math.isnan(duration) else verdict for duration, verdict in pairs]
 
 
 def _samples(arguments: argparse.Namespace, rows: Sequence[int]) -> "tuple[Plans, int]":

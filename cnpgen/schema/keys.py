@@ -111,11 +111,7 @@ class Key:
 
 
 def keys(cls: type) -> tuple[Key, ...]:
-    """List the keys of a dataclass, in order.
-
-    Args:
-        cls: Dataclass; fields that are not declared with ``field`` are not keys.
-    """
+    """List the keys of a dataclass, in order; fields that are not declared with ``field`` are not keys."""
     return _keys_of(cls)
 
 

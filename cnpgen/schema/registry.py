@@ -128,11 +128,7 @@ RENAMED: dict[str, dict[str, str]] = {PLANNERS: {"cnp-b": "cnpgen", "cnp-b+refin
 
 
 def names(group: str) -> tuple[str, ...]:
-    """List the kinds of a group: the built-in ones in their order, then those of installed packages by name.
-
-    Args:
-        group: ``STAGES``, ``CONSTRAINTS``, ``OBJECTIVES``, ``PLANNERS``, ``EXPORTERS`` or ``FAMILIES``.
-    """
+    """List the kinds of a group: the built-in ones in their order, then those of installed packages by name."""
     others = {entry.name for entry in installed(group)} - BUILT_IN[group].keys()
     return (*BUILT_IN[group], *sorted(others))
 
@@ -194,12 +190,7 @@ def group_of(kind: type) -> str:
 
 
 def name_of(group: str, kind: type) -> str:
-    """Return the name under which a class is registered, or ``"module:Class"`` if it is not.
-
-    Args:
-        group: ``STAGES``, ``CONSTRAINTS``, ``OBJECTIVES``, ``PLANNERS``, ``EXPORTERS`` or ``FAMILIES``.
-        kind: The class.
-    """
+    """Return the name under which a class is registered in a group, or ``"module:Class"`` if it is not."""
     spec = f"{kind.__module__}:{kind.__qualname__}"
     for name, built_in in BUILT_IN[group].items():
         if built_in == spec:
@@ -239,13 +230,7 @@ def package_of(group: str, kind: type) -> str:
 
 
 def why_missing(group: str, use: str, package: str) -> str:
-    """Return the missing package of a kind in a recipe; empty if the kind exists.
-
-    Args:
-        group: ``STAGES``, ``CONSTRAINTS``, ``OBJECTIVES``, ``PLANNERS``, ``EXPORTERS`` or ``FAMILIES``.
-        use: Name of the kind.
-        package: The package that had it, empty if that is not known.
-    """
+    """Return a message with the package of a missing kind, which may be empty if unknown; empty if the kind exists."""
     if use in names(group):
         return ""
     noun = noun_of(group)

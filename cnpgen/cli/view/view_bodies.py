@@ -68,14 +68,7 @@ def capsule_bodies(robot: Robot) -> list[Body]:
 
 
 def wrapped(name: str, joint: int, corners: Array, radius: float) -> Body:
-    """Return the hull of points, inflated by a radius, as triangles that face outwards.
-
-    Args:
-        name: Name of the body.
-        joint: Index of the joint that moves it.
-        corners: The points [m], shape (V, 3).
-        radius: Thickness of the layer around the hull [m].
-    """
+    """Return the hull of points [m], shape (V, 3), inflated by a radius [m], as triangles that face outwards."""
     from scipy.spatial import ConvexHull
 
     points = (corners[:, None] + radius * _ball()).reshape(-1, 3) if radius else corners

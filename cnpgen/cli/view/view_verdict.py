@@ -17,12 +17,7 @@ def view_verdict(
 ) -> dict[str, Any]:
     """Return a verdict for JSON, its margins located in time and space, the largest violation first.
 
-    Args:
-        verdict: The verdict on a plan.
-        curves: Curves of its conditions.
-        times: Times of the K frames [s].
-        poses: Poses of the joints, the universe first and the tip last, shape (K, joints, 4, 4).
-        joints: Names of the planned joints.
+    The poses of the joints, the universe first and the tip last, have shape (K, joints, 4, 4), the times [s] (K,).
     """
     by_name = {curve.name: curve for curve in curves}
     margins = sorted(verdict.margins.values(), key=lambda margin: -margin.severity)
