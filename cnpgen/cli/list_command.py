@@ -42,13 +42,14 @@ def run(arguments: argparse.Namespace) -> int:
 
 def list_all(what: str) -> list[dict[str, Any]]:
     """List the recipes of one kind, the models, or a group of kinds, of ``WHAT``, with name, title and size."""
-    from cnpgen.planner.model_file import shipped_models
     from cnpgen.schema import registry
-    from cnpgen.schema.catalogue import list_recipes
 
     group = f"cnpgen.{what}"
     if group in registry.CONTRACTS:
         return [{"name": name, "title": _summary(group, name)} for name in registry.names(group)]
+    from cnpgen.planner.model_file import shipped_models
+    from cnpgen.schema.catalogue import list_recipes
+
     describe = {"datasets": _dataset, "models": _model, "pipelines": _pipeline, "problems": _problem}[what]
     kinds: dict[str, Kind] = {"datasets": "dataset", "pipelines": "pipeline", "problems": "problem"}
     files = list_recipes(kinds[what]) if what in kinds else shipped_models()
