@@ -51,7 +51,7 @@ _MODULES = ("benchmark", "errors", "losses", "plugins", "recipes", "results", "s
 
 
 def _lazy_exports(package: str, file: str) -> tuple[list[str], Callable[[str], Any], Callable[[], list[str]]]:
-    """Return ``__all__``, ``__getattr__`` and ``__dir__`` of a package whose stub beside ``file`` lists its names."""
+    """Return ``__all__``, ``__getattr__`` and ``__dir__`` of a module whose stub beside ``file`` lists its names."""
     stub = ast.parse(Path(file).with_suffix(".pyi").read_text(encoding="utf-8"))
     imports = [node for node in stub.body if isinstance(node, ast.ImportFrom)]
     modules = {alias.name: str(node.module) for node in imports for alias in node.names}

@@ -181,9 +181,9 @@ def test_every_module_is_imported_or_registered() -> None:
 
 
 def public_modules() -> set[str]:
-    """Return the modules of the public names in the package's stub."""
-    stub = ast.parse((PACKAGE / "__init__.pyi").read_text(encoding="utf-8"))
-    return {str(node.module) for node in stub.body if isinstance(node, ast.ImportFrom)}
+    """Return the modules of the public names in the stubs."""
+    stubs = [ast.parse(path.read_text(encoding="utf-8")) for path in PACKAGE.rglob("*.pyi")]
+    return {str(node.module) for stub in stubs for node in stub.body if isinstance(node, ast.ImportFrom)}
 
 
 def kinds_by_name() -> set[str]:

@@ -126,7 +126,10 @@ def test_the_walk_sees_functions_fields_methods_and_properties() -> None:
     assert {cnpgen.Problem, cnpgen.Boundary, cnpgen.Scene, cnpgen.recipes.TrajectorySpec} <= classes
 
 
-@pytest.mark.parametrize("package", ["cnpgen", "cnpgen.losses", "cnpgen.benchmark"])
+STUBS = ["cnpgen", *(f"cnpgen.{name}" for name in MODULES if name != "errors")]
+
+
+@pytest.mark.parametrize("package", STUBS)
 def test_a_stub_lists_every_name_once_and_nothing_else(package: str) -> None:
     module = importlib.import_module(package)
     stub = Path(str(module.__file__)).with_suffix(".pyi").read_text(encoding="utf-8")

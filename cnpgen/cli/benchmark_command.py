@@ -3,14 +3,13 @@
 import argparse
 import json
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cnpgen.cli import recipe_names, values
-from cnpgen.cli.parser import Commands, Parser, add_command, add_engine, add_json
+from cnpgen.cli.interruption import resumable
+from cnpgen.cli.parser import ENGINE, Commands, Parser, add_command, add_engine, add_json, options_of
 from cnpgen.cli.progress import Meter
 from cnpgen.errors import CnpgenError, UsageError
 
@@ -39,12 +38,8 @@ def add(commands: "Commands[Parser]") -> None:
     option("--n", metavar="N", type=values.positive, help="number of problems; a random suite has any number")
     option("--simulate", action="store_true", help="also execute the plans")
     option("--plant", metavar="NAME", nargs="+", help="simulated robots that execute them (default: nominal)")
-    option(
-        "--environment",
-        metavar="PATH",
-        type=Path,
-        help="also execute them in this clone of the Air Hockey Challenge",
-    )
+    text = "also execute them in this clone of the Air Hockey Challenge"
+    option("--environment", metavar="PATH", type=Path, help=text)
     option("--video", action="store_true", help="film the first plan of every planner for the report")
     option("--time-limit", metavar="S", type=values.seconds, default=60.0, help="time limit per problem (default: 60s)")
     text = "processes for execution, and with --engine for planning; default one per available core"
@@ -68,16 +63,11 @@ def add(commands: "Commands[Parser]") -> None:
 
 def parameter(text: str) -> tuple[str, str, Any]:
     """Read a field of a planner: its name, the key and the value, as in a recipe or as plain text."""
-    import tomllib
-
     left, equals, value = text.partition("=")
     name, dot, key = left.rpartition(".")
     if not (equals and dot and name and key):
         raise argparse.ArgumentTypeError(f"expected NAME.KEY=VALUE, such as trajopt.iterations=50, got {text!r}")
-    try:
-        return name, key, tomllib.loads(f"value = {value}")["value"]
-    except tomllib.TOMLDecodeError:
-        return name, key, value
+    return name, key, values.toml_value(value)
 
 
 def parameter_range(text: str) -> tuple[str, str, tuple[float, float]]:
@@ -106,11 +96,9 @@ def run(arguments: argparse.Namespace) -> int:
         return 0
     if arguments.suite is None:
         raise UsageError("the argument SUITE is missing; 'cnpgen benchmark --list' lists suites")
-    if (arguments.plant or arguments.environment) and not arguments.simulate:
-        option = "--plant" if arguments.plant else "--environment"
-        raise UsageError(f"{option} needs --simulate")
-    if arguments.video and not arguments.simulate:
-        raise UsageError("--video needs --simulate")
+    for name in ("plant", "environment", "video"):
+        if getattr(arguments, name) and not arguments.simulate:
+            raise UsageError(f"--{name} needs --simulate")
     if arguments.search:
         return _search(arguments)
     folder = arguments.out or Path(f"{Path(arguments.suite).stem}-results")
@@ -131,10 +119,9 @@ def _search(arguments: argparse.Namespace) -> int:
     if others or arguments.planners not in (None, [planner]) or arguments.set or arguments.repeat != 1:
         raise UsageError("--search has fields of one planner, without --planners, --set and --repeat")
     folder = arguments.out or Path(f"{Path(arguments.suite).stem}-search")
-    with _kept(folder):
-        trials = search_parameters(
-            arguments.suite, folder, planner, ranges, trials=arguments.trials, **_options(arguments)
-        )
+    options = {"trials": arguments.trials, **_options(arguments)}
+    with resumable(folder):
+        trials = search_parameters(arguments.suite, folder, planner, ranges, **options)
     documents = json.dumps([asdict(trial) for trial in trials], indent=2) + "\n"
     sys.stdout.write(documents if arguments.json else csv_of(trials, list(ranges)))
     print(f"trials: {folder / SEARCH_FILE}", file=sys.stderr)
@@ -152,7 +139,7 @@ def _run(arguments: argparse.Namespace, folder: Path) -> "Benchmark":
             meter.begin(what, total, done - 1)
         meter(1)
 
-    with meter, _kept(folder):
+    with meter, resumable(folder):
         return run_benchmark(
             arguments.suite,
             folder,
@@ -167,19 +154,9 @@ def _run(arguments: argparse.Namespace, folder: Path) -> "Benchmark":
 
 def _options(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return the options of a run and of the runs of a search."""
-    names = ("n", "environment", "time_limit", "seed", "plane_tolerance", "workers", "engine", "address")
+    names = ("n", "environment", "time_limit", "seed", "plane_tolerance", *ENGINE, "replan", "force")
     plants = (arguments.plant or ("nominal",)) if arguments.simulate else ()
-    return {"plants": plants, **{name: getattr(arguments, name) for name in (*names, "replan", "force")}}
-
-
-@contextmanager
-def _kept(folder: Path) -> Iterator[None]:
-    """Name the folder of the results in the message of an interruption."""
-    try:
-        yield
-    except KeyboardInterrupt as interruption:
-        kept = f"{folder} keeps all finished problems; run the same command again to resume"
-        raise type(interruption)(kept) from interruption
+    return {"plants": plants, **options_of(arguments, *names)}
 
 
 def _parameters(fields: list[tuple[str, str, Any]]) -> dict[str, dict[str, Any]]:
@@ -216,9 +193,8 @@ def _text(found: "Benchmark") -> str:
 
     head = f"{found.suite.name} {found.suite.version}: {len(found.problems)} problems"
     tables = [table([(*row, "") for row in table_rows(found, plant)], indent="  ") for plant in found.executions]
-    return "\n\n".join(
-        [head, *("\n".join(lines) for lines in tables), "\n".join([*failure_summaries(found), *notes(found)])]
-    )
+    sections = [[head], *tables, [*failure_summaries(found), *notes(found)]]
+    return "\n\n".join("\n".join(lines) for lines in sections)
 
 
 def _listing(*, as_json: bool) -> str:
@@ -226,12 +202,12 @@ def _listing(*, as_json: bool) -> str:
     from cnpgen.benchmark.simulator.plant import PLANTS
     from cnpgen.benchmark.suite import list_suites, load_suite
     from cnpgen.cli.describe import table
-    from cnpgen.schema import registry
 
+    planners, fields = _planners()
     found = {
         "suites": {name: load_suite(name).title for name in list_suites()},
-        "planners": {name: _summary(name) for name in registry.names(registry.PLANNERS)},
-        "fields": {key: text for name in registry.names(registry.PLANNERS) for key, text in _fields(name).items()},
+        "planners": planners,
+        "fields": fields,
         "plants": {plant.name: plant.title for plant in PLANTS.values()},
     }
     if as_json:
@@ -239,25 +215,21 @@ def _listing(*, as_json: bool) -> str:
     return "\n\n".join("\n".join([what, *table(list(names.items()), indent="  ")]) for what, names in found.items())
 
 
-def _summary(planner: str) -> str:
-    """Describe a planner in one line, or report why it cannot be used."""
+def _planners() -> tuple[dict[str, str], dict[str, str]]:
+    """Describe the planners, or why they cannot be used, and their fields by the names for ``--set``."""
     from cnpgen.cli.describe_keys import kind_summary
-    from cnpgen.schema import registry
-
-    try:
-        return kind_summary(registry.load(registry.PLANNERS, planner))
-    except CnpgenError as error:
-        return f"cannot be used: {error}"
-
-
-def _fields(planner: str) -> dict[str, str]:
-    """Describe the fields of a planner, by their names for ``--set`` and ``--search``."""
     from cnpgen.schema import registry
     from cnpgen.schema.keys import keys
 
-    try:
-        known = keys(registry.load(registry.PLANNERS, planner))
-    except CnpgenError:
-        return {}
-    units = {key.name: "" if key.unit == "1" else f" {key.unit}" for key in known}
-    return {f"{planner}.{key.name}": f"{key.doc} (default {key.default!r}{units[key.name]})" for key in known}
+    planners, fields = dict[str, str](), dict[str, str]()
+    for name in registry.names(registry.PLANNERS):
+        try:
+            kind = registry.load(registry.PLANNERS, name)
+        except CnpgenError as error:
+            planners[name] = f"cannot be used: {error}"
+            continue
+        planners[name] = kind_summary(kind)
+        for key in keys(kind):
+            unit = "" if key.unit == "1" else f" {key.unit}"
+            fields[f"{name}.{key.name}"] = f"{key.doc} (default {key.default!r}{unit})"
+    return planners, fields

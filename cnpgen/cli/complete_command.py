@@ -31,9 +31,8 @@ if no task has an answer.
 
 def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
-    parser = add_command(
-        commands, "complete", run, title="compute boundary problems for tasks in the workspace", text=_TEXT
-    )
+    title = "compute boundary problems for tasks in the workspace"
+    parser = add_command(commands, "complete", run, title=title, text=_TEXT)
     option = parser.add_argument
     text = "a pipeline, dataset or problem by name, or a recipe file"
     option("pipeline", metavar="NAME|FILE", type=recipe_names.tasks_of, help=text)
@@ -57,16 +56,12 @@ def run(arguments: argparse.Namespace) -> int:
     if not arguments.quiet:
         print("\n".join(_summary(found)), file=sys.stderr)
     if arguments.json:
-        print(json.dumps(_facts(found, arguments.out), indent=2))
+        rejected = [{"task": task, "reason": reason} for task, reason in enumerate(found.reasons) if reason]
+        facts = {"file": str(arguments.out) if len(found.plans) else None, "tasks": len(found.reasons)}
+        print(json.dumps({**facts, "completed": len(found), "without_answer": rejected}, indent=2))
     elif len(found.plans):
         print(arguments.out)
     return 0 if len(found.plans) else 1
-
-
-def _facts(found: "Completed", out: Path) -> dict[str, object]:
-    rejected = [{"task": task, "reason": reason} for task, reason in enumerate(found.reasons) if reason]
-    written = str(out) if len(found.plans) else None
-    return {"file": written, "tasks": len(found.reasons), "completed": len(found), "without_answer": rejected}
 
 
 def _summary(found: "Completed") -> list[str]:

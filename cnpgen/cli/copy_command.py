@@ -66,12 +66,7 @@ def _name(folder: Path) -> str:
 
 
 def copied_texts(recipe: "Recipe", name: str) -> dict[str, str]:
-    """Return the files of a copy, that of the recipe itself first: name -> text.
-
-    Args:
-        recipe: A shipped dataset, pipeline or problem.
-        name: Name of the copies.
-    """
+    """Return the files of a copy with another name, that of the recipe itself first: file name -> text."""
     from cnpgen.make.recipe import DatasetRecipe
     from cnpgen.pipelines.pipeline import Pipeline
 

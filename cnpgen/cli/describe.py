@@ -1,8 +1,8 @@
 """Output of ``cnpgen show``: recipes in words and numbers."""
 
-import textwrap
 from collections.abc import Sequence
 from pathlib import Path
+from textwrap import TextWrapper, wrap
 from typing import Any
 
 from cnpgen.cli.shape_rows import link_rows, pair_rows, shape_to_dict
@@ -56,9 +56,8 @@ def describe_dataset(recipe: DatasetRecipe) -> str:
         ("recipe", f"sha256 {recipe_digest(recipe)}"),
         ("file", recipe.path),
     ]
-    return "\n".join(
-        [f"dataset {recipe.name} {recipe.version}", *title_lines(recipe.title), *table(facts, indent="  ")]
-    )
+    head = f"dataset {recipe.name} {recipe.version}"
+    return "\n".join([head, *title_lines(recipe.title), *table(facts, indent="  ")])
 
 
 def describe_pipeline(pipeline: Pipeline) -> str:
@@ -105,26 +104,22 @@ def _obstacle(obstacle: Obstacle) -> str:
     """Describe an obstacle; a mesh by the number of its corners."""
     same = [key.name for key in keys(Obstacle) if getattr(obstacle, key.name) == key.default]
     text = numbers(obstacle, leave_out=("name", "mesh", *same))
-    if not obstacle.mesh:
-        return text
-    return f"{text}, the hull of {len(corners_of(obstacle.mesh))} corners"
+    return f"{text}, the hull of {len(corners_of(obstacle.mesh))} corners" if obstacle.mesh else text
 
 
 def _shape(problem: Problem, robot: Robot) -> list[str]:
     """Describe the robot's shape: its links, its pairs of links, and the free space that its convex parts reject."""
     if robot.shape is None:
         return []
-    links, pairs = link_rows(robot.shape), pair_rows(robot.shape)
-    numbers_of_links, numbers_of_pairs = range(1, 6), (2, 3)
     gap = problem.robot.hull_gap
     states = "of the random states in which no triangle meshes overlap are rejected by the convex parts"
     return [
         "",
         "  link geometry: collision geometry of the URDF, and capsules that enclose it",
-        *table(links, indent="    ", right=numbers_of_links),
+        *table(link_rows(robot.shape), indent="    ", right=range(1, 6)),
         "",
         "  pairs of links, by random states",
-        *table(pairs, indent="    ", right=numbers_of_pairs),
+        *table(pair_rows(robot.shape), indent="    ", right=(2, 3)),
         *([] if gap is None else ["", f"  gap: {gap:.2%} {states}"]),
     ]
 
@@ -157,17 +152,14 @@ def with_units(units: str, cells: Sequence[str]) -> tuple[str, ...]:
 
 def title_lines(title: str) -> list[str]:
     """Wrap a title as lines below a name."""
-    return textwrap.wrap(title, LINE_WIDTH - 2, initial_indent="  ", subsequent_indent="  ")
+    return wrap(title, LINE_WIDTH - 2, initial_indent="  ", subsequent_indent="  ")
 
 
 def numbers(obj: Any, *, leave_out: Sequence[str] = ()) -> str:
     """List the keys of an object that was read from a table, with values and units, without those left at nothing."""
-    shown = [
-        f"{key.name} {quantity(getattr(obj, key.name), key.unit)}"
-        for key in keys(type(obj))
-        if key.name not in leave_out and (getattr(obj, key.name) != key.default or getattr(obj, key.name))
-    ]
-    return ", ".join(shown)
+    values = [(key, getattr(obj, key.name)) for key in keys(type(obj)) if key.name not in leave_out]
+    shown = [(key, value) for key, value in values if value != key.default or value]
+    return ", ".join(f"{key.name} {quantity(value, key.unit)}" for key, value in shown)
 
 
 def quantity(value: Any, unit: str = "1") -> str:
@@ -207,7 +199,8 @@ def recipe_to_dict(recipe: Recipe) -> dict[str, Any]:
     pipeline = recipe.pipeline if isinstance(recipe, DatasetRecipe) else recipe
     problem = pipeline.problem if isinstance(pipeline, Pipeline) else pipeline
     robot = load_robot(problem)
-    content: dict[str, Any] = {"kind": _noun(recipe), "file": str(recipe.path), "recipe": resolved(recipe)}
+    kind = {Problem: "problem", Pipeline: "pipeline", DatasetRecipe: "dataset"}[type(recipe)]
+    content: dict[str, Any] = {"kind": kind, "file": str(recipe.path), "recipe": resolved(recipe)}
     if isinstance(pipeline, Pipeline):
         content["recipe_sha256"] = recipe_digest(pipeline)
         content["stages"] = [{"use": kind_name(stage), "text": stage.describe()} for stage in pipeline.stage]
@@ -220,38 +213,34 @@ def recipe_to_dict(recipe: Recipe) -> dict[str, Any]:
     return content
 
 
-def _noun(recipe: Recipe) -> str:
-    return {Problem: "problem", Pipeline: "pipeline", DatasetRecipe: "dataset"}[type(recipe)]
-
-
 def table(
-    rows: Sequence[Sequence[Any]], *, indent: str = "", right: Sequence[int] = (), one_line: bool = False
+    rows: Sequence[Sequence[Any]],
+    *,
+    indent: str = "",
+    right: Sequence[int] = (),
+    one_line: bool = False,
+    width: int = LINE_WIDTH,
 ) -> list[str]:
-    """Lay out rows as aligned columns that fit into ``LINE_WIDTH``.
+    """Lay out rows as aligned columns.
 
     Args:
         rows: The cells, in rows of the same length. A path in the last column stays in one piece, for scripts.
         indent: Put before every line.
         right: The columns that are aligned to the right.
         one_line: Whether to cut what does not fit into the last column; it is wrapped by default.
+        width: Maximum length of a line.
 
     Returns:
         The lines.
     """
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]) - 1)]
     hanging = indent + " " * (sum(widths) + 2 * len(widths))
-    width = max(LINE_WIDTH - len(hanging), 30)
+    space, count = max(width - len(hanging), 30), 1 if one_line else None
+    wrapper = TextWrapper(space, break_on_hyphens=False, break_long_words=one_line, max_lines=count, placeholder=" ...")
     lines = []
     for *cells, last in rows:
         pairs = enumerate(zip(cells, widths, strict=True))
         head = indent + "".join(f"{text.rjust(w) if i in right else text.ljust(w)}  " for i, (text, w) in pairs)
-        parts = [str(last)] if isinstance(last, Path) else _wrapped(last, width, one_line=one_line)
+        parts = [str(last)] if isinstance(last, Path) else wrapper.wrap(last)
         lines += [(head + (parts[0] if parts else "")).rstrip(), *(hanging + part for part in parts[1:])]
     return lines
-
-
-def _wrapped(text: str, width: int, *, one_line: bool) -> list[str]:
-    lines = 1 if one_line else None
-    return textwrap.wrap(
-        text, width, break_on_hyphens=False, break_long_words=one_line, max_lines=lines, placeholder=" ..."
-    )

@@ -49,15 +49,7 @@ def _first_line(kind: type) -> str:
 
 
 def describe_kind(group: str, name: str) -> str:
-    """Describe a kind of stage, constraint or objective term: its purpose, and the keys of its table.
-
-    Args:
-        group: ``registry.STAGES``, ``registry.CONSTRAINTS`` or ``registry.OBJECTIVES``.
-        name: Name of the kind.
-
-    Raises:
-        RecipeError: There is no such kind.
-    """
+    """Describe a kind of stage, constraint or objective term: its purpose, and the keys of its table."""
     kind = registry.load(group, name)
     head = ("key", "default", "description (value)")
     rows = [(key.name, _default(key), f"{key.doc} ({_expected(key)})") for key in keys(kind)]
@@ -66,11 +58,7 @@ def describe_kind(group: str, name: str) -> str:
 
 
 def kind_to_dict(group: str, name: str) -> dict[str, Any]:
-    """Describe a kind of stage or constraint for JSON.
-
-    Raises:
-        RecipeError: There is no such kind.
-    """
+    """Describe a kind of stage or constraint for JSON."""
     return {"kind": registry.noun_of(group), "name": name, **_table_to_dict(registry.load(group, name))}
 
 

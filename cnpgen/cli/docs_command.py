@@ -112,20 +112,16 @@ def _text(page: Path) -> str:
 
 
 def _list(pages: dict[str, Path], *, as_json: bool) -> None:
-    rows = [
-        {"page": name, "kind": file.parent.name, "title": page_title(file)}
-        for name, file in pages.items()
-        if name != "index"
-    ]
+    listed = {name: file for name, file in pages.items() if name != "index"}
+    rows = [{"page": name, "kind": file.parent.name, "title": page_title(file)} for name, file in listed.items()]
     if as_json:
         _print_json(rows)
         return
     width = max(map(len, pages))
     for kind in KINDS:
         print(f"{kind}:")
-        print(
-            *(f"  {row['page']:<{width}}  {row['title']}" for row in rows if row["kind"] == kind), sep="\n", end="\n\n"
-        )
+        lines = [f"  {row['page']:<{width}}  {row['title']}" for row in rows if row["kind"] == kind]
+        print(*lines, sep="\n", end="\n\n")
     print("'cnpgen docs PAGE' prints a page, 'cnpgen docs --search TEXT' searches all pages.")
 
 

@@ -19,29 +19,20 @@ DOCUMENTS = 90_000  # bytes: specification.json, manifest, card and statistics
 
 
 def spec_text(recipe: DatasetRecipe, out: str | None, *, force: bool, **settings: Any) -> str:
-    """Resolve the specification of a dataset without making anything, and describe it.
-
-    Args:
-        recipe: The recipe.
-        out: Its folder; None for the default.
-        force: Whether another dataset in the folder would be replaced.
-        settings: Arguments of ``draw_up``.
-
-    Raises:
-        CnpgenError: The dataset cannot be made like this.
-    """
+    """Resolve the specification of a dataset by ``draw_up`` without making anything, and describe it."""
     load_notes(recipe)
     workspace = find_workspace(dataset_folder(recipe, out))
     spec = draw_up(recipe, workspace, **settings, force=force).spec
     files = shards(spec)
     splits = [f"{split} {rows:,}" for split, rows in spec.splits.items()]
     counts = [f"{split} {sum(task.split == split for task in files)}" for split in spec.splits]
+    size = sum(spec.splits.values()) * row_bytes(spec) + len(files) * SHARD_OVERHEAD + DOCUMENTS
     facts = [
         ("folder", workspace.folder),
         ("state", folder_state(workspace, spec, force=force)),
         ("rows", f"{sum(spec.splits.values()):,}: {', '.join(splits)}"),
         ("shards", f"{len(files)} of at most {spec.shard_size:,} rows: {', '.join(counts)}"),
-        ("size", f"about {size_text(estimate_bytes(spec))}, {row_bytes(spec)} bytes per row"),
+        ("size", f"about {size_text(size)}, {row_bytes(spec)} bytes per row"),
         ("seed", str(spec.seed)),
         ("backend", spec.backend),
         ("dtype", spec.dtype),
@@ -49,24 +40,13 @@ def spec_text(recipe: DatasetRecipe, out: str | None, *, force: bool, **settings
     ]
     fields = [("field", "columns", "unit", "what")]
     fields += [(item.name, str(item.width or "-"), item.unit, item.long_name) for item in spec.fields]
-    return "\n".join(
-        [
-            f"{spec.name} {spec.version}",
-            *table(facts, indent="  "),
-            "",
-            *table(fields, indent="  ", right=(1,)),
-        ]
-    )
+    head = f"{spec.name} {spec.version}"
+    return "\n".join([head, *table(facts, indent="  "), "", *table(fields, indent="  ", right=(1,))])
 
 
 def row_bytes(spec: DatasetSpec) -> int:
     """Return the size of a row in bytes."""
     return sum(max(field.width, 1) * storage_dtype(field, spec.dtype).itemsize for field in spec.fields)
-
-
-def estimate_bytes(spec: DatasetSpec) -> int:
-    """Estimate the size of the finished dataset in bytes."""
-    return sum(spec.splits.values()) * row_bytes(spec) + len(shards(spec)) * SHARD_OVERHEAD + DOCUMENTS
 
 
 def folder_state(workspace: Workspace, spec: DatasetSpec, *, force: bool) -> str:

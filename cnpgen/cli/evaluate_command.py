@@ -41,55 +41,28 @@ def add(commands: "Commands[Parser]") -> None:
     parser = add_command(commands, "evaluate", run, title="judge plans or sampled trajectories", text=_TEXT)
     option = parser.add_argument
     option("file", metavar="FILE", type=Path, help="plan file, .h5, or sampled trajectories")
-    option(
-        "--problem",
-        metavar="NAME|FILE",
-        type=recipe_names.problem,
-        help="the problem of the plans; its tolerances are used",
-    )
-    option(
-        "--step",
-        metavar="S",
-        type=values.seconds,
-        default=1e-3,
-        help="time between two samples (default: 1ms, at most 10ms)",
-    )
-    option(
-        "--tracking-error",
-        metavar="E,...",
-        type=values.tracking_errors,
-        help="largest tracking error of the joints, such as 2deg: position limits, clearances and the manifold hold"
-        " within it; one number, or one per joint (default: exact tracking)",
-    )
+    text = "the problem of the plans; its tolerances are used"
+    option("--problem", metavar="NAME|FILE", type=recipe_names.problem, help=text)
+    text = "time between two samples (default: 1ms, at most 10ms)"
+    option("--step", metavar="S", type=values.seconds, default=1e-3, help=text)
+    text = "largest tracking error of the joints, such as 2deg: position limits, clearances and the manifold hold"
+    text += " within it; one number, or one per joint (default: exact tracking)"
+    option("--tracking-error", metavar="E,...", type=values.tracking_errors, help=text)
     option("--workers", metavar="W", type=values.positive, help="processes; default one per available core")
     option("--list", action="store_true", help="also list the plans, one per line, invalid ones first")
     option("--plot", metavar="PICTURE", type=values.plot_file, help="draw one plan or trajectory: .png, .pdf or .svg")
-    option(
-        "--plan",
-        metavar="I",
-        type=values.natural,
-        help="plan or trajectory to draw; default the first that is not valid, or 0",
-    )
+    text = "plan or trajectory to draw; default the first that is not valid, or 0"
+    option("--plan", metavar="I", type=values.natural, help=text)
     add_json(parser)
     sampled = parser.add_argument_group("sampled trajectories")
     add_trajectory_options(sampled)
-    sampled.add_argument(
-        "--interpolation",
-        choices=("hold", "linear", "cubic", "quintic"),
-        help="judge a controller's curve; default: the motion that the samples resolve ('cnpgen docs trajectories')",
-    )
-    sampled.add_argument(
-        "--max-jerk",
-        metavar="J,...",
-        type=values.amounts,
-        help="judge every curve through the samples whose jerks are at most J [rad/s^3]: one number, or one per joint",
-    )
-    sampled.add_argument(
-        "--noise",
-        metavar="E,...",
-        type=values.errors,
-        help="largest error of the samples in SI units: one number, or of positions, velocities and accelerations",
-    )
+    option = sampled.add_argument
+    text = "judge a controller's curve; default: the motion that the samples resolve ('cnpgen docs trajectories')"
+    option("--interpolation", choices=("hold", "linear", "cubic", "quintic"), help=text)
+    text = "judge every curve through the samples whose jerks are at most J [rad/s^3]: one number, or one per joint"
+    option("--max-jerk", metavar="J,...", type=values.amounts, help=text)
+    text = "largest error of the samples in SI units: one number, or of positions, velocities and accelerations"
+    option("--noise", metavar="E,...", type=values.errors, help=text)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -123,18 +96,17 @@ def _run_trajectories(arguments: argparse.Namespace) -> int:
         raise UsageError("--tracking-error is for plans: --noise gives the error of sampled trajectories")
     problem = problem_of(arguments)
     loaded = load_file(arguments, problem)
-    if arguments.plan is not None and arguments.plan >= len(loaded.trajectories):
-        count = len(loaded.trajectories)
+    count = len(loaded.trajectories)
+    if arguments.plan is not None and arguments.plan >= count:
         raise UsageError(f"{arguments.file} has no trajectory {arguments.plan}: {count} are numbered from 0")
-    noise, jerk = arguments.noise or (0.0,), arguments.max_jerk
     with Meter(quiet=not sys.stderr.isatty(), noun="trajectory") as meter:
-        meter.begin(f"judging {arguments.file}", len(loaded.trajectories))
+        meter.begin(f"judging {arguments.file}", count)
         found = evaluate_trajectories(
             problem,
             loaded.trajectories,
             interpolation=arguments.interpolation,
-            noise=noise[0] if len(noise) == 1 else noise,
-            max_jerk=jerk[0] if jerk and len(jerk) == 1 else jerk,
+            noise=arguments.noise or 0.0,
+            max_jerk=arguments.max_jerk,
             step=arguments.step,
             workers=arguments.workers or 1,
             progress=meter,
@@ -156,13 +128,12 @@ def _evaluate(arguments: argparse.Namespace) -> "Evaluation":
     plans = read_plans(arguments.file, problem=arguments.problem)
     if arguments.plan is not None and arguments.plan >= len(plans):
         raise UsageError(f"{arguments.file} has no plan {arguments.plan}: {len(plans)} plans are numbered from 0")
-    error = arguments.tracking_error
     with Meter(quiet=not sys.stderr.isatty(), noun="plan") as meter:
         meter.begin(f"judging {arguments.file}", len(plans))
         return evaluate_plans(
             plans,
             step=arguments.step,
-            tracking_error=error[0] if error and len(error) == 1 else error,
+            tracking_error=arguments.tracking_error,
             workers=arguments.workers,
             progress=meter,
         )
@@ -196,10 +167,9 @@ def _draw_trajectory(found: "TrajectoryEvaluation", picture: str, index: int | N
     from cnpgen.judges.trajectories.trajectory_plot import plot_trajectory
     from cnpgen.plans import open_problem
 
-    verdicts = found.verdicts
-    first = next((at for at, verdict in enumerate(verdicts) if not verdict.valid), 0)
+    first = next((at for at, verdict in enumerate(found.verdicts) if not verdict.valid), 0)
     chosen = first if index is None else index
-    trajectory, verdict = found.trajectories[chosen], verdicts[chosen]
+    trajectory, verdict = found.trajectories[chosen], found.verdicts[chosen]
     margins = [entry.margin for entry in verdict.conditions.values() if not entry.margin.ok]
     problem, robot = open_problem(found.problem)
     title = f"{problem.name}, {labels[chosen]}: {trajectory.duration:.3f} s\n{verdict}"

@@ -12,7 +12,6 @@ from cnpgen.errors import UsageError, counted, listed
 
 if TYPE_CHECKING:
     from cnpgen.plans import Plans
-    from cnpgen.plans.export import Exported
     from cnpgen.plans.exporter import Exporter
     from cnpgen.plans.join import JoinedPlans
 
@@ -35,36 +34,17 @@ def add(commands: "Commands[Parser]") -> None:
     parser = add_command(commands, "export", run, title="write plans as sampled trajectories", text=_TEXT)
     option = parser.add_argument
     option("file", metavar="FILE", type=recipe_names.present, help="plan file, .h5")
-    option(
-        "--to",
-        metavar="FORMAT",
-        required=True,
-        help="format: npz, csv, parquet, lerobot, mpd, ... ('cnpgen list exporters')",
-    )
+    text = "format: npz, csv, parquet, lerobot, mpd, ... ('cnpgen list exporters')"
+    option("--to", metavar="FORMAT", required=True, help=text)
     option("--rate", metavar="HZ", type=values.hertz, default=1000.0, help="samples per second (default: 1000)")
-    option(
-        "-o",
-        "--out",
-        metavar="PATH",
-        type=Path,
-        help="file (npz) or folder to write; default: in the current folder, named after FILE and FORMAT",
-    )
+    text = "file (npz) or folder to write; default: in the current folder, named after FILE and FORMAT"
+    option("-o", "--out", metavar="PATH", type=Path, help=text)
     option("--plan", metavar="I", type=values.numbers, help="these plans only, by index: 0,3,10-12")
     option("--sample", metavar="I", type=values.numbers, help="these samples' plans only, by sample_id; adds to --plan")
-    option(
-        "--join",
-        metavar="NEXT",
-        type=Path,
-        action="append",
-        help="cut every plan of FILE and continue with the plan of the same number of this file; may be repeated",
-    )
-    option(
-        "--at",
-        metavar="S",
-        type=values.seconds,
-        action="append",
-        help="time at which NEXT takes over: 330ms; once per --join (default: at the end)",
-    )
+    text = "cut every plan of FILE and continue with the plan of the same number of this file; may be repeated"
+    option("--join", metavar="NEXT", type=Path, action="append", help=text)
+    text = "time at which NEXT takes over: 330ms; once per --join (default: at the end)"
+    option("--at", metavar="S", type=values.seconds, action="append", help=text)
     option("--force", action="store_true", help="replace existing files")
 
 
@@ -80,10 +60,13 @@ def run(arguments: argparse.Namespace) -> int:
     for why in exported.refused.values():
         print(f"cnpgen: left out: {why}", file=sys.stderr)
     if exported.invalid:
-        print(f"cnpgen: warning: {_invalid(exported)}", file=sys.stderr)
+        which = f"plan{'s' * (len(exported.invalid) > 1)} {listed(exported.invalid, MAX_LISTED_PLANS)}"
+        text = f"not valid by their status ('cnpgen evaluate' reports why): {which}"
+        print(f"cnpgen: warning: {text}", file=sys.stderr)
     if open_problem(plans.problem)[0].has_sample_obstacles:
         print(f"cnpgen: note: {NO_OBSTACLES}", file=sys.stderr)
-    print(f"exported {_counted(exported)} at {arguments.rate:g} Hz", file=sys.stderr)
+    of_all = f" of {exported.count + len(exported.refused):,}" if exported.refused else ""
+    print(f"exported {counted(exported.count, 'plan')}{of_all} at {arguments.rate:g} Hz", file=sys.stderr)
     print(exported.files[0] if exporter.single_file else out)
     return 1 if exported.refused else 0
 
@@ -100,18 +83,6 @@ def _plans(arguments: argparse.Namespace) -> "Plans | JoinedPlans":
     for file, time in zip(following, times or [None] * len(following), strict=True):
         plans = join_plans(plans, read_plans(file), at=time)
     return plans
-
-
-def _counted(exported: "Exported") -> str:
-    all_plans = exported.count + len(exported.refused)
-    return counted(exported.count, "plan") + (f" of {all_plans:,}" if exported.refused else "")
-
-
-def _invalid(exported: "Exported") -> str:
-    """List the exported plans that are known to be invalid."""
-    plural = "s" * (len(exported.invalid) > 1)
-    which = listed(exported.invalid, MAX_LISTED_PLANS)
-    return f"not valid by their status ('cnpgen evaluate' reports why): plan{plural} {which}"
 
 
 def _place(arguments: argparse.Namespace, exporter: "Exporter") -> Path:

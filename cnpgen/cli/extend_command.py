@@ -5,7 +5,7 @@ from functools import partial
 
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.make_command import make_metered
-from cnpgen.cli.parser import Commands, Parser, add_command, add_engine
+from cnpgen.cli.parser import ENGINE, Commands, Parser, add_command, add_engine, options_of
 
 _TEXT = """\
 The samples are those of a dataset that is made at once, every split in the proportion of the recipe. Existing shards
@@ -29,13 +29,6 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     from cnpgen.make.extend import extend_dataset
 
-    extend = partial(
-        extend_dataset,
-        arguments.folder,
-        arguments.n,
-        workers=arguments.workers,
-        engine=arguments.engine,
-        address=arguments.address,
-    )
+    extend = partial(extend_dataset, arguments.folder, arguments.n, **options_of(arguments, *ENGINE))
     make_metered(extend, quiet=arguments.quiet)
     return 0

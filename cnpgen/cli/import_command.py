@@ -25,13 +25,8 @@ def add(commands: "Commands[Parser]") -> None:
     parser = add_command(commands, "import", run, title="make plans of sampled trajectories", text=_TEXT)
     option = parser.add_argument
     option("file", metavar="FILE", type=recipe_names.present, help="file of trajectories, or a folder of them")
-    option(
-        "--problem",
-        metavar="NAME|FILE",
-        type=recipe_names.problem,
-        required=True,
-        help="the problem of the trajectories",
-    )
+    text = "the problem of the trajectories"
+    option("--problem", metavar="NAME|FILE", type=recipe_names.problem, required=True, help=text)
     option("-o", "--out", metavar="PLANS", type=Path, required=True, help="plan file to write, .h5")
     option("--force", action="store_true", help="replace PLANS")
     add_trajectory_options(parser)
@@ -53,22 +48,20 @@ def run(arguments: argparse.Namespace) -> int:
     from cnpgen.store.files.kind import PLANS
     from cnpgen.store.paths import file_kind
 
-    out = arguments.out
     if file_kind(arguments.file) == PLANS:
         raise UsageError(f"{arguments.file} is {PLANS} already: 'cnpgen refine' optimizes them")
-    check_place(out, force=arguments.force)
+    check_place(arguments.out, force=arguments.force)
     problem = problem_of(arguments)
     loaded = load_file(arguments, problem)
-    noise = arguments.noise or (0.0,)
     imported = import_trajectories(
         problem,
         loaded.trajectories,
-        noise=noise[0] if len(noise) == 1 else noise,
+        noise=arguments.noise or 0.0,
         at_rest=arguments.at_rest,
         source=f"imported from {arguments.file.name}",
     )
     plans = imported.plans if arguments.stay_within is None else _refined(imported.plans, arguments.stay_within)
-    save_plans(out, plans)
+    save_plans(arguments.out, plans)
     points = imported.plans.path_control_points.shape[1]
     print(
         f"imported {counted(len(imported.plans), 'plan')} with {points} control points of the path;"
@@ -80,7 +73,7 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"plan {index}: the ends cannot be moved onto the constraints by a small change", file=sys.stderr)
     largest = float(np.nanmax(imported.snapped)) if len(failed) < len(imported.plans) else 0.0
     print(f"ends moved by at most {largest:.2g} rad to meet the constraints", file=sys.stderr)
-    print(out)
+    print(arguments.out)
     return 0
 
 

@@ -3,7 +3,7 @@
 import argparse
 import sys
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from cnpgen.cli.parser import Commands, Parser, add_command
@@ -28,10 +28,8 @@ def add(commands: "Commands[Parser]") -> None:
     kind.add_argument("--urdf", metavar="FILE", type=Path, help="URDF file; the recipes refer to its path")
     kind.add_argument("--planner", action="store_true", help="write a package with a planner for 'cnpgen benchmark'")
     option("--tip", metavar="FRAME", help="tip frame, a link or joint; default the only link without a child")
-    text = "a folder that is searched for package:// of the URDF; may be repeated. By default those of"
-    text += (
-        " ROS_PACKAGE_PATH and AMENT_PREFIX_PATH, and those above the URDF; what is used of the former is written down"
-    )
+    text = "a folder that is searched for package:// of the URDF; may be repeated. By default those of ROS_PACKAGE_PATH"
+    text += " and AMENT_PREFIX_PATH, and those above the URDF; what is used of the former is written down"
     option("--packages", metavar="DIR", type=Path, action="append", default=[], help=text)
     text = "an SRDF file, whose disabled pairs of links are not checked for collisions"
     option("--srdf", metavar="FILE", type=Path, help=text)
@@ -48,8 +46,7 @@ def run(arguments: argparse.Namespace) -> int:
     folder = arguments.name
     if arguments.planner:
         return _write_planner(folder, force=arguments.force)
-    there = [str(folder / name) for name in FILES if (folder / name).exists()]
-    _refuse(there if not arguments.force else [])
+    _check_place(folder, FILES, force=arguments.force)
     arm = read_arm(arguments.urdf, arguments.tip)
     packages = (*arguments.packages, *packages_of_environment(arm.meshes, arm.urdf, arguments.packages))
     with warnings.catch_warnings():
@@ -59,7 +56,12 @@ def run(arguments: argparse.Namespace) -> int:
         sys.stderr.writelines(f"note: {note}\n" for note in initial.notes)
         recipe, share = dataset_of(initial, folder)
     _write(folder, sampling_texts(recipe, share))
-    _say_next(folder)
+    _print_next(
+        f"cnpgen show {folder}/dataset.toml               what is in them",
+        f"cnpgen make-dataset {folder}/dataset.toml --n 1000",
+        f"cnpgen solve {folder}/pipeline.toml --n 10 -o {folder.name}-plans.h5",
+        f"cnpgen view {folder}/problem.toml -o {folder.name}.html",
+    )
     return 0
 
 
@@ -67,10 +69,10 @@ def _write_planner(folder: Path, *, force: bool) -> int:
     from cnpgen.cli.init.planner_package import planner_texts
 
     texts = planner_texts(folder.name)
-    _refuse([] if force else [str(folder / name) for name in texts if (folder / name).exists()])
+    _check_place(folder, texts, force=force)
     _write(folder, texts)
-    next_ = [f"pip install -e {folder}", f"cnpgen benchmark hits-81 --planners {folder.name} cnpgen --n 2"]
-    print("next:", *next_, "cnpgen docs benchmark", sep="\n  ", file=sys.stderr)
+    test = f"cnpgen benchmark hits-81 --planners {folder.name} cnpgen --n 2"
+    _print_next(f"pip install -e {folder}", test, "cnpgen docs benchmark")
     return 0
 
 
@@ -97,16 +99,11 @@ def _folder(name: str) -> Path:
     return folder
 
 
-def _refuse(there: list[str]) -> None:
-    if there:
+def _check_place(folder: Path, names: Iterable[str], *, force: bool) -> None:
+    there = [str(folder / name) for name in names if (folder / name).exists()]
+    if there and not force:
         raise UsageError(f"{', '.join(there)} exist{'s' if len(there) == 1 else ''} already: --force writes over it")
 
 
-def _say_next(folder: Path) -> None:
-    lines = [
-        f"cnpgen show {folder}/dataset.toml               what is in them",
-        f"cnpgen make-dataset {folder}/dataset.toml --n 1000",
-        f"cnpgen solve {folder}/pipeline.toml --n 10 -o {folder.name}-plans.h5",
-        f"cnpgen view {folder}/problem.toml -o {folder.name}.html",
-    ]
+def _print_next(*lines: str) -> None:
     print("next:", *lines, sep="\n  ", file=sys.stderr)

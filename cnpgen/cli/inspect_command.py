@@ -19,7 +19,6 @@ The command reads documents and shard records, not samples, so it is fast for la
 ones; 'cnpgen validate' verifies the samples. "accepts" is the share of candidates that pass a condition, "left" the
 share of all candidates that remain after it. The exit code is 1 if the dataset is damaged, 0 if it is unfinished.
 """
-_UNREAD = "checksums of the shards were not checked, 'cnpgen validate' does"
 
 
 def add(commands: "Commands[Parser]") -> None:
@@ -68,9 +67,10 @@ def _facts(found: "Inspection") -> list[tuple[str, str]]:
         f"{split} {n:,}" + ("" if n == spec.splits[split] else f" of {spec.splits[split]:,}")
         for split, n in found.rows.items()
     ]
+    unread = "checksums of the shards were not checked, 'cnpgen validate' does"
     versions = [", ".join(f"{name} {version}" for name, version in made.items()) for made in found.environments]
     return [
-        ("state", f"complete; {_UNREAD}" if found.complete else found.state),
+        ("state", f"complete; {unread}" if found.complete else found.state),
         ("rows", f"{sum(found.rows.values()):,}: {', '.join(splits)}"),
         ("shards", f"{len(found.summary.records)} of at most {spec.shard_size:,} rows"),
         ("size", f"{size_text(found.bytes)}, {spec.dtype}"),

@@ -5,6 +5,7 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 from cnpgen.machine.signals import signals_handled
 
@@ -23,14 +24,19 @@ def exit_code(interruption: KeyboardInterrupt) -> int:
 
 
 def raise_if_interrupted() -> None:
-    """Raise the interruption again, because libraries that call back into Python may have dropped it.
-
-    Raises:
-        KeyboardInterrupt: The process was interrupted.
-        Terminated: The process was asked to end.
-    """
+    """Raise the interruption again, because libraries that call back into Python may have dropped it."""
     if _interruptions:
         raise Terminated if _interruptions[0] == signal.SIGTERM else KeyboardInterrupt
+
+
+@contextmanager
+def resumable(place: Path) -> Iterator[None]:
+    """Name the file or folder of the finished problems in the message of an interruption."""
+    try:
+        yield
+    except KeyboardInterrupt as interruption:
+        kept = f"{place} keeps all finished problems; run the same command again to resume"
+        raise type(interruption)(kept) from interruption
 
 
 def _interrupt(number: int) -> None:

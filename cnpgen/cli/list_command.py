@@ -1,10 +1,14 @@
 """``cnpgen list``: shipped recipes and models, and the kinds of stages, constraints, objectives and exporters."""
 
 import argparse
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from cnpgen.cli.parser import Commands, Parser, add_command, add_json
 from cnpgen.errors import RecipeError
+
+if TYPE_CHECKING:
+    from cnpgen.schema.toml import Kind
 
 WHAT = ("datasets", "models", "pipelines", "problems", "stages", "constraints", "objectives", "exporters")
 
@@ -37,72 +41,51 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def list_all(what: str) -> list[dict[str, Any]]:
-    """List the recipes of one kind, the models, or a group of kinds, with name, title and size.
-
-    Args:
-        what: One of ``WHAT``.
-    """
+    """List the recipes of one kind, the models, or a group of kinds, of ``WHAT``, with name, title and size."""
     from cnpgen.schema import registry
 
-    groups = {
-        "stages": registry.STAGES,
-        "constraints": registry.CONSTRAINTS,
-        "objectives": registry.OBJECTIVES,
-        "exporters": registry.EXPORTERS,
-    }
-    if what in groups:
-        return [{"name": name, "title": _summary(groups[what], name)} for name in registry.names(groups[what])]
-    return {"datasets": _datasets, "models": _models, "pipelines": _pipelines, "problems": _problems}[what]()
-
-
-def _datasets() -> list[dict[str, Any]]:
-    from cnpgen.make.recipe_file import load_dataset_recipe
-    from cnpgen.schema.catalogue import list_recipes
-
-    entries = []
-    for name, file in list_recipes("dataset").items():
-        recipe = load_dataset_recipe(name)
-        rows = sum(recipe.splits.values())
-        size = {"size": f"{rows:,} rows", "rows": rows, "splits": recipe.splits}
-        about = {"version": recipe.version, "pipeline": recipe.pipeline.name}
-        entries.append({"name": name, "title": recipe.title, **about, **size, "file": file})
-    return entries
-
-
-def _models() -> list[dict[str, Any]]:
+    group = f"cnpgen.{what}"
+    if group in registry.CONTRACTS:
+        return [{"name": name, "title": _summary(group, name)} for name in registry.names(group)]
     from cnpgen.planner.model_file import shipped_models
+    from cnpgen.schema.catalogue import list_recipes
 
-    entries = []
-    for name, file in shipped_models().items():  # their names are those of datasets; reading them would load HDF5
-        count = file.stat().st_size
-        size = {"size": f"{count / 1e6:.1f} MB", "bytes": count}
-        entries.append({"name": name, "title": f"planner trained on {name}", **size, "file": file})
-    return entries
+    describe = {"datasets": _dataset, "models": _model, "pipelines": _pipeline, "problems": _problem}[what]
+    kinds: dict[str, Kind] = {"datasets": "dataset", "pipelines": "pipeline", "problems": "problem"}
+    files = list_recipes(kinds[what]) if what in kinds else shipped_models()
+    return [{"name": name, **describe(name, file), "file": file} for name, file in files.items()]
 
 
-def _pipelines() -> list[dict[str, Any]]:
+def _dataset(name: str, _: Path) -> dict[str, Any]:
+    from cnpgen.make.recipe_file import load_dataset_recipe
+
+    recipe = load_dataset_recipe(name)
+    rows = sum(recipe.splits.values())
+    about = {"title": recipe.title, "version": recipe.version, "pipeline": recipe.pipeline.name}
+    return about | {"size": f"{rows:,} rows", "rows": rows, "splits": recipe.splits}
+
+
+def _model(name: str, file: Path) -> dict[str, Any]:
+    """Describe a model by its name, which is that of its dataset; reading the file would load HDF5."""
+    count = file.stat().st_size
+    return {"title": f"planner trained on {name}", "size": f"{count / 1e6:.1f} MB", "bytes": count}
+
+
+def _pipeline(name: str, _: Path) -> dict[str, Any]:
     from cnpgen.pipelines.pipeline_file import load_pipeline
-    from cnpgen.schema.catalogue import list_recipes
 
-    entries = []
-    for name, file in list_recipes("pipeline").items():
-        recipe = load_pipeline(name)
-        size = {"size": f"{len(recipe.stage)} stages", "stages": len(recipe.stage)}
-        entries.append({"name": name, "title": recipe.title, "problem": recipe.problem.name, **size, "file": file})
-    return entries
+    recipe = load_pipeline(name)
+    count = len(recipe.stage)
+    return {"title": recipe.title, "problem": recipe.problem.name, "size": f"{count} stages", "stages": count}
 
 
-def _problems() -> list[dict[str, Any]]:
+def _problem(name: str, _: Path) -> dict[str, Any]:
     from cnpgen.problems.problem_file import load_problem
-    from cnpgen.schema.catalogue import list_recipes
 
-    entries = []
-    for name, file in list_recipes("problem").items():
-        recipe = load_problem(name)
-        count = {"joints": len(recipe.robot.joints), "constraints": len(recipe.constraint)}
-        size = ", ".join(f"{number} {what}" for what, number in count.items())
-        entries.append({"name": name, "title": recipe.title, "size": size, **count, "file": file})
-    return entries
+    recipe = load_problem(name)
+    count = {"joints": len(recipe.robot.joints), "constraints": len(recipe.constraint)}
+    size = ", ".join(f"{number} {what}" for what, number in count.items())
+    return {"title": recipe.title, "size": size, **count}
 
 
 def _summary(group: str, name: str) -> str:

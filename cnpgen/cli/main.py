@@ -40,9 +40,8 @@ from cnpgen.cli import (
 )
 from cnpgen.cli.interruption import Terminated, exit_code, interruptible
 from cnpgen.cli.parser import Parser, add_debug
-from cnpgen.cli.shell import shell_spelling
 from cnpgen.cli.terminal import printing_safely
-from cnpgen.errors import CnpgenError, MachineError, RecipeError
+from cnpgen.errors import CnpgenError, MachineError, RecipeError, Spelling, python_spelling
 from cnpgen.machine.threads import prefer_one_thread
 from cnpgen.machine.versions import DOCUMENTATION_URL, installed_version
 
@@ -111,6 +110,7 @@ stdout is data, stderr everything else. Exit codes:
 """
 
 BROKEN_PIPE = 141  # 128 + SIGPIPE, as shells have it
+_OPTIONS = {"discard": "force", "other": "other_rows"}  # arguments whose options have another name
 
 
 class _LinkedParser(Parser):
@@ -132,14 +132,7 @@ class _Version(argparse.Action):
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line.
-
-    Args:
-        argv: The arguments; those of the process by default.
-
-    Returns:
-        The exit code, as ``cnpgen --help`` lists them.
-    """
+    """Run the command line with arguments, by default those of the process; return the exit code."""
     words, given = list(sys.argv[1:] if argv is None else argv), argparse.Namespace()
     prefer_one_thread()
     _prepare_streams()
@@ -173,8 +166,6 @@ def _run(words: list[str], given: argparse.Namespace) -> int:
     if chosen is parser:
         parser.print_help(sys.stderr)
         return 2
-    from cnpgen.cli.notices import notices
-
     with notices(quiet=getattr(arguments, "quiet", False)):
         code: int = arguments.run(arguments)
     return code
@@ -217,10 +208,48 @@ def _explain(error: BaseException, options: Container[str]) -> tuple[Sequence[st
         return ["out of memory; fewer --workers need less"], code
     if isinstance(error, OSError) and error.strerror:
         return [f"{error.filename}: {error.strerror}" if error.filename else error.strerror], code
-    text = " ".join(f"{type(error).__name__}: {error}".split())
-    return [
-        f"internal error: {text}; please report it (--debug shows the traceback, 'cnpgen doctor' the machine)"
-    ], code
+    text = " ".join(f"internal error: {type(error).__name__}: {error}".split())
+    return [f"{text}; please report it (--debug shows the traceback, 'cnpgen doctor' the machine)"], code
+
+
+def shell_spelling(options: Container[str]) -> Spelling:
+    """Return a spelling for ``CnpgenError.text``: ``force=True`` becomes ``--force``, ``workers=2`` ``--workers 2``.
+
+    Arguments that are no options of the command, as argparse names them, keep the Python spelling.
+    """
+
+    def spell(name: str, value: object) -> str:
+        option = _OPTIONS.get(name, name)
+        if option not in options:
+            return python_spelling(name, value)
+        text = f"--{option.replace('_', '-')}"
+        return text if value is None or isinstance(value, bool) else f"{text} {value}"
+
+    return spell
+
+
+@contextmanager
+def notices(*, quiet: bool = False) -> Iterator[None]:
+    """Print the library's log messages of the block on stderr, each one once; with ``quiet`` only warnings."""
+    import logging
+
+    logger, handler, seen = logging.getLogger("cnpgen"), logging.StreamHandler(sys.stderr), set[str]()
+    handler.setFormatter(logging.Formatter("cnpgen: %(message)s"))
+
+    def is_new(record: logging.LogRecord) -> bool:
+        known = record.getMessage() in seen
+        seen.add(record.getMessage())
+        return not known
+
+    handler.addFilter(is_new)
+    before = logger.level
+    logger.setLevel(logging.WARNING if quiet else logging.INFO)
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(before)
 
 
 def _prepare_streams() -> None:

@@ -3,11 +3,11 @@
 import argparse
 import sys
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.interruption import raise_if_interrupted
-from cnpgen.cli.parser import Commands, Parser, add_command, add_engine
+from cnpgen.cli.parser import ENGINE, Commands, Parser, add_command, add_engine, options_of
 from cnpgen.cli.progress import Meter
 from cnpgen.errors import UsageError, counted
 
@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from cnpgen.make.make_dataset import MadeDataset
-    from cnpgen.make.recipe import DatasetRecipe
     from cnpgen.store.sampling_statistics import SamplingStatistics
 
+_SETTINGS = ("n", "seed", "shard_size", "dtype", "backend", "force")
 INTERRUPTED_TEXT = "finished shards are kept; run the same command again to resume"
 
 _TEXT = """\
@@ -44,22 +44,14 @@ def add(commands: "Commands[Parser]") -> None:
     option("-o", "--out", metavar="DIR", help="folder of the dataset; default NAME-vMAJOR here")
     option("--workers", metavar="W", type=values.positive, help="processes; default one per available core")
     add_engine(parser)
-    option(
-        "--shard-size",
-        metavar="R",
-        type=values.positive,
-        help="rows per file; default 8192 to 65536, with --certify 64 to 1024",
-    )
+    text = "rows per file; default 8192 to 65536, with --certify 64 to 1024"
+    option("--shard-size", metavar="R", type=values.positive, help=text)
     option("--dtype", choices=("float64", "float32"), default="float64", help="stored number type")
     option("--backend", choices=("compiled", "numpy", "casadi"), help="kernel backend; default the fastest available")
     option("--part", metavar="K/M", type=values.part, help="make only part K of M (0/M to M-1/M), for job arrays")
     option("--certify", action="store_true", help="plan every sample, and store those with a valid plan")
-    option(
-        "--model",
-        metavar="NAME|FILE",
-        type=recipe_names.model,
-        help="with --certify: start from the plans of this planner, a shipped one or a file",
-    )
+    text = "with --certify: start from the plans of this planner, a shipped one or a file"
+    option("--model", metavar="NAME|FILE", type=recipe_names.model, help=text)
     option("--force", action="store_true", help="overwrite another dataset in the folder")
     option("--dry-run", action="store_true", help="print the specification and write nothing")
     option("--quiet", action="store_true", help="no progress and no summary")
@@ -82,36 +74,13 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.dry_run:
         from cnpgen.cli.dry_run import spec_text
 
-        print(spec_text(recipe, **_settings(arguments), force=arguments.force))
+        print(spec_text(recipe, arguments.out, **options_of(arguments, *_SETTINGS)))
         return 0
-    _make(recipe, arguments)
-    return 0
-
-
-def _settings(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return the arguments that determine the dataset."""
-    return {name: getattr(arguments, name) for name in ("out", "n", "seed", "shard_size", "dtype", "backend")}
-
-
-def _make(recipe: "DatasetRecipe", arguments: argparse.Namespace) -> None:
     from cnpgen.make.make_dataset import make_dataset
 
-    make = partial(
-        make_dataset,
-        recipe,
-        arguments.out,
-        n=arguments.n,
-        seed=arguments.seed,
-        workers=arguments.workers,
-        engine=arguments.engine,
-        address=arguments.address,
-        shard_size=arguments.shard_size,
-        dtype=arguments.dtype,
-        backend=arguments.backend,
-        force=arguments.force,
-        part=arguments.part,
-    )
-    make_metered(make, quiet=arguments.quiet, part=arguments.part)
+    options = options_of(arguments, *_SETTINGS, *ENGINE, "part")
+    make_metered(partial(make_dataset, recipe, arguments.out, **options), quiet=arguments.quiet, part=arguments.part)
+    return 0
 
 
 def make_metered(
@@ -119,11 +88,7 @@ def make_metered(
 ) -> None:
     """Make a dataset with progress and a summary on stderr, and print its folder.
 
-    Args:
-        make: Takes ``begin`` and ``progress``, as ``make_dataset`` does.
-        quiet: Whether to print nothing on stderr.
-        part: Which part of the dataset is made.
-        verb: Past participle of the action.
+    ``make`` takes ``begin`` and ``progress``, as ``make_dataset`` does; the verb of the summary is a past participle.
     """
     meter = Meter(quiet=quiet)
 
@@ -163,8 +128,7 @@ def _summary(made: "MadeDataset", meter: Meter, part: tuple[int, int] | None, ve
     share = "" if made.made == wanted else f"the missing {made.made:,} of "
     whole, making = meter.seconds, max(meter.running, 1e-9)
     times = f"in {whole:.1f} s: {whole - making:.1f} s to get ready, then {made.made / making:,.0f} rows/s"
-    lines = [f"{verb} {share}{text} {times}{rest}"]
-    lines += [_yield(meter.sampling)] if meter.sampling else []
+    lines = [f"{verb} {share}{text} {times}{rest}", *([_yield(meter.sampling)] if meter.sampling else [])]
     return [row for line in lines for row in textwrap.wrap(line, 100, subsequent_indent="  ")]
 
 

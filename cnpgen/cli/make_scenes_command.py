@@ -42,15 +42,10 @@ def add(commands: "Commands[Parser]") -> None:
 
 def family_parameter(text: str) -> tuple[str, Any]:
     """Read a parameter of a family: the key and the value, as in a recipe or as plain text."""
-    import tomllib
-
     key, equals, value = text.partition("=")
     if not (equals and key):
         raise argparse.ArgumentTypeError(f"expected KEY=VALUE, such as tables=2, got {text!r}")
-    try:
-        return key, tomllib.loads(f"value = {value}")["value"]
-    except tomllib.TOMLDecodeError:
-        return key, value
+    return key, values.toml_value(value)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -61,8 +56,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.list:
         print(_listing(as_json=arguments.json))
         return 0
-    missing = [name for name, value in (("FAMILY", arguments.family), ("--robot", arguments.robot)) if value is None]
-    missing += ["--n"] if arguments.n is None else []
+    needed = {"FAMILY": arguments.family, "--robot": arguments.robot, "--n": arguments.n}
+    missing = [name for name, value in needed.items() if value is None]
     if missing:
         raise UsageError(f"{' and '.join(missing)} must be given; 'cnpgen make-scenes --list' lists families")
     out = arguments.out or Path(f"{arguments.family}-scenes.h5")
@@ -103,19 +98,13 @@ def _check_place(out: Path, *, force: bool) -> None:
 
 def _listing(*, as_json: bool) -> str:
     """Return the families with their parameters."""
-    from dataclasses import fields
-
     from cnpgen.pipelines.families.catalog import FAMILIES
+    from cnpgen.schema.keys import keys
 
     table: dict[str, Any] = {}
     for name, family in FAMILIES.items():
         parameters = {
-            item.name: {
-                "description": item.metadata["doc"],
-                "unit": item.metadata["unit"],
-                "default": _plain(item.default),
-            }
-            for item in fields(family)
+            key.name: {"description": key.doc, "unit": key.unit, "default": _plain(key.default)} for key in keys(family)
         }
         table[name] = {"description": family.describe(), "parameters": parameters}
     if as_json:

@@ -64,18 +64,7 @@ Options = argparse._ActionsContainer  # a parser or a group of its options: opti
 
 
 def add_command(commands: "Commands[Parser]", name: str, run: Command, *, title: str, text: str = "") -> Parser:
-    """Add a command.
-
-    Args:
-        commands: The commands of the parser.
-        name: Name of the command.
-        run: Function that runs it.
-        title: Summary for the list of commands.
-        text: Details for its own help.
-
-    Returns:
-        The parser of its own arguments.
-    """
+    """Add a command with a title for the list of commands and a text for its help; return the parser of its options."""
     parser = commands.add_parser(name, help=title, description=f"{title[0].upper()}{title[1:]}.", epilog=text or None)
     add_debug(parser, default=argparse.SUPPRESS)  # keep an option before the command
     parser.set_defaults(run=run, parser=parser)
@@ -87,12 +76,20 @@ def add_debug(parser: Parser, *, default: Any = False) -> None:
     parser.add_argument("--debug", action="store_true", default=default, help="show the traceback of an error")
 
 
+ENGINE = ("workers", "engine", "address")
+
+
 def add_engine(parser: Options) -> None:
     """Add ``--engine`` and ``--address``."""
     text = "engine of the workers: local processes (loky, default), or a cluster ('cnpgen docs scale')"
     parser.add_argument("--engine", choices=("loky", "dask", "ray"), help=text)
     text = "address of the cluster, such as tcp://host:8786; without it a local cluster is started"
     parser.add_argument("--address", metavar="A", help=text)
+
+
+def options_of(arguments: argparse.Namespace, *names: str) -> dict[str, Any]:
+    """Return options of a command as keyword arguments."""
+    return {name: getattr(arguments, name) for name in names}
 
 
 def add_json(parser: Parser) -> None:

@@ -6,14 +6,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names, values
-from cnpgen.cli.parser import Commands, Parser, add_command, add_engine, add_json
+from cnpgen.cli.parser import ENGINE, Commands, Parser, add_command, add_engine, add_json, options_of
 from cnpgen.cli.refine_options import LARGE_ANGLES, REFINING, WORKERS, add_refining, check_place, refine_and_save
 from cnpgen.errors import UsageError, counted
 
 if TYPE_CHECKING:
     from cnpgen.planner.model import Model
     from cnpgen.planner.plan_requests import Requests
-    from cnpgen.plans import Plans
 
 _TEXT = """\
 The problems are samples of a dataset, fresh draws of a recipe as 'cnpgen solve' makes them, scenes ('cnpgen docs
@@ -34,9 +33,8 @@ def add(commands: "Commands[Parser]") -> None:
     option("problems", metavar="DIR|NAME|FILE", type=recipe_names.problems, help=text)
     text = "a shipped model, or a model file (default for a shipped dataset by name: the model of this name)"
     option("--model", metavar="NAME|FILE", type=recipe_names.model, help=text)
-    option(
-        "-o", "--out", metavar="PLANS", type=Path, help="plan file to write, .h5 (default for a recipe: NAME-plans.h5)"
-    )
+    text = "plan file to write, .h5 (default for a recipe: NAME-plans.h5)"
+    option("-o", "--out", metavar="PLANS", type=Path, help=text)
     option("--split", metavar="NAME", help="split of the dataset (default: validation)")
     option("--first", metavar="I", type=values.natural, help="first sample of the split (default: 0)")
     option("--n", metavar="K", type=values.rows, help="number of problems; for a folder by default all that follow")
@@ -56,13 +54,14 @@ def add(commands: "Commands[Parser]") -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
+    import json
     import time
 
     from cnpgen.planner.model_file import load_model
     from cnpgen.planner.planner import Planner
+    from cnpgen.plans import save_plans
 
     _complete(arguments)
-    _check(arguments)
     model = load_model(arguments.model)
     requests = _requests(arguments, model)
     planner = Planner(model, scale_time=not arguments.no_time_scaling)
@@ -81,15 +80,15 @@ def run(arguments: argparse.Namespace) -> int:
         print(text, file=sys.stderr)
     if arguments.refine:
         return refine_and_save(arguments, plans, arguments.out, title=f"refining plans of {arguments.model}")
-    return _save(arguments, plans, seconds)
+    save_plans(arguments.out, plans)
+    duration = float(plans.duration.mean()) if len(plans) else None
+    facts = {"file": str(arguments.out), "plans": len(plans), "seconds": seconds, "mean_duration_s": duration}
+    print(json.dumps(facts, indent=2) if arguments.json else arguments.out)
+    return 0
 
 
 def _complete(arguments: argparse.Namespace) -> None:
-    """Set the model and the output of a recipe's fresh problems, if they are not given.
-
-    Raises:
-        UsageError: One of them is missing, and there is no default.
-    """
+    """Set the default model and output of a recipe; refuse contradictory arguments and existing output."""
     from cnpgen.planner.model_file import shipped_models
 
     name, recipe = arguments.problems, recipe_names.is_recipe(arguments.problems)
@@ -100,31 +99,11 @@ def _complete(arguments: argparse.Namespace) -> None:
     for option, value in (("--model", arguments.model), ("-o/--out", arguments.out)):
         if value is None:
             raise UsageError(f"the following arguments are required: {option}; see 'cnpgen plan --help'")
-
-
-def _check(arguments: argparse.Namespace) -> None:
-    """Refuse contradictory arguments and existing output before any work."""
-    default = arguments.parser.get_default
-    lost = [
-        name
-        for name in ("workers", "engine", "address", "explain", *REFINING)
-        if getattr(arguments, name) != default(name)
-    ]
+    refining = options_of(arguments, *ENGINE, "explain", *REFINING)
+    lost = [name for name, value in refining.items() if value != arguments.parser.get_default(name)]
     if lost and not arguments.refine:
         raise UsageError(f"--{lost[0].replace('_', '-')} needs --refine")
     check_place(arguments.out, force=arguments.force)
-
-
-def _save(arguments: argparse.Namespace, plans: "Plans", seconds: float) -> int:
-    import json
-
-    from cnpgen.plans import save_plans
-
-    save_plans(arguments.out, plans)
-    duration = float(plans.duration.mean()) if len(plans) else None
-    facts = {"file": str(arguments.out), "plans": len(plans), "seconds": seconds, "mean_duration_s": duration}
-    print(json.dumps(facts, indent=2) if arguments.json else arguments.out)
-    return 0
 
 
 def _requests(arguments: argparse.Namespace, model: "Model") -> "Requests":

@@ -10,11 +10,7 @@ if TYPE_CHECKING:
 
 
 def read_plans(path: Path, *, problem: str | None = None) -> "Plans":
-    """Read the plans of a file, as ``cnpgen.load_plans`` does.
-
-    Raises:
-        DatasetError: The file has no plans, or as ``load_plans``.
-    """
+    """Read the plans of a file, as ``cnpgen.load_plans`` does; refuse files without plans."""
     from cnpgen.plans import load_plans
 
     plans = load_plans(path, problem=problem)

@@ -31,13 +31,7 @@ class Meter:
         self._bar: Any = None
 
     def begin(self, title: str, total: int, initial: int = 0) -> None:
-        """Show the start of a step; the previous step is over.
-
-        Args:
-            title: Name of the step.
-            total: Samples at the end.
-            initial: Samples that exist already.
-        """
+        """Show the start of a step with ``total`` samples, of which ``initial`` exist; the previous step is over."""
         self.close()
         self.rows, self.sampling, self._begun = 0, None, time.perf_counter()
         if not self._quiet and sys.stderr.isatty():

@@ -1,6 +1,7 @@
 """Arguments that name a recipe or a path; one that does not exist or is of another kind is refused."""
 
 import os
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,12 +23,7 @@ _HINTS = {  # what a file is -> what to do with it
 def check_recipe(recipe: str, *, of_dataset: str = DATASET) -> None:
     """Refuse the folder of a dataset, tables and HDF5 files, before they are looked for, or read, as recipes.
 
-    Args:
-        recipe: Name or path.
-        of_dataset: What to do with a dataset; "{0}" is its folder.
-
-    Raises:
-        UsageError: It is one of these.
+    ``of_dataset`` is the hint for a dataset, in whose folder "{0}" stands.
     """
     from cnpgen.store.files.atomic import check_readable
     from cnpgen.store.paths import file_kind
@@ -51,22 +47,11 @@ def check_recipe(recipe: str, *, of_dataset: str = DATASET) -> None:
 def is_recipe(what: str) -> bool:
     """Return whether an argument is a recipe file, or the name of a shipped dataset or pipeline and no path."""
     path = Path(what)
-    return (
-        path.suffix == ".toml" if path.exists() else path.suffix == ".toml" or what in _shipped("dataset", "pipeline")
-    )
+    return path.suffix == ".toml" or (not path.exists() and what in _shipped("dataset", "pipeline"))
 
 
 def check_there(what: str, *kinds: str) -> None:
-    """Refuse an argument that is neither a path nor the name of a recipe.
-
-    Args:
-        what: Name or path of a recipe, or the folder of a dataset.
-        *kinds: Kinds of recipes, datasets and pipelines by default.
-
-    Raises:
-        UsageError: No recipe has this name.
-        MachineError: The path cannot be read.
-    """
+    """Refuse an argument that is neither a path nor the name of a recipe, by default of a dataset or a pipeline."""
     from cnpgen.store.files.atomic import check_readable
     from cnpgen.store.files.kind import kind_of_content
     from cnpgen.store.paths import similar_path
@@ -124,17 +109,7 @@ def tasks_of(text: str) -> str:
     return text
 
 
-def problem(text: str) -> str:
-    """Read the name or the file of a problem, or of a pipeline or a dataset with it."""
-    return _recipe(text, "problem", "pipeline", "dataset")
-
-
-def suite(text: str) -> str:
-    """Read the name or the file of a suite, a dataset or a pipeline."""
-    return _recipe(text, "suite", "dataset", "pipeline")
-
-
-def _recipe(text: str, *kinds: "Kind") -> str:
+def _recipe(kinds: "tuple[Kind, ...]", text: str) -> str:
     """Read the name or the file of a recipe of one of several kinds."""
     from cnpgen.schema.catalogue import find_recipe
     from cnpgen.store.files.atomic import check_readable
@@ -142,6 +117,10 @@ def _recipe(text: str, *kinds: "Kind") -> str:
     check_recipe(text)
     check_readable(find_recipe(kinds, text))
     return text
+
+
+problem = partial(_recipe, ("problem", "pipeline", "dataset"))  # or a recipe with the problem
+suite = partial(_recipe, ("suite", "dataset", "pipeline"))
 
 
 def family(text: str) -> str:

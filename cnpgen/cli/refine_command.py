@@ -23,15 +23,10 @@ def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
     parser = add_command(commands, "refine", run, title="optimize the plans of a file", text=_TEXT)
     parser.add_argument("file", metavar="FILE", type=Path, help="plan file, .h5")
-    parser.add_argument(
-        "-o", "--out", metavar="OUT", type=Path, help="output file (default: FILE-refined.h5 beside it)"
-    )
-    parser.add_argument(
-        "--problem",
-        metavar="NAME|FILE",
-        type=recipe_names.problem,
-        help="the problem of the plans; its tolerances are used",
-    )
+    text = "output file (default: FILE-refined.h5 beside it)"
+    parser.add_argument("-o", "--out", metavar="OUT", type=Path, help=text)
+    text = "the problem of the plans; its tolerances are used"
+    parser.add_argument("--problem", metavar="NAME|FILE", type=recipe_names.problem, help=text)
     add_options(parser)
 
 

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cnpgen.cli import values
-from cnpgen.cli.parser import Options, Parser, add_engine, add_json
+from cnpgen.cli.interruption import resumable
+from cnpgen.cli.parser import ENGINE, Options, Parser, add_engine, add_json, options_of
 from cnpgen.cli.progress import Meter
 from cnpgen.errors import UsageError, counted
 
@@ -48,37 +49,20 @@ def add_options(parser: Parser) -> None:
 def add_refining(parser: Options) -> None:
     """Add the options that say how plans are refined: ``REFINING``."""
     option = parser.add_argument
-    option(
-        "--objective",
-        metavar="TERMS",
-        default="time",
-        help="objective: that of the problem file (time, default), or the duration with terms such as effort=0.5 or"
-        " effort=1,jerk=0.1 ('cnpgen list objectives')",
-    )
+    text = "objective: that of the problem file (time, default), or the duration with terms such as effort=0.5 or"
+    text += " effort=1,jerk=0.1 ('cnpgen list objectives')"
+    option("--objective", metavar="TERMS", default="time", help=text)
     option("--weight", metavar="X", type=float, help="weight of these terms (default: as in the problem or 1)")
     option("--max-iterations", metavar="I", type=values.natural, help="steps of the coarse level (default: 40)")
-    option(
-        "--tolerance",
-        metavar="X",
-        type=float,
-        help="relative change of the objective at which the iteration converges (default: 1e-3; without an initial"
-        " guess a tenth of it, among obstacles a twentieth)",
-    )
-    option(
-        "--deadline",
-        metavar="S",
-        type=values.seconds_with_unit,
-        help="time per plan, such as 10ms: returns the best plan until then, never worse than the input",
-    )
-    option(
-        "--stay-within",
-        metavar="E",
-        type=values.angle,
-        help="largest difference of every joint from the input path, such as 2deg (default: only the ends are kept)",
-    )
-    option(
-        "--explain", action="store_true", help="report for every invalid plan whether its problem is proven infeasible"
-    )
+    text = "relative change of the objective at which the iteration converges (default: 1e-3; without an initial"
+    text += " guess a tenth of it, among obstacles a twentieth)"
+    option("--tolerance", metavar="X", type=float, help=text)
+    text = "time per plan, such as 10ms: returns the best plan until then, never worse than the input"
+    option("--deadline", metavar="S", type=values.seconds_with_unit, help=text)
+    text = "largest difference of every joint from the input path, such as 2deg (default: only the ends are kept)"
+    option("--stay-within", metavar="E", type=values.angle, help=text)
+    text = "report for every invalid plan whether its problem is proven infeasible"
+    option("--explain", action="store_true", help=text)
 
 
 def refine_and_save(
@@ -91,22 +75,16 @@ def refine_and_save(
 ) -> int:
     """Refine plans, save them, print a summary; return the exit code.
 
-    Args:
-        arguments: What ``add_options`` added.
-        plans: The plans; None if ``make`` has them.
-        out: Where they go.
-        title: What is going on.
-        make: ``refine_plans`` by default, ``solve_plans``, or a function that solves scenes.
+    ``make`` is ``refine_plans`` by default, ``solve_plans``, or a function that solves scenes and has no plans.
     """
     from cnpgen.plans import save_plans
     from cnpgen.refine.options import RefineOptions
     from cnpgen.refine.refine_plans import refine_plans
 
-    given = {name: getattr(arguments, name) for name in REFINING}
+    given = options_of(arguments, *REFINING)
     options = RefineOptions(**{name: value for name, value in given.items() if value is not None})
     check_place(out, force=arguments.force)
     journal = out.with_name(out.name + ".part")
-    meter = Meter(quiet=arguments.quiet, noun="plan")
     finished = [0, 0]
 
     def progress(plans: int, valid: int) -> None:
@@ -114,30 +92,26 @@ def refine_and_save(
         meter(plans)
         meter.note(f"{finished[1] / finished[0]:.1%} valid")
 
-    try:
-        run: Callable[..., Refinement | SolvedScenes] = make or refine_plans
+    run: Callable[..., Refinement | SolvedScenes] = make or refine_plans
+    with resumable(journal), Meter(quiet=arguments.quiet, noun="plan") as meter:
         found = run(
             plans,
             options=options,
-            workers=arguments.workers,
-            engine=arguments.engine,
-            address=arguments.address,
             journal=journal,
             discard=arguments.force,
             begin=lambda total, there: meter.begin(title, total, there),
             progress=progress,
+            **options_of(arguments, *ENGINE),
         )
         facts = found.summary()
         if arguments.explain and any("finding" not in failure for failure in facts["not_valid"]):
             _explain(facts, found, meter)
-    except KeyboardInterrupt as interruption:
-        kept = f"{journal} keeps all finished problems; run the same command again to resume"
-        raise type(interruption)(kept) from interruption
-    finally:
-        meter.close()
     save_plans(out, found.plans)
     journal.unlink(missing_ok=True)
-    _tell(arguments, facts, out, found.times)
+    if not arguments.quiet:
+        lines = _summary(facts, found.times, listed=facts["plans"] if arguments.explain else LISTED)
+        print("\n".join(lines), file=sys.stderr)
+    print(json.dumps({"file": str(out), **facts}, indent=2) if arguments.json else out)
     return 0 if found.valid.all() else 1
 
 
@@ -154,19 +128,11 @@ def check_place(out: Path, *, force: bool) -> None:
     check_writable(out)
 
 
-def _tell(arguments: argparse.Namespace, facts: dict[str, Any], out: Path, times: "Times") -> None:
-    if not arguments.quiet:
-        lines = _summary(facts, times, listed=facts["plans"] if arguments.explain else LISTED)
-        print("\n".join(lines), file=sys.stderr)
-    print(json.dumps({"file": str(out), **facts}, indent=2) if arguments.json else out)
-
-
 def _explain(facts: dict[str, Any], found: "Refinement | SolvedScenes", meter: Meter) -> None:
     """Add proofs of infeasibility to the results of invalid plans."""
     from cnpgen.refine.proof.explain import explain_plans
 
-    if facts["not_valid"]:
-        meter.begin("explaining", len(facts["not_valid"]))
+    meter.begin("explaining", len(facts["not_valid"]))
     for failure in facts["not_valid"]:
         (finding,) = explain_plans(found.plans, [failure["plan"]]).values()
         failure |= {"finding": str(finding.kind), "explanation": finding.text}
@@ -178,10 +144,8 @@ def _summary(facts: dict[str, Any], times: "Times", *, listed: int) -> list[str]
     from cnpgen.refine.task import Outcome
 
     mean = facts["mean_duration_s"]
-    lines = [
-        f"{facts['valid']:,} of {counted(facts['plans'], 'plan')} valid in {times}"
-        + ("" if mean is None else f"; mean motion time {mean:.4f} s")
-    ]
+    mean_text = "" if mean is None else f"; mean motion time {mean:.4f} s"
+    lines = [f"{facts['valid']:,} of {counted(facts['plans'], 'plan')} valid in {times}{mean_text}"]
     lines += [f"  {count:,} {Outcome[name.upper()].text}" for name, count in facts["outcomes"].items()]
     for failure in facts["not_valid"][:listed]:
         lines += textwrap.wrap(_failure_text(failure), 110, subsequent_indent="  ")

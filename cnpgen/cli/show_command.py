@@ -25,12 +25,8 @@ def add(commands: "Commands[Parser]") -> None:
     title = "describe a recipe, a kind of stage or constraint, or the keys of recipe files"
     parser = add_command(commands, "show", run, title=title, text=_TEXT)
     what = parser.add_mutually_exclusive_group(required=True)
-    what.add_argument(
-        "recipe",
-        metavar="NAME|FILE",
-        nargs="?",
-        help="a shipped dataset, pipeline or problem (see 'cnpgen list'), or a recipe file",
-    )
+    text = "a shipped dataset, pipeline or problem (see 'cnpgen list'), or a recipe file"
+    what.add_argument("recipe", metavar="NAME|FILE", nargs="?", help=text)
     what.add_argument("--stage", metavar="KIND", help="describe a kind of stage and its keys")
     what.add_argument("--constraint", metavar="KIND", help="describe a kind of constraint and its keys")
     text = "all keys of problem, pipeline, dataset and suite files, in Markdown ('cnpgen docs keys'); WHAT is one kind"
@@ -72,23 +68,13 @@ def _about_kinds(arguments: argparse.Namespace) -> str:
 
 
 def load_any(name_or_path: str, kind: Kind | None = None) -> "Recipe":
-    """Load a recipe of any kind; of several with the same name the one that includes the others.
-
-    Raises:
-        RecipeError: There is none, or it has mistakes.
-    """
+    """Load a recipe of any kind; of several with the same name the one that includes the others."""
     from cnpgen.make.recipe_file import load_dataset_recipe
     from cnpgen.pipelines.pipeline_file import load_pipeline
     from cnpgen.problems.problem_file import load_problem
+    from cnpgen.schema.catalogue import find_recipe
 
-    kind = kind or _kind(name_or_path)
+    kind = kind or kind_of_file(find_recipe(KINDS, name_or_path))
     if kind == "dataset":
         return load_dataset_recipe(name_or_path)
     return load_pipeline(name_or_path) if kind == "pipeline" else load_problem(name_or_path)
-
-
-def _kind(name_or_path: str) -> Kind:
-    """Determine the kind of a recipe."""
-    from cnpgen.schema.catalogue import find_recipe
-
-    return kind_of_file(find_recipe(KINDS, name_or_path))

@@ -55,18 +55,9 @@ def add(commands: "Commands[Parser]") -> None:
     option("--workers", metavar="W", type=values.positive, help="processes; default one per available core")
     option("--list", action="store_true", help="also list the plans, one per line")
     option("--plan", metavar="I", type=values.natural, default=0, help="plan to draw (default: 0)")
-    option(
-        "--image",
-        metavar="PICTURE",
-        type=lambda text: values.picture_file(text, ".png"),
-        help="draw the world at the end of one plan: .png",
-    )
-    option(
-        "--video",
-        metavar="FILM",
-        type=lambda text: values.picture_file(text, ".mp4", ".gif"),
-        help="film one plan: .mp4 or .gif",
-    )
+    text = "draw the world at the end of one plan: .png"
+    option("--image", metavar="PICTURE", type=values.file_in(".png"), help=text)
+    option("--video", metavar="FILM", type=values.file_in(".mp4", ".gif"), help="film one plan: .mp4 or .gif")
     add_json(parser)
 
 
@@ -99,16 +90,10 @@ def _text(file: Path, found: "Simulation") -> str:
 
     summary, count = found.summary(), len(found.executed)
     head = f"{file}: {counted(count, 'plan')} of {found.plans.problem.name}, executed by the {found.plant.name} plant"
-    tallies = [
-        (text, f"{summary[name]:,} of {count:,}", f"{summary[name] / count:.2%}")
-        for name, text in _NAMES.items()
-        if name in summary
-    ]
-    figures = [
-        (text, form.format(summary["medians"][name]))
-        for name, (text, form) in _figures(found).items()
-        if name in summary["medians"]
-    ]
+    counts = {text: summary[name] for name, text in _NAMES.items() if name in summary}
+    tallies = [(text, f"{number:,} of {count:,}", f"{number / count:.2%}") for text, number in counts.items()]
+    shown = {name: figure for name, figure in _figures(found).items() if name in summary["medians"]}
+    figures = [(text, form.format(summary["medians"][name])) for name, (text, form) in shown.items()]
     lines = [head, "", *table(tallies, indent="  ", right=(1, 2)), "", "  medians", *table(figures, indent="    ")]
     refused = [(index, each.failure) for index, each in enumerate(found.executed) if each.failure]
     return "\n".join(lines + [f"  plan {index} was not executed: {why}" for index, why in refused])

@@ -35,23 +35,15 @@ def add(commands: "Commands[Parser]") -> None:
     """Add the command."""
     parser = add_command(commands, "solve", run, title="plan without an initial guess", text=_TEXT)
     option = parser.add_argument
-    option(
-        "what",
-        metavar="DIR|NAME|FILE",
-        type=recipe_names.problems,
-        help="a dataset's folder; a dataset or pipeline by name, or a recipe file; boundary conditions in HDF5;"
-        " or, with --robot, scenes",
-    )
+    text = "a dataset's folder; a dataset or pipeline by name, or a recipe file; boundary conditions in HDF5;"
+    text += " or, with --robot, scenes"
+    option("what", metavar="DIR|NAME|FILE", type=recipe_names.problems, help=text)
     option("--n", metavar="K", type=values.rows, help="number of problems; for a folder all of the split by default")
     option("--split", metavar="NAME", help="split of the folder (default: validation)")
     option("--first", metavar="I", type=values.natural, help="first sample of the split (default: 0)")
     option("--seed", metavar="S", type=values.seed, help="root seed of fresh problems; default the recipe's")
-    option(
-        "--problem",
-        metavar="NAME|FILE",
-        type=recipe_names.problem,
-        help="the problem of boundary conditions in HDF5; its tolerances are used",
-    )
+    text = "the problem of boundary conditions in HDF5; its tolerances are used"
+    option("--problem", metavar="NAME|FILE", type=recipe_names.problem, help=text)
     text = "solve scenes with this problem of a robot, such as panda"
     option("--robot", metavar="NAME|FILE", type=recipe_names.problem, help=text)
     option("-o", "--out", metavar="OUT", type=Path, help="output file (default: DIR-plans.h5 or NAME-plans.h5)")
@@ -63,7 +55,8 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     from cnpgen.refine.refine_plans import refine_plans, solve_plans
 
-    out = arguments.out or Path(f"{_name(Path(arguments.what))}-plans.h5")
+    what = Path(arguments.what)
+    out = arguments.out or Path(f"{what.resolve().name if what.is_dir() else what.stem}-plans.h5")
     check_place(out, force=arguments.force)
     if arguments.robot is not None:
         return _solve_scenes(arguments, out)
@@ -85,11 +78,6 @@ def _solve_scenes(arguments: argparse.Namespace, out: Path) -> int:
         return solve_scenes(problem, scenes, **options)
 
     return refine_and_save(arguments, None, out, title=f"solving {arguments.what}", make=solve)
-
-
-def _name(what: Path) -> str:
-    """Return the stem of the output: the name of the folder or of the recipe."""
-    return what.resolve().name if what.is_dir() else what.stem
 
 
 def _problems(arguments: argparse.Namespace) -> "Plans":

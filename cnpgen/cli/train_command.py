@@ -4,16 +4,15 @@ import argparse
 import shlex
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names, values
-from cnpgen.cli.parser import Commands, Parser, add_command
+from cnpgen.cli.parser import Commands, Parser, add_command, options_of
 from cnpgen.cli.train_options import add_settings, changed_settings, passed_settings
 from cnpgen.cli.train_text import Watch, summary
 from cnpgen.errors import MachineError
 
 if TYPE_CHECKING:
-    from cnpgen.training.settings import TrainingSettings
     from cnpgen.training.train import Trained
 
 _TEXT = """\
@@ -39,35 +38,21 @@ def add(commands: "Commands[Parser]") -> None:
     option = parser.add_argument
     option("folder", metavar="DIR", type=recipe_names.present, help="the dataset; or, with --robot, scenes")
     option("-o", "--out", metavar="MODEL", type=Path, required=True, help="model file to write, .h5")
-    _add_length(parser)
-    _add_how(parser)
+    length = parser.add_mutually_exclusive_group().add_argument
+    length("--cpu-seconds", metavar="S", type=values.seconds, help=_SECONDS)
+    length("--steps", metavar="N", type=values.positive, help="length of the run in steps")
+    length("--epochs", metavar="E", type=values.positive, help="length of the run in passes over all samples")
+    option("--preset", choices=("paper",), help=_PRESET)
+    add_settings(parser)
+    text = "start from the parameters of a model, by name or file; --hidden, --layers, --features and --expected-time"
+    text += " must be those of the model"
+    option("--from", dest="start_from", metavar="MODEL", type=recipe_names.model, help=text)
     option("--check", metavar="N", type=values.positive, default=200, help=_CHECK)
     text = "train on scenes with this problem of a robot, such as panda"
     option("--robot", metavar="NAME|FILE", type=recipe_names.problem, help=text)
     option("--workers", metavar="W", type=values.positive, help="processes of the last validation, on up to 2,000 rows")
     option("--force", action="store_true", help="replace MODEL, its log and another run's checkpoint")
     option("--quiet", action="store_true", help="no progress and no summary")
-
-
-def _add_length(parser: Parser) -> None:
-    option = parser.add_mutually_exclusive_group().add_argument
-    option("--cpu-seconds", metavar="S", type=values.seconds, help=_SECONDS)
-    option("--steps", metavar="N", type=values.positive, help="length of the run in steps")
-    option("--epochs", metavar="E", type=values.positive, help="length of the run in passes over all samples")
-
-
-def _add_how(parser: Parser) -> None:
-    option = parser.add_argument
-    option("--preset", choices=("paper",), help=_PRESET)
-    add_settings(parser)
-    option(
-        "--from",
-        dest="start_from",
-        metavar="MODEL",
-        type=recipe_names.model,
-        help="start from the parameters of a model, by name or file; --hidden, --layers, --features and --expected-time"
-        " must be those of the model",
-    )
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -90,46 +75,31 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _train(arguments: argparse.Namespace, watch: Watch) -> "Trained":
+    """Train with the settings and the length of a preset where the options have none."""
+    from cnpgen.training.presets import PRESETS
+    from cnpgen.training.settings import TrainingSettings
     from cnpgen.training.train import train_model
 
+    preset, length = PRESETS.get(arguments.preset), options_of(arguments, *_LENGTHS)
+    if preset is not None and all(value is None for value in length.values()):
+        length = vars(preset.length)
     return train_model(
         arguments.folder,
         arguments.out,
-        settings=_settings(arguments),
-        start_from=arguments.start_from,
-        **_length(arguments),
+        settings=changed_settings(TrainingSettings() if preset is None else preset.settings, arguments),
+        **length,
         check_rows=arguments.check,
         command=_command(arguments),
-        force=arguments.force,
-        workers=arguments.workers,
-        robot=arguments.robot,
         begin=watch.begin,
         watch=watch,
+        **options_of(arguments, "start_from", "force", "workers", "robot"),
     )
-
-
-def _settings(arguments: argparse.Namespace) -> "TrainingSettings":
-    from cnpgen.training.presets import PRESETS
-    from cnpgen.training.settings import TrainingSettings
-
-    settings = TrainingSettings() if arguments.preset is None else PRESETS[arguments.preset].settings
-    return changed_settings(settings, arguments)
-
-
-def _length(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return the length of the run, by name: as passed, else that of the preset."""
-    from cnpgen.training.presets import PRESETS
-
-    passed = {name: getattr(arguments, name) for name in _LENGTHS}
-    if arguments.preset is None or any(value is not None for value in passed.values()):
-        return passed
-    return vars(PRESETS[arguments.preset].length)
 
 
 def _command(arguments: argparse.Namespace) -> str:
     """Return the command that makes this model, without what changes nothing."""
-    given = [(name, getattr(arguments, name)) for name in ("preset", *_LENGTHS)]
-    given += [*passed_settings(arguments), ("check", arguments.check)]
+    given = [*options_of(arguments, "preset", *_LENGTHS).items(), *passed_settings(arguments)]
+    given.append(("check", arguments.check))
     if arguments.start_from is not None:
         given.insert(0, ("from", shlex.quote(Path(arguments.start_from).name)))
     if arguments.robot is not None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from cnpgen.cli import values
-from cnpgen.cli.parser import Parser
+from cnpgen.cli.parser import Parser, options_of
 from cnpgen.errors import UsageError
 
 if TYPE_CHECKING:
@@ -22,15 +22,13 @@ class _Setting:
         read: Function that reads the value; None for a flag.
         metavar: Placeholder of the value.
         help: Help text.
-        choices: Allowed values; empty for any.
-        value: Value of a flag.
+        choices: Allowed values; None for any.
     """
 
     read: Callable[[str], Any] | None
     metavar: str | None
     help: str
-    choices: tuple[str, ...] = ()
-    value: bool = True
+    choices: tuple[str, ...] | None = None
 
 
 def _real(text: str) -> float:
@@ -105,7 +103,6 @@ _METRIC: dict[str, str] = {
     "gamma": "step size of a learned metric (default: 1e-2; bounded 1e-3)",
     "budget_factor": "factor of all budgets of a learned metric (default: 1)",
 }
-_OTHERS = ("metric", *_METRIC)
 
 
 def add_settings(parser: Parser) -> None:
@@ -115,42 +112,27 @@ def add_settings(parser: Parser) -> None:
         flag = f"--{name.replace('_', '-')}"
         if setting.read is None:
             option(flag, action="store_true", default=None, help=setting.help)
-        elif setting.choices:
-            option(flag, choices=setting.choices, help=setting.help)
         else:
-            option(flag, metavar=setting.metavar, type=setting.read, help=setting.help)
+            option(flag, metavar=setting.metavar, type=setting.read, choices=setting.choices, help=setting.help)
     metrics = ("ramped", "fixed", "learned", "bounded")
     option("--metric", choices=metrics, help="weights of the constraints (default: ramped)")
     for name, text in _METRIC.items():
         option(f"--{name.replace('_', '-')}", metavar="X", type=_real, help=text)
-    option(
-        "--margin",
-        metavar="TERM=X",
-        type=_margin,
-        action="append",
-        help="train with limits X times those of the problem, such as joint-acceleration=0.96 (default: 0.985; of"
-        " joint-velocity 0.99); may be repeated",
-    )
+    text = "train with limits X times those of the problem, such as joint-acceleration=0.96 (default: 0.985; of"
+    text += " joint-velocity 0.99); may be repeated"
+    option("--margin", metavar="TERM=X", type=_margin, action="append", help=text)
     option("--no-margins", action="store_true", default=None, help="tighten only the limits that --margin names")
-    option(
-        "--imitate",
-        metavar="X",
-        type=_real,
-        help="fraction of the steps, such as 0.1, that imitate the plans of a dataset made with --certify (default: 0)",
-    )
+    text = "fraction of the steps, such as 0.1, that imitate the plans of a dataset made with --certify (default: 0)"
+    option("--imitate", metavar="X", type=_real, help=text)
 
 
 def changed_settings(settings: "TrainingSettings", arguments: argparse.Namespace) -> "TrainingSettings":
-    """Return settings with the options that were passed.
-
-    Raises:
-        UsageError: A value is invalid, or an option has no effect on the metric.
-    """
+    """Return settings with the options that were passed; refuse those without effect on the metric."""
     from cnpgen.training.settings import METRICS
 
-    changes = {name: getattr(arguments, name) for name in _OPTIONS if getattr(arguments, name) is not None}
+    changes = {name: value for name, value in options_of(arguments, *_OPTIONS).items() if value is not None}
     metric = settings.metric if arguments.metric is None else METRICS[arguments.metric]
-    passed = {name: getattr(arguments, name) for name in _METRIC if getattr(arguments, name) is not None}
+    passed = {name: value for name, value in options_of(arguments, *_METRIC).items() if value is not None}
     for name in passed:
         if metric.kind == "fixed" or (metric.kind == "ramped" and name != "growth"):
             reason = "whose weights do not grow" if name == "growth" else "which learns nothing"
@@ -167,12 +149,10 @@ def changed_settings(settings: "TrainingSettings", arguments: argparse.Namespace
 
 def passed_settings(arguments: argparse.Namespace) -> Iterator[tuple[str, Any]]:
     """Yield the names and texts of the options that were passed."""
-    for name in (*_OPTIONS, *_OTHERS):
-        yield name, getattr(arguments, name)
+    yield from options_of(arguments, *_OPTIONS, "metric", *_METRIC).items()
     for term, factor in arguments.margin or ():
         yield "margin", f"{term}={factor:g}"
-    yield "no_margins", arguments.no_margins
-    yield "imitate", arguments.imitate
+    yield from options_of(arguments, "no_margins", "imitate").items()
 
 
 def _margin(text: str) -> tuple[str, float]:

@@ -58,13 +58,13 @@ class Watch:
 
 
 def _words(found: Mapping[str, Any]) -> str:
-    words = [f"{found['valid']:.1%} of {found['plans']:,} plans valid", f"{found['duration_s']:.3f} s"]
+    text = f"{found['valid']:.1%} of {found['plans']:,} plans valid, {found['duration_s']:.3f} s"
     if "z_error_mm_s" in found:
-        words.append(f"z error {found['z_error_mm_s']:.3f} mm s")
+        text += f", z error {found['z_error_mm_s']:.3f} mm s"
     if "vertical_error_rad_s" in found:
-        words.append(f"vertical error {found['vertical_error_rad_s']:.4f} rad s")
+        text += f", vertical error {found['vertical_error_rad_s']:.4f} rad s"
     broken = sorted(found["broken"].items(), key=lambda item: -item[1])[:3]
-    return ", ".join(words) + (f"; broken: {', '.join(f'{name} {count}' for name, count in broken)}" if broken else "")
+    return text + (f"; broken: {', '.join(f'{name} {count}' for name, count in broken)}" if broken else "")
 
 
 def _terms(record: Mapping[str, Any]) -> str:
@@ -72,9 +72,8 @@ def _terms(record: Mapping[str, Any]) -> str:
     words = []
     for name, weight in record["weights"].items():
         value, budget = record["terms"][name], record["budgets"][name]
-        words.append(
-            f"{name} {value / budget:.2g} x {weight:.2g}" if budget else f"{name} ({value:.2g}) x {weight:.2g}"
-        )
+        amount = f"{value / budget:.2g}" if budget else f"({value:.2g})"
+        words.append(f"{name} {amount} x {weight:.2g}")
     head = f"loss {record['loss']:.4g}, learning rate {record['learning_rate']:.2g}; terms / budgets x weights: "
     return _fitted("  " + head + ", ".join(words))
 
@@ -82,15 +81,13 @@ def _terms(record: Mapping[str, Any]) -> str:
 def summary(trained: "Trained") -> str:
     """Say in a line what came of a run."""
     training = trained.model.training
-    words = _words(trained.score)
+    steps, best, words = f"{training['steps']:,} steps", f"{training['best_step']:,}", _words(trained.score)
     if not trained.made:
-        return _fitted(
-            f"already trained: {training['steps']:,} steps, of which that of step {training['best_step']:,}: {words}"
-        )
+        return _fitted(f"already trained: {steps}, of which that of step {best}: {words}")
     return _fitted(
-        f"trained {training['steps']:,} steps in {training['cpu_seconds']:.0f} s of CPU time and"
-        f" {training['validation_cpu_seconds']:.0f} s for validations; this run took {trained.times}; the model of step"
-        f" {training['best_step']:,} is kept: {words}"
+        f"trained {steps} in {training['cpu_seconds']:.0f} s of CPU time and"
+        f" {training['validation_cpu_seconds']:.0f} s for validations; this run took {trained.times};"
+        f" the model of step {best} is kept: {words}"
     )
 
 

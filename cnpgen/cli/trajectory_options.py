@@ -2,12 +2,13 @@
 
 import argparse
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cnpgen.cli import values
-from cnpgen.cli.parser import Options
+from cnpgen.cli.parser import Options, options_of
 from cnpgen.errors import UsageError, listed
 
 if TYPE_CHECKING:
@@ -36,8 +37,8 @@ def add_trajectory_options(option: Options) -> None:
 
 def refuse_trajectory_options(arguments: argparse.Namespace, file: Path, *others: str) -> None:
     """Refuse options of sampled trajectories for a plan file or a dataset."""
-    for name in (*TRAJECTORY_OPTIONS, "payload", *others):
-        if getattr(arguments, name) is not None:
+    for name, value in options_of(arguments, *TRAJECTORY_OPTIONS, "payload", *others).items():
+        if value is not None:
             raise UsageError(f"--{name.replace('_', '-')} is for sampled trajectories, {file} holds plans")
 
 
@@ -58,11 +59,10 @@ def problem_of(arguments: argparse.Namespace) -> "str | Problem":
 
 def load_file(arguments: argparse.Namespace, problem: "str | Problem") -> "LoadedTrajectories":
     """Load the trajectories of a command, and list the columns that are not used on stderr."""
-    import sys
-
     from cnpgen.plans.load_trajectories import load_trajectories
 
-    given = {name: getattr(arguments, name) for name in TRAJECTORY_OPTIONS if getattr(arguments, name) is not None}
+    given = options_of(arguments, *TRAJECTORY_OPTIONS)
+    given = {name: value for name, value in given.items() if value is not None}
     loaded = load_trajectories(arguments.file, problem, **given)
     if loaded.ignored:
         print(f"columns that are not used: {listed(loaded.ignored, MAX_IGNORED)}", file=sys.stderr)
@@ -81,28 +81,26 @@ def write_json(file: Path, found: "TrajectoryEvaluation", labels: tuple[str, ...
 def summary_text(file: Path, found: "TrajectoryEvaluation") -> str:
     """Return the counts, and for every condition the decisions with the worst margin."""
     from cnpgen.cli.describe import table
-    from cnpgen.cli.verdict_text import margin_cells
+    from cnpgen.cli.verdict_text import margin_cells, margin_head
 
     counts = ", ".join(f"{count:,} {decision}" for decision, count in found.counts.items())
     lines = [f"{file}: trajectories of {found.problem.name}: {counts}", ""]
     decided: list[tuple[str, ...]] = [
         ("condition", "valid", "invalid", "undecided", "time violated", "time undecided", "")
     ]
-    margins: list[tuple[str, ...]] = [
-        ("condition", "worst violation", "tolerance", "unit", "trajectory", "t [s]", "where")
-    ]
-    summary = found.summary()["conditions"]
-    for name, decisions in summary.items():
+    margins = [margin_head("condition", item="trajectory")]
+    summary = found.summary()
+    for name, decisions in summary["conditions"].items():
         entries = [(index, v.conditions[name]) for index, v in enumerate(found.verdicts) if name in v.conditions]
         worst, entry = max(entries, key=lambda item: item[1].margin.severity)
         shares = [max(getattr(e, share) for _, e in entries) for share in ("violated_share", "undecided_share")]
         counted = [f"{decisions[decision]:,}" for decision in ("valid", "invalid", "undecided")]
         decided.append((name, *counted, *(f"{share:.1%}" for share in shares), ""))
         margins.append((name, *margin_cells(entry.margin.to_dict(), worst)))
-    if summary:
+    if summary["conditions"]:
         lines += [*table(decided, indent="  ", right=(1, 2, 3, 4, 5)), ""]
         lines += table(margins, indent="  ", right=(1, 2, 4, 5))
-    lines += ["", *(f"  {count:,} because of: {reason}" for reason, count in found.summary()["reasons"].items())]
+    lines += ["", *(f"  {count:,} because of: {reason}" for reason, count in summary["reasons"].items())]
     return "\n".join(lines).rstrip()
 
 

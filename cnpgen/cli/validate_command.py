@@ -2,15 +2,11 @@
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names, values
-from cnpgen.cli.parser import Commands, Parser, add_command, add_engine, add_json
+from cnpgen.cli.parser import ENGINE, Commands, Parser, add_command, add_engine, add_json, options_of
 from cnpgen.cli.progress import Meter
 from cnpgen.errors import DatasetError
-
-if TYPE_CHECKING:
-    from cnpgen.validate.validate_dataset import ValidationReport
 
 _TEXT = """\
 The command always checks that every file exists and matches its sha256, the specification and the manifest. --deep
@@ -33,13 +29,8 @@ def add(commands: "Commands[Parser]") -> None:
     option = parser.add_argument
     option("folder", metavar="DIR", type=recipe_names.dataset, help="folder of a dataset")
     option("--deep", action="store_true", help="check every row, its constraints with Pinocchio and Coal")
-    option(
-        "--regenerate",
-        metavar="K",
-        type=values.natural,
-        default=0,
-        help="make K random blocks again from the seed and compare them",
-    )
+    text = "make K random blocks again from the seed and compare them"
+    option("--regenerate", metavar="K", type=values.natural, default=0, help=text)
     option("--workers", metavar="W", type=values.positive, help="processes for --deep; default one per available core")
     add_engine(parser)
     option("--quiet", action="store_true", help="print findings only")
@@ -49,8 +40,14 @@ def add(commands: "Commands[Parser]") -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     from cnpgen.store.files.documents import plain, render
+    from cnpgen.validate.validate_dataset import validate_dataset
 
-    report = _validate(arguments)
+    options = options_of(arguments, "deep", "regenerate", *ENGINE)
+    with Meter(quiet=arguments.quiet) as meter:
+        if rows := _rows(arguments.folder) if arguments.deep else 0:
+            meter.begin(f"validating {arguments.folder}", rows)
+            options["progress"] = meter
+        report = validate_dataset(arguments.folder, **options)
     if arguments.json:
         print(render(plain(report.to_dict())))
     else:
@@ -61,19 +58,6 @@ def run(arguments: argparse.Namespace) -> int:
         if not arguments.quiet:
             print(report.summary())
     return 0 if report.ok else 1
-
-
-def _validate(arguments: argparse.Namespace) -> "ValidationReport":
-    from cnpgen.validate.validate_dataset import validate_dataset
-
-    names = ("deep", "regenerate", "workers", "engine", "address")
-    options = {name: getattr(arguments, name) for name in names}
-    rows = _rows(arguments.folder) if arguments.deep else 0
-    if not rows:
-        return validate_dataset(arguments.folder, **options)
-    with Meter(quiet=arguments.quiet) as meter:
-        meter.begin(f"validating {arguments.folder}", rows)
-        return validate_dataset(arguments.folder, **options, progress=meter)
 
 
 def _rows(folder: Path) -> int:

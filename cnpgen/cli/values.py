@@ -3,9 +3,12 @@
 import math
 import re
 from argparse import ArgumentTypeError
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from decimal import Decimal
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from cnpgen.errors import either
 
@@ -18,11 +21,7 @@ MAX_SELECTED = 10**7  # of the numbers in a range
 
 
 def whole(text: str) -> int:
-    """Read a whole number: ``120000``, ``120_000``, or ``1e6`` if it is exact.
-
-    Raises:
-        ValueError: The text is no whole number.
-    """
+    """Read a whole number: ``120000``, ``120_000``, or ``1e6`` if it is exact; raise ValueError for other texts."""
     if len(text) <= _MAX_DIGITS and _PLAIN.fullmatch(text):
         return int(text)
     if len(text) <= _MAX_DIGITS and _SCIENTIFIC.fullmatch(text):
@@ -32,7 +31,7 @@ def whole(text: str) -> int:
     raise ValueError(f"no whole number: {text[:_MAX_DIGITS]!r}")
 
 
-def _at_least(low: int, text: str, example: str) -> int:
+def _at_least(low: int, example: str, text: str) -> int:
     try:
         number = whole(text)
     except ValueError:
@@ -42,22 +41,16 @@ def _at_least(low: int, text: str, example: str) -> int:
     return number
 
 
+positive = partial(_at_least, 1, "4")
+natural = partial(_at_least, 0, "7")
+
+
 def rows(text: str) -> int:
     """Read a number of rows, 1 to 10^12."""
-    number = _at_least(1, text, "120000, 120_000 or 1e6")
+    number = _at_least(1, "120000, 120_000 or 1e6", text)
     if number > MAX_ROWS_ARGUMENT:
         raise ArgumentTypeError(f"expected at most {MAX_ROWS_ARGUMENT:.0e} rows, got {text!r}")
     return number
-
-
-def positive(text: str) -> int:
-    """Read a whole number, at least 1."""
-    return _at_least(1, text, "4")
-
-
-def natural(text: str) -> int:
-    """Read a whole number, at least 0."""
-    return _at_least(0, text, "7")
 
 
 def port(text: str) -> int:
@@ -87,49 +80,46 @@ def part(text: str) -> tuple[int, int]:
     return k, m
 
 
-def plot_file(text: str) -> str:
-    """Read the name of a picture file in an existing folder."""
-    return picture_file(text, ".png", ".pdf", ".svg")
+def toml_value(text: str) -> Any:
+    """Read a value as in a recipe, or as plain text."""
+    import tomllib
+
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
 
 
-def picture_file(text: str, *endings: str) -> str:
-    """Read the name of a file with one of some endings, in a folder that is there and can be written."""
-    from cnpgen.store.files.atomic import check_writable
+def file_in(*endings: str) -> Callable[[str], str]:
+    """Return a reader of the name of a file with one of some endings, in a folder that is there and can be written."""
 
-    if not text.lower().endswith(endings):
-        raise ArgumentTypeError(f"expected a file that ends in {either(endings)}, got {text!r}")
-    if not Path(text).absolute().parent.is_dir():
-        raise ArgumentTypeError(f"expected a file in a folder that is there, got {text!r}")
-    check_writable(Path(text))
-    return text
+    def read(text: str) -> str:
+        from cnpgen.store.files.atomic import check_writable
+
+        if not text.lower().endswith(endings):
+            raise ArgumentTypeError(f"expected a file that ends in {either(endings)}, got {text!r}")
+        if not Path(text).absolute().parent.is_dir():
+            raise ArgumentTypeError(f"expected a file in a folder that is there, got {text!r}")
+        check_writable(Path(text))
+        return text
+
+    return read
 
 
-def seconds(text: str) -> float:
-    """Read a time above 0: ``0.001`` or ``1ms``."""
-    return _quantity(text, "s", "a time above 0, such as 0.001 or 1ms")
+plot_file = file_in(".png", ".pdf", ".svg")
 
 
 def seconds_with_unit(text: str) -> float:
     """Read a time above 0 with its unit, where a number alone is probably meant in another one: ``10ms``."""
     time = seconds(text)
     if text.strip()[-1:].isdigit() or text.strip().endswith("."):
-        raise ArgumentTypeError(
-            f"expected a time with its unit, such as 10ms; got {text!r}, is it {text}ms or {text}s?"
-        )
+        text = f"expected a time with its unit, such as 10ms; got {text!r}, is it {text}ms or {text}s?"
+        raise ArgumentTypeError(text)
     return time
 
 
-def meters(text: str) -> float:
-    """Read a length above 0: ``0.02`` or ``20mm``."""
-    return _quantity(text, "m", "a length above 0, such as 0.02 or 20mm")
-
-
-def hertz(text: str) -> float:
-    """Read a rate above 0: ``1000`` or ``1000Hz``."""
-    return _quantity(text, "1/s", "a rate above 0, such as 1000 or 1000Hz")
-
-
-def _quantity(text: str, unit: str, expected: str) -> float:
+def _quantity(unit: str, expected: str, text: str) -> float:
+    """Read a number above 0, in SI or with its unit."""
     from cnpgen.schema.units import parse_number
 
     try:
@@ -140,6 +130,11 @@ def _quantity(text: str, unit: str, expected: str) -> float:
     if number <= 0:
         raise ArgumentTypeError(f"expected {expected}; got {text!r}")
     return number
+
+
+seconds = partial(_quantity, "s", "a time above 0, such as 0.001 or 1ms")
+meters = partial(_quantity, "m", "a length above 0, such as 0.02 or 20mm")
+hertz = partial(_quantity, "1/s", "a rate above 0, such as 1000 or 1000Hz")
 
 
 def numbers(text: str) -> tuple[int, ...]:
@@ -162,6 +157,10 @@ def names(text: str) -> tuple[str, ...]:
     return found
 
 
+def _one_or_several(found: Sequence[float]) -> float | tuple[float, ...]:
+    return found[0] if len(found) == 1 else tuple(found)
+
+
 def _numbers(text: str) -> tuple[float, ...]:
     """Read numbers separated by commas; none if one of them is no number."""
     try:
@@ -170,17 +169,16 @@ def _numbers(text: str) -> tuple[float, ...]:
         return ()
 
 
-def errors(text: str) -> tuple[float, ...]:
+def errors(text: str) -> float | tuple[float, ...]:
     """Read one number or three, at least 0: ``1e-3`` or ``1e-3,1e-2,0.5``."""
     found = _numbers(text)
     if len(found) not in {1, 3} or not all(0 <= value < math.inf for value in found):
-        raise ArgumentTypeError(
-            f"expected one number or three, at least 0, such as 1e-3 or 1e-3,1e-2,0.5; got {text[:60]!r}"
-        )
-    return found
+        expected = "one number or three, at least 0, such as 1e-3 or 1e-3,1e-2,0.5"
+        raise ArgumentTypeError(f"expected {expected}; got {text[:60]!r}")
+    return _one_or_several(found)
 
 
-def tracking_errors(text: str) -> tuple[float, ...]:
+def tracking_errors(text: str) -> float | tuple[float, ...]:
     """Read angles or lengths of at least 0, separated by commas: ``2deg`` or ``1deg,1deg,5mm``."""
     from cnpgen.schema.units import parse_number
 
@@ -194,7 +192,7 @@ def tracking_errors(text: str) -> tuple[float, ...]:
         raise ArgumentTypeError(f"expected angles of at least 0, such as 2deg or 1deg,1deg,0.01; got {text[:60]!r}")
     if max(found) > MAX_ERROR:
         raise ArgumentTypeError(f"expected at most {MAX_ERROR:g} rad or m, such as 2deg; got {text[:60]!r}")
-    return tuple(found)
+    return _one_or_several(found)
 
 
 def parameters(text: str) -> dict[str, float]:
@@ -218,23 +216,22 @@ def payload(text: str) -> tuple[float, ...]:
     """Read a mass [kg], or a mass and the centre of mass in the tip frame [m]: ``2`` or ``2,0,0,0.1``."""
     found = _numbers(text)
     if len(found) not in {1, 4} or not all(map(math.isfinite, found)) or found[0] <= 0:
-        raise ArgumentTypeError(
-            f"expected a mass above 0, with or without the centre of mass, such as 2 or 2,0,0,0.1; got {text[:60]!r}"
-        )
+        expected = "a mass above 0, with or without the centre of mass, such as 2 or 2,0,0,0.1"
+        raise ArgumentTypeError(f"expected {expected}; got {text[:60]!r}")
     return found
 
 
 def angle(text: str) -> float:
     """Read an angle or a length above 0: ``2deg``, ``0.035`` or ``5mm``."""
     found = tracking_errors(text)
-    if len(found) != 1 or not found[0] > 0:
+    if isinstance(found, tuple) or not found > 0:
         raise ArgumentTypeError(f"expected one angle above 0, such as 2deg; got {text[:60]!r}")
-    return found[0]
+    return found
 
 
-def amounts(text: str) -> tuple[float, ...]:
+def amounts(text: str) -> float | tuple[float, ...]:
     """Read positive numbers separated by commas: ``500`` or ``7500,3750,5000``."""
     found = _numbers(text)
     if not found or not all(0 < value < math.inf for value in found):
         raise ArgumentTypeError(f"expected numbers above 0, such as 500 or 7500,3750; got {text[:60]!r}")
-    return found
+    return _one_or_several(found)

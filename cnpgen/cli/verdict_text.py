@@ -1,6 +1,7 @@
 """Output of ``cnpgen evaluate``: counts, reasons, statistics, margins; and the plans one by one."""
 
 import math
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -38,10 +39,8 @@ def summary_text(file: Path, found: "Evaluation") -> str:
     if (found.plans.duration > MAX_TIME_SAMPLES * found.step).any():
         step += f" or of {MAX_TIME_SAMPLES:,} in all"
     head = f"{file}: {counted(count, 'plan')} of {found.plans.problem.name}, judged at steps of {step} and between them"
-    tallies = [
-        (text, f"{summary[name]:,} of {count:,}", f"{summary[f'{name}_ratio']:.2%}", "")
-        for name, text in _TALLIES.items()
-    ]
+    counts = {text: (summary[name], summary[f"{name}_ratio"]) for name, text in _TALLIES.items()}
+    tallies = [(text, f"{number:,} of {count:,}", f"{share:.2%}", "") for text, (number, share) in counts.items()]
     sections = [[head, checksum_text(found.plans), "", *table(tallies, indent="  ", right=(1, 2))]]
     tables = (_reasons(found, summary), (1,)), (_figures(summary), range(1, 7)), (_margins(summary), (1, 2, 3, 5, 6))
     sections += [table(rows, indent="  ", right=tuple(right)) for rows, right in tables if len(rows) > 1]
@@ -53,7 +52,7 @@ def _reasons(found: "Evaluation", summary: dict[str, Any]) -> list[tuple[str, ..
     rows: list[tuple[str, ...]] = [("not valid because", "plans", "the worst of them")]
     for reason, number in summary["reasons"].items():
         plans = [(index, verdict) for index, verdict in enumerate(found.verdicts) if str(verdict.reason) == reason]
-        index, worst = max(plans, key=lambda plan: _severity(plan[1]))
+        index, worst = max(plans, key=lambda plan: plan[1].worst.severity if plan[1].worst else -math.inf)
         if not worst.valid:
             why = _why(worst)
             rows.append((reason, f"{number:,}", f"plan {index}{why and f': {why}'}"))
@@ -75,10 +74,6 @@ def _why(verdict: "Verdict") -> str:
     return str(verdict.worst or "")
 
 
-def _severity(verdict: "Verdict") -> float:
-    return verdict.worst.severity if verdict.worst else -math.inf
-
-
 def _figures(summary: dict[str, Any]) -> list[tuple[str, ...]]:
     """Lay out the metrics: of valid plans, of those valid by the paper's rules, and of all."""
     columns = [("metrics_of_valid", name) for name in ("mean", "median", "p95", "max")]
@@ -93,12 +88,15 @@ def _figures(summary: dict[str, Any]) -> list[tuple[str, ...]]:
 
 def _margins(summary: dict[str, Any]) -> list[tuple[str, ...]]:
     """Format per condition the number of violating plans and the plan with the smallest margin."""
-    rows: list[tuple[str, ...]] = [
-        ("condition", "violated by", "worst violation", "tolerance", "unit", "plan", "t [s]", "where")
-    ]
+    rows = [margin_head("condition", "violated by", item="plan")]
     for name, worst in summary["conditions"].items():
         rows.append((name, f"{worst['violating_plans']:,}", *margin_cells(worst, worst["worst_plan"])))
     return rows
+
+
+def margin_head(*first: str, item: str) -> tuple[str, ...]:
+    """Return the head of a table with ``margin_cells``."""
+    return *first, "worst violation", "tolerance", "unit", item, "t [s]", "where"
 
 
 def margin_cells(margin: Mapping[str, Any], index: int) -> tuple[str, ...]:
@@ -113,26 +111,13 @@ def listing_text(found: "Evaluation") -> str:
     order = sorted(range(len(found.verdicts)), key=lambda index: found.verdicts[index].valid)
     metrics = {index: found.verdicts[index].metrics.to_dict() for index in order}
     shown = [name for name in METRICS if any(name in values for values in metrics.values())]
-    rows = [
-        ("plan", "sample", "verdict", *(METRICS[name][1] for name in shown), "smallest margin, or largest violation")
-    ]
+    names = [METRICS[name][1] for name in shown]
+    rows = [("plan", "sample", "verdict", *names, "smallest margin, or largest violation")]
     for index in order:
         values = [(METRICS[name][2], metrics[index].get(name)) for name in shown]
         figures = ["-" if value is None else _figure(form, value) for form, value in values]
         verdict, sample = found.verdicts[index], int(found.plans.sample_id[index])
         why = _why(verdict) or "-"
         rows.append((str(index), str(sample), str(verdict.reason), *figures, why))
-    return "\n".join(_columns(rows, left={2, len(rows[0]) - 1}))
-
-
-def _columns(rows: list[tuple[str, ...]], left: set[int]) -> list[str]:
-    """Align cells in lines of any length: one plan is one line, for ``grep`` and ``sort``."""
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    padded = [
-        [
-            cell.ljust(width) if i in left else cell.rjust(width)
-            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ]
-        for row in rows
-    ]
-    return ["  ".join(cells).rstrip() for cells in padded]
+    right = [column for column in range(len(rows[0])) if column != 2]
+    return "\n".join(table(rows, right=right, width=sys.maxsize))  # one plan is one line, for grep and sort

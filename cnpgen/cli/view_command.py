@@ -3,6 +3,7 @@
 import argparse
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -38,23 +39,14 @@ def add(commands: "Commands[Parser]") -> None:
     rows = parser.add_mutually_exclusive_group()
     text = "plan of the file, or sample of the split (default: 0)"
     rows.add_argument("--row", metavar="I", type=values.natural, help=text)
-    rows.add_argument(
-        "--rows",
-        metavar="I,...",
-        type=values.numbers,
-        help=f"several of them, such as 0,3,10-12; at most {MAX_ROWS_OF_PAGE}",
-    )
+    text = f"several of them, such as 0,3,10-12; at most {MAX_ROWS_OF_PAGE}"
+    rows.add_argument("--rows", metavar="I,...", type=values.numbers, help=text)
     option("--split", metavar="NAME", help="split of the folder (default: validation)")
     text = "the problem of plans, rows or trajectories, whose URDF leads to its visual meshes"
     option("--problem", metavar="NAME|FILE", type=recipe_names.problem, help=text)
     where = parser.add_mutually_exclusive_group()
-    where.add_argument(
-        "-o",
-        "--out",
-        metavar="OUT",
-        type=lambda text: values.picture_file(text, ".html"),
-        help="output file (default: NAME.html)",
-    )
+    text = "output file (default: NAME.html)"
+    where.add_argument("-o", "--out", metavar="OUT", type=values.file_in(".html"), help=text)
     text = "serve the page on this machine, and show every change of its files (default port: 8000)"
     where.add_argument("--serve", metavar="PORT", type=values.port, nargs="?", const=8000, help=text)
     add_trajectory_options(parser.add_argument_group("sampled trajectories"))
@@ -96,6 +88,7 @@ def _scene(arguments: argparse.Namespace) -> "ViewScene":
     """Build the scene of a problem, of samples or of plans."""
     from cnpgen.cli.view.view_scene import scene_of_plans, scene_of_problem
     from cnpgen.plans import open_problem
+    from cnpgen.plans.evaluate import evaluate_plans
     from cnpgen.plans.trajectory_tables import holds_trajectories, is_trajectory_file
     from cnpgen.problems.load_robot import load_robot
     from cnpgen.problems.problem_file import load_problem_behind
@@ -103,14 +96,17 @@ def _scene(arguments: argparse.Namespace) -> "ViewScene":
     from cnpgen.store.paths import file_kind
 
     what, rows = Path(arguments.what), arguments.rows or (arguments.row or 0,)
+    if len(rows) > MAX_ROWS_OF_PAGE:
+        raise UsageError(f"--rows: expected at most {MAX_ROWS_OF_PAGE} rows on one page, got {len(rows)}")
     if what.exists() and (what.is_dir() or is_trajectory_file(what)) and holds_trajectories(what):
         return _scene_of_trajectories(arguments, rows)
     refuse_trajectory_options(arguments, what)
     if not what.is_dir() and not file_kind(what) and what.suffix not in HDF5_SUFFIXES:
-        _refuse_for_problem(arguments)
+        extra = [name for name in ("row", "rows", "split", "problem") if getattr(arguments, name) is not None]
+        if extra:
+            raise UsageError(f"--{extra[0]} needs plans or the folder of a dataset, got {arguments.what}")
         problem = load_problem_behind(arguments.what)
         return scene_of_problem(problem, load_robot(problem))
-    _check_rows(rows)
     plans, count = _samples(arguments, rows) if what.is_dir() else _plans(arguments, rows)
     if arguments.problem:
         problem = load_problem_behind(arguments.problem)
@@ -118,21 +114,17 @@ def _scene(arguments: argparse.Namespace) -> "ViewScene":
     else:
         problem, robot = open_problem(plans.problem)
     noun = "row" if what.is_dir() else "plan"
-    return scene_of_plans(
-        problem,
-        robot,
-        plans,
-        [f"{problem.name}: {what.name}, {noun} {row}" for row in rows],
-        _verdicts(plans, of_samples=what.is_dir()),
-        with_meshes=bool(arguments.problem),
-        first_row=rows[0],
-        n_rows=count,
-    )
+    titles = [f"{problem.name}: {what.name}, {noun} {row}" for row in rows]
+    verdicts: list[Verdict | None] = list(evaluate_plans(plans, workers=1).verdicts)
+    if what.is_dir():  # samples without a plan have a duration of nan and no verdict
+        pairs = zip(plans.duration.tolist(), verdicts, strict=True)
+        verdicts = [None if math.isnan(duration) else verdict for duration, verdict in pairs]
+    scene = scene_of_plans(problem, robot, plans, titles, verdicts, with_meshes=bool(arguments.problem))
+    return replace(scene, first_row=rows[0], n_rows=count)
 
 
 def _scene_of_trajectories(arguments: argparse.Namespace, rows: Sequence[int]) -> "ViewScene":
     """Build the scene of sampled trajectories with their verdicts."""
-    _check_rows(rows)
     from cnpgen.cli.view.view_scene import scene_of_trajectories
     from cnpgen.plans.evaluate_trajectories import evaluate_trajectories
     from cnpgen.problems.load_robot import load_robot
@@ -148,31 +140,8 @@ def _scene_of_trajectories(arguments: argparse.Namespace, rows: Sequence[int]) -
     chosen = [loaded.trajectories[row] for row in rows]
     titles = [f"{problem.name}: {loaded.labels[row]}" for row in rows]
     verdicts = evaluate_trajectories(problem, chosen).verdicts
-    return scene_of_trajectories(
-        problem, load_robot(problem), chosen, titles, verdicts, first_row=rows[0], n_rows=count
-    )
-
-
-def _check_rows(rows: Sequence[int]) -> None:
-    """Refuse more rows than a page may have."""
-    if len(rows) > MAX_ROWS_OF_PAGE:
-        raise UsageError(f"--rows: expected at most {MAX_ROWS_OF_PAGE} rows on one page, got {len(rows)}")
-
-
-def _verdicts(plans: "Plans", *, of_samples: bool) -> "list[Verdict | None]":
-    """Judge plans; None for samples without a plan, whose durations are nan."""
-    from cnpgen.plans.evaluate import evaluate_plans
-
-    verdicts = evaluate_plans(plans, workers=1).verdicts
-    pairs = zip(plans.duration.tolist(), verdicts, strict=True)
-    return [None if of_samples and math.isnan(duration) else verdict for duration, verdict in pairs]
-
-
-def _refuse_for_problem(arguments: argparse.Namespace) -> None:
-    """Refuse options that do not apply to a problem."""
-    extra = [name for name in ("row", "rows", "split", "problem") if getattr(arguments, name) is not None]
-    if extra:
-        raise UsageError(f"--{extra[0]} needs plans or the folder of a dataset, got {arguments.what}")
+    scene = scene_of_trajectories(problem, load_robot(problem), chosen, titles, verdicts)
+    return replace(scene, first_row=rows[0], n_rows=count)
 
 
 def _samples(arguments: argparse.Namespace, rows: Sequence[int]) -> "tuple[Plans, int]":

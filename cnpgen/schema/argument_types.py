@@ -9,14 +9,14 @@ import os
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from types import UnionType
-from typing import Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, ParamSpec, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from cnpgen.errors import CnpgenError, MachineError, UsageError, either, nearest
 from cnpgen.schema.arguments import flag, integer, number, reject_masked
+from cnpgen.schema.keys import alternatives
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -33,27 +33,6 @@ NOUNS = {  # class name -> description for messages; arguments of these classes 
 _ARRAYS = set(get_args(ArrayLike))
 
 
-@dataclasses.dataclass(frozen=True)
-class _Checks:
-    """Checks of the parameters of a function.
-
-    Attributes:
-        names: Names of the positional parameters.
-        first: Checks before the call, by name: of types that the function would accept or misread.
-        late: Checks after a call that raised another error than a ``CnpgenError``.
-    """
-
-    names: tuple[str, ...]
-    first: dict[str, Check]
-    late: dict[str, Check]
-
-    def run(self, checks: dict[str, Check], args: tuple[Any, ...], keywords: dict[str, Any]) -> None:
-        """Raise a UsageError for the first invalid argument."""
-        for name, value in (*zip(self.names, args, strict=False), *keywords.items()):
-            if name in checks:
-                checks[name](name, value)
-
-
 def checked_arguments(function: Callable[P, R]) -> Callable[P, R]:
     """Check the types of the arguments of every call by the annotations.
 
@@ -63,48 +42,49 @@ def checked_arguments(function: Callable[P, R]) -> Callable[P, R]:
     """
 
     @functools.cache
-    def checks() -> _Checks:
+    def prepared() -> tuple[tuple[str, ...], dict[str, Check], dict[str, Check]]:
+        """Return the positional parameters, their checks before the call, and those after an error."""
         parameters = inspect.signature(function).parameters.values()
         names = tuple(p.name for p in parameters if p.kind in {p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD})
         annotations = {p.name: p.annotation for p in parameters if p.kind != p.VAR_KEYWORD and p.annotation != p.empty}
         hints = {name: _evaluated(function, hint) for name, hint in annotations.items()}
         found = {name: _check_of(hint) for name, hint in hints.items()}
         late = {name: check for name, check in found.items() if check is not None}
-        return _Checks(names, {name: check for name, check in late.items() if _is_first(hints[name])}, late)
+        return names, {name: check for name, check in late.items() if _is_first(hints[name])}, late
 
     @functools.wraps(function)
     def call(*args: P.args, **keywords: P.kwargs) -> R:
-        known = checks()
-        known.run(known.first, args, keywords)
+        names, first, late = prepared()
+        _run(first, names, args, keywords)
         try:
             return function(*args, **keywords)
         except CnpgenError:
             raise
         except MemoryError as error:
-            raise MachineError(
-                f"out of memory in {function.__name__}: {error or 'pass fewer or smaller arrays'}"
-            ) from error
+            text = f"out of memory in {function.__name__}: {error or 'pass fewer or smaller arrays'}"
+            raise MachineError(text) from error
         except Exception:
-            known.run(known.late, args, keywords)
+            _run(late, names, args, keywords)
             raise
 
     return call
 
 
+def _run(checks: dict[str, Check], names: tuple[str, ...], args: tuple[Any, ...], keywords: dict[str, Any]) -> None:
+    """Raise a UsageError for the first invalid argument."""
+    for name, value in (*zip(names, args, strict=False), *keywords.items()):
+        if name in checks:
+            checks[name](name, value)
+
+
 def _is_first(hint: Any) -> bool:
     """Return whether a wrong type must be found before the call."""
-    present = _alternatives(hint)
+    present = alternatives(hint)
     if len(present) != 1:
         return set(present) >= _ARRAYS
     (kind,) = present
     kind = get_origin(kind) or kind
     return kind in {bool, str, collections.abc.Callable, np.ndarray} or getattr(kind, "__name__", kind) in NOUNS
-
-
-def _alternatives(hint: Any) -> tuple[Any, ...]:
-    """Return the alternatives of an annotation without None."""
-    options = get_args(hint) if get_origin(hint) in {Union, UnionType} else (hint,)
-    return tuple(option for option in options if option is not type(None))
 
 
 def _evaluated(function: Callable[..., Any], annotation: Any) -> Any:
@@ -134,13 +114,8 @@ def _field_checks(cls: type) -> tuple[tuple[str, Check], ...]:
 
 
 def _check_of(hint: Any, *, strict: bool = False) -> Check | None:
-    """Return the check of an annotation; None if every value is accepted.
-
-    Args:
-        hint: The annotation.
-        strict: Whether arrays must be arrays of NumPy, and numbers may be infinite, as in fields.
-    """
-    options = _alternatives(hint)
+    """Return the check of an annotation, None if every value is accepted; fields are ``strict``."""
+    options = alternatives(hint)
     arrays = set(options) >= _ARRAYS
     present = [option for option in options if not (arrays and option in _ARRAYS)]
     checks: list[Check] = [_masked] if arrays else []
@@ -171,25 +146,26 @@ def _check_of(hint: Any, *, strict: bool = False) -> Check | None:
 
 
 def _check_of_type(hint: Any, *, strict: bool) -> Check | None:
-    """Return the check of one alternative of an annotation."""
+    """Return the check of one alternative; if ``strict`` only NumPy's arrays, and numbers may be infinite."""
     if isinstance(hint, str):
         return functools.partial(_named, hint) if hint.isidentifier() else None
     kind = get_origin(hint) or hint
     if kind is Literal:
         return functools.partial(_choice, get_args(hint))
-    known: dict[Any, Check] = {
-        int: functools.partial(integer, least=None),
-        bool: flag,
-        str: _text,
-        float: _real if strict else number,
+    known: dict[Any, Check] = {int: integer, bool: flag, float: _real if strict else number}
+    known |= {
+        str: functools.partial(_accepted, lambda value: isinstance(value, str), "a text"),
+        collections.abc.Callable: functools.partial(_accepted, callable, "a function"),
+        np.ndarray: _array if strict else _masked,
     }
-    known |= {collections.abc.Callable: _callable, np.ndarray: _array if strict else _masked}
     if kind in known:
         return known[kind]
     if not inspect.isclass(kind) or kind is object or getattr(kind, "_is_protocol", False):
         return None
     if kind in {collections.abc.Iterable, collections.abc.Sequence}:
-        return functools.partial(_collection, kind)
+        return functools.partial(
+            _accepted, lambda value: isinstance(value, kind) and not isinstance(value, str | bytes), "a list"
+        )
     return functools.partial(_instance, kind)
 
 
@@ -210,9 +186,9 @@ def _real(name: str, value: Any) -> float:
     return value if isinstance(value, float) and math.isinf(value) else number(name, value)
 
 
-def _text(name: str, value: Any) -> str:
-    if not isinstance(value, str):
-        raise UsageError(f"must be a text, got {value!r:.100}", argument=name)
+def _accepted(accepts: Callable[[Any], bool], noun: str, name: str, value: Any) -> Any:
+    if not accepts(value):
+        raise UsageError(f"must be {noun}, got {value!r:.100}", argument=name)
     return value
 
 
@@ -223,22 +199,10 @@ def _path(name: str, value: Any) -> str | Path:
     return value if isinstance(value, str) else Path(value)
 
 
-def _callable(name: str, value: Any) -> Any:
-    if not callable(value):
-        raise UsageError(f"must be a function, got {value!r:.100}", argument=name)
-    return value
-
-
 def _choice(choices: tuple[Any, ...], name: str, value: Any) -> Any:
     if not isinstance(value, str) or value not in choices:
         hint = nearest(value, choices) if isinstance(value, str) else ""
         raise UsageError(f"must be one of {', '.join(map(str, choices))}, got {value!r:.100}{hint}", argument=name)
-    return value
-
-
-def _collection(kind: type, name: str, value: Any) -> Any:
-    if not isinstance(value, kind) or isinstance(value, str | bytes):
-        raise UsageError(f"must be a list, got {value!r:.100}", argument=name)
     return value
 
 

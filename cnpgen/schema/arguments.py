@@ -19,12 +19,6 @@ Array = NDArray[Any]
 def integer(name: str, value: Any, *, least: int | None = None, most: int | None = None) -> int:
     """Return an argument as an integer; accept NumPy integers, reject bool.
 
-    Args:
-        name: Name of the argument.
-        value: Value of the argument.
-        least: Minimum value, None for no minimum.
-        most: Maximum value, None for no maximum.
-
     Raises:
         UsageError: The value is not an integer, or out of range.
     """
@@ -94,14 +88,7 @@ def _fitting(name: str, array: Array) -> Array:
 
 
 def check_range(name: str, values: ArrayLike, low: float, high: float, unit: str) -> None:
-    """Raise an error for a value outside of its range, with the unit that was probably meant.
-
-    Args:
-        name: Name of the argument.
-        values: One value or an array [unit].
-        low: Minimum value.
-        high: Maximum value.
-        unit: SI unit.
+    """Raise an error for values [unit] outside of their range, with the unit that was probably meant.
 
     Raises:
         UsageError: A value is outside of the range, or nan.

@@ -115,9 +115,8 @@ def read_kind(group: str, value: Any, where: RecipeLocation, mistakes: list[str]
     if not isinstance(use, str):
         known = ", ".join(registry.names(group))
         given = isinstance(value, dict) and "use" in value
-        text = (
-            f"expected one of {known}, got {show(value['use'])}" if given else f"missing key, expected one of {known}"
-        )
+        text = f"expected one of {known}"
+        text = f"{text}, got {show(value['use'])}" if given else f"missing key, {text}"
         mistakes.append((where / "use").message(text))
         return None
     try:

@@ -111,11 +111,7 @@ class Key:
 
 
 def keys(cls: type) -> tuple[Key, ...]:
-    """List the keys of a dataclass, in order.
-
-    Args:
-        cls: Dataclass; fields that are not declared with ``field`` are not keys.
-    """
+    """List the keys of a dataclass, in order; fields that are not declared with ``field`` are not keys."""
     return _keys_of(cls)
 
 
@@ -177,11 +173,15 @@ def _plain(value: Any, label: Callable[[Any], Mapping[str, Any]]) -> Any:
     return dict(value) if isinstance(value, dict) else value
 
 
+def alternatives(hint: Any) -> tuple[Any, ...]:
+    """Return the alternatives of an annotation without None."""
+    options = get_args(hint) if get_origin(hint) in {Union, UnionType} else (hint,)
+    return tuple(option for option in options if option is not type(None))
+
+
 def _present(hint: Any) -> Any:
     """Return ``X`` for ``X | None``, since TOML has no null."""
-    if get_origin(hint) not in (Union, UnionType):
-        return hint
-    options = [option for option in get_args(hint) if option is not type(None)]
+    options = alternatives(hint)
     return options[0] if len(options) == 1 else hint
 
 

@@ -233,30 +233,17 @@ def _bounded(number: _Number, key: Key, value: Any) -> _Number:
 
 
 def _plausible(read: Any, value: Any, key: Key) -> Any:
-    """Return a value in SI; raise ValueError if it is probably in another unit.
-
-    Args:
-        read: The value in SI: a number, a range, or several numbers.
-        value: The TOML value; a hint follows only if it has no unit.
-        key: Its key.
-    """
+    """Return a value in SI; raise ValueError if it is probably in another unit, with a hint if it has no unit."""
     limit = PLAUSIBLE_MAX.get(key.unit, math.inf) if key.plausible is None else key.plausible
     if limit == math.inf or _IS_STORED.get():
         return read
-    for number in _numbers_of(read):
+    numbers = (read.low, read.high) if isinstance(read, Range) else getattr(read, "values", read)
+    for number in numbers if isinstance(numbers, tuple) else (numbers,):
         if abs(number) > limit:
             size = "small, expected at least -" if number < 0 else "large, expected at most "
             hint = "" if _has_unit(value) else suggested_unit(number, key.unit, -limit, limit)
             raise ValueError(f"{number} {key.unit} is too {size}{limit:.4g} {key.unit}{hint}")
     return read
-
-
-def _numbers_of(read: Any) -> tuple[float, ...]:
-    if isinstance(read, Range):
-        return read.low, read.high
-    if isinstance(read, PerJoint):
-        return read.values
-    return read if isinstance(read, tuple) else (read,)
 
 
 def _has_unit(value: Any) -> bool:

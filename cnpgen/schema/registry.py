@@ -128,11 +128,7 @@ RENAMED: dict[str, dict[str, str]] = {PLANNERS: {"cnp-b": "cnpgen", "cnp-b+refin
 
 
 def names(group: str) -> tuple[str, ...]:
-    """List the kinds of a group: the built-in ones in their order, then those of installed packages by name.
-
-    Args:
-        group: ``STAGES``, ``CONSTRAINTS``, ``OBJECTIVES``, ``PLANNERS``, ``EXPORTERS`` or ``FAMILIES``.
-    """
+    """List the kinds of a group: the built-in ones in their order, then those of installed packages by name."""
     others = {entry.name for entry in installed(group)} - BUILT_IN[group].keys()
     return (*BUILT_IN[group], *sorted(others))
 
@@ -153,14 +149,21 @@ def load(group: str, name: str) -> type[Any]:
     sources = _sources(group, name)
     noun = noun_of(group)
     if not sources:
-        known = names(group)
-        hint = name_hint(group, name)
-        known_names = f"known: {', '.join(known)}, and those of packages with the entry point group {group!r}"
-        raise RecipeError([f"unknown {noun} {name!r}{hint}; {known_names}"])
+        known = f"known: {', '.join(names(group))}, and those of packages with the entry point group {group!r}"
+        raise RecipeError([f"unknown {noun} {name!r}{name_hint(group, name)}; {known}"])
     if len(sources) > 1:
         raise RecipeError([f"{noun} {name!r} is defined more than once: by {' and by '.join(sources)}"])
     source, importer = next(iter(sources.items()))
-    return _imported(importer, f"{noun} {name!r} of {source}", base=contract(group))
+    what, base = f"{noun} {name!r} of {source}", contract(group)
+    try:
+        kind: type[Any] = importer()
+    except Exception as error:  # imported modules may raise any exception
+        raise RecipeError([f"{what} cannot be imported: {type(error).__name__}: {error}"]) from error
+    if not (inspect.isclass(kind) and issubclass(kind, base)):
+        raise RecipeError([f"{what} is not a subclass of {base.__module__}.{base.__name__}, got {kind!r}"])
+    if faults := list(_faults(kind)):
+        raise RecipeError([f"{what}: {fault}" for fault in faults])
+    return kind
 
 
 def name_hint(group: str, name: str) -> str:
@@ -187,12 +190,7 @@ def group_of(kind: type) -> str:
 
 
 def name_of(group: str, kind: type) -> str:
-    """Return the name under which a class is registered, or ``"module:Class"`` if it is not.
-
-    Args:
-        group: ``STAGES``, ``CONSTRAINTS``, ``OBJECTIVES``, ``PLANNERS``, ``EXPORTERS`` or ``FAMILIES``.
-        kind: The class.
-    """
+    """Return the name under which a class is registered in a group, or ``"module:Class"`` if it is not."""
     spec = f"{kind.__module__}:{kind.__qualname__}"
     for name, built_in in BUILT_IN[group].items():
         if built_in == spec:
@@ -221,9 +219,7 @@ def package_digest(package: str) -> str:
     files = [file for folder in folders for file in sorted(folder.rglob("*.py"))]
     if not folders and source:
         files = [Path(source)]
-    if not files:
-        return ""
-    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest() if files else ""
 
 
 def package_of(group: str, kind: type) -> str:
@@ -234,13 +230,7 @@ def package_of(group: str, kind: type) -> str:
 
 
 def why_missing(group: str, use: str, package: str) -> str:
-    """Return the missing package of a kind in a recipe; empty if the kind exists.
-
-    Args:
-        group: ``STAGES``, ``CONSTRAINTS``, ``OBJECTIVES``, ``PLANNERS``, ``EXPORTERS`` or ``FAMILIES``.
-        use: Name of the kind.
-        package: The package that had it, empty if that is not known.
-    """
+    """Return a message with the package of a missing kind, which may be empty if unknown; empty if the kind exists."""
     if use in names(group):
         return ""
     noun = noun_of(group)
@@ -274,20 +264,6 @@ def _named(spec: str) -> Any:
     """Import the object ``"module:name"``."""
     module, _, attribute = spec.partition(":")
     return getattr(importlib.import_module(module), attribute)
-
-
-def _imported(importer: Callable[[], Any], what: str, *, base: type) -> type[Any]:
-    """Import a class and check that it is a concrete kind of ``base``."""
-    try:
-        kind = importer()
-    except Exception as error:  # imported modules may raise any exception
-        raise RecipeError([f"{what} cannot be imported: {type(error).__name__}: {error}"]) from error
-    if not (inspect.isclass(kind) and issubclass(kind, base)):
-        raise RecipeError([f"{what} is not a subclass of {base.__module__}.{base.__name__}, got {kind!r}"])
-    faults = list(_faults(kind))
-    if faults:
-        raise RecipeError([f"{what}: {fault}" for fault in faults])
-    return kind
 
 
 def _faults(kind: type[Any]) -> Iterator[str]:

@@ -7,12 +7,7 @@ MAX_NOTES_BYTES = 1 << 20  # of a card, or of the notes for one
 
 
 def read_at_most(path: Path, most: int, what: str) -> bytes:
-    """Read a file of a bounded size.
-
-    Args:
-        path: Path of the file.
-        most: Maximum size [bytes].
-        what: Expected content, for the message: "a recipe".
+    """Read a file of at most so many bytes; the message has the expected content, such as "a recipe".
 
     Raises:
         ValueError: The file is missing, not a regular file or too large.
@@ -26,12 +21,9 @@ def read_at_most(path: Path, most: int, what: str) -> bytes:
 
 
 def read_own(path: Path, owner: Path, what: str) -> bytes:
-    """Read a file next to its owner; links to other folders are rejected, since they could leak private files.
+    """Read a file of at most ``MAX_NOTES_BYTES`` bytes next to the file to which it belongs.
 
-    Args:
-        path: Path of the file, of at most ``MAX_NOTES_BYTES`` bytes.
-        owner: Path of the file to which it belongs.
-        what: Expected content, for the message: "notes".
+    Links to other folders are rejected, since they could leak private files.
 
     Raises:
         ValueError: The file is a link out of the owner's folder, missing, not a regular file or too large.

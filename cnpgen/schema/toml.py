@@ -36,24 +36,22 @@ def kind_of_file(path: Path) -> Kind:
 
 
 def read_table(path: Path, kinds: tuple[Kind, ...], mistakes: list[str]) -> dict[str, Any] | None:
-    """Return the top-level table of a recipe file, or None after a mistake."""
+    """Return the top-level table of a recipe file, or None after a mistake, such as a recipe of another kind."""
     try:
-        return _expect(path, kinds, _read(path))
+        table = _read(path)
     except OSError as error:
         mistakes.append(f"{path}: cannot be read: {error.strerror}")
+        return None
     except ValueError as error:
         mistakes.append(f"{path}: {error}")
-    return None
-
-
-def _expect(path: Path, kinds: tuple[Kind, ...], table: dict[str, Any]) -> dict[str, Any]:
-    """Return the table; raise ValueError if it is a recipe of another kind, with the right file beside it."""
+        return None
     found = [kind for kind in MARKS if is_kind(kind, table)]
-    if found and not set(found) & set(kinds):
-        beside = [path.parent / f"{kind}.toml" for kind in kinds]
-        hint = next((f" (did you mean {file}?)" for file in beside if file.is_file() and file != path), "")
-        raise ValueError(f"is a {found[0]}, expected a {' or a '.join(kinds)}{hint}")
-    return table
+    if not found or set(found) & set(kinds):
+        return table
+    beside = [path.parent / f"{kind}.toml" for kind in kinds]
+    hint = next((f" (did you mean {file}?)" for file in beside if file.is_file() and file != path), "")
+    mistakes.append(f"{path}: is a {found[0]}, expected a {' or a '.join(kinds)}{hint}")
+    return None
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -6,8 +6,7 @@ from pathlib import Path
 import h5py
 import pytest
 
-from cnpgen.cli.main import main
-from cnpgen.cli.shell import shell_spelling
+from cnpgen.cli.main import main, shell_spelling
 from cnpgen.errors import CnpgenError, DatasetError, RecipeError, UsageError
 from cnpgen.training.train import check_beside
 

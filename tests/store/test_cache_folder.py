@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from cnpgen.cli.notices import notices
+from cnpgen.cli.main import notices
 from cnpgen.errors import MachineError
 from cnpgen.kernels.library import KernelLibrary, choose_backend
 from cnpgen.store.files.cache_folder import (

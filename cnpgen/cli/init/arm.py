@@ -77,11 +77,7 @@ class Arm:
 
 
 def read_arm(urdf: Path, tip: str | None) -> Arm:
-    """Read an arm.
-
-    Args:
-        urdf: The URDF file.
-        tip: The tip frame: a link or a joint; by default the only link without a child.
+    """Read an arm, whose tip frame is a link or a joint, by default the only link without a child.
 
     Raises:
         RecipeError: The file cannot be read, needs xacro, or has no joint that moves the tip.
@@ -101,17 +97,18 @@ def read_arm(urdf: Path, tip: str | None) -> Arm:
     tip = tip if tip is not None else _only_leaf(urdf, links, joints)
     if text := missing_frame(tree, urdf, tip):
         raise UsageError(f"--tip: {text}")
-    moving = [joint for joint in _path(tip, joints) if _moves(joint)]
+    moving = [joint for joint in _path(tip, joints) if joint.kind != "fixed"]
     if not moving:
         raise RecipeError([f"{urdf}: no joint moves the frame {tip!r}; its frames: {listed(frames_of(tree))}"])
     planned = tuple(map(_joint, moving))
     moved = tuple(link for link in links if moving[0] in _path(link, joints))
     names = {joint.name for joint in planned}
+    locked = [joint.name for joint in joints.values() if joint.kind != "fixed" and joint.name not in names]
     return Arm(
         urdf=urdf,
         tip=tip,
         planned=planned,
-        locked=tuple(joint.name for joint in joints.values() if _moves(joint) and joint.name not in names),
+        locked=tuple(locked),
         moved=moved,
         frames=tuple(frames_of(tree)),
         masses={link: inertia.mass if inertia else 0.0 for link, inertia in parameters.inertias.items()},
@@ -172,10 +169,6 @@ def _is_impossible(inertia: LinkInertia | None) -> bool:
         return False
     low, medium, high = np.linalg.eigvalsh(inertia.inertia)
     return bool(low < -MAX_INERTIA_ERROR * high or high > (1 + MAX_INERTIA_ERROR) * (low + medium))
-
-
-def _moves(joint: UrdfJoint) -> bool:
-    return joint.kind != "fixed"
 
 
 def _joint(joint: UrdfJoint) -> ArmJoint:

@@ -108,16 +108,11 @@ def _clearance(world: World, q: Array) -> float:
 
 
 def find_boxes(pipeline: Pipeline) -> tuple[Pipeline, float]:
-    """Find boxes of start and goal positions, side by side about the tip of the base configuration.
+    """Return a pipeline with boxes of positions in its first stage, and the share of accepted candidates.
 
-    Boxes are tried from the largest to the smallest. The first with more than half of the candidates accepted is
-    returned, or else the one with the largest share.
-
-    Args:
-        pipeline: A pipeline whose first stage samples positions.
-
-    Returns:
-        The pipeline with the boxes, and the share of accepted candidates.
+    The boxes of start and goal are side by side about the tip of the base configuration. They are tried from the
+    largest to the smallest. The first with more than half of the candidates accepted is returned, or else the one with
+    the largest share.
 
     Raises:
         RecipeError: No box has enough accepted candidates.
@@ -144,14 +139,7 @@ def find_boxes(pipeline: Pipeline) -> tuple[Pipeline, float]:
 
 
 def _boxes(centre: Array, edge: float, moves: NDArray[np.bool_], distance: float) -> DrawPositions:
-    """Return two boxes side by side, along y if the tip moves along it; flat along axes along which it does not.
-
-    Args:
-        centre: Midpoint between the boxes [m], shape (3,).
-        edge: Edge of the boxes [m].
-        moves: Mask of the axes along which the tip moves, shape (3,).
-        distance: Distance between the boxes [m].
-    """
+    """Return two boxes side by side, along y if the tip moves along it; flat along axes along which it does not."""
     aside = next((axis for axis in (1, 2, 0) if moves[axis]), 1)
     shift = np.where(np.arange(3) == aside, (edge + distance) / 2 + ROUNDING_M, 0.0)
 
@@ -162,9 +150,8 @@ def _boxes(centre: Array, edge: float, moves: NDArray[np.bool_], distance: float
         )
         return x, y, z
 
-    horizontal = aside < 2
-    floor = math.floor(1e3 * distance) / 1e3
-    return DrawPositions(start=box(centre - shift), goal=box(centre + shift), min_distance=floor if horizontal else 0.0)
+    min_distance = math.floor(1e3 * distance) / 1e3 if aside < 2 else 0.0  # in the horizontal plane
+    return DrawPositions(start=box(centre - shift), goal=box(centre + shift), min_distance=min_distance)
 
 
 def _accepted(pipeline: Pipeline) -> float:

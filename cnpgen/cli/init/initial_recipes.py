@@ -60,12 +60,7 @@ class InitialProblem:
 def problem_of(arm: Arm, name: str, folder: Path, packages: tuple[Path, ...], srdf: Path | None) -> InitialProblem:
     """Make the problem of an arm.
 
-    Args:
-        arm: The arm.
-        name: Name of the problem.
-        folder: Folder of the problem.
-        packages: Folders that are searched for packages.
-        srdf: SRDF file with disabled pairs of links.
+    ``packages`` are folders that are searched for packages of the URDF, the SRDF disables pairs of links.
 
     Raises:
         RecipeError: The arm cannot be planned for.
@@ -90,36 +85,18 @@ def problem_of(arm: Arm, name: str, folder: Path, packages: tuple[Path, ...], sr
 
 
 def dataset_of(initial: InitialProblem, folder: Path) -> tuple[DatasetRecipe, float]:
-    """Make the pipeline and the dataset of a problem.
-
-    Args:
-        initial: The problem of an arm.
-        folder: Folder of the recipes.
-
-    Returns:
-        The dataset with its pipeline and its problem, and the share of accepted candidates.
+    """Return the dataset of a problem, with its pipeline and the problem, and the share of accepted candidates.
 
     Raises:
         RecipeError: No positions were found that the arm reaches.
     """
     problem, name = initial.problem, initial.problem.name
-    pipeline = Pipeline(
-        name=name,
-        title=f"From rest to rest: {name}",
-        problem=problem,
-        stage=_stages(initial.arm, problem),
-        path=folder / "pipeline.toml",
-    )
-    pipeline, share = find_boxes(pipeline)
+    title, path = f"From rest to rest: {name}", folder / "pipeline.toml"
+    stages = _stages(initial.arm, problem)
+    pipeline, share = find_boxes(Pipeline(name=name, title=title, problem=problem, stage=stages, path=path))
+    title, path = f"Motions from rest to rest: {name}", folder / "dataset.toml"
     splits = {"train": 18_000, "validation": 2_000}
-    dataset = DatasetRecipe(
-        name=name,
-        title=f"Motions from rest to rest: {name}",
-        pipeline=pipeline,
-        splits=splits,
-        path=folder / "dataset.toml",
-    )
-    return dataset, share
+    return DatasetRecipe(name=name, title=title, pipeline=pipeline, splits=splits, path=path), share
 
 
 def _problem(arm: Arm, name: str, folder: Path, packages: tuple[Path, ...], srdf: Path | None) -> Problem:

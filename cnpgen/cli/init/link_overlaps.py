@@ -43,9 +43,6 @@ class LinkOverlaps:
 def resolve_overlaps(problem: Problem) -> LinkOverlaps:
     """Decompose the links whose hulls reject much free space, and ignore pairs in contact if no state is free.
 
-    Args:
-        problem: A problem with the link geometry of its URDF.
-
     Raises:
         RecipeError: A mesh is missing or cannot be read.
     """
@@ -91,11 +88,8 @@ def _ignore_contacts(problem: Problem, gap: HullGap) -> tuple[Problem, HullGap, 
         pairs = tuple((pair.first, pair.second) for pair in ignored)
         problem = replace(problem, robot=replace(problem.robot, ignored_pairs=pairs))
         gap = _gap(problem)
-    return (
-        problem,
-        gap,
-        [f"ignored, since otherwise no state is free of collisions: {_overlap(pair)}" for pair in ignored],
-    )
+    notes = [f"ignored, since otherwise no state is free of collisions: {_overlap(pair)}" for pair in ignored]
+    return problem, gap, notes
 
 
 def _pair_notes(pairs: Sequence[LinkPair], ignored: set[frozenset[str]]) -> Iterator[str]:

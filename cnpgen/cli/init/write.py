@@ -25,12 +25,7 @@ _WHERE = "constraints and stages: 'cnpgen show --keys'."
 
 
 def problem_text(initial: InitialProblem, folder: Path) -> str:
-    """Write the problem of an arm.
-
-    Args:
-        initial: The problem, with findings about the arm.
-        folder: Folder of the file.
-    """
+    """Write the problem of an arm in a folder, with findings about the arm."""
     problem, arm = initial.problem, initial.arm
     places: dict[str, Any] = {"robot.urdf": _from(folder, problem.robot.urdf)}
     places["robot.packages"] = tuple(_from(folder, each) for each in problem.robot.packages)
@@ -41,15 +36,7 @@ def problem_text(initial: InitialProblem, folder: Path) -> str:
 
 
 def sampling_texts(recipe: DatasetRecipe, share: float) -> dict[str, str]:
-    """Write the pipeline and the dataset of an arm.
-
-    Args:
-        recipe: The dataset, with its pipeline.
-        share: Share of accepted candidates.
-
-    Returns:
-        Name of the file -> its text.
-    """
+    """Write the pipeline and the dataset of an arm, with the share of accepted candidates: file name -> text."""
     comments = {
         "stage.0.start": f"Found by sampling: of the draws {100 * share:.0f} % become samples.",
         "stage.1.guess": "About the base configuration of the problem.",

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from cnpgen.cli.view.view_bodies import Body
 from cnpgen.cli.view.view_scene import View, ViewScene
-from cnpgen.cli.view.view_verdict import ViewVerdict
 from cnpgen.errors import requires_extra
 from cnpgen.judges.plans.condition_curves import ConditionCurve
 from cnpgen.robots.robot import Robot
@@ -26,11 +25,7 @@ _PROBE = 0.5  # joint displacement from which the axis of a joint is computed
 
 
 def page_of(scene: ViewScene, *, stamp: str = "") -> str:
-    """Write a scene as a page.
-
-    Args:
-        scene: The scene.
-        stamp: State of the files behind it; a served page reloads when the server has another one.
+    """Write a scene as a page; a served one reloads when the server has another stamp of the files behind it.
 
     Raises:
         MissingExtraError: MeshCat is not installed.
@@ -82,13 +77,8 @@ def _view(view: View) -> dict[str, Any]:
         "path": [_body(body, smooth=True) for body in view.path],
         "curves": [{"name": name, "shares": share.round(SHARE_DIGITS).tolist()} for name, share in view.shares.items()],
         "conditions": [_condition(curve) for curve in view.conditions],
-        "verdict": None if view.verdict is None else _verdict(view.verdict),
+        "verdict": view.verdict,
     }
-
-
-def _verdict(verdict: ViewVerdict) -> dict[str, Any]:
-    causes = [vars(cause) | {"point": cause.point.tolist()} for cause in verdict.causes]
-    return {"valid": verdict.valid, "reason": verdict.reason, "causes": causes}
 
 
 def _condition(curve: ConditionCurve) -> dict[str, Any]:

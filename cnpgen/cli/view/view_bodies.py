@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -18,9 +18,6 @@ from cnpgen.robots.shape.convex_part import convex_part_of, origin_of
 from cnpgen.robots.shape.inline import read_mesh, scale_of, sides_of
 from cnpgen.robots.shape.mesh_files import find_named_file
 from cnpgen.robots.urdf import urdf_tree
-
-if TYPE_CHECKING:
-    import pinocchio as pin
 
 Array = NDArray[np.float64]
 
@@ -49,10 +46,7 @@ class Body:
 def robot_bodies(problem: Problem, robot: Robot, *, with_meshes: bool = True) -> tuple[list[Body], str]:
     """Return the bodies of a robot, and their kind: "meshes", "convex parts" or "line".
 
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        with_meshes: Whether to read the visual meshes that its URDF names; false for untrusted files.
+    ``with_meshes`` reads the visual meshes that the URDF names; it is false for untrusted files.
     """
     try:
         visual = list(_visual_bodies(problem, robot)) if with_meshes else []
@@ -61,10 +55,8 @@ def robot_bodies(problem: Problem, robot: Robot, *, with_meshes: bool = True) ->
     if visual and sum(len(body.triangles) for body in visual) <= MAX_TRIANGLES:
         return visual, "meshes"
     if robot.shape is not None:
-        parts = robot.shape.convex_parts
-        return [
-            wrapped(each.link, robot.shape.joints[each.link], each.vertices, each.radius) for each in parts
-        ], "convex parts"
+        parts, joints = robot.shape.convex_parts, robot.shape.joints
+        return [wrapped(each.link, joints[each.link], each.vertices, each.radius) for each in parts], "convex parts"
     return list(_line(robot, problem.arm_radius or LINE_ARM_RADIUS_M)), "line"
 
 
@@ -76,14 +68,7 @@ def capsule_bodies(robot: Robot) -> list[Body]:
 
 
 def wrapped(name: str, joint: int, corners: Array, radius: float) -> Body:
-    """Return the hull of points, inflated by a radius, as triangles that face outwards.
-
-    Args:
-        name: Name of the body.
-        joint: Index of the joint that moves it.
-        corners: The points [m], shape (V, 3).
-        radius: Thickness of the layer around the hull [m].
-    """
+    """Return the hull of points [m], shape (V, 3), inflated by a radius [m], as triangles that face outwards."""
     from scipy.spatial import ConvexHull
 
     points = (corners[:, None] + radius * _ball()).reshape(-1, 3) if radius else corners
@@ -126,7 +111,8 @@ def _visual_bodies(problem: Problem, robot: Robot) -> Iterator[Body]:
         frame = robot.model.frames[frame_of(robot.model, name)]
         for element in link.findall("visual"):
             corners, triangles = _visual(name, element, robot.urdf, packages)
-            yield Body(name, int(frame.parentJoint), _placed(frame.placement, corners), triangles)
+            placed = corners @ frame.placement.rotation.T + frame.placement.translation
+            yield Body(name, int(frame.parentJoint), placed, triangles)
 
 
 def _visual(
@@ -141,10 +127,6 @@ def _visual(
     rotation, translation = origin_of(element.find("origin"))
     points, loaded = read_mesh(find_named_file(mesh.get("filename", ""), urdf, packages), scale_of(mesh))
     return points @ rotation.T + translation, sides_of(loaded)
-
-
-def _placed(placement: "pin.SE3", points: Array) -> Array:
-    return np.asarray(points @ placement.rotation.T + placement.translation)
 
 
 def _line(robot: Robot, radius: float) -> Iterator[Body]:

@@ -2,12 +2,13 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.cli.view.view_bodies import Body, capsule_bodies, robot_bodies, tube, wrapped
-from cnpgen.cli.view.view_verdict import ViewVerdict, view_verdict
+from cnpgen.cli.view.view_verdict import view_verdict
 from cnpgen.judges.plans.condition_curves import ConditionCurve, condition_curves
 from cnpgen.judges.plans.plan_plot import along, shares_of_limits
 from cnpgen.judges.plans.verdict import Reason, Verdict
@@ -51,7 +52,7 @@ class View:
         path: Path of the tip, of a motion.
         shares: Quantity -> share of the limits, shape (n, K); empty without a motion.
         conditions: Curves of the other conditions; empty without a motion.
-        verdict: The verdict; None without a motion.
+        verdict: The verdict for JSON; None without a motion.
     """
 
     title: str
@@ -63,7 +64,7 @@ class View:
     path: tuple[Body, ...]
     shares: dict[str, Array]
     conditions: tuple[ConditionCurve, ...]
-    verdict: ViewVerdict | None
+    verdict: dict[str, Any] | None
 
 
 @dataclass(frozen=True)
@@ -112,26 +113,13 @@ def scene_of_plans(
     verdicts: Sequence[Verdict | None],
     *,
     with_meshes: bool,
-    first_row: int = 0,
-    n_rows: int = 1,
 ) -> ViewScene:
-    """Show motions or, of rows without a plan, their starts and goals.
-
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        plans: The plans.
-        titles: Title of each plan.
-        verdicts: Verdict on each plan; None for rows without a plan.
-        with_meshes: Whether the URDF's visual meshes are read.
-        first_row: Row of the first plan in its source.
-        n_rows: Number of rows of the source.
-    """
+    """Show motions or, of rows without a plan, which have no verdict, their starts and goals."""
     scene = plans.scene
     views = [
         _view(problem, robot, plans[i : i + 1], titles[i], verdicts[i], scene[i : i + 1]) for i in range(len(plans))
     ]
-    return _scene(problem, robot, views, with_meshes=with_meshes, first_row=first_row, n_rows=n_rows)
+    return _scene(problem, robot, views, with_meshes=with_meshes)
 
 
 def scene_of_trajectories(
@@ -140,21 +128,8 @@ def scene_of_trajectories(
     trajectories: Sequence[Trajectory],
     titles: Sequence[str],
     verdicts: Sequence[TrajectoryVerdict],
-    *,
-    first_row: int = 0,
-    n_rows: int = 1,
 ) -> ViewScene:
-    """Show sampled trajectories, by the interpolation that their derivatives determine.
-
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        trajectories: The trajectories.
-        titles: Title of each.
-        verdicts: Verdict on each.
-        first_row: Index of the first trajectory in its source.
-        n_rows: Number of trajectories of the source.
-    """
+    """Show sampled trajectories, by the interpolation that their derivatives determine."""
     views = []
     for trajectory, title, verdict in zip(trajectories, titles, verdicts, strict=True):
         margins = {name: entry.margin for name, entry in verdict.conditions.items()}
@@ -165,7 +140,7 @@ def scene_of_trajectories(
             )
             shown = Verdict(Reason.OK if verdict.valid else str(verdict), margins)
             views.append(_moving(problem, robot, world, s, times, scene, title, shown))
-    return _scene(problem, robot, views, with_meshes=True, first_row=first_row, n_rows=n_rows)
+    return _scene(problem, robot, views, with_meshes=True)
 
 
 def _view(  # noqa: PLR0917 - all of them are shown
@@ -175,7 +150,7 @@ def _view(  # noqa: PLR0917 - all of them are shown
     if verdict is None or not verdict.margins:
         boundary = plan.boundary
         q = np.array([boundary.start_q[0], boundary.goal_q[0]]).T
-        rejected = None if verdict is None else ViewVerdict(valid=False, reason=str(verdict.reason), causes=())
+        rejected = None if verdict is None else {"valid": False, "reason": str(verdict.reason), "causes": ()}
         return _still(problem, robot, title, q, ("start", "goal"), scene, rejected)
     extra = [margin.time for margin in verdict.margins.values() if not margin.ok]
     world, s, times = along(problem, robot, plan.motion, 0, samples=FRAMES_PER_MOTION, extra_times=extra, scene=scene)
@@ -216,40 +191,29 @@ def _still(  # noqa: PLR0917 - all of them are shown
     q: Array,
     labels: tuple[str, ...],
     scene: Scene,
-    verdict: ViewVerdict | None = None,
+    verdict: dict[str, Any] | None = None,
 ) -> View:
     """Show configurations without a motion."""
     times, world = np.arange(float(len(labels))), tuple(_world(problem, scene))
     return View(title, labels, times, q, _poses(robot, q), world, (), {}, (), verdict)
 
 
-def _scene(
-    problem: Problem,
-    robot: Robot,
-    views: list[View],
-    *,
-    with_meshes: bool,
-    first_row: int = 0,
-    n_rows: int = 1,
-) -> ViewScene:
+def _scene(problem: Problem, robot: Robot, views: list[View], *, with_meshes: bool) -> ViewScene:
     bodies, kind = robot_bodies(problem, robot, with_meshes=with_meshes)
     size, contact, tip = problem.object_size, problem.first(PuckContact), robot.n + 1
+    disc = None if contact is None else _disc_corners(np.zeros(3), contact.mallet_radius, MALLET_HEIGHT_M)
     return ViewScene(
         robot=robot,
         bodies=tuple(bodies),
         kind=kind,
         capsules=tuple(capsule_bodies(robot)),
         held=() if size is None else (wrapped("object", tip, CUBE * np.array(size), 0.0),),
-        mallet=()
-        if contact is None
-        else (wrapped("mallet", tip, _disc_corners(np.zeros(3), contact.mallet_radius, MALLET_HEIGHT_M), 0.0),),
+        mallet=() if disc is None else (wrapped("mallet", tip, disc, 0.0),),
         triad=tuple(
             wrapped(f"axis {name}", tip, np.array([np.zeros(3), TRIAD_LENGTH_M * axis]), TRIAD_RADIUS_M)
             for name, axis in zip("xyz", np.eye(3), strict=True)
         ),
         views=tuple(views),
-        first_row=first_row,
-        n_rows=n_rows,
     )
 
 

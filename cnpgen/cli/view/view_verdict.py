@@ -1,7 +1,7 @@
 """The verdict of a page: reasons, and the time and place of every condition's smallest margin."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,60 +12,22 @@ from cnpgen.judges.plans.verdict import Margin, Verdict
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Cause:
-    """The smallest margin of a condition, or its largest violation.
-
-    Attributes:
-        name: Name of the condition with the joint, axis or bodies.
-        text: Margin or violation, with unit and tolerance.
-        frame: Frame of the view at its time.
-        ok: Whether the condition is met.
-        point: Place in the world frame [m], shape (3,): between the closest points, at the joint, or at the tip.
-    """
-
-    name: str
-    text: str
-    frame: int
-    ok: bool
-    point: Array
-
-
-@dataclass(frozen=True)
-class ViewVerdict:
-    """The verdict on one plan.
-
-    Attributes:
-        valid: Whether the plan is valid.
-        reason: Reason, "ok" if it is valid.
-        causes: All conditions, the largest violation first.
-    """
-
-    valid: bool
-    reason: str
-    causes: tuple[Cause, ...]
-
-
 def view_verdict(
     verdict: Verdict, curves: Sequence[ConditionCurve], times: Array, poses: Array, joints: Sequence[str]
-) -> ViewVerdict:
-    """Locate the margins of a verdict in time and space.
+) -> dict[str, Any]:
+    """Return a verdict for JSON, its margins located in time and space, the largest violation first.
 
-    Args:
-        verdict: The verdict on a plan.
-        curves: Curves of its conditions.
-        times: Times of the K frames [s].
-        poses: Poses of the joints, the universe first and the tip last, shape (K, joints, 4, 4).
-        joints: Names of the planned joints.
+    The poses of the joints, the universe first and the tip last, have shape (K, joints, 4, 4), the times [s] (K,).
     """
     by_name = {curve.name: curve for curve in curves}
     margins = sorted(verdict.margins.values(), key=lambda margin: -margin.severity)
     causes = []
     for margin in margins:
         frame = int(np.abs(times - margin.time).argmin())
-        point = _point(margin, by_name.get(margin.name), poses[frame], frame, joints)
-        causes.append(Cause(f"{margin.name} {margin.part}".strip(), margin_text(margin), frame, margin.ok, point))
-    return ViewVerdict(verdict.valid, str(verdict.reason), tuple(causes))
+        point = _point(margin, by_name.get(margin.name), poses[frame], frame, joints).tolist()
+        name, text = f"{margin.name} {margin.part}".strip(), margin_text(margin)
+        causes.append({"name": name, "text": text, "frame": frame, "ok": margin.ok, "point": point})
+    return {"valid": verdict.valid, "reason": str(verdict.reason), "causes": causes}
 
 
 def margin_text(margin: Margin) -> str:
@@ -77,7 +39,7 @@ def margin_text(margin: Margin) -> str:
 
 
 def _point(margin: Margin, curve: ConditionCurve | None, poses: Array, frame: int, joints: Sequence[str]) -> Array:
-    """Return the place of a margin [m], shape (3,)."""
+    """Return the place of a margin [m], shape (3,): between the closest points, at the joint, or at the tip."""
     if curve is not None and curve.points is not None:
         return np.asarray(curve.points[frame].mean(axis=0))
     if margin.part in joints:

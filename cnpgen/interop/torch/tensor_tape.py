@@ -16,9 +16,8 @@ from cnpgen.kernels.tape import NAMES, OPERATIONS, Tape
 
 Value = Any  # a tensor, or a constant as a Python number
 MAX_GUARD = 1e-12  # a denominator ``fmax(x, guard)`` with a smaller constant is that of a closest point
-MIN_REGULAR_DENOMINATOR_M2 = (
-    1e-6  # below, segment and face or segment are parallel, and their closest points are arbitrary
-)
+# Below, segment and face or segment are parallel, and their closest points are arbitrary.
+MIN_REGULAR_DENOMINATOR_M2 = 1e-6
 
 
 def _maximum(a: Value, b: Value) -> torch.Tensor:

@@ -1,0 +1,15 @@
+from cnpgen.kernels.symbolic.symbolic_state import SymbolicState as SymbolicState
+from cnpgen.pipelines.context import Context as Context
+from cnpgen.pipelines.stages.stage import CandidateBatch as CandidateBatch
+from cnpgen.pipelines.stages.stage import Stage as Stage
+from cnpgen.plans.exporter import ExportedSet as ExportedSet
+from cnpgen.plans.exporter import Exporter as Exporter
+from cnpgen.plans.exporter import SampledPlan as SampledPlan
+from cnpgen.problems.constraints.constraint import Condition as Condition
+from cnpgen.problems.constraints.constraint import Constraint as Constraint
+from cnpgen.problems.objectives import ObjectiveTerm as ObjectiveTerm
+from cnpgen.schema.keys import PerJoint as PerJoint
+from cnpgen.schema.keys import Range as Range
+from cnpgen.schema.keys import field as field
+from cnpgen.store.field import Field as Field
+from cnpgen.world.world import World as World

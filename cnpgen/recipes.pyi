@@ -1,0 +1,14 @@
+from cnpgen.make.recipe import DatasetRecipe as DatasetRecipe
+from cnpgen.make.recipe_file import load_dataset_recipe as load_dataset_recipe
+from cnpgen.pipelines.pipeline import Pipeline as Pipeline
+from cnpgen.pipelines.pipeline_file import load_pipeline as load_pipeline
+from cnpgen.problems.problem import Objective as Objective
+from cnpgen.problems.problem_record import ProblemRecord as ProblemRecord
+from cnpgen.robots.obstacle import Obstacle as Obstacle
+from cnpgen.robots.parameter_ranges import ParameterRanges as ParameterRanges
+from cnpgen.robots.robot_spec import HeldObject as HeldObject
+from cnpgen.robots.robot_spec import LimitSpec as LimitSpec
+from cnpgen.robots.robot_spec import Payload as Payload
+from cnpgen.robots.robot_spec import RobotSpec as RobotSpec
+from cnpgen.schema.catalogue import list_recipes as list_recipes
+from cnpgen.trajectory.trajectory_spec import TrajectorySpec as TrajectorySpec
