@@ -14,7 +14,7 @@ import numpy as np
 from cnpgen.benchmark.hypothesis_tests import FIGURES
 from cnpgen.errors import DatasetError, UsageError
 from cnpgen.plans.plans import Plans, make_plans
-from cnpgen.store.files.atomic import machine_error, write_file
+from cnpgen.store.files.atomic import machine_errors, write_file
 from cnpgen.store.files.document_structure import (
     ANY_KEY,
     ANYTHING,
@@ -191,10 +191,8 @@ def _present(structures: dict[str, Structure], table: dict[str, Any]) -> dict[st
 def _complete_lines(path: Path) -> list[str]:
     """Return the lines of a file up to the first line that is not JSON."""
     complete = []
-    try:
+    with machine_errors("read", path):
         lines = path.read_bytes().decode("utf-8", "replace").splitlines()
-    except OSError as error:
-        raise machine_error("read", path, error) from error
     for line in lines:
         try:
             parse_json(line)

@@ -22,7 +22,7 @@ from typing import Any, TypeVar
 from cnpgen.errors import MachineError
 from cnpgen.machine.signals import NUMBERS, signals_deferred
 from cnpgen.schema.arguments import integer
-from cnpgen.store.files.atomic import machine_error
+from cnpgen.store.files.atomic import machine_errors
 
 _IGNORED_WARNING = "ignore:resource_tracker:UserWarning"  # in the format of the option -W
 DIED = "a worker died (killed, or out of memory)"
@@ -140,10 +140,8 @@ def _packed(function: Callable[[T], R], folder: str, task: T) -> bytes | str:
     if len(message) <= MAX_PIPE_BYTES:
         return message
     path = Path(folder) / uuid.uuid4().hex
-    try:
+    with machine_errors("write", path):
         path.write_bytes(message)
-    except OSError as error:
-        raise machine_error("write", path, error) from error
     return str(path)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from cnpgen.errors import DatasetError
 from cnpgen.store.checked_shard import Shard, read_rows
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask
-from cnpgen.store.files.atomic import machine_error
+from cnpgen.store.files.atomic import machine_errors
 from cnpgen.store.layout import MANIFEST
 from cnpgen.store.shard_record import check_committed
 
@@ -64,7 +64,5 @@ def delete_shards(folder: Path, tasks: Sequence[ShardTask]) -> None:
     """
     # First the manifest and the sidecars, which mark data as complete.
     for name in (MANIFEST, *(name for task in tasks for name in (task.sidecar, task.file))):
-        try:
+        with machine_errors("delete", folder / name):
             (folder / name).unlink(missing_ok=True)
-        except OSError as error:
-            raise machine_error("delete", folder / name, error) from error

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from cnpgen.errors import DatasetError, UsageError, nearest
 from cnpgen.schema.arguments import numbers
 from cnpgen.store.field import Field
-from cnpgen.store.files.atomic import machine_error
+from cnpgen.store.files.atomic import machine_errors
 from cnpgen.store.files.csv_table import read_csv_table
 from cnpgen.store.files.hdf5 import opened_hdf5
 from cnpgen.store.files.kind import is_hdf5
@@ -33,10 +33,8 @@ def read_tasks(path: Path, fields: Mapping[str, Field], *, flat: bool) -> dict[s
         MachineError: The file cannot be read.
     """
     require_file(path, "a table of tasks, CSV or HDF5", kinds=("a text file", *HDF5_KINDS))
-    try:
+    with machine_errors("read", path):
         columns = _hdf5_columns(path) if is_hdf5(path) else _csv_columns(path)
-    except OSError as error:
-        raise machine_error("read", path, error) from error
     if columns and not any(values.size for values in columns.values()):
         raise DatasetError(f"{path} has no tasks: it names columns ({', '.join(columns)}), but has no numbers")
     known = {**fields, **{column: field for field in fields.values() for column in field.columns}}

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from cnpgen.errors import DatasetError
 from cnpgen.store.dataset_spec import DatasetSpec, ShardTask
 from cnpgen.store.field import Field
-from cnpgen.store.files.atomic import machine_error
+from cnpgen.store.files.atomic import machine_errors
 from cnpgen.store.intact import RERUN_HINT, require_intact, size_problem
 from cnpgen.store.layout import SPECIFICATION
 from cnpgen.store.scene_table import SCENE_ARRAYS, SCENE_ID, SceneTable, check_scenes, check_shapes
@@ -126,14 +126,11 @@ def read_columns(shard: Shard, placements: Mapping[str, StoredField], names: Ite
     if any(place.offset is None for place in selected.values()):
         return read_shard(shard.path, list(selected))
     columns: dict[str, NDArray[Any]] = {}
-    try:
-        with shard.path.open("rb", buffering=0) as file:
-            for name, place in selected.items():
-                columns[name] = np.empty(place.shape, place.dtype)
-                file.seek(place.offset or 0)
-                _fill(shard, file.readinto, columns[name].data.cast("B"))
-    except OSError as error:
-        raise machine_error("read", shard.path, error) from error
+    with machine_errors("read", shard.path), shard.path.open("rb", buffering=0) as file:
+        for name, place in selected.items():
+            columns[name] = np.empty(place.shape, place.dtype)
+            file.seek(place.offset or 0)
+            _fill(shard, file.readinto, columns[name].data.cast("B"))
     return columns
 
 

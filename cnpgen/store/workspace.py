@@ -9,7 +9,7 @@ from typing import Literal
 
 from cnpgen.errors import DatasetError, MachineError, UsageError
 from cnpgen.store.dataset_spec import INFORMATIONAL, DatasetSpec, load_dataset_spec, to_json, write_dataset_spec
-from cnpgen.store.files.atomic import check_writable, machine_error, read_file
+from cnpgen.store.files.atomic import check_writable, machine_errors, read_file
 from cnpgen.store.files.documents import Difference, differences
 from cnpgen.store.files.leftovers import remove_leftovers
 from cnpgen.store.intact import COPY_HINT, OUTSIDE, outside_links
@@ -44,15 +44,13 @@ class Workspace:
 
 def find_workspace(folder: Path) -> Workspace:
     """Inspect the folder for a new dataset."""
-    try:
+    with machine_errors("write to", folder):
         above = [folder.absolute(), *folder.absolute().parents]
         existing = next(path for path in above if path.exists())
         if not existing.is_dir():
             return Workspace(folder, existing, "a file")
         if existing != above[0] or all(item.name == WORK for item in folder.iterdir()):
             return Workspace(folder, existing, "nothing")
-    except OSError as error:
-        raise machine_error("write to", folder, error) from error
     if not is_dataset(folder):
         return Workspace(folder, existing, "something else")
     has_shards = any(_shard_files(folder))
@@ -117,12 +115,10 @@ def open_workspace(folder: Path, spec: DatasetSpec, *, force: bool = False) -> D
     workspace = _cleared(workspace) if force else workspace
     begun = started_spec(workspace, spec)
     if begun is None:
-        try:
+        with machine_errors("write to", folder):
             folder.mkdir(parents=True, exist_ok=True)
             for name in _SUMMARIES:
                 (folder / name).unlink(missing_ok=True)
-        except OSError as error:
-            raise machine_error("write to", folder, error) from error
         write_dataset_spec(folder, spec)
     remove_leftovers(folder / WORK)
     return begun or spec
@@ -214,7 +210,7 @@ def _cleared(workspace: Workspace) -> Workspace:
     if workspace.content != "a dataset":
         return workspace
     folder, splits = workspace.folder, check_clearable(workspace)
-    try:
+    with machine_errors("delete from", folder):
         (folder / MANIFEST).unlink(missing_ok=True)  # first: a partially deleted dataset must not appear complete
         for split in splits:
             for path in split.iterdir():
@@ -224,8 +220,6 @@ def _cleared(workspace: Workspace) -> Workspace:
         # Last: a partially deleted dataset must still be recognized.
         for name in (*_SUMMARIES, OLD_SPECIFICATION, SPECIFICATION):
             (folder / name).unlink(missing_ok=True)
-    except OSError as error:
-        raise machine_error("delete from", folder, error) from error
     return Workspace(folder, workspace.existing, "nothing")
 
 

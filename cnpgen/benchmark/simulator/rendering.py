@@ -12,7 +12,7 @@ from cnpgen.benchmark.simulator import hockey
 from cnpgen.benchmark.simulator.execute import Execution, compile_scene, load_mujoco
 from cnpgen.benchmark.simulator.reference import TICK_S
 from cnpgen.errors import MachineError, MissingExtraError, requires_extra
-from cnpgen.store.files.atomic import machine_error
+from cnpgen.store.files.atomic import machine_error, machine_errors
 
 IMAGE_WIDTH, IMAGE_HEIGHT = 640, 480
 FILM_FRAMES_PER_S = 25
@@ -37,10 +37,8 @@ def save_picture(path: Path, execution: Execution) -> None:
     imageio = _imageio()
     with _renderer(execution) as draw:
         image = draw(min(execution.reference.ticks, len(execution.states) - 1))
-    try:
+    with machine_errors("write", path):
         imageio.imwrite(path, image)
-    except OSError as error:
-        raise machine_error("write", path, error) from error
 
 
 def save_film(path: Path, execution: Execution, *, max_frames: int | None = None) -> None:

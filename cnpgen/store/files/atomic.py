@@ -37,6 +37,15 @@ def machine_error(verb: str, path: Path, error: OSError) -> MachineError:
     return MachineError(f"cannot {verb} {path}: {error.strerror or error}; {hint}")
 
 
+@contextmanager
+def machine_errors(verb: str, path: Path) -> Iterator[None]:
+    """Raise ``machine_error`` for system calls in the block that fail."""
+    try:
+        yield
+    except OSError as error:
+        raise machine_error(verb, path, error) from error
+
+
 def check_readable(path: Path) -> None:
     """Check that an existing file or folder can be read.
 
@@ -61,15 +70,13 @@ def check_writable(path: Path) -> None:
     Raises:
         MachineError: An existing file is read-only, or no file can be created in its folder or in the next one above.
     """
-    try:
+    with machine_errors("write", path):
         places = [path.absolute(), *path.absolute().parents]
         if path.is_file():
             places.pop(0).open("ab").close()
         folder = next(place for place in places if place.exists())
         with tempfile.TemporaryFile(dir=folder):
             pass
-    except OSError as error:
-        raise machine_error("write", path, error) from error
 
 
 @contextmanager

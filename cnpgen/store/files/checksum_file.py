@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import DatasetError
-from cnpgen.store.files.atomic import machine_error, read_file, write_file
+from cnpgen.store.files.atomic import machine_errors, read_file, write_file
 from cnpgen.store.files.hdf5 import create_hdf5, opened_hdf5, require_possible_size
 from cnpgen.store.files.kind import HDF5, apparent_kind, kind_name, own_kind
 from cnpgen.store.files.size_limits import MAX_CHECKSUM_FILE_BYTES
@@ -71,15 +71,12 @@ def verify_checksum(path: Path, *, kind: str, version: int) -> bool:
     Raises:
         DatasetError: The file is cut off, damaged or too large, or has another format version.
     """
-    try:
-        with path.open("rb") as file:
-            block = file.read(HEADER_BYTES)
-            if block.startswith(HDF5) or not _HEADER_PART.search(block):
-                return False
-            require_possible_size(path)
-            digest = hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise machine_error("read", path, error) from error
+    with machine_errors("read", path), path.open("rb") as file:
+        block = file.read(HEADER_BYTES)
+        if block.startswith(HDF5) or not _HEADER_PART.search(block):
+            return False
+        require_possible_size(path)
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
     _check_checksum(path, block, digest, kind=kind, version=version)
     return True
 

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cnpgen.errors import requires_extra
-from cnpgen.store.files.atomic import machine_error
+from cnpgen.store.files.atomic import machine_errors
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -23,7 +23,5 @@ def new_figure(width: float, height: float, dpi: int = 110) -> "Figure":
 
 def save_figure(figure: "Figure", path: Path) -> None:
     """Write a figure in the format of the suffix."""
-    try:
+    with machine_errors("write", path):
         figure.savefig(path)
-    except OSError as error:
-        raise machine_error("write", path, error) from error

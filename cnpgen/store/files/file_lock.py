@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import IO
 
 from cnpgen.errors import UsageError
-from cnpgen.store.files.atomic import machine_error
+from cnpgen.store.files.atomic import machine_errors
 
 
 def try_lock(file: IO[bytes]) -> bool:
@@ -39,10 +39,8 @@ def output_lock(out: Path, lock: Path) -> Iterator[None]:
         UsageError: Another process writes the output.
         MachineError: The lock file cannot be created.
     """
-    try:
+    with machine_errors("write", lock):
         file = lock.open("ab")
-    except OSError as error:
-        raise machine_error("write", lock, error) from error
     with file:
         if not try_lock(file) or not _is_present(file, lock):
             text = f"another process is writing {out}: wait for it, or choose another {{out}}"

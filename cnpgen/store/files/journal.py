@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import IO
 
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.store.files.atomic import machine_error
+from cnpgen.store.files.atomic import machine_error, machine_errors
 from cnpgen.store.files.file_lock import try_lock
 
 MAX_RECORD_BYTES = 1 << 30
@@ -24,13 +24,10 @@ _MODE = os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0)  # the file is not t
 
 def append_line(path: Path, line: str) -> None:
     """Append a line to a text file and flush it to the disk."""
-    try:
-        with path.open("a", encoding="utf-8") as file:
-            file.write(f"{line}\n")
-            file.flush()
-            os.fsync(file.fileno())
-    except OSError as error:
-        raise machine_error("write", path, error) from error
+    with machine_errors("write", path), path.open("a", encoding="utf-8") as file:
+        file.write(f"{line}\n")
+        file.flush()
+        os.fsync(file.fileno())
 
 
 @dataclass
@@ -45,23 +42,19 @@ class JournalFile:
     def append(self, record: bytes) -> None:
         """Append a record and flush it to the disk."""
         length = len(record).to_bytes(_LENGTH_BYTES, "little")
-        try:
+        with machine_errors("write", self.path):
             self._file.write(length + hashlib.sha256(record).digest() + record)
             self._file.flush()
             os.fsync(self._file.fileno())
-        except OSError as error:
-            raise machine_error("write", self.path, error) from error
         self.records.append(record)
 
     def clear(self) -> None:
         """Remove all records."""
-        try:
+        with machine_errors("write", self.path):
             self._file.seek(0)
             self._file.truncate()
             self._file.write(self._magic)
             self._file.flush()
-        except OSError as error:
-            raise machine_error("write", self.path, error) from error
         self.records.clear()
 
     def close(self) -> None:
@@ -79,10 +72,8 @@ def open_journal_file(path: Path, magic: bytes) -> JournalFile:
         DatasetError: The file does not start with ``magic``.
         UsageError: Another process has locked the file.
     """
-    try:
+    with machine_errors("write", path):
         file = os.fdopen(os.open(path, _MODE, 0o666), "r+b")
-    except OSError as error:
-        raise machine_error("write", path, error) from error
     try:
         return _recover(path, file, magic)
     except OSError as error:
