@@ -95,14 +95,35 @@ class JointTrajectory(Exporter):
     def write(self, path: Path, plans: Iterable[SampledPlan], exported: ExportedSet) -> None:
         """Write a message; see ``Exporter.write``."""
         (plan,) = plans
-        points = ",\n    ".join(point_text(plan, k) for k in range(len(plan.t)))
+        points = ",\n    ".join(_point_text(plan, k) for k in range(len(plan.t)))
         header = json.dumps({"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""})
         names = json.dumps(exported.joint_names)
         text = f'{{\n  "header": {header},\n  "joint_names": {names},\n  "points": [\n    {points}\n  ]\n}}\n'
         write_file(path, text)
 
 
-def point_text(plan: SampledPlan, k: int, *, effort: bool = True) -> str:
+@dataclass(frozen=True)
+class TrajectoryControllerGoal(Exporter):
+    """A folder with one goal of ``control_msgs/action/FollowJointTrajectory`` per plan, as YAML.
+
+    ``ros2 action send_goal`` takes the content as its goal.
+    """
+
+    suffix = ".yaml"
+
+    def write(self, path: Path, plans: Iterable[SampledPlan], exported: ExportedSet) -> None:
+        """Write a goal; see ``Exporter.write``."""
+        (plan,) = plans
+        lines = [
+            "trajectory:",
+            f"  joint_names: {json.dumps(exported.joint_names)}",
+            "  points:",
+            *(f"    - {_point_text(plan, k, effort=False)}" for k in range(len(plan.t))),
+        ]
+        write_file(path, "\n".join(lines) + "\n")
+
+
+def _point_text(plan: SampledPlan, k: int, *, effort: bool = True) -> str:
     """Return sample k of a plan as a ``trajectory_msgs/JointTrajectoryPoint`` in one line of JSON that is also YAML."""
     sec, nanosec = divmod(round(plan.t[k] * 1e9), 10**9)
     values = {"positions": plan.q, "velocities": plan.dq, "accelerations": plan.ddq}

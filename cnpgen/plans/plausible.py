@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.plans.format import UNITS
 from cnpgen.robots.plausible_values import UnitError, check_plausible
 from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.boundary import Boundary
-
-UNITS = {"q": "rad", "dq": "rad/s", "ddq": "rad/s^2"}
 
 
 def check_boundary_units(

@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from xml.etree import ElementTree
 from xml.parsers.expat import ExpatError, ParserCreate
@@ -89,6 +90,11 @@ def _tree_without_namespaces(text: str) -> ElementTree.Element:
     except ExpatError as error:
         raise ValueError(f"it is not XML: {error}") from error
     return builder.close()
+
+
+def numbers_text(values: Iterable[float]) -> str:
+    """Return numbers as the text of an attribute, from which the same float64 are read."""
+    return " ".join(f"{value:.17g}" for value in values)
 
 
 def number_in(element: ElementTree.Element | None, attribute: str, default: float) -> float:

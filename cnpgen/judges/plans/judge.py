@@ -140,7 +140,7 @@ class Judge:
         return [
             _Plan(
                 self._problem,
-                Motion(motion.path[i : i + 1], motion.rate[i : i + 1], motion.degree),
+                motion[i : i + 1],
                 boundary[i : i + 1],
                 scene.poses[i],
                 goal_xyz[i],

@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 
 from cnpgen.judges.plans.sampling import Samples
 from cnpgen.judges.plans.verdict import Metrics, PaperRule
+from cnpgen.problems.constraints.axis import Vertical
 from cnpgen.problems.constraints.clearance import ObjectContact
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.constraints.joint import JointAcceleration, JointTorque, JointVelocity
 from cnpgen.problems.constraints.table import Table
-from cnpgen.problems.constraints.vertical import Vertical
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.solid import solids_of
 from cnpgen.world.path import PathWorld

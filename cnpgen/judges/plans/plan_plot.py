@@ -67,7 +67,7 @@ def plot_plan(
     """
     if not 0 <= index < len(motion):
         raise UsageError(f"there is no plan {index}, expected 0 to {len(motion) - 1}")
-    one = Motion(motion.path[index : index + 1], motion.rate[index : index + 1], motion.degree)
+    one = motion[index : index + 1]
     margins = [] if verdict is None else [margin for margin in verdict.margins.values() if not margin.ok]
     with np.errstate(all="ignore"):
         world, s, t = along(problem, robot, one, index, extra_times=[margin.time for margin in margins])
@@ -243,18 +243,21 @@ def _draw_limits(axis: "Axes", largest: float) -> None:
 
 def _draw_over_table(figure: "SubFigure", table: Table, world: PathWorld, s: Array, t: Array) -> None:
     """Draw the tip from above in the rectangle, and its height over time in the valid band."""
+    from matplotlib.patches import Rectangle
+
     above, beside = figure.subplots(2, 1, height_ratios=[1.5, 1.0])
     x, y, z = world.parameters.on_table(world.tip_position)
     low, high = table.bounds_of(world.parameters.values)
-    _draw_rectangle(above, (low[0], high[0]), (low[1], high[1]), fill=False)
+    width, height = high[0] - low[0], high[1] - low[1]
+    above.add_patch(Rectangle((low[0], low[1]), width, height, fill=False, edgecolor=_LIMIT, zorder=0))
     _draw_tip_path(above, x, y)
     above.set_aspect("equal")
     above.margins(0.08)
     above.set(xlabel="x [m]", ylabel="y [m]", title="tip over the table, one dot per 20 ms")
     ticks = np.arange(0.0, t[-1], 0.02)
     above.plot(np.interp(ticks, t, x), np.interp(ticks, t, y), ".", color="black", markersize=4)
-    height = table.measured(cast(World, world))[1]
-    band = 1e3 * (table.allowed(height) + table.bound_relaxation(height, s, world.tip_position[:, 0]))
+    off_table = table.measured(cast(World, world))[1]
+    band = 1e3 * (table.allowed(off_table) + table.bound_relaxation(off_table, s, world.tip_position[:, 0]))
     beside.fill_between(t, -band, band, color="tab:green", alpha=0.12, linewidth=0, label="valid")
     beside.plot(t, 1e3 * (z - table.z), color="black", linewidth=1.2)
     beside.set(xlabel="t [s]", ylabel="z above the table [mm]", xlim=(t[0], t[-1]))
@@ -342,10 +345,3 @@ def _draw_solid(axis: "Axes", solid: Solid, plane: tuple[int, int]) -> None:
     outline = _outline((solid.position + solid.corners)[:, list(plane)], solid.radius)
     axis.add_patch(Polygon(outline, facecolor=_BOX, edgecolor=_LIMIT, zorder=0))
     axis.update_datalim(outline)
-
-
-def _draw_rectangle(axis: "Axes", across: tuple[float, float], up: tuple[float, float], *, fill: bool) -> None:
-    from matplotlib.patches import Rectangle
-
-    corner, width, height = (across[0], up[0]), across[1] - across[0], up[1] - up[0]
-    axis.add_patch(Rectangle(corner, width, height, fill=fill, facecolor=_BOX, edgecolor=_LIMIT, zorder=0))

@@ -75,8 +75,8 @@ class TipManifold(Constraint):
 
     @property
     def band(self) -> float:
-        """Maximum distance of a start from the manifold [m]."""
-        return 0.0
+        """Maximum distance of a start from the manifold [m]: the key ``start_band`` of kinds that have it."""
+        return float(getattr(self, "start_band", 0.0))
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the tip position [m]."""

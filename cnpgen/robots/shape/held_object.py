@@ -11,15 +11,8 @@ from cnpgen.errors import RecipeError, nearest
 from cnpgen.robots.chain import Chain
 from cnpgen.robots.shape.capsule import Capsule, covering_capsule
 from cnpgen.robots.shape.convex_part import ConvexPart, link_convex_parts
-from cnpgen.robots.shape.hull import CUBE, ball_round, coal_hull
-from cnpgen.robots.shape.link_pairs import (
-    ALWAYS_FRACTION,
-    CollisionBody,
-    LinkContact,
-    LinkPair,
-    body_of_part,
-    sample_poses,
-)
+from cnpgen.robots.shape.hull import CUBE
+from cnpgen.robots.shape.link_pairs import ALWAYS_FRACTION, LinkContact, LinkPair, body_of_part, sample_poses
 from cnpgen.robots.shape.shape import SHAPE_REVISION, Shape, cached_capsules, parts_of, place_convex_parts
 
 if TYPE_CHECKING:
@@ -117,7 +110,7 @@ def _compare(
     model: "pin.Model", parts: tuple[ConvexPart, ...], capsules: tuple[Capsule, ...], joints: dict[str, int]
 ) -> tuple[LinkPair, ...]:
     """Compare the object with all links and their capsules in random states."""
-    bodies = [*map(body_of_part, parts), *(_body_of_capsule(capsule) for capsule in capsules)]
+    bodies = map(body_of_part, [*parts, *map(_part_of_capsule, capsules)])
     all_joints = joints | {_capsule_name(capsule.link): joints[capsule.link] for capsule in capsules}
     contact, pairs = LinkContact(sample_poses(model, SAMPLED_HELD_STATES), bodies, all_joints), []
     for capsule in capsules:
@@ -132,8 +125,5 @@ def _capsule_name(link: str) -> str:
     return f"capsule of {link}"
 
 
-def _body_of_capsule(capsule: Capsule) -> tuple[str, CollisionBody]:
-    ends = np.array([capsule.first, capsule.second])
-    hull = coal_hull(ends)
-    hull.setSweptSphereRadius(capsule.radius)
-    return _capsule_name(capsule.link), CollisionBody(*ball_round(ends, capsule.radius), hull)
+def _part_of_capsule(capsule: Capsule) -> ConvexPart:
+    return ConvexPart(_capsule_name(capsule.link), np.array([capsule.first, capsule.second]), capsule.radius)

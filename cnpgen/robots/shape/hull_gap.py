@@ -143,10 +143,7 @@ def _body(
     points, loaded = read_mesh(find_named_file(mesh.get("filename", ""), path, packages), scale_of(mesh))
     for rotation, translation in (origin_of(element.find("origin")), placement):
         points = points @ rotation.T + translation
-    low, high = points.min(axis=0), points.max(axis=0)
-    center = (low + high) / 2
-    radius = float(np.linalg.norm(points - center, axis=1).max())
-    return CollisionBody(center, radius, _triangles(points, sides_of(loaded)))
+    return CollisionBody(*ball_round(points, 0.0), _triangles(points, sides_of(loaded)))
 
 
 def _exact_body(part: ConvexPart) -> CollisionBody:
