@@ -234,6 +234,18 @@ class PathWorld:
         bodies = self._placed_bodies()
         return self._once("self", lambda: bodies.pair_distances(bodies.link_pairs))
 
+    def pairs(self, bodies: str) -> PairDistances:
+        """Return the signed distances of all pairs of some bodies.
+
+        Args:
+            bodies: "robot": links, or segments without link geometry, and obstacles; "self": links of the robot;
+                "object": the held object and obstacles; "held object": the held object and links.
+        """
+        if bodies == "robot":
+            return self.segment_pairs() if self.robot.shape is None else self.shape_pairs()
+        pairs = {"self": self.self_pairs, "object": self.object_pairs, "held object": self.held_object_pairs}
+        return pairs[bodies]()
+
     def _smallest(self, pairs: PairDistances, sufficient: float, *, of_each: bool = False) -> list[Array]:
         """Measure distances, or return their bounds if the path is not exact and all bounds are sufficient."""
         if not self._is_finite():

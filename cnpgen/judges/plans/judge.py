@@ -124,16 +124,38 @@ class Judge:
         """
         plans = self._plans(motion, boundary, scene, goal_xyz)
         with np.errstate(all="ignore"):  # overflows give inf or nan, which are detected
-            return [
-                _judge_plan(plan, self._world, self._limits, self._step, early_exit=early_exit, tube=self._tube)
-                for plan in plans
-            ]
+            return [self._judge(plan, early_exit=early_exit) for plan in plans]
 
     def refutes(self, motion: Motion, boundary: Boundary, scene: Scene, goal_xyz: Array) -> list[bool]:
         """Return for N plans whether a few samples prove that they are invalid; False proves nothing."""
         plans = self._plans(motion, boundary, scene, goal_xyz)
         with np.errstate(all="ignore"):
             return [_is_refuted(plan, self._world) for plan in plans]
+
+    def _judge(self, plan: "_Plan", *, early_exit: bool) -> Verdict:
+        """Judge one plan."""
+        if reason := _invalid_reason(plan):
+            return Verdict(reason)
+        cells = EARLY_EXIT_CELLS if early_exit else TABLE_CELLS
+        table = time_table(plan.motion.rate[0], plan.motion.degree, cells=cells)
+        sampled = _sampled_for_early_exit(plan, table) if early_exit else _sampled(plan, table, self._step)
+        if sampled is None:
+            return Verdict(Reason.TOO_LONG, metrics=Metrics(duration=float(table[1, -1])))
+        (states, samples), world = sampled, self._world
+        if not states.is_finite():
+            return Verdict(Reason.NOT_FINITE, metrics=Metrics(duration=float(samples.t[-1])), samples=len(samples.s))
+        world.set_path(states.q, states.dq, states.ddq, plan.obstacle_poses, states.jerk, exact=not early_exit)
+        ends = boundary_margins(states, plan.boundary, samples, world.robot)
+        metrics, paper = Metrics(), PaperRule()
+        if not early_exit:
+            metrics = metrics_of(plan.problem, world, samples, jerks(plan.motion, samples.s))
+            paper = paper_rule(plan.problem, world, plan.obstacle_poses, plan.goal_xyz)
+        curve = SplineCurve(plan.motion)
+        context = evaluation_context(plan.problem, curve, plan.obstacle_poses, world, samples, table)
+        context = context if self._tube is None else self._tube.widen(context)
+        motion = polynomials(plan.motion, jerk=plan.problem.uses_jerk)
+        margins = [*ends, *_margins(context, motion, self._limits, early_exit=early_exit)]
+        return Verdict(reason_of(margins), by_name(margins), metrics, paper, len(samples.s))
 
     def _plans(self, motion: Motion, boundary: Boundary, scene: Scene, goal_xyz: Array) -> "list[_Plan]":
         _check_shapes(self._robot, motion, boundary, scene, goal_xyz)
@@ -217,39 +239,6 @@ def _check_shapes(robot: Robot, motion: Motion, boundary: Boundary, scene: Scene
             raise UsageError(
                 f"{name} must have shape {shape} for {n_plans} plans of {n} joints, got {np.shape(values)}"
             )
-
-
-def _judge_plan(
-    plan: _Plan,
-    world: PathWorld,
-    limits: ProvenJointLimits,
-    step: float,
-    *,
-    early_exit: bool,
-    tube: TrackingTube | None,
-) -> Verdict:
-    """Judge one plan."""
-    if reason := _invalid_reason(plan):
-        return Verdict(reason)
-    table = time_table(plan.motion.rate[0], plan.motion.degree, cells=EARLY_EXIT_CELLS if early_exit else TABLE_CELLS)
-    sampled = _sampled_for_early_exit(plan, table) if early_exit else _sampled(plan, table, step)
-    if sampled is None:
-        return Verdict(Reason.TOO_LONG, metrics=Metrics(duration=float(table[1, -1])))
-    states, samples = sampled
-    if not states.is_finite():
-        return Verdict(Reason.NOT_FINITE, metrics=Metrics(duration=float(samples.t[-1])), samples=len(samples.s))
-    world.set_path(states.q, states.dq, states.ddq, plan.obstacle_poses, states.jerk, exact=not early_exit)
-    ends = boundary_margins(states, plan.boundary, samples, world.robot)
-    metrics, paper = Metrics(), PaperRule()
-    if not early_exit:
-        metrics = metrics_of(plan.problem, world, samples, jerks(plan.motion, samples.s))
-        paper = paper_rule(plan.problem, world, plan.obstacle_poses, plan.goal_xyz)
-    curve = SplineCurve(plan.motion)
-    context = evaluation_context(plan.problem, curve, plan.obstacle_poses, world, samples, table)
-    context = context if tube is None else tube.widen(context)
-    motion = polynomials(plan.motion, jerk=plan.problem.uses_jerk)
-    margins = [*ends, *_margins(context, motion, limits, early_exit=early_exit)]
-    return Verdict(reason_of(margins), by_name(margins), metrics, paper, len(samples.s))
 
 
 def _margins(

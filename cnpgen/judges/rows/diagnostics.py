@@ -42,14 +42,8 @@ class Diagnostic:
         index, end = np.nonzero(~np.isnan(self.stored[finite]))
         row = finite[index]
         error = np.abs(self.stored[row, end] - self.recomputed[row, end])
-        return compare(
-            self.name,
-            self.unit,
-            violation=error,
-            tolerance=np.full(len(row), DIAGNOSTIC_TOLERANCES[dtype]),
-            row=row,
-            end=end,
-        )
+        tolerance = DIAGNOSTIC_TOLERANCES[dtype]
+        return compare(self.name, self.unit, violation=error, tolerance=tolerance, row=row, end=end)
 
 
 def stored_diagnostics(problem: Problem, columns: Mapping[str, Array]) -> list[Diagnostic]:

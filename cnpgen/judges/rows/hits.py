@@ -72,14 +72,16 @@ def judge_goals(
         home = near_base if rule.near == "base" else columns[f"{rule.near}_q"][finite]
         direction = _directions(robot, columns, finite)
         error = _projected_gradients(robot, q, home, direction, ACTIVE_LIMIT_TOLERANCES_RAD[dtype])
-        judged.append(_compared("hitting configuration", "m^2/rad", error, STATIONARITY_TOLERANCES[dtype], finite))
+        tolerance = STATIONARITY_TOLERANCES[dtype]
+        judged.append(compare("hitting configuration", "m^2/rad", violation=error, tolerance=tolerance, row=finite))
     if rule.full_speed is not None and "hit_speed_max" in columns:
         fraction = speed_fractions(columns)[finite]
         share = fraction * velocity_factors(robot, columns)[finite]
         violation = np.abs(columns["goal_dq"][finite]) - share[:, None] * robot.velocity_limit
         too_slow = np.where(fraction == 1, 0.0, np.inf) if rule.full_speed == 1 else np.zeros(len(finite))
         error = np.maximum(np.maximum(violation.max(axis=1, initial=0.0), 0.0), too_slow)
-        judged.append(_compared("hitting velocity", "rad/s", error, BOUNDARY_TOLERANCES[dtype]["velocity"], finite))
+        tolerance = BOUNDARY_TOLERANCES[dtype]["velocity"]
+        judged.append(compare("hitting velocity", "rad/s", violation=error, tolerance=tolerance, row=finite))
     return judged
 
 
@@ -109,11 +111,6 @@ def repeated_fraction(fractions: Array, dtype: str) -> tuple[int, float]:
         return 0, 0.0
     value = float(drawn[int(np.argmax(close))])
     return int((np.abs(drawn - value) <= FRACTION_TOLERANCES[dtype]).sum()), value
-
-
-def _compared(name: str, unit: str, error: Array, tolerance: float, rows: Index) -> tuple[Check, Index]:
-    ones = np.ones(len(rows), np.int64)
-    return compare(name, unit, violation=error, tolerance=np.full(len(rows), tolerance), row=rows, end=ones)
 
 
 def velocity_factors(robot: Robot, columns: Mapping[str, Array]) -> Array:

@@ -5,7 +5,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -139,7 +138,7 @@ def _verify_block(problem: Problem, world: World, columns: dict[str, Array], dty
     finite = np.flatnonzero(n_invalid == 0)
     measurements = _measure(problem, world, columns, finite)
     judged = [
-        _judge_finite(n_invalid),
+        compare("finite", "1", violation=n_invalid.astype(float), tolerance=0.0, row=np.arange(rows), end=0),
         _judge_position(measurements, columns, finite, dtype),
         *(values.judged(key, dtype) for key, values in measurements.conditions.items()),
         *_judge_hit(measurements, columns, finite, dtype),
@@ -194,18 +193,11 @@ def _states(columns: dict[str, Array], end: str) -> tuple[list[Array], list[int]
     return [q, dq, ddq], np.where(np.any(dq != 0, axis=1), 1, 2).tolist()
 
 
-def _judge_finite(n_invalid: Index) -> tuple[Check, Index]:
-    """Check that no row has values that are not finite."""
-    zeros = np.zeros(len(n_invalid), np.int64)
-    violation, tolerance = n_invalid.astype(float), zeros.astype(float)
-    return compare("finite", "1", violation=violation, tolerance=tolerance, row=np.arange(len(n_invalid)), end=zeros)
-
-
 def _judge_position(block: _Measurements, columns: dict[str, Array], finite: Index, dtype: str) -> tuple[Check, Index]:
     claimed = np.stack([columns[f"{end}_xyz"] for end in ENDS], axis=1)
     error = np.linalg.norm(block.position - claimed, axis=2)[finite].ravel()
     row, end = np.repeat(finite, len(ENDS)), np.tile(np.arange(len(ENDS)), len(finite))
-    tolerance = np.full(error.shape, BOUNDARY_TOLERANCES[dtype]["position"])
+    tolerance = BOUNDARY_TOLERANCES[dtype]["position"]
     return compare("tip position", "m", violation=error, tolerance=tolerance, row=row, end=end)
 
 
@@ -218,17 +210,11 @@ def _judge_hit(
     angle, speed = columns["hit_angle"][finite, 0], columns["hit_speed"][finite, 0]
     x, y, _ = block.hit_velocity[finite].T
     along, across = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
-    moving = speed > 0
-
-    def judged(name: str, unit: str, error: Any, rows: Index, quantity: str) -> tuple[Check, Index]:
-        tolerance = np.full(len(rows), BOUNDARY_TOLERANCES[dtype][quantity])
-        return compare(
-            name, unit, violation=np.abs(error), tolerance=tolerance, row=rows, end=np.ones(len(rows), np.int64)
-        )
-
-    direction = np.arctan2(across, along)[moving]
-    yield judged("hit direction", "rad", direction, finite[moving], "direction")
-    yield judged("hit speed", "m/s", along - speed, finite, "velocity")
+    moving, tolerances = speed > 0, BOUNDARY_TOLERANCES[dtype]
+    direction, error = np.abs(np.arctan2(across, along)[moving]), np.abs(along - speed)
+    tolerance = tolerances["direction"]
+    yield compare("hit direction", "rad", violation=direction, tolerance=tolerance, row=finite[moving])
+    yield compare("hit speed", "m/s", violation=error, tolerance=tolerances["velocity"], row=finite)
 
 
 def _judge_highest(
@@ -239,5 +225,4 @@ def _judge_highest(
         highest = highest_speed(block.hit_jacobian[finite], columns["hit_angle"][finite, 0], robot.velocity_limit)
         highest *= velocity_factors(robot, columns)[finite]
         error = np.abs(columns["hit_speed_max"][finite, 0] - highest)
-        tolerance, end = np.full(len(finite), DIAGNOSTIC_TOLERANCES[dtype]), np.ones(len(finite), np.int64)
-        yield compare("highest hit speed", "m/s", violation=error, tolerance=tolerance, row=finite, end=end)
+        yield compare("highest hit speed", "m/s", violation=error, tolerance=DIAGNOSTIC_TOLERANCES[dtype], row=finite)

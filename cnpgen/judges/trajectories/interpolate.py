@@ -66,10 +66,7 @@ def family_of_data(t: Array, data: list[Array]) -> CurveFamily:
         t: Times of the knots [s], from 0, shape (S + 1,).
         data: Positions, then their derivatives in SI units, shape (S + 1, n) each.
     """
-    h = np.diff(t)
-    coefficients = np.einsum("cw,swn->csn", hermite_weights(len(data)), span_data(data, h))
-    exact = np.zeros((len(h), data[0].shape[1]))
-    return CurveFamily(t, coefficients, (exact, exact, exact, exact))
+    return _known(t, np.einsum("cw,swn->csn", hermite_weights(len(data)), span_data(data, np.diff(t))))
 
 
 def through_positions(trajectory: Trajectory, neighbors: int) -> CurveFamily:
@@ -80,9 +77,12 @@ def through_positions(trajectory: Trajectory, neighbors: int) -> CurveFamily:
         neighbors: Number of samples that determine a polynomial.
     """
     _, weights, data = polynomials_of_positions(trajectory.t, trajectory.q, neighbors)
-    exact = np.zeros((len(data), trajectory.q.shape[1]))
-    coefficients = np.einsum("scw,swn->csn", weights, data)
-    return CurveFamily(trajectory.t, coefficients, (exact, exact, exact, exact))
+    return _known(trajectory.t, np.einsum("scw,swn->csn", weights, data))
+
+
+def _known(t: Array, coefficients: Array) -> CurveFamily:
+    exact = np.zeros(coefficients.shape[1:])
+    return CurveFamily(t, coefficients, (exact, exact, exact, exact))
 
 
 def bounded_jerk(trajectory: Trajectory, max_jerk: Array, noise: Array) -> CurveFamily | None:

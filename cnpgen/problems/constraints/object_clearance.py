@@ -1,13 +1,13 @@
 """Clearance constraint between the held object and the robot's links."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.problems.constraints.clearance import MAX_LINK_PENETRATION_M
-from cnpgen.problems.constraints.constraint import Condition, Constraint
+from cnpgen.problems.constraints.clearance import MAX_LINK_PENETRATION_M, DistanceConstraint, names_of_pairs
+from cnpgen.problems.constraints.constraint import Condition
 from cnpgen.schema.keys import field
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ MAX_HELD_CAPSULE_ERROR_FRACTION = 0.1  # of the free states, in which the capsul
 
 
 @dataclass(frozen=True, kw_only=True)
-class ObjectClearance(Constraint):
+class ObjectClearance(DistanceConstraint):
     """Constraint: the held object is further than ``distance`` from the links that may not touch it.
 
     It requires the geometry of the URDF. ``touch_links`` in [object] may touch the object. Links that the joint of the
@@ -28,7 +28,7 @@ class ObjectClearance(Constraint):
     Solvers use the capsules of links whose capsules hardly ever overlap the object unless the links do.
     """
 
-    reason = "object in collision with the robot"
+    reason, condition_name, bodies = "object in collision with the robot", "object clearance", "held object"
     uses_obstacles = False
     training_weight = 3000.0
     distance: float = field(
@@ -52,12 +52,8 @@ class ObjectClearance(Constraint):
 
     def measured(self, world: "World") -> tuple[Condition, ...]:
         """Measure the signed distances of the convex parts with Coal [m]."""
-        distances, shape = world.held_object_distances(self.distance), world.robot.held_shape
-        links = [part.link for part in shape.convex_parts] if shape else []
-        pairs = shape.checked_pairs if shape else ()
-        lower, upper = np.full(len(distances), self.distance), np.full(len(distances), np.inf)
-        parts = tuple(f"{links[first]}, {links[second]}" for first, second in pairs)
-        return (Condition("object clearance", "m", distances, lower, upper, "position", parts=parts),)
+        distances, parts = world.held_object_distances(self.distance), names_of_pairs(world.robot.held_shape)
+        return self._at_least(distances, self.distance, parts=parts)
 
     def met(self, path: "PathWorld", tolerance: float) -> NDArray[np.bool_]:
         """Return a mask of the states with sufficient distances between the object and the links."""
@@ -66,13 +62,13 @@ class ObjectClearance(Constraint):
     def solved(self, world: "World") -> tuple[Condition, ...]:
         """Return the conditions of the capsules."""
         capsules = _solver_capsules(world.robot)
-        (condition,) = self._clear([0.0] * len(capsules), capsules)
-        return (replace(condition, parts=tuple(capsule.link for capsule in capsules)),)
+        return self._clear([0.0] * len(capsules), capsules, parts=tuple(capsule.link for capsule in capsules))
 
-    def _clear(self, distances: list[Any], capsules: "list[Capsule]") -> tuple[Condition, ...]:
-        lower = np.array([capsule.radius + self.distance for capsule in capsules])
-        upper = np.full(len(capsules), np.inf)
-        return (Condition("object clearance", "m", distances, lower, upper, "position", sufficient=True),)
+    def _clear(
+        self, distances: list[Any], capsules: "list[Capsule]", parts: tuple[str, ...] = ()
+    ) -> tuple[Condition, ...]:
+        least = np.array([capsule.radius + self.distance for capsule in capsules])
+        return self._at_least(distances, least, parts=parts, sufficient=True)
 
 
 def _solver_capsules(robot: "Robot") -> "list[Capsule]":
