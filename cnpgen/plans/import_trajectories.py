@@ -134,17 +134,9 @@ def _boundary(
 def _snapped(
     snapper: StateSnapper, state: State, end: End, given: Sequence[bool], allowed: float
 ) -> tuple[State, float]:
-    """Snap a state, without its estimated derivatives if they prevent it; also return the change of the positions.
+    """Snap a state, without its estimated derivatives, those that are not given, if they prevent it.
 
-    Args:
-        snapper: The constraints.
-        state: The state.
-        end: End of the motion.
-        given: Whether the velocities and the accelerations are those of the file, not estimates.
-        allowed: Largest change of the positions [rad].
-
-    Returns:
-        The state and its change [rad]; the state as it is and nan if a larger change is necessary.
+    Return it with its change [rad]; or as it is, with nan, if a change above the allowed one is necessary.
     """
     q, dq, ddq = state
     still = np.zeros_like(q)

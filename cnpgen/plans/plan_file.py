@@ -138,12 +138,7 @@ def agreed_problem(
 ) -> ProblemRecord:
     """Return the problem of a file: the required one if it is consistent, or the file's own.
 
-    Args:
-        path: Path of the file.
-        stored: Problem in the file, or None.
-        wanted: Required problem, None for any.
-        content: Content of the file, for messages: "plans".
-        command: Command with the option ``--problem``, for messages.
+    Content and command, which has the option ``--problem``, are for messages.
 
     Raises:
         DatasetError: The file is of another problem.

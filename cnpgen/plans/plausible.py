@@ -52,10 +52,8 @@ def check_boundary_units(
 def are_usual(robot: Robot, states: Sequence[NDArray[Any]]) -> bool:
     """Return whether states are within the limits of the joints: a fast check.
 
-    Args:
-        robot: Robot of the problem.
-        states: Positions, velocities and accelerations of one state, or of two without or with the last accelerations;
-            shape (N, n) each.
+    The states are positions, velocities and accelerations of one state, or of two without or with the last
+    accelerations; shape (N, n) each.
     """
     shape = (len(states[0]), robot.n)
     if any(values.shape != shape for values in states):

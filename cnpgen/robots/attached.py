@@ -82,13 +82,7 @@ def attach(model: "pin.Model", attached: Attached) -> None:
 
 
 def bounded(urdf: str, tree: ElementTree.Element, attached: Attached) -> str:
-    """Return a URDF in which continuous joints with a given range are revolute.
-
-    Args:
-        urdf: Text of the URDF.
-        tree: Parsed URDF, modified in place.
-        attached: Attachments with the ranges.
-    """
+    """Return a URDF in which continuous joints with a given range are revolute; the tree is modified in place."""
     turning = [joint for joint in tree.iter("joint") if joint.get("type") == "continuous"]
     given = [joint for joint in turning if joint.get("name") in attached.ranges]
     for joint in given:

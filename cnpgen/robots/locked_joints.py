@@ -15,12 +15,9 @@ _MOTION = ("axis", "limit", "mimic", "calibration", "dynamics", "safety_controll
 
 
 def with_locked_joints(urdf: str, positions: Mapping[str, float], *, is_stored: bool) -> str:
-    """Return a URDF whose locked joints are fixed at their positions, with those that mimic them.
+    """Return a URDF whose locked joints are fixed at their positions [rad or m], with those that mimic them.
 
-    Args:
-        urdf: Text of the URDF.
-        positions: Joint -> position [rad or m].
-        is_stored: Whether the URDF is that of a stored problem, whose joints are fixed already.
+    The joints of a stored problem are fixed already.
 
     Raises:
         RecipeError: A joint does not exist, does not move, or its position is outside of its limits.

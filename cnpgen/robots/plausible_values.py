@@ -67,13 +67,9 @@ def find_implausible_value(robot: Robot, name: str, values: NDArray[Any], unit: 
 
 
 def check_plausible(robot: Robot, columns: Mapping[str, NDArray[Any]], units: Mapping[str, str], *, noun: str) -> None:
-    """Raise an error for the first value that is probably in another unit.
+    """Raise an error for the first value of columns, shape (N, width), that is probably in another unit than theirs.
 
-    Args:
-        robot: Robot of the problem.
-        columns: Name -> values, shape (N, width).
-        units: Name -> unit.
-        noun: Noun of a row: "task" or "plan".
+    The noun of a row is "task" or "plan".
 
     Raises:
         UnitError: A value is far outside of its range.

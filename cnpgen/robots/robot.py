@@ -125,11 +125,7 @@ class Robot:
 def reduced_model(urdf: Path, text: str, joints: tuple[str, ...], attached: Attached) -> "pin.Model":
     """Build the Pinocchio model of a URDF, reduced to the planned joints, with the attachments of a problem.
 
-    Args:
-        urdf: Path of the URDF file, for messages.
-        text: Text of the URDF.
-        joints: Planned joints; all others are locked at zero.
-        attached: Attachments of the problem.
+    The path is for messages. Joints that are not planned are locked at zero.
 
     Raises:
         RecipeError: The text is not a URDF, it lacks the joints in this order, or Pinocchio reads other numbers.

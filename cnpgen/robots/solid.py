@@ -128,12 +128,7 @@ def _posed_numbers(obstacle: Obstacle) -> Array:
 
 
 def solids_of(obstacles: Sequence[Obstacle], numbers: Array) -> list[Solid]:
-    """Return the convex bodies of obstacles.
-
-    Args:
-        obstacles: Obstacles of the problem.
-        numbers: Poses and sizes of the obstacles, shape (pose_width,).
-    """
+    """Return the convex bodies of obstacles with these poses and sizes, shape (pose_width,)."""
     return [_solid(each, numbers[part]) for each, part in zip(obstacles, number_slices(obstacles), strict=True)]
 
 

@@ -107,14 +107,9 @@ def number_in(element: ElementTree.Element | None, attribute: str, default: floa
 
 
 def numbers_in(element: ElementTree.Element | None, attribute: str, default: tuple[float, ...]) -> tuple[float, ...]:
-    """Return the numbers in an attribute of an element.
+    """Return the numbers in an attribute of an element; as many as the default ones of a missing attribute or element.
 
     The accepted notation is that of URDF parsers, which drop an element with other numbers without an error.
-
-    Args:
-        element: The element, or None.
-        attribute: Name of the attribute.
-        default: Numbers of a missing element or attribute; their count is required.
 
     Raises:
         ValueError: The attribute does not have as many finite decimal numbers.

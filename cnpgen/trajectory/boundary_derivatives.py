@@ -31,10 +31,7 @@ class BoundaryDerivative:
 def boundary_derivatives(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> list[BoundaryDerivative]:
     """Differentiate ``start_points`` and ``goal_points`` of ``cnpgen.trajectory.boundary``; other derivatives are zero.
 
-    Args:
-        boundary: Boundary conditions of N motions.
-        rate: Rate control points [1/s], shape (N, R), positive.
-        spec: Degree and numbers of control points.
+    Rate control points [1/s], shape (N, R), are positive.
     """
     b, last, points = boundary, spec.rate_control_points - 1, spec.path_control_points
     c1, c2, c2_inner = _end_derivatives(b.start_dq, b.start_ddq, rate[:, :1], rate[:, 1:2], spec)

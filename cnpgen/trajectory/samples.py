@@ -51,13 +51,7 @@ def checked_samples(t: ArrayLike, q: ArrayLike, dq: ArrayLike | None) -> tuple[A
 
 
 def resampled(t: Array, q: Array, dq: Array | None) -> tuple[Array, Array]:
-    """Return times and positions, resampled by cubic Hermite interpolation if they are sparse and have velocities.
-
-    Args:
-        t: Times [s], shape (K,).
-        q: Joint positions [rad], shape (K, n).
-        dq: Joint velocities [rad/s], shape (K, n), or None.
-    """
+    """Return times and positions, resampled by cubic Hermite interpolation if they are sparse and have velocities."""
     if dq is None or len(t) >= MIN_DENSE_SAMPLES:
         return t, q
     from scipy.interpolate import CubicHermiteSpline
@@ -68,7 +62,7 @@ def resampled(t: Array, q: Array, dq: Array | None) -> tuple[Array, Array]:
 
 
 def sampled_boundary(t: ArrayLike, q: ArrayLike, dq: ArrayLike | None = None) -> Boundary:
-    """Estimate the boundary conditions of one trajectory from its samples.
+    """Estimate the boundary conditions of one trajectory from its samples; the goal acceleration is free.
 
     Positions, and velocities if they are passed, are those of the first and the last sample. Other derivatives are
     those of cubics through the samples next to the ends; negligible values are set to zero.
@@ -77,9 +71,6 @@ def sampled_boundary(t: ArrayLike, q: ArrayLike, dq: ArrayLike | None = None) ->
         t: Times [s], shape (K,).
         q: Joint positions [rad], shape (K, n).
         dq: Joint velocities [rad/s], shape (K, n), or None.
-
-    Returns:
-        Boundary conditions of one motion with a free goal acceleration.
 
     Raises:
         UsageError: A shape is wrong, the times do not increase, or a value is not finite.
@@ -107,15 +98,10 @@ def _derivatives(t: Array, q: Array, velocity: Array | None) -> tuple[Array, Arr
 
 
 def _cubic(t: Array, travel: Array, first: int) -> Array:
-    """Fit a cubic without powers below t^first to the first samples and return its coefficient of t^first, shape (n,).
+    """Fit a cubic without powers below t^first to the first samples; return its coefficient of t^first, shape (n,).
 
     A wide window averages noise, a narrow one follows the motion: the window with the smallest estimated standard error
     is chosen.
-
-    Args:
-        t: Times after the start [s], shape (K,).
-        travel: Displacements to fit [rad], shape (K, n).
-        first: Lowest power.
     """
     widths = [min(width, len(t)) for width in WINDOWS if width <= max(len(t) // 5, WINDOWS[0])]
     best = np.inf, np.zeros(travel.shape[1])

@@ -104,9 +104,8 @@ class ForwardKinematics:
 def _coefficients(model: "pin.Model", joint: int) -> Array:
     """Return the coefficients of a joint's pose in the frame of its parent, shape (12, 4).
 
-    Rows 0 to 3 are the constant parts of its x, y and z axis and of its origin. Rows 4 to 7 are the coefficients of
-    sin q and rows 8 to 11 those of cos q; for a prismatic joint, rows 4 to 7 are the coefficients of q. A point is
-    (x, y, z, 1), a vector (x, y, z, 0).
+    Each four rows are its x, y and z axis and origin: constants, factors of sin q, or of q of a prismatic joint, and of
+    cos q. A point is (x, y, z, 1), a vector (x, y, z, 0).
     """
     data = model.joints[joint].createData()
     model.joints[joint].calc(data, np.zeros(model.nq), np.zeros(model.nv))

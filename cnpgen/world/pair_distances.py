@@ -67,19 +67,11 @@ def smallest_distances(bounds: Array, measure: Measure, separation: Callable[[in
 def clear_states(
     bounds: Array, min_distance: float, measure: Measure, separation: Callable[[int, Array, Indices], Array]
 ) -> NDArray[np.bool_]:
-    """Find the states at which the signed distances of all M pairs of convex bodies reach a minimum.
+    """Return a mask of the states at which the signed distances of all M pairs of convex bodies reach a minimum [m].
 
     A state whose bound is too small is measured. Its separating direction also bounds the distances at the other
-    unresolved states and usually resolves most of them.
-
-    Args:
-        bounds: Initial lower bounds of the distances [m], shape (M, K).
-        min_distance: Required distance [m].
-        measure: Measures a pair at a state, as of ``smallest_distances``.
-        separation: Returns lower bounds of the distances of a pair [m] along a unit vector at J states, shape (J,).
-
-    Returns:
-        Mask of the states, shape (K,); False where a distance cannot be measured.
+    unresolved states and usually resolves most of them. States whose distance cannot be measured are not clear. Other
+    arguments are those of ``smallest_distances``.
     """
     clear = np.ones(bounds.shape[1], bool)
     proven = bounds >= min_distance

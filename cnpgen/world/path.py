@@ -209,11 +209,7 @@ class PathWorld:
     def shape_distances(self, sufficient: float = np.inf) -> list[Array]:
         """Measure the signed distance of every moving part of the robot's links from every obstacle, part by part [m].
 
-        Args:
-            sufficient: As of ``segment_distances``.
-
-        Returns:
-            Arrays of shape (K,), of which the smallest value is exact (``cnpgen.world.pair_distances``).
+        See ``segment_distances``.
 
         Raises:
             RecipeError: The robot has no link geometry.
@@ -292,11 +288,7 @@ class PathWorld:
     def motion_bounds(self, max_positions: Array) -> Array:
         """Bound the displacement of any point of the robot or the held object per unit of motion of each joint [m].
 
-        Args:
-            max_positions: Largest absolute joint positions of a motion, shape (n,), needed for prismatic joints.
-
-        Returns:
-            Motion bounds (Schwarzer et al. 2005), shape (n,).
+        Largest absolute joint positions, shape (n,), are needed for prismatic joints (Schwarzer et al. 2005).
         """
         return self._kinematics.motion_bounds(self._extents, max_positions)
 
@@ -320,13 +312,9 @@ class PathWorld:
         return self._bodies
 
     def object_distances(self, sufficient: float = np.inf) -> list[Array]:
-        """Measure the signed distance of the held object from every obstacle [m], negative if they overlap.
+        """Measure the signed distance of the held object from every obstacle [m]; see ``segment_distances``.
 
-        Args:
-            sufficient: As of ``segment_distances``.
-
-        Returns:
-            Arrays of shape (K,), of each of which the smallest value is exact (``cnpgen.world.pair_distances``).
+        The smallest value of each array is exact.
 
         Raises:
             RecipeError: The problem has no held object.
@@ -356,10 +344,7 @@ class PathWorld:
         return self._object_size
 
     def object_corners(self, states: "slice | NDArray[np.bool_]" = slice(None)) -> Array:
-        """Compute the corners of the held object [m], shape (8, 3, K).
-
-        Args:
-            states: Slice or mask of the states.
+        """Compute the corners of the held object at a slice or a mask of the states [m], shape (8, 3, K).
 
         Raises:
             RecipeError: The problem has no held object.

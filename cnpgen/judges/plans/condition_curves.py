@@ -65,14 +65,7 @@ def plot_unit(unit: str) -> tuple[float, str]:
 
 
 def condition_curves(problem: Problem, world: PathWorld, s: Array, solids: Sequence[Solid]) -> list[ConditionCurve]:
-    """Measure all conditions that are no limits of joints, at every state.
-
-    Args:
-        problem: The problem.
-        world: The robot along a motion, among the obstacles of the motion.
-        s: Phases of the states, shape (K,).
-        solids: The obstacles of the motion.
-    """
+    """Measure all conditions that are no limits of joints at phases s, shape (K,), where the robot is."""
     start_tip = world.tip_position[:, 0].copy()
     curves: list[ConditionCurve] = []
     for constraint in problem.constraint:

@@ -69,9 +69,8 @@ def check_continuous_collision(
 ) -> Iterator[tuple[MeasuredCondition, Margin]]:
     """Yield contact conditions and their margins between samples: around the smallest, and in unresolved intervals.
 
-    Args:
-        context: A motion whose world is at its samples; the world is moved.
-        early_exit: Whether to subdivide only if it can change the verdict or the size of a violation.
+    The world of the context is at its samples, and is moved. With early exit, intervals are subdivided only if it can
+    change the verdict or the size of a violation.
     """
     contacts = [condition for condition in context.measured if is_contact(condition.constraint)]
     if not contacts:
@@ -104,10 +103,7 @@ def _subdivisions(
 def _intervals(
     context: EvaluationContext, s: Array, contacts: Sequence[MeasuredCondition], motion_bounds: Array
 ) -> list[Intervals]:
-    """Return, for each contact condition, the intervals between neighbors in rows of phases s, where the world is.
-
-    ``s`` has shape (rows, K).
-    """
+    """Return the intervals of each contact between neighbors in rows of phases, shape (rows, K), where the world is."""
     world, last = context.world, s.shape[1] - 1
     displacements = motion_bounds @ np.abs(world.q[:, 1:] - world.q[:, :-1])
     displacements[last :: last + 1] = -np.inf  # between rows there is no interval

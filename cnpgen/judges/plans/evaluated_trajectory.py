@@ -49,14 +49,9 @@ class EvaluatedTrajectory:
 
 
 def evaluate_trajectory(motion: Motion, s: Array, *, jerk: bool = False) -> EvaluatedTrajectory:
-    """Evaluate one motion at phases s.
+    """Evaluate one motion at phases s in [0, 1], shape (K,), optionally with jerks.
 
     For many phases of one motion this takes a tenth of the time of ``Motion.at``.
-
-    Args:
-        motion: One motion.
-        s: Phases in [0, 1], shape (K,).
-        jerk: Whether to evaluate jerks.
     """
     orders = PATH_ORDERS + jerk
     p = spline_derivatives(motion.path[0], motion.degree, s, orders=orders)

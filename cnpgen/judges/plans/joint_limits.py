@@ -155,12 +155,7 @@ class ProvenJointLimits:
 
 
 def joint_limits(problem: Problem, world: PathWorld) -> ProvenJointLimits:
-    """Return the joint limits of a problem that are proven.
-
-    Args:
-        problem: The problem.
-        world: Its robot at any state with a jerk; the bounds do not depend on the state.
-    """
+    """Return the joint limits of a problem that are proven; its robot may be at any state with a jerk."""
     constraints = tuple(constraint for constraint in problem.constraint if is_proven(constraint))
     conditions = tuple(constraint.measured(cast(World, world))[0] for constraint in constraints)
     shape = len(constraints), world.robot.n

@@ -217,10 +217,7 @@ class _Plan:
 
 @lru_cache(maxsize=8)
 def _corners(path_points: int, rate_points: int, degree: int, kinks: tuple[float, ...]) -> frozenset[float]:
-    """Return the knots of both splines, and two phases on either side of each kink.
-
-    Second differences across a kink are no estimates of the second derivative next to it.
-    """
+    """Return knots and two phases on either side of kinks, across which second differences estimate no derivative."""
     return knots(path_points, rate_points, degree).union(s + k * KINK_OFFSET for s in kinks for k in range(-2, 3))
 
 

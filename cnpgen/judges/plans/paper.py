@@ -114,14 +114,7 @@ def _is_clear(problem: Problem, world: PathWorld, obstacle_poses: Array) -> bool
 
 
 def metrics_of(problem: Problem, world: PathWorld, samples: Samples, jerk: Array) -> Metrics:
-    """Compute the metrics of one motion.
-
-    Args:
-        problem: The problem.
-        world: Its robot at the samples.
-        samples: Times and phases of the samples.
-        jerk: Joint jerks at the samples [rad/s^3], shape (n, K); nan if unknown.
-    """
+    """Compute the metrics of one motion from its joint jerks at the samples [rad/s^3], shape (n, K); nan if unknown."""
     robot = world.robot
     torque_ratio = world.torque / robot.torque_limit[:, None]
     table, tip = problem.first(Table), world.parameters.on_table(world.tip_position)

@@ -284,10 +284,7 @@ def _draw_views(figure: "SubFigure", problem: Problem, world: PathWorld, solids:
 
 
 def _links(problem: Problem, world: PathWorld, k: int) -> list[tuple[Array, float]]:
-    """Return the links at one state: corners of a hull in the world [m], shape (V, 3), and its radius [m].
-
-    They are the parts of the robot's link geometry, or its segments with the radius of a constraint.
-    """
+    """Return the parts of links, or segments, at one state: corners in the world [m], shape (V, 3), and radius [m]."""
     robot = world.robot
     if robot.shape is None:
         return [(segment, problem.arm_radius or 0.0) for segment in world.segments()[..., k]]

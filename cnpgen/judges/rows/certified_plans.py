@@ -32,13 +32,7 @@ class PlanCheck:
 
 
 def check_plans(problem: Problem, robot: Robot, columns: Mapping[str, NDArray[Any]]) -> PlanCheck:
-    """Judge the plans in rows of a certified dataset; rows of other datasets have none.
-
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        columns: Field -> values, shape (rows, width) or (rows,).
-    """
+    """Judge the plans in columns of a certified dataset, field -> values; rows of other datasets have none."""
     if "path_control_points" not in columns:
         return PlanCheck()
     rows, spec = len(columns["start_q"]), problem.trajectory

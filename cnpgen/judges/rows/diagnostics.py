@@ -47,12 +47,7 @@ class Diagnostic:
 
 
 def stored_diagnostics(problem: Problem, columns: Mapping[str, Array]) -> list[Diagnostic]:
-    """List the diagnostics in rows that can be recomputed.
-
-    Args:
-        problem: The problem.
-        columns: Field -> values, shape (rows, width).
-    """
+    """List the diagnostics in columns, field -> values of shape (rows, width), that can be recomputed."""
     kinds = [("torque_ratio", "holding torque ratio", "1", _torque_ratio), *_clearance(problem)]
     return [
         Diagnostic(name, unit, compute, stored, np.full_like(stored, np.nan))

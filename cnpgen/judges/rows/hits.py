@@ -95,9 +95,7 @@ def speed_fractions(columns: Mapping[str, Array]) -> Array:
 def repeated_fraction(fractions: Array, dtype: str) -> tuple[int, float]:
     """Find a fraction below 1 that more hits have than chance explains: such hits were scaled in time afterwards.
 
-    Args:
-        fractions: Result of ``speed_fractions`` for all rows of a dataset.
-        dtype: Float type of the stored rows.
+    The fractions are those of all rows of a dataset.
 
     Returns:
         Number of hits with the fraction, and the fraction; 0 if there is none.
@@ -146,19 +144,10 @@ def _projected_gradients(robot: Robot, q: Array, home: Array, direction: Array, 
 
 
 def _gradients(robot: Robot, q: Array, home: Array, direction: Array) -> tuple[Array, Array]:
-    """Return J and the gradient of f, by Pinocchio's derivatives of the tip's velocity.
+    """Return J, shape (rows, 3, n), and the gradient of f, shape (rows, n), by derivatives of the tip's velocity.
 
     Pinocchio differentiates the velocity of the tip's frame as if its axes turned with it. That adds a combination of
     the rows of J to the gradient, which the projection removes.
-
-    Args:
-        robot: The robot.
-        q: Joint positions [rad], shape (rows, n).
-        home: Configurations to stay close to [rad], shape (rows, n).
-        direction: Unit directions of the hits, shape (rows, 3).
-
-    Returns:
-        Arrays of shapes (rows, 3, n) and (rows, n).
     """
     import pinocchio as pin
 

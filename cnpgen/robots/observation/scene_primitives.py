@@ -15,10 +15,7 @@ NO_BODY = -1  # kind of the padding
 
 
 def scene_primitives(scenes: Scene | Sequence[Sequence[Obstacle]]) -> Primitives:
-    """Return the bodies of N scenes, arrays with a first axis of length N.
-
-    Args:
-        scenes: Obstacles of N samples, those that are parked below the robot omitted; or the obstacles of N scenes.
+    """Return the bodies of N scenes, arrays with a first axis of length N; without obstacles parked below the robot.
 
     Raises:
         UsageError: An obstacle is a mesh.

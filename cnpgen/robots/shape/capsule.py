@@ -42,14 +42,11 @@ class Capsule:
 
 
 def covering_capsule(convex_parts: Sequence[ConvexPart]) -> Capsule:
-    """Find a capsule of small overhang that covers all convex parts of one link.
+    """Find a capsule of small overhang that covers all convex parts of one link, which are in one frame.
 
     The initial guess is the best of 30 directions, each with the minimum enclosing circle of the link's projection.
     Sequential quadratic programming then minimizes the radius plus the maximum excess of an end over a facet, which is
     the overhang for ends inside the hull. The final radius covers every corner.
-
-    Args:
-        convex_parts: The convex parts of the link, in one frame.
     """
     corners = np.concatenate([part.vertices for part in convex_parts])
     thickness = np.concatenate([np.full(len(part.vertices), part.radius) for part in convex_parts])
@@ -98,10 +95,7 @@ def _axes(corners: Array) -> Array:
 
 
 def _along(axis: Array, corners: Array, thickness: Array) -> Array:
-    """Return the ends of the capsule of minimum length along an axis, shape (2, 3).
-
-    Its radius is that of the enclosing circle of the link's projection, iterated as by Badoiu and Clarkson (2003).
-    """
+    """Return the ends of the shortest capsule along an axis, shape (2, 3) (Badoiu and Clarkson 2003, for its circle)."""
     across = np.linalg.svd(axis[None])[2][1:]  # two unit vectors orthogonal to the axis
     projection = corners @ across.T
     center = projection.mean(axis=0)

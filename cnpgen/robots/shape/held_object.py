@@ -85,13 +85,9 @@ def load_held_shape(urdf: str, model: "pin.Model", held: HeldBody, keep: Path | 
 
 
 def with_held_object(shape: Shape, held: Shape | None, chain: Chain, size: Size) -> Shape:
-    """Return the link geometry with the held object as a further link.
+    """Return the link geometry of a robot with the held object, of these edge lengths [m], as a further link.
 
-    Args:
-        shape: Link geometry of the robot.
-        held: Link geometry and the held object, whose pairs are added; None for no pairs with the object.
-        chain: The chain from the base to the tip, the center of the object.
-        size: Edge lengths along the axes of the tip frame [m].
+    The tip of the chain is its center. Pairs of the held shape are added; None for no pairs with the object.
     """
     box, half = _box(size, chain.tip_rotation, chain.tip_translation), np.array(size) / 2
     widest = int(np.argmax(half))

@@ -140,11 +140,7 @@ def points_of(mesh: ElementTree.Element) -> Array:
 
 
 def inline_mesh(path: Path, scale: Array) -> str:
-    """Return the corners of the convex hull of a mesh file as a ``data:`` address.
-
-    Args:
-        path: Path of the mesh file.
-        scale: Scale factors of x, y and z, shape (3,).
+    """Return the corners of the convex hull of a mesh file, scaled along x, y and z, as a ``data:`` address.
 
     Raises:
         RecipeError: The file cannot be read.
@@ -247,11 +243,7 @@ def sides_of(mesh: "coal.BVHModelBase") -> NDArray[np.int64]:
 
 
 def read_mesh(path: Path, scale: Array) -> tuple[Array, "coal.BVHModelBase"]:
-    """Read a mesh: STL, DAE or OBJ.
-
-    Args:
-        path: Path of the mesh file.
-        scale: Scale factors of x, y and z, shape (3,).
+    """Read a mesh, scaled along x, y and z: STL, DAE or OBJ.
 
     Returns:
         Points of the mesh [m], shape (N, 3), and the mesh as an object of Coal.

@@ -15,13 +15,8 @@ PAYLOAD = "carried payload"  # name of the link and of its joint
 def with_payload_link(urdf: str, spec: RobotSpec, payload: Payload | None, *, is_stored: bool) -> str:
     """Return a URDF with the box of the payload as a link without mass, fixed to the tip.
 
-    The mass belongs to the robot's attachments.
-
-    Args:
-        urdf: Text of the URDF.
-        spec: The robot of the problem, with the pose of the tip.
-        payload: The payload; a body if it has touch links.
-        is_stored: Whether the URDF is that of a stored problem, whose link is replaced if it differs.
+    The mass belongs to the robot's attachments. A payload with touch links is a body. A stored problem has the link
+    already, which is replaced if it differs.
 
     Raises:
         RecipeError: A touch link or the tip does not exist, or the URDF has a link of this name.
