@@ -106,7 +106,7 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "ros2-control": "cnpgen.plans.formats:TrajectoryControllerGoal",
         "parquet": "cnpgen.plans.parquet_table:ParquetTable",
         "lerobot": "cnpgen.plans.lerobot_dataset:LeRobotDataset",
-        "mpd": "cnpgen.plans.spline_table:PathSplines",
+        "mpd": "cnpgen.plans.formats:PathSplines",
     },
     FAMILIES: {
         "tabletop": "cnpgen.pipelines.families.tables:Tabletop",

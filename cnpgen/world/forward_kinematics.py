@@ -101,15 +101,20 @@ class ForwardKinematics:
         return np.asarray(self._data.oMi[len(self._coefficients)].homogeneous[:3])
 
 
+def joint_motion(model: "pin.Model", joint: int) -> Array:
+    """Return the linear and the angular velocity per unit velocity of a joint in its own frame, shape (6,)."""
+    data = model.joints[joint].createData()
+    model.joints[joint].calc(data, np.zeros(model.nq), np.zeros(model.nv))
+    return np.array(data.S).reshape(6)
+
+
 def _coefficients(model: "pin.Model", joint: int) -> Array:
     """Return the coefficients of a joint's pose in the frame of its parent, shape (12, 4).
 
     Each four rows are its x, y and z axis and origin: constants, factors of sin q, or of q of a prismatic joint, and of
     cos q. A point is (x, y, z, 1), a vector (x, y, z, 0).
     """
-    data = model.joints[joint].createData()
-    model.joints[joint].calc(data, np.zeros(model.nq), np.zeros(model.nv))
-    motion = np.array(data.S).reshape(6)
+    motion = joint_motion(model, joint)
     x, y, z = motion[3:]
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     placement, rows = model.jointPlacements[joint], np.zeros((12, 4))

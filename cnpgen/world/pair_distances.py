@@ -130,18 +130,16 @@ class PairDistances:
         return clear_states(self.bounds, min_distance, self.measure, self.separation)
 
     def interval_bounds(self, min_distances: Array, displacements: Array, deviations: Array) -> Array:
-        """Bound by how much the distances exceed a minimum between neighboring states.
+        """Bound by how much all distances exceed a minimum between neighboring states [m], shape (K - 1,).
 
-        Every point of a body stays within a bounded deviation from the chord between its two positions. Bodies that
-        are separated along a direction at both states are therefore separated between them, up to that deviation.
+        Every point of a body stays within a bounded deviation from the chord between its two positions. Bodies that are
+        separated along a direction at both states are therefore separated between them, up to that deviation. Bounds
+        are only tightened until they reach 0.
 
         Args:
             min_distances: Required distance of every pair [m], shape (M,).
             displacements: Maximum displacement of a point of one body in the frame of the other [m], shape (K - 1,).
             deviations: Maximum deviation of its path from the chord [m], shape (K - 1,).
-
-        Returns:
-            Lower bounds over all pairs [m], shape (K - 1,). They are only tightened until they reach 0.
         """
         margins = self.bounds - min_distances[:, None]
         intervals = (margins[:, 1:] + margins[:, :-1] - displacements) / 2 - deviations

@@ -256,14 +256,6 @@ class PathWorld:
             self._pairs[name] = make()
         return self._pairs[name]
 
-    def clear_of_obstacles(self, min_distance: float) -> NDArray[np.bool_]:
-        """Return a mask of states: all moving parts of links keep a distance [m] from all obstacles, shape (K,)."""
-        return self.shape_pairs().clear_states(min_distance)
-
-    def clear_of_itself(self, min_distance: float) -> NDArray[np.bool_]:
-        """Return a mask of states: all parts of links that must not touch keep a distance [m], shape (K,)."""
-        return self.self_pairs().clear_states(min_distance)
-
     def held_object_distances(self, sufficient: float = np.inf) -> list[Array]:
         """Measure the signed distance of the held object from parts of links [m]; see ``shape_distances``."""
         return self._smallest(self.held_object_pairs(), sufficient)
@@ -280,10 +272,6 @@ class PathWorld:
         if "held" not in self._pairs:
             bodies.place(self._rotations, self._origins, [])
         return self._once("held", lambda: bodies.pair_distances(bodies.link_pairs))
-
-    def clear_of_held_object(self, min_distance: float) -> NDArray[np.bool_]:
-        """Return a mask of states: the links keep a distance [m] from the held object, shape (K,)."""
-        return self.held_object_pairs().clear_states(min_distance)
 
     def motion_bounds(self, max_positions: Array) -> Array:
         """Bound the displacement of any point of the robot or the held object per unit of motion of each joint [m].

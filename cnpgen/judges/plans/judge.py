@@ -183,15 +183,7 @@ def check_step(step: float) -> None:
 
 @dataclass(frozen=True)
 class _Plan:
-    """One motion with its problem and boundary conditions.
-
-    Attributes:
-        problem: The problem.
-        motion: One motion.
-        boundary: Boundary conditions of the motion.
-        obstacle_poses: Poses and sizes of the obstacles, shape (width,).
-        goal_xyz: Tip position of the goal [m], shape (3,).
-    """
+    """One motion with its problem, boundary conditions, obstacle poses, shape (width,), and goal of the tip [m]."""
 
     problem: Problem
     motion: Motion

@@ -86,18 +86,7 @@ def draw_path(
     title: str,
     margins: Sequence[Margin],
 ) -> None:
-    """Draw joints, conditions and tip of a path in a figure.
-
-    Args:
-        problem: The problem.
-        world: The robot at K times.
-        s: Phases, shape (K,).
-        t: Times [s], shape (K,).
-        path: Image file.
-        scene: Obstacles of the motion; None if its ends place them.
-        title: Title of the figure.
-        margins: Violations to mark.
-    """
+    """Draw joints, conditions and tip of a path at phases s and times t [s], shape (K,), and violations."""
     with np.errstate(all="ignore"):
         if scene is None:
             ends = world.tip_position[:, :1].T, world.tip_position[:, -1:].T

@@ -115,14 +115,10 @@ class _ConditionValues:
 
 @dataclass
 class _Measurements:
-    """Measurements in a block of rows.
+    """Measurements in a block of rows; nan in rows that were not measured.
 
-    Attributes:
-        position: Tip positions [m], shape (rows, 2, 3); nan in rows that were not measured, as in the next two arrays.
-        hit_velocity: Tip velocities at the goal along the axes of the table [m/s], shape (rows, 3).
-        hit_jacobian: Jacobians of the tip at the goal along these axes [m], shape (rows, 3, n).
-        diagnostics: Diagnostics that the rows store.
-        conditions: Conditions of the constraints, in order of first use.
+    Tip positions [m] have shape (rows, 2, 3). Velocities [m/s], shape (rows, 3), and Jacobians [m], shape (rows, 3, n),
+    of hits are those of the tip at the goal along the axes of the table. Conditions are in order of first use.
     """
 
     position: Array

@@ -43,6 +43,23 @@ class DistanceConstraint(Constraint):
 
 
 @dataclass(frozen=True, kw_only=True)
+class LinkClearance(DistanceConstraint):
+    """Base class: bodies that the robot moves are further than ``distance`` from each other."""
+
+    uses_obstacles = False
+    distance: float
+
+    @property
+    def effective_tolerance(self) -> float:
+        """Tolerance up to a penetration of ``MAX_LINK_PENETRATION_M``."""
+        return min(self.tolerance, self.distance + MAX_LINK_PENETRATION_M)
+
+    def met(self, path: "PathWorld", tolerance: float) -> NDArray[np.bool_]:
+        """Return a mask of the states with sufficient distances between the bodies."""
+        return path.pairs(self.bodies).clear_states(self.distance - tolerance)
+
+
+@dataclass(frozen=True, kw_only=True)
 class RobotClearance(DistanceConstraint):
     """Constraint: the robot is further than ``distance`` from every obstacle.
 
@@ -112,7 +129,7 @@ class RobotClearance(DistanceConstraint):
 
     def met(self, path: "PathWorld", tolerance: float) -> NDArray[np.bool_] | None:
         """Return a mask of the states with sufficient distance of the convex parts from the obstacles."""
-        return path.clear_of_obstacles(self.distance - tolerance) if path.robot.shape else None
+        return path.shape_pairs().clear_states(self.distance - tolerance) if path.robot.shape else None
 
     def solved(self, world: "World") -> tuple[Condition, ...]:
         """Return the conditions of the capsules."""

@@ -4,9 +4,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.problems.constraints.clearance import MAX_LINK_PENETRATION_M, DistanceConstraint, names_of_pairs
+from cnpgen.problems.constraints.clearance import LinkClearance, names_of_pairs
 from cnpgen.problems.constraints.constraint import Condition
 from cnpgen.schema.keys import field
 
@@ -14,13 +13,12 @@ if TYPE_CHECKING:
     from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
     from cnpgen.robots.robot import Robot
     from cnpgen.robots.shape.capsule import Capsule
-    from cnpgen.world.path import PathWorld
     from cnpgen.world.world import World
 MAX_HELD_CAPSULE_ERROR_FRACTION = 0.1  # of the free states, in which the capsule of a usable link overlaps the object
 
 
 @dataclass(frozen=True, kw_only=True)
-class ObjectClearance(DistanceConstraint):
+class ObjectClearance(LinkClearance):
     """Constraint: the held object is further than ``distance`` from the links that may not touch it.
 
     It requires the geometry of the URDF. ``touch_links`` in [object] may touch the object. Links that the joint of the
@@ -29,17 +27,11 @@ class ObjectClearance(DistanceConstraint):
     """
 
     reason, condition_name, bodies = "object in collision with the robot", "object clearance", "held object"
-    uses_obstacles = False
     training_weight = 3000.0
     distance: float = field(
         "minimum distance of the object from the links", unit="m", low=0.0, default=0.0, plausible=2.0
     )
     tolerance: float = field("violation that a valid motion may have", unit="m", low=0.0, default=0.0, plausible=0.5)
-
-    @property
-    def effective_tolerance(self) -> float:
-        """Tolerance up to a penetration of ``MAX_LINK_PENETRATION_M``."""
-        return min(self.tolerance, self.distance + MAX_LINK_PENETRATION_M)
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the distances of the capsules' axes from the object [m]."""
@@ -54,10 +46,6 @@ class ObjectClearance(DistanceConstraint):
         """Measure the signed distances of the convex parts with Coal [m]."""
         distances, parts = world.held_object_distances(self.distance), names_of_pairs(world.robot.held_shape)
         return self._at_least(distances, self.distance, parts=parts)
-
-    def met(self, path: "PathWorld", tolerance: float) -> NDArray[np.bool_]:
-        """Return a mask of the states with sufficient distances between the object and the links."""
-        return path.clear_of_held_object(self.distance - tolerance)
 
     def solved(self, world: "World") -> tuple[Condition, ...]:
         """Return the conditions of the capsules."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.problems.constraints.clearance import MAX_LINK_PENETRATION_M, DistanceConstraint, names_of_pairs
+from cnpgen.problems.constraints.clearance import LinkClearance, names_of_pairs
 from cnpgen.problems.constraints.constraint import Condition, End
 from cnpgen.schema.keys import field
 
@@ -15,12 +15,11 @@ if TYPE_CHECKING:
     from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
     from cnpgen.robots.robot import Robot
     from cnpgen.robots.shape.link_pairs import LinkPair
-    from cnpgen.world.path import PathWorld
     from cnpgen.world.world import World
 
 
 @dataclass(frozen=True, kw_only=True)
-class SelfClearance(DistanceConstraint):
+class SelfClearance(LinkClearance):
     """Constraint: the links of every pair that is not left out are further than ``distance`` from each other.
 
     It requires the geometry of the URDF. Judges measure the convex parts of the links. Solvers use the capsules of
@@ -28,14 +27,8 @@ class SelfClearance(DistanceConstraint):
     """
 
     reason, condition_name, bodies = "robot in collision with itself", "self clearance", "self"
-    uses_obstacles = False
     distance: float = field("minimum distance of links", unit="m", low=0.0, default=0.0, plausible=2.0)
     tolerance: float = field("violation that a valid motion may have", unit="m", low=0.0, plausible=0.5)
-
-    @property
-    def effective_tolerance(self) -> float:
-        """Tolerance up to a penetration of ``MAX_LINK_PENETRATION_M``."""
-        return min(self.tolerance, self.distance + MAX_LINK_PENETRATION_M)
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the distances of the capsules' axes [m] of the pairs for solvers."""
@@ -45,10 +38,6 @@ class SelfClearance(DistanceConstraint):
         """Measure the signed distances of the convex parts with Coal [m]."""
         distances, parts = world.self_distances(self.distance), names_of_pairs(world.robot.shape)
         return self._at_least(distances, self.distance, parts=parts)
-
-    def met(self, path: "PathWorld", tolerance: float) -> NDArray[np.bool_]:
-        """Return a mask of the states with sufficient distances between the convex parts."""
-        return path.clear_of_itself(self.distance - tolerance)
 
     def solved(self, world: "World") -> tuple[Condition, ...]:
         """Return the conditions of the capsules."""

@@ -95,7 +95,7 @@ def _axes(corners: Array) -> Array:
 
 
 def _along(axis: Array, corners: Array, thickness: Array) -> Array:
-    """Return the ends of the minimum capsule along an axis, shape (2, 3); Badoiu and Clarkson (2003) iterate its circle."""
+    """Return the ends of the minimum capsule along an axis, shape (2, 3), by a circle (Badoiu and Clarkson 2003)."""
     across = np.linalg.svd(axis[None])[2][1:]  # two unit vectors orthogonal to the axis
     projection = corners @ across.T
     center = projection.mean(axis=0)

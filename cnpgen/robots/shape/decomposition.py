@@ -60,13 +60,7 @@ class TriangleMesh:
 
 @dataclass(frozen=True)
 class _Cut:
-    """Best cut of a part.
-
-    Attributes:
-        part: The part.
-        reduction: Volume by which the cut reduces the hulls [m^3]; 0 if no cut does.
-        halves: The triangles below and above the cut.
-    """
+    """Best cut of a part with the volume by which it reduces the hulls [m^3], 0 for none, and both halves."""
 
     part: TriangleMesh
     reduction: float = 0.0
