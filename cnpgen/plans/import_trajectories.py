@@ -19,7 +19,7 @@ from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import as_record, open_problem
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.store.dataset_spec import StoredProblem
-from cnpgen.trajectory.boundary import Boundary
+from cnpgen.trajectory.boundary import Boundary, join_boundaries
 from cnpgen.trajectory.fit import fit_motion, largest_error
 from cnpgen.trajectory.sampled_trajectory import Trajectory
 from cnpgen.trajectory.samples import sampled_boundary
@@ -89,18 +89,12 @@ def import_trajectories(
     motions, deviation = _fitted(trajectories, boundaries, record.trajectory, MAX_FIT_ERROR_RAD + float(errors[0]))
     plans = make_plans(
         record,
-        _joined(boundaries),
+        join_boundaries(boundaries),
         path_control_points=np.concatenate([motion.path for motion in motions]),
         rate_control_points=np.concatenate([motion.rate for motion in motions]),
         source=source,
     )
     return ImportedTrajectories(plans, deviation, snapped)
-
-
-def _joined(boundaries: Sequence[Boundary]) -> Boundary:
-    """Return the boundary conditions of all trajectories."""
-    arrays = [boundary.arrays() for boundary in boundaries]
-    return Boundary(**{name: np.concatenate([parts[name] for parts in arrays]) for name in arrays[0]})
 
 
 def _boundary(

@@ -19,14 +19,9 @@ def check_boundary_units(
 ) -> None:
     """Raise an error for boundary conditions so far outside of their limits that their unit is probably wrong.
 
-    Other violations of limits are no errors: the verdict reports them. Values that are not finite are ignored.
-
-    Args:
-        robot: Robot of the problem.
-        boundary: Boundary conditions, shape (N, n) each.
-        where: Source of the boundary conditions, for messages.
-        argument: Name of the caller's argument that holds them; by default the name of the condition.
-        allow_large_angles: Whether to issue a warning instead.
+    Other violations of limits are no errors: the verdict reports them. Values that are not finite are ignored. Messages
+    begin with their source and concern the caller's argument, by default the condition. ``allow_large_angles`` issues a
+    warning instead.
 
     Raises:
         UnitError: A value is probably in another unit.

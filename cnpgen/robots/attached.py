@@ -19,13 +19,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PayloadBody:
-    """Rigid body of the payload.
-
-    Attributes:
-        mass: Mass [kg].
-        com: Center of mass in the tip frame [m], shape (3,).
-        inertia: Inertia about the center of mass, in the axes of the tip frame [kg m^2], shape (3, 3).
-    """
+    """Rigid body of the payload: mass [kg], center of mass [m] and inertia about it [kg m^2] along the tip frame."""
 
     mass: float
     com: Array

@@ -6,7 +6,7 @@ different numbers of joints, or the spline has less than degree + 2 control poin
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from enum import Enum
 from typing import Any, Protocol
@@ -138,6 +138,12 @@ class Boundary:
             raise MotionIndexError(
                 f"motions are selected by a slice, numbers or a mask: {error}", concerns="index"
             ) from error
+
+
+def join_boundaries(parts: Sequence[Boundary]) -> Boundary:
+    """Return the boundary conditions of the motions of all parts, which have the same conditions."""
+    arrays = [part.arrays() for part in parts]
+    return Boundary(**{name: np.concatenate([part[name] for part in arrays]) for name in arrays[0]})
 
 
 def start_points(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> Array:

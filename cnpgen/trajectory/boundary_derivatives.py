@@ -15,13 +15,7 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True)
 class BoundaryDerivative:
-    """Derivative of one path control point with respect to one rate control point.
-
-    Attributes:
-        point: Index of the path control point, 0 to C - 1.
-        variable: Index of the rate control point, 0 to R - 1.
-        derivative: d(path control point) / d(rate control point) [rad s], shape (N, n).
-    """
+    """Derivative [rad s], shape (N, n), of a path control point with respect to a rate control point."""
 
     point: int
     variable: int

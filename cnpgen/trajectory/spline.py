@@ -76,9 +76,7 @@ def _cox_de_boor(s: Array, knots: Array, degree: int, first: NDArray[np.intp]) -
 def power_coefficients(control: Array, degree: int) -> Array:
     """Convert N splines to the power basis of each span, for ``select_spans`` and ``horner``.
 
-    Args:
-        control: Control points, shape (N, C) or (N, C, n).
-        degree: Degree D.
+    Control points have shape (N, C) or (N, C, n).
 
     Returns:
         Coefficients of the powers of (s - left knot), highest first, shape (D + 1, spans, N, ...).
@@ -101,11 +99,7 @@ def taylor_coefficients(points: int, degree: int) -> Array:
 
 
 def select_spans(coefficients: Array, s: Array) -> tuple[Array, Array]:
-    """Select, for every spline, the coefficients of the spans that contain its phases.
-
-    Args:
-        coefficients: Result of ``power_coefficients``.
-        s: Phases in [0, 1], shape (N, K).
+    """Select, for every spline, the coefficients of the spans that contain its phases in [0, 1], shape (N, K).
 
     Returns:
         ``(selected, offset)``: coefficients, shape (D + 1, N, K, ...), and s - left knot, shape (N, K).

@@ -80,12 +80,12 @@ class PathWorld:
         """Move to K states.
 
         Args:
-            q: Joint positions [rad], shape (n, K), K > 0.
-            dq: Joint velocities [rad/s], shape (n, K).
-            ddq: Joint accelerations [rad/s^2], shape (n, K).
+            q: Joint positions [rad], shape (n, K), K > 0, as of velocities, accelerations and jerks.
+            dq: Joint velocities [rad/s].
+            ddq: Joint accelerations [rad/s^2].
             obstacle_poses: Poses and sizes of the obstacles (``cnpgen.robots.solid``), then values for a constraint,
                 then the parameters of the problem, shape (width,).
-            jerk: Joint jerks [rad/s^3], shape (n, K), or None if no constraint needs them.
+            jerk: Joint jerks [rad/s^3], or None if no constraint needs them.
             exact: Whether the smallest distance must be exact even if bounds prove that all distances are sufficient.
         """
         import pinocchio as pin
@@ -179,8 +179,7 @@ class PathWorld:
     def segment_distances(self, sufficient: float = np.inf) -> list[Array]:
         """Measure the signed distance of every segment of the robot from every obstacle, segment by segment [m].
 
-        Args:
-            sufficient: Distance from which lower bounds are returned without measuring, if the path is not exact [m].
+        If the path is not exact, sufficient lower bounds are returned without measuring.
 
         Returns:
             Arrays of shape (K,), of which the smallest value is exact (``cnpgen.world.pair_distances``).

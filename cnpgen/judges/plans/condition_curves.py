@@ -130,15 +130,7 @@ def _distance_curves(
     count = len(closest.distance)
     least = np.full(count, 1e3 * (float(stated.lower[0]) - radius))
     names = [name_part(problem, constraint, stated, i) for i in range(len(stated.g))]
-    yield ConditionCurve(
-        stated.name,
-        stated.name,
-        "mm",
-        ("",),
-        1e3 * closest.distance[None],
-        least,
-        np.full(count, np.inf),
-        1e3 * float(constraint.allowed(stated)[0]),
-        closest.points,
-        tuple(names[pair] for pair in closest.pair),
-    )
+    pairs, tolerance = tuple(names[pair] for pair in closest.pair), 1e3 * float(constraint.allowed(stated)[0])
+    values, unbounded = 1e3 * closest.distance[None], np.full(count, np.inf)
+    name = stated.name
+    yield ConditionCurve(name, name, "mm", ("",), values, least, unbounded, tolerance, closest.points, pairs)

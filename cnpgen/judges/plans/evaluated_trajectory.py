@@ -18,11 +18,7 @@ PATH_ORDERS = 3  # derivatives of the path for accelerations, including order 0;
 
 @dataclass(frozen=True, eq=False)
 class Phases:
-    """Phases at which many motions are evaluated.
-
-    Attributes:
-        s: Phases, ascending, in [0, 1], shape (K,).
-    """
+    """Phases, ascending, in [0, 1], shape (K,), at which many motions are evaluated."""
 
     s: Array
 

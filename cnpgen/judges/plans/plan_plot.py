@@ -120,16 +120,9 @@ def along(
     extra_times: Sequence[float] = (),
     scene: Scene | None = None,
 ) -> tuple[PathWorld, Array, Array]:
-    """Place the robot at K times of one motion, uniformly spaced but for extra ones.
+    """Place the robot at K times of one motion, uniformly spaced but for extra ones [s].
 
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        motion: The motion.
-        index: Index of the plan in error messages.
-        samples: Number of uniformly spaced times.
-        extra_times: Further times [s].
-        scene: Obstacles of the motion; by default those of the problem, which matter for distances only.
+    The index is that of error messages. Obstacles, by default those of the problem, matter for distances only.
 
     Returns:
         The world, phases, and times [s], shape (K,) each.

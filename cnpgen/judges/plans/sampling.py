@@ -26,12 +26,7 @@ EARLY_EXIT_PER_SPAN, EARLY_EXIT_PER_END = 8, 16  # samples of early_exit, which 
 
 @dataclass(frozen=True)
 class Samples:
-    """K samples of one motion, including both of its ends.
-
-    Attributes:
-        s: Phases, ascending from 0 to 1, shape (K,).
-        t: Times [s], shape (K,).
-    """
+    """K samples of one motion with both ends: phases from 0 to 1 and times [s], ascending, shape (K,) each."""
 
     s: Array
     t: Array

@@ -18,13 +18,7 @@ from cnpgen.trajectory.spline_motion import Motion
 
 @dataclass(frozen=True)
 class PlanCheck:
-    """Result of the check of plans in rows of a certified dataset.
-
-    Attributes:
-        judged: Number of plans.
-        valid: Number of valid plans.
-        problems: Error messages, one line each.
-    """
+    """Numbers of plans in rows of a certified dataset and of valid ones, and error messages, one line each."""
 
     judged: int = 0
     valid: int = 0

@@ -37,9 +37,8 @@ PARALLEL_TOLERANCE = 1e-9  # relative determinant below which two terms have no 
 class HitRule:
     """Rule by which the stages of a dataset chose its goals.
 
-    Attributes:
-        near: Configuration to which goals stay close, "base", "start" or "home"; empty if no stage chooses them.
-        full_speed: Fraction of the hits at the highest possible speed; None if no stage chooses the speed.
+    They stay close to the configuration "base", "start" or "home", if it is not empty. A fraction of the hits has the
+    highest possible speed; None if no stage chooses the speed.
     """
 
     near: str = ""
@@ -163,15 +162,10 @@ def _gradients(robot: Robot, q: Array, home: Array, direction: Array) -> tuple[A
 
 
 def highest_speed(jacobian: Array, angle: Array, limit: Array) -> Array:
-    """Compute the highest speed of the tip along hits in the x-y plane within the velocity limits [m/s].
+    """Compute the highest speed of the tip along hits in the x-y plane within velocity limits [m/s], shape (rows,).
 
-    Args:
-        jacobian: Translational Jacobians of the tip in world axes [m], shape (rows, 3, n).
-        angle: Directions of the hits [rad], shape (rows,).
-        limit: Velocity limits of the joints [rad/s], shape (n,).
-
-    Returns:
-        Speeds, shape (rows,); inf where B has less than two independent columns.
+    Translational Jacobians in world axes [m] have shape (rows, 3, n), directions [rad] (rows,). The speed is inf where
+    B has less than two independent columns.
     """
     x, y, z = jacobian.transpose(1, 0, 2)
     cosine, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]

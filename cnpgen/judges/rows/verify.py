@@ -1,6 +1,7 @@
 """Verification of rows from their stored numbers: every constraint at both ends, positions and hits."""
 
 import math
+from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -125,7 +126,7 @@ class _Measurements:
     hit_velocity: Array
     hit_jacobian: Array
     diagnostics: list[Diagnostic]
-    conditions: dict[Key, _ConditionValues] = field(default_factory=dict)
+    conditions: defaultdict[Key, _ConditionValues] = field(default_factory=lambda: defaultdict(_ConditionValues))
 
 
 def _verify_block(problem: Problem, world: World, columns: dict[str, Array], dtype: str, rule: HitRule) -> RowReport:
@@ -176,9 +177,8 @@ def _measure(problem: Problem, world: World, columns: dict[str, Array], finite: 
 def _record(measurements: _Measurements, conditions: Iterator[Condition], place: tuple[int, int]) -> None:
     for condition in conditions:
         key = condition.name, condition.unit, condition.tolerance_kind
-        values = measurements.conditions.get(key) or measurements.conditions.setdefault(key, _ConditionValues())
-        values.conditions.append(condition)
-        values.places.append(place)
+        measurements.conditions[key].conditions.append(condition)
+        measurements.conditions[key].places.append(place)
 
 
 def _states(columns: dict[str, Array], end: str) -> tuple[list[Array], list[int]]:

@@ -30,12 +30,9 @@ CONSISTENCY_TOLERANCE = 1e-6  # relative, of samples with a bound of the jerk: r
 
 
 def interpolated(trajectory: Trajectory, interpolation: Interpolation | None, noise: Array) -> CurveFamily:
-    """Return the curves of an interpolation through samples with noise.
+    """Return the curves of an interpolation, by default the one that the derivatives determine, through samples.
 
-    Args:
-        trajectory: The samples.
-        interpolation: The interpolation; by default the one that the derivatives determine.
-        noise: Largest errors of positions, velocities and accelerations [rad, rad/s, rad/s^2], shape (3,).
+    Positions, velocities and accelerations have errors of at most the noise, shape (3,).
 
     Raises:
         UsageError: The samples lack the derivatives of the interpolation.

@@ -39,12 +39,7 @@ MIN_KNOT_STEP_S = 3e-5  # between knots in a span: rounding of positions changes
 
 @dataclass(frozen=True, eq=False)
 class AccelerationLimits:
-    """Largest absolute accelerations and jerks of a curve at its ends.
-
-    Attributes:
-        acceleration: Accelerations [rad/s^2], shape (n,); inf without a limit.
-        jerk: Jerks [rad/s^3], shape (n,); inf without a limit.
-    """
+    """Largest accelerations [rad/s^2] and jerks [rad/s^3] of a curve at its ends, shape (n,) each; inf for no limit."""
 
     acceleration: Array
     jerk: Array

@@ -51,14 +51,7 @@ def plot_trajectory(
 def along_trajectory(
     problem: Problem, robot: Robot, trajectory: Trajectory, *, samples: int, extra_times: Sequence[float] = ()
 ) -> tuple[PathWorld, Array, Array, Scene]:
-    """Place the robot at K times of a trajectory, uniformly spaced but for extra ones, among obstacles by its ends.
-
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        trajectory: The trajectory.
-        samples: Number of uniformly spaced times.
-        extra_times: Further times [s].
+    """Place the robot at K times of a trajectory, uniformly spaced but for extra ones [s], among obstacles by its ends.
 
     Returns:
         The world, phases, times [s], shape (K,) each, and the obstacles.

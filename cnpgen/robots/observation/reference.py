@@ -19,14 +19,9 @@ class ObservationBackend(Protocol):
     """Functions of N scenes, which are primitives with a first axis of length N."""
 
     def distances(self, scenes: Primitives, points: Array) -> Values:
-        """Return the smallest signed distance of points from the bodies of each scene [m].
+        """Return the smallest signed distance of points from the bodies of each scene [m], shape (N, P); inf without.
 
-        Args:
-            scenes: The scenes.
-            points: Points in the world frame [m], shape (P, 3) for all scenes or (N, P, 3).
-
-        Returns:
-            Shape (N, P); inf for scenes without bodies.
+        World points [m] have shape (P, 3) for all scenes or (N, P, 3).
         """
 
     def surface_points(self, scenes: Primitives, count: int, seeds: Seeds) -> Values:

@@ -6,6 +6,7 @@ search minimizes the overhang of the capsule over the link.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,21 +61,17 @@ def covering_capsule(convex_parts: Sequence[ConvexPart]) -> Capsule:
         excess = (np.array([first, second]) @ normals.T - offsets).max()
         return Capsule(convex_parts[0].link, first, second, float(radius), float(radius + excess))
 
-    starts = sorted((finished(_along(axis, corners, thickness)) for axis in _axes(corners)), key=_by_overhang)
+    starts = sorted((finished(_along(axis, corners, thickness)) for axis in _axes(corners)), key=attrgetter("overhang"))
     improved = [
         finished(_improved(start, corners, thickness, normals, offsets)) for start in starts[:SEARCH_DIRECTIONS]
     ]
-    return min([*starts[:1], *improved], key=_by_overhang)
+    return min([*starts[:1], *improved], key=attrgetter("overhang"))
 
 
 def covers(capsule: Capsule, convex_parts: Sequence[ConvexPart]) -> bool:
     """Return whether a capsule contains all corners, and therefore all convex parts, of its link."""
     reach = [_distances(each.vertices, capsule.first, capsule.second)[0].max() + each.radius for each in convex_parts]
     return bool(reach) and max(reach) <= capsule.radius
-
-
-def _by_overhang(capsule: Capsule) -> float:
-    return capsule.overhang
 
 
 def _facets(corners: Array, thickness: Array) -> tuple[Array, Array]:

@@ -30,12 +30,7 @@ DECOMPOSITION_REVISION = 2  # of the decomposition; cached parts of another revi
 
 @dataclass(frozen=True)
 class TriangleMesh:
-    """Triangles of a mesh or of a part of it.
-
-    Attributes:
-        points: Points [m], shape (N, 3).
-        triangles: Triangles as indices of points, shape (T, 3).
-    """
+    """Triangles of a mesh or of a part of it: points [m], shape (N, 3), and indices of points, shape (T, 3)."""
 
     points: Array
     triangles: NDArray[np.int64]
@@ -68,13 +63,10 @@ class _Cut:
 
 
 def convex_parts(points: Array, triangles: NDArray[np.int64], most: int, keep: Path | None) -> list[Array]:
-    """Decompose a mesh into convex parts that together cover its surface.
+    """Decompose a mesh into at most so many convex parts that together cover its surface.
 
-    Args:
-        points: Points of the mesh [m], shape (N, 3).
-        triangles: Triangles as indices of points, shape (T, 3).
-        most: Maximum number of parts.
-        keep: Cache folder, since a decomposition takes seconds; None for no cache.
+    Points [m] have shape (N, 3), triangles are indices of points, shape (T, 3). A cache folder keeps the result, which
+    takes seconds; None for no cache.
 
     Returns:
         Corners of each part [m], shape (V, 3); those of the hull if no cut reduces its volume.

@@ -27,13 +27,7 @@ SAMPLED_HELD_STATES = 2000  # states in which the object and the links are compa
 
 @dataclass(frozen=True)
 class HeldBody:
-    """The held cuboid, with its center at the tip frame.
-
-    Attributes:
-        size: Edge lengths along the axes of the tip frame [m].
-        touch_links: Links that may touch it, such as a gripper.
-        tip_frame: Index of the tip frame in the model.
-    """
+    """The held cuboid: edge lengths along the tip frame [m], links that may touch it, and the frame, its center."""
 
     size: Size
     touch_links: tuple[str, ...]
@@ -41,13 +35,9 @@ class HeldBody:
 
 
 def load_held_shape(urdf: str, model: "pin.Model", held: HeldBody, keep: Path | None) -> Shape:
-    """Load the link geometry for collisions with the held object.
+    """Load the link geometry for collisions with the held object, for a URDF with inline meshes and its reduced model.
 
-    Args:
-        urdf: Text of the URDF with inline meshes (``cnpgen.robots.shape.inline``).
-        model: Pinocchio model, reduced to the planned joints.
-        held: The held object.
-        keep: Cache folder of capsules and pairs; None for no cache.
+    A cache folder keeps capsules and pairs; None for no cache.
 
     Returns:
         The convex parts of all links that may not touch the object, then the object; a capsule and a pair for each of
