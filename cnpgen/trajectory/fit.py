@@ -71,7 +71,10 @@ def fit_motion(
 def largest_error(motion: Motion, t: ArrayLike, q: ArrayLike) -> float:
     """Compute the maximum distance of one motion from samples over all joints and samples [rad].
 
-    The motion starts at the first sample. Times [s] have shape (K,), positions [rad] (K, n).
+    Args:
+        motion: One motion; it starts at the first sample.
+        t: Times of the samples [s], shape (K,).
+        q: Joint positions [rad], shape (K, n).
     """
     times, positions, _ = checked_samples(t, q, None)
     return float(np.abs(motion.at(motion.phase_at(times[None] - times[0])).q[0] - positions).max())

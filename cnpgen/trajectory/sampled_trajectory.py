@@ -76,7 +76,10 @@ class Trajectory:
         return lambda share: np.asarray(interpolator(share))
 
     def states(self, t: Array) -> tuple[Array, Array, Array]:
-        """Evaluate the trajectory at times [s], shape (K,).
+        """Evaluate the trajectory.
+
+        Args:
+            t: Times [s], shape (K,).
 
         Returns:
             Positions [rad], velocities [rad/s] and accelerations [rad/s^2], shape (K, n) each.

@@ -62,7 +62,7 @@ def resampled(t: Array, q: Array, dq: Array | None) -> tuple[Array, Array]:
 
 
 def sampled_boundary(t: ArrayLike, q: ArrayLike, dq: ArrayLike | None = None) -> Boundary:
-    """Estimate the boundary conditions of one trajectory from its samples; the goal acceleration is free.
+    """Estimate the boundary conditions of one trajectory from its samples.
 
     Positions, and velocities if they are passed, are those of the first and the last sample. Other derivatives are
     those of cubics through the samples next to the ends; negligible values are set to zero.
@@ -71,6 +71,9 @@ def sampled_boundary(t: ArrayLike, q: ArrayLike, dq: ArrayLike | None = None) ->
         t: Times [s], shape (K,).
         q: Joint positions [rad], shape (K, n).
         dq: Joint velocities [rad/s], shape (K, n), or None.
+
+    Returns:
+        Boundary conditions of one motion with a free goal acceleration.
 
     Raises:
         UsageError: A shape is wrong, the times do not increase, or a value is not finite.

@@ -48,7 +48,14 @@ class Observation(ABC):
 
     @abstractmethod
     def observe(self, scenes: SceneBatch) -> dict[str, Array]:
-        """Observe N scenes; return name -> array with a first axis of length N."""
+        """Observe N scenes.
+
+        Args:
+            scenes: The scenes.
+
+        Returns:
+            Name -> array with a first axis of length N.
+        """
 
 
 @dataclass(frozen=True, kw_only=True)
