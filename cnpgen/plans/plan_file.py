@@ -157,12 +157,9 @@ def agreed_problem(
 
 
 def stored_problem(path: Path, attributes: Mapping[str, Any], *, required: bool = True) -> ProblemRecord | None:
-    """Return the problem named by a file; None if it names none.
+    """Return the problem named by the attributes of a file; None if they name none.
 
-    Args:
-        path: Path of the file.
-        attributes: Attributes of the file: ``problem``, ``problem_recipe``, ``problem_urdf`` and ``problem_sha256``.
-        required: Whether a problem in another folder, which is not opened, is an error; otherwise it is ignored.
+    A problem in another folder, which is not opened, is an error if it is required, otherwise ignored.
 
     Raises:
         DatasetError: The named problem is damaged, cannot be found or is in another folder than the file.

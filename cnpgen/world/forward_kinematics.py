@@ -66,16 +66,10 @@ class ForwardKinematics:
         return frames[:, :3].swapaxes(1, 2), frames[:, 3]
 
     def motion_bounds(self, extents: Array, max_positions: Array) -> Array:
-        """Bound the displacement of any point of the robot per unit of motion of each joint [m].
+        """Bound the displacement of any point of the robot per unit of motion of each joint [m], shape (n,).
 
-        Args:
-            extents: Largest distance of a point of each link from the origin of the base or of its joint [m], shape
-                (n + 1,).
-            max_positions: Largest absolute joint positions, shape (n,).
-
-        Returns:
-            Motion bounds, shape (n,): the maximum distance along the chain to a point that the joint moves; 1 for
-            prismatic joints.
+        It is the maximum distance along the chain to a point that the joint moves; 1 for prismatic joints. Extents are
+        the largest distances of points of the links from the origin of the base or of their joint [m], shape (n + 1,).
         """
         lengths = self._lengths[:, 0] + self._lengths[:, 1] * max_positions
         bounds = extents[1:].copy()

@@ -75,12 +75,10 @@ class RigidBodies:
         self._set_obstacles([])
 
     def place(self, rotations: Array, positions: Array, solids: Sequence[Solid]) -> None:
-        """Move to K states.
+        """Move to K states and place the obstacles.
 
-        Args:
-            rotations: Rotation matrices of the joints' frames, that of the base first, shape (n + 1, 3, 3, K).
-            positions: Origins of the joints' frames [m], shape (n + 1, 3, K).
-            solids: Solids of the obstacles.
+        Rotation matrices of the joints' frames, that of the base first, have shape (n + 1, 3, 3, K), their origins [m]
+        (n + 1, 3, K).
         """
         count = rotations.shape[-1]
         if len(solids) != len(self._solids) or not all(map(same_shape, solids, self._solids)):

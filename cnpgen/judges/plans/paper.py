@@ -38,13 +38,9 @@ MAX_OBJECT_DEPTH_M = 0.02
 
 
 def paper_rule(problem: Problem, world: PathWorld, obstacle_poses: Array, goal_xyz: Array) -> PaperRule:
-    """Judge one motion by the paper's rules.
+    """Judge one motion by the paper's rules; the world is at its samples.
 
-    Args:
-        problem: The problem.
-        world: Its robot at the samples of the motion.
-        obstacle_poses: Poses and sizes of the obstacles, shape (width,).
-        goal_xyz: Tip position of the goal [m], shape (3,).
+    Poses and sizes of the obstacles have shape (width,), the tip position of the goal [m] (3,).
     """
     finished = bool(np.linalg.norm(world.tip_position[:, -1] - goal_xyz) < MAX_GOAL_DISTANCE_M)
     broken = tuple(reason for reason, ok in _checks(problem, world, obstacle_poses) if not ok)

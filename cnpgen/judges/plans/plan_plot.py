@@ -47,19 +47,11 @@ def plot_plan(
     note: str = "",
     verdict: Verdict | None = None,
 ) -> None:
-    """Draw one plan: joints relative to their limits, other conditions with their bounds, and the tip.
+    """Draw one of N motions: joints relative to their limits, other conditions with their bounds, and the tip.
 
-    States at which a condition is violated are marked, and so are the violations of the verdict.
-
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        motion: N motions.
-        index: Index of the motion.
-        path: Image file, ``.png``, ``.pdf`` or ``.svg``; overwritten if it exists.
-        scene: Obstacles of this motion; by default from its ends.
-        note: Additional text of the title.
-        verdict: The verdict on this motion, whose violations are marked.
+    States at which a condition is violated are marked, and so are the violations of the verdict. An existing image
+    file, ``.png``, ``.pdf`` or ``.svg``, is overwritten. Obstacles are by default those of the motion's ends. The note
+    is additional text of the title.
 
     Raises:
         UsageError: There is no such plan, or it cannot be evaluated.

@@ -57,12 +57,7 @@ def judge_goals(
 ) -> list[tuple[Check, Index]]:
     """Check the goals of finite rows against the rule of the stages.
 
-    Args:
-        robot: The robot.
-        rule: Rule of the stages.
-        columns: Field -> values in SI units, shape (rows, width).
-        finite: Rows to check.
-        dtype: Float type of the stored rows.
+    Columns, field -> values in SI units, have shape (rows, width). The float type is that of the stored rows.
     """
     judged = []
     if rule.near and "hit_angle" in columns:

@@ -30,13 +30,7 @@ def plot_trajectory(
 ) -> None:
     """Draw a sampled trajectory as ``plot_plan`` draws plans, by the interpolation that its derivatives determine.
 
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        trajectory: The trajectory.
-        path: Image file, ``.png``, ``.pdf`` or ``.svg``; overwritten if it exists.
-        title: Title of the figure.
-        margins: Violations to mark.
+    Violations to mark are given as margins.
 
     Raises:
         MachineError: matplotlib is missing, or the file cannot be written.

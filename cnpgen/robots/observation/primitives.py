@@ -49,10 +49,8 @@ class Primitives:
 def primitives_of(obstacles: Sequence[Obstacle], numbers: Array) -> Primitives:
     """Return obstacles as primitives.
 
-    Args:
-        obstacles: The obstacles.
-        numbers: Their poses and sizes (``cnpgen.robots.solid``), shape (pose_width,); or of N samples, shape
-            (N, pose_width), which gives arrays with a first axis of length N.
+    Poses and sizes (``cnpgen.robots.solid``) have shape (pose_width,), or of N samples (N, pose_width), which gives
+    arrays with a first axis of length N.
 
     Raises:
         UsageError: An obstacle is a mesh.

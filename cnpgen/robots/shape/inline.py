@@ -44,13 +44,8 @@ def with_inline_meshes(
 ) -> str:
     """Return a URDF with inline hulls of its collision meshes; a URDF without such meshes is returned unchanged.
 
-    Args:
-        urdf: Text of the URDF.
-        path: File of the URDF, the base of relative mesh paths.
-        packages: Folders of packages.
-        most: Maximum number of convex parts of a mesh; 1 for its hull.
-        links: Links whose meshes are decomposed; by default all.
-        keep: Cache folder of convex parts; None for no cache.
+    Relative mesh paths begin in the folder of the URDF's file, others in folders of packages. Meshes of all links, or
+    of some, consist of at most so many convex parts, 1 for the hull, which a cache folder keeps.
 
     Raises:
         RecipeError: Links or meshes are missing or cannot be read; the error lists all of them.
