@@ -10,7 +10,7 @@ from cnpgen.losses.plan_loss import PlanLoss
 from cnpgen.plans.scene_plans import with_capacity
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
-from cnpgen.robots.observation.scene_primitives import scene_primitives
+from cnpgen.robots.observation.primitives import scene_primitives
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.solid import number_slices, place_obstacles
 from tests.conftest import needs_compiler

@@ -11,8 +11,7 @@ from cnpgen.problems.problem_record import as_problem
 from cnpgen.recipes import Obstacle
 from cnpgen.robots.observation.camera import depth_image
 from cnpgen.robots.observation.observations import OBSERVATIONS, Observation
-from cnpgen.robots.observation.primitives import KINDS
-from cnpgen.robots.observation.scene_primitives import bodies_of
+from cnpgen.robots.observation.primitives import KINDS, bodies_of
 from cnpgen.robots.observation.signed_distance import signed_distances
 from cnpgen.robots.scene import PARKED_POSITION_M, Scene
 from cnpgen.robots.solid import place_obstacles
