@@ -38,7 +38,7 @@ class DistanceConstraint(Constraint):
     ) -> tuple[Condition, ...]:
         """State that m distances are at least one bound, or m [m]."""
         m = len(distances)
-        lower, upper = np.zeros(m) + least, np.full(m, np.inf)
+        lower, upper = np.full(m, least, float), np.full(m, np.inf)
         return (Condition(self.condition_name, "m", distances, lower, upper, "position", parts, sufficient),)
 
 
