@@ -32,8 +32,8 @@ from cnpgen.pipelines.families.scene_generator import make_scenes
 from cnpgen.plans.boundary_problems import plans_of_rows
 from cnpgen.plans.plans import Plans
 from cnpgen.plans.scene_plans import scene_plans
+from cnpgen.problems.constraints.axis import Vertical
 from cnpgen.problems.constraints.joint import JointJerk
-from cnpgen.problems.constraints.vertical import Vertical
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import load_problem

@@ -14,7 +14,7 @@ from cnpgen.losses.plan_batch import PlanBatch
 from cnpgen.losses.quadrature import BasisTable
 from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.problem import Problem
-from cnpgen.robots.observation.scene_primitives import scene_primitives
+from cnpgen.robots.observation.primitives import scene_primitives
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene import Scene
 

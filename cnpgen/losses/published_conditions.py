@@ -15,9 +15,9 @@ from cnpgen.kernels.symbolic.linalg import Vec, add, dot, scale, subtract
 from cnpgen.kernels.symbolic.obstacle_distances import SymbolicUprightBox, symbolic_solids
 from cnpgen.kernels.symbolic.segment_distance import SMOOTHING_M2
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
+from cnpgen.problems.constraints.axis import Vertical
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.constraints.constraint import Condition, Constraint
-from cnpgen.problems.constraints.vertical import Vertical
 from cnpgen.robots.parameter_ranges import UPRIGHT_TOLERANCE
 
 MAX_POINT_SPACING_M = 0.1  # between points on the capsule axes of the robot

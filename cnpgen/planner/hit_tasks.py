@@ -18,8 +18,8 @@ from cnpgen.pipelines.stages.stage import TaskBatch
 from cnpgen.planner.inference_pipeline import loaded_problem
 from cnpgen.planner.model import Model
 from cnpgen.planner.plan_requests import drawing_stages
-from cnpgen.plans.format import CONDITIONS
-from cnpgen.plans.plausible import UNITS, are_usual
+from cnpgen.plans.format import CONDITIONS, UNITS
+from cnpgen.plans.plausible import are_usual
 from cnpgen.robots.plausible_values import MAX_LIMIT_RATIO, check_plausible
 from cnpgen.robots.robot import Robot
 from cnpgen.schema.arguments import concerning, numbers

@@ -81,10 +81,7 @@ class BoundaryFile:
                     read_rows(Shard(folder, spec, task))
 
     def problem(self, *, required: bool = True) -> ProblemRecord | None:
-        """Return the problem named by the file or by the dataset that contains it; None if neither names one.
-
-        Args:
-            required: See ``stored_problem``.
+        """Return the problem named by the file or by its dataset; None if neither names one; see ``stored_problem``.
 
         Raises:
             DatasetError: The named problem is damaged or cannot be found.
@@ -174,10 +171,7 @@ def read_boundary_file(path: Path) -> BoundaryFile:
 def boundary_in(where: str, columns: Mapping[str, NDArray[Any]], n: int) -> Boundary:
     """Read boundary conditions of n joints from columns; missing ones are zero, missing goal accelerations are free.
 
-    Args:
-        where: Source of the columns, for messages.
-        columns: Name -> values, shape (N, n); N is the same for all.
-        n: Number of planned joints.
+    The columns, name -> values of shape (N, n), have a source for messages.
 
     Raises:
         DatasetError: A shape is wrong, or a value is not finite.

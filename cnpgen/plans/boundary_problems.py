@@ -99,14 +99,7 @@ def scene_columns(
 
 
 def chosen_rows(folder: Path, spec: DatasetSpec, *, split: str, start: int, n: int | None) -> range:
-    """Return the range of rows of a split.
-
-    Args:
-        folder: Folder of the dataset, for messages.
-        spec: Specification of the dataset.
-        split: Name of the split.
-        start: First row.
-        n: Number of rows; by default all that follow.
+    """Return the range of n rows of a split from a first one on; by default all that follow.
 
     Raises:
         UsageError: The split or the rows do not exist.
@@ -141,13 +134,7 @@ def _of_file(path: Path, wanted: ProblemRecord | None, *, allow_large_angles: bo
 
 
 def plans_of_rows(problem: ProblemRecord, columns: Mapping[str, NDArray[Any]], *, source: str = "") -> Plans:
-    """Return rows of a dataset as plans, with the plans of a certified dataset or control points of nan.
-
-    Args:
-        problem: Problem of the rows.
-        columns: Field -> values, shape (N,) or (N, w), as in shards.
-        source: Source of the rows, a line of text.
-    """
+    """Return rows of a dataset, columns as in shards, as plans: those of a certified dataset, or of nan."""
     spec = problem.trajectory
     rows, n = columns["start_q"].shape
     kept = ("start_xyz", "goal_xyz", OBSTACLE_POSES, GOAL_OPTION, *CONTEXT)

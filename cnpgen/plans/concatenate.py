@@ -9,7 +9,7 @@ import numpy as np
 from cnpgen.errors import UsageError
 from cnpgen.plans.format import NOTES
 from cnpgen.plans.plans import Plans
-from cnpgen.trajectory.boundary import Boundary
+from cnpgen.trajectory.boundary import join_boundaries
 
 
 def concatenate(parts: Sequence[Plans]) -> Plans:
@@ -25,16 +25,12 @@ def concatenate(parts: Sequence[Plans]) -> Plans:
         for what, mine, its in _kinds(first, other):
             if mine != its:
                 raise UsageError(f"plans cannot be joined: {what} is {its} in part {index}, but {mine} in part 0")
-    joined = [
-        None if first_part is None else np.concatenate([getattr(part.boundary, name) for part in parts])
-        for name, first_part in vars(first.boundary).items()
-    ]
     sources, options = (list(dict.fromkeys(getattr(part, name) for part in parts)) for name in NOTES)
     return replace(
         first,
         source="; ".join(filter(None, sources)),
         refined_with=options[0] if len(options) == 1 else "",
-        boundary=Boundary(*joined),  # type: ignore[arg-type]
+        boundary=join_boundaries([part.boundary for part in parts]),
         path_control_points=np.concatenate([part.path_control_points for part in parts]),
         rate_control_points=np.concatenate([part.rate_control_points for part in parts]),
         columns={name: np.concatenate([part.columns[name] for part in parts]) for name in first.columns},

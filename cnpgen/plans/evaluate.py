@@ -6,8 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
-from itertools import chain
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +21,8 @@ from cnpgen.plans.tips import correct_tips
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import number, numbers
+
+T = TypeVar("T")
 
 FORMAT = "cnpgen-evaluation"
 EVALUATION_VERSION = 2
@@ -120,15 +121,29 @@ def evaluate_plans(
         raise UsageError(f"must be angles [rad], got {tracking_error}", argument="tracking_error")
     error = () if tracking_error is None else tuple(np.atleast_1d(numbers("tracking_error", tracking_error)).tolist())
     plans = correct_tips(plans)
-    parts = [plans[first : first + PLANS_PER_VERDICT_TASK] for first in range(0, len(plans), PLANS_PER_VERDICT_TASK)]
-    count = worker_count(1 if workers is None and len(plans) <= MAX_PLANS_OF_ONE_PROCESS else workers, len(parts))
-    verdicts: list[list[Verdict]] = []
-    with closing(distribute(partial(_judge, step=step, error=error), parts, count, ordered=True)) as results:
-        for found in results:
-            verdicts.append(found)
+    workers = 1 if workers is None and len(plans) <= MAX_PLANS_OF_ONE_PROCESS else workers
+    task = partial(_judge, step=step, error=error)
+    verdicts = judged_in_parts(task, plans, size=PLANS_PER_VERDICT_TASK, workers=workers, progress=progress)
+    return Evaluation(plans, tuple(verdicts), step, error)
+
+
+def judged_in_parts(
+    judge_part: Callable[[Any], list[T]],
+    items: Any,
+    *,
+    size: int,
+    workers: int | None,
+    progress: Callable[[int], None] | None,
+) -> list[T]:
+    """Judge a sequence in parts of a size in several processes; return the results in order."""
+    parts = [items[first : first + size] for first in range(0, len(items), size)]
+    results: list[T] = []
+    with closing(distribute(judge_part, parts, worker_count(workers, len(parts)), ordered=True)) as judged:
+        for found in judged:
+            results += found
             if progress is not None:
                 progress(len(found))
-    return Evaluation(plans, tuple(chain.from_iterable(verdicts)), step, error)
+    return results
 
 
 def _judge(plans: Plans, *, step: float, error: tuple[float, ...]) -> list[Verdict]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -19,8 +18,7 @@ from cnpgen.judges.trajectories.interpolate import bounded_jerk, interpolated
 from cnpgen.judges.trajectories.judge_family import FamilyJudge
 from cnpgen.judges.trajectories.judge_samples import judge_samples
 from cnpgen.judges.trajectories.trajectory_verdict import Decision, TrajectoryVerdict
-from cnpgen.machine.workers import distribute, worker_count
-from cnpgen.plans.evaluate import MAX_VERDICT_STEP_S
+from cnpgen.plans.evaluate import MAX_VERDICT_STEP_S, judged_in_parts
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import ProblemRecord, as_record, open_problem
 from cnpgen.schema.argument_types import checked_arguments
@@ -131,18 +129,10 @@ def evaluate_trajectories(
         raise UsageError("interpolation and max_jerk exclude each other", concerns="interpolation")
     errors = non_negative("noise", noise, 3)
     jerk = None if max_jerk is None else non_negative("max_jerk", max_jerk, n)
-    parts = [
-        list(trajectories[first : first + TRAJECTORIES_PER_TASK])
-        for first in range(0, len(trajectories), TRAJECTORIES_PER_TASK)
-    ]
     task = partial(_judge, record=record, interpolation=interpolation, noise=errors, max_jerk=jerk, step=step)
-    verdicts: list[TrajectoryVerdict] = []
-    with closing(distribute(task, parts, worker_count(workers, len(parts)), ordered=True)) as results:
-        for found in results:
-            verdicts += found
-            if progress is not None:
-                progress(len(found))
-    return TrajectoryEvaluation(record, tuple(trajectories), tuple(verdicts), step)
+    chosen = tuple(trajectories)
+    verdicts = judged_in_parts(task, chosen, size=TRAJECTORIES_PER_TASK, workers=workers, progress=progress)
+    return TrajectoryEvaluation(record, chosen, tuple(verdicts), step)
 
 
 def check_trajectories(trajectories: Sequence[Trajectory], record: ProblemRecord) -> None:
@@ -176,7 +166,7 @@ def non_negative(name: str, value: ArrayLike, size: int) -> Array:
 
 
 def _judge(  # noqa: PLR0917 - the arguments of evaluate_trajectories
-    trajectories: list[Trajectory],
+    trajectories: Sequence[Trajectory],
     record: ProblemRecord,
     interpolation: Literal["hold", "linear", "cubic", "quintic"] | None,
     noise: Array,

@@ -42,12 +42,7 @@ _OTHERS = (
 
 
 def plan_fields(joints: tuple[str, ...], sliding: tuple[bool, ...]) -> dict[str, Field]:
-    """Describe the datasets that have a fixed definition.
-
-    Args:
-        joints: Names of the planned joints.
-        sliding: Whether each joint is prismatic.
-    """
+    """Describe the datasets that have a fixed definition, for planned joints that are prismatic or not."""
     fields = {item.name: item for item in _OTHERS}
     for end, goal in (("start", "the start"), ("goal", "the goal")):
         for what, text in _DESCRIPTIONS.items():
@@ -64,12 +59,7 @@ KNOWN = frozenset(plan_fields((), ()))  # names with a fixed definition
 
 
 def refuse_misspelt(path: Path, names: Collection[str], asked: Collection[str]) -> None:
-    """Raise DatasetError for a misspelled name of a missing optional dataset, which would be ignored.
-
-    Args:
-        path: Path of the file, for the message.
-        names: Names of the datasets in the file.
-        asked: Known names.
+    """Raise DatasetError for a misspelled name of a missing optional dataset among names, which would be ignored.
 
     Raises:
         DatasetError: A name is misspelled.

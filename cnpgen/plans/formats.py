@@ -1,4 +1,4 @@
-"""Built-in export formats: archives of NumPy, tables, and messages of ROS 2."""
+"""Built-in export formats: archives of NumPy, tables, messages of ROS 2, and path splines."""
 
 import csv
 import io
@@ -13,12 +13,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.errors import UsageError
 from cnpgen.plans.exporter import ExportedSet, Exporter, SampledPlan, parameter_columns
 from cnpgen.plans.format import UNITS
 from cnpgen.plans.trajectory_tables import PHASE_COLUMN
 from cnpgen.store.files.atomic import committing, write_file
+from cnpgen.store.files.hdf5 import create_hdf5
 from cnpgen.store.joint_units import unit_of, units_of_joints
+from cnpgen.trajectory.spline_motion import Motion
 
+PATH_WAYPOINTS = 128  # of a path spline, equidistant in phase
 # YAML 1.1, which ROS's tools read, parses 1e-05 as text: a number needs a point before its exponent.
 _WITHOUT_POINT = re.compile(r"(?<![\d.])(\d+)(?=e[+-])")
 
@@ -95,14 +99,66 @@ class JointTrajectory(Exporter):
     def write(self, path: Path, plans: Iterable[SampledPlan], exported: ExportedSet) -> None:
         """Write a message; see ``Exporter.write``."""
         (plan,) = plans
-        points = ",\n    ".join(point_text(plan, k) for k in range(len(plan.t)))
+        points = ",\n    ".join(_point_text(plan, k) for k in range(len(plan.t)))
         header = json.dumps({"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""})
         names = json.dumps(exported.joint_names)
         text = f'{{\n  "header": {header},\n  "joint_names": {names},\n  "points": [\n    {points}\n  ]\n}}\n'
         write_file(path, text)
 
 
-def point_text(plan: SampledPlan, k: int, *, effort: bool = True) -> str:
+@dataclass(frozen=True)
+class TrajectoryControllerGoal(Exporter):
+    """A folder with one goal of ``control_msgs/action/FollowJointTrajectory`` per plan, as YAML.
+
+    ``ros2 action send_goal`` takes the content as its goal.
+    """
+
+    suffix = ".yaml"
+
+    def write(self, path: Path, plans: Iterable[SampledPlan], exported: ExportedSet) -> None:
+        """Write a goal; see ``Exporter.write``."""
+        (plan,) = plans
+        lines = [
+            "trajectory:",
+            f"  joint_names: {json.dumps(exported.joint_names)}",
+            "  points:",
+            *(f"    - {_point_text(plan, k, effort=False)}" for k in range(len(plan.t))),
+        ]
+        write_file(path, "\n".join(lines) + "\n")
+
+
+@dataclass(frozen=True)
+class PathSplines(Exporter):
+    """One HDF5 file with the paths of all plans as clamped B-splines over [0, 1]; durations are in a column.
+
+    Motion Planning Diffusion trains on it (Carvalho et al. 2025).
+
+    For N paths with C control points: ``bspline_params_tt`` (N, C + d + 1), ``bspline_params_cc`` (N, n, C),
+    ``bspline_params_k`` (N,), ``sol_path`` (N, 128, n) [rad], ``task_id`` (N,), ``q_start`` and ``q_goal`` (N, n), and
+    ``duration`` (N,) [s].
+    """
+
+    suffix = ".hdf5"
+    single_file = True
+
+    def write(self, path: Path, plans: Iterable[SampledPlan], exported: ExportedSet) -> None:
+        """Write the file; see ``Exporter.write``."""
+        del plans  # splines are not sampled in time
+        motion = exported.motion
+        if motion is None:
+            raise UsageError("joined plans have no single spline: choose another format", concerns="to")
+        import h5py
+
+        buffer = io.BytesIO()
+        with h5py.File(create_hdf5(buffer)) as file:
+            for name, values in _spline_columns(motion, exported).items():
+                file.create_dataset(name, data=values, track_times=False)
+            file.attrs["joint_names"] = list(exported.joint_names)
+            file.attrs["problem"] = exported.problem
+        write_file(path, buffer.getvalue())
+
+
+def _point_text(plan: SampledPlan, k: int, *, effort: bool = True) -> str:
     """Return sample k of a plan as a ``trajectory_msgs/JointTrajectoryPoint`` in one line of JSON that is also YAML."""
     sec, nanosec = divmod(round(plan.t[k] * 1e9), 10**9)
     values = {"positions": plan.q, "velocities": plan.dq, "accelerations": plan.ddq}
@@ -117,3 +173,24 @@ def _add(archive: zipfile.ZipFile, name: str, values: NDArray[Any]) -> None:
     """Add an array with a fixed date, so that equal plans give equal bytes."""
     with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
         np.lib.format.write_array(member, values, allow_pickle=False)
+
+
+def _spline_columns(motion: Motion, exported: ExportedSet) -> dict[str, NDArray[np.float64] | NDArray[np.int64]]:
+    """Return the datasets of the file."""
+    from scipy.interpolate import BSpline
+
+    count, points, degree = len(motion.path), motion.path.shape[1], motion.degree
+    inner = np.linspace(0, 1, points - degree + 1)
+    knots = np.concatenate([np.zeros(degree), inner, np.ones(degree)])
+    control = motion.path.transpose(1, 0, 2)
+    waypoints = BSpline(knots, control, degree)(np.linspace(0, 1, PATH_WAYPOINTS)).transpose(1, 0, 2)
+    return {
+        "bspline_params_tt": np.tile(knots, (count, 1)),
+        "bspline_params_cc": np.ascontiguousarray(motion.path.transpose(0, 2, 1)),
+        "bspline_params_k": np.full(count, degree, np.int64),
+        "sol_path": np.ascontiguousarray(waypoints),
+        "task_id": exported.sample_id,
+        "q_start": motion.path[:, 0],
+        "q_goal": motion.path[:, -1],
+        "duration": motion.duration(),
+    }

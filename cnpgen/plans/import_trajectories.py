@@ -19,7 +19,7 @@ from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import as_record, open_problem
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.store.dataset_spec import StoredProblem
-from cnpgen.trajectory.boundary import Boundary
+from cnpgen.trajectory.boundary import Boundary, join_boundaries
 from cnpgen.trajectory.fit import fit_motion, largest_error
 from cnpgen.trajectory.sampled_trajectory import Trajectory
 from cnpgen.trajectory.samples import sampled_boundary
@@ -89,18 +89,12 @@ def import_trajectories(
     motions, deviation = _fitted(trajectories, boundaries, record.trajectory, MAX_FIT_ERROR_RAD + float(errors[0]))
     plans = make_plans(
         record,
-        _joined(boundaries),
+        join_boundaries(boundaries),
         path_control_points=np.concatenate([motion.path for motion in motions]),
         rate_control_points=np.concatenate([motion.rate for motion in motions]),
         source=source,
     )
     return ImportedTrajectories(plans, deviation, snapped)
-
-
-def _joined(boundaries: Sequence[Boundary]) -> Boundary:
-    """Return the boundary conditions of all trajectories."""
-    arrays = [boundary.arrays() for boundary in boundaries]
-    return Boundary(**{name: np.concatenate([parts[name] for parts in arrays]) for name in arrays[0]})
 
 
 def _boundary(
@@ -134,17 +128,9 @@ def _boundary(
 def _snapped(
     snapper: StateSnapper, state: State, end: End, given: Sequence[bool], allowed: float
 ) -> tuple[State, float]:
-    """Snap a state, without its estimated derivatives if they prevent it; also return the change of the positions.
+    """Snap a state, without its estimated derivatives, those that are not given, if they prevent it.
 
-    Args:
-        snapper: The constraints.
-        state: The state.
-        end: End of the motion.
-        given: Whether the velocities and the accelerations are those of the file, not estimates.
-        allowed: Largest change of the positions [rad].
-
-    Returns:
-        The state and its change [rad]; the state as it is and nan if a larger change is necessary.
+    Return it with its change [rad]; or as it is, with nan, if a change above the allowed one is necessary.
     """
     q, dq, ddq = state
     still = np.zeros_like(q)

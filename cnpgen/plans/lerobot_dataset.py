@@ -69,12 +69,7 @@ class LeRobotDataset(Exporter):
 
 @dataclass(frozen=True, eq=False)
 class _Episode:
-    """One plan.
-
-    Attributes:
-        columns: Values of the frames, shape (K,) or (K, w).
-        file: Index of the data file.
-    """
+    """One plan: values of the frames, shape (K,) or (K, w), and the index of the data file."""
 
     columns: Mapping[str, Values]
     file: int

@@ -194,7 +194,7 @@ def _trajectory(table: TrajectoryTable, options: _Options) -> tuple[Trajectory, 
     except UsageError as error:
         raise UsageError(f"{table.place}: {error}") from error
     _check_times(table, trajectory, options)
-    unused = [name for name in table.columns if name not in used and not _is_unused_kind(name)]
+    unused = [name for name in table.columns if name not in used and not _plain(name).lower().startswith(UNUSED_KINDS)]
     return trajectory, unused
 
 
@@ -389,10 +389,6 @@ def _factor(table: TrajectoryTable, name: str, unit: str, default: float) -> flo
 def _plain(name: str) -> str:
     """Return the name of a column without its unit."""
     return _UNIT.sub("", name).strip()
-
-
-def _is_unused_kind(name: str) -> bool:
-    return _plain(name).lower().startswith(UNUSED_KINDS)
 
 
 def _missing(table: TrajectoryTable, options: _Options) -> str:

@@ -138,12 +138,7 @@ def agreed_problem(
 ) -> ProblemRecord:
     """Return the problem of a file: the required one if it is consistent, or the file's own.
 
-    Args:
-        path: Path of the file.
-        stored: Problem in the file, or None.
-        wanted: Required problem, None for any.
-        content: Content of the file, for messages: "plans".
-        command: Command with the option ``--problem``, for messages.
+    Content and command, which has the option ``--problem``, are for messages.
 
     Raises:
         DatasetError: The file is of another problem.
@@ -162,12 +157,9 @@ def agreed_problem(
 
 
 def stored_problem(path: Path, attributes: Mapping[str, Any], *, required: bool = True) -> ProblemRecord | None:
-    """Return the problem named by a file; None if it names none.
+    """Return the problem named by the attributes of a file; None if they name none.
 
-    Args:
-        path: Path of the file.
-        attributes: Attributes of the file: ``problem``, ``problem_recipe``, ``problem_urdf`` and ``problem_sha256``.
-        required: Whether a problem in another folder, which is not opened, is an error; otherwise it is ignored.
+    A problem in another folder, which is not opened, is an error if it is required, otherwise ignored.
 
     Raises:
         DatasetError: The named problem is damaged, cannot be found or is in another folder than the file.

@@ -261,7 +261,7 @@ def screen(plans: Plans) -> NDArray[np.uint8]:
     Returns:
         Status, shape (N,): NOT_FINITE, NOT_FORWARD, or UNKNOWN for plans that can be evaluated.
     """
-    parts = [part for part in _parts(plans.boundary) if part is not None] + [plans.rate_control_points]
+    parts = [*plans.boundary.arrays().values(), plans.rate_control_points]
     finite = np.isfinite(plans.path_control_points).all(axis=(1, 2))
     finite &= np.all([np.isfinite(part).all(axis=1) for part in parts], axis=0)
     found = np.where(np.isfinite(plans.duration), PlanStatus.UNKNOWN, PlanStatus.NOT_FORWARD)
@@ -303,10 +303,6 @@ def _checked(which: Any, plans: int) -> slice | NDArray[Any]:
         wrong = int(found.max() if found.max() >= plans else found.min())
         raise PlanIndexError(f"there is no plan {wrong}: {plans} plans are numbered from 0", concerns="which")
     return np.atleast_1d(found)
-
-
-def _parts(boundary: Boundary) -> list[Array | None]:
-    return list(vars(boundary).values())
 
 
 def _mistakes(plans: Plans, rows: int | None = None) -> Iterator[str]:
@@ -354,7 +350,7 @@ def _parameter_mistakes(plans: Plans, rows: int) -> Iterator[str]:
 
 def _rows(plans: Plans) -> int:
     """Return the most frequent number of plans among the fields."""
-    fields: list[NDArray[Any]] = [part for part in _parts(plans.boundary) if part is not None]
+    fields: list[NDArray[Any]] = [*plans.boundary.arrays().values()]
     fields += [plans.path_control_points, plans.rate_control_points, plans.sample_id, plans.status]
     fields += plans.columns.values()
     return Counter(len(field) if getattr(field, "ndim", 0) else 0 for field in fields).most_common(1)[0][0]

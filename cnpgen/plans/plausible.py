@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.plans.format import UNITS
 from cnpgen.robots.plausible_values import UnitError, check_plausible
 from cnpgen.robots.robot import Robot
 from cnpgen.trajectory.boundary import Boundary
-
-UNITS = {"q": "rad", "dq": "rad/s", "ddq": "rad/s^2"}
 
 
 def check_boundary_units(
@@ -20,14 +19,9 @@ def check_boundary_units(
 ) -> None:
     """Raise an error for boundary conditions so far outside of their limits that their unit is probably wrong.
 
-    Other violations of limits are no errors: the verdict reports them. Values that are not finite are ignored.
-
-    Args:
-        robot: Robot of the problem.
-        boundary: Boundary conditions, shape (N, n) each.
-        where: Source of the boundary conditions, for messages.
-        argument: Name of the caller's argument that holds them; by default the name of the condition.
-        allow_large_angles: Whether to issue a warning instead.
+    Other violations of limits are no errors: the verdict reports them. Values that are not finite are ignored. Messages
+    begin with their source and concern the caller's argument, by default the condition. ``allow_large_angles`` issues a
+    warning instead.
 
     Raises:
         UnitError: A value is probably in another unit.
@@ -53,10 +47,8 @@ def check_boundary_units(
 def are_usual(robot: Robot, states: Sequence[NDArray[Any]]) -> bool:
     """Return whether states are within the limits of the joints: a fast check.
 
-    Args:
-        robot: Robot of the problem.
-        states: Positions, velocities and accelerations of one state, or of two without or with the last accelerations;
-            shape (N, n) each.
+    The states are positions, velocities and accelerations of one state, or of two without or with the last
+    accelerations; shape (N, n) each.
     """
     shape = (len(states[0]), robot.n)
     if any(values.shape != shape for values in states):

@@ -152,14 +152,7 @@ def _obstacle_poses(problem: Problem, fixed: int, scene: SceneProblem) -> Array:
 
 
 def with_wider_capacity(plans: Plans, problem: Problem, own: Capacity, capacity: Capacity) -> Plans:
-    """Return plans with parked obstacles up to another capacity, so that plans of several capacities fit one file.
-
-    Args:
-        plans: Plans of ``with_capacity(problem, own)``.
-        problem: The robot's problem.
-        own: Capacity of the plans.
-        capacity: Capacity of the result, at least as large.
-    """
+    """Return plans of a problem's own capacity with parked obstacles up to another one, so that they fit one file."""
     before, after = with_capacity(problem, own).obstacle, with_capacity(problem, capacity)
     poses = np.tile(place_obstacles(after.obstacle), (len(plans), 1))
     positions = {

@@ -40,12 +40,7 @@ class StateSnapper:
         self._poses = scene_of(self._problem, nowhere, nowhere, nowhere, rows).poses[0]
 
     def __call__(self, state: State, end: End) -> State:
-        """Move a state, or return the last one that was reached if the constraints cannot be met.
-
-        Args:
-            state: Positions [rad], velocities [rad/s] and accelerations [rad/s^2], shape (n,) each.
-            end: End of the motion.
-        """
+        """Move a state at an end, or return the last one that was reached if the constraints cannot be met."""
         x = np.concatenate(state) / self._scale
         for _ in range(MAX_ITERATIONS):
             g, lower, upper = self._values(x, end)

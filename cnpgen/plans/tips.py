@@ -12,14 +12,10 @@ TIP_TOLERANCE_M = 1e-5  # maximum deviation of a tip position from forward kinem
 
 
 def correct_tips(plans: Plans, *, where: str = "") -> Plans:
-    """Replace tip positions that are inconsistent with the joints, with a warning.
+    """Replace tip positions that are inconsistent with the joints, with a warning that begins with ``where``.
 
     Tip positions define the ends of the tip and the obstacles below the object. The joints have priority, since plans
     are executed with them and control points match them.
-
-    Args:
-        plans: Plans with the columns ``start_xyz`` and ``goal_xyz``.
-        where: Beginning of the warning: the file.
     """
     found = {}
     for end in ("start", "goal"):

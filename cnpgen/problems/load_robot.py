@@ -14,7 +14,7 @@ from cnpgen.problems.plausible_sizes import check_plausible_sizes
 from cnpgen.problems.problem import Problem, kept_folder
 from cnpgen.robots.attached import Attached, PayloadBody
 from cnpgen.robots.chain import chain_from_model
-from cnpgen.robots.robot import Robot, reduced_model
+from cnpgen.robots.robot import Robot, mistakes_in, reduced_model
 from cnpgen.robots.shape.convex_part import turned
 from cnpgen.robots.shape.held_object import HeldBody, load_held_shape
 from cnpgen.robots.shape.shape import Shape, load_shape
@@ -35,7 +35,7 @@ def load_robot(problem: Problem) -> Robot:
         PluginError: The URDF belongs to a package that is not installed.
     """
     spec, limits = problem.robot, problem.limits
-    try:
+    with mistakes_in(problem.path):
         urdf, attached = problem.urdf_text, _attached(problem)
         model = reduced_model(problem.urdf_path, urdf, spec.joints, attached)
         chain = chain_from_model(model, attached.tip)
@@ -45,8 +45,6 @@ def load_robot(problem: Problem) -> Robot:
         most = np.minimum(limits.acceleration_rate * velocity, limits.acceleration_cap)
         acceleration = _given(limits.acceleration, "acceleration", most)
         jerk = _given(limits.jerk, "jerk", JERK_RATE * acceleration)
-    except RecipeError as error:
-        raise type(error)([f"{problem.path}: {mistake}" for mistake in error.mistakes]) from error
     center = (np.array(model.upperPositionLimit) + np.array(model.lowerPositionLimit)) / 2
     half = limits.position_scale * (np.array(model.upperPositionLimit) - np.array(model.lowerPositionLimit)) / 2
     robot = Robot(
@@ -70,8 +68,9 @@ def load_robot(problem: Problem) -> Robot:
     )
     if mistakes := list(_mistakes(problem, robot)):
         raise RecipeError(mistakes)
-    shape = _shape(problem, robot) if spec.geometry == "urdf" else None
-    model, robot = robot.model, replace(robot, shape=shape, held_shape=_held_shape(problem, robot))
+    with mistakes_in(problem.path):
+        shape = load_shape(urdf, robot.model, kept_folder()) if spec.geometry == "urdf" else None
+        model, robot = robot.model, replace(robot, shape=shape, held_shape=_held_shape(problem, robot))
     vars(robot)["model"] = model  # a cached property, expensive to build again
     if not problem.is_stored:
         check_plausible_sizes(robot, problem)
@@ -104,23 +103,12 @@ def _given(values: PerJoint | None, what: str, otherwise: Array) -> Array:
     return np.broadcast_to(np.array(values.values), len(otherwise)).copy()
 
 
-def _shape(problem: Problem, robot: Robot) -> Shape:
-    """Load the shape of the robot."""
-    try:
-        return load_shape(robot.urdf_text, robot.model, kept_folder())
-    except RecipeError as error:
-        raise RecipeError([f"{problem.path}: {mistake}" for mistake in error.mistakes]) from error
-
-
 def _held_shape(problem: Problem, robot: Robot) -> Shape | None:
     """Load the geometry for collisions of the held object with the robot, if a constraint needs it."""
     if problem.object is None or problem.first(ObjectClearance) is None:
         return None
     held = HeldBody(problem.object.size, problem.object.touch_links, robot.tip_frame)
-    try:
-        return load_held_shape(robot.urdf_text, robot.model, held, kept_folder())
-    except RecipeError as error:
-        raise RecipeError([f"{problem.path}: {mistake}" for mistake in error.mistakes]) from error
+    return load_held_shape(robot.urdf_text, robot.model, held, kept_folder())
 
 
 def _mistakes(problem: Problem, robot: Robot) -> Iterator[str]:

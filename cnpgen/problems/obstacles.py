@@ -78,11 +78,7 @@ def table_frame_of(problem: Problem, parameters: Array | None) -> TableFrame | N
 def goal_velocities(problem: Problem, robot: Robot, goal_q: Array, goal_dq: Array) -> Array | None:
     """Compute tip velocities at the goals with Pinocchio [m/s], shape (N, 3); None if the problem needs none.
 
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        goal_q: Joint positions at the goal [rad], shape (N, n).
-        goal_dq: Joint velocities at the goal [rad/s], shape (N, n).
+    Joint positions [rad] and velocities [rad/s] at the goals have shape (N, n).
     """
     from cnpgen.world.path import PathWorld
 

@@ -48,10 +48,7 @@ KIND_READERS: dict[type, Reader] = {
 
 
 def load_problem_behind(name_or_path: str | Path) -> Problem:
-    """Load the problem of a problem, pipeline or dataset recipe.
-
-    Args:
-        name_or_path: Name of a shipped problem, pipeline or dataset, or path of such a file.
+    """Load the problem of a problem, pipeline or dataset recipe, by its name or path.
 
     Raises:
         RecipeError: There is no such recipe, or the problem file has mistakes.
@@ -125,12 +122,7 @@ def without_defaults(value: Any) -> Any:
 
 
 def restore_problem(content: dict[str, Any], urdf: str, folder: Path) -> Problem:
-    """Rebuild a problem from its resolved form.
-
-    Args:
-        content: Resolved problem.
-        urdf: Text of the robot's URDF file.
-        folder: Folder for the URDF file.
+    """Rebuild a problem from its resolved form and the text of its URDF, for whose file there is a folder.
 
     Raises:
         RecipeError: This version of cnpgen does not support the content.

@@ -172,12 +172,7 @@ class ProblemRecord(StoredProblem):
 
 
 def with_control_points(record: ProblemRecord, path: int | None, rate: int | None) -> ProblemRecord:
-    """Return the record of a problem with other numbers of control points.
-
-    Args:
-        record: The record.
-        path: Number of control points of p(s); None for that of the problem.
-        rate: Number of control points of r(s); None for that of the problem.
+    """Return the record of a problem with other numbers of control points of p(s) and r(s); None keeps a number.
 
     Raises:
         UsageError: A number does not suit the degree.
@@ -196,11 +191,7 @@ def with_control_points(record: ProblemRecord, path: int | None, rate: int | Non
 
 
 def with_objective(record: ProblemRecord, objective: str) -> ProblemRecord:
-    """Return the record of a problem with another objective.
-
-    Args:
-        record: The record.
-        objective: See ``read_objective``; empty or "time" for the objective of the problem.
+    """Return the record of a problem with another objective (``read_objective``); empty or "time" for its own.
 
     Raises:
         UsageError: The objective is invalid.
@@ -213,12 +204,7 @@ def with_objective(record: ProblemRecord, objective: str) -> ProblemRecord:
 
 
 def with_payload_of(record: ProblemRecord, parameters: Array) -> ProblemRecord:
-    """Return the record of a problem without parameters, whose payload is that of a sample.
-
-    Args:
-        record: The record.
-        parameters: Parameters of the sample, shape (width,).
-    """
+    """Return the record of a problem without parameters, with the payload of a sample's, shape (width,)."""
     with record.restored() as problem:
         values = dict(zip(problem.parameters.names, parameters.tolist(), strict=True))
         payload = None if problem.payload is None else problem.payload.at(values)

@@ -19,10 +19,6 @@ _PARKED_ROTATION = (0.1, 0.1, 0.1)  # any rotation: boxes of scenes have rotatio
 def with_capacity(problem: Problem, capacity: Capacity) -> Problem:
     """Return a problem with further obstacles, which stand far below the robot until a plan places them.
 
-    Args:
-        problem: The problem; its own obstacles stay where they are.
-        capacity: Numbers of further obstacles.
-
     Raises:
         UsageError: No constraint keeps the robot away from obstacles, or the problem has other values of each sample.
     """

@@ -19,13 +19,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PayloadBody:
-    """Rigid body of the payload.
-
-    Attributes:
-        mass: Mass [kg].
-        com: Center of mass in the tip frame [m], shape (3,).
-        inertia: Inertia about the center of mass, in the axes of the tip frame [kg m^2], shape (3, 3).
-    """
+    """Rigid body of the payload: mass [kg], center of mass [m] and inertia about it [kg m^2] along the tip frame."""
 
     mass: float
     com: Array
@@ -82,13 +76,7 @@ def attach(model: "pin.Model", attached: Attached) -> None:
 
 
 def bounded(urdf: str, tree: ElementTree.Element, attached: Attached) -> str:
-    """Return a URDF in which continuous joints with a given range are revolute.
-
-    Args:
-        urdf: Text of the URDF.
-        tree: Parsed URDF, modified in place.
-        attached: Attachments with the ranges.
-    """
+    """Return a URDF in which continuous joints with a given range are revolute; the tree is modified in place."""
     turning = [joint for joint in tree.iter("joint") if joint.get("type") == "continuous"]
     given = [joint for joint in turning if joint.get("name") in attached.ranges]
     for joint in given:

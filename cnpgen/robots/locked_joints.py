@@ -8,19 +8,16 @@ import numpy as np
 
 from cnpgen.errors import RecipeError, nearest
 from cnpgen.robots.shape.convex_part import turned
-from cnpgen.robots.urdf import number_in, numbers_in, urdf_tree
+from cnpgen.robots.urdf import number_in, numbers_in, numbers_text, urdf_tree
 
 _TURNING, _SLIDING = ("revolute", "continuous"), ("prismatic",)
 _MOTION = ("axis", "limit", "mimic", "calibration", "dynamics", "safety_controller")  # elements of a joint that moves
 
 
 def with_locked_joints(urdf: str, positions: Mapping[str, float], *, is_stored: bool) -> str:
-    """Return a URDF whose locked joints are fixed at their positions, with those that mimic them.
+    """Return a URDF whose locked joints are fixed at their positions [rad or m], with those that mimic them.
 
-    Args:
-        urdf: Text of the URDF.
-        positions: Joint -> position [rad or m].
-        is_stored: Whether the URDF is that of a stored problem, whose joints are fixed already.
+    The joints of a stored problem are fixed already.
 
     Raises:
         RecipeError: A joint does not exist, does not move, or its position is outside of its limits.
@@ -57,6 +54,8 @@ def _mimicking(joints: Mapping[str, Element], positions: Mapping[str, float]) ->
 
 def _fix(joint: Element, position: float, is_stored: bool) -> list[str]:
     """Make a joint fixed at a position; return its mistakes."""
+    import pinocchio as pin
+
     name, kind = joint.get("name", ""), joint.get("type", "")
     if kind == "fixed" and is_stored:
         return []
@@ -81,7 +80,7 @@ def _fix(joint: Element, position: float, is_stored: bool) -> list[str]:
     for part in [part for part in joint if part.tag in (*_MOTION, "origin")]:
         joint.remove(part)
     joint.set("type", "fixed")
-    joint.insert(0, Element("origin", xyz=_text(xyz), rpy=_text(_roll_pitch_yaw(rotation))))
+    joint.insert(0, Element("origin", xyz=numbers_text(xyz), rpy=numbers_text(pin.rpy.matrixToRpy(rotation))))
     return []
 
 
@@ -90,13 +89,3 @@ def _turn(axis: np.ndarray, angle: float) -> np.ndarray:
     x, y, z = axis
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return np.asarray(np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross)
-
-
-def _roll_pitch_yaw(rotation: np.ndarray) -> np.ndarray:
-    import pinocchio as pin
-
-    return np.array(pin.rpy.matrixToRpy(rotation))
-
-
-def _text(values: np.ndarray) -> str:
-    return " ".join(f"{value:.17g}" for value in values)

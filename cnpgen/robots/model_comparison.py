@@ -20,11 +20,7 @@ WORLD = 0  # index of Pinocchio's joint of the root link
 
 
 def check_model(model: "pin.Model", parameters: UrdfParameters) -> None:
-    """Raise an error if a Pinocchio model differs from the XML of its URDF.
-
-    Args:
-        model: The model, with all joints of the URDF or reduced to some of them; the others are at position zero.
-        parameters: Parameters in the XML.
+    """Raise an error if a Pinocchio model, all joints of a URDF or some with others at zero, differs from its XML.
 
     Raises:
         RecipeError: A link or a joint of the model differs from the XML; the error lists all of them.

@@ -25,82 +25,47 @@ MAX_TILT_RAD = 0.5  # of a table or an upright direction about each axis
 RANGE_ROUNDING = 1e-12  # of values at the ends of a range
 
 
+def _range(doc: str, unit: str = "1", **bounds: Any) -> Any:
+    """Declare the optional range of a parameter."""
+    return field(doc, unit=unit, default=None, since_version=2, **bounds)
+
+
+def _tilt(doc: str) -> Any:
+    """Declare the optional range of an angle of a tilt."""
+    return _range(doc, "rad", low=-MAX_TILT_RAD, high=MAX_TILT_RAD)
+
+
 @dataclass(frozen=True, kw_only=True)
 class ParameterRanges:
     """Ranges of the parameters that samples of a problem have, in the order of their columns."""
 
-    table_height: Range | None = field(
-        "height of the table above that of the constraint 'table'", unit="m", default=None, since_version=2
-    )
-    table_roll: Range | None = field(
-        "turn of the table about its x axis",
-        unit="rad",
-        default=None,
-        since_version=2,
-        low=-MAX_TILT_RAD,
-        high=MAX_TILT_RAD,
-    )
-    table_pitch: Range | None = field(
-        "turn of the table about world y, after the roll",
-        unit="rad",
-        default=None,
-        since_version=2,
-        low=-MAX_TILT_RAD,
-        high=MAX_TILT_RAD,
-    )
-    table_x_low: Range | None = field(
-        "lower bound of the table's rectangle along its x axis", unit="m", default=None, since_version=2
-    )
-    table_x_high: Range | None = field("upper bound along x", unit="m", default=None, since_version=2)
-    table_y_low: Range | None = field("lower bound along y", unit="m", default=None, since_version=2)
-    table_y_high: Range | None = field("upper bound along y", unit="m", default=None, since_version=2)
-    upright_roll: Range | None = field(
-        "turn about world x of the direction of the constraint 'vertical' or 'axis'",
-        unit="rad",
-        default=None,
-        since_version=2,
-        low=-MAX_TILT_RAD,
-        high=MAX_TILT_RAD,
-    )
-    upright_pitch: Range | None = field(
-        "its turn about world y, after the roll",
-        unit="rad",
-        default=None,
-        since_version=2,
-        low=-MAX_TILT_RAD,
-        high=MAX_TILT_RAD,
-    )
-    upright_tolerance: Range | None = field(
+    table_height: Range | None = _range("height of the table above that of the constraint 'table'", "m")
+    table_roll: Range | None = _tilt("turn of the table about its x axis")
+    table_pitch: Range | None = _tilt("turn of the table about world y, after the roll")
+    table_x_low: Range | None = _range("lower bound of the table's rectangle along its x axis", "m")
+    table_x_high: Range | None = _range("upper bound along x", "m")
+    table_y_low: Range | None = _range("lower bound along y", "m")
+    table_y_high: Range | None = _range("upper bound along y", "m")
+    upright_roll: Range | None = _tilt("turn about world x of the direction of the constraint 'vertical' or 'axis'")
+    upright_pitch: Range | None = _tilt("its turn about world y, after the roll")
+    upright_tolerance: Range | None = _range(
         "'angle' of the constraint 'axis', or 'tolerance' of an aligned axis and of 'vertical'",
-        unit="rad",
-        default=None,
-        since_version=2,
+        "rad",
         low=1e-4,
         high=1.5,
     )
-    velocity_factor: Range | None = field(
-        "joint velocity limit, as a fraction of that of [limits]", default=None, since_version=2, low=1e-3, high=1.0
+    velocity_factor: Range | None = _range(
+        "joint velocity limit, as a fraction of that of [limits]", low=1e-3, high=1.0
     )
-    acceleration_factor: Range | None = field(
-        "joint acceleration limit, as a fraction of that of [limits]", default=None, since_version=2, low=1e-3, high=1.0
+    acceleration_factor: Range | None = _range(
+        "joint acceleration limit, as a fraction of that of [limits]", low=1e-3, high=1.0
     )
-    payload_mass: Range | None = field(
-        "mass of the payload, whose inertia is proportional to it", unit="kg", default=None, since_version=2, low=1e-9
-    )
-    payload_x: Range | None = field(
-        "centre of mass of the payload along the tip's x axis",
-        unit="m",
-        default=None,
-        since_version=2,
-        plausible=5.0,
-    )
-    payload_y: Range | None = field("the same along its y axis", unit="m", default=None, since_version=2, plausible=5.0)
-    payload_z: Range | None = field("the same along its z axis", unit="m", default=None, since_version=2, plausible=5.0)
-    payload_inertia: Range | None = field(
-        "inertia of the payload about its centre, as a fraction of that of [payload] at equal mass",
-        default=None,
-        since_version=2,
-        low=0.0,
+    payload_mass: Range | None = _range("mass of the payload, whose inertia is proportional to it", "kg", low=1e-9)
+    payload_x: Range | None = _range("centre of mass of the payload along the tip's x axis", "m", plausible=5.0)
+    payload_y: Range | None = _range("the same along its y axis", "m", plausible=5.0)
+    payload_z: Range | None = _range("the same along its z axis", "m", plausible=5.0)
+    payload_inertia: Range | None = _range(
+        "inertia of the payload about its centre, as a fraction of that of [payload] at equal mass", low=0.0
     )
 
     @cached_property
@@ -148,11 +113,7 @@ class ParameterRanges:
         return len(self.names)
 
     def nominal(self, values: Mapping[str, float]) -> Array:
-        """Return the values of a sample without parameters, shape (width,).
-
-        Args:
-            values: Values of the problem file for parameters that do not describe a change, by name.
-        """
+        """Return the values of a sample without parameters, shape (width,); those of the problem file by name."""
         factors = ("velocity_factor", "acceleration_factor", "payload_inertia")
         nominal = dict.fromkeys(self.names, 0.0) | dict.fromkeys(factors, 1.0) | dict(values)
         return np.array([nominal[name] for name in self.names], np.float64)

@@ -51,11 +51,8 @@ class ImplausibleValue:
 def find_implausible_value(robot: Robot, name: str, values: NDArray[Any], unit: str) -> ImplausibleValue | None:
     """Find the first value outside of the plausible range of its quantity; nan and infinite values are ignored.
 
-    Args:
-        robot: Robot of the problem.
-        name: Name of the column: "start_q", "hit_angle", ...
-        values: Values, shape (N, width).
-        unit: Unit of the columns, as ``Field.unit``.
+    The name is that of the column, such as "start_q" or "hit_angle", its values have shape (N, width), and the unit is
+    that of ``Field.unit``.
     """
     low, high = (np.broadcast_to(bound, values.shape[1:]) for bound in _plausible_range(robot, name, unit))
     outside = np.isfinite(values) & ((values < low) | (values > high))
@@ -67,13 +64,9 @@ def find_implausible_value(robot: Robot, name: str, values: NDArray[Any], unit: 
 
 
 def check_plausible(robot: Robot, columns: Mapping[str, NDArray[Any]], units: Mapping[str, str], *, noun: str) -> None:
-    """Raise an error for the first value that is probably in another unit.
+    """Raise an error for the first value of columns, shape (N, width), that is probably in another unit than theirs.
 
-    Args:
-        robot: Robot of the problem.
-        columns: Name -> values, shape (N, width).
-        units: Name -> unit.
-        noun: Noun of a row: "task" or "plan".
+    The noun of a row is "task" or "plan".
 
     Raises:
         UnitError: A value is far outside of its range.

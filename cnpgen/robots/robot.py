@@ -1,6 +1,6 @@
 """Robot: Pinocchio model, reduced to the planned joints, and planning limits of the problem."""
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -14,15 +14,16 @@ from numpy.typing import NDArray
 from cnpgen.errors import RecipeError, nearest
 from cnpgen.robots.attached import Attached, attach, bounded
 from cnpgen.robots.chain import Chain, frame_of, name_links_uniquely
-from cnpgen.robots.mimic import check_mimic
 from cnpgen.robots.model_comparison import check_model
 from cnpgen.robots.parameter_ranges import NO_PARAMETERS, ParameterRanges
 from cnpgen.robots.shape.shape import Shape
-from cnpgen.robots.urdf import urdf_tree
+from cnpgen.robots.urdf import number_in, urdf_tree
 from cnpgen.robots.urdf_parameters import UrdfParameters, urdf_parameters
 from cnpgen.store.joint_units import units_of_joints
 
 if TYPE_CHECKING:
+    from xml.etree.ElementTree import Element
+
     import pinocchio as pin
 
 Array = NDArray[np.float64]
@@ -124,11 +125,7 @@ class Robot:
 def reduced_model(urdf: Path, text: str, joints: tuple[str, ...], attached: Attached) -> "pin.Model":
     """Build the Pinocchio model of a URDF, reduced to the planned joints, with the attachments of a problem.
 
-    Args:
-        urdf: Path of the URDF file, for messages.
-        text: Text of the URDF.
-        joints: Planned joints; all others are locked at zero.
-        attached: Attachments of the problem.
+    The path is for messages. Joints that are not planned are locked at zero.
 
     Raises:
         RecipeError: The text is not a URDF, it lacks the joints in this order, or Pinocchio reads other numbers.
@@ -137,7 +134,7 @@ def reduced_model(urdf: Path, text: str, joints: tuple[str, ...], attached: Atta
 
     try:
         tree = urdf_tree(text)
-        check_mimic(tree, joints)
+        _check_mimic(tree, joints)
         limited = bounded(text, tree, attached)
         with mistakes_in(urdf):
             parameters = urdf_parameters(tree)
@@ -165,16 +162,36 @@ def reduced_model(urdf: Path, text: str, joints: tuple[str, ...], attached: Atta
     return reduced
 
 
+def _check_mimic(tree: "Element", joints: Sequence[str]) -> None:
+    """Raise RecipeError if a mimic joint would have a wrong position: Pinocchio treats them as independent joints."""
+    mistakes = [f"robot.joints: {text}" for joint in tree.iter("joint") for text in _mimic_mistakes(joint, joints)]
+    if mistakes:
+        raise RecipeError(mistakes)
+
+
+def _mimic_mistakes(joint: "Element", planned: Sequence[str]) -> Iterator[str]:
+    mimic = joint.find("mimic")
+    if mimic is None:
+        return
+    name, other = joint.get("name", ""), mimic.get("joint", "")
+    if name in planned:
+        yield f"{name!r} mimics {other!r} and cannot be planned by itself; mimic joints are not supported"
+    elif other in planned:
+        yield f"{name!r} mimics the planned joint {other!r}, but would stay at zero; mimic joints are not supported"
+    elif offset := _mimic_offset(mimic):
+        yield f"{name!r} mimics {other!r} with {offset}, but would stay at zero; mimic joints are not supported"
+
+
+def _mimic_offset(mimic: "Element") -> str:
+    """Return an error message for a non-zero offset, otherwise an empty text."""
+    try:
+        return "an offset" if number_in(mimic, "offset", 0.0) else ""
+    except ValueError as error:
+        return str(error)
+
+
 def _check_order_of_limits(parameters: UrdfParameters, joints: Collection[str]) -> None:
-    """Raise an error for lower limits above the upper ones.
-
-    Args:
-        parameters: Parameters of the URDF.
-        joints: Names of the joints.
-
-    Raises:
-        RecipeError: Limits are swapped; the error lists all of them.
-    """
+    """Raise an error that lists the joints whose lower limits are above the upper ones."""
     limits = {joint.name: joint.limits for joint in parameters.joints.values() if joint.name in joints}
     mistakes = [
         f"joint {name!r}: its limits lower={of['lower']:g} and upper={of['upper']:g} are swapped: exchange them"
@@ -187,11 +204,11 @@ def _check_order_of_limits(parameters: UrdfParameters, joints: Collection[str]) 
 
 @contextmanager
 def mistakes_in(urdf: Path) -> Iterator[None]:
-    """Put the name of the URDF before the mistakes that the block raises."""
+    """Put the name of a file, such as the URDF, before the mistakes that the block raises."""
     try:
         yield
     except RecipeError as error:
-        raise RecipeError([f"{urdf}: {mistake}" for mistake in error.mistakes]) from error
+        raise type(error)([f"{urdf}: {mistake}" for mistake in error.mistakes]) from error
 
 
 def _capsule_axes(model: "pin.Model", tip: str) -> tuple[tuple[int, int], ...]:

@@ -79,10 +79,6 @@ def scene_poses(obstacles: Sequence[Obstacle], table: SceneTable) -> Array:
 
     The obstacles of a scene take the places of the parked obstacles of their kind, in order; the others stay parked.
 
-    Args:
-        obstacles: Obstacles of the problem.
-        table: The scenes.
-
     Raises:
         UsageError: A scene has more obstacles of a kind than the problem.
     """

@@ -96,9 +96,7 @@ def _count(obstacle: Obstacle) -> int:
 def place_obstacles(obstacles: Sequence[Obstacle], bottoms: Mapping[str, Array] | None = None) -> Array:
     """Compute poses and sizes of obstacles, shape (..., pose_width).
 
-    Args:
-        obstacles: Obstacles of the problem.
-        bottoms: Height of the object's bottom [m] at "start" and "goal", arrays of shape (...); by default 0.
+    The bottom of the object is at these heights [m] at "start" and "goal", arrays of shape (...); by default 0.
     """
     bottoms = bottoms or {"start": np.zeros(()), "goal": np.zeros(())}
     numbers = np.empty((*bottoms["start"].shape, pose_width(obstacles)))
@@ -128,12 +126,7 @@ def _posed_numbers(obstacle: Obstacle) -> Array:
 
 
 def solids_of(obstacles: Sequence[Obstacle], numbers: Array) -> list[Solid]:
-    """Return the convex bodies of obstacles.
-
-    Args:
-        obstacles: Obstacles of the problem.
-        numbers: Poses and sizes of the obstacles, shape (pose_width,).
-    """
+    """Return the convex bodies of obstacles with these poses and sizes, shape (pose_width,)."""
     return [_solid(each, numbers[part]) for each, part in zip(obstacles, number_slices(obstacles), strict=True)]
 
 

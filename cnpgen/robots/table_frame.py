@@ -49,13 +49,7 @@ class TableFrame:
 
 
 def table_frame(ranges: ParameterRanges, pivot: Array, parameters: Array) -> TableFrame:
-    """Return the frame of the table of N samples.
-
-    Args:
-        ranges: Parameters that samples have.
-        pivot: Point about which the table turns [m], shape (3,).
-        parameters: Parameters of the samples, shape (N, width).
-    """
+    """Return the frame of the table of N samples, with parameters of shape (N, width), turned about a pivot [m]."""
     columns = dict(zip(ranges.names, parameters.T, strict=True))
     zero = np.zeros(len(parameters))
     roll, pitch, height = (columns.get(name, zero) for name in ("table_roll", "table_pitch", "table_height"))
@@ -63,12 +57,7 @@ def table_frame(ranges: ParameterRanges, pivot: Array, parameters: Array) -> Tab
 
 
 def upright_axes(ranges: ParameterRanges, parameters: Array) -> Array:
-    """Return the axes that turn with the upright direction of N samples, one per row, shape (N, 3, 3).
-
-    Args:
-        ranges: Parameters that samples have.
-        parameters: Parameters of the samples, shape (N, width).
-    """
+    """Return the axes that turn with the upright direction of N samples, one per row, shape (N, 3, 3)."""
     columns, zero = dict(zip(ranges.names, parameters.T, strict=True)), np.zeros(len(parameters))
     return turned_axes(*(columns.get(name, zero) for name in UPRIGHT_TURN))
 
@@ -91,11 +80,7 @@ def table_axes(sin_roll: Any, cos_roll: Any, sin_pitch: Any, cos_pitch: Any) -> 
 def moved_box(ranges: ParameterRanges, pivot: Array, low: Array, high: Array) -> tuple[Array, Array]:
     """Return a box in the world frame that contains a box in the frames of all tables: both corners [m], shape (3,).
 
-    Args:
-        ranges: Parameters that samples have.
-        pivot: Point about which the table turns [m], shape (3,).
-        low: Lower corner [m], shape (3,).
-        high: Upper corner [m], shape (3,).
+    The tables turn about a pivot [m], shape (3,).
     """
     heights = ranges.table_height
     roll, pitch = (

@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from xml.etree import ElementTree
 from xml.parsers.expat import ExpatError, ParserCreate
@@ -91,6 +92,11 @@ def _tree_without_namespaces(text: str) -> ElementTree.Element:
     return builder.close()
 
 
+def numbers_text(values: Iterable[float]) -> str:
+    """Return numbers as the text of an attribute, from which the same float64 are read."""
+    return " ".join(f"{value:.17g}" for value in values)
+
+
 def number_in(element: ElementTree.Element | None, attribute: str, default: float) -> float:
     """Return a numeric attribute of an element.
 
@@ -101,14 +107,9 @@ def number_in(element: ElementTree.Element | None, attribute: str, default: floa
 
 
 def numbers_in(element: ElementTree.Element | None, attribute: str, default: tuple[float, ...]) -> tuple[float, ...]:
-    """Return the numbers in an attribute of an element.
+    """Return the numbers in an attribute of an element; as many as the default ones of a missing attribute or element.
 
     The accepted notation is that of URDF parsers, which drop an element with other numbers without an error.
-
-    Args:
-        element: The element, or None.
-        attribute: Name of the attribute.
-        default: Numbers of a missing element or attribute; their count is required.
 
     Raises:
         ValueError: The attribute does not have as many finite decimal numbers.

@@ -27,12 +27,7 @@ _ZERO = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class LinkFrame:
-    """Pose of a frame in another one.
-
-    Attributes:
-        rotation: Rotation matrix, shape (3, 3).
-        translation: Origin [m], shape (3,).
-    """
+    """Pose of a frame in another one: rotation matrix, shape (3, 3), and origin [m], shape (3,)."""
 
     rotation: Array
     translation: Array
@@ -85,12 +80,7 @@ class UrdfJoint:
 
 @dataclass(frozen=True)
 class UrdfParameters:
-    """Links and joints of a URDF.
-
-    Attributes:
-        inertias: Link -> inertial parameters; None for links without them.
-        joints: Child link -> joint that moves it.
-    """
+    """Link -> inertial parameters, None for links without them, and child link -> joint of a URDF."""
 
     inertias: dict[str, LinkInertia | None]
     joints: dict[str, UrdfJoint]

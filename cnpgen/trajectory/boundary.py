@@ -1,8 +1,12 @@
-"""Boundary conditions, and the control points that meet them exactly (paper, Appendix A)."""
+"""Boundary conditions, and the control points that meet them exactly (paper, Appendix A).
+
+Rate control points [1/s], shape (N, R), are positive. Functions raise ``UsageError`` if boundary conditions have
+different numbers of joints, or the spline has less than degree + 2 control points.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from enum import Enum
 from typing import Any, Protocol
@@ -136,20 +140,14 @@ class Boundary:
             ) from error
 
 
+def join_boundaries(parts: Sequence[Boundary]) -> Boundary:
+    """Return the boundary conditions of the motions of all parts, which have the same conditions."""
+    arrays = [part.arrays() for part in parts]
+    return Boundary(**{name: np.concatenate([part[name] for part in arrays]) for name in arrays[0]})
+
+
 def start_points(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> Array:
-    """Compute the first three path control points.
-
-    Args:
-        boundary: Boundary conditions.
-        rate: Rate control points [1/s], shape (N, R), positive.
-        spec: Degree and numbers of control points.
-
-    Returns:
-        Control points [rad], shape (N, 3, n).
-
-    Raises:
-        UsageError: Boundary conditions have different numbers of joints.
-    """
+    """Compute the first three path control points [rad], shape (N, 3, n)."""
     _check_joints(boundary)
     path, speed = _end_derivatives(spec)
     dr = speed.eta * (rate[:, 1:2] - rate[:, :1])
@@ -157,18 +155,9 @@ def start_points(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> Array
 
 
 def goal_points(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> Array:
-    """Compute the last two path control points, or three if the goal's acceleration is prescribed, in path order.
+    """Compute the last path control points [rad], in path order, shape (N, 2, n).
 
-    Args:
-        boundary: Boundary conditions.
-        rate: Rate control points [1/s], shape (N, R), positive.
-        spec: Degree and numbers of control points.
-
-    Returns:
-        Control points [rad], shape (N, 2 or 3, n).
-
-    Raises:
-        UsageError: Boundary conditions have different numbers of joints.
+    They are three if the goal's acceleration is prescribed.
     """
     _check_joints(boundary)
     path, speed = _end_derivatives(spec)
@@ -213,36 +202,14 @@ def _three(q: Array, dq: Array, ddq: Array, rate: Array, *, dr: Array, path: End
 
 
 def assemble(boundary: Boundary, interior: Array, rate: Array, spec: TrajectorySpec) -> Array:
-    """Compute all path control points from the interior ones.
-
-    Args:
-        boundary: Boundary conditions.
-        interior: Interior path control points [rad], shape (N, C - 3 - N_d, n).
-        rate: Rate control points [1/s], shape (N, R), positive.
-        spec: Degree and numbers of control points.
-
-    Returns:
-        Control points [rad], shape (N, C, n).
-
-    Raises:
-        UsageError: Boundary conditions have different numbers of joints, or C is below degree + 2.
-    """
+    """Compute all path control points [rad], shape (N, C, n), from the interior ones, shape (N, C - 3 - N_d, n)."""
     return np.concatenate([start_points(boundary, rate, spec), interior, goal_points(boundary, rate, spec)], axis=1)
 
 
 def anchor_line(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> Array:
-    """Compute interior control points on the line from C_2 to C_{C - N_d} (paper, eq. of the configuration points).
+    """Compute interior control points on the line from C_2 to C_{C - N_d} [rad], shape (N, C - 3 - N_d, n).
 
-    Args:
-        boundary: Boundary conditions.
-        rate: Rate control points [1/s], shape (N, R), positive.
-        spec: Degree and numbers of control points.
-
-    Returns:
-        Control points [rad], shape (N, C - 3 - N_d, n).
-
-    Raises:
-        UsageError: As of ``assemble``.
+    It is that of the paper's equation of the configuration points.
     """
     first, last = start_points(boundary, rate, spec)[:, 2:3], goal_points(boundary, rate, spec)[:, :1]
     count = spec.path_control_points - 3 - boundary.fixed_at_goal

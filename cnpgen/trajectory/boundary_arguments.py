@@ -25,15 +25,8 @@ def boundary_of(  # noqa: PLR0917 - in the order of the paper
 ) -> Boundary:
     """Check boundary conditions and bring them to shape (N, n).
 
-    Args:
-        n: Number of planned joints.
-        start_q: Start positions [rad], shape (n,) or (N, n), as of every array here.
-        start_dq: Start velocities [rad/s], or None for zero.
-        start_ddq: Start accelerations [rad/s^2], or None for zero.
-        goal_q: Goal positions [rad].
-        goal_dq: Goal velocities [rad/s], or None for zero.
-        goal_ddq: Goal accelerations [rad/s^2], or None if they are free.
-        parameters: Parameters of the problem, shape (width,) or (N, width), or None if it has none.
+    Positions [rad], velocities [rad/s] and accelerations [rad/s^2] of n joints have shape (n,) or (N, n), parameters
+    (width,) or (N, width). Derivatives that are None are zero, at the goal's acceleration free.
 
     Raises:
         UsageError: A shape is wrong, or a value is not finite.

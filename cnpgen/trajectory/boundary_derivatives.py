@@ -15,13 +15,7 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True)
 class BoundaryDerivative:
-    """Derivative of one path control point with respect to one rate control point.
-
-    Attributes:
-        point: Index of the path control point, 0 to C - 1.
-        variable: Index of the rate control point, 0 to R - 1.
-        derivative: d(path control point) / d(rate control point) [rad s], shape (N, n).
-    """
+    """Derivative [rad s], shape (N, n), of a path control point with respect to a rate control point."""
 
     point: int
     variable: int
@@ -31,10 +25,7 @@ class BoundaryDerivative:
 def boundary_derivatives(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> list[BoundaryDerivative]:
     """Differentiate ``start_points`` and ``goal_points`` of ``cnpgen.trajectory.boundary``; other derivatives are zero.
 
-    Args:
-        boundary: Boundary conditions of N motions.
-        rate: Rate control points [1/s], shape (N, R), positive.
-        spec: Degree and numbers of control points.
+    Rate control points [1/s], shape (N, R), are positive.
     """
     b, last, points = boundary, spec.rate_control_points - 1, spec.path_control_points
     c1, c2, c2_inner = _end_derivatives(b.start_dq, b.start_ddq, rate[:, :1], rate[:, 1:2], spec)

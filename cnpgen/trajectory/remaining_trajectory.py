@@ -25,14 +25,9 @@ COMPARISON_SAMPLES = 64  # times at which accelerations are compared
 def remaining_trajectory(
     motion: Motion, t: Array, boundary: Boundary, *, spec: TrajectorySpec, acceleration_limit: Array
 ) -> Motion:
-    """Fit a motion to the remaining trajectory of each of N motions after a time.
+    """Fit a motion to the remaining trajectory of each of N motions after a time [s], shape (N,), before their end.
 
-    Args:
-        motion: N motions.
-        t: Times since their start [s], shape (N,), before their end.
-        boundary: States at these times, and the goals of the motions.
-        spec: Degree and numbers of control points of the results.
-        acceleration_limit: Acceleration limits of the joints [rad/s^2], shape (n,).
+    Boundary conditions are the states at these times and the goals. Acceleration limits [rad/s^2] have shape (n,).
 
     Returns:
         N motions with exact ends and durations, and with the control points of ``spec``. Each span is divided into two

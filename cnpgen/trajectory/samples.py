@@ -51,13 +51,7 @@ def checked_samples(t: ArrayLike, q: ArrayLike, dq: ArrayLike | None) -> tuple[A
 
 
 def resampled(t: Array, q: Array, dq: Array | None) -> tuple[Array, Array]:
-    """Return times and positions, resampled by cubic Hermite interpolation if they are sparse and have velocities.
-
-    Args:
-        t: Times [s], shape (K,).
-        q: Joint positions [rad], shape (K, n).
-        dq: Joint velocities [rad/s], shape (K, n), or None.
-    """
+    """Return times and positions, resampled by cubic Hermite interpolation if they are sparse and have velocities."""
     if dq is None or len(t) >= MIN_DENSE_SAMPLES:
         return t, q
     from scipy.interpolate import CubicHermiteSpline
@@ -107,15 +101,10 @@ def _derivatives(t: Array, q: Array, velocity: Array | None) -> tuple[Array, Arr
 
 
 def _cubic(t: Array, travel: Array, first: int) -> Array:
-    """Fit a cubic without powers below t^first to the first samples and return its coefficient of t^first, shape (n,).
+    """Fit a cubic without powers below t^first to the first samples; return its coefficient of t^first, shape (n,).
 
     A wide window averages noise, a narrow one follows the motion: the window with the smallest estimated standard error
     is chosen.
-
-    Args:
-        t: Times after the start [s], shape (K,).
-        travel: Displacements to fit [rad], shape (K, n).
-        first: Lowest power.
     """
     widths = [min(width, len(t)) for width in WINDOWS if width <= max(len(t) // 5, WINDOWS[0])]
     best = np.inf, np.zeros(travel.shape[1])

@@ -46,15 +46,9 @@ def basis(s: Array, points: int, degree: int, order: int = 0) -> Array:
 
 
 def derivative(points: int, degree: int, order: int) -> tuple[Array, Array]:
-    """Return the knots of a derivative of a spline, and the matrix that turns its control points into the derivative's.
+    """Return the knots of a derivative of a spline, and the matrix from its control points to those of the derivative.
 
-    Args:
-        points: Number of control points C.
-        degree: Degree D.
-        order: Order of the derivative with respect to s, at most D.
-
-    Returns:
-        ``(knots, matrix)``: shapes (C + D + 1 - 2 order,) and (C - order, C); the derivative's degree is D - order.
+    The shapes are (C + D + 1 - 2 order,) and (C - order, C); the derivative's degree is D - order.
     """
     knots, matrix = clamped_knots(points, degree), np.eye(points)
     for p in range(degree, degree - order, -1):
@@ -64,16 +58,9 @@ def derivative(points: int, degree: int, order: int) -> tuple[Array, Array]:
 
 
 def _cox_de_boor(s: Array, knots: Array, degree: int, first: NDArray[np.intp]) -> Array:
-    """Evaluate the D + 1 basis functions that are not 0 at phases s, by the recursion that SciPy uses.
+    """Evaluate the D + 1 basis functions that are not 0 at phases s, the first one given, shape (D + 1, K).
 
-    Args:
-        s: Phases, shape (K,).
-        knots: Knots.
-        degree: Degree D.
-        first: Index of the first of these basis functions at every phase, shape (K,).
-
-    Returns:
-        Shape (D + 1, K).
+    The recursion is that of SciPy.
     """
     weights = np.ones((1, len(s)))
     right = first + degree + 1 + np.arange(degree)[:, None]
@@ -89,9 +76,7 @@ def _cox_de_boor(s: Array, knots: Array, degree: int, first: NDArray[np.intp]) -
 def power_coefficients(control: Array, degree: int) -> Array:
     """Convert N splines to the power basis of each span, for ``select_spans`` and ``horner``.
 
-    Args:
-        control: Control points, shape (N, C) or (N, C, n).
-        degree: Degree D.
+    Control points have shape (N, C) or (N, C, n).
 
     Returns:
         Coefficients of the powers of (s - left knot), highest first, shape (D + 1, spans, N, ...).
@@ -114,11 +99,7 @@ def taylor_coefficients(points: int, degree: int) -> Array:
 
 
 def select_spans(coefficients: Array, s: Array) -> tuple[Array, Array]:
-    """Select, for every spline, the coefficients of the spans that contain its phases.
-
-    Args:
-        coefficients: Result of ``power_coefficients``.
-        s: Phases in [0, 1], shape (N, K).
+    """Select, for every spline, the coefficients of the spans that contain its phases in [0, 1], shape (N, K).
 
     Returns:
         ``(selected, offset)``: coefficients, shape (D + 1, N, K, ...), and s - left knot, shape (N, K).
@@ -149,12 +130,9 @@ def horner(selected: Array, offset: Array, order: int = 0) -> Array:
 
 
 def derivatives_of_each(control: Array, degree: int, s: Array) -> Array:
-    """Evaluate N splines and their first two derivatives, each at its own phase, shape (3, N, n).
+    """Evaluate N splines and their first two derivatives, each at its own phase in [0, 1], shape (3, N, n).
 
-    Args:
-        control: Control points, shape (N, C, n).
-        degree: Degree D.
-        s: Phases in [0, 1], shape (N,).
+    Control points have shape (N, C, n).
     """
     spans = control.shape[1] - degree
     span = np.minimum((s * spans).astype(np.intp), spans - 1)

@@ -269,8 +269,7 @@ class Motion:
     def _cells(self) -> Iterator[tuple[slice | list[int], Array, Array]]:
         """Yield groups of motions, the edges of the quadrature cells of ``t(s)`` for them, and ``_nodes`` of the edges.
 
-        The edges are shared by all motions, except those whose r has control points that are not positive: it may have
-        a minimum close to 0.
+        All motions share the edges, except those whose r has control points that are not positive: it may nearly be 0.
         """
         points, degree = self.rate.shape[1], self.degree
         shared = _shared_cells(points, degree)
@@ -334,11 +333,7 @@ def time_derivatives(p: Sequence[Array], r: Sequence[Array]) -> list[Array]:
 
 
 def states_at_times(motion: Motion, t: Array) -> tuple[Array, Array, Array]:
-    """Evaluate each motion at one time, faster than ``Motion.at_times``; online replanning needs this most often.
-
-    Args:
-        motion: N motions.
-        t: One time for each [s], shape (N,); clipped to the motion.
+    """Evaluate each of N motions at one time [s], shape (N,), faster than ``Motion.at_times``, for online replanning.
 
     Returns:
         Positions [rad], velocities [rad/s] and accelerations [rad/s^2], shape (N, n) each.

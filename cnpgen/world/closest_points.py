@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +15,6 @@ from cnpgen.world.path import PathWorld
 
 Array = NDArray[np.float64]
 Place = Callable[[int], tuple[ConvexBody, Pose]]  # state -> body and its pose
-Kind = Literal["robot", "self", "object"]
 
 _AT_ORIGIN = np.eye(3), np.zeros(3)
 
@@ -36,24 +34,23 @@ class ClosestPoints:
     points: Array
 
 
-def closest_points(world: PathWorld, kind: Kind, solids: Sequence[Solid], *, radius: float = 0.0) -> ClosestPoints:
+def closest_points(world: PathWorld, bodies: str, solids: Sequence[Solid], *, radius: float = 0.0) -> ClosestPoints:
     """Measure the smallest distance at every state, unlike the judge, which needs the smallest one of all states.
 
     Args:
         world: The robot along a path.
-        kind: Bodies: "robot" and obstacles, the links of the robot itself ("self"), or the held "object" and obstacles.
+        bodies: The bodies, see ``PathWorld.pairs``, other than the held object and links.
         solids: The obstacles of the world.
         radius: Radius of the segments of a robot without link geometry [m].
 
     Raises:
         RecipeError: The robot has no link geometry, or no held object, as required.
     """
-    pairs = _pair_distances(world, kind)
-    bodies = _pairs_of_bodies(world, kind, solids, radius)
-    inflation = radius if kind == "robot" and world.robot.shape is None else 0.0
-    distance, pair = smallest_per_state(pairs)
+    places = _pairs_of_bodies(world, bodies, solids, radius)
+    inflation = radius if bodies == "robot" and world.robot.shape is None else 0.0
+    distance, pair = smallest_per_state(world.pairs(bodies))
     certified = CertifiedDistance()
-    points = [_witnesses(certified, bodies[index], k) for k, index in enumerate(pair.tolist())]
+    points = [_witnesses(certified, places[index], k) for k, index in enumerate(pair.tolist())]
     return ClosestPoints(distance - inflation, pair, np.array(points))
 
 
@@ -76,25 +73,18 @@ def smallest_per_state(pairs: PairDistances) -> tuple[Array, NDArray[np.intp]]:
     return distances, closest
 
 
-def _pair_distances(world: PathWorld, kind: Kind) -> PairDistances:
-    """Return the distances of the pairs of a kind."""
-    if kind == "object":
-        return world.object_pairs()
-    if kind == "self":
-        return world.self_pairs()
-    return world.segment_pairs() if world.robot.shape is None else world.shape_pairs()
-
-
-def _pairs_of_bodies(world: PathWorld, kind: Kind, solids: Sequence[Solid], radius: float) -> list[tuple[Place, Place]]:
-    """Return both bodies of every pair of a kind, in the order of ``_pair_distances``."""
+def _pairs_of_bodies(
+    world: PathWorld, bodies: str, solids: Sequence[Solid], radius: float
+) -> list[tuple[Place, Place]]:
+    """Return both bodies of every pair of bodies, in the order of ``PathWorld.pairs``."""
     obstacles = [_fixed(solid) for solid in solids]
-    if kind == "object":
+    if bodies == "object":
         return [(_held_object(world), obstacle) for obstacle in obstacles]
     if world.robot.shape is None:
         count = len(world.robot.capsule_axes)
         return [(_segment(world, index, radius), obstacle) for index in range(count) for obstacle in obstacles]
     shape, places = world.robot.shape, _links(world)
-    if kind == "self":
+    if bodies == "self":
         return [(places[i], places[j]) for i, j in shape.checked_pairs]
     moving = [index for index, part in enumerate(shape.convex_parts) if shape.joints[part.link]]
     return [(places[index], obstacle) for index in moving for obstacle in obstacles]

@@ -72,11 +72,7 @@ class CollisionWorld:
         return [box and coal.ComputeDistance(shape, box) for box in self._boxes]
 
     def segment_distances(self, segments: Sequence[tuple[Point, Point]]) -> list[float]:
-        """Measure the signed distance of every segment from every obstacle, segment by segment [m].
-
-        Args:
-            segments: Both ends of each segment [m].
-        """
+        """Measure the signed distance of every segment, two ends, from every obstacle, segment by segment [m]."""
         distances: list[float] = []
         for index, (a, b) in enumerate(segments):
             self._place_segment(index, a, b)
@@ -84,12 +80,7 @@ class CollisionWorld:
         return distances
 
     def segment_distance(self, a: Point, b: Point, obstacle: int) -> tuple[float, Array]:
-        """Measure the signed distance of one segment from one obstacle.
-
-        Args:
-            a: First end of the segment [m].
-            b: Second end of the segment [m].
-            obstacle: Index of the obstacle.
+        """Measure the signed distance of the segment from a to b [m] from one obstacle.
 
         Returns:
             The distance [m], minus the penetration depth if they overlap, and the separating unit vector from the
@@ -112,27 +103,12 @@ class CollisionWorld:
         self._transform.setTranslation(pose[1])
 
     def object_distances(self, position: Array, rotation: Array) -> list[float]:
-        """Measure the signed distance of the held object from every obstacle [m], negative if they overlap.
-
-        Args:
-            position: Center of the object [m], shape (3,).
-            rotation: Rotation matrix of the object, shape (3, 3).
-        """
+        """Measure the signed distance of the held object from every obstacle [m], negative if they overlap."""
         self._place_object(position, rotation)
         return self._measure(self._from_object)
 
     def object_distance(self, position: Array, rotation: Array, obstacle: int) -> tuple[float, Array]:
-        """Measure the signed distance of the held object from one obstacle.
-
-        Args:
-            position: Center of the object [m], shape (3,).
-            rotation: Rotation matrix of the object, shape (3, 3).
-            obstacle: Index of the obstacle.
-
-        Returns:
-            The distance [m], minus the penetration depth if they overlap, and the separating unit vector from the
-            obstacle to the object, shape (3,).
-        """
+        """Measure the signed distance of the held object from one obstacle; see ``segment_distance``."""
         self._place_object(position, rotation)
         return self._distance_and_normal(self._from_object, obstacle)
 

@@ -66,16 +66,10 @@ class ForwardKinematics:
         return frames[:, :3].swapaxes(1, 2), frames[:, 3]
 
     def motion_bounds(self, extents: Array, max_positions: Array) -> Array:
-        """Bound the displacement of any point of the robot per unit of motion of each joint [m].
+        """Bound the displacement of any point of the robot per unit of motion of each joint [m], shape (n,).
 
-        Args:
-            extents: Largest distance of a point of each link from the origin of the base or of its joint [m], shape
-                (n + 1,).
-            max_positions: Largest absolute joint positions, shape (n,).
-
-        Returns:
-            Motion bounds, shape (n,): the maximum distance along the chain to a point that the joint moves; 1 for
-            prismatic joints.
+        It is the maximum distance along the chain to a point that the joint moves; 1 for prismatic joints. Extents are
+        the largest distances of points of the links from the origin of the base or of their joint [m], shape (n + 1,).
         """
         lengths = self._lengths[:, 0] + self._lengths[:, 1] * max_positions
         bounds = extents[1:].copy()
@@ -101,16 +95,20 @@ class ForwardKinematics:
         return np.asarray(self._data.oMi[len(self._coefficients)].homogeneous[:3])
 
 
+def joint_motion(model: "pin.Model", joint: int) -> Array:
+    """Return the linear and the angular velocity per unit velocity of a joint in its own frame, shape (6,)."""
+    data = model.joints[joint].createData()
+    model.joints[joint].calc(data, np.zeros(model.nq), np.zeros(model.nv))
+    return np.array(data.S).reshape(6)
+
+
 def _coefficients(model: "pin.Model", joint: int) -> Array:
     """Return the coefficients of a joint's pose in the frame of its parent, shape (12, 4).
 
-    Rows 0 to 3 are the constant parts of its x, y and z axis and of its origin. Rows 4 to 7 are the coefficients of
-    sin q and rows 8 to 11 those of cos q; for a prismatic joint, rows 4 to 7 are the coefficients of q. A point is
-    (x, y, z, 1), a vector (x, y, z, 0).
+    Each four rows are its x, y and z axis and origin: constants, factors of sin q, or of q of a prismatic joint, and of
+    cos q. A point is (x, y, z, 1), a vector (x, y, z, 0).
     """
-    data = model.joints[joint].createData()
-    model.joints[joint].calc(data, np.zeros(model.nq), np.zeros(model.nv))
-    motion = np.array(data.S).reshape(6)
+    motion = joint_motion(model, joint)
     x, y, z = motion[3:]
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     placement, rows = model.jointPlacements[joint], np.zeros((12, 4))

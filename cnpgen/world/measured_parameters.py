@@ -60,11 +60,7 @@ class MeasuredParameters:
         return np.asarray(self._turn @ vector)
 
     def on_table(self, position: Array) -> Array:
-        """Return positions in the frame of the table, whose axes and origin are the world's if it is not moved.
-
-        Args:
-            position: Positions in the world frame [m], shape (3,) or (3, K).
-        """
+        """Return world positions [m], shape (3,) or (3, K), in the frame of the table, by default the world's."""
         if not self._robot.parameters.tilts_table:
             return position
         shape = 3, *[1] * (position.ndim - 1)

@@ -67,19 +67,11 @@ def smallest_distances(bounds: Array, measure: Measure, separation: Callable[[in
 def clear_states(
     bounds: Array, min_distance: float, measure: Measure, separation: Callable[[int, Array, Indices], Array]
 ) -> NDArray[np.bool_]:
-    """Find the states at which the signed distances of all M pairs of convex bodies reach a minimum.
+    """Return a mask of the states at which the signed distances of all M pairs of convex bodies reach a minimum [m].
 
     A state whose bound is too small is measured. Its separating direction also bounds the distances at the other
-    unresolved states and usually resolves most of them.
-
-    Args:
-        bounds: Initial lower bounds of the distances [m], shape (M, K).
-        min_distance: Required distance [m].
-        measure: Measures a pair at a state, as of ``smallest_distances``.
-        separation: Returns lower bounds of the distances of a pair [m] along a unit vector at J states, shape (J,).
-
-    Returns:
-        Mask of the states, shape (K,); False where a distance cannot be measured.
+    unresolved states and usually resolves most of them. States whose distance cannot be measured are not clear. Other
+    arguments are those of ``smallest_distances``.
     """
     clear = np.ones(bounds.shape[1], bool)
     proven = bounds >= min_distance
@@ -138,18 +130,16 @@ class PairDistances:
         return clear_states(self.bounds, min_distance, self.measure, self.separation)
 
     def interval_bounds(self, min_distances: Array, displacements: Array, deviations: Array) -> Array:
-        """Bound by how much the distances exceed a minimum between neighboring states.
+        """Bound by how much all distances exceed a minimum between neighboring states [m], shape (K - 1,).
 
-        Every point of a body stays within a bounded deviation from the chord between its two positions. Bodies that
-        are separated along a direction at both states are therefore separated between them, up to that deviation.
+        Every point of a body stays within a bounded deviation from the chord between its two positions. Bodies that are
+        separated along a direction at both states are therefore separated between them, up to that deviation. Bounds
+        are only tightened until they reach 0.
 
         Args:
             min_distances: Required distance of every pair [m], shape (M,).
             displacements: Maximum displacement of a point of one body in the frame of the other [m], shape (K - 1,).
             deviations: Maximum deviation of its path from the chord [m], shape (K - 1,).
-
-        Returns:
-            Lower bounds over all pairs [m], shape (K - 1,). They are only tightened until they reach 0.
         """
         margins = self.bounds - min_distances[:, None]
         intervals = (margins[:, 1:] + margins[:, :-1] - displacements) / 2 - deviations

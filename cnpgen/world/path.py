@@ -80,12 +80,12 @@ class PathWorld:
         """Move to K states.
 
         Args:
-            q: Joint positions [rad], shape (n, K), K > 0.
-            dq: Joint velocities [rad/s], shape (n, K).
-            ddq: Joint accelerations [rad/s^2], shape (n, K).
+            q: Joint positions [rad], shape (n, K), K > 0, as of velocities, accelerations and jerks.
+            dq: Joint velocities [rad/s].
+            ddq: Joint accelerations [rad/s^2].
             obstacle_poses: Poses and sizes of the obstacles (``cnpgen.robots.solid``), then values for a constraint,
                 then the parameters of the problem, shape (width,).
-            jerk: Joint jerks [rad/s^3], shape (n, K), or None if no constraint needs them.
+            jerk: Joint jerks [rad/s^3], or None if no constraint needs them.
             exact: Whether the smallest distance must be exact even if bounds prove that all distances are sufficient.
         """
         import pinocchio as pin
@@ -179,8 +179,7 @@ class PathWorld:
     def segment_distances(self, sufficient: float = np.inf) -> list[Array]:
         """Measure the signed distance of every segment of the robot from every obstacle, segment by segment [m].
 
-        Args:
-            sufficient: Distance from which lower bounds are returned without measuring, if the path is not exact [m].
+        If the path is not exact, sufficient lower bounds are returned without measuring.
 
         Returns:
             Arrays of shape (K,), of which the smallest value is exact (``cnpgen.world.pair_distances``).
@@ -209,11 +208,7 @@ class PathWorld:
     def shape_distances(self, sufficient: float = np.inf) -> list[Array]:
         """Measure the signed distance of every moving part of the robot's links from every obstacle, part by part [m].
 
-        Args:
-            sufficient: As of ``segment_distances``.
-
-        Returns:
-            Arrays of shape (K,), of which the smallest value is exact (``cnpgen.world.pair_distances``).
+        See ``segment_distances``.
 
         Raises:
             RecipeError: The robot has no link geometry.
@@ -234,6 +229,18 @@ class PathWorld:
         bodies = self._placed_bodies()
         return self._once("self", lambda: bodies.pair_distances(bodies.link_pairs))
 
+    def pairs(self, bodies: str) -> PairDistances:
+        """Return the signed distances of all pairs of some bodies.
+
+        Args:
+            bodies: "robot": links, or segments without link geometry, and obstacles; "self": links of the robot;
+                "object": the held object and obstacles; "held object": the held object and links.
+        """
+        if bodies == "robot":
+            return self.segment_pairs() if self.robot.shape is None else self.shape_pairs()
+        pairs = {"self": self.self_pairs, "object": self.object_pairs, "held object": self.held_object_pairs}
+        return pairs[bodies]()
+
     def _smallest(self, pairs: PairDistances, sufficient: float, *, of_each: bool = False) -> list[Array]:
         """Measure distances, or return their bounds if the path is not exact and all bounds are sufficient."""
         if not self._is_finite():
@@ -247,14 +254,6 @@ class PathWorld:
         if name not in self._pairs:
             self._pairs[name] = make()
         return self._pairs[name]
-
-    def clear_of_obstacles(self, min_distance: float) -> NDArray[np.bool_]:
-        """Return a mask of states: all moving parts of links keep a distance [m] from all obstacles, shape (K,)."""
-        return self.shape_pairs().clear_states(min_distance)
-
-    def clear_of_itself(self, min_distance: float) -> NDArray[np.bool_]:
-        """Return a mask of states: all parts of links that must not touch keep a distance [m], shape (K,)."""
-        return self.self_pairs().clear_states(min_distance)
 
     def held_object_distances(self, sufficient: float = np.inf) -> list[Array]:
         """Measure the signed distance of the held object from parts of links [m]; see ``shape_distances``."""
@@ -273,18 +272,10 @@ class PathWorld:
             bodies.place(self._rotations, self._origins, [])
         return self._once("held", lambda: bodies.pair_distances(bodies.link_pairs))
 
-    def clear_of_held_object(self, min_distance: float) -> NDArray[np.bool_]:
-        """Return a mask of states: the links keep a distance [m] from the held object, shape (K,)."""
-        return self.held_object_pairs().clear_states(min_distance)
-
     def motion_bounds(self, max_positions: Array) -> Array:
         """Bound the displacement of any point of the robot or the held object per unit of motion of each joint [m].
 
-        Args:
-            max_positions: Largest absolute joint positions of a motion, shape (n,), needed for prismatic joints.
-
-        Returns:
-            Motion bounds (Schwarzer et al. 2005), shape (n,).
+        Largest absolute joint positions, shape (n,), are needed for prismatic joints (Schwarzer et al. 2005).
         """
         return self._kinematics.motion_bounds(self._extents, max_positions)
 
@@ -308,13 +299,9 @@ class PathWorld:
         return self._bodies
 
     def object_distances(self, sufficient: float = np.inf) -> list[Array]:
-        """Measure the signed distance of the held object from every obstacle [m], negative if they overlap.
+        """Measure the signed distance of the held object from every obstacle [m]; see ``segment_distances``.
 
-        Args:
-            sufficient: As of ``segment_distances``.
-
-        Returns:
-            Arrays of shape (K,), of each of which the smallest value is exact (``cnpgen.world.pair_distances``).
+        The smallest value of each array is exact.
 
         Raises:
             RecipeError: The problem has no held object.
@@ -344,10 +331,7 @@ class PathWorld:
         return self._object_size
 
     def object_corners(self, states: "slice | NDArray[np.bool_]" = slice(None)) -> Array:
-        """Compute the corners of the held object [m], shape (8, 3, K).
-
-        Args:
-            states: Slice or mask of the states.
+        """Compute the corners of the held object at a slice or a mask of the states [m], shape (8, 3, K).
 
         Raises:
             RecipeError: The problem has no held object.

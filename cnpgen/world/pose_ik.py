@@ -5,17 +5,12 @@ carries. With tolerances, every step aims for the nearest pose within them, and 
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.robots.robot import Robot
-from cnpgen.world.forward_kinematics import ForwardKinematics
-
-if TYPE_CHECKING:
-    import pinocchio as pin
-
+from cnpgen.world.forward_kinematics import ForwardKinematics, joint_motion
 
 Array = NDArray[np.float64]
 
@@ -80,7 +75,7 @@ class PoseKinematics:
         self.robot, self._carrier = robot, placed.parentJoint
         self._turn, self._offset = np.array(placed.placement.rotation), np.array(placed.placement.translation)
         self._kinematics, self._joints = ForwardKinematics(model), list(model.supports[self._carrier])[1:]
-        self._motions = [_motion(model, joint) for joint in range(1, model.njoints)]
+        self._motions = [joint_motion(model, joint) for joint in range(1, model.njoints)]
 
     def evaluate(self, q: Array) -> tuple[Array, Array, Array]:
         """Compute poses and Jacobians.
@@ -102,13 +97,6 @@ class PoseKinematics:
             J[:, :3, joint - 1] = linear + np.cross(angular, position - points[:, joint])
             J[:, 3:, joint - 1] = angular
         return position, turns[:, self._carrier] @ self._turn, J
-
-
-def _motion(model: "pin.Model", joint: int) -> Array:
-    """Return the linear and the angular velocity per unit velocity of a joint in its own frame, shape (6,)."""
-    data = model.joints[joint].createData()
-    model.joints[joint].calc(data, np.zeros(model.nq), np.zeros(model.nv))
-    return np.array(data.S).reshape(6)
 
 
 def solve_pose_ik(

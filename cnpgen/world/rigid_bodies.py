@@ -75,12 +75,10 @@ class RigidBodies:
         self._set_obstacles([])
 
     def place(self, rotations: Array, positions: Array, solids: Sequence[Solid]) -> None:
-        """Move to K states.
+        """Move to K states and place the obstacles.
 
-        Args:
-            rotations: Rotation matrices of the joints' frames, that of the base first, shape (n + 1, 3, 3, K).
-            positions: Origins of the joints' frames [m], shape (n + 1, 3, K).
-            solids: Solids of the obstacles.
+        Rotation matrices of the joints' frames, that of the base first, have shape (n + 1, 3, 3, K), their origins [m]
+        (n + 1, 3, K).
         """
         count = rotations.shape[-1]
         if len(solids) != len(self._solids) or not all(map(same_shape, solids, self._solids)):
@@ -100,11 +98,7 @@ class RigidBodies:
         self._centers, self._radii, self._half_sizes = map(np.array, zip(*self._balls, *boxes, strict=True))
 
     def pair_distances(self, pairs: Pairs) -> PairDistances:
-        """Return the signed distances of pairs of bodies; minus the penetration depth if they overlap.
-
-        Args:
-            pairs: ``obstacle_pairs`` or ``link_pairs``.
-        """
+        """Return the signed distances of ``obstacle_pairs`` or ``link_pairs``; overlaps are negative."""
         bodies = [(a, b) for a, b in pairs.tolist()]
 
         def measure(pair: int, k: int) -> tuple[float, Array]:
@@ -116,13 +110,9 @@ class RigidBodies:
         return PairDistances(self._bounds(pairs), measure, separation)
 
     def contacts(self, pairs: Pairs, within: float) -> Contacts:
-        """Measure all pairs of bodies at states where their signed distance is below ``within`` [m].
+        """Measure ``obstacle_pairs`` or ``link_pairs`` at states where their signed distance is below ``within`` [m].
 
         The separating direction of a pair that is farther at one state also excludes most of the other states.
-
-        Args:
-            pairs: ``obstacle_pairs`` or ``link_pairs``.
-            within: Distance below which a pair is returned [m].
         """
         near, contacts = ~(self._bounds(pairs) >= within), list[Any]()
         for pair in np.flatnonzero(near.any(axis=1)).tolist():

@@ -4,6 +4,8 @@ The signed distance of two convex bodies (minus the penetration depth if they ov
 u of their separation ``min over a of u . a - max over b of u . b``: any u gives a lower bound. Faces of the boxes and
 of the body are evaluated at all states at once; better directions come from measurements
 (``cnpgen.world.pair_distances``).
+
+Cuboids have centers [m], shape (3, K), rotation matrices, shape (3, 3, K), and edge lengths [m], shape (3,).
 """
 
 from collections.abc import Sequence
@@ -17,48 +19,24 @@ Array = NDArray[np.float64]
 
 
 def separation(vertices: Array, solid: Solid, direction: Array) -> Array:
-    """Compute the separation of a convex body from a solid along a direction, at every state [m].
+    """Compute the separation of a convex body from a solid along a direction, at every state [m], shape (K,).
 
-    Args:
-        vertices: Vertices of the body [m], shape (V, 3, K).
-        solid: Solid of the obstacle.
-        direction: Unit vector from the solid to the body, shape (3,).
-
-    Returns:
-        Separations, shape (K,).
+    Vertices of the body [m] have shape (V, 3, K); the direction is a unit vector from the solid to the body.
     """
     return np.asarray((direction @ vertices).min(axis=0) - solid.furthest(direction))
 
 
 def cuboid_separation(position: Array, rotation: Array, size: Array, solid: Solid, direction: Array) -> Array:
-    """Compute the separation of a cuboid from a solid along a direction, at every state [m].
-
-    Args:
-        position: Centers of the cuboid [m], shape (3, K).
-        rotation: Rotation matrices of the cuboid, shape (3, 3, K).
-        size: Edge lengths of the cuboid [m], shape (3,).
-        solid: Solid of the obstacle.
-        direction: Unit vector from the solid to the cuboid, shape (3,).
-
-    Returns:
-        Separations, shape (K,).
-    """
+    """Compute the separation of a cuboid from a solid along a unit vector to it, at every state [m], shape (K,)."""
     reach = (size / 2) @ np.abs(np.einsum("i,ijk->jk", direction, rotation))
     return np.asarray(direction @ position - reach - solid.furthest(direction))
 
 
 def gaps(low: Array, high: Array, solids: Sequence[Solid]) -> Array:
-    """Bound the distances of axis-aligned boxes from S solids.
+    """Bound the distances of axis-aligned boxes from S solids [m], shape (..., S, K).
 
-    If there are gaps along several axes, the distance is at least the length of the vector that they form.
-
-    Args:
-        low: Lowest coordinates of the boxes [m], shape (..., 3, K).
-        high: Highest coordinates of the boxes [m], same shape.
-        solids: Solids of the obstacles.
-
-    Returns:
-        Lower bounds [m], shape (..., S, K).
+    If there are gaps along several axes, the distance is at least the length of the vector that they form. Lowest and
+    highest coordinates of the boxes [m] have shape (..., 3, K).
     """
     floor, top = _boxes(solids)
     gap = np.maximum(low[..., None, :, :] - top[..., None], floor[..., None] - high[..., None, :, :])
@@ -68,17 +46,7 @@ def gaps(low: Array, high: Array, solids: Sequence[Solid]) -> Array:
 
 
 def cuboid_gaps(position: Array, rotation: Array, size: Array, solids: Sequence[Solid]) -> Array:
-    """Bound the signed distances of a cuboid from S solids by its faces and those of the solids' bounding boxes.
-
-    Args:
-        position: Centers of the cuboid [m], shape (3, K).
-        rotation: Rotation matrices of the cuboid, shape (3, 3, K).
-        size: Edge lengths of the cuboid [m], shape (3,).
-        solids: Solids of the obstacles.
-
-    Returns:
-        Lower bounds [m], shape (S, K).
-    """
+    """Bound the signed distances of a cuboid from S solids by its faces and their bounding boxes [m], shape (S, K)."""
     turned, (floor, top) = np.abs(rotation), _boxes(solids)
     reach = np.einsum("ijk,j->ik", turned, size / 2)  # of the cuboid along the world axes
     offset = position - (floor + top)[..., None] / 2

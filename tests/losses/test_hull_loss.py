@@ -11,7 +11,7 @@ from cnpgen.plans.scene_plans import shape_of, with_capacity
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem_file import load_problem
 from cnpgen.problems.scenes.scene_problem import make_mesh
-from cnpgen.robots.observation.scene_primitives import scene_primitives
+from cnpgen.robots.observation.primitives import scene_primitives
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.convex_part import turned
 from cnpgen.robots.shape.hull import CUBE

@@ -9,9 +9,9 @@ import pytest
 import cnpgen
 from cnpgen.errors import UsageError
 from cnpgen.plans.plans import make_plans
+from cnpgen.problems.constraints.axis import Vertical
 from cnpgen.problems.constraints.clearance import ObjectContact
 from cnpgen.problems.constraints.object_clearance import ObjectClearance
-from cnpgen.problems.constraints.vertical import Vertical
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.scene import PARKED_POSITION_M
 from cnpgen.robots.solid import place_obstacles

@@ -13,7 +13,7 @@ import pytest
 
 from cnpgen.kernels.symbolic.linalg import symbols
 from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
-from cnpgen.problems.constraints.axis import Axis
+from cnpgen.problems.constraints.axis import Axis, Vertical
 from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
 from cnpgen.problems.constraints.constraint import BOUNDARY_TOLERANCES, Condition, Constraint
 from cnpgen.problems.constraints.joint import JointAcceleration, JointJerk, JointPosition, JointTorque, JointVelocity
@@ -26,7 +26,6 @@ from cnpgen.problems.constraints.puck_contact import PuckContact
 from cnpgen.problems.constraints.self_clearance import SelfClearance
 from cnpgen.problems.constraints.table import Table
 from cnpgen.problems.constraints.tip_speed import TipSpeed
-from cnpgen.problems.constraints.vertical import Vertical
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_file import load_problem

@@ -108,7 +108,7 @@ def test_clear_states_agree_with_single_states(crane, what, monkeypatch):
     bodies, calls = path._placed_bodies(), []
     real = type(bodies)._measure
     monkeypatch.setattr(type(bodies), "_measure", lambda *x: (calls.append(1), real(*x))[1])
-    clear = path.clear_of_obstacles if what == "shape" else path.clear_of_itself
+    clear = path.pairs("robot" if what == "shape" else "self").clear_states
     for least in (-0.01, 0.0, 0.02):
         expected = np.array(nearest) >= least
         assert 0.02 < expected.mean() < 0.98

@@ -143,13 +143,7 @@ def _to_bernstein_form(points: int, degree: int, orders: tuple[int, ...], edges:
 
 
 def _polar(knots: Array, last: int, arguments: list[float]) -> Array:
-    """Return the weights of all control points in a polar form, by de Boor's recursion, shape (C,).
-
-    Args:
-        knots: Knots.
-        last: Index of the last control point with a nonzero weight between these knots.
-        arguments: Phases, as many as the degree.
-    """
+    """Return the weights of control points in a polar form, by de Boor's recursion, shape (C,); none after ``last``."""
     degree = len(arguments)
     weights = np.eye(len(knots) - degree - 1)[last - degree : last + 1]
     for p, s in enumerate(arguments, start=1):
@@ -170,10 +164,7 @@ def _product(a: Array, b: Array) -> Array:
 
 @cache
 def _products(i: int, j: int) -> Array:
-    """Return the matrix from a function's coefficients to its multiplication matrix, shape (j+1, (i+j+1) (i+1)).
-
-    The multiplication matrix maps coefficients of a function of degree i to those of the product.
-    """
+    """Return the matrix from coefficients to a matrix of multiplication, shape (j + 1, (i + j + 1) (i + 1))."""
     matrix = np.zeros((j + 1, i + j + 1, i + 1))
     for k in range(i + 1):
         for m in range(j + 1):
@@ -183,10 +174,7 @@ def _products(i: int, j: int) -> Array:
 
 @cache
 def _subdivision(size: int, parts: int) -> Array:
-    """Return de Casteljau's matrix for parts of equal length, a power of 2, shape (parts (d + 1), d + 1).
-
-    It maps coefficients to the first ones of all parts, then the second ones of all parts, and so on.
-    """
+    """Return de Casteljau's matrix for equal parts, all first coefficients first, shape (parts (d + 1), d + 1)."""
     first = np.array([[comb(k, m) / 2**k for m in range(size)] for k in range(size)])
     matrices = [np.eye(size)]
     while len(matrices) < parts:

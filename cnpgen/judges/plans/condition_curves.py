@@ -9,13 +9,11 @@ from numpy.typing import NDArray
 
 from cnpgen.judges.plans.joint_limits import is_proven
 from cnpgen.judges.plans.measure import MeasuredCondition, measure, name_part
-from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
-from cnpgen.problems.constraints.constraint import Constraint
+from cnpgen.problems.constraints.clearance import DistanceConstraint
 from cnpgen.problems.constraints.joint import JointTorque
-from cnpgen.problems.constraints.self_clearance import SelfClearance
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.solid import Solid
-from cnpgen.world.closest_points import ClosestPoints, Kind, closest_points
+from cnpgen.world.closest_points import closest_points
 from cnpgen.world.path import PathWorld
 from cnpgen.world.world import World
 
@@ -67,20 +65,13 @@ def plot_unit(unit: str) -> tuple[float, str]:
 
 
 def condition_curves(problem: Problem, world: PathWorld, s: Array, solids: Sequence[Solid]) -> list[ConditionCurve]:
-    """Measure all conditions that are no limits of joints, at every state.
-
-    Args:
-        problem: The problem.
-        world: The robot along a motion, among the obstacles of the motion.
-        s: Phases of the states, shape (K,).
-        solids: The obstacles of the motion.
-    """
+    """Measure all conditions that are no limits of joints at phases s, shape (K,), where the robot is."""
     start_tip = world.tip_position[:, 0].copy()
     curves: list[ConditionCurve] = []
     for constraint in problem.constraint:
         if is_proven(constraint) or isinstance(constraint, JointTorque):
             continue
-        if isinstance(constraint, RobotClearance | SelfClearance | ObjectContact):
+        if isinstance(constraint, DistanceConstraint) and constraint.bodies != "held object":
             curves += _distance_curves(problem, constraint, world, solids)
         else:
             curves += _value_curves(problem, measure(constraint, world, s, start_tip))
@@ -128,28 +119,18 @@ def _tilt_curve(condition: MeasuredCondition) -> ConditionCurve:
 
 
 def _distance_curves(
-    problem: Problem, constraint: Constraint, world: PathWorld, solids: Sequence[Solid]
+    problem: Problem, constraint: DistanceConstraint, world: PathWorld, solids: Sequence[Solid]
 ) -> Iterator[ConditionCurve]:
     """Measure the smallest distance of a constraint on distances at every state, with the closest points."""
-    kind: Kind = "object" if isinstance(constraint, ObjectContact) else "robot"
-    kind = "self" if isinstance(constraint, SelfClearance) else kind
     (stated,) = constraint.judged(cast(World, world))
     if not stated.g:
         return
-    radius = (problem.arm_radius or 0.0) if kind == "robot" and world.robot.shape is None else 0.0
-    closest: ClosestPoints = closest_points(world, kind, solids, radius=radius)
+    radius = (problem.arm_radius or 0.0) if constraint.bodies == "robot" and world.robot.shape is None else 0.0
+    closest = closest_points(world, constraint.bodies, solids, radius=radius)
     count = len(closest.distance)
     least = np.full(count, 1e3 * (float(stated.lower[0]) - radius))
     names = [name_part(problem, constraint, stated, i) for i in range(len(stated.g))]
-    yield ConditionCurve(
-        stated.name,
-        stated.name,
-        "mm",
-        ("",),
-        1e3 * closest.distance[None],
-        least,
-        np.full(count, np.inf),
-        1e3 * float(constraint.allowed(stated)[0]),
-        closest.points,
-        tuple(names[pair] for pair in closest.pair),
-    )
+    pairs, tolerance = tuple(names[pair] for pair in closest.pair), 1e3 * float(constraint.allowed(stated)[0])
+    values, unbounded = 1e3 * closest.distance[None], np.full(count, np.inf)
+    name = stated.name
+    yield ConditionCurve(name, name, "mm", ("",), values, least, unbounded, tolerance, closest.points, pairs)

@@ -20,10 +20,8 @@ from numpy.typing import NDArray
 from cnpgen.judges.plans.judged_curve import Curve
 from cnpgen.judges.plans.measure import EvaluationContext, MeasuredCondition
 from cnpgen.judges.plans.verdict import Margin
-from cnpgen.problems.constraints.clearance import ObjectContact, RobotClearance
+from cnpgen.problems.constraints.clearance import DistanceConstraint
 from cnpgen.problems.constraints.constraint import Constraint
-from cnpgen.problems.constraints.object_clearance import ObjectClearance
-from cnpgen.problems.constraints.self_clearance import SelfClearance
 from cnpgen.world.pair_distances import PairDistances
 from cnpgen.world.path import PathWorld
 
@@ -37,7 +35,7 @@ MINIMUM_LEVELS = 2  # of subdivision around the smallest margin, even if it cann
 
 def is_contact(constraint: Constraint) -> bool:
     """Return whether a constraint is about distances of bodies, which have kinks where the closest features change."""
-    return isinstance(constraint, ObjectClearance | ObjectContact | RobotClearance | SelfClearance)
+    return isinstance(constraint, DistanceConstraint)
 
 
 @dataclass(frozen=True)
@@ -71,9 +69,8 @@ def check_continuous_collision(
 ) -> Iterator[tuple[MeasuredCondition, Margin]]:
     """Yield contact conditions and their margins between samples: around the smallest, and in unresolved intervals.
 
-    Args:
-        context: A motion whose world is at its samples; the world is moved.
-        early_exit: Whether to subdivide only if it can change the verdict or the size of a violation.
+    The world of the context is at its samples, and is moved. With early exit, intervals are subdivided only if it can
+    change the verdict or the size of a violation.
     """
     contacts = [condition for condition in context.measured if is_contact(condition.constraint)]
     if not contacts:
@@ -106,10 +103,7 @@ def _subdivisions(
 def _intervals(
     context: EvaluationContext, s: Array, contacts: Sequence[MeasuredCondition], motion_bounds: Array
 ) -> list[Intervals]:
-    """Return, for each contact condition, the intervals between neighbors in rows of phases s, where the world is.
-
-    ``s`` has shape (rows, K).
-    """
+    """Return the intervals of each contact between neighbors in rows of phases, shape (rows, K), where the world is."""
     world, last = context.world, s.shape[1] - 1
     displacements = motion_bounds @ np.abs(world.q[:, 1:] - world.q[:, :-1])
     displacements[last :: last + 1] = -np.inf  # between rows there is no interval
@@ -129,13 +123,8 @@ def _intervals(
 
 def pairs_of(world: PathWorld, constraint: Constraint) -> PairDistances:
     """Return the distances of a contact constraint, one pair for each of its values."""
-    if isinstance(constraint, ObjectContact):
-        return world.object_pairs()
-    if isinstance(constraint, SelfClearance):
-        return world.self_pairs()
-    if isinstance(constraint, ObjectClearance):
-        return world.held_object_pairs()
-    return world.segment_pairs() if world.robot.shape is None else world.shape_pairs()
+    assert isinstance(constraint, DistanceConstraint)
+    return world.pairs(constraint.bodies)
 
 
 def chord_deviation_bounds(curve: Curve, s: Array, motion_bounds: Array) -> Array:

@@ -18,11 +18,7 @@ PATH_ORDERS = 3  # derivatives of the path for accelerations, including order 0;
 
 @dataclass(frozen=True, eq=False)
 class Phases:
-    """Phases at which many motions are evaluated.
-
-    Attributes:
-        s: Phases, ascending, in [0, 1], shape (K,).
-    """
+    """Phases, ascending, in [0, 1], shape (K,), at which many motions are evaluated."""
 
     s: Array
 
@@ -49,14 +45,9 @@ class EvaluatedTrajectory:
 
 
 def evaluate_trajectory(motion: Motion, s: Array, *, jerk: bool = False) -> EvaluatedTrajectory:
-    """Evaluate one motion at phases s.
+    """Evaluate one motion at phases s in [0, 1], shape (K,), optionally with jerks.
 
     For many phases of one motion this takes a tenth of the time of ``Motion.at``.
-
-    Args:
-        motion: One motion.
-        s: Phases in [0, 1], shape (K,).
-        jerk: Whether to evaluate jerks.
     """
     orders = PATH_ORDERS + jerk
     p = spline_derivatives(motion.path[0], motion.degree, s, orders=orders)

@@ -82,14 +82,10 @@ class ProvenJointLimits:
     def margins(
         self, world: PathWorld, polynomials: PiecewisePolynomials, s: Array, table: Array, *, early_exit: bool
     ) -> list[Margin]:
-        """Find where a motion comes closest to violating each limit, or violates it most.
+        """Find where a motion, as polynomials, comes closest to violating each limit, or violates it most.
 
-        Args:
-            world: The robot at the samples.
-            polynomials: The motion as polynomials.
-            s: Phases of the samples, shape (K,).
-            table: Times of the motion (``time_table``).
-            early_exit: Whether the margin at the samples is enough if a limit is proven to hold.
+        The world is at its samples, phases of shape (K,); the table is that of ``time_table``. With early exit, the
+        margin at the samples is enough if a limit is proven to hold.
         """
         if not self.constraints:
             return []
@@ -155,12 +151,7 @@ class ProvenJointLimits:
 
 
 def joint_limits(problem: Problem, world: PathWorld) -> ProvenJointLimits:
-    """Return the joint limits of a problem that are proven.
-
-    Args:
-        problem: The problem.
-        world: Its robot at any state with a jerk; the bounds do not depend on the state.
-    """
+    """Return the joint limits of a problem that are proven; its robot may be at any state with a jerk."""
     constraints = tuple(constraint for constraint in problem.constraint if is_proven(constraint))
     conditions = tuple(constraint.measured(cast(World, world))[0] for constraint in constraints)
     shape = len(constraints), world.robot.n

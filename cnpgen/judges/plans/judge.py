@@ -124,10 +124,7 @@ class Judge:
         """
         plans = self._plans(motion, boundary, scene, goal_xyz)
         with np.errstate(all="ignore"):  # overflows give inf or nan, which are detected
-            return [
-                _judge_plan(plan, self._world, self._limits, self._step, early_exit=early_exit, tube=self._tube)
-                for plan in plans
-            ]
+            return [self._judge(plan, early_exit=early_exit) for plan in plans]
 
     def refutes(self, motion: Motion, boundary: Boundary, scene: Scene, goal_xyz: Array) -> list[bool]:
         """Return for N plans whether a few samples prove that they are invalid; False proves nothing."""
@@ -135,12 +132,37 @@ class Judge:
         with np.errstate(all="ignore"):
             return [_is_refuted(plan, self._world) for plan in plans]
 
+    def _judge(self, plan: "_Plan", *, early_exit: bool) -> Verdict:
+        """Judge one plan."""
+        if reason := _invalid_reason(plan):
+            return Verdict(reason)
+        cells = EARLY_EXIT_CELLS if early_exit else TABLE_CELLS
+        table = time_table(plan.motion.rate[0], plan.motion.degree, cells=cells)
+        sampled = _sampled_for_early_exit(plan, table) if early_exit else _sampled(plan, table, self._step)
+        if sampled is None:
+            return Verdict(Reason.TOO_LONG, metrics=Metrics(duration=float(table[1, -1])))
+        (states, samples), world = sampled, self._world
+        if not states.is_finite():
+            return Verdict(Reason.NOT_FINITE, metrics=Metrics(duration=float(samples.t[-1])), samples=len(samples.s))
+        world.set_path(states.q, states.dq, states.ddq, plan.obstacle_poses, states.jerk, exact=not early_exit)
+        ends = boundary_margins(states, plan.boundary, samples, world.robot)
+        metrics, paper = Metrics(), PaperRule()
+        if not early_exit:
+            metrics = metrics_of(plan.problem, world, samples, jerks(plan.motion, samples.s))
+            paper = paper_rule(plan.problem, world, plan.obstacle_poses, plan.goal_xyz)
+        curve = SplineCurve(plan.motion)
+        context = evaluation_context(plan.problem, curve, plan.obstacle_poses, world, samples, table)
+        context = context if self._tube is None else self._tube.widen(context)
+        motion = polynomials(plan.motion, jerk=plan.problem.uses_jerk)
+        margins = [*ends, *_margins(context, motion, self._limits, early_exit=early_exit)]
+        return Verdict(reason_of(margins), by_name(margins), metrics, paper, len(samples.s))
+
     def _plans(self, motion: Motion, boundary: Boundary, scene: Scene, goal_xyz: Array) -> "list[_Plan]":
         _check_shapes(self._robot, motion, boundary, scene, goal_xyz)
         return [
             _Plan(
                 self._problem,
-                Motion(motion.path[i : i + 1], motion.rate[i : i + 1], motion.degree),
+                motion[i : i + 1],
                 boundary[i : i + 1],
                 scene.poses[i],
                 goal_xyz[i],
@@ -161,15 +183,7 @@ def check_step(step: float) -> None:
 
 @dataclass(frozen=True)
 class _Plan:
-    """One motion with its problem and boundary conditions.
-
-    Attributes:
-        problem: The problem.
-        motion: One motion.
-        boundary: Boundary conditions of the motion.
-        obstacle_poses: Poses and sizes of the obstacles, shape (width,).
-        goal_xyz: Tip position of the goal [m], shape (3,).
-    """
+    """One motion with its problem, boundary conditions, obstacle poses, shape (width,), and goal of the tip [m]."""
 
     problem: Problem
     motion: Motion
@@ -195,10 +209,7 @@ class _Plan:
 
 @lru_cache(maxsize=8)
 def _corners(path_points: int, rate_points: int, degree: int, kinks: tuple[float, ...]) -> frozenset[float]:
-    """Return the knots of both splines, and two phases on either side of each kink.
-
-    Second differences across a kink are no estimates of the second derivative next to it.
-    """
+    """Return knots and two phases on either side of kinks, across which second differences estimate no derivative."""
     return knots(path_points, rate_points, degree).union(s + k * KINK_OFFSET for s in kinks for k in range(-2, 3))
 
 
@@ -217,39 +228,6 @@ def _check_shapes(robot: Robot, motion: Motion, boundary: Boundary, scene: Scene
             raise UsageError(
                 f"{name} must have shape {shape} for {n_plans} plans of {n} joints, got {np.shape(values)}"
             )
-
-
-def _judge_plan(
-    plan: _Plan,
-    world: PathWorld,
-    limits: ProvenJointLimits,
-    step: float,
-    *,
-    early_exit: bool,
-    tube: TrackingTube | None,
-) -> Verdict:
-    """Judge one plan."""
-    if reason := _invalid_reason(plan):
-        return Verdict(reason)
-    table = time_table(plan.motion.rate[0], plan.motion.degree, cells=EARLY_EXIT_CELLS if early_exit else TABLE_CELLS)
-    sampled = _sampled_for_early_exit(plan, table) if early_exit else _sampled(plan, table, step)
-    if sampled is None:
-        return Verdict(Reason.TOO_LONG, metrics=Metrics(duration=float(table[1, -1])))
-    states, samples = sampled
-    if not states.is_finite():
-        return Verdict(Reason.NOT_FINITE, metrics=Metrics(duration=float(samples.t[-1])), samples=len(samples.s))
-    world.set_path(states.q, states.dq, states.ddq, plan.obstacle_poses, states.jerk, exact=not early_exit)
-    ends = boundary_margins(states, plan.boundary, samples, world.robot)
-    metrics, paper = Metrics(), PaperRule()
-    if not early_exit:
-        metrics = metrics_of(plan.problem, world, samples, jerks(plan.motion, samples.s))
-        paper = paper_rule(plan.problem, world, plan.obstacle_poses, plan.goal_xyz)
-    curve = SplineCurve(plan.motion)
-    context = evaluation_context(plan.problem, curve, plan.obstacle_poses, world, samples, table)
-    context = context if tube is None else tube.widen(context)
-    motion = polynomials(plan.motion, jerk=plan.problem.uses_jerk)
-    margins = [*ends, *_margins(context, motion, limits, early_exit=early_exit)]
-    return Verdict(reason_of(margins), by_name(margins), metrics, paper, len(samples.s))
 
 
 def _margins(

@@ -45,11 +45,7 @@ class Curve(Protocol):
 
 @dataclass(frozen=True)
 class SplineCurve:
-    """One motion as two B-splines.
-
-    Attributes:
-        motion: One motion.
-    """
+    """One motion as two B-splines."""
 
     motion: Motion
 

@@ -46,10 +46,7 @@ class _SampledValues:
     violation: Array
 
     def promising(self, largest: Array) -> tuple[Indices, Indices, Array]:
-        """Find intervals that may contain a relevant maximum, the highest estimate first.
-
-        Args:
-            largest: Largest known violation of every condition.
+        """Find intervals that may contain a larger maximum than the known ones, the highest estimate first.
 
         Returns:
             ``(of, part, ends)`` of I intervals; ends have shape (I, 2).
@@ -67,11 +64,7 @@ class _SampledValues:
 
 
 def check_local_maxima(context: EvaluationContext) -> Iterator[tuple[MeasuredCondition, Margin]]:
-    """Yield smooth conditions and their margins in intervals that could change the verdict.
-
-    Args:
-        context: A motion; its world is moved.
-    """
+    """Yield smooth conditions and their margins in intervals that could change the verdict; the world is moved."""
     smooth = [condition for condition in context.measured if not is_contact(condition.constraint)]
     largest = np.array([condition.relative_violation.max() for condition in smooth])
     values = _initial_values(context.samples.s, smooth)

@@ -40,14 +40,7 @@ _PER_JOINT = JointPosition | JointVelocity | JointAcceleration | JointJerk | Joi
 
 
 def boundary_margins(states: EvaluatedTrajectory, boundary: Boundary, samples: Samples, robot: Robot) -> list[Margin]:
-    """Compare the ends of a motion with its boundary conditions.
-
-    Args:
-        states: States of one motion, including both ends.
-        boundary: Boundary conditions of one motion.
-        samples: Times and phases of the states.
-        robot: The robot.
-    """
+    """Compare the ends of one motion with its boundary conditions; the states include both ends."""
     margins = []
     for quantity, (name, unit, tolerance) in BOUNDARY_TOLERANCES.items():
         start, goal = getattr(boundary, f"start_{quantity}"), getattr(boundary, f"goal_{quantity}")
@@ -152,14 +145,7 @@ def by_name(margins: list[Margin]) -> dict[str, Margin]:
 
 
 def name_part(problem: Problem, constraint: Constraint, condition: Condition, part: int) -> str:
-    """Name one of a condition's values: empty if it is the only one, a number for constraints of plug-ins.
-
-    Args:
-        problem: The problem.
-        constraint: Constraint that the condition belongs to.
-        condition: The condition.
-        part: Index of the value.
-    """
+    """Name one of a condition's values by its index: empty if it is the only one, a number for those of plug-ins."""
     if len(condition.g) == 1:
         return ""
     if isinstance(constraint, _PER_JOINT):
@@ -225,17 +211,7 @@ def evaluation_context(  # noqa: PLR0917 - all of them are independent inputs
     table: Array,
     phase_of: Callable[[Array], Array] | None = None,
 ) -> EvaluationContext:
-    """Measure all conditions of one motion that are not proven, at the samples where the robot is.
-
-    Args:
-        problem: The problem.
-        curve: One motion.
-        obstacle_poses: Poses and sizes of the obstacles, shape (width,).
-        world: The robot at the samples.
-        samples: Times and phases of the samples.
-        table: Times of the motion (``time_table``).
-        phase_of: See ``EvaluationContext``.
-    """
+    """Measure all conditions that are not proven where the robot is; arguments as of ``EvaluationContext``."""
     start_tip = world.tip_position[:, 0].copy()
     constraints = [constraint for constraint in problem.constraint if not is_proven(constraint)]
     phases = samples.s if phase_of is None else phase_of(samples.s)

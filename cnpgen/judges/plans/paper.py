@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 
 from cnpgen.judges.plans.sampling import Samples
 from cnpgen.judges.plans.verdict import Metrics, PaperRule
+from cnpgen.problems.constraints.axis import Vertical
 from cnpgen.problems.constraints.clearance import ObjectContact
 from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.constraints.joint import JointAcceleration, JointTorque, JointVelocity
 from cnpgen.problems.constraints.table import Table
-from cnpgen.problems.constraints.vertical import Vertical
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.solid import solids_of
 from cnpgen.world.path import PathWorld
@@ -38,13 +38,9 @@ MAX_OBJECT_DEPTH_M = 0.02
 
 
 def paper_rule(problem: Problem, world: PathWorld, obstacle_poses: Array, goal_xyz: Array) -> PaperRule:
-    """Judge one motion by the paper's rules.
+    """Judge one motion by the paper's rules; the world is at its samples.
 
-    Args:
-        problem: The problem.
-        world: Its robot at the samples of the motion.
-        obstacle_poses: Poses and sizes of the obstacles, shape (width,).
-        goal_xyz: Tip position of the goal [m], shape (3,).
+    Poses and sizes of the obstacles have shape (width,), the tip position of the goal [m] (3,).
     """
     finished = bool(np.linalg.norm(world.tip_position[:, -1] - goal_xyz) < MAX_GOAL_DISTANCE_M)
     broken = tuple(reason for reason, ok in _checks(problem, world, obstacle_poses) if not ok)
@@ -114,14 +110,7 @@ def _is_clear(problem: Problem, world: PathWorld, obstacle_poses: Array) -> bool
 
 
 def metrics_of(problem: Problem, world: PathWorld, samples: Samples, jerk: Array) -> Metrics:
-    """Compute the metrics of one motion.
-
-    Args:
-        problem: The problem.
-        world: Its robot at the samples.
-        samples: Times and phases of the samples.
-        jerk: Joint jerks at the samples [rad/s^3], shape (n, K); nan if unknown.
-    """
+    """Compute the metrics of one motion from its joint jerks at the samples [rad/s^3], shape (n, K); nan if unknown."""
     robot = world.robot
     torque_ratio = world.torque / robot.torque_limit[:, None]
     table, tip = problem.first(Table), world.parameters.on_table(world.tip_position)

@@ -47,19 +47,11 @@ def plot_plan(
     note: str = "",
     verdict: Verdict | None = None,
 ) -> None:
-    """Draw one plan: joints relative to their limits, other conditions with their bounds, and the tip.
+    """Draw one of N motions: joints relative to their limits, other conditions with their bounds, and the tip.
 
-    States at which a condition is violated are marked, and so are the violations of the verdict.
-
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        motion: N motions.
-        index: Index of the motion.
-        path: Image file, ``.png``, ``.pdf`` or ``.svg``; overwritten if it exists.
-        scene: Obstacles of this motion; by default from its ends.
-        note: Additional text of the title.
-        verdict: The verdict on this motion, whose violations are marked.
+    States at which a condition is violated are marked, and so are the violations of the verdict. An existing image
+    file, ``.png``, ``.pdf`` or ``.svg``, is overwritten. Obstacles are by default those of the motion's ends. The note
+    is additional text of the title.
 
     Raises:
         UsageError: There is no such plan, or it cannot be evaluated.
@@ -67,7 +59,7 @@ def plot_plan(
     """
     if not 0 <= index < len(motion):
         raise UsageError(f"there is no plan {index}, expected 0 to {len(motion) - 1}")
-    one = Motion(motion.path[index : index + 1], motion.rate[index : index + 1], motion.degree)
+    one = motion[index : index + 1]
     margins = [] if verdict is None else [margin for margin in verdict.margins.values() if not margin.ok]
     with np.errstate(all="ignore"):
         world, s, t = along(problem, robot, one, index, extra_times=[margin.time for margin in margins])
@@ -86,18 +78,7 @@ def draw_path(
     title: str,
     margins: Sequence[Margin],
 ) -> None:
-    """Draw joints, conditions and tip of a path in a figure.
-
-    Args:
-        problem: The problem.
-        world: The robot at K times.
-        s: Phases, shape (K,).
-        t: Times [s], shape (K,).
-        path: Image file.
-        scene: Obstacles of the motion; None if its ends place them.
-        title: Title of the figure.
-        margins: Violations to mark.
-    """
+    """Draw joints, conditions and tip of a path at phases s and times t [s], shape (K,), and violations."""
     with np.errstate(all="ignore"):
         if scene is None:
             ends = world.tip_position[:, :1].T, world.tip_position[:, -1:].T
@@ -131,16 +112,9 @@ def along(
     extra_times: Sequence[float] = (),
     scene: Scene | None = None,
 ) -> tuple[PathWorld, Array, Array]:
-    """Place the robot at K times of one motion, uniformly spaced but for extra ones.
+    """Place the robot at K times of one motion, uniformly spaced but for extra ones [s].
 
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        motion: The motion.
-        index: Index of the plan in error messages.
-        samples: Number of uniformly spaced times.
-        extra_times: Further times [s].
-        scene: Obstacles of the motion; by default those of the problem, which matter for distances only.
+    The index is that of error messages. Obstacles, by default those of the problem, matter for distances only.
 
     Returns:
         The world, phases, and times [s], shape (K,) each.
@@ -243,18 +217,21 @@ def _draw_limits(axis: "Axes", largest: float) -> None:
 
 def _draw_over_table(figure: "SubFigure", table: Table, world: PathWorld, s: Array, t: Array) -> None:
     """Draw the tip from above in the rectangle, and its height over time in the valid band."""
+    from matplotlib.patches import Rectangle
+
     above, beside = figure.subplots(2, 1, height_ratios=[1.5, 1.0])
     x, y, z = world.parameters.on_table(world.tip_position)
     low, high = table.bounds_of(world.parameters.values)
-    _draw_rectangle(above, (low[0], high[0]), (low[1], high[1]), fill=False)
+    width, height = high[0] - low[0], high[1] - low[1]
+    above.add_patch(Rectangle((low[0], low[1]), width, height, fill=False, edgecolor=_LIMIT, zorder=0))
     _draw_tip_path(above, x, y)
     above.set_aspect("equal")
     above.margins(0.08)
     above.set(xlabel="x [m]", ylabel="y [m]", title="tip over the table, one dot per 20 ms")
     ticks = np.arange(0.0, t[-1], 0.02)
     above.plot(np.interp(ticks, t, x), np.interp(ticks, t, y), ".", color="black", markersize=4)
-    height = table.measured(cast(World, world))[1]
-    band = 1e3 * (table.allowed(height) + table.bound_relaxation(height, s, world.tip_position[:, 0]))
+    off_table = table.measured(cast(World, world))[1]
+    band = 1e3 * (table.allowed(off_table) + table.bound_relaxation(off_table, s, world.tip_position[:, 0]))
     beside.fill_between(t, -band, band, color="tab:green", alpha=0.12, linewidth=0, label="valid")
     beside.plot(t, 1e3 * (z - table.z), color="black", linewidth=1.2)
     beside.set(xlabel="t [s]", ylabel="z above the table [mm]", xlim=(t[0], t[-1]))
@@ -281,10 +258,7 @@ def _draw_views(figure: "SubFigure", problem: Problem, world: PathWorld, solids:
 
 
 def _links(problem: Problem, world: PathWorld, k: int) -> list[tuple[Array, float]]:
-    """Return the links at one state: corners of a hull in the world [m], shape (V, 3), and its radius [m].
-
-    They are the parts of the robot's link geometry, or its segments with the radius of a constraint.
-    """
+    """Return the parts of links, or segments, at one state: corners in the world [m], shape (V, 3), and radius [m]."""
     robot = world.robot
     if robot.shape is None:
         return [(segment, problem.arm_radius or 0.0) for segment in world.segments()[..., k]]
@@ -342,10 +316,3 @@ def _draw_solid(axis: "Axes", solid: Solid, plane: tuple[int, int]) -> None:
     outline = _outline((solid.position + solid.corners)[:, list(plane)], solid.radius)
     axis.add_patch(Polygon(outline, facecolor=_BOX, edgecolor=_LIMIT, zorder=0))
     axis.update_datalim(outline)
-
-
-def _draw_rectangle(axis: "Axes", across: tuple[float, float], up: tuple[float, float], *, fill: bool) -> None:
-    from matplotlib.patches import Rectangle
-
-    corner, width, height = (across[0], up[0]), across[1] - across[0], up[1] - up[0]
-    axis.add_patch(Rectangle(corner, width, height, fill=fill, facecolor=_BOX, edgecolor=_LIMIT, zorder=0))

@@ -26,12 +26,7 @@ EARLY_EXIT_PER_SPAN, EARLY_EXIT_PER_END = 8, 16  # samples of early_exit, which 
 
 @dataclass(frozen=True)
 class Samples:
-    """K samples of one motion, including both of its ends.
-
-    Attributes:
-        s: Phases, ascending from 0 to 1, shape (K,).
-        t: Times [s], shape (K,).
-    """
+    """K samples of one motion with both ends: phases from 0 to 1 and times [s], ascending, shape (K,) each."""
 
     s: Array
     t: Array
@@ -62,10 +57,9 @@ def time_table(rate: Array, degree: int, *, cells: int = TABLE_CELLS) -> Array:
 
 @cache
 def _table_phases(cells: int) -> tuple[Array, Array]:
-    """Return phases between which 1 / r is smooth: uniform ones, and geometric ones near the ends, where r may be 0.
+    """Return phases between which 1 / r is smooth, shape (C,), and half the widths of the cells, shape (C - 1,).
 
-    Returns:
-        The phases, shape (C,), and half the widths of the cells, shape (C - 1,).
+    They are uniform, and geometric near the ends, where r may be 0.
     """
     near = np.geomspace(1e-9, 12 / cells, 160)
     phases = np.unique(np.concatenate([np.linspace(0, 1, cells + 1), near, 1 - near]))
@@ -100,13 +94,9 @@ def sample(table: Array, step: float, spans: int, additional: Collection[float] 
 
 @lru_cache(maxsize=8)
 def early_exit_phases(spans: int, additional: frozenset[float] = frozenset()) -> Phases:
-    """Return the phases for verdicts with early exit: some in every span and some near each end.
+    """Return the phases for verdicts with early exit: some in every span, some near each end, and additional ones.
 
     They do not depend on the duration, so all motions of a problem share them.
-
-    Args:
-        spans: Number of intervals between the knots of the finer spline.
-        additional: Additional phases.
     """
     s = np.unique(_phases(EARLY_EXIT_PER_SPAN * spans, EARLY_EXIT_PER_END, additional))
     return Phases(s[np.diff(s, prepend=-1.0) > MIN_PHASE_STEP])

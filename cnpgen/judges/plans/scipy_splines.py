@@ -79,9 +79,7 @@ def spline_derivatives(control: Array, degree: int, s: Array, *, orders: int) ->
 def states_by_chain_rule(p: Sequence[Array], r: Sequence[Array]) -> list[Array]:
     """Return positions, velocities, accelerations and, if p''' is given, jerks.
 
-    Args:
-        p: Path and its first two or three derivatives by phase, shape (n, K) each.
-        r: Rate and its derivatives by phase, one less than of the path, shape (K,) or (1, K) each.
+    The path has one derivative by phase more, shape (n, K) each, than the rate, shape (K,) or (1, K) each.
     """
     states = [p[0], p[1] * r[0], (p[2] * r[0] + p[1] * r[1]) * r[0]]
     if len(p) > 3:

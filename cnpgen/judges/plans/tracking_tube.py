@@ -18,7 +18,6 @@ from cnpgen.judges.plans.continuous_collision import is_contact
 from cnpgen.judges.plans.joint_limits import ProvenJointLimits
 from cnpgen.judges.plans.measure import EvaluationContext, MeasuredCondition, measure
 from cnpgen.problems.constraints.clearance import ObjectContact
-from cnpgen.problems.constraints.constraint import Constraint
 from cnpgen.problems.constraints.joint import JointPosition
 from cnpgen.problems.constraints.needs import measured_needs
 from cnpgen.problems.problem import Problem
@@ -57,12 +56,11 @@ class TrackingTube:
         self._problem, self._error = problem, np.broadcast_to(values, robot.n).copy()
         self._world = PathWorld(robot, problem.obstacle, problem.object_size)
         world = World(robot, problem.obstacle, problem.object_size)
-        self._position_conditions = {
-            (id(constraint), condition.name)
-            for constraint in problem.constraint
-            for condition, order in zip(constraint.judged(world), _orders(constraint, problem, world), strict=True)
-            if order == 0
-        }
+        self._position_conditions: set[tuple[int, str]] = set()
+        for constraint in problem.constraint:
+            orders = measured_needs([constraint.judged], world, jerk=problem.uses_jerk)
+            judged = zip(constraint.judged(world), orders, strict=True)
+            self._position_conditions |= {(id(constraint), condition.name) for condition, order in judged if order == 0}
 
     def tighten(self, limits: ProvenJointLimits) -> ProvenJointLimits:
         """Return joint limits whose position limits are moved inwards by the tracking error."""
@@ -108,8 +106,3 @@ class TrackingTube:
         for signs in random.choice([-1.0, 1.0], (TUBE_COMBINATIONS, len(self._error))):
             np.maximum(total, np.abs(values(signs * self._error) - nominal), out=total)
         return np.asarray(TUBE_CURVATURE_FACTOR * total)
-
-
-def _orders(constraint: Constraint, problem: Problem, world: World) -> list[int]:
-    """Return the derivative orders of the judged conditions of a constraint."""
-    return measured_needs([constraint.judged], world, jerk=problem.uses_jerk)

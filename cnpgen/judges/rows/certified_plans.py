@@ -18,13 +18,7 @@ from cnpgen.trajectory.spline_motion import Motion
 
 @dataclass(frozen=True)
 class PlanCheck:
-    """Result of the check of plans in rows of a certified dataset.
-
-    Attributes:
-        judged: Number of plans.
-        valid: Number of valid plans.
-        problems: Error messages, one line each.
-    """
+    """Numbers of plans in rows of a certified dataset and of valid ones, and error messages, one line each."""
 
     judged: int = 0
     valid: int = 0
@@ -32,13 +26,7 @@ class PlanCheck:
 
 
 def check_plans(problem: Problem, robot: Robot, columns: Mapping[str, NDArray[Any]]) -> PlanCheck:
-    """Judge the plans in rows of a certified dataset; rows of other datasets have none.
-
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        columns: Field -> values, shape (rows, width) or (rows,).
-    """
+    """Judge the plans in columns of a certified dataset, field -> values; rows of other datasets have none."""
     if "path_control_points" not in columns:
         return PlanCheck()
     rows, spec = len(columns["start_q"]), problem.trajectory

@@ -42,23 +42,12 @@ class Diagnostic:
         index, end = np.nonzero(~np.isnan(self.stored[finite]))
         row = finite[index]
         error = np.abs(self.stored[row, end] - self.recomputed[row, end])
-        return compare(
-            self.name,
-            self.unit,
-            violation=error,
-            tolerance=np.full(len(row), DIAGNOSTIC_TOLERANCES[dtype]),
-            row=row,
-            end=end,
-        )
+        tolerance = DIAGNOSTIC_TOLERANCES[dtype]
+        return compare(self.name, self.unit, violation=error, tolerance=tolerance, row=row, end=end)
 
 
 def stored_diagnostics(problem: Problem, columns: Mapping[str, Array]) -> list[Diagnostic]:
-    """List the diagnostics in rows that can be recomputed.
-
-    Args:
-        problem: The problem.
-        columns: Field -> values, shape (rows, width).
-    """
+    """List the diagnostics in columns, field -> values of shape (rows, width), that can be recomputed."""
     kinds = [("torque_ratio", "holding torque ratio", "1", _torque_ratio), *_clearance(problem)]
     return [
         Diagnostic(name, unit, compute, stored, np.full_like(stored, np.nan))

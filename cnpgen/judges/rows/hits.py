@@ -37,9 +37,8 @@ PARALLEL_TOLERANCE = 1e-9  # relative determinant below which two terms have no 
 class HitRule:
     """Rule by which the stages of a dataset chose its goals.
 
-    Attributes:
-        near: Configuration to which goals stay close, "base", "start" or "home"; empty if no stage chooses them.
-        full_speed: Fraction of the hits at the highest possible speed; None if no stage chooses the speed.
+    They stay close to the configuration "base", "start" or "home", if it is not empty. A fraction of the hits has the
+    highest possible speed; None if no stage chooses the speed.
     """
 
     near: str = ""
@@ -58,12 +57,7 @@ def judge_goals(
 ) -> list[tuple[Check, Index]]:
     """Check the goals of finite rows against the rule of the stages.
 
-    Args:
-        robot: The robot.
-        rule: Rule of the stages.
-        columns: Field -> values in SI units, shape (rows, width).
-        finite: Rows to check.
-        dtype: Float type of the stored rows.
+    Columns, field -> values in SI units, have shape (rows, width). The float type is that of the stored rows.
     """
     judged = []
     if rule.near and "hit_angle" in columns:
@@ -72,14 +66,16 @@ def judge_goals(
         home = near_base if rule.near == "base" else columns[f"{rule.near}_q"][finite]
         direction = _directions(robot, columns, finite)
         error = _projected_gradients(robot, q, home, direction, ACTIVE_LIMIT_TOLERANCES_RAD[dtype])
-        judged.append(_compared("hitting configuration", "m^2/rad", error, STATIONARITY_TOLERANCES[dtype], finite))
+        tolerance = STATIONARITY_TOLERANCES[dtype]
+        judged.append(compare("hitting configuration", "m^2/rad", violation=error, tolerance=tolerance, row=finite))
     if rule.full_speed is not None and "hit_speed_max" in columns:
         fraction = speed_fractions(columns)[finite]
         share = fraction * velocity_factors(robot, columns)[finite]
         violation = np.abs(columns["goal_dq"][finite]) - share[:, None] * robot.velocity_limit
         too_slow = np.where(fraction == 1, 0.0, np.inf) if rule.full_speed == 1 else np.zeros(len(finite))
         error = np.maximum(np.maximum(violation.max(axis=1, initial=0.0), 0.0), too_slow)
-        judged.append(_compared("hitting velocity", "rad/s", error, BOUNDARY_TOLERANCES[dtype]["velocity"], finite))
+        tolerance = BOUNDARY_TOLERANCES[dtype]["velocity"]
+        judged.append(compare("hitting velocity", "rad/s", violation=error, tolerance=tolerance, row=finite))
     return judged
 
 
@@ -93,9 +89,7 @@ def speed_fractions(columns: Mapping[str, Array]) -> Array:
 def repeated_fraction(fractions: Array, dtype: str) -> tuple[int, float]:
     """Find a fraction below 1 that more hits have than chance explains: such hits were scaled in time afterwards.
 
-    Args:
-        fractions: Result of ``speed_fractions`` for all rows of a dataset.
-        dtype: Float type of the stored rows.
+    The fractions are those of all rows of a dataset.
 
     Returns:
         Number of hits with the fraction, and the fraction; 0 if there is none.
@@ -109,11 +103,6 @@ def repeated_fraction(fractions: Array, dtype: str) -> tuple[int, float]:
         return 0, 0.0
     value = float(drawn[int(np.argmax(close))])
     return int((np.abs(drawn - value) <= FRACTION_TOLERANCES[dtype]).sum()), value
-
-
-def _compared(name: str, unit: str, error: Array, tolerance: float, rows: Index) -> tuple[Check, Index]:
-    ones = np.ones(len(rows), np.int64)
-    return compare(name, unit, violation=error, tolerance=np.full(len(rows), tolerance), row=rows, end=ones)
 
 
 def velocity_factors(robot: Robot, columns: Mapping[str, Array]) -> Array:
@@ -149,19 +138,10 @@ def _projected_gradients(robot: Robot, q: Array, home: Array, direction: Array, 
 
 
 def _gradients(robot: Robot, q: Array, home: Array, direction: Array) -> tuple[Array, Array]:
-    """Return J and the gradient of f, by Pinocchio's derivatives of the tip's velocity.
+    """Return J, shape (rows, 3, n), and the gradient of f, shape (rows, n), by derivatives of the tip's velocity.
 
     Pinocchio differentiates the velocity of the tip's frame as if its axes turned with it. That adds a combination of
     the rows of J to the gradient, which the projection removes.
-
-    Args:
-        robot: The robot.
-        q: Joint positions [rad], shape (rows, n).
-        home: Configurations to stay close to [rad], shape (rows, n).
-        direction: Unit directions of the hits, shape (rows, 3).
-
-    Returns:
-        Arrays of shapes (rows, 3, n) and (rows, n).
     """
     import pinocchio as pin
 
@@ -177,15 +157,10 @@ def _gradients(robot: Robot, q: Array, home: Array, direction: Array) -> tuple[A
 
 
 def highest_speed(jacobian: Array, angle: Array, limit: Array) -> Array:
-    """Compute the highest speed of the tip along hits in the x-y plane within the velocity limits [m/s].
+    """Compute the highest speed of the tip along hits in the x-y plane within velocity limits [m/s], shape (rows,).
 
-    Args:
-        jacobian: Translational Jacobians of the tip in world axes [m], shape (rows, 3, n).
-        angle: Directions of the hits [rad], shape (rows,).
-        limit: Velocity limits of the joints [rad/s], shape (n,).
-
-    Returns:
-        Speeds, shape (rows,); inf where B has less than two independent columns.
+    Translational Jacobians in world axes [m] have shape (rows, 3, n), directions [rad] (rows,). The speed is inf where
+    B has less than two independent columns.
     """
     x, y, z = jacobian.transpose(1, 0, 2)
     cosine, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]

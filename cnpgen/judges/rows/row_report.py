@@ -83,22 +83,31 @@ class RowReport:
         return {"rows": self.rows, "failed_rows": self.failed_rows.tolist(), "checks": checks}
 
 
-def compare(name: str, unit: str, *, violation: Array, tolerance: Array, row: Index, end: Index) -> tuple[Check, Index]:
+def compare(
+    name: str,
+    unit: str,
+    *,
+    violation: Array,
+    tolerance: Array | float,
+    row: Index,
+    end: Index | int = 1,
+) -> tuple[Check, Index]:
     """Compare violations with their tolerances.
 
     Args:
         name: Name of the check.
         unit: SI unit of the violations.
         violation: Distance of each value outside its bounds, shape (k,); nan counts as infinite.
-        tolerance: Tolerance of each value, shape (k,).
+        tolerance: Tolerance of each value, shape (k,), or of all.
         row: Row of each value, shape (k,).
-        end: End of each value as an index of ``ENDS``, shape (k,).
+        end: End of each value as an index of ``ENDS``, shape (k,), or of all; the goal by default.
 
     Returns:
         The result, and the rows that fail the check, ascending.
     """
     if violation.size == 0:
         return Check(name, unit, 0.0, 0.0, 0, -1, "start"), np.empty(0, np.int64)
+    tolerance, end = np.broadcast_to(tolerance, violation.shape), np.broadcast_to(end, violation.shape)
     violation = np.where(np.isnan(violation), np.inf, violation)
     failed = np.unique(row[violation > tolerance])
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):

@@ -1,11 +1,11 @@
 """Verification of rows from their stored numbers: every constraint at both ends, positions and hits."""
 
 import math
+from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -116,21 +116,17 @@ class _ConditionValues:
 
 @dataclass
 class _Measurements:
-    """Measurements in a block of rows.
+    """Measurements in a block of rows; nan in rows that were not measured.
 
-    Attributes:
-        position: Tip positions [m], shape (rows, 2, 3); nan in rows that were not measured, as in the next two arrays.
-        hit_velocity: Tip velocities at the goal along the axes of the table [m/s], shape (rows, 3).
-        hit_jacobian: Jacobians of the tip at the goal along these axes [m], shape (rows, 3, n).
-        diagnostics: Diagnostics that the rows store.
-        conditions: Conditions of the constraints, in order of first use.
+    Tip positions [m] have shape (rows, 2, 3). Velocities [m/s], shape (rows, 3), and Jacobians [m], shape (rows, 3, n),
+    of hits are those of the tip at the goal along the axes of the table. Conditions are in order of first use.
     """
 
     position: Array
     hit_velocity: Array
     hit_jacobian: Array
     diagnostics: list[Diagnostic]
-    conditions: dict[Key, _ConditionValues] = field(default_factory=dict)
+    conditions: defaultdict[Key, _ConditionValues] = field(default_factory=lambda: defaultdict(_ConditionValues))
 
 
 def _verify_block(problem: Problem, world: World, columns: dict[str, Array], dtype: str, rule: HitRule) -> RowReport:
@@ -139,7 +135,7 @@ def _verify_block(problem: Problem, world: World, columns: dict[str, Array], dty
     finite = np.flatnonzero(n_invalid == 0)
     measurements = _measure(problem, world, columns, finite)
     judged = [
-        _judge_finite(n_invalid),
+        compare("finite", "1", violation=n_invalid.astype(float), tolerance=0.0, row=np.arange(rows), end=0),
         _judge_position(measurements, columns, finite, dtype),
         *(values.judged(key, dtype) for key, values in measurements.conditions.items()),
         *_judge_hit(measurements, columns, finite, dtype),
@@ -181,9 +177,8 @@ def _measure(problem: Problem, world: World, columns: dict[str, Array], finite: 
 def _record(measurements: _Measurements, conditions: Iterator[Condition], place: tuple[int, int]) -> None:
     for condition in conditions:
         key = condition.name, condition.unit, condition.tolerance_kind
-        values = measurements.conditions.get(key) or measurements.conditions.setdefault(key, _ConditionValues())
-        values.conditions.append(condition)
-        values.places.append(place)
+        measurements.conditions[key].conditions.append(condition)
+        measurements.conditions[key].places.append(place)
 
 
 def _states(columns: dict[str, Array], end: str) -> tuple[list[Array], list[int]]:
@@ -194,18 +189,11 @@ def _states(columns: dict[str, Array], end: str) -> tuple[list[Array], list[int]
     return [q, dq, ddq], np.where(np.any(dq != 0, axis=1), 1, 2).tolist()
 
 
-def _judge_finite(n_invalid: Index) -> tuple[Check, Index]:
-    """Check that no row has values that are not finite."""
-    zeros = np.zeros(len(n_invalid), np.int64)
-    violation, tolerance = n_invalid.astype(float), zeros.astype(float)
-    return compare("finite", "1", violation=violation, tolerance=tolerance, row=np.arange(len(n_invalid)), end=zeros)
-
-
 def _judge_position(block: _Measurements, columns: dict[str, Array], finite: Index, dtype: str) -> tuple[Check, Index]:
     claimed = np.stack([columns[f"{end}_xyz"] for end in ENDS], axis=1)
     error = np.linalg.norm(block.position - claimed, axis=2)[finite].ravel()
     row, end = np.repeat(finite, len(ENDS)), np.tile(np.arange(len(ENDS)), len(finite))
-    tolerance = np.full(error.shape, BOUNDARY_TOLERANCES[dtype]["position"])
+    tolerance = BOUNDARY_TOLERANCES[dtype]["position"]
     return compare("tip position", "m", violation=error, tolerance=tolerance, row=row, end=end)
 
 
@@ -218,17 +206,11 @@ def _judge_hit(
     angle, speed = columns["hit_angle"][finite, 0], columns["hit_speed"][finite, 0]
     x, y, _ = block.hit_velocity[finite].T
     along, across = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
-    moving = speed > 0
-
-    def judged(name: str, unit: str, error: Any, rows: Index, quantity: str) -> tuple[Check, Index]:
-        tolerance = np.full(len(rows), BOUNDARY_TOLERANCES[dtype][quantity])
-        return compare(
-            name, unit, violation=np.abs(error), tolerance=tolerance, row=rows, end=np.ones(len(rows), np.int64)
-        )
-
-    direction = np.arctan2(across, along)[moving]
-    yield judged("hit direction", "rad", direction, finite[moving], "direction")
-    yield judged("hit speed", "m/s", along - speed, finite, "velocity")
+    moving, tolerances = speed > 0, BOUNDARY_TOLERANCES[dtype]
+    direction, error = np.abs(np.arctan2(across, along)[moving]), np.abs(along - speed)
+    tolerance = tolerances["direction"]
+    yield compare("hit direction", "rad", violation=direction, tolerance=tolerance, row=finite[moving])
+    yield compare("hit speed", "m/s", violation=error, tolerance=tolerances["velocity"], row=finite)
 
 
 def _judge_highest(
@@ -239,5 +221,4 @@ def _judge_highest(
         highest = highest_speed(block.hit_jacobian[finite], columns["hit_angle"][finite, 0], robot.velocity_limit)
         highest *= velocity_factors(robot, columns)[finite]
         error = np.abs(columns["hit_speed_max"][finite, 0] - highest)
-        tolerance, end = np.full(len(finite), DIAGNOSTIC_TOLERANCES[dtype]), np.ones(len(finite), np.int64)
-        yield compare("highest hit speed", "m/s", violation=error, tolerance=tolerance, row=finite, end=end)
+        yield compare("highest hit speed", "m/s", violation=error, tolerance=DIAGNOSTIC_TOLERANCES[dtype], row=finite)

@@ -30,12 +30,9 @@ CONSISTENCY_TOLERANCE = 1e-6  # relative, of samples with a bound of the jerk: r
 
 
 def interpolated(trajectory: Trajectory, interpolation: Interpolation | None, noise: Array) -> CurveFamily:
-    """Return the curves of an interpolation through samples with noise.
+    """Return the curves of an interpolation, by default the one that the derivatives determine, through samples.
 
-    Args:
-        trajectory: The samples.
-        interpolation: The interpolation; by default the one that the derivatives determine.
-        noise: Largest errors of positions, velocities and accelerations [rad, rad/s, rad/s^2], shape (3,).
+    Positions, velocities and accelerations have errors of at most the noise, shape (3,).
 
     Raises:
         UsageError: The samples lack the derivatives of the interpolation.
@@ -60,29 +57,19 @@ def interpolated(trajectory: Trajectory, interpolation: Interpolation | None, no
 
 
 def family_of_data(t: Array, data: list[Array]) -> CurveFamily:
-    """Return the known curve through positions and derivatives at knots.
-
-    Args:
-        t: Times of the knots [s], from 0, shape (S + 1,).
-        data: Positions, then their derivatives in SI units, shape (S + 1, n) each.
-    """
-    h = np.diff(t)
-    coefficients = np.einsum("cw,swn->csn", hermite_weights(len(data)), span_data(data, h))
-    exact = np.zeros((len(h), data[0].shape[1]))
-    return CurveFamily(t, coefficients, (exact, exact, exact, exact))
+    """Return the known curve through positions and derivatives at times from 0 [s], shape (S + 1, n) each."""
+    return _known(t, np.einsum("cw,swn->csn", hermite_weights(len(data)), span_data(data, np.diff(t))))
 
 
 def through_positions(trajectory: Trajectory, neighbors: int) -> CurveFamily:
-    """Return the curve of polynomials through the positions around every span; its velocities jump at the samples.
-
-    Args:
-        trajectory: The samples.
-        neighbors: Number of samples that determine a polynomial.
-    """
+    """Return the curve of polynomials through the positions around every span; its velocities jump at the samples."""
     _, weights, data = polynomials_of_positions(trajectory.t, trajectory.q, neighbors)
-    exact = np.zeros((len(data), trajectory.q.shape[1]))
-    coefficients = np.einsum("scw,swn->csn", weights, data)
-    return CurveFamily(trajectory.t, coefficients, (exact, exact, exact, exact))
+    return _known(trajectory.t, np.einsum("scw,swn->csn", weights, data))
+
+
+def _known(t: Array, coefficients: Array) -> CurveFamily:
+    exact = np.zeros(coefficients.shape[1:])
+    return CurveFamily(t, coefficients, (exact, exact, exact, exact))
 
 
 def bounded_jerk(trajectory: Trajectory, max_jerk: Array, noise: Array) -> CurveFamily | None:
@@ -209,14 +196,7 @@ def _noise_errors(weights: Array, order: int, h: Array, noise: Array, m: int) ->
 
 
 def _kernel_norms(nodes: Array, orders: NDArray[np.intp], weights: Array, order: int) -> Array:
-    """Integrate the absolute Peano kernel of a derivative over the nodes' range, at most over the span, shape (S,).
-
-    Args:
-        nodes: Nodes of every span, where the span is [0, 1], shape (S, W).
-        orders: Order of the derivative that each node has, shape (W,).
-        weights: Weights of the data for the Bernstein coefficients, shape (S, d + 1, W).
-        order: Order of the derivative.
-    """
+    """Integrate the absolute Peano kernel of a derivative over the nodes of every span, at most over it, shape (S,)."""
     _, chosen, inverse = np.unique(np.round(nodes, 6), axis=0, return_index=True, return_inverse=True)
     norms = np.empty(len(chosen))
     for row, index in enumerate(chosen):

@@ -6,7 +6,7 @@ sampled trajectory without phases has the share of its duration as phase.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import chain, product
 
 import numpy as np
@@ -107,8 +107,7 @@ class FamilyJudge:
         limits = self._limits.scaled(self._world.parameters.values)
         entries = [*_limit_entries(limits, family, smooth, samples), *_measured_entries(context)]
         names = list(by_name([entry.margin for entry in entries]))
-        conditions = dict(zip(names, (entry.decided() for entry in entries), strict=True))
-        return _verdict(conditions, family.duration, len(s))
+        return _verdict(dict(zip(names, entries, strict=True)), family.duration, len(s))
 
     def _obstacle_poses(self, q: Array, dq: Array, parameters: Array | None) -> Array:
         """Place the obstacles, and the puck of a hit, by the tip at both ends."""
@@ -152,42 +151,24 @@ def checked_phases(family: CurveFamily, step: float) -> Array:
     return np.unique(np.concatenate([inner, np.nextafter(family.edges[1:-1], 0.0), family.edges]))
 
 
-@dataclass(frozen=True)
-class _Entry:
-    """Findings on one condition.
+def _decided(margin: Margin, error: float, certain: float, *shares: float) -> ConditionDecision:
+    """Decide a condition by the worst margin of any curve and the largest relative violation that every curve has."""
+    if margin.ok:
+        decision, reason = Decision.VALID, ""
+    elif certain > 1:
+        decision, reason = Decision.INVALID, margin.reason
+    else:
+        decision, reason = Decision.UNDECIDED, _doubt(margin, error)
+    return ConditionDecision(decision, reason, margin, error, *shares)
 
-    Attributes:
-        margin: The worst margin of any curve.
-        error: Its uncertainty [unit of the margin].
-        certain: Largest violation that every curve has, in multiples of the tolerance.
-        violated: Share of time with a violation by every curve.
-        undecided: Share of time with a violation by some curves.
-    """
 
-    margin: Margin
-    error: float
-    certain: float
-    violated: float
-    undecided: float
-
-    def decided(self) -> ConditionDecision:
-        """Return the decision."""
-        if self.margin.ok:
-            decision, reason = Decision.VALID, ""
-        elif self.certain > 1:
-            decision, reason = Decision.INVALID, self.margin.reason
-        else:
-            decision, reason = Decision.UNDECIDED, self._doubt()
-        return ConditionDecision(decision, reason, self.margin, self.error, self.violated, self.undecided)
-
-    def _doubt(self) -> str:
-        """Return why the condition is undecided."""
-        unit, name = self.margin.unit, self.margin.name
-        if self.error >= DECIDING_ERROR:
-            return f"{name}: the curve lacks a derivative at its samples"
-        if self.error == 0:
-            return f"{name}: the bound depends on the phase, which the samples do not have"
-        return f"{name}: known up to {self.error:.2g} {unit}, which some curves need to be valid"
+def _doubt(margin: Margin, error: float) -> str:
+    """Return why a condition is undecided."""
+    if error >= DECIDING_ERROR:
+        return f"{margin.name}: the curve lacks a derivative at its samples"
+    if error == 0:
+        return f"{margin.name}: the bound depends on the phase, which the samples do not have"
+    return f"{margin.name}: known up to {error:.2g} {margin.unit}, which some curves need to be valid"
 
 
 def _share(mask: NDArray[np.bool_], t: Array) -> float:
@@ -197,7 +178,7 @@ def _share(mask: NDArray[np.bool_], t: Array) -> float:
 
 def _limit_entries(
     limits: ProvenJointLimits, family: CurveFamily, smooth: CurveFamily | None, samples: Samples
-) -> list[_Entry]:
+) -> list[ConditionDecision]:
     """Decide the joint limits; a violation by the smooth curve leaves a limit undecided."""
     entries, curves = [], [family] if smooth is None else [family, smooth]
     states = [curve.evaluate(samples.s, jerk=True) for curve in curves]
@@ -224,11 +205,11 @@ def _limit_entries(
         highest, lowest = np.max([at + error_at, *others], axis=(0, 2)), (at - error_at).max(axis=1)
         violated = _share(lowest > 1, samples.t)
         share = _share((highest > 1) & (lowest <= 1), samples.t)
-        entries.append(_Entry(margin, uncertainty, certain, violated, share))
+        entries.append(_decided(margin, uncertainty, certain, violated, share))
     return entries
 
 
-def _measured_entries(context: EvaluationContext) -> list[_Entry]:
+def _measured_entries(context: EvaluationContext) -> list[ConditionDecision]:
     """Decide the measured conditions; the world of the context is moved."""
     t, samples = context.samples.t, context.samples
     worst = {id(condition): condition.margin(context.problem, samples) for condition in context.measured}
@@ -248,7 +229,7 @@ def _measured_entries(context: EvaluationContext) -> list[_Entry]:
     for condition in context.measured:
         key = id(condition)
         error = _error_at(context, condition, worst[key])
-        entries.append(_Entry(worst[key], error, certain[key], *masks[key]))
+        entries.append(_decided(worst[key], error, certain[key], *masks[key]))
     return entries
 
 

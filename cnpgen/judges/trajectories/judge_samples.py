@@ -30,11 +30,8 @@ def judge_samples(
 ) -> TrajectoryVerdict:
     """Judge the motion that samples resolve.
 
-    Args:
-        judge: The judge of the problem.
-        trajectory: The samples.
-        noise: Largest errors of positions, velocities and accelerations [rad, rad/s, rad/s^2], shape (3,).
-        scene: Obstacles, see ``FamilyJudge``.
+    The noise is the largest error of positions, velocities and accelerations [rad, rad/s, rad/s^2], shape (3,). For the
+    scene see ``FamilyJudge``.
     """
     limits = acceleration_limits(judge.limits(trajectory.parameters))
     if trajectory.dq is None and not noise.any() and np.diff(trajectory.t).max() <= MAX_LINEAR_SPAN_S:

@@ -66,10 +66,8 @@ class _Polynomials:
 def resolved_curves(trajectory: Trajectory, noise: Array, max_acceleration: Array) -> CurveFamily:
     """Return the curves that samples with noise resolve.
 
-    Args:
-        trajectory: The samples.
-        noise: Largest errors of positions, velocities and accelerations [rad, rad/s, rad/s^2], shape (3,).
-        max_acceleration: Acceleration limits [rad/s^2], shape (n,); inf without a limit.
+    The noise is that of positions, velocities and accelerations, shape (3,); acceleration limits [rad/s^2], shape (n,),
+    may be inf.
     """
     t, data = trajectory.t, data_of(trajectory)
     h = np.diff(t)
@@ -95,12 +93,7 @@ def resolved_curves(trajectory: Trajectory, noise: Array, max_acceleration: Arra
 
 
 def is_resolved(trajectory: Trajectory, max_acceleration: Array) -> bool:
-    """Return whether samples with velocities resolve the accelerations except in the first and the last spans.
-
-    Args:
-        trajectory: The samples.
-        max_acceleration: Acceleration limits [rad/s^2], shape (n,); inf without a limit.
-    """
+    """Return whether samples with velocities resolve the accelerations but at the ends; limits [rad/s^2] may be inf."""
     if trajectory.dq is None or len(trajectory.t) < 2 * END_SPANS + 2:
         return False
     few = estimated_derivative(trajectory, 2, FEW_NEIGHBORS)

@@ -39,12 +39,7 @@ MIN_KNOT_STEP_S = 3e-5  # between knots in a span: rounding of positions changes
 
 @dataclass(frozen=True, eq=False)
 class AccelerationLimits:
-    """Largest absolute accelerations and jerks of a curve at its ends.
-
-    Attributes:
-        acceleration: Accelerations [rad/s^2], shape (n,); inf without a limit.
-        jerk: Jerks [rad/s^3], shape (n,); inf without a limit.
-    """
+    """Largest accelerations [rad/s^2] and jerks [rad/s^3] of a curve at its ends, shape (n,) each; inf for no limit."""
 
     acceleration: Array
     jerk: Array
@@ -53,9 +48,7 @@ class AccelerationLimits:
 def smooth_curve(trajectory: Trajectory, limits: AccelerationLimits) -> CurveFamily | None:
     """Return the smooth curve through samples; None if no such curve meets the limits at the ends.
 
-    Args:
-        trajectory: Samples with velocities; given accelerations are those of the curve at the samples.
-        limits: Limits at the ends.
+    Given accelerations are those of the curve at the samples.
     """
     t, q, dq = trajectory.t, trajectory.q, trajectory.dq
     if dq is None or len(t) < 2 * END_SPANS + 2:
@@ -84,13 +77,7 @@ def smooth_curve(trajectory: Trajectory, limits: AccelerationLimits) -> CurveFam
 
 
 def estimated_derivative(trajectory: Trajectory, order: int, neighbors: int) -> Array:
-    """Estimate a derivative at the samples from positions and velocities of neighbors, shape (K, n).
-
-    Args:
-        trajectory: Samples with velocities.
-        order: Order of the derivative.
-        neighbors: Number of samples that determine it.
-    """
+    """Estimate a derivative at samples with velocities from some of their neighbors, shape (K, n)."""
     t, q, dq = trajectory.t, trajectory.q, trajectory.dq
     if dq is None:
         raise UsageError("an estimate of derivatives needs samples with velocities")
@@ -192,15 +179,7 @@ class _EndProgram:
         )
 
     def solve(self, q: Array, dq: Array, ddq: Array, jerk: float, bounds: tuple[float, float]) -> Array | None:
-        """Return the accelerations at the knots, shape (N,); None if there are none within the bounds.
-
-        Args:
-            q: Positions of one joint at the samples, shape (K,).
-            dq: Velocities.
-            ddq: Accelerations; without given ones, only the last is used.
-            jerk: Jerk at the last sample.
-            bounds: Largest acceleration and jerk.
-        """
+        """Return the accelerations of one joint at the knots, shape (N,); None if there are none within both bounds."""
         import daqp
 
         moved = (q[1:] - q[:-1] - dq[:-1] * self.h) / self.h**2

@@ -30,13 +30,7 @@ def plot_trajectory(
 ) -> None:
     """Draw a sampled trajectory as ``plot_plan`` draws plans, by the interpolation that its derivatives determine.
 
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        trajectory: The trajectory.
-        path: Image file, ``.png``, ``.pdf`` or ``.svg``; overwritten if it exists.
-        title: Title of the figure.
-        margins: Violations to mark.
+    Violations to mark are given as margins.
 
     Raises:
         MachineError: matplotlib is missing, or the file cannot be written.
@@ -51,14 +45,7 @@ def plot_trajectory(
 def along_trajectory(
     problem: Problem, robot: Robot, trajectory: Trajectory, *, samples: int, extra_times: Sequence[float] = ()
 ) -> tuple[PathWorld, Array, Array, Scene]:
-    """Place the robot at K times of a trajectory, uniformly spaced but for extra ones, among obstacles by its ends.
-
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        trajectory: The trajectory.
-        samples: Number of uniformly spaced times.
-        extra_times: Further times [s].
+    """Place the robot at K times of a trajectory, uniformly spaced but for extra ones [s], among obstacles by its ends.
 
     Returns:
         The world, phases, times [s], shape (K,) each, and the obstacles.

@@ -61,15 +61,9 @@ def uncertainty_of(  # noqa: PLR0917 - the family, and everything that measures 
     measured: Sequence[MeasuredCondition],
     s: Array,
 ) -> Uncertainty:
-    """Compute the errors of measured conditions.
+    """Compute the errors of measured conditions at phases s of the samples, shape (K,), by moving another robot.
 
-    Args:
-        problem: The problem.
-        family: The curves.
-        world: A robot that is moved, other than the one at the samples.
-        scenes: Poses and sizes of the obstacles, shape (width,); first those of the nominal curve, then possible ones.
-        measured: Conditions at the samples, with the values of the nominal curve.
-        s: Phases of the samples, shape (K,).
+    The first scene has the poses and sizes of the nominal curve, shape (width,); others are possible ones.
     """
     reach = world.motion_bounds(family.max_positions())
     displacement = float((family.bounds[0] @ reach).max())

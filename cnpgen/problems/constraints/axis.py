@@ -183,6 +183,22 @@ class Axis(TipAxis):
         )
 
 
+@dataclass(frozen=True, kw_only=True)
+class Vertical(TipAxis):
+    """Constraint: the tip's z axis points up, a special case of ``axis``: ``R_02 = R_12 = 0`` and ``R_22 > 0``.
+
+    It is the vertical-orientation manifold of the paper's heavy object (Appendix B).
+    """
+
+    reason = "not vertical"
+    tolerance: float = field("tilt that a valid motion may have", unit="rad", low=1e-9, plausible=1.0)
+
+    @cached_property
+    def directions(self) -> tuple[list[float], list[float]]:
+        """Return both z axes."""
+        return [0.0, 0.0, 1.0], [0.0, 0.0, 1.0]
+
+
 def _cosine(angle: Any) -> Any:
     """Return the cosine of an angle, -1 above a half turn; ``angle`` may be a symbol."""
     import casadi as ca

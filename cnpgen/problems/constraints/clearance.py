@@ -1,7 +1,7 @@
 """Collision constraints: clearance of the robot and contact depth of the held object."""
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
     from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
     from cnpgen.robots.obstacle import Obstacle
+    from cnpgen.robots.shape.shape import Shape
     from cnpgen.world.path import PathWorld
     from cnpgen.world.world import World
 
@@ -21,7 +22,45 @@ MAX_LINK_PENETRATION_M = 1e-4  # of links in a valid motion: the accuracy of dis
 
 
 @dataclass(frozen=True, kw_only=True)
-class RobotClearance(Constraint):
+class DistanceConstraint(Constraint):
+    """Base class: the distances of bodies are at least a bound; judges also check them between samples.
+
+    Attributes:
+        condition_name: Name of the condition.
+        bodies: The bodies, see ``cnpgen.world.path.PathWorld.pairs``.
+    """
+
+    condition_name: ClassVar[str]
+    bodies: ClassVar[str]
+
+    def _at_least(
+        self, distances: list[Any], least: Any, *, parts: tuple[str, ...] = (), sufficient: bool = False
+    ) -> tuple[Condition, ...]:
+        """State that m distances are at least one bound, or m [m]."""
+        m = len(distances)
+        lower, upper = np.full(m, least, float), np.full(m, np.inf)
+        return (Condition(self.condition_name, "m", distances, lower, upper, "position", parts, sufficient),)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinkClearance(DistanceConstraint):
+    """Base class: bodies that the robot moves are further than ``distance`` from each other."""
+
+    uses_obstacles = False
+    distance: float
+
+    @property
+    def effective_tolerance(self) -> float:
+        """Tolerance up to a penetration of ``MAX_LINK_PENETRATION_M``."""
+        return min(self.tolerance, self.distance + MAX_LINK_PENETRATION_M)
+
+    def met(self, path: "PathWorld", tolerance: float) -> NDArray[np.bool_]:
+        """Return a mask of the states with sufficient distances between the bodies."""
+        return path.pairs(self.bodies).clear_states(self.distance - tolerance)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotClearance(DistanceConstraint):
     """Constraint: the robot is further than ``distance`` from every obstacle.
 
     With the paper's geometry the robot consists of capsules along the chain (Appendix B, robot collision). Unlike the
@@ -29,7 +68,7 @@ class RobotClearance(Constraint):
     links. Solvers use the links' capsules, which is conservative.
     """
 
-    reason = "robot in collision"
+    reason, condition_name, bodies = "robot in collision", "robot clearance", "robot"
     training_weight = 3000.0
     radius: float | None = field(
         'radius of the paper\'s capsules, with geometry = "paper-capsules" only',
@@ -90,7 +129,7 @@ class RobotClearance(Constraint):
 
     def met(self, path: "PathWorld", tolerance: float) -> NDArray[np.bool_] | None:
         """Return a mask of the states with sufficient distance of the convex parts from the obstacles."""
-        return path.clear_of_obstacles(self.distance - tolerance) if path.robot.shape else None
+        return path.shape_pairs().clear_states(self.distance - tolerance) if path.robot.shape else None
 
     def solved(self, world: "World") -> tuple[Condition, ...]:
         """Return the conditions of the capsules."""
@@ -112,18 +151,15 @@ class RobotClearance(Constraint):
 
     def _clear(self, distances: list[Any], radii: list[float], *, sufficient: bool = False) -> tuple[Condition, ...]:
         """State that the distance of every capsule axis is at least its radius plus ``distance``."""
-        m = len(distances)
-        least = np.repeat(radii, m // max(len(radii), 1)) + self.distance
-        return (
-            Condition("robot clearance", "m", distances, least, np.full(m, np.inf), "position", sufficient=sufficient),
-        )
+        least = np.repeat(radii, len(distances) // max(len(radii), 1)) + self.distance
+        return self._at_least(distances, least, sufficient=sufficient)
 
 
 @dataclass(frozen=True, kw_only=True)
-class ObjectContact(Constraint):
+class ObjectContact(DistanceConstraint):
     """Constraint: the held object penetrates obstacles by at most ``depth`` (paper, Appendix B, object collision)."""
 
-    reason = "object in collision"
+    reason, condition_name, bodies = "object in collision", "object contact", "object"
     training_weight, training_inset = 3e4, 5e-4  # the inset in m
     depth: float = field("depth of legal contact", unit="m", low=0.0, plausible=0.5)
     tolerance: float = field("additional depth that a valid motion may have", unit="m", low=0.0, plausible=0.5)
@@ -134,20 +170,21 @@ class ObjectContact(Constraint):
 
         kin, size, solids = state.kinematics, state.object_size or (0.0, 0.0, 0.0), symbolic_solids(state)
         distances = [solid.cuboid_separation(kin.tip, kin.rotation, size) for solid in solids]
-        return self._shallow(distances, sufficient=_has_poses(state.obstacles))
+        return self._at_least(distances, -self.depth, sufficient=_has_poses(state.obstacles))
 
     def measured(self, world: "World") -> tuple[Condition, ...]:
         """Measure the signed distances with Coal [m]."""
-        return self._shallow(world.object_distances(-self.depth))
+        return self._at_least(world.object_distances(-self.depth), -self.depth)
 
     def solved(self, world: "World") -> tuple[Condition, ...]:
         """Return the conditions on the solver's shapes of the obstacles."""
-        return self._shallow([0.0] * len(world.obstacles), sufficient=_has_poses(world.obstacles))
+        return self._at_least([0.0] * len(world.obstacles), -self.depth, sufficient=_has_poses(world.obstacles))
 
-    def _shallow(self, distances: list[Any], *, sufficient: bool = False) -> tuple[Condition, ...]:
-        m = len(distances)
-        least, most = np.full(m, -self.depth), np.full(m, np.inf)
-        return (Condition("object contact", "m", distances, least, most, "position", sufficient=sufficient),)
+
+def names_of_pairs(shape: "Shape | None") -> tuple[str, ...]:
+    """Return the names of the checked pairs of convex parts."""
+    links = [part.link for part in shape.convex_parts] if shape else []
+    return tuple(f"{links[first]}, {links[second]}" for first, second in (shape.checked_pairs if shape else ()))
 
 
 def _is_cautious(state: "SymbolicState") -> bool:

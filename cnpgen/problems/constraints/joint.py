@@ -20,10 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class _RelativeLimit(Constraint):
-    """Base class: symmetric limit with a relative tolerance.
-
-    States have a property ``rates``, which is None for jerks of boundary states, and robots one ``limit``.
-    """
+    """Base class: symmetric limit of rates, None for jerks of boundary states, with a relative tolerance."""
 
     condition_name: ClassVar[str]
     unit: ClassVar[str]

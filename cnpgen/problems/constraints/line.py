@@ -39,8 +39,3 @@ class Line(TipManifold):
         direction = unit(self.direction, "direction")
         bounded, ranges = ([direction.tolist()], (self.piece,)) if self.piece else ((), ())
         return TipRegion(np.array(self.point), beside(direction).tolist(), bounded, ranges)
-
-    @property
-    def band(self) -> float:
-        """Maximum distance of a start from the line [m]."""
-        return self.start_band

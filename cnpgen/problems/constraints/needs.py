@@ -22,12 +22,10 @@ _MIXED = np.cos(np.arange(64.0))  # both signs and distinct magnitudes
 
 
 def symbolic_needs(condition: Condition, *derivatives: Any) -> int:
-    """Return the derivative order of a condition in symbolic form.
+    """Return the derivative order of a condition with SX expressions.
 
-    Args:
-        condition: Condition with SX expressions.
-        derivatives: SX columns of the symbols of the velocities, of those in the accelerations alone and, for states
-            with jerks, of those in the jerks alone.
+    The derivatives are SX columns of the symbols of the velocities, of those in the accelerations alone and, for states
+    with jerks, of those in the jerks alone.
     """
     import casadi as ca
 

@@ -1,26 +1,24 @@
 """Clearance constraint between the held object and the robot's links."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cnpgen.problems.constraints.clearance import MAX_LINK_PENETRATION_M
-from cnpgen.problems.constraints.constraint import Condition, Constraint
+from cnpgen.problems.constraints.clearance import LinkClearance, names_of_pairs
+from cnpgen.problems.constraints.constraint import Condition
 from cnpgen.schema.keys import field
 
 if TYPE_CHECKING:
     from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
     from cnpgen.robots.robot import Robot
     from cnpgen.robots.shape.capsule import Capsule
-    from cnpgen.world.path import PathWorld
     from cnpgen.world.world import World
 MAX_HELD_CAPSULE_ERROR_FRACTION = 0.1  # of the free states, in which the capsule of a usable link overlaps the object
 
 
 @dataclass(frozen=True, kw_only=True)
-class ObjectClearance(Constraint):
+class ObjectClearance(LinkClearance):
     """Constraint: the held object is further than ``distance`` from the links that may not touch it.
 
     It requires the geometry of the URDF. ``touch_links`` in [object] may touch the object. Links that the joint of the
@@ -28,18 +26,12 @@ class ObjectClearance(Constraint):
     Solvers use the capsules of links whose capsules hardly ever overlap the object unless the links do.
     """
 
-    reason = "object in collision with the robot"
-    uses_obstacles = False
+    reason, condition_name, bodies = "object in collision with the robot", "object clearance", "held object"
     training_weight = 3000.0
     distance: float = field(
         "minimum distance of the object from the links", unit="m", low=0.0, default=0.0, plausible=2.0
     )
     tolerance: float = field("violation that a valid motion may have", unit="m", low=0.0, default=0.0, plausible=0.5)
-
-    @property
-    def effective_tolerance(self) -> float:
-        """Tolerance up to a penetration of ``MAX_LINK_PENETRATION_M``."""
-        return min(self.tolerance, self.distance + MAX_LINK_PENETRATION_M)
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the distances of the capsules' axes from the object [m]."""
@@ -52,27 +44,19 @@ class ObjectClearance(Constraint):
 
     def measured(self, world: "World") -> tuple[Condition, ...]:
         """Measure the signed distances of the convex parts with Coal [m]."""
-        distances, shape = world.held_object_distances(self.distance), world.robot.held_shape
-        links = [part.link for part in shape.convex_parts] if shape else []
-        pairs = shape.checked_pairs if shape else ()
-        lower, upper = np.full(len(distances), self.distance), np.full(len(distances), np.inf)
-        parts = tuple(f"{links[first]}, {links[second]}" for first, second in pairs)
-        return (Condition("object clearance", "m", distances, lower, upper, "position", parts=parts),)
-
-    def met(self, path: "PathWorld", tolerance: float) -> NDArray[np.bool_]:
-        """Return a mask of the states with sufficient distances between the object and the links."""
-        return path.clear_of_held_object(self.distance - tolerance)
+        distances, parts = world.held_object_distances(self.distance), names_of_pairs(world.robot.held_shape)
+        return self._at_least(distances, self.distance, parts=parts)
 
     def solved(self, world: "World") -> tuple[Condition, ...]:
         """Return the conditions of the capsules."""
         capsules = _solver_capsules(world.robot)
-        (condition,) = self._clear([0.0] * len(capsules), capsules)
-        return (replace(condition, parts=tuple(capsule.link for capsule in capsules)),)
+        return self._clear([0.0] * len(capsules), capsules, parts=tuple(capsule.link for capsule in capsules))
 
-    def _clear(self, distances: list[Any], capsules: "list[Capsule]") -> tuple[Condition, ...]:
-        lower = np.array([capsule.radius + self.distance for capsule in capsules])
-        upper = np.full(len(capsules), np.inf)
-        return (Condition("object clearance", "m", distances, lower, upper, "position", sufficient=True),)
+    def _clear(
+        self, distances: list[Any], capsules: "list[Capsule]", parts: tuple[str, ...] = ()
+    ) -> tuple[Condition, ...]:
+        least = np.array([capsule.radius + self.distance for capsule in capsules])
+        return self._at_least(distances, least, parts=parts, sufficient=True)
 
 
 def _solver_capsules(robot: "Robot") -> "list[Capsule]":

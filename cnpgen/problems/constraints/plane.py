@@ -46,11 +46,6 @@ class Plane(TipManifold):
         bounded = [axis.tolist() for axis, _ in given]
         return TipRegion(np.array(self.point), [normal.tolist()], bounded, tuple(each for _, each in given))
 
-    @property
-    def band(self) -> float:
-        """Maximum distance of a start from the plane [m]."""
-        return self.start_band
-
     def _axes(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the normal and both directions in the plane, unit vectors."""
         normal = unit(self.normal, "normal")

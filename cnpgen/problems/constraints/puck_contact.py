@@ -82,9 +82,7 @@ class PuckContact(Constraint):
     def scene_values(self, goal_xyz: Array, goal_velocity: Array) -> Array:
         """Return the goal and the puck of N motions: x and y of both [m], shape (N, 4); out of reach if at rest.
 
-        Args:
-            goal_xyz: Tip positions at the goal [m], shape (N, 3).
-            goal_velocity: Tip velocities at the goal [m/s], shape (N, 3).
+        See ``Constraint.scene_values``.
         """
         goal, velocity = goal_xyz[:, :2], goal_velocity[:, :2]
         speed = np.hypot(velocity[:, :1], velocity[:, 1:])
@@ -124,12 +122,7 @@ class PuckContact(Constraint):
         return _at_least(self.contact_range + ADDED_RADIUS_M, self._measured_distances(world)[1])
 
     def touches(self, tip: Array, scene_values: Array) -> NDArray[np.bool_]:
-        """Return whether the mallet touches the puck at N positions.
-
-        Args:
-            tip: Tip positions [m], shape (N, 3).
-            scene_values: Goal and puck, see ``scene_values``, shape (N, 4).
-        """
+        """Return whether the mallet touches the pucks of ``scene_values`` at N tip positions [m], shape (N, 3)."""
         touching: NDArray[np.bool_] = np.hypot(*(tip[:, :2] - scene_values[:, 2:]).T) < self.contact_range
         return touching
 
@@ -156,25 +149,16 @@ class PuckContact(Constraint):
 
         The relaxation ``h max(1 - rho^2 / (h l), 0)`` at a distance rho from the goal, for the overlap h and the length
         l, permits contact in the disc of diameter l. The maximum is rounded, so that the verdict finds local maxima.
-
-        Args:
-            from_goal: Squared distance of the tip from the goal [m^2].
-            distance: Distance of the centres [m].
         """
         overlap = self.overlap + ADDED_RADIUS_M
         relaxation = overlap * _positive_part(1 - from_goal / (overlap * self.last), ROUNDING)
         return _at_least(self.contact_range + ADDED_RADIUS_M, distance + relaxation)
 
     def _cone(self, from_goal: Any, distance: Any, margin: float) -> tuple[Condition, ...]:
-        """State a stricter condition that limits all of the last states and not only the first contact.
+        """State a stricter condition, by a margin [m], that limits all of the last states, not only the first contact.
 
         The relaxation decreases linearly with the distance from the goal, so that a straight hit has the same margin
         at all of them. Solvers, which check grid points only, would miss the first contact.
-
-        Args:
-            from_goal: Squared distance of the tip from the goal [m^2].
-            distance: Distance of the centres [m].
-            margin: Distance from the puck in addition to that of ``_condition`` [m].
         """
         overlap = self.overlap + ADDED_RADIUS_M + margin
         rho = (from_goal + MIN_SQUARED_PUCK_DISTANCE_M2) ** 0.5
@@ -184,12 +168,7 @@ class PuckContact(Constraint):
     def initial_tip_paths(self, values: Array, start_xyz: Array) -> list[Array]:
         """Return tip paths around the puck on either side, the shorter one first; none if it is not in the way.
 
-        Args:
-            values: Goal and puck, see ``scene_values``, shape (4,).
-            start_xyz: Tip position at the start [m], shape (3,).
-
-        Returns:
-            Polylines from start to goal [m], shape (K, 3) each.
+        See ``Constraint.initial_tip_paths``.
         """
         goal, puck, start = values[:2], values[2:], start_xyz[:2]
         hit = (puck - goal) / self.contact_distance

@@ -1,41 +1,34 @@
 """Self-collision constraint: links that move relative to each other do not touch."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.problems.constraints.clearance import MAX_LINK_PENETRATION_M
-from cnpgen.problems.constraints.constraint import Condition, Constraint, End
+from cnpgen.problems.constraints.clearance import LinkClearance, names_of_pairs
+from cnpgen.problems.constraints.constraint import Condition, End
 from cnpgen.schema.keys import field
 
 if TYPE_CHECKING:
     from cnpgen.kernels.symbolic.symbolic_state import SymbolicState
     from cnpgen.robots.robot import Robot
     from cnpgen.robots.shape.link_pairs import LinkPair
-    from cnpgen.world.path import PathWorld
     from cnpgen.world.world import World
 
 
 @dataclass(frozen=True, kw_only=True)
-class SelfClearance(Constraint):
+class SelfClearance(LinkClearance):
     """Constraint: the links of every pair that is not left out are further than ``distance`` from each other.
 
     It requires the geometry of the URDF. Judges measure the convex parts of the links. Solvers use the capsules of
     pairs whose capsules hardly ever overlap unless the links do; only judges check the other pairs.
     """
 
-    reason = "robot in collision with itself"
-    uses_obstacles = False
+    reason, condition_name, bodies = "robot in collision with itself", "self clearance", "self"
     distance: float = field("minimum distance of links", unit="m", low=0.0, default=0.0, plausible=2.0)
     tolerance: float = field("violation that a valid motion may have", unit="m", low=0.0, plausible=0.5)
-
-    @property
-    def effective_tolerance(self) -> float:
-        """Tolerance up to a penetration of ``MAX_LINK_PENETRATION_M``."""
-        return min(self.tolerance, self.distance + MAX_LINK_PENETRATION_M)
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the distances of the capsules' axes [m] of the pairs for solvers."""
@@ -43,20 +36,13 @@ class SelfClearance(Constraint):
 
     def measured(self, world: "World") -> tuple[Condition, ...]:
         """Measure the signed distances of the convex parts with Coal [m]."""
-        (found,) = self._least(world.self_distances(self.distance), [0.0], sufficient=False)
-        shape = world.robot.shape
-        links = [piece.link for piece in shape.convex_parts] if shape else []
-        pairs = shape.checked_pairs if shape else ()
-        return (replace(found, parts=tuple(f"{links[i]}, {links[j]}" for i, j in pairs)),)
-
-    def met(self, path: "PathWorld", tolerance: float) -> NDArray[np.bool_]:
-        """Return a mask of the states with sufficient distances between the convex parts."""
-        return path.clear_of_itself(self.distance - tolerance)
+        distances, parts = world.self_distances(self.distance), names_of_pairs(world.robot.shape)
+        return self._at_least(distances, self.distance, parts=parts)
 
     def solved(self, world: "World") -> tuple[Condition, ...]:
         """Return the conditions of the capsules."""
         radii = _radii(world.robot, _for_solvers(world.robot))
-        return self._least([0.0] * len(radii), radii, sufficient=True)
+        return self._at_least([0.0] * len(radii), radii + self.distance, sufficient=True)
 
     def symbolic_at(self, state: "SymbolicState", end: End) -> tuple[Condition, ...]:  # noqa: ARG002
         """State the distances of all pairs."""
@@ -67,12 +53,7 @@ class SelfClearance(Constraint):
 
         ends = [(state.capsules[pair.first], state.capsules[pair.second]) for pair in pairs]
         distances = [segment_distance((a, b), (c, d), freeze=state.freeze) for (a, b, _), (c, d, _) in ends]
-        return self._least(distances, _radii(state.robot, pairs), sufficient=True)
-
-    def _least(self, distances: list[Any], radii: list[float], *, sufficient: bool) -> tuple[Condition, ...]:
-        m = len(distances)
-        least, most = np.zeros(m) + radii + self.distance, np.full(m, np.inf)
-        return (Condition("self clearance", "m", distances, least, most, "position", sufficient=sufficient),)
+        return self._at_least(distances, _radii(state.robot, pairs) + self.distance, sufficient=True)
 
 
 def _looked_at(robot: "Robot") -> "list[LinkPair]":
@@ -85,7 +66,7 @@ def _for_solvers(robot: "Robot") -> "list[LinkPair]":
     return [pair for pair in _looked_at(robot) if pair.for_solvers]
 
 
-def _radii(robot: "Robot", pairs: "Sequence[LinkPair]") -> list[float]:
+def _radii(robot: "Robot", pairs: "Sequence[LinkPair]") -> NDArray[np.float64]:
     """Return the sums of the capsule radii of pairs [m]."""
     radius = {capsule.link: capsule.radius for capsule in robot.shape.capsules} if robot.shape else {}
-    return [radius[pair.first] + radius[pair.second] for pair in pairs]
+    return np.array([radius[pair.first] + radius[pair.second] for pair in pairs], float)

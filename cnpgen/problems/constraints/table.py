@@ -47,11 +47,6 @@ class Table(TipManifold):
         return TipRegion(np.array([0.0, 0.0, self.z]), held=axes[2:], bounded=axes[:2], ranges=(self.x, self.y))
 
     @property
-    def band(self) -> float:
-        """Maximum vertical distance of a start from the table [m]."""
-        return self.start_band
-
-    @property
     def bounds(self) -> dict[str, float]:
         """Bounds of the rectangle [m], by the names of parameters."""
         return dict(zip(TABLE_BOUNDS, (self.x.low, self.x.high, self.y.low, self.y.high), strict=True))

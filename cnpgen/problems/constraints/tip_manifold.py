@@ -75,8 +75,8 @@ class TipManifold(Constraint):
 
     @property
     def band(self) -> float:
-        """Maximum distance of a start from the manifold [m]."""
-        return 0.0
+        """Maximum distance of a start from the manifold [m]: the key ``start_band`` of kinds that have it."""
+        return float(getattr(self, "start_band", 0.0))
 
     def symbolic(self, state: "SymbolicState") -> tuple[Condition, ...]:
         """State the tip position [m]."""
@@ -116,11 +116,7 @@ class TipManifold(Constraint):
         return self.start_off(start_tip)[..., None] * open_
 
     def start_off(self, start_tip: Array) -> Array:
-        """Return the relaxation for the starts of motions [m]: their distance from the manifold, at most ``band``.
-
-        Args:
-            start_tip: Positions of the tip at the start [m], shape (..., 3).
-        """
+        """Return the distances of starts, shape (..., 3), from the manifold, at most ``band`` [m]."""
         place = self.place
         pairs = zip(place.held, place.height, strict=True)
         off = reduce(np.maximum, [np.abs(along(row, start_tip.T).T - height) for row, height in pairs])

@@ -40,13 +40,10 @@ def is_moveit(document: Any) -> bool:
 
 
 def read_moveit(documents: dict[Path, Any]) -> Iterator[SceneProblem]:
-    """Yield the problems of planning scenes and requests.
+    """Yield the problems of planning scenes and requests, file -> document.
 
     A request belongs to the scene in its own document, or to the scene in the same folder whose name differs by
     "request" and "scene" only: ``request0001.yaml`` and ``scene0001.yaml``. A scene without a request is an error.
-
-    Args:
-        documents: File -> its document.
 
     Raises:
         SceneError: A document is invalid, or a scene has no request.
@@ -223,14 +220,10 @@ def _rotation(xyzw: Any, where: str) -> Array:
 
 
 def moveit_texts(scene: SceneProblem, joints: Sequence[str]) -> tuple[str, str]:
-    """Return a scene and its request as YAML.
-
-    Args:
-        scene: The scene; capsules are not part of MoveIt.
-        joints: Names of the joints.
+    """Return a scene and its request, with these names of joints, as YAML.
 
     Raises:
-        SceneError: An obstacle has no primitive in MoveIt, or the scene has no goal state.
+        SceneError: An obstacle, such as a capsule, has no primitive in MoveIt, or the scene has no goal state.
     """
     lines = [f"name: {_text(scene.name)}", "world:", "  collision_objects:" + ("" if scene.obstacles else " []")]
     for obstacle in scene.obstacles:

@@ -152,10 +152,7 @@ def _obstacles(numbers: dict[str, Array], place: str) -> Iterator[Obstacle]:
 
 
 def mpinets_bytes(scenes: Sequence[SceneProblem]) -> bytes:
-    """Return scenes as an HDF5 file; equal scenes give equal bytes.
-
-    Args:
-        scenes: The scenes, each with one goal state and the same number of joints.
+    """Return scenes, with one goal state and equal numbers of joints, as an HDF5 file; equal scenes give equal bytes.
 
     Raises:
         SceneError: A scene has no goal state or several, or an obstacle of another kind.

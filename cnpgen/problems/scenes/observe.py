@@ -11,8 +11,7 @@ from cnpgen.errors import UsageError
 from cnpgen.machine.threads import one_thread
 from cnpgen.problems.scenes.scene_problem import SceneProblem
 from cnpgen.robots.observation.observations import Observation, SceneBatch, as_observation
-from cnpgen.robots.observation.primitives import Primitives
-from cnpgen.robots.observation.scene_primitives import scene_primitives
+from cnpgen.robots.observation.primitives import Primitives, scene_primitives
 from cnpgen.robots.observation.surface_points import scene_seeds
 from cnpgen.robots.obstacle import Obstacle, invalid_obstacle
 from cnpgen.robots.scene import Scene

@@ -11,11 +11,7 @@ MAX_NORM_ERROR = 0.01  # of a quaternion that is accepted and normalized
 
 
 def quaternion_mistake(quaternion: Array) -> str:
-    """Return an error message for a quaternion that is not of unit length; empty for a valid one.
-
-    Args:
-        quaternion: Four components in any order, shape (4,).
-    """
+    """Return an error message for a quaternion, shape (4,), that is not of unit length; empty for a valid one."""
     norm = float(np.linalg.norm(quaternion))
     if abs(norm - 1) <= MAX_NORM_ERROR:
         return ""

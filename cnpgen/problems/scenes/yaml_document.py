@@ -21,13 +21,9 @@ MAX_YAML_DEPTH = 32  # nested mappings and lists
 
 
 def read_yaml(path: Path, *, numbers: bool = False) -> list[Any]:
-    """Read the documents of a YAML file; scalars stay texts, and plain nulls become None.
+    """Read the documents of a YAML file; scalars stay texts, or with ``numbers`` become float, and plain nulls None.
 
-    Anchors and aliases are refused, so the memory is proportional to the size of the file.
-
-    Args:
-        path: The file.
-        numbers: Whether plain scalars that are numbers become float; keys stay texts.
+    Anchors and aliases are refused, so the memory is proportional to the size of the file. Keys stay texts.
 
     Raises:
         SceneError: The file is not YAML, has anchors, or is nested too deeply.
@@ -97,16 +93,10 @@ class _Key:
 
 
 def part(document: Any, key: str, kind: type, where: str) -> Any:
-    """Return an entry of a mapping, or an empty mapping, list or text if it is missing.
-
-    Args:
-        document: The mapping.
-        key: Key of the entry.
-        kind: Expected type: dict, list or str.
-        where: Place of the mapping, for messages.
+    """Return an entry of a mapping, or an empty mapping, list or text if it is missing; ``where`` is for messages.
 
     Raises:
-        SceneError: The entry has another type, or the document is not a mapping.
+        SceneError: The entry is no dict, list or str as required, or the document is not a mapping.
     """
     if not isinstance(document, dict):
         raise SceneError(f"{where} must be a mapping, got {document!r:.60}")
@@ -120,12 +110,7 @@ def part(document: Any, key: str, kind: type, where: str) -> Any:
 
 
 def vector(value: Any, keys: str, where: str) -> Array:
-    """Return numbers of a list, or of a mapping by its keys.
-
-    Args:
-        value: A list of numbers, or a mapping such as ``{x: 1, y: 2, z: 3}``.
-        keys: Keys of a mapping in order, such as "xyz"; empty for a list of any length.
-        where: Place of the value, for messages.
+    """Return the numbers of a list, or of a mapping by its keys in order, such as "xyz"; without keys, of any list.
 
     Raises:
         SceneError: There is another number of entries, or an entry is not a number.

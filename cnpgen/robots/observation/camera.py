@@ -66,16 +66,9 @@ class Camera:
 
 
 def depth_image(primitives: Primitives, camera: Camera) -> Array:
-    """Compute distances along the camera's axis at the centers of the pixels [m].
+    """Compute distances along the camera's axis at the centers of the pixels [m], shape (height, width); inf for none.
 
     Bodies that contain the camera are not seen.
-
-    Args:
-        primitives: M primitives.
-        camera: The camera.
-
-    Returns:
-        Shape (height, width); inf where no body is seen.
     """
     x, y = ((2 * np.arange(count) + 1) / count - 1 for count in (camera.width, camera.height))
     forward, right, down = camera.axes
@@ -92,16 +85,9 @@ def depth_image(primitives: Primitives, camera: Camera) -> Array:
 
 
 def depth_points(depth: Array, camera: Camera, count: int, seed: np.uint64) -> Array:
-    """Return points of a depth image, evenly distributed over the pixels that see a body; nan if there are none.
+    """Return points of a depth image [m], evenly distributed over the pixels that see a body, shape (count, 3).
 
-    Args:
-        depth: Depth image [m], shape (height, width).
-        camera: Its camera.
-        count: Number of points; they repeat if there are fewer such pixels.
-        seed: Seed of the scene.
-
-    Returns:
-        Points in the world frame [m], shape (count, 3).
+    They repeat if there are fewer such pixels, and are nan if there are none. The seed is that of the scene.
     """
     seen = np.flatnonzero(np.isfinite(depth))
     if not len(seen):

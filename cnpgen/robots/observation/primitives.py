@@ -1,4 +1,4 @@
-"""Obstacles of samples as arrays of boxes, spheres, cylinders, capsules and convex meshes with poses."""
+"""Obstacles of samples or scenes as arrays of boxes, spheres, cylinders, capsules and convex meshes with poses."""
 
 from __future__ import annotations
 
@@ -13,16 +13,18 @@ from numpy.typing import NDArray
 from cnpgen.errors import UsageError
 from cnpgen.robots.observation.convex_mesh import ConvexMesh, convex_mesh
 from cnpgen.robots.obstacle import Obstacle
+from cnpgen.robots.scene import PARKED_POSITION_M, Scene
 from cnpgen.robots.shape.convex_part import PRISM_SIDES
 from cnpgen.robots.shape.hull import frames_along
 from cnpgen.robots.shape.inline import is_inline
-from cnpgen.robots.solid import UNBOUNDED_OBSTACLE_HEIGHT_M, number_slices
+from cnpgen.robots.solid import UNBOUNDED_OBSTACLE_HEIGHT_M, number_slices, place_obstacles, pose_width
 from cnpgen.schema.keys import Range
 
 Array = NDArray[np.float64]
 
 KINDS = ("box", "sphere", "cylinder", "capsule")  # index: the code of a kind
 MESH = len(KINDS)  # the code of the first mesh, followed by those of the others
+NO_BODY = -1  # kind of the padding
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,10 +61,8 @@ class Primitives:
 def primitives_of(obstacles: Sequence[Obstacle], numbers: Array) -> Primitives:
     """Return obstacles as primitives.
 
-    Args:
-        obstacles: The obstacles.
-        numbers: Their poses and sizes (``cnpgen.robots.solid``), shape (pose_width,); or of N samples, shape
-            (N, pose_width), which gives arrays with a first axis of length N.
+    Poses and sizes (``cnpgen.robots.solid``) have shape (pose_width,), or of N samples (N, pose_width), which gives
+    arrays with a first axis of length N.
 
     Raises:
         UsageError: An obstacle is a mesh file, not its corners.
@@ -117,3 +117,41 @@ def _fill(obstacle: Obstacle, numbers: Array, center: Array, rotation: Array, si
         rotation[:] = frames_along(rest[:, :3], half)
         size[:, 0] = rest[:, 3] * (math.cos(math.pi / PRISM_SIDES) if obstacle.kind == "cylinder" else 1.0)
         size[:, 1] = half
+
+
+def scene_primitives(scenes: Scene | Sequence[Sequence[Obstacle]]) -> Primitives:
+    """Return the bodies of N scenes, arrays with a first axis of length N; without obstacles parked below the robot.
+
+    Raises:
+        UsageError: An obstacle is a mesh file, not its corners.
+    """
+    if isinstance(scenes, Scene):
+        bodies = primitives_of(scenes.obstacles, scenes.poses[:, : pose_width(scenes.obstacles)])
+        bodies.kinds[bodies.centers[:, :, 2] <= PARKED_POSITION_M[2] / 2] = NO_BODY  # meshes have another center
+        return bodies
+    known: dict[int, Primitives] = {}  # problems of one scene share its obstacles
+    for obstacles in scenes:
+        if id(obstacles) not in known:
+            known[id(obstacles)] = primitives_of(obstacles, place_obstacles(obstacles))
+    return padded([known[id(obstacles)] for obstacles in scenes])
+
+
+def padded(scenes: Sequence[Primitives]) -> Primitives:
+    """Return the bodies of N scenes as arrays with a first axis of length N, padded with bodies of kind -1."""
+    shape = len(scenes), max(map(len, scenes), default=0)
+    kinds, centers = np.full(shape, NO_BODY, np.int64), np.zeros((*shape, 3))
+    rotations, sizes = np.tile(np.eye(3), (*shape, 1, 1)), np.zeros((*shape, 3))
+    meshes: dict[ConvexMesh, int] = {}  # mesh -> index
+    for index, scene in enumerate(scenes):
+        count = len(scene)
+        codes = [MESH + meshes.setdefault(mesh, len(meshes)) for mesh in scene.meshes]
+        kinds[index, :count] = np.array([*range(MESH), *codes, NO_BODY])[scene.kinds]
+        centers[index, :count] = scene.centers
+        rotations[index, :count], sizes[index, :count] = scene.rotations, scene.sizes
+    return Primitives(kinds, centers, rotations, sizes, tuple(meshes))
+
+
+def bodies_of(scenes: Primitives, index: int) -> Primitives:
+    """Return the bodies of one of N scenes, without padding."""
+    scene = scenes[index]
+    return scene[scene.kinds >= 0]

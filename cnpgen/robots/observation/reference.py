@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.robots.observation.camera import Camera, depth_image, depth_points
-from cnpgen.robots.observation.primitives import Primitives
-from cnpgen.robots.observation.scene_primitives import bodies_of
+from cnpgen.robots.observation.primitives import Primitives, bodies_of
 from cnpgen.robots.observation.signed_distance import smallest_signed_distances
 from cnpgen.robots.observation.surface_points import Seeds, surface_points
 
@@ -19,14 +18,9 @@ class ObservationBackend(Protocol):
     """Functions of N scenes, which are primitives with a first axis of length N."""
 
     def distances(self, scenes: Primitives, points: Array) -> Values:
-        """Return the smallest signed distance of points from the bodies of each scene [m].
+        """Return the smallest signed distance of points from the bodies of each scene [m], shape (N, P).
 
-        Args:
-            scenes: The scenes.
-            points: Points in the world frame [m], shape (P, 3) for all scenes or (N, P, 3).
-
-        Returns:
-            Shape (N, P); inf for scenes without bodies.
+        Points in the world frame [m] have shape (P, 3) for all scenes or (N, P, 3). Without bodies distances are inf.
         """
 
     def surface_points(self, scenes: Primitives, count: int, seeds: Seeds) -> Values:

@@ -11,15 +11,7 @@ POINTS_PER_CHUNK = 65_536  # keeps the temporary arrays of one primitive in the 
 
 
 def signed_distances(primitives: Primitives, points: Array) -> Array:
-    """Compute the signed distance of points from every primitive.
-
-    Args:
-        primitives: M primitives.
-        points: Points in the world frame [m], shape (P, 3).
-
-    Returns:
-        Distances [m], negative inside, shape (M, P).
-    """
+    """Compute the signed distances of P world points from M primitives [m], negative inside, shape (M, P)."""
     distances = np.empty((len(primitives), len(points)))
     for index in range(len(primitives)):
         mesh, kind, size = primitives.mesh(index), int(primitives.kinds[index]), primitives.sizes[index]

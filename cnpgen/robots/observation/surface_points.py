@@ -69,18 +69,10 @@ class _Patch:
 
 
 def surface_points(primitives: Primitives, count: int, seed: np.uint64) -> Array:
-    """Return points on all surfaces, in proportion to the areas, ordered by body; nan without bodies.
+    """Return points on all surfaces [m], by area, ordered by body, shape (count, 3); nan without bodies.
 
     Points that are inside of another body are kept. Within a part of a surface they form a Kronecker sequence, which
-    is more even than random points.
-
-    Args:
-        primitives: M primitives.
-        count: Number of points.
-        seed: Seed of the scene.
-
-    Returns:
-        Points in the world frame [m], shape (count, 3).
+    is more even than random points. The seed is that of the scene.
     """
     patches = [patch for index in range(len(primitives)) for patch in _patches(primitives, index)]
     if not patches:

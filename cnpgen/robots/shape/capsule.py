@@ -6,6 +6,7 @@ search minimizes the overhang of the capsule over the link.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,14 +43,11 @@ class Capsule:
 
 
 def covering_capsule(convex_parts: Sequence[ConvexPart]) -> Capsule:
-    """Find a capsule of small overhang that covers all convex parts of one link.
+    """Find a capsule of small overhang that covers all convex parts of one link, which are in one frame.
 
     The initial guess is the best of 30 directions, each with the minimum enclosing circle of the link's projection.
     Sequential quadratic programming then minimizes the radius plus the maximum excess of an end over a facet, which is
     the overhang for ends inside the hull. The final radius covers every corner.
-
-    Args:
-        convex_parts: The convex parts of the link, in one frame.
     """
     corners = np.concatenate([part.vertices for part in convex_parts])
     thickness = np.concatenate([np.full(len(part.vertices), part.radius) for part in convex_parts])
@@ -63,21 +61,17 @@ def covering_capsule(convex_parts: Sequence[ConvexPart]) -> Capsule:
         excess = (np.array([first, second]) @ normals.T - offsets).max()
         return Capsule(convex_parts[0].link, first, second, float(radius), float(radius + excess))
 
-    starts = sorted((finished(_along(axis, corners, thickness)) for axis in _axes(corners)), key=_by_overhang)
+    starts = sorted((finished(_along(axis, corners, thickness)) for axis in _axes(corners)), key=attrgetter("overhang"))
     improved = [
         finished(_improved(start, corners, thickness, normals, offsets)) for start in starts[:SEARCH_DIRECTIONS]
     ]
-    return min([*starts[:1], *improved], key=_by_overhang)
+    return min([*starts[:1], *improved], key=attrgetter("overhang"))
 
 
 def covers(capsule: Capsule, convex_parts: Sequence[ConvexPart]) -> bool:
     """Return whether a capsule contains all corners, and therefore all convex parts, of its link."""
     reach = [_distances(each.vertices, capsule.first, capsule.second)[0].max() + each.radius for each in convex_parts]
     return bool(reach) and max(reach) <= capsule.radius
-
-
-def _by_overhang(capsule: Capsule) -> float:
-    return capsule.overhang
 
 
 def _facets(corners: Array, thickness: Array) -> tuple[Array, Array]:
@@ -98,10 +92,7 @@ def _axes(corners: Array) -> Array:
 
 
 def _along(axis: Array, corners: Array, thickness: Array) -> Array:
-    """Return the ends of the capsule of minimum length along an axis, shape (2, 3).
-
-    Its radius is that of the enclosing circle of the link's projection, iterated as by Badoiu and Clarkson (2003).
-    """
+    """Return the ends of the minimum capsule along an axis, shape (2, 3), by a circle (Badoiu and Clarkson 2003)."""
     across = np.linalg.svd(axis[None])[2][1:]  # two unit vectors orthogonal to the axis
     projection = corners @ across.T
     center = projection.mean(axis=0)

@@ -34,22 +34,14 @@ class ConvexPart:
     radius: float = 0.0
 
     def moved(self, rotation: Array, translation: Array) -> "ConvexPart":
-        """Return the part in another frame.
-
-        Args:
-            rotation: Rotation of the present frame in the other one, shape (3, 3).
-            translation: Origin of the present frame in the other one [m], shape (3,).
-        """
+        """Return the part in another frame, given rotation and translation [m] of the present frame in it."""
         return ConvexPart(self.link, self.vertices @ rotation.T + translation, self.radius)
 
 
 def link_convex_parts(urdf: str) -> list[ConvexPart]:
-    """Read the collision geometry of a URDF whose meshes are inline (``cnpgen.robots.shape.inline``).
+    """Read the collision geometry of a URDF whose meshes are inline, in the frames of its links and in its order.
 
     A cylinder becomes a prism of ``PRISM_SIDES`` sides that contains it; all other geometry is exact.
-
-    Returns:
-        The convex parts in the frames of their links, in the order of the URDF.
 
     Raises:
         RecipeError: A collision element is invalid.
@@ -104,12 +96,7 @@ def _core(shape: ElementTree.Element) -> tuple[Array, float]:
 
 
 def prism(outer: float, half: float) -> Array:
-    """Return the corners of a prism of ``PRISM_SIDES`` sides along z [m], shape (2 PRISM_SIDES, 3).
-
-    Args:
-        outer: Distance of the corners from the axis [m].
-        half: Half the length of the prism [m].
-    """
+    """Return the corners of a prism along z by their distance from z and half its length [m], shape (2 sides, 3)."""
     return _UNIT_PRISM * [outer, outer, half]
 
 

@@ -30,12 +30,7 @@ DECOMPOSITION_REVISION = 2  # of the decomposition; cached parts of another revi
 
 @dataclass(frozen=True)
 class TriangleMesh:
-    """Triangles of a mesh or of a part of it.
-
-    Attributes:
-        points: Points [m], shape (N, 3).
-        triangles: Triangles as indices of points, shape (T, 3).
-    """
+    """Triangles of a mesh or of a part of it: points [m], shape (N, 3), and indices of points, shape (T, 3)."""
 
     points: Array
     triangles: NDArray[np.int64]
@@ -60,13 +55,7 @@ class TriangleMesh:
 
 @dataclass(frozen=True)
 class _Cut:
-    """Best cut of a part.
-
-    Attributes:
-        part: The part.
-        reduction: Volume by which the cut reduces the hulls [m^3]; 0 if no cut does.
-        halves: The triangles below and above the cut.
-    """
+    """Best cut of a part with the volume by which it reduces the hulls [m^3], 0 for none, and both halves."""
 
     part: TriangleMesh
     reduction: float = 0.0
@@ -74,13 +63,10 @@ class _Cut:
 
 
 def convex_parts(points: Array, triangles: NDArray[np.int64], most: int, keep: Path | None) -> list[Array]:
-    """Decompose a mesh into convex parts that together cover its surface.
+    """Decompose a mesh into at most so many convex parts that together cover its surface.
 
-    Args:
-        points: Points of the mesh [m], shape (N, 3).
-        triangles: Triangles as indices of points, shape (T, 3).
-        most: Maximum number of parts.
-        keep: Cache folder, since a decomposition takes seconds; None for no cache.
+    Points [m] have shape (N, 3), triangles are indices of points, shape (T, 3). A cache folder keeps the result, which
+    takes seconds; None for no cache.
 
     Returns:
         Corners of each part [m], shape (V, 3); those of the hull if no cut reduces its volume.
@@ -104,15 +90,7 @@ def _identity(points: Array, triangles: NDArray[np.int64], most: int) -> str:
 
 
 def cut_parts(mesh: TriangleMesh, most: int) -> list[TriangleMesh]:
-    """Cut a mesh into parts whose convex hulls have a small total volume.
-
-    Args:
-        mesh: The mesh.
-        most: Maximum number of parts.
-
-    Returns:
-        The triangles of each part; triangles across a cut are cut, too.
-    """
+    """Cut a mesh into at most so many parts whose convex hulls have a small total volume; triangles are cut, too."""
     least = MIN_VOLUME_REDUCTION * mesh.hull_volume
     cuts = [_best_cut(mesh)]
     while len(cuts) < most:
@@ -135,11 +113,7 @@ def _best_cut(part: TriangleMesh) -> _Cut:
 
 
 def _cut_positions(coordinates: Array) -> list[float]:
-    """Return positions of planes: evenly between both ends, and those of most points, such as faces across the axis.
-
-    Args:
-        coordinates: Coordinates of the points along the axis [m], shape (N,).
-    """
+    """Return positions of planes: evenly between both ends, and those of most points, such as faces across the axis."""
     low, high = float(coordinates.min()), float(coordinates.max())
     even = np.linspace(low, high, CUTS_PER_AXIS + 2)[1:-1]
     faces, counts = np.unique(np.round(coordinates / FACE_TOLERANCE_M), return_counts=True)
@@ -148,16 +122,7 @@ def _cut_positions(coordinates: Array) -> list[float]:
 
 
 def cut_mesh(mesh: TriangleMesh, axis: int, position: float) -> tuple[TriangleMesh, TriangleMesh]:
-    """Cut a mesh by a plane across an axis.
-
-    Args:
-        mesh: The mesh.
-        axis: 0, 1 or 2 for x, y or z.
-        position: Position of the plane along the axis [m].
-
-    Returns:
-        The triangles below and above the plane, which together cover the mesh.
-    """
+    """Cut a mesh by a plane across axis 0, 1 or 2 at a position [m] into the triangles below and above it."""
     height = mesh.points[:, axis] - position
     upper = height[mesh.triangles] > 0
     crossing = upper.any(axis=1) & ~upper.all(axis=1)

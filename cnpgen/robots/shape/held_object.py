@@ -11,15 +11,8 @@ from cnpgen.errors import RecipeError, nearest
 from cnpgen.robots.chain import Chain
 from cnpgen.robots.shape.capsule import Capsule, covering_capsule
 from cnpgen.robots.shape.convex_part import ConvexPart, link_convex_parts
-from cnpgen.robots.shape.hull import CUBE, ball_round, coal_hull
-from cnpgen.robots.shape.link_pairs import (
-    ALWAYS_FRACTION,
-    CollisionBody,
-    LinkContact,
-    LinkPair,
-    body_of_part,
-    sample_poses,
-)
+from cnpgen.robots.shape.hull import CUBE
+from cnpgen.robots.shape.link_pairs import ALWAYS_FRACTION, LinkContact, LinkPair, body_of_part, sample_poses
 from cnpgen.robots.shape.shape import SHAPE_REVISION, Shape, cached_capsules, parts_of, place_convex_parts
 
 if TYPE_CHECKING:
@@ -34,13 +27,7 @@ SAMPLED_HELD_STATES = 2000  # states in which the object and the links are compa
 
 @dataclass(frozen=True)
 class HeldBody:
-    """The held cuboid, with its center at the tip frame.
-
-    Attributes:
-        size: Edge lengths along the axes of the tip frame [m].
-        touch_links: Links that may touch it, such as a gripper.
-        tip_frame: Index of the tip frame in the model.
-    """
+    """The held cuboid: edge lengths along the tip frame [m], links that may touch it, and the frame, its center."""
 
     size: Size
     touch_links: tuple[str, ...]
@@ -48,13 +35,9 @@ class HeldBody:
 
 
 def load_held_shape(urdf: str, model: "pin.Model", held: HeldBody, keep: Path | None) -> Shape:
-    """Load the link geometry for collisions with the held object.
+    """Load the link geometry for collisions with the held object, for a URDF with inline meshes and its reduced model.
 
-    Args:
-        urdf: Text of the URDF with inline meshes (``cnpgen.robots.shape.inline``).
-        model: Pinocchio model, reduced to the planned joints.
-        held: The held object.
-        keep: Cache folder of capsules and pairs; None for no cache.
+    A cache folder keeps capsules and pairs; None for no cache.
 
     Returns:
         The convex parts of all links that may not touch the object, then the object; a capsule and a pair for each of
@@ -92,13 +75,9 @@ def load_held_shape(urdf: str, model: "pin.Model", held: HeldBody, keep: Path | 
 
 
 def with_held_object(shape: Shape, held: Shape | None, chain: Chain, size: Size) -> Shape:
-    """Return the link geometry with the held object as a further link.
+    """Return the link geometry of a robot with the held object, of these edge lengths [m], as a further link.
 
-    Args:
-        shape: Link geometry of the robot.
-        held: Link geometry and the held object, whose pairs are added; None for no pairs with the object.
-        chain: The chain from the base to the tip, the center of the object.
-        size: Edge lengths along the axes of the tip frame [m].
+    The tip of the chain is its center. Pairs of the held shape are added; None for no pairs with the object.
     """
     box, half = _box(size, chain.tip_rotation, chain.tip_translation), np.array(size) / 2
     widest = int(np.argmax(half))
@@ -117,7 +96,7 @@ def _compare(
     model: "pin.Model", parts: tuple[ConvexPart, ...], capsules: tuple[Capsule, ...], joints: dict[str, int]
 ) -> tuple[LinkPair, ...]:
     """Compare the object with all links and their capsules in random states."""
-    bodies = [*map(body_of_part, parts), *(_body_of_capsule(capsule) for capsule in capsules)]
+    bodies = map(body_of_part, [*parts, *map(_part_of_capsule, capsules)])
     all_joints = joints | {_capsule_name(capsule.link): joints[capsule.link] for capsule in capsules}
     contact, pairs = LinkContact(sample_poses(model, SAMPLED_HELD_STATES), bodies, all_joints), []
     for capsule in capsules:
@@ -132,8 +111,5 @@ def _capsule_name(link: str) -> str:
     return f"capsule of {link}"
 
 
-def _body_of_capsule(capsule: Capsule) -> tuple[str, CollisionBody]:
-    ends = np.array([capsule.first, capsule.second])
-    hull = coal_hull(ends)
-    hull.setSweptSphereRadius(capsule.radius)
-    return _capsule_name(capsule.link), CollisionBody(*ball_round(ends, capsule.radius), hull)
+def _part_of_capsule(capsule: Capsule) -> ConvexPart:
+    return ConvexPart(_capsule_name(capsule.link), np.array([capsule.first, capsule.second]), capsule.radius)

@@ -25,14 +25,7 @@ MAX_COORDINATE_M = 1e4  # larger coordinates are treated as mistakes of units
 
 
 def check_solid(corners: Array) -> None:
-    """Raise ValueError for coplanar or too few corners, which untrusted input may contain.
-
-    Args:
-        corners: The corners [m], shape (V, 3).
-
-    Raises:
-        ValueError: There is no body between them, or they are too many.
-    """
+    """Raise ValueError for coplanar, too few or too many corners, shape (V, 3), of untrusted input."""
     from scipy.spatial import ConvexHull, QhullError
 
     if len(corners) > MAX_CORNERS:
@@ -45,13 +38,9 @@ def check_solid(corners: Array) -> None:
 
 
 def hull_corners(points: Array) -> Array:
-    """Return the corners of the convex hull of points, with a thickness of at least ``MIN_THICKNESS_M``.
+    """Return the corners of the convex hull of points [m], shape (V, 3), at least ``MIN_THICKNESS_M`` thick.
 
-    Args:
-        points: The points [m], shape (N, 3).
-
-    Returns:
-        Shape (V, 3), in an order that depends on the coordinates only.
+    Their order depends on the coordinates only.
     """
     from scipy.spatial import ConvexHull
 
@@ -65,15 +54,9 @@ def hull_corners(points: Array) -> Array:
 
 
 def enclosing_hull(corners: Array) -> tuple[Array, float]:
-    """Return a body with fewer corners that contains a convex hull.
+    """Return a body with fewer corners that contains a convex hull, and their maximum distance from it [m].
 
     Supporting planes in ``ENCLOSING_PLANES`` directions bound it, spread evenly after scaling all extents to one.
-
-    Args:
-        corners: Corners of the hull [m], shape (V, 3).
-
-    Returns:
-        Corners of the body [m], shape (W, 3), and their maximum distance from the hull [m].
     """
     import coal
     from scipy.spatial import HalfspaceIntersection
@@ -102,13 +85,8 @@ def half_sphere(count: int) -> Array:
 def supporting_planes(corners: Array) -> Array:
     """Return a few bounding planes of a convex hull in all directions, shape (P, 4).
 
-    They are faces of the hull. Each next face has the normal most distant from the previous normals and the axes.
-
-    Args:
-        corners: The corners of the hull [m], shape (V, 3).
-
-    Returns:
-        Outer unit normals and offsets [m]: ``normal @ x <= offset`` for all points of the hull.
+    They are faces of the hull: outer unit normals and offsets [m], ``normal @ x <= offset`` for all of its points. Each
+    next face has the normal most distant from the previous normals and the axes.
     """
     from scipy.spatial import ConvexHull
 
@@ -123,21 +101,13 @@ def supporting_planes(corners: Array) -> Array:
 
 
 def ball_round(corners: Array, radius: float) -> tuple[Array, float]:
-    """Return the center [m], shape (3,), and radius [m] of a ball that contains a convex body.
-
-    Args:
-        corners: Corners of the body's hull [m], shape (V, 3).
-        radius: Radius around the hull [m].
-    """
+    """Return center, shape (3,), and radius of a ball around a hull of corners, shape (V, 3), with a radius [m]."""
     centre: Array = (corners.min(axis=0) + corners.max(axis=0)) / 2
     return centre, float(np.linalg.norm(corners - centre, axis=1).max()) + radius
 
 
 def coal_hull(corners: Array) -> "coal.Convex":
-    """Return a convex hull as a Coal shape.
-
-    Args:
-        corners: Its corners [m], shape (V, 3); up to three are a point, a segment, a triangle.
+    """Return a convex hull of corners [m], shape (V, 3), as a Coal shape; three are a triangle, two a segment.
 
     Raises:
         UsageError: The corners are those of no body, for example of a damaged scene.

@@ -77,14 +77,10 @@ class HullGap:
 
 
 def measure_hull_gap(urdf: str, path: Path, packages: Sequence[Path], *, model: "pin.Model", shape: Shape) -> HullGap:
-    """Compare the convex parts of link pairs with the collision geometry of a URDF.
+    """Compare the convex parts of link pairs with the collision geometry of a URDF that names its mesh files.
 
-    Args:
-        urdf: Text of the URDF with the names of its mesh files.
-        path: File of the URDF, the base of relative mesh paths.
-        packages: Folders of packages.
-        model: Pinocchio model, reduced to the planned joints; states are sampled within its position limits.
-        shape: Shape of the robot, with the convex parts that are compared.
+    Relative mesh paths begin in the folder of the URDF's file, others in folders of packages. The model has the planned
+    joints; states are sampled within its position limits.
 
     Raises:
         RecipeError: A mesh is missing or cannot be read.
@@ -143,10 +139,7 @@ def _body(
     points, loaded = read_mesh(find_named_file(mesh.get("filename", ""), path, packages), scale_of(mesh))
     for rotation, translation in (origin_of(element.find("origin")), placement):
         points = points @ rotation.T + translation
-    low, high = points.min(axis=0), points.max(axis=0)
-    center = (low + high) / 2
-    radius = float(np.linalg.norm(points - center, axis=1).max())
-    return CollisionBody(center, radius, _triangles(points, sides_of(loaded)))
+    return CollisionBody(*ball_round(points, 0.0), _triangles(points, sides_of(loaded)))
 
 
 def _exact_body(part: ConvexPart) -> CollisionBody:

@@ -44,13 +44,8 @@ def with_inline_meshes(
 ) -> str:
     """Return a URDF with inline hulls of its collision meshes; a URDF without such meshes is returned unchanged.
 
-    Args:
-        urdf: Text of the URDF.
-        path: File of the URDF, the base of relative mesh paths.
-        packages: Folders of packages.
-        most: Maximum number of convex parts of a mesh; 1 for its hull.
-        links: Links whose meshes are decomposed; by default all.
-        keep: Cache folder of convex parts; None for no cache.
+    Relative mesh paths begin in the folder of the URDF's file, others in folders of packages. Meshes of all links, or
+    of some, consist of at most so many convex parts, 1 for the hull, which a cache folder keeps.
 
     Raises:
         RecipeError: Links or meshes are missing or cannot be read; the error lists all of them.
@@ -140,11 +135,7 @@ def points_of(mesh: ElementTree.Element) -> Array:
 
 
 def inline_mesh(path: Path, scale: Array) -> str:
-    """Return the corners of the convex hull of a mesh file as a ``data:`` address.
-
-    Args:
-        path: Path of the mesh file.
-        scale: Scale factors of x, y and z, shape (3,).
+    """Return the corners of the convex hull of a mesh file, scaled along x, y and z, as a ``data:`` address.
 
     Raises:
         RecipeError: The file cannot be read.
@@ -247,11 +238,7 @@ def sides_of(mesh: "coal.BVHModelBase") -> NDArray[np.int64]:
 
 
 def read_mesh(path: Path, scale: Array) -> tuple[Array, "coal.BVHModelBase"]:
-    """Read a mesh: STL, DAE or OBJ.
-
-    Args:
-        path: Path of the mesh file.
-        scale: Scale factors of x, y and z, shape (3,).
+    """Read a mesh, scaled along x, y and z: STL, DAE or OBJ.
 
     Returns:
         Points of the mesh [m], shape (N, 3), and the mesh as an object of Coal.

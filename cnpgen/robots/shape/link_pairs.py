@@ -89,29 +89,13 @@ def find_pairs(
 
 
 def sample_poses(model: "pin.Model", count: int) -> tuple[Array, Array]:
-    """Return poses of all joints at random states; fewer states are the first of more.
-
-    Args:
-        model: Pinocchio model; states are sampled within its position limits.
-        count: Number of states K.
-
-    Returns:
-        Rotations, shape (joints, K, 3, 3), and positions [m], shape (joints, K, 3).
-    """
+    """Return ``joint_poses`` at random states within the position limits; fewer states are the first of more."""
     random = np.random.default_rng(0)
     return joint_poses(model, random.uniform(model.lowerPositionLimit, model.upperPositionLimit, (count, model.nq)))
 
 
 def joint_poses(model: "pin.Model", states: Array) -> tuple[Array, Array]:
-    """Return poses of all joints at K states.
-
-    Args:
-        model: Pinocchio model.
-        states: Joint positions [rad], shape (K, n).
-
-    Returns:
-        Rotations, shape (joints, K, 3, 3), and positions [m], shape (joints, K, 3).
-    """
+    """Return rotations, shape (joints, K, 3, 3), and positions [m], shape (joints, K, 3), of all joints at K states."""
     import pinocchio as pin
 
     data, poses = model.createData(), np.empty((model.njoints, len(states), 4, 3))
@@ -170,13 +154,7 @@ class LinkContact:
         self._request, self._places = coal.CollisionRequest(), (coal.Transform3s(), coal.Transform3s())
 
     def of(self, first: str, second: str, *, among: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
-        """Return a mask of the states in which two links overlap, shape (K,).
-
-        Args:
-            first: A link.
-            second: Another link.
-            among: Mask of the states that are checked, shape (K,); by default all.
-        """
+        """Return a mask of the states, among all or those of a mask, in which two links overlap, shape (K,)."""
         hit = np.zeros(self._positions.shape[1], bool)
         for one, other in product(self._of_link[first], self._of_link[second]):
             centers = [

@@ -19,11 +19,6 @@ _EXTRAS = {"example-robot-data": "robots"}  # Python packages of robots -> cnpge
 def find_urdf(name: str, problem: Path, packages: Sequence[Path] = ()) -> Path:
     """Find the URDF of a problem, in a package (see ``find_named_file``) or relative to the problem file.
 
-    Args:
-        name: Name of the URDF in the problem.
-        problem: Path of the problem file.
-        packages: Package folders of the problem.
-
     Raises:
         PluginError: The package of the file is not installed; the message lists the searched folders.
     """
@@ -43,11 +38,6 @@ def find_named_file(name: str, urdf: Path, packages: Sequence[Path] = ()) -> Pat
     package of this name; each may hold the package or be it. Finally the folders around the URDF are taken for the
     package, whose folder may have another name. What is no URI is relative to the URDF's folder.
 
-    Args:
-        name: Name of the file in the URDF.
-        urdf: Path of the URDF file.
-        packages: Package folders of the problem.
-
     Raises:
         RecipeError: It is in none of these places; with every one of them.
     """
@@ -58,13 +48,7 @@ def find_named_file(name: str, urdf: Path, packages: Sequence[Path] = ()) -> Pat
 
 
 def packages_of_environment(names: Iterable[str], urdf: Path, packages: Sequence[Path] = ()) -> tuple[Path, ...]:
-    """List the folders from environment variables that contain packages of a URDF.
-
-    Args:
-        names: File names in the URDF; missing files and files outside packages are ignored.
-        urdf: Path of the URDF file.
-        packages: Package folders with priority.
-    """
+    """List the folders from environment variables with packages of file names in a URDF; others are ignored."""
     used = []
     for name in (each for each in names if urlparse(each).scheme in _PACKAGE):
         place = _first(_places(name, urdf.absolute(), packages))

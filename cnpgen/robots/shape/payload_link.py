@@ -7,7 +7,7 @@ import numpy as np
 from cnpgen.errors import RecipeError, nearest
 from cnpgen.robots.robot_spec import Payload, RobotSpec
 from cnpgen.robots.shape.convex_part import turned
-from cnpgen.robots.urdf import urdf_tree
+from cnpgen.robots.urdf import numbers_text, urdf_tree
 
 PAYLOAD = "carried payload"  # name of the link and of its joint
 
@@ -15,13 +15,8 @@ PAYLOAD = "carried payload"  # name of the link and of its joint
 def with_payload_link(urdf: str, spec: RobotSpec, payload: Payload | None, *, is_stored: bool) -> str:
     """Return a URDF with the box of the payload as a link without mass, fixed to the tip.
 
-    The mass belongs to the robot's attachments.
-
-    Args:
-        urdf: Text of the URDF.
-        spec: The robot of the problem, with the pose of the tip.
-        payload: The payload; a body if it has touch links.
-        is_stored: Whether the URDF is that of a stored problem, whose link is replaced if it differs.
+    The mass belongs to the robot's attachments. A payload with touch links is a body. A stored problem has the link
+    already, which is replaced if it differs.
 
     Raises:
         RecipeError: A touch link or the tip does not exist, or the URDF has a link of this name.
@@ -63,13 +58,9 @@ def _elements(
     link, joint = ElementTree.Element("link", name=PAYLOAD), ElementTree.Element("joint", name=PAYLOAD, type="fixed")
     for kind in ("visual", "collision"):
         geometry = ElementTree.SubElement(ElementTree.SubElement(link, kind), "geometry")
-        ElementTree.SubElement(geometry, "box", size=_numbers(payload.size or ()))
+        ElementTree.SubElement(geometry, "box", size=numbers_text(payload.size or ()))
     ElementTree.SubElement(joint, "parent", link=parent)
     ElementTree.SubElement(joint, "child", link=PAYLOAD)
     center = np.array(spec.tip_offset) + turned(*spec.tip_rotation) @ np.array(payload.centre)
-    ElementTree.SubElement(joint, "origin", xyz=_numbers(center.tolist()), rpy=_numbers(spec.tip_rotation))
+    ElementTree.SubElement(joint, "origin", xyz=numbers_text(center.tolist()), rpy=numbers_text(spec.tip_rotation))
     return link, joint
-
-
-def _numbers(values: tuple[float, ...] | list[float]) -> str:
-    return " ".join(f"{value:.17g}" for value in values)

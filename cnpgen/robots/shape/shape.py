@@ -62,12 +62,9 @@ class Shape:
 
 
 def load_shape(urdf: str, model: "pin.Model", keep: Path | None) -> Shape:
-    """Load the shape of a robot from a URDF.
+    """Load the shape of a robot from a URDF with inline meshes (``cnpgen.robots.shape.inline``) and its reduced model.
 
-    Args:
-        urdf: Text of the URDF with inline meshes (``cnpgen.robots.shape.inline``).
-        model: Pinocchio model, reduced to the planned joints.
-        keep: Cache folder of capsules and pairs, which take some seconds to compute; None for no cache.
+    Capsules and pairs, which take some seconds to compute, are kept in a cache folder, if there is one.
 
     Raises:
         RecipeError: The URDF has no collision geometry, or some that cannot be read.
@@ -92,13 +89,9 @@ def cached_capsules(
     convex_parts: tuple[ConvexPart, ...],
     compute: Callable[[], tuple[tuple[Capsule, ...], tuple[LinkPair, ...]]],
 ) -> tuple[tuple[Capsule, ...], tuple[LinkPair, ...]]:
-    """Return capsules and link pairs from the cache, or compute and store them.
+    """Return capsules and link pairs from the cache folder, or compute and store them; without a folder, compute them.
 
-    Args:
-        keep: Cache folder; None for no cache.
-        numbers: JSON values that determine the result.
-        convex_parts: Convex parts that the capsules must cover.
-        compute: Function that computes them.
+    JSON values determine the result. Capsules must cover the convex parts.
     """
     name = f"shape-{hashlib.sha256(json.dumps(numbers).encode()).hexdigest()[:32]}.json"
     if keep is not None:
@@ -121,8 +114,7 @@ def place_convex_parts(
 ) -> tuple[tuple[ConvexPart, ...], dict[str, int]]:
     """Transform convex parts from the frames of their links to those of the joints that move them.
 
-    Returns:
-        The convex parts, and link -> index of the joint that moves it; 0 for fixed links.
+    Also return link -> index of the joint that moves it; 0 for fixed links.
     """
     placed, joints = [], {}
     for part in convex_parts:

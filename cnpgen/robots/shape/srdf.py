@@ -11,11 +11,7 @@ _TAG = "disable_collisions"
 
 
 def with_disabled_pairs(urdf: str, srdf: Path) -> str:
-    """Return a URDF with the disabled link pairs of an SRDF file.
-
-    Args:
-        urdf: Text of the URDF; URDF parsers ignore unknown elements.
-        srdf: Path of the SRDF file.
+    """Return a URDF with the disabled link pairs of an SRDF file; URDF parsers ignore unknown elements.
 
     Raises:
         RecipeError: The SRDF cannot be read, is a URDF, or names links that the URDF does not have.
