@@ -66,9 +66,9 @@ class Camera:
 
 
 def depth_image(primitives: Primitives, camera: Camera) -> Array:
-    """Compute distances along the camera's axis at the centers of the pixels [m], shape (height, width); inf for none.
+    """Compute distances along the camera's axis at the centers of the pixels [m], shape (height, width).
 
-    Bodies that contain the camera are not seen.
+    Pixels that see no body have inf. Bodies that contain the camera are not seen.
     """
     x, y = ((2 * np.arange(count) + 1) / count - 1 for count in (camera.width, camera.height))
     forward, right, down = camera.axes
