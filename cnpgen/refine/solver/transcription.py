@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.refine.solver.cost_term import CostTerm
 from cnpgen.refine.solver.grid import Bases, Grid
-from cnpgen.trajectory.boundary import Boundary, assemble
-from cnpgen.trajectory.boundary_derivatives import boundary_derivatives
+from cnpgen.trajectory.boundary import Boundary, assemble, boundary_derivatives
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
 Array = NDArray[np.float64]
