@@ -111,11 +111,6 @@ def _cubic(t: Array, travel: Array, first: int) -> Array:
 
     A wide window averages noise, a narrow one follows the motion: the window with the smallest estimated standard error
     is chosen.
-
-    Args:
-        t: Times after the start [s], shape (K,).
-        travel: Displacements to fit [rad], shape (K, n).
-        first: Lowest power.
     """
     widths = [min(width, len(t)) for width in WINDOWS if width <= max(len(t) // 5, WINDOWS[0])]
     best = np.inf, np.zeros(travel.shape[1])

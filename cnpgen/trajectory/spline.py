@@ -64,17 +64,7 @@ def derivative(points: int, degree: int, order: int) -> tuple[Array, Array]:
 
 
 def _cox_de_boor(s: Array, knots: Array, degree: int, first: NDArray[np.intp]) -> Array:
-    """Evaluate the D + 1 basis functions that are not 0 at phases s, by the recursion that SciPy uses.
-
-    Args:
-        s: Phases, shape (K,).
-        knots: Knots.
-        degree: Degree D.
-        first: Index of the first of these basis functions at every phase, shape (K,).
-
-    Returns:
-        Shape (D + 1, K).
-    """
+    """Evaluate the D + 1 basis functions from ``first`` (K,) at phases s (K,), by SciPy's recursion: (D + 1, K)."""
     weights = np.ones((1, len(s)))
     right = first + degree + 1 + np.arange(degree)[:, None]
     for p in range(1, degree + 1):
