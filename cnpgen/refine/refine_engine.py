@@ -45,9 +45,7 @@ class Solver(Protocol):
 def refine_serially(plans: Plans, options: RefineOptions) -> list[Attempt]:
     """Refine plans one by one; results do not depend on the other plans or their order.
 
-    Args:
-        plans: Plans; where control points are not finite or rates not positive, the input plan is not used.
-        options: Options of the refiner.
+    Where control points are not finite or rates not positive, the input plan is not used.
     """
     refiner = prepare(plans, options)
     checker = _checker(plans.problem, plans.degree, get_ident())
@@ -59,12 +57,7 @@ def refine_serially(plans: Plans, options: RefineOptions) -> list[Attempt]:
 
 def prepare(plans: Plans, options: RefineOptions) -> Refiner:
     """Return the refiner for plans; kernels that are not in the cache are compiled."""
-    spec = TrajectorySpec(
-        degree=plans.degree,
-        path_control_points=plans.path_control_points.shape[1],
-        rate_control_points=plans.rate_control_points.shape[1],
-    )
-    return _refiner(plans.problem, spec, replace(options, deadline=None, stay_within=None))
+    return _refiner(plans.problem, plans.motion.spec, replace(options, deadline=None, stay_within=None))
 
 
 def tasks_of(plans: Plans) -> list[RefinementTask]:
@@ -79,8 +72,7 @@ def load_solver(problem: Problem, robot: Robot, kernels: KernelLibrary) -> Solve
 
     Returns:
         A function of the columns of N rows, shape (N, width) each, among them ``obstacle_poses`` of scenes, and of N
-        motions as initial guesses, or None. It
-        returns N motions and the mask of those that the verdict accepts, shape (N,).
+        motions as initial guesses, or None. It returns N motions and the mask of those that the verdict accepts, (N,).
     """
     refiner = load_refiner(problem, robot, kernels=kernels)
     checker, spec = PlanChecker(problem, robot, degree=refiner.spec.degree), refiner.spec
