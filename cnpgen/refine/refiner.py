@@ -106,7 +106,7 @@ class Refiner:
         )
         has_manifold = self.measures_hulls and bool(self.check.equalities)
         self._equalities = kernels.load_by_structure(equality_residuals) if has_manifold else None
-        self._accepted = cache_last(self._measure_ends)  # several levels of a task need it
+        self.accepted_at_ends = cache_last(self._measure_ends)  # several levels of a task need it
         every, orders = tuple(vars(self.levels).values()), problem.path_orders
         self._grids = {points: make_grid(self.spec, points, orders) for points in {level.points for level in every}}
         self._feedbacks = dict[int, HullFeedback]()
@@ -223,15 +223,8 @@ class Refiner:
     ) -> tuple[Attempt, Array] | None:
         """Continue an attempt that the verdict rejected for a collision at a phase with a depth [m].
 
-        Args:
-            task: The task.
-            attempt: The attempt.
-            phase: Phase of the collision.
-            depth: Its depth [m].
-            extra: Additional distances of earlier collisions [m], shape (K, columns), or None.
-
-        Returns:
-            The result with larger required distances there, and all additional distances; None without compiled hulls.
+        Return the result with larger required distances there, and all additional distances [m], shape (K, columns),
+        which include ``extra`` of earlier collisions; None without compiled hulls.
         """
         if not self.measures_hulls:
             return None
@@ -256,11 +249,8 @@ class Refiner:
             result = replace(result, iterations=earlier + result.iterations)
         return result
 
-    def accepted_at_ends(self, task: RefinementTask) -> Array:
-        """Return by how much the hulls at both ends violate their distances within the tolerance [m], shape (2, m)."""
-        return self._accepted(task)
-
     def _measure_ends(self, task: RefinementTask) -> Array:
+        """Return by how much the hulls at both ends violate their distances within the tolerance [m], shape (2, m)."""
         ends = np.stack([task.boundary.start_q[0], task.boundary.goal_q[0]], axis=1)
         return self.hulls.accepted_at(ends, task.scene.poses[0])
 
@@ -298,27 +288,21 @@ class Refiner:
 
     def line_guess(self, task: RefinementTask) -> Array:
         """Return the variables of the initial guess of the coarse level: along a tip path, or a line."""
-        guess = next(self.tip_path_guesses(task), None)
-        if guess is not None:
+        for guess in self.tip_path_guesses(task):
             return guess
         return self.slow_guess(task, initial_guesses.rising_line(*self._guess_arguments(task)))
 
     def tip_path_guesses(self, task: RefinementTask) -> Iterator[Array]:
         """Yield the variables of motions along the initial tip paths of the problem's constraint."""
         constraint = self.problem.scene_constraint
-        values, parameters = self._values_of(task)
-        frame = table_frame_of(self.problem, parameters)
+        width = self.problem.scene_width - len(self.problem.parameters)  # of all values before the parameters
+        values = task.scene.poses[0, pose_width(self.problem.obstacle) : width]
+        frame = table_frame_of(self.problem, task.scene.poses[:, width:])
         start = task.start_xyz if frame is None else frame.to_table(task.start_xyz[None])[0]
         for polyline in [] if constraint is None else constraint.initial_tip_paths(values, start):
             path = polyline if frame is None else np.array([frame.to_world(point[None])[0] for point in polyline])
             ends = task.boundary.start_q[0], task.boundary.goal_q[0]
             yield self.path_guess(task, initial_guesses.along_tip_path(self._world, *ends, path))
-
-    def _values_of(self, task: RefinementTask) -> tuple[Array, Array]:
-        """Return the values of a task for a constraint, shape (width,), and its parameters, shape (1, width)."""
-        width = self.problem.scene_width - len(self.problem.parameters)
-        poses = task.scene.poses
-        return poses[0, pose_width(self.problem.obstacle) : width], poses[:, width:]
 
     def even_line_guess(self, task: RefinementTask) -> Array:
         """Return the variables of the straight line at constant rate."""

@@ -105,13 +105,7 @@ def refine_task_until(refiner: Refiner, checker: PlanChecker, task: RefinementTa
     """Refine the input plan of a task until a deadline; the result is never worse than the input.
 
     The input plan is judged first. Steps and verdicts are not interrupted: one starts only if it is expected to end in
-    time. Without a usable input plan one attempt is always made.
-
-    Args:
-        refiner: Refiner of the problem.
-        checker: Independent check.
-        task: The task.
-        seconds: Time from now to the deadline [s].
+    time. Without a usable input plan one attempt is always made. The deadline is ``seconds`` [s] from now.
     """
     until = time.perf_counter() + seconds
     if not task.is_finite:
@@ -165,13 +159,6 @@ def _is_input(task: RefinementTask, path: Array, rate: Array) -> bool:
     return all(bool(difference <= MAX_ROUNDING_ERROR) for difference in differences)
 
 
-def _severity(verdict: Verdict) -> float:
-    """Return 1 for a valid plan, a larger number for others, inf for plans that could not be evaluated."""
-    if verdict.valid:
-        return 1.0
-    return max((margin.severity for margin in verdict.margins.values()), default=np.inf)
-
-
 def _invalid_input(refiner: Refiner, task: RefinementTask) -> Attempt:
     """Return the input plan, or nan, for boundary conditions that are not finite."""
     spec, n = refiner.spec, task.boundary.start_q.shape[1]
@@ -185,13 +172,7 @@ def _invalid_input(refiner: Refiner, task: RefinementTask) -> Attempt:
 
 
 class PlanChecker:
-    """Independent check of the plans of a problem.
-
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        degree: Degree of the plans' splines.
-    """
+    """Independent check of the plans of a problem, splines of one degree."""
 
     def __init__(self, problem: Problem, robot: Robot, *, degree: int) -> None:
         self._problem, self._robot, self._degree = problem, robot, degree
@@ -311,24 +292,22 @@ class RefinementSearch:
 
     def judge(self, plan: Attempt) -> Attempt:
         """Return a plan with its verdict."""
-        verdict = self.verdict = self._verdict(plan)
+        removable = self.refiner.measures_hulls and not self._ends_touch  # contacts, by the solver
+        judge = self.checker.strict_verdict if removable else self.checker.verdict
+        verdict = self.verdict = judge(self.task, plan.path, plan.rate)
         touches = not verdict.valid and verdict.reason in LINK_REASONS
-        if touches and self.refiner.measures_hulls and not self._ends_touch:
+        if touches and removable:
             verdict = self.checker.verdict(self.task, plan.path, plan.rate)
         keeps_outcome = verdict.valid or plan.outcome in INPUT_OUTCOMES
+        worst = max((margin.severity for margin in verdict.margins.values()), default=np.inf)
         return replace(
             plan,
             outcome=plan.outcome if keeps_outcome else Outcome.UNSOLVED,
             reason=verdict.reason,
-            severity=_severity(verdict),
+            severity=1.0 if verdict.valid else worst,
             is_precise=self._is_precise(verdict) and not touches,
             touches=touches and verdict.valid,
         )
-
-    def _verdict(self, plan: Attempt) -> Verdict:
-        """Return the verdict, without a tolerance of contacts if the solver can remove them."""
-        removable = self.refiner.measures_hulls and not self._ends_touch
-        return (self.checker.strict_verdict if removable else self.checker.verdict)(self.task, plan.path, plan.rate)
 
     @cached_property
     def _ends_touch(self) -> bool:
@@ -352,7 +331,7 @@ class RefinementSearch:
 
 
 def make_attempts(refiner: Refiner, task: RefinementTask, x: Array | None) -> Iterator[Attempt]:
-    """Yield attempts at a task that stay near its input path if they must; see ``_all_attempts``."""
+    """Yield attempts at a task that stay near its input path, of variables x, if they must; see ``_all_attempts``."""
     if x is None:
         yield from _all_attempts(refiner, replace(task, stay_within=None), x)
         return
@@ -362,13 +341,7 @@ def make_attempts(refiner: Refiner, task: RefinementTask, x: Array | None) -> It
 
 
 def _all_attempts(refiner: Refiner, task: RefinementTask, x: Array | None) -> Iterator[Attempt]:
-    """Yield attempts at a task; later ones are more expensive and requested only if the earlier ones were rejected.
-
-    Args:
-        refiner: Refiner of the problem.
-        task: The task, with finite boundary conditions.
-        x: Variables of the input plan, see ``Refiner.input_variables``.
-    """
+    """Yield attempts at a task; later ones are more expensive and requested only if the earlier ones were rejected."""
     if refiner.settings.max_iterations == 0:
         yield _repair_only(refiner, task, x)
         return
