@@ -22,12 +22,7 @@ MAX_FED_BACK_M = 0.02  # larger collisions are not between grid points
 
 
 class HullFeedback:
-    """Check of a motion's hulls between the points of a grid.
-
-    Args:
-        spec: Degree and numbers of control points.
-        s: Phases of the grid, shape (K,).
-    """
+    """Check of a motion's hulls between the points of a grid with phases s, shape (K,)."""
 
     def __init__(self, spec: TrajectorySpec, s: Array) -> None:
         fractions = np.arange(STATES_PER_INTERVAL) / STATES_PER_INTERVAL
