@@ -1,10 +1,9 @@
 """Refiners of problems with their kernels, and the refinement of plans in one process."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import lru_cache
 from threading import get_ident
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,18 +27,9 @@ from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.remaining_trajectory import is_finer
 from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
-from cnpgen.world.world import World
 
 Array = NDArray[np.float64]
-
-
-class Solver(Protocol):
-    """Function that ``load_solver`` returns."""
-
-    def __call__(
-        self, columns: Mapping[str, Array], initial_guess: Motion | None = None
-    ) -> tuple[Motion, NDArray[np.bool_]]:
-        """Return N motions and the mask of the valid ones."""
+Solver = Callable[..., tuple[Motion, NDArray[np.bool_]]]  # of ``load_solver``
 
 
 def refine_serially(plans: Plans, options: RefineOptions) -> list[Attempt]:
@@ -146,7 +136,6 @@ def load_refiner(
         problem,
         robot,
         kernels=kernels,
-        world=World(robot, problem.obstacle, problem.object_size),
         spec=spec,
         cost_term=choose_cost_term(problem, options.objective, options.weight),
         settings=settings,

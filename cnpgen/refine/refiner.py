@@ -54,7 +54,6 @@ class Refiner:
         problem: The problem.
         robot: Its robot.
         kernels: Library of kernels.
-        world: World of the problem.
         spec: Degree and numbers of control points; the problem's by default.
         cost_term: Cost term in addition to the duration, or None.
         settings: Settings of the iteration.
@@ -68,7 +67,6 @@ class Refiner:
         robot: Robot,
         *,
         kernels: KernelLibrary,
-        world: World,
         spec: TrajectorySpec | None = None,
         cost_term: CostTerm | None = None,
         settings: Settings = DEFAULT_SETTINGS,
@@ -77,7 +75,7 @@ class Refiner:
     ) -> None:
         self.problem, self.robot, self.settings, self.coarser = problem, robot, settings, coarser
         self.spec = problem.trajectory if spec is None else spec
-        library = load_collision_library(kernels)
+        library, world = load_collision_library(kernels), World(robot, problem.obstacle, problem.object_size)
         self.measures_hulls = library is not None and can_measure_hulls(problem, robot, world)
         self._library, self._hulls, solved = library, dict[int, Hulls](), problem
         if self.measures_hulls:
@@ -138,8 +136,7 @@ class Refiner:
         """Run the solver on one level from variables x, shape (nx,); ``hulls`` replace the capsules.
 
         A refiner that ``measures_hulls`` has no capsules: its hulls are rows of compiled code on all levels. Their
-        required distances then grow by ``extra`` [m], shape (K, columns), for a
-        motion that is nearly valid.
+        required distances then grow by ``extra`` [m], shape (K, columns), for a motion that is nearly valid.
         """
         motion = self.transcription(task, level)
         settings = level.settings if extra is None else self.levels.strict.settings
@@ -336,7 +333,7 @@ class Refiner:
     def rest_space(self, task: RefinementTask, hulls: Hulls | None = None) -> RestSpace:
         """Return the valid states at rest, for the search of joint-space paths."""
         bounds, poses = self.check.rest_bounds(task), self.kernel_poses(task)
-        return RestSpace(self.residual_kernels, self.robot, bounds, poses, hulls, task.scene.poses[0])
+        return RestSpace(self.residual_kernels, self.robot, bounds, poses, task.scene.poses[0], hulls)
 
     def manifold(self, task: RefinementTask) -> EqualityKernel | None:
         """Return the equalities that compiled trees keep, or None if there are none."""

@@ -46,11 +46,10 @@ from cnpgen.refine.obstacle_attempts import (
 from cnpgen.refine.proof.end_violations import end_violations
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.solver.bounds import PRECISE_FRACTION
-from cnpgen.refine.solver.deadline import Deadline
 from cnpgen.refine.solver.hull_feedback import MAX_FED_BACK_M, MIN_FED_BACK_M
 from cnpgen.refine.solver.hull_problem import without_contacts
 from cnpgen.refine.solver.hulls import Hulls, has_clearance_constraints
-from cnpgen.refine.solver.sqp import Result
+from cnpgen.refine.solver.sqp import Deadline, Result
 from cnpgen.refine.task import MAX_JUDGED_VIOLATION, Attempt, Outcome, RefinementTask
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene import Scene
