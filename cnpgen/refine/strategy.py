@@ -35,14 +35,7 @@ from cnpgen.problems.constraints.object_clearance import ObjectClearance
 from cnpgen.problems.constraints.self_clearance import SelfClearance
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.grid_levels import MAX_INITIAL_VIOLATION
-from cnpgen.refine.obstacle_attempts import (
-    along_path,
-    around_obstacles,
-    ends_penetrate,
-    hulls_of_trees,
-    is_deep,
-    path_guesses,
-)
+from cnpgen.refine.obstacle_attempts import along_path, around_obstacles, ends_penetrate, is_deep, path_guesses
 from cnpgen.refine.proof.end_violations import end_violations
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.solver.bounds import PRECISE_FRACTION
@@ -331,9 +324,7 @@ class RefinementSearch:
 
 def make_attempts(refiner: Refiner, task: RefinementTask, x: Array | None) -> Iterator[Attempt]:
     """Yield attempts at a task that stay near its input path, of variables x, if they must; see ``_all_attempts``."""
-    if x is None:
-        yield from _all_attempts(refiner, replace(task, stay_within=None), x)
-        return
+    task = replace(task, stay_within=None) if x is None else task
     for attempt in _all_attempts(refiner, task, x):
         if task.is_near(attempt.path, refiner.spec.degree):
             yield attempt
@@ -342,12 +333,14 @@ def make_attempts(refiner: Refiner, task: RefinementTask, x: Array | None) -> It
 def _all_attempts(refiner: Refiner, task: RefinementTask, x: Array | None) -> Iterator[Attempt]:
     """Yield attempts at a task; later ones are more expensive and requested only if the earlier ones were rejected."""
     if refiner.settings.max_iterations == 0:
-        yield _repair_only(refiner, task, x)
+        guess, outcome = (refiner.line_guess(task), Outcome.SOLVED) if x is None else (x, Outcome.ADJUSTED)
+        yield refiner.measured(task, guess, outcome, unlimited=True)
         return
     if x is not None and refiner.coarser is not None:
         yield from _with_fewer_control_points(refiner, refiner.coarser, task, x)
     adjusted = refiner.measured(task, x, Outcome.ADJUSTED) if x is not None and task.at_rest else None
-    hulls = hulls_of_trees(refiner, task)
+    searches_trees = refiner.measures_hulls and task.deadline is None
+    hulls = refiner.hulls if searches_trees else None
     if hulls is None:
         best = yield from run_levels(refiner, task, x, adjusted)
     else:
@@ -379,12 +372,6 @@ def _best_of(attempts: Iterator[Attempt], best: Attempt) -> Generator[Attempt, N
         yield attempt
         best = attempt if attempt.is_better(best) else best
     return best
-
-
-def _repair_only(refiner: Refiner, task: RefinementTask, x: Array | None) -> Attempt:
-    """Scale the input plan or a straight line in time, without iterations of the solver."""
-    guess, outcome = (refiner.line_guess(task), Outcome.SOLVED) if x is None else (x, Outcome.ADJUSTED)
-    return refiner.measured(task, guess, outcome, unlimited=True)
 
 
 def _with_fewer_control_points(refiner: Refiner, coarser: Refiner, task: RefinementTask, x: Array) -> Iterator[Attempt]:
