@@ -52,9 +52,8 @@ def prepare(plans: Plans, options: RefineOptions) -> Refiner:
 
 def tasks_of(plans: Plans) -> list[RefinementTask]:
     """Return the boundary problem of every plan, with the plan as input plan."""
-    tasks = _tasks(plans.boundary, plans.scene, plans.columns["start_xyz"], plans.columns["goal_xyz"])
-    control_points = zip(plans.path_control_points, plans.rate_control_points, strict=True)
-    return [replace(task, path=path, rate=rate) for task, (path, rate) in zip(tasks, control_points, strict=True)]
+    ends = plans.columns["start_xyz"], plans.columns["goal_xyz"]
+    return _tasks(plans.boundary, plans.scene, *ends, plans.motion)
 
 
 def load_solver(problem: Problem, robot: Robot, kernels: KernelLibrary) -> Solver:
@@ -73,26 +72,22 @@ def load_solver(problem: Problem, robot: Robot, kernels: KernelLibrary) -> Solve
         velocity = goal_velocities(problem, robot, boundary.goal_q, boundary.goal_dq)
         poses = columns.get(OBSTACLE_POSES)
         scene = scene_of(problem, *ends, velocity, boundary.parameters, obstacle_poses=poses)
-        tasks = _tasks(boundary, scene, *ends)
-        if initial_guess is not None:
-            tasks = [
-                replace(task, path=initial_guess.path[i], rate=initial_guess.rate[i]) for i, task in enumerate(tasks)
-            ]
+        tasks = _tasks(boundary, scene, *ends, initial_guess)
         results = [refine_task(refiner, checker, task) for task in tasks]
-        path = np.array([result.path for result in results])
-        rate = np.array([result.rate for result in results])
-        motion = Motion(
-            path.reshape(len(results), spec.path_control_points, robot.n),
-            rate.reshape(len(results), spec.rate_control_points),
-            spec.degree,
-        )
-        return motion, np.array([result.valid for result in results], bool)
+        path = np.array([result.path for result in results]).reshape(-1, spec.path_control_points, robot.n)
+        rate = np.array([result.rate for result in results]).reshape(-1, spec.rate_control_points)
+        return Motion(path, rate, spec.degree), np.array([result.valid for result in results], bool)
 
     return solve
 
 
-def _tasks(boundary: Boundary, scene: Scene, start_xyz: Array, goal_xyz: Array) -> list[RefinementTask]:
-    return [RefinementTask(boundary[i : i + 1], scene[i], start_xyz[i], goal_xyz[i]) for i in range(len(boundary))]
+def _tasks(
+    boundary: Boundary, scene: Scene, start_xyz: Array, goal_xyz: Array, plan: Motion | None
+) -> list[RefinementTask]:
+    tasks = [RefinementTask(boundary[i : i + 1], scene[i], start_xyz[i], goal_xyz[i]) for i in range(len(boundary))]
+    if plan is None:
+        return tasks
+    return [replace(task, path=plan.path[i], rate=plan.rate[i]) for i, task in enumerate(tasks)]
 
 
 @lru_cache(maxsize=8)
