@@ -123,16 +123,9 @@ class NumpyBackend:
 
 @dataclass(frozen=True)
 class NumpySubproblem:
-    """Quadratic model of the objective and linear model of the residuals, solved by DAQP.
+    """Quadratic model of the objective and linear model of the selected residuals, solved by DAQP.
 
-    Attributes:
-        motion: The transcription.
-        at: Linearization at the iterate.
-        bounds: Bounds of the residuals.
-        selected: Mask of the residuals in the program, shape (K, m).
-        violation: Largest violation at the iterate.
-        proximal: Weight of the proximal term.
-        penalty: Cost of the largest violation.
+    ``proximal`` is the weight of the proximal term, ``penalty`` that of the largest violation at the iterate.
     """
 
     motion: Transcription

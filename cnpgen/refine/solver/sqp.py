@@ -156,19 +156,10 @@ def make_backend(motion: Transcription, bounds: Bounds, thinning: int) -> Backen
 
 
 class _Iterate:
-    """State of the iteration.
+    """State of the iteration: variables, regularized objective, largest violation."""
 
-    Attributes:
-        x: Variables.
-        cost: Regularized objective.
-        violation: Largest violation.
-        converged: Whether the iteration has ended.
-        restoring: Whether steps only restore feasibility, before a deadline.
-        tightened: Whether the last step tightened the bounds for violations between grid points.
-    """
-
-    restoring = False
-    tightened = False
+    restoring = False  # whether steps only restore feasibility, before a deadline
+    tightened = False  # whether the last step tightened the bounds for violations between grid points
 
     def __init__(self, motion: Transcription, bounds: Bounds, settings: Settings, x: Array) -> None:
         self._backend, self._motion = make_backend(motion, bounds, settings.thinning), motion
