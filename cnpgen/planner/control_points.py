@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.planner.tasks import Tasks
-from cnpgen.trajectory.boundary import goal_points, start_points
-from cnpgen.trajectory.boundary_derivatives import boundary_derivatives
+from cnpgen.trajectory.boundary import boundary_derivatives, goal_points, start_points
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
 Array = NDArray[Any]

@@ -60,14 +60,15 @@ class FineCheck:
 
     Args:
         problem: The problem.
-        world: World of the problem.
-        kernels: Residual kernels.
+        world: Its world.
+        kernels: Its residual kernels.
         poses: Function that returns the scene values of a task that the kernels take.
         penetration: Function of a task and states (n, K) that returns by how much distances that the kernels do not
             compute are violated above their tolerance [m]; None if there are none.
 
     Attributes:
         equalities: Names of the equality conditions.
+        transcription: Function that returns the transcription of a task on the fine grid; the last one is cached.
     """
 
     def __init__(
@@ -81,7 +82,7 @@ class FineCheck:
     ) -> None:
         self._penetration = penetration
         self._grid = make_grid(kernels.spec, FINE_POINTS, problem.path_orders)
-        self._last = cache_last(
+        self.transcription = cache_last(
             lambda task: Transcription(kernels, self._grid, boundary=task.boundary, obstacle_poses=poses(task))
         )
         self._bounds = bounds_template(problem, world, self._grid.s, NO_TIGHTENING)
@@ -93,10 +94,6 @@ class FineCheck:
         )
         self._speeds = np.flatnonzero((self._bounds.orders == 1) & ~limits)  # bounded speeds other than those of joints
         self._powers = _powers_of_rate(problem, world, kernels)[self._speeds] if len(self._speeds) else np.empty(0)
-
-    def transcription(self, task: RefinementTask) -> Transcription:
-        """Return the transcription on the fine grid; the last one is cached."""
-        return self._last(task)
 
     def measure(self, task: RefinementTask, x: Array) -> tuple[float, GridViolation]:
         """Return the objective [s] and the largest violation of a motion with variables x, shape (nx,)."""

@@ -35,17 +35,10 @@ def refine_goal_options(
     begin: Callable[[int, int], None] | None,
     progress: Progress | None,
 ) -> Refinement:
-    """Refine plans to several goal states of each task; return the best one of each task.
+    """Refine plans to several goal states of each task; return the refinement of the best row of each, in their order.
 
-    Args:
-        plans: Plans with the column ``goal_option``.
-        refine: ``refine_plans`` with its other arguments.
-        journal: File for finished plans; later rounds have files beside it.
-        begin: See ``refine_plans``; it is called with the number of tasks.
-        progress: See ``refine_plans``; tasks count as finished after their first goal state.
-
-    Returns:
-        The refinement of the chosen rows, one for each task, in the order of the tasks.
+    The arguments are those of ``refine_plans``, which ``refine`` calls. Later rounds have files beside the journal.
+    ``begin`` is called with the number of tasks, and tasks count as finished after their first goal state.
     """
     _check_tasks(plans)
     tasks = list(dict.fromkeys(plans.sample_id.tolist()))

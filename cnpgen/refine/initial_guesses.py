@@ -78,17 +78,7 @@ def quintic(boundary: Boundary, velocity_limit: Array, spec: TrajectorySpec) -> 
 
 
 def fit_to_path(states: Array, boundary: Boundary, velocity_limit: Array, spec: TrajectorySpec) -> tuple[Array, Array]:
-    """Fit a motion with the boundary conditions to a joint-space path by least squares.
-
-    Args:
-        states: States of the path [rad], shape (K, n).
-        boundary: Boundary conditions of one motion.
-        velocity_limit: Velocity limits of the joints [rad/s], shape (n,).
-        spec: Degree and numbers of control points.
-
-    Returns:
-        ``(path, rate)``, see ``straight_line``.
-    """
+    """Fit a motion to states (K, n) of a joint-space path by least squares; see ``straight_line``."""
     min_duration = float((np.abs(np.diff(states, axis=0)) / velocity_limit).max(axis=1).sum())
     rate = np.full(spec.rate_control_points, 1.0 / (PATH_DURATION_FACTOR * min_duration + 0.1))
     s = np.linspace(0, 1, SAMPLES_PER_CONTROL_POINT * spec.path_control_points)
@@ -102,16 +92,15 @@ def fit_to_path(states: Array, boundary: Boundary, velocity_limit: Array, spec: 
 
 
 def along_tip_path(world: World, start_q: Array, goal_q: Array, tip_path: Array) -> Array:
-    """Return joint positions along a tip path: Gauss-Newton steps from the joint-space line, of minimum norm.
+    """Return joint positions along a tip path [rad], shape (TIP_PATH_STATES, n).
+
+    They result from Gauss-Newton steps of minimum norm from the joint-space line.
 
     Args:
         world: World of the robot; it is moved.
         start_q: Joint positions at the start [rad], shape (n,).
         goal_q: Joint positions at the goal [rad], shape (n,).
         tip_path: Polyline from the tip at the start to the tip at the goal [m], shape (K, 3).
-
-    Returns:
-        Joint positions [rad], shape (TIP_PATH_STATES, n).
     """
     lengths, rest = _arc_lengths(tip_path), np.zeros(len(start_q))
     along = np.linspace(0, 1, TIP_PATH_STATES)

@@ -10,7 +10,6 @@ from cnpgen.refine.solver.cost_term import choose_cost_term, cost_term_residuals
 from cnpgen.refine.solver.grid import make_grid
 from cnpgen.schema import registry
 from cnpgen.schema.argument_types import checked_arguments
-from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
 Array = NDArray[np.float64]
 CONSTRAINT_POINTS = 8  # of the grid, whose nodes of the cost are used only
@@ -40,14 +39,7 @@ def objective_values(plans: Plans, objective: str = "time") -> dict[str, Array]:
     kernels = problem_kernels(problem, robot, *choose_backend("numpy"))
     residuals = kernels.load(cost_term_residuals, terms=cost_term.tables)
     counts = residual_counts(robot, cost_term)
-    grid = make_grid(
-        TrajectorySpec(
-            degree=plans.degree,
-            path_control_points=plans.path_control_points.shape[1],
-            rate_control_points=plans.rate_control_points.shape[1],
-        ),
-        CONSTRAINT_POINTS,
-    )
+    grid = make_grid(plans.motion.spec, CONSTRAINT_POINTS)
     control_points = zip(plans.path_control_points, plans.rate_control_points, strict=True)
     states = [grid.cost_bases.states(path, rate) for path, rate in control_points]
     e, _ = residuals(np.concatenate(states, axis=1))

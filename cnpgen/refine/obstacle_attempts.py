@@ -19,11 +19,6 @@ MIN_END_PENETRATION_M = 1e-5  # of an end: smaller ones may be rounding errors
 MAX_LINE_PENETRATION_M = 0.05  # of the initial line, above which joint-space paths come first
 
 
-def hulls_of_trees(refiner: Refiner, task: RefinementTask) -> Hulls | None:
-    """Return the clearances of the hulls if compiled trees can search paths for a task."""
-    return refiner.hulls if refiner.measures_hulls and task.deadline is None else None
-
-
 def is_deep(refiner: Refiner, task: RefinementTask, hulls: Hulls) -> bool:
     """Return whether the initial line is so deep in an obstacle that paths around it are tried first."""
     motion = refiner.transcription(task, refiner.levels.coarse)

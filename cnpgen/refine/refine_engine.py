@@ -1,10 +1,9 @@
 """Refiners of problems with their kernels, and the refinement of plans in one process."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import lru_cache
 from threading import get_ident
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,26 +27,15 @@ from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.remaining_trajectory import is_finer
 from cnpgen.trajectory.spline_motion import Motion
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
-from cnpgen.world.world import World
 
 Array = NDArray[np.float64]
-
-
-class Solver(Protocol):
-    """Function that ``load_solver`` returns."""
-
-    def __call__(
-        self, columns: Mapping[str, Array], initial_guess: Motion | None = None
-    ) -> tuple[Motion, NDArray[np.bool_]]:
-        """Return N motions and the mask of the valid ones."""
+Solver = Callable[..., tuple[Motion, NDArray[np.bool_]]]  # of ``load_solver``
 
 
 def refine_serially(plans: Plans, options: RefineOptions) -> list[Attempt]:
     """Refine plans one by one; results do not depend on the other plans or their order.
 
-    Args:
-        plans: Plans; where control points are not finite or rates not positive, the input plan is not used.
-        options: Options of the refiner.
+    Where control points are not finite or rates not positive, the input plan is not used.
     """
     refiner = prepare(plans, options)
     checker = _checker(plans.problem, plans.degree, get_ident())
@@ -59,19 +47,13 @@ def refine_serially(plans: Plans, options: RefineOptions) -> list[Attempt]:
 
 def prepare(plans: Plans, options: RefineOptions) -> Refiner:
     """Return the refiner for plans; kernels that are not in the cache are compiled."""
-    spec = TrajectorySpec(
-        degree=plans.degree,
-        path_control_points=plans.path_control_points.shape[1],
-        rate_control_points=plans.rate_control_points.shape[1],
-    )
-    return _refiner(plans.problem, spec, replace(options, deadline=None, stay_within=None))
+    return _refiner(plans.problem, plans.motion.spec, replace(options, deadline=None, stay_within=None))
 
 
 def tasks_of(plans: Plans) -> list[RefinementTask]:
     """Return the boundary problem of every plan, with the plan as input plan."""
-    tasks = _tasks(plans.boundary, plans.scene, plans.columns["start_xyz"], plans.columns["goal_xyz"])
-    control_points = zip(plans.path_control_points, plans.rate_control_points, strict=True)
-    return [replace(task, path=path, rate=rate) for task, (path, rate) in zip(tasks, control_points, strict=True)]
+    ends = plans.columns["start_xyz"], plans.columns["goal_xyz"]
+    return _tasks(plans.boundary, plans.scene, *ends, plans.motion)
 
 
 def load_solver(problem: Problem, robot: Robot, kernels: KernelLibrary) -> Solver:
@@ -79,8 +61,7 @@ def load_solver(problem: Problem, robot: Robot, kernels: KernelLibrary) -> Solve
 
     Returns:
         A function of the columns of N rows, shape (N, width) each, among them ``obstacle_poses`` of scenes, and of N
-        motions as initial guesses, or None. It
-        returns N motions and the mask of those that the verdict accepts, shape (N,).
+        motions as initial guesses, or None. It returns N motions and the mask of those that the verdict accepts, (N,).
     """
     refiner = load_refiner(problem, robot, kernels=kernels)
     checker, spec = PlanChecker(problem, robot, degree=refiner.spec.degree), refiner.spec
@@ -91,26 +72,22 @@ def load_solver(problem: Problem, robot: Robot, kernels: KernelLibrary) -> Solve
         velocity = goal_velocities(problem, robot, boundary.goal_q, boundary.goal_dq)
         poses = columns.get(OBSTACLE_POSES)
         scene = scene_of(problem, *ends, velocity, boundary.parameters, obstacle_poses=poses)
-        tasks = _tasks(boundary, scene, *ends)
-        if initial_guess is not None:
-            tasks = [
-                replace(task, path=initial_guess.path[i], rate=initial_guess.rate[i]) for i, task in enumerate(tasks)
-            ]
+        tasks = _tasks(boundary, scene, *ends, initial_guess)
         results = [refine_task(refiner, checker, task) for task in tasks]
-        path = np.array([result.path for result in results])
-        rate = np.array([result.rate for result in results])
-        motion = Motion(
-            path.reshape(len(results), spec.path_control_points, robot.n),
-            rate.reshape(len(results), spec.rate_control_points),
-            spec.degree,
-        )
-        return motion, np.array([result.valid for result in results], bool)
+        path = np.array([result.path for result in results]).reshape(-1, spec.path_control_points, robot.n)
+        rate = np.array([result.rate for result in results]).reshape(-1, spec.rate_control_points)
+        return Motion(path, rate, spec.degree), np.array([result.valid for result in results], bool)
 
     return solve
 
 
-def _tasks(boundary: Boundary, scene: Scene, start_xyz: Array, goal_xyz: Array) -> list[RefinementTask]:
-    return [RefinementTask(boundary[i : i + 1], scene[i], start_xyz[i], goal_xyz[i]) for i in range(len(boundary))]
+def _tasks(
+    boundary: Boundary, scene: Scene, start_xyz: Array, goal_xyz: Array, plan: Motion | None
+) -> list[RefinementTask]:
+    tasks = [RefinementTask(boundary[i : i + 1], scene[i], start_xyz[i], goal_xyz[i]) for i in range(len(boundary))]
+    if plan is None:
+        return tasks
+    return [replace(task, path=plan.path[i], rate=plan.rate[i]) for i, task in enumerate(tasks)]
 
 
 @lru_cache(maxsize=8)
@@ -154,7 +131,6 @@ def load_refiner(
         problem,
         robot,
         kernels=kernels,
-        world=World(robot, problem.obstacle, problem.object_size),
         spec=spec,
         cost_term=choose_cost_term(problem, options.objective, options.weight),
         settings=settings,

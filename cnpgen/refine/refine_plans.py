@@ -5,14 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cnpgen.machine.engine import Engine, assembled
 from cnpgen.machine.threads import one_thread
@@ -32,8 +31,6 @@ from cnpgen.schema.argument_types import checked_arguments
 
 MAX_SERIAL_PLANS = 60  # up to which the start of a second process takes longer than the plans
 PLANS_PER_TASK = 4  # of one of several processes: the transfer of a task takes a twentieth of a plan's time
-
-Array = NDArray[np.float64]
 
 
 @checked_arguments
@@ -168,36 +165,28 @@ def _refinement(plans: Plans, results: list[Attempt], options: RefineOptions) ->
         plans,
         path_control_points=np.stack([result.path for result in results]),
         rate_control_points=np.stack([result.rate for result in results]),
-        columns={**plans.columns, **_columns(results)},
+        columns={
+            **plans.columns,
+            "refine_outcome": np.array([result.outcome for result in results], float),
+            "refine_iterations": np.array([result.iterations for result in results], float),
+            "refine_objective": np.array([result.cost for result in results], float),
+        },
         refined_with=json.dumps({"cnpgen": __version__, **options.document()}),
         has_checksum=False,
     )
-    status = _status(refined, np.array([result.valid for result in results]))
-    return Refinement(plans, replace(refined, status=status), tuple(results))
-
-
-def _status(plans: Plans, valid: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    invalid = np.array([not result.valid for result in results])
     status = np.full(len(plans), PlanStatus.VALID, np.uint8)
-    if not valid.all():
-        screened = screen(plans[~valid])
-        status[~valid] = np.where(screened == PlanStatus.UNKNOWN, PlanStatus.INVALID, screened)
-    return status
-
-
-def _columns(results: list[Attempt]) -> Mapping[str, Array]:
-    return {
-        "refine_outcome": np.array([result.outcome for result in results], float),
-        "refine_iterations": np.array([result.iterations for result in results], float),
-        "refine_objective": np.array([result.cost for result in results], float),
-    }
+    if invalid.any():
+        screened = screen(refined[invalid])
+        status[invalid] = np.where(screened == PlanStatus.UNKNOWN, PlanStatus.INVALID, screened)
+    return Refinement(plans, replace(refined, status=status), tuple(results))
 
 
 def _identity(plans: Plans, options: RefineOptions) -> str:
     """Return the JSON text that identifies a run: version, options and a checksum of the plans."""
     digest = hashlib.sha256(plans.problem.recipe.encode() + plans.problem.urdf.encode())
     boundary = [values for values in vars(plans.boundary).values() if values is not None]
-    ends = [plans.columns["start_xyz"], plans.columns["goal_xyz"]]
-    ends += [plans.columns[name] for name in (OBSTACLE_POSES,) if name in plans.columns]
+    ends = [plans.columns[name] for name in ("start_xyz", "goal_xyz", OBSTACLE_POSES) if name in plans.columns]
     for values in (*boundary, *ends, plans.path_control_points, plans.rate_control_points):
         digest.update(str(values.shape).encode() + np.ascontiguousarray(values).tobytes())
     return json.dumps(

@@ -54,7 +54,6 @@ class Refiner:
         problem: The problem.
         robot: Its robot.
         kernels: Library of kernels.
-        world: World of the problem.
         spec: Degree and numbers of control points; the problem's by default.
         cost_term: Cost term in addition to the duration, or None.
         settings: Settings of the iteration.
@@ -68,7 +67,6 @@ class Refiner:
         robot: Robot,
         *,
         kernels: KernelLibrary,
-        world: World,
         spec: TrajectorySpec | None = None,
         cost_term: CostTerm | None = None,
         settings: Settings = DEFAULT_SETTINGS,
@@ -77,7 +75,7 @@ class Refiner:
     ) -> None:
         self.problem, self.robot, self.settings, self.coarser = problem, robot, settings, coarser
         self.spec = problem.trajectory if spec is None else spec
-        library = load_collision_library(kernels)
+        library, world = load_collision_library(kernels), World(robot, problem.obstacle, problem.object_size)
         self.measures_hulls = library is not None and can_measure_hulls(problem, robot, world)
         self._library, self._hulls, solved = library, dict[int, Hulls](), problem
         if self.measures_hulls:
@@ -106,7 +104,7 @@ class Refiner:
         )
         has_manifold = self.measures_hulls and bool(self.check.equalities)
         self._equalities = kernels.load_by_structure(equality_residuals) if has_manifold else None
-        self._accepted = cache_last(self._measure_ends)  # several levels of a task need it
+        self.accepted_at_ends = cache_last(self._measure_ends)  # several levels of a task need it
         every, orders = tuple(vars(self.levels).values()), problem.path_orders
         self._grids = {points: make_grid(self.spec, points, orders) for points in {level.points for level in every}}
         self._feedbacks = dict[int, HullFeedback]()
@@ -138,8 +136,7 @@ class Refiner:
         """Run the solver on one level from variables x, shape (nx,); ``hulls`` replace the capsules.
 
         A refiner that ``measures_hulls`` has no capsules: its hulls are rows of compiled code on all levels. Their
-        required distances then grow by ``extra`` [m], shape (K, columns), for a
-        motion that is nearly valid.
+        required distances then grow by ``extra`` [m], shape (K, columns), for a motion that is nearly valid.
         """
         motion = self.transcription(task, level)
         settings = level.settings if extra is None else self.levels.strict.settings
@@ -223,15 +220,8 @@ class Refiner:
     ) -> tuple[Attempt, Array] | None:
         """Continue an attempt that the verdict rejected for a collision at a phase with a depth [m].
 
-        Args:
-            task: The task.
-            attempt: The attempt.
-            phase: Phase of the collision.
-            depth: Its depth [m].
-            extra: Additional distances of earlier collisions [m], shape (K, columns), or None.
-
-        Returns:
-            The result with larger required distances there, and all additional distances; None without compiled hulls.
+        Return the result with larger required distances there, and all additional distances [m], shape (K, columns),
+        which include ``extra`` of earlier collisions; None without compiled hulls.
         """
         if not self.measures_hulls:
             return None
@@ -256,11 +246,8 @@ class Refiner:
             result = replace(result, iterations=earlier + result.iterations)
         return result
 
-    def accepted_at_ends(self, task: RefinementTask) -> Array:
-        """Return by how much the hulls at both ends violate their distances within the tolerance [m], shape (2, m)."""
-        return self._accepted(task)
-
     def _measure_ends(self, task: RefinementTask) -> Array:
+        """Return by how much the hulls at both ends violate their distances within the tolerance [m], shape (2, m)."""
         ends = np.stack([task.boundary.start_q[0], task.boundary.goal_q[0]], axis=1)
         return self.hulls.accepted_at(ends, task.scene.poses[0])
 
@@ -298,27 +285,21 @@ class Refiner:
 
     def line_guess(self, task: RefinementTask) -> Array:
         """Return the variables of the initial guess of the coarse level: along a tip path, or a line."""
-        guess = next(self.tip_path_guesses(task), None)
-        if guess is not None:
+        for guess in self.tip_path_guesses(task):
             return guess
         return self.slow_guess(task, initial_guesses.rising_line(*self._guess_arguments(task)))
 
     def tip_path_guesses(self, task: RefinementTask) -> Iterator[Array]:
         """Yield the variables of motions along the initial tip paths of the problem's constraint."""
         constraint = self.problem.scene_constraint
-        values, parameters = self._values_of(task)
-        frame = table_frame_of(self.problem, parameters)
+        width = self.problem.scene_width - len(self.problem.parameters)  # of all values before the parameters
+        values = task.scene.poses[0, pose_width(self.problem.obstacle) : width]
+        frame = table_frame_of(self.problem, task.scene.poses[:, width:])
         start = task.start_xyz if frame is None else frame.to_table(task.start_xyz[None])[0]
         for polyline in [] if constraint is None else constraint.initial_tip_paths(values, start):
             path = polyline if frame is None else np.array([frame.to_world(point[None])[0] for point in polyline])
             ends = task.boundary.start_q[0], task.boundary.goal_q[0]
             yield self.path_guess(task, initial_guesses.along_tip_path(self._world, *ends, path))
-
-    def _values_of(self, task: RefinementTask) -> tuple[Array, Array]:
-        """Return the values of a task for a constraint, shape (width,), and its parameters, shape (1, width)."""
-        width = self.problem.scene_width - len(self.problem.parameters)
-        poses = task.scene.poses
-        return poses[0, pose_width(self.problem.obstacle) : width], poses[:, width:]
 
     def even_line_guess(self, task: RefinementTask) -> Array:
         """Return the variables of the straight line at constant rate."""
@@ -352,7 +333,7 @@ class Refiner:
     def rest_space(self, task: RefinementTask, hulls: Hulls | None = None) -> RestSpace:
         """Return the valid states at rest, for the search of joint-space paths."""
         bounds, poses = self.check.rest_bounds(task), self.kernel_poses(task)
-        return RestSpace(self.residual_kernels, self.robot, bounds, poses, hulls, task.scene.poses[0])
+        return RestSpace(self.residual_kernels, self.robot, bounds, poses, task.scene.poses[0], hulls)
 
     def manifold(self, task: RefinementTask) -> EqualityKernel | None:
         """Return the equalities that compiled trees keep, or None if there are none."""

@@ -8,8 +8,7 @@ numbers are the same for every task. The refiner adds velocities and acceleratio
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -45,17 +44,17 @@ class RestSpace:
         kernels: Residual kernels.
         robot: The robot.
         bounds: Bounds of the residuals of a state.
-        obstacle_poses: Poses and sizes of the obstacles, shape (width,).
+        kernel_poses: Scene values that the kernels take, shape (width,).
+        scene_poses: Poses and sizes of the obstacles of the hulls, shape (width,).
         hulls: Hulls that decide where capsules collide, or without capsules everywhere; None where links are capsules.
-        scene_poses: Poses and sizes of the obstacles of the hulls, by default ``obstacle_poses``.
     """
 
     kernels: ResidualKernels
     robot: Robot
     bounds: RestBounds
-    obstacle_poses: Array
-    hulls: Hulls | None = None
-    scene_poses: Array | None = None
+    kernel_poses: Array
+    scene_poses: Array
+    hulls: Hulls | None
 
     def follow(self, q: Array) -> Array:
         """Project K states, shape (n, K), onto the equalities; return the leading valid ones."""
@@ -67,17 +66,18 @@ class RestSpace:
         counts = [max(int(np.ceil(np.abs(b - a).max() / STATE_SPACING)), 1) for a, b in pairwise(path)]
         where = np.concatenate([k + np.arange(count) / count for k, count in enumerate(counts)])
         q = np.stack([np.interp(where, np.arange(len(path)), joint) for joint in path.T])
+        return bool(self._met(q)[~self.bounds.capsules].all())
+
+    def _met(self, q: Array) -> NDArray[np.bool_]:
+        """Return a mask of the bounds that the states meet, shape (m, K)."""
         (g,) = self.kernels.values(*self._arguments(q))
-        met = (g >= self.bounds.lower[:, None]) & (g <= self.bounds.upper[:, None])
-        return bool(met[~self.bounds.capsules].all())
+        return np.asarray((g >= self.bounds.lower[:, None]) & (g <= self.bounds.upper[:, None]))
 
     def _count_valid(self, q: Array) -> int:
         """Return the number of leading valid states."""
-        (g,) = self.kernels.values(*self._arguments(q))
-        met = (g >= self.bounds.lower[:, None]) & (g <= self.bounds.upper[:, None])
+        met, poses = self._met(q), self.scene_poses
         if self.hulls is None:
             return _first(~np.logical_and.reduce(met))
-        poses = self.obstacle_poses if self.scene_poses is None else self.scene_poses
         first = _first(~np.logical_and.reduce(met[~self.bounds.capsules]))
         if first:
             first = _first(~self.hulls.clear_states(q[:, :first], poses, uncovered_only=True))
@@ -90,7 +90,7 @@ class RestSpace:
 
     def projected(self, q: Array) -> Array:
         """Project K states onto the equalities; joints that reach a limit stay there."""
-        low, high = self._limits
+        low, high = self.robot.position_lower[:, None], self.robot.position_upper[:, None]
         q, rows = np.clip(q, low, high), self.bounds.equal
         lower, upper = self.bounds.lower[rows, None], self.bounds.upper[rows, None]
         for _ in range(MAX_PROJECTIONS):
@@ -106,16 +106,12 @@ class RestSpace:
             q = np.clip(q - step, low, high)
         return q
 
-    @cached_property
-    def _limits(self) -> tuple[Array, Array]:
-        return self.robot.position_lower[:, None], self.robot.position_upper[:, None]
-
     def _arguments(self, q: Array) -> tuple[Array, Array]:
         """Return the kernel arguments of K states at rest."""
         (n, count), width = q.shape, self.kernels.values.tape.inputs[0]
         w, orders = np.zeros((width, count)), (width + 1) // (n + 1)
         w[:n], w[orders * n] = q, 1.0  # positions and the rate
-        return w, np.repeat(self.obstacle_poses[:, None], count, axis=1)
+        return w, np.repeat(self.kernel_poses[:, None], count, axis=1)
 
 
 def _first(mask: NDArray[np.bool_]) -> int:
@@ -123,22 +119,11 @@ def _first(mask: NDArray[np.bool_]) -> int:
     return int(np.argmax(mask)) if mask.any() else len(mask)
 
 
-@dataclass
 class _Tree:
-    """Tree of configurations that are connected with one end.
+    """Tree of configurations that are connected with one end: nodes (n,), their parents, and states (k, n) of edges."""
 
-    Attributes:
-        nodes: Configurations, shape (n,) each.
-        parents: Index of the parent of every node.
-        states: States on the edge from the parent, shape (k, n) each.
-    """
-
-    nodes: list[Array]
-    parents: list[int] = field(default_factory=lambda: [-1])
-    states: list[Array] = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.states = [self.nodes[0][None]]
+    def __init__(self, root: Array) -> None:
+        self.nodes, self.parents, self.states = [root], [-1], [root[None]]
 
     def grow(self, target: Array, follow: Follow, max_extension: float) -> bool:
         """Extend the nearest node towards a configuration while states are valid; return whether it is reached."""
@@ -209,19 +194,11 @@ def find_paths(start: Array, goal: Array, robot: Robot, follow: Follow) -> Itera
 
 
 def find_path(start: Array, goal: Array, robot: Robot, follow: Follow, *, seed: int) -> Array | None:
-    """Search for one path by RRT-Connect.
+    """Search for one path by RRT-Connect; return its states, shape (K, n), or None if the trees do not connect.
 
-    Args:
-        start: First configuration, shape (n,).
-        goal: Last configuration, shape (n,).
-        robot: The robot, see ``find_paths``.
-        follow: Function that returns the leading valid states, see ``RestSpace.follow``.
-        seed: Seed of the random numbers.
-
-    Returns:
-        States of the path, shape (K, n), or None if the trees do not connect.
+    The arguments are those of ``find_paths``, and the seed of the random numbers.
     """
-    random, trees = np.random.default_rng(seed), (_Tree([start]), _Tree([goal]))
+    random, trees = np.random.default_rng(seed), (_Tree(start), _Tree(goal))
     lower = np.maximum(robot.position_lower, np.minimum(start, goal) - MAX_TURN)
     upper = np.minimum(robot.position_upper, np.maximum(start, goal) + MAX_TURN)
     for extension in range(MAX_EXTENSIONS):

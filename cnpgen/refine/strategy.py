@@ -35,22 +35,14 @@ from cnpgen.problems.constraints.object_clearance import ObjectClearance
 from cnpgen.problems.constraints.self_clearance import SelfClearance
 from cnpgen.problems.problem import Problem
 from cnpgen.refine.grid_levels import MAX_INITIAL_VIOLATION
-from cnpgen.refine.obstacle_attempts import (
-    along_path,
-    around_obstacles,
-    ends_penetrate,
-    hulls_of_trees,
-    is_deep,
-    path_guesses,
-)
+from cnpgen.refine.obstacle_attempts import along_path, around_obstacles, ends_penetrate, is_deep, path_guesses
 from cnpgen.refine.proof.end_violations import end_violations
 from cnpgen.refine.refiner import Refiner
 from cnpgen.refine.solver.bounds import PRECISE_FRACTION
-from cnpgen.refine.solver.deadline import Deadline
 from cnpgen.refine.solver.hull_feedback import MAX_FED_BACK_M, MIN_FED_BACK_M
 from cnpgen.refine.solver.hull_problem import without_contacts
 from cnpgen.refine.solver.hulls import Hulls, has_clearance_constraints
-from cnpgen.refine.solver.sqp import Result
+from cnpgen.refine.solver.sqp import Deadline, Result
 from cnpgen.refine.task import MAX_JUDGED_VIOLATION, Attempt, Outcome, RefinementTask
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene import Scene
@@ -105,13 +97,7 @@ def refine_task_until(refiner: Refiner, checker: PlanChecker, task: RefinementTa
     """Refine the input plan of a task until a deadline; the result is never worse than the input.
 
     The input plan is judged first. Steps and verdicts are not interrupted: one starts only if it is expected to end in
-    time. Without a usable input plan one attempt is always made.
-
-    Args:
-        refiner: Refiner of the problem.
-        checker: Independent check.
-        task: The task.
-        seconds: Time from now to the deadline [s].
+    time. Without a usable input plan one attempt is always made. The deadline is ``seconds`` [s] from now.
     """
     until = time.perf_counter() + seconds
     if not task.is_finite:
@@ -165,13 +151,6 @@ def _is_input(task: RefinementTask, path: Array, rate: Array) -> bool:
     return all(bool(difference <= MAX_ROUNDING_ERROR) for difference in differences)
 
 
-def _severity(verdict: Verdict) -> float:
-    """Return 1 for a valid plan, a larger number for others, inf for plans that could not be evaluated."""
-    if verdict.valid:
-        return 1.0
-    return max((margin.severity for margin in verdict.margins.values()), default=np.inf)
-
-
 def _invalid_input(refiner: Refiner, task: RefinementTask) -> Attempt:
     """Return the input plan, or nan, for boundary conditions that are not finite."""
     spec, n = refiner.spec, task.boundary.start_q.shape[1]
@@ -185,13 +164,7 @@ def _invalid_input(refiner: Refiner, task: RefinementTask) -> Attempt:
 
 
 class PlanChecker:
-    """Independent check of the plans of a problem.
-
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        degree: Degree of the plans' splines.
-    """
+    """Independent check of the plans of a problem, splines of one degree."""
 
     def __init__(self, problem: Problem, robot: Robot, *, degree: int) -> None:
         self._problem, self._robot, self._degree = problem, robot, degree
@@ -311,24 +284,22 @@ class RefinementSearch:
 
     def judge(self, plan: Attempt) -> Attempt:
         """Return a plan with its verdict."""
-        verdict = self.verdict = self._verdict(plan)
+        removable = self.refiner.measures_hulls and not self._ends_touch  # contacts, by the solver
+        judge = self.checker.strict_verdict if removable else self.checker.verdict
+        verdict = self.verdict = judge(self.task, plan.path, plan.rate)
         touches = not verdict.valid and verdict.reason in LINK_REASONS
-        if touches and self.refiner.measures_hulls and not self._ends_touch:
+        if touches and removable:
             verdict = self.checker.verdict(self.task, plan.path, plan.rate)
         keeps_outcome = verdict.valid or plan.outcome in INPUT_OUTCOMES
+        worst = max((margin.severity for margin in verdict.margins.values()), default=np.inf)
         return replace(
             plan,
             outcome=plan.outcome if keeps_outcome else Outcome.UNSOLVED,
             reason=verdict.reason,
-            severity=_severity(verdict),
+            severity=1.0 if verdict.valid else worst,
             is_precise=self._is_precise(verdict) and not touches,
             touches=touches and verdict.valid,
         )
-
-    def _verdict(self, plan: Attempt) -> Verdict:
-        """Return the verdict, without a tolerance of contacts if the solver can remove them."""
-        removable = self.refiner.measures_hulls and not self._ends_touch
-        return (self.checker.strict_verdict if removable else self.checker.verdict)(self.task, plan.path, plan.rate)
 
     @cached_property
     def _ends_touch(self) -> bool:
@@ -352,30 +323,24 @@ class RefinementSearch:
 
 
 def make_attempts(refiner: Refiner, task: RefinementTask, x: Array | None) -> Iterator[Attempt]:
-    """Yield attempts at a task that stay near its input path if they must; see ``_all_attempts``."""
-    if x is None:
-        yield from _all_attempts(refiner, replace(task, stay_within=None), x)
-        return
+    """Yield attempts at a task that stay near its input path, of variables x, if they must; see ``_all_attempts``."""
+    task = replace(task, stay_within=None) if x is None else task
     for attempt in _all_attempts(refiner, task, x):
         if task.is_near(attempt.path, refiner.spec.degree):
             yield attempt
 
 
 def _all_attempts(refiner: Refiner, task: RefinementTask, x: Array | None) -> Iterator[Attempt]:
-    """Yield attempts at a task; later ones are more expensive and requested only if the earlier ones were rejected.
-
-    Args:
-        refiner: Refiner of the problem.
-        task: The task, with finite boundary conditions.
-        x: Variables of the input plan, see ``Refiner.input_variables``.
-    """
+    """Yield attempts at a task; later ones are more expensive and requested only if the earlier ones were rejected."""
     if refiner.settings.max_iterations == 0:
-        yield _repair_only(refiner, task, x)
+        guess, outcome = (refiner.line_guess(task), Outcome.SOLVED) if x is None else (x, Outcome.ADJUSTED)
+        yield refiner.measured(task, guess, outcome, unlimited=True)
         return
     if x is not None and refiner.coarser is not None:
         yield from _with_fewer_control_points(refiner, refiner.coarser, task, x)
     adjusted = refiner.measured(task, x, Outcome.ADJUSTED) if x is not None and task.at_rest else None
-    hulls = hulls_of_trees(refiner, task)
+    searches_trees = refiner.measures_hulls and task.deadline is None
+    hulls = refiner.hulls if searches_trees else None
     if hulls is None:
         best = yield from run_levels(refiner, task, x, adjusted)
     else:
@@ -407,12 +372,6 @@ def _best_of(attempts: Iterator[Attempt], best: Attempt) -> Generator[Attempt, N
         yield attempt
         best = attempt if attempt.is_better(best) else best
     return best
-
-
-def _repair_only(refiner: Refiner, task: RefinementTask, x: Array | None) -> Attempt:
-    """Scale the input plan or a straight line in time, without iterations of the solver."""
-    guess, outcome = (refiner.line_guess(task), Outcome.SOLVED) if x is None else (x, Outcome.ADJUSTED)
-    return refiner.measured(task, guess, outcome, unlimited=True)
 
 
 def _with_fewer_control_points(refiner: Refiner, coarser: Refiner, task: RefinementTask, x: Array) -> Iterator[Attempt]:

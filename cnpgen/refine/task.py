@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.judges.plans.verdict import Reason
-from cnpgen.refine.solver.deadline import Deadline
+from cnpgen.refine.solver.sqp import Deadline
 from cnpgen.robots.scene import Scene
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.spline import basis

@@ -53,7 +53,7 @@ class TreeSearch:
         first, and then those of shorter estimated duration. Paths of large trees with shorter edges follow.
         """
         found, seeds = list[Array](), count()
-        line = self._grow(0, self._settings(0.0, 0, TREE_EXTENSION_RAD))
+        line = self._grow(0, 0, TREE_EXTENSION_RAD)
         if line is not None:
             yield line
             return
@@ -73,23 +73,23 @@ class TreeSearch:
             if seed == len(TREE_MARGINS_M) and number < MIN_TREE_PATHS:
                 return
             margin = TREE_MARGINS_M[seed % len(TREE_MARGINS_M)]
-            path = self._grow(seed, self._settings(margin, SMALL_TREE_EXTENSIONS, TREE_EXTENSION_RAD))
+            path = self._grow(seed, SMALL_TREE_EXTENSIONS, TREE_EXTENSION_RAD, margin)
             if path is not None:
                 number += 1
                 yield path
 
     def _large_trees(self, seeds: Iterator[int], extension: float, connected: bool) -> Iterator[Array]:
         """Yield the paths of large trees; of fewer ones if there is no path yet."""
-        settings = self._settings(0.0, LARGE_TREE_EXTENSIONS, extension)
         for number, seed in enumerate(islice(seeds, LARGE_TREES)):
             if number == MAX_UNCONNECTED_TREES and not connected:
                 return  # there is probably no path
-            path = self._grow(seed, settings)
+            path = self._grow(seed, LARGE_TREE_EXTENSIONS, extension)
             if path is not None:
                 connected = True
                 yield path
 
-    def _settings(self, margin: float, extensions: int, length: float) -> TreeSettings:
+    def _grow(self, seed: int, extensions: int, length: float, margin: float = 0.0) -> Array | None:
+        """Return the path of one pair of trees, or None."""
         settings = TreeSettings(
             self.hulls.obstacle_distance,
             self.hulls.self_distance,
@@ -98,13 +98,9 @@ class TreeSearch:
             max_extensions=extensions,
             shortcuts=TREE_SHORTCUTS,
         )
-        if self.manifold is None:
-            return settings
-        nodes = MANIFOLD_LARGE_TREE_NODES if extensions == LARGE_TREE_EXTENSIONS else MANIFOLD_NODES
-        return replace(settings, spacing=MANIFOLD_SPACING_RAD, max_nodes=nodes)
-
-    def _grow(self, seed: int, settings: TreeSettings) -> Array | None:
-        """Return the path of one pair of trees, or None."""
+        if self.manifold is not None:
+            nodes = MANIFOLD_LARGE_TREE_NODES if extensions == LARGE_TREE_EXTENSIONS else MANIFOLD_NODES
+            settings = replace(settings, spacing=MANIFOLD_SPACING_RAD, max_nodes=nodes)
         task, robot = self.task, self.space.robot
         start, goal = task.boundary.start_q[0], task.boundary.goal_q[0]
         lower, upper = np.minimum(start, goal) - MAX_TURN, np.maximum(start, goal) + MAX_TURN

@@ -1,4 +1,4 @@
-"""Boundary conditions, and the control points that meet them exactly (paper, Appendix A).
+"""Boundary conditions, the control points that meet them exactly (paper, Appendix A), and their derivatives.
 
 Rate control points [1/s], shape (N, R), are positive. Functions raise ``UsageError`` if boundary conditions have
 different numbers of joints, or the spline has less than degree + 2 control points.
@@ -215,3 +215,51 @@ def anchor_line(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> Array:
     count = spec.path_control_points - 3 - boundary.fixed_at_goal
     along = np.linspace(0, 1, count)[:, None]
     return first * (1 - along) + last * along
+
+
+@dataclass(frozen=True)
+class BoundaryDerivative:
+    """Derivative of one path control point with respect to one rate control point.
+
+    Attributes:
+        point: Index of the path control point, 0 to C - 1.
+        variable: Index of the rate control point, 0 to R - 1.
+        derivative: d(path control point) / d(rate control point) [rad s], shape (N, n).
+    """
+
+    point: int
+    variable: int
+    derivative: Array
+
+
+def boundary_derivatives(boundary: Boundary, rate: Array, spec: TrajectorySpec) -> list[BoundaryDerivative]:
+    """Differentiate ``start_points`` and ``goal_points``; other derivatives are zero.
+
+    Args:
+        boundary: Boundary conditions of N motions.
+        rate: Rate control points [1/s], shape (N, R), positive.
+        spec: Degree and numbers of control points.
+    """
+    b, last, points = boundary, spec.rate_control_points - 1, spec.path_control_points
+    c1, c2, c2_inner = _three_derivatives(b.start_dq, b.start_ddq, rate[:, :1], rate[:, 1:2], spec)
+    derivatives = [BoundaryDerivative(1, 0, c1), BoundaryDerivative(2, 0, c2), BoundaryDerivative(2, 1, c2_inner)]
+    if b.goal_ddq is None:
+        return [*derivatives, BoundaryDerivative(points - 2, last, _first_derivative(-b.goal_dq, rate[:, -1:], spec))]
+    c1, c2, c2_inner = _three_derivatives(-b.goal_dq, b.goal_ddq, rate[:, -1:], rate[:, -2:-1], spec)
+    derivatives += [BoundaryDerivative(points - 2, last, c1), BoundaryDerivative(points - 3, last, c2)]
+    return [*derivatives, BoundaryDerivative(points - 3, last - 1, c2_inner)]
+
+
+def _first_derivative(dq: Array, outer: Array, spec: TrajectorySpec) -> Array:
+    """Return dc1/dr0 at the end where the path has velocity dq, with ``c1 = q + p' / eta`` and ``p' = dq / r0``."""
+    return np.asarray(-dq / (outer**2 * end_derivatives(spec.path_control_points, spec.degree).eta))
+
+
+def _three_derivatives(
+    dq: Array, ddq: Array, outer: Array, inner: Array, spec: TrajectorySpec
+) -> tuple[Array, Array, Array]:
+    """Return dc1/dr0, dc2/dr0 and dc2/dr1 at an end of ``_three``, with ``r' = eta_r (r1 - r0)``."""
+    path, speed = _end_derivatives(spec)
+    c1 = _first_derivative(dq, outer, spec)
+    second = (-2 * (ddq - dq * speed.eta * (inner - outer)) / outer + dq * speed.eta) / outer**2
+    return c1, second / path.beta + 3 * c1, -dq * speed.eta / (outer**2 * path.beta)

@@ -10,7 +10,7 @@ to the samples, so that no r causes a drift in time.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -63,7 +63,9 @@ def fit_motion(
     errors = [fit.error(rate) for rate in rates]
     rate = rates[int(np.argmin(np.maximum(errors, MIN_FIT_ERROR_RAD)))]
     if min(errors) > MIN_FIT_ERROR_RAD and len(fit.t) > spec.path_control_points:
-        rate = min(rate, fit.thinned(MAX_RATE_FIT_SAMPLES).improved_rate(rate), key=fit.error)
+        step = -(-len(fit.t) // MAX_RATE_FIT_SAMPLES)
+        thinned = replace(fit, t=fit.t[::step], q=fit.q[::step])
+        rate = min(rate, thinned.improved_rate(rate), key=fit.error)
     return Motion(fit.path(rate).control[None], rate, spec.degree)
 
 
@@ -93,32 +95,17 @@ def _checked_boundary(boundary: Boundary, n: int) -> Boundary:
 
 @dataclass(frozen=True)
 class _Path:
-    """The least-squares fit of the path for a fixed r.
+    """The least-squares fit of the path for a fixed r: control points (C, n) and residuals (K + smoothing rows, n)."""
 
-    Attributes:
-        s: Phases of the samples, shape (K,).
-        rows: Matrix of the fit for all control points, shape (K + smoothing rows, C).
-        control: Control points [rad], shape (C, n).
-        residual: Residuals, shape (K + smoothing rows, n).
-    """
-
-    s: Array
-    rows: Array
+    s: Array  # phases of the samples
+    rows: Array  # matrix of the fit for all control points
     control: Array
     residual: Array
 
 
 @dataclass(frozen=True)
 class _Fit:
-    """The fitting problem: K samples of a trajectory from t = 0. Rates are control points of shape (N, R).
-
-    Attributes:
-        t: Times [s], shape (K,).
-        q: Joint positions [rad], shape (K, n).
-        duration: Duration of the trajectory [s].
-        spec: Degree and numbers of control points.
-        boundary: Boundary conditions of one motion.
-    """
+    """The fitting problem: K samples of a trajectory from t = 0. Rates are control points of shape (N, R)."""
 
     t: Array
     q: Array
@@ -130,11 +117,6 @@ class _Fit:
     def free(self) -> slice:
         """The interior path control points."""
         return slice(3, self.spec.path_control_points - self.boundary.fixed_at_goal)
-
-    def thinned(self, max_samples: int) -> _Fit:
-        """Subsample evenly to at most ``max_samples``."""
-        step = -(-len(self.t) // max_samples)
-        return _Fit(self.t[::step], self.q[::step], self.duration, self.spec, self.boundary)
 
     def mixed_rate(self, mixture: float) -> Array:
         """Choose r so that the phase is a mixture of arc length and time, shape (1, R).

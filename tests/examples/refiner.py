@@ -21,7 +21,6 @@ from cnpgen.refine.strategy import PlanChecker, refine_task
 from cnpgen.refine.task import Attempt, RefinementTask
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.trajectory.spline_motion import Motion
-from cnpgen.world.world import World
 from tests.examples.plans import PROBLEMS, ROBOTS, Plan
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
@@ -64,14 +63,7 @@ def refiner(name: str, cost_term: CostTerm | None = None) -> Refiner:
 def refiner_of(problem: Problem, cost_term: CostTerm | None = None, **options: object) -> Refiner:
     """Return the refiner of a problem with the residuals of the shipped one."""
     robot, kernels = ROBOTS[problem.name], library(problem.name)
-    return Refiner(
-        problem,
-        robot,
-        kernels=kernels,
-        world=World(robot, problem.obstacle, problem.object_size),
-        cost_term=cost_term,
-        **options,
-    )
+    return Refiner(problem, robot, kernels=kernels, cost_term=cost_term, **options)
 
 
 def obstacle_poses(plan: Plan) -> np.ndarray:

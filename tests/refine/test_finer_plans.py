@@ -12,7 +12,7 @@ from cnpgen.refine import strategy
 from cnpgen.refine.options import RefineOptions
 from cnpgen.refine.refine_engine import load_refiner, prepare
 from cnpgen.refine.refiner import Refiner
-from cnpgen.refine.solver.deadline import Deadline
+from cnpgen.refine.solver.sqp import Deadline
 from cnpgen.refine.strategy import PlanChecker, refine_task
 from cnpgen.refine.task import Attempt, Outcome, RefinementTask
 from cnpgen.trajectory.remaining_trajectory import finer, with_fewer_knots, with_finer_knots

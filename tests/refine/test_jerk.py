@@ -15,7 +15,6 @@ from cnpgen.refine.solver.transcription import Transcription
 from cnpgen.refine.strategy import PlanChecker, refine_task
 from cnpgen.refine.task import Outcome
 from cnpgen.trajectory.spline_motion import Motion
-from cnpgen.world.world import World
 from tests.examples.jerk_limits import jerk_limited, jerk_limited_plan
 from tests.examples.plans import load, reference_trajectory
 from tests.examples.refiner import obstacle_poses, refine, task, verdict
@@ -28,7 +27,7 @@ def jerk_limited_refiner(name: str) -> Refiner:
         "compiled" if find_compiler() and name == "airhockey" else "numpy"
     )  # the other problem needs few evaluations
     kernels = problem_kernels(problem, robot, backend, default_cache_folder())
-    return Refiner(problem, robot, kernels=kernels, world=World(robot, problem.obstacle, problem.object_size))
+    return Refiner(problem, robot, kernels=kernels)
 
 
 @pytest.mark.slow

@@ -26,7 +26,7 @@ def test_a_motion_on_a_manifold_is_found_without_input_plan(name: str, tmp_path:
         world.set_state(configuration, 0 * configuration, 0 * configuration, np.zeros(0))
         tips.append(world.tip_position)
     kernels = problem_kernels(problem, ROBOT, "numpy", tmp_path)
-    tool = Refiner(problem, ROBOT, kernels=kernels, world=world)
+    tool = Refiner(problem, ROBOT, kernels=kernels)
     boundary = Boundary(q[0][None], rest, rest, q[1][None], rest)
     found = refine_task(
         tool, PlanChecker(problem, ROBOT, degree=7), RefinementTask(boundary, Scene((), np.empty((1, 0))), *tips)

@@ -24,11 +24,10 @@ from cnpgen.refine.solver import compiled_backend, qp_subproblem, sqp
 from cnpgen.refine.solver.bounds import INTERVAL_FRACTION, NO_TIGHTENING, Bounds, bounds_template
 from cnpgen.refine.solver.compiled_backend import CompiledBackend
 from cnpgen.refine.solver.cost_term import CostTerm, choose_cost_term, cost_term_residuals, residual_counts
-from cnpgen.refine.solver.deadline import Deadline
 from cnpgen.refine.solver.grid import make_grid
 from cnpgen.refine.solver.qp_subproblem import Backend, NumpyBackend, ResidualSelection
 from cnpgen.refine.solver.residuals import stage_jacobian, stage_values
-from cnpgen.refine.solver.sqp import Settings, minimize
+from cnpgen.refine.solver.sqp import Deadline, Settings, minimize
 from cnpgen.refine.solver.transcription import ResidualKernels, Transcription
 from cnpgen.refine.strategy import PlanChecker, refine_task
 from cnpgen.refine.task import Attempt, Outcome
@@ -509,8 +508,7 @@ def test_time_scaling_is_as_large_as_the_bound_of_the_tip_speed_requires(tmp_pat
     limit = TipSpeed(highest=fastest / 1.05)
     problem = replace(plan.problem, constraint=(*plan.problem.constraint, limit))
     kernels = problem_kernels(problem, plan.robot, "numpy", tmp_path)
-    world = World(plan.robot, problem.obstacle, problem.object_size)
-    tool = Refiner(problem, plan.robot, kernels=kernels, world=world, settings=Settings(max_iterations=0))
+    tool = Refiner(problem, plan.robot, kernels=kernels, settings=Settings(max_iterations=0))
     checker = PlanChecker(problem, plan.robot, degree=7)
     found = refine_task(tool, checker, task(plan, path=plan.motion.path[0], rate=plan.motion.rate[0]))
     assert (found.outcome, found.reason) == (Outcome.TIME_SCALED, "ok")

@@ -70,7 +70,7 @@ def test_states_off_the_equalities_are_projected_within_the_joint_limits() -> No
     world = World(robot, problem.obstacle, problem.object_size)
     (vertical,) = (item for item in problem.constraint if item.reason == "not vertical")
     for q in projected.T:
-        world.set_state(q, 0 * q, 0 * q, space.obstacle_poses)
+        world.set_state(q, 0 * q, 0 * q, space.scene_poses)
         assert all(condition.violation() < 0.1 * vertical.tolerance for condition in vertical.measured(world))
 
 

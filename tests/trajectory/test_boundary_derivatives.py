@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from cnpgen.trajectory.boundary import Boundary, goal_points, start_points
-from cnpgen.trajectory.boundary_derivatives import boundary_derivatives
+from cnpgen.trajectory.boundary import Boundary, boundary_derivatives, goal_points, start_points
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
 STEP = 1e-6

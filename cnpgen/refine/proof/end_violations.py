@@ -29,12 +29,6 @@ def end_violations(
 
     If the boundary conditions leave the acceleration at the goal free, there must be one within its limits whose
     torques are within theirs.
-
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        boundary: Boundary conditions of one motion.
-        scene: Its obstacles, one sample.
     """
     world = World(robot, problem.obstacle, problem.object_size)
     (obstacle_poses,) = scene.poses

@@ -56,14 +56,7 @@ class Explanation:
 
 
 def explain_failure(problem: Problem, robot: Robot, boundary: Boundary, scene: Scene) -> Explanation:
-    """Explain why no valid plan of a boundary problem was found.
-
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        boundary: Boundary conditions of one motion.
-        scene: Its obstacles, one sample.
-    """
+    """Explain why no valid plan of a boundary problem was found: one motion, with a scene of one sample."""
     conditions = (scene.poses, *vars(boundary).values())
     if not all(values is None or np.isfinite(values).all() for values in conditions):
         return Explanation(Feasibility.INFEASIBLE, "the boundary conditions are not finite")
@@ -127,10 +120,8 @@ def _off_table(problem: Problem, robot: Robot, boundary: Boundary) -> Explanatio
     table_exit = find_table_exit(problem, robot, boundary)
     if table_exit is None:
         return None
-    subject, distance = (
-        f"{_time_text(table_exit.end, table_exit.time)} the tip",
-        f"{1e3 * abs(table_exit.distance):.2g} mm",
-    )
+    subject = f"{_time_text(table_exit.end, table_exit.time)} the tip"
+    distance = f"{1e3 * abs(table_exit.distance):.2g} mm"
     if table_exit.proven:
         text = f"{subject} is {distance} or more off the table, for any acceleration"
         return Explanation(Feasibility.INFEASIBLE, text)

@@ -6,7 +6,6 @@ The multipliers at the minimum combine the table's bounds to one direction, alon
 violation for the whole box.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -118,13 +117,7 @@ class TableExit:
 
 
 def find_table_exit(problem: Problem, robot: Robot, boundary: Boundary) -> TableExit | None:
-    """Find a proven exit from a table, or else one with less than ``VERGE_DISTANCE_M`` to the edge, or None.
-
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        boundary: Boundary conditions of one motion.
-    """
+    """Find a proven exit of one motion from a table, or one within ``VERGE_DISTANCE_M`` of the edge, or None."""
     arm, nearly = ArmKinematics(robot), None
     start_tip = arm.at(boundary.start_q[0]).position
     exact, wide = (table_bounds(problem, start_tip, tolerances=tolerances) for tolerances in (0.0, 1.0))
@@ -168,7 +161,9 @@ def _prove(arm: ArmKinematics, bounds: TableBounds, violations: list[TableViolat
 def _smallest(arm: ArmKinematics, bounds: TableBounds, time: float, box: tuple[Array, Array]) -> TableViolation:
     """Search from several configurations; stop at one without violation."""
     best: TableViolation | None = None
-    for q in _initial_configurations(*box):
+    random = np.random.default_rng(0)
+    center = (box[0] + box[1]) / 2
+    for q in (center, *(random.uniform(*box) for _ in range(LOCAL_SEARCHES - 1))):
         value, multipliers = _search(arm, bounds, q, box)
         if best is None or value < best.value:
             best = TableViolation(time, value, multipliers, box)
@@ -176,13 +171,6 @@ def _smallest(arm: ArmKinematics, bounds: TableBounds, time: float, box: tuple[A
             break
     assert best is not None
     return best
-
-
-def _initial_configurations(lower: Array, upper: Array) -> Iterator[Array]:
-    random = np.random.default_rng(0)
-    yield (lower + upper) / 2
-    for _ in range(LOCAL_SEARCHES - 1):
-        yield random.uniform(lower, upper)
 
 
 def _search(arm: ArmKinematics, bounds: TableBounds, q: Array, box: tuple[Array, Array]) -> tuple[float, Array]:

@@ -1,7 +1,7 @@
 """Bounds of the residuals on a grid, tightened against overshoot between grid points."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import accumulate
 
 import numpy as np
 from numpy.typing import NDArray
@@ -142,13 +142,7 @@ def bounds_template(problem: Problem, world: World, s: Array, tightening: Tighte
 
 
 class BoundsTemplate:
-    """Bounds of the motions of a problem on one grid.
-
-    Args:
-        problem: The problem.
-        world: World of the problem; its state is changed.
-        s: Phases of the grid, shape (K,).
-        tightening: Tightening of the bounds.
+    """Bounds of the motions of a problem on one grid with phases s, shape (K,); the state of its world is changed.
 
     Attributes:
         conditions: Conditions of the residuals.
@@ -164,22 +158,25 @@ class BoundsTemplate:
         orders = condition_orders(problem, world)
         pairs = [(constraint, condition) for constraint in problem.constraint for condition in constraint.solved(world)]
         tables, untightened = (
-            [_bounds(*pair, s, amount, order) for pair, order in zip(pairs, orders, strict=True)]
+            np.concatenate(
+                [_bounds(*pair, s, amount, order) for pair, order in zip(pairs, orders, strict=True)], axis=-1
+            )
             for amount in (tightening, NO_TIGHTENING)
         )
         self._tightening = tightening
         self._s, self._bound_phases = s, s * (PHASE_FACTOR if tightening.band else 1.0)
-        self._lower = np.asfortranarray(np.concatenate([low for low, _ in tables], axis=1))  # the layout of residuals
-        self._upper = np.asfortranarray(np.concatenate([high for _, high in tables], axis=1))
-        self._time_varying = list(_time_varying_conditions(pairs))
+        self._lower, self._upper = map(np.asfortranarray, tables)  # the layout of residuals
         self.conditions = [condition for _, condition in pairs]
         self.tolerances = np.concatenate([_tolerances(*pair) for pair in pairs])
         widths = [len(condition.g) for condition in self.conditions]
+        self._time_varying = [
+            (*pair, slice(behind - width, behind))
+            for pair, width, behind in zip(pairs, widths, accumulate(widths), strict=True)
+            if type(pair[0]).bound_relaxation is not Constraint.bound_relaxation
+        ]
         self.orders = np.repeat(orders, widths)
-        clearances = [isinstance(constraint, RobotClearance | SelfClearance) for constraint, _ in pairs]
-        self.capsules = np.repeat(clearances, widths)
-        held = [isinstance(constraint, ObjectClearance) for constraint, _ in pairs]
-        self.held_clearances = np.repeat(held, widths)
+        self.capsules = np.repeat([isinstance(item, RobotClearance | SelfClearance) for item, _ in pairs], widths)
+        self.held_clearances = np.repeat([isinstance(item, ObjectClearance) for item, _ in pairs], widths)
         scales = [_scale(*pair) if isinstance(pair[0], JointPosition) else np.nan for pair in pairs]
         self._position_scale = np.concatenate(
             [np.broadcast_to(scale, width) for scale, width in zip(scales, widths, strict=True)]
@@ -187,8 +184,7 @@ class BoundsTemplate:
         self.equal = np.repeat([condition.is_equality for condition in self.conditions], widths)
         with np.errstate(invalid="ignore"):
             interval_tolerance = np.where(self.equal, PRECISE_FRACTION, 1.0) * self.tolerances + np.fmax(
-                np.concatenate([high for _, high in untightened], axis=1) - self._upper,
-                self._lower - np.concatenate([low for low, _ in untightened], axis=1),
+                untightened[1] - self._upper, self._lower - untightened[0]
             )
         self._interval_tolerance = np.asfortranarray(np.where(np.isnan(interval_tolerance), np.inf, interval_tolerance))
         self._nonsmooth = np.zeros(self._lower.shape, bool, order="F")
@@ -202,7 +198,15 @@ class BoundsTemplate:
             ends: Residuals of the boundary states, shape (2, m), nan where they are free. Bounds near an end that
                 violates them within the tolerance are relaxed by the violation: no motion meets narrower ones.
         """
-        bounds = self._without_ends(start_tip)
+        lower, upper = self._lower, self._upper
+        for constraint, condition, columns in self._time_varying:
+            relaxation = constraint.bound_relaxation(condition, self._bound_phases, start_tip)
+            if np.any(relaxation > 0):
+                scale = _scale(constraint, condition)
+                lower, upper = lower.copy("F"), upper.copy("F")
+                lower[:, columns] -= relaxation[:, None] / scale
+                upper[:, columns] += relaxation[:, None] / scale
+        bounds = Bounds(lower, upper, self._nonsmooth, self._interval_tolerance)
         return bounds if ends is None else self._relaxed_at_ends(bounds, ends)
 
     def near(self, bounds: Bounds, positions: Array, distance: float) -> Bounds:
@@ -258,17 +262,6 @@ class BoundsTemplate:
         interval_tolerance = bounds.interval_tolerance - np.where(self.equal, 0.0, relaxation)
         return Bounds(lower, upper, bounds.nonsmooth, interval_tolerance)
 
-    def _without_ends(self, start_tip: Array) -> Bounds:
-        lower, upper = self._lower, self._upper
-        for constraint, condition, columns in self._time_varying:
-            relaxation = constraint.bound_relaxation(condition, self._bound_phases, start_tip)
-            if np.any(relaxation > 0):
-                scale = _scale(constraint, condition)
-                lower, upper = lower.copy("F"), upper.copy("F")
-                lower[:, columns] -= relaxation[:, None] / scale
-                upper[:, columns] += relaxation[:, None] / scale
-        return Bounds(lower, upper, self._nonsmooth, self._interval_tolerance)
-
 
 def near_ends(s: Array) -> Array:
     """Return the share of the violation of the start and of the goal that bounds accept at phases, shape (2, K, 1)."""
@@ -277,25 +270,8 @@ def near_ends(s: Array) -> Array:
 
 
 def accepted_along(shares: Array, accepted: Array) -> Array:
-    """Return the violations that are accepted at K phases, shape (K, m).
-
-    Args:
-        shares: Result of ``near_ends``, shape (2, K, 1).
-        accepted: Accepted violations of both ends, shape (2, m).
-    """
+    """Return the violations that are accepted at K phases, shape (K, m), from ``near_ends`` and those of both ends."""
     return np.asarray((shares * accepted[:, None]).max(axis=0))
-
-
-def _time_varying_conditions(
-    pairs: list[tuple[Constraint, Condition]],
-) -> Iterator[tuple[Constraint, Condition, slice]]:
-    """Yield the conditions with time-varying bounds and their columns."""
-    column = 0
-    for constraint, condition in pairs:
-        width = len(condition.g)
-        if type(constraint).bound_relaxation is not Constraint.bound_relaxation:
-            yield constraint, condition, slice(column, column + width)
-        column += width
 
 
 def _scale(constraint: Constraint, condition: Condition) -> Array:
@@ -308,10 +284,8 @@ def _tolerances(constraint: Constraint, condition: Condition) -> Array:
     return constraint.allowed(condition) / _scale(constraint, condition)
 
 
-def _bounds(
-    constraint: Constraint, condition: Condition, s: Array, tightening: Tightening, order: int
-) -> tuple[Array, Array]:
-    """Return scaled bounds (K, m) of one condition that depends on derivatives up to ``order``."""
+def _bounds(constraint: Constraint, condition: Condition, s: Array, tightening: Tightening, order: int) -> Array:
+    """Return scaled bounds, shape (2, K, m), of one condition that depends on derivatives up to ``order``."""
     scale = _scale(constraint, condition)
     lower = np.repeat((condition.lower / scale)[None], len(s), axis=0)
     upper = np.repeat((condition.upper / scale)[None], len(s), axis=0)
@@ -328,7 +302,7 @@ def _bounds(
         lower, upper = lower + inside, upper - inside
     if order < 2:  # fixed by the boundary conditions
         lower[s == 1], upper[s == 1] = -np.inf, np.inf
-    return lower, upper
+    return np.stack([lower, upper])
 
 
 def _added_clearance(s: Array, tightening: Tightening) -> Array:

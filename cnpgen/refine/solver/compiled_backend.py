@@ -66,14 +66,11 @@ class _Motion(ctypes.Structure):
         *((name, c_void_p) for name in ("values", "jacobian", "cost_residuals")),
         *((name, c_void_p) for name in ("start_q", "start_dq", "start_ddq", "goal_q", "goal_dq", "goal_ddq")),
         *((name, c_void_p) for name in ("obstacle_poses", "time_basis", "time_weights", "cost_weights", "cost_groups")),
-        *((name, c_void_p) for name in ("smoothing",)),
-        *((name, c_void_p) for name in ("lower", "upper", "nonsmooth", "accelerated")),
+        *((name, c_void_p) for name in ("smoothing", "lower", "upper", "nonsmooth", "accelerated")),
         *((name, c_void_p) for name in ("control", "rates", "derivative", "w")),
-        *((name, c_void_p) for name in ("gradient", "hessian", "factor", "scratch")),
-        *((name, c_void_p) for name in ("index", "initial")),
+        *((name, c_void_p) for name in ("gradient", "hessian", "factor", "scratch", "index", "initial")),
         ("program", _Polyhedron),
-        *((name, c_double) for name in ("eta", "beta", "rate_eta")),
-        *((name, c_double) for name in ("violation", "gain", "remaining")),
+        *((name, c_double) for name in ("eta", "beta", "rate_eta", "violation", "gain", "remaining")),
         *((name, c_long * 6) for name in ("point", "variable")),
         *((name, c_long) for name in ("n_derivatives", "n_selected")),
     )
@@ -166,12 +163,11 @@ class CompiledBackend:
             rate_eta=rate.eta,
             program=self._program(stride),
             **self._constants(motion, bounds),
-            **self._kernel_addresses(motion),
             **self._work_arrays(motion, stride),
         )
 
     def _constants(self, motion: Transcription, bounds: Bounds) -> dict[str, Any]:
-        """Return the arrays that no step changes."""
+        """Return the arrays and kernels that no step changes."""
         grid, kernels = motion.grid, motion.kernels
         groups = np.empty((0, 3)) if kernels.cost_term is None else kernels.cost_term.groups(kernels.cost_counts)
         arrays = {
@@ -189,16 +185,10 @@ class CompiledBackend:
         }
         fields: dict[str, Any] = {name: None if array is None else self._keep(array) for name, array in arrays.items()}
         fields |= {"grid": self._bases(grid.bases), "cost_bases": self._bases(grid.cost_bases)}
+        fields |= {"values": kernels.values.address, "jacobian": kernels.jacobian.address}
+        if (cost := kernels.cost_residuals) is not None:
+            fields |= {"cost_residuals": cost.address, "n_cost_residuals": cost.tape.outputs[0]}
         return {**fields, "n_time_nodes": len(grid.time_weights), "n_cost_groups": len(groups)}
-
-    def _kernel_addresses(self, motion: Transcription) -> dict[str, Any]:
-        """Return the addresses of the compiled kernels and the constants of the cost term."""
-        kernels = motion.kernels
-        fields = {"values": kernels.values.address, "jacobian": kernels.jacobian.address}
-        if kernels.cost_term is None or kernels.cost_residuals is None:
-            return fields
-        count, address = kernels.cost_residuals.tape.outputs[0], kernels.cost_residuals.address
-        return {**fields, "cost_residuals": address, "n_cost_residuals": count}
 
     def _work_arrays(self, motion: Transcription, stride: int) -> dict[str, int]:
         """Allocate the work arrays with the sizes of step.c."""
@@ -251,21 +241,13 @@ class CompiledBackend:
 
 @dataclass(frozen=True)
 class CompiledSubproblem:
-    """Subproblem of step.c; see ``Subproblem``.
-
-    Attributes:
-        backend: Backend that built it.
-        fallback: Function that builds the same subproblem in NumPy.
-        g: Residuals at the iterate, shape (K, m).
-        selected: Mask of the residuals in the program, shape (K, m).
-        elastic_gradient: Gradient of the elastic variable's cost.
-    """
+    """Subproblem of step.c at an iterate with residuals g; see ``Subproblem``."""
 
     backend: CompiledBackend
-    fallback: Callable[[], Subproblem]
+    fallback: Callable[[], Subproblem]  # builds the same subproblem in NumPy
     g: Array
     selected: Mask
-    elastic_gradient: float
+    elastic_gradient: float  # of the elastic variable's cost
 
     def solve(self, box: Array, *, warm: Array | None = None, relax: bool = False) -> Step | None:
         """Return the best step within the box; see ``Subproblem``. DAQP solves it if active_set.c does not."""

@@ -82,12 +82,7 @@ def choose_cost_term(problem: Problem, objective: str = "time", weight: float | 
 
 
 def cost_term_residuals(robot: Robot, terms: list[dict[str, Any]]) -> Any:
-    """Build ``w -> (e, de/dw)`` with ``w = (p, p', p'', p''', r, r', r'')``, the Jacobian column by column.
-
-    Args:
-        robot: The robot.
-        terms: ``CostTerm.tables``.
-    """
+    """Build ``w -> (e, de/dw)`` of ``CostTerm.tables``, column by column, with ``w = (p, ..., p''', r, r', r'')``."""
     import casadi as ca
 
     w_sx, state = _state(robot)

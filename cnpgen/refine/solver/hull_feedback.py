@@ -22,12 +22,7 @@ MAX_FED_BACK_M = 0.02  # larger collisions are not between grid points
 
 
 class HullFeedback:
-    """Check of a motion's hulls between the points of a grid.
-
-    Args:
-        spec: Degree and numbers of control points.
-        s: Phases of the grid, shape (K,).
-    """
+    """Check of a motion's hulls between the points of a grid with phases s, shape (K,)."""
 
     def __init__(self, spec: TrajectorySpec, s: Array) -> None:
         fractions = np.arange(STATES_PER_INTERVAL) / STATES_PER_INTERVAL
@@ -63,17 +58,9 @@ class HullFeedback:
         return np.asarray(np.maximum(np.concatenate([between, edge]), np.concatenate([edge, between])))
 
     def clearance_at(self, path: Array, hulls: Hulls, obstacle_poses: Array, *, phase: float, depth: float) -> Array:
-        """Return by how much the required distances must grow around the phase of a rejected collision [m].
+        """Return by how much the required distances must grow around a rejected collision [m], shape (K, columns).
 
-        Args:
-            path: Path control points, shape (C, n).
-            hulls: Clearances of the hulls.
-            obstacle_poses: Poses and sizes of the obstacles, shape (width,).
-            phase: Phase of the collision.
-            depth: Depth of the collision by the verdict [m]; it is the least increase for the pairs that are closest.
-
-        Returns:
-            Shape (K, columns).
+        The depth [m] is that of the verdict, and the least increase for the pairs that are closest.
         """
         interval = int(np.searchsorted(self._phases, phase)) - 1
         first, last = max(interval - 1, 0), min(interval + 2, self._intervals)

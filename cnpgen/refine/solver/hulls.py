@@ -6,10 +6,11 @@ The derivative of the distance treats the closest points and the direction as co
 velocity of the points along the direction.
 """
 
+from collections import defaultdict
 from ctypes import CDLL
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +27,6 @@ from cnpgen.refine.solver.residuals import DISTANCE_SCALE_M
 from cnpgen.refine.solver.transcription import Linearization, ResidualKernels, Transcription, cache_last
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.held_object import HELD_OBJECT, with_held_object
-from cnpgen.robots.shape.shape import Shape
 from cnpgen.robots.solid import solids_of
 from cnpgen.trajectory.boundary import Boundary
 from cnpgen.world.forward_kinematics import ForwardKinematics
@@ -63,37 +63,6 @@ class _Group:
     numbers: Pairs
 
 
-@dataclass(frozen=True)
-class _Distances:
-    """Largest distances that the constraints of each kind require [m]; None without one."""
-
-    kinds: ClassVar = (RobotClearance, ObjectContact, SelfClearance, ObjectClearance)
-    robot: float | None
-    object: float | None
-    links: float | None
-    object_from_links: float | None
-
-    @property
-    def from_obstacles(self) -> float | None:
-        """Largest required distance from obstacles [m]."""
-        return max((each for each in (self.robot, self.object) if each is not None), default=None)
-
-    @property
-    def from_links(self) -> float | None:
-        """Largest required distance of links and the held object from other links [m]."""
-        return max((each for each in (self.links, self.object_from_links) if each is not None), default=None)
-
-    def differences(self, shape: Shape) -> tuple[dict[str, float], dict[frozenset[str], float]]:
-        """Return what links and link pairs add to the largest distances, see ``CollisionChecker``."""
-        base, own = self.from_obstacles or 0.0, self.from_links or 0.0
-        added = dict.fromkeys(shape.joints, _difference(self.robot, base)) | {
-            HELD_OBJECT: _difference(self.object, base)
-        }
-        of_pairs = _difference(self.links, own), _difference(self.object_from_links, own)
-        pairs = (frozenset((pair.first, pair.second)) for pair in shape.pairs)
-        return added, {pair: of_pairs[HELD_OBJECT in pair] for pair in pairs}
-
-
 class Hulls:
     """Clearances of a robot's convex parts at many states. Not thread-safe: memory is reused.
 
@@ -128,27 +97,29 @@ class Hulls:
         names = [*links, *range(len(problem.obstacle))]
         columns: dict[Any, int] = {}
         self._groups, self._uncovered = list[_Group](), list[tuple[Pairs, float]]()
-        min_distances, accepted_of = dict[int, float](), dict[int, float]()
+        min_distances, accepted = (defaultdict[int, float](lambda: -np.inf) for _ in range(2))  # by column
         covered = {frozenset((pair.first, pair.second)) for pair in shape.pairs if pair.for_solvers}
         for constraint in constraints:
             of_links, required = isinstance(constraint, SelfClearance | ObjectClearance), _required(constraint)
             pairs, numbers = self._pairs_of(constraint, names, of_links=of_links)
             indices = [columns.setdefault((names[a], names[b]), len(columns)) for a, b in pairs.tolist()]
             for column in indices:
-                min_distances[column] = max(min_distances.get(column, -np.inf), required)
-                accepted = max(accepted_of.get(column, -np.inf), required - _tolerance(constraint))
-                accepted_of[column] = accepted
+                min_distances[column] = max(min_distances[column], required)
+                accepted[column] = max(accepted[column], required - _tolerance(constraint))
             self._groups.append(_Group(pairs, np.array(indices, np.intp), required, not of_links, numbers))
             if of_links:
                 uncovered = [frozenset((names[a], names[b])) not in covered for a, b in pairs.tolist()]
                 self._uncovered.append((pairs[np.array(uncovered, bool)], required))
         self.min_distances = np.array([min_distances[column] for column in range(len(columns))])
-        self.tolerances = self.min_distances - np.array([accepted_of[column] for column in range(len(columns))])
-        distances = _Distances(*(_largest(constraints, kind) for kind in _Distances.kinds))
-        self.obstacle_distance, self.self_distance = distances.from_obstacles, distances.from_links
+        self.tolerances = self.min_distances - np.array([accepted[column] for column in range(len(columns))])
+        self.obstacle_distance, (added_to_links, added_to_object) = _largest(constraints, RobotClearance, ObjectContact)
+        self.self_distance, added = _largest(constraints, SelfClearance, ObjectClearance)
         self.checker = None
         if library is not None and robot.n <= MAX_JOINTS:
-            self.checker = CollisionChecker(library, robot, shape, *distances.differences(shape))
+            of_parts = dict.fromkeys(shape.joints, added_to_links) | {HELD_OBJECT: added_to_object}
+            names_of_pairs = (frozenset((pair.first, pair.second)) for pair in shape.pairs)
+            of_pairs = {pair: added[HELD_OBJECT in pair] for pair in names_of_pairs}
+            self.checker = CollisionChecker(library, robot, shape, of_parts, of_pairs)
         self._axes = np.array([joint.axis for joint in robot.chain.joints])
         self._sliding = np.array(robot.sliding)
         supports = [list(joints) for joints in robot.model.supports]
@@ -181,12 +152,9 @@ class Hulls:
         return distances, groups
 
     def clear_states(self, q: Array, obstacle_poses: Array, *, uncovered_only: bool = False) -> NDArray[np.bool_]:
-        """Return a mask of the states with the required distances, shape (K,).
+        """Return a mask of the states q (n, K) with the required distances, shape (K,).
 
-        Args:
-            q: Joint positions [rad], shape (n, K).
-            obstacle_poses: Poses and sizes of the obstacles, shape (width,).
-            uncovered_only: Whether to check only pairs of links that the solver's capsules do not cover.
+        With ``uncovered_only`` only pairs of links that the solver's capsules do not cover are checked.
         """
         if self.checker is not None:
             limit = None if uncovered_only else self.obstacle_distance
@@ -200,12 +168,9 @@ class Hulls:
         return clear
 
     def violation(self, q: Array, obstacle_poses: Array, *, above_tolerance: bool = False) -> float:
-        """Return the largest violation of the required distances at states q (n, K) [m], at least 0.
+        """Return the largest violation of the required distances, or its part above the tolerance [m].
 
-        Args:
-            q: Joint positions [rad], shape (n, K).
-            obstacle_poses: Poses and sizes of the obstacles, shape (width,).
-            above_tolerance: Whether only the part above the tolerance counts.
+        It is at least 0, and inf if the states q (n, K) are not finite.
         """
         if not np.isfinite(q).all():
             return np.inf
@@ -221,15 +186,9 @@ class Hulls:
         return np.asarray(np.clip(self.min_distances - distances, 0.0, self.tolerances))
 
     def missing(self, q: Array, margins: Array, obstacle_poses: Array) -> Array:
-        """Return by how much the distances at states q (n, K) are below the required ones plus margins [m], at least 0.
+        """Return by how much the distances at states q (n, K) are below the required ones plus margins (K,) [m].
 
-        Args:
-            q: Joint positions [rad], shape (n, K).
-            margins: Additional distance at every state [m], shape (K,).
-            obstacle_poses: Poses and sizes of the obstacles, shape (width,).
-
-        Returns:
-            Shape (K, m).
+        The result has shape (K, m) and is at least 0.
         """
         missing = np.zeros((q.shape[1], len(self.min_distances)))
         if not np.isfinite(q).all():
@@ -266,15 +225,13 @@ class Hulls:
 
     @cached_property
     def _columns(self) -> DistanceColumns:
-        rows = {
-            True: np.zeros(len(self._bodies.obstacle_pairs), np.int64),
-            False: np.zeros(len(self._bodies.link_pairs), np.int64),
-        }
+        pairs = self._bodies.link_pairs, self._bodies.obstacle_pairs
+        of_links, of_obstacles = rows = [np.zeros(len(each), np.int64) for each in pairs]
         for group in self._groups:
             rows[group.of_obstacles][group.numbers] = group.columns
         distances = self.obstacle_distance, self.self_distance
         return DistanceColumns(
-            self.min_distances, rows[True], rows[False], *distances, MEASURED_RANGE_M, DISTANCE_SCALE_M
+            self.min_distances, of_obstacles, of_links, *distances, MEASURED_RANGE_M, DISTANCE_SCALE_M
         )
 
     def placed_checker(self, obstacle_poses: Array) -> CollisionChecker:
@@ -326,25 +283,19 @@ def _tolerance(constraint: Any) -> float:
     return float(constraint.tolerance if isinstance(constraint, ObjectContact) else constraint.effective_tolerance)
 
 
-def _largest(constraints: list[Any], kind: type) -> float | None:
-    """Return the largest distance that constraints of a kind require [m]; None without one."""
-    return max((_required(constraint) for constraint in constraints if isinstance(constraint, kind)), default=None)
-
-
-def _difference(required: float | None, base: float) -> float:
-    return -np.inf if required is None else required - base
+def _largest(constraints: list[Any], *kinds: type) -> tuple[float | None, list[float]]:
+    """Return the largest distance that constraints of some kinds require [m], and what each kind adds to it."""
+    largest = [
+        max((_required(item) for item in constraints if isinstance(item, kind)), default=-np.inf) for kind in kinds
+    ]
+    required = max(largest)
+    return (None, largest) if required == -np.inf else (required, [distance - required for distance in largest])
 
 
 class CompiledHullTranscription(Transcription):
     """One motion on one grid with the clearances of the links' hulls as further residuals, evaluated in compiled code.
 
-    Args:
-        kernels: Residual kernels with compiled code.
-        grid: The grid.
-        hulls: Clearances of the hulls with compiled checks.
-        boundary: Boundary conditions of one motion.
-        kernel_poses: Scene values that the residual kernels take, shape (width,).
-        obstacle_poses: Poses and sizes of the obstacles, shape (width,).
+    Kernels and hulls must be compiled; ``kernel_poses`` are the scene values that the kernels take, shape (width,).
     """
 
     def __init__(
@@ -367,15 +318,7 @@ class CompiledHullTranscription(Transcription):
 
 
 class HullTranscription(Transcription):
-    """One motion on one grid with the clearances of the links' hulls as further residuals, evaluated in NumPy.
-
-    Args:
-        kernels: Residual kernels.
-        grid: The grid.
-        hulls: Clearances of the hulls.
-        boundary: Boundary conditions of one motion.
-        obstacle_poses: Poses and sizes of its obstacles, shape (width,).
-    """
+    """One motion on one grid with the clearances of the links' hulls as further residuals, evaluated in NumPy."""
 
     def __init__(
         self, kernels: ResidualKernels, grid: Grid, hulls: Hulls, *, boundary: Boundary, obstacle_poses: Array

@@ -95,13 +95,7 @@ class Backend(Protocol):
 
 
 class NumpyBackend:
-    """Backend in NumPy and DAQP.
-
-    Args:
-        motion: The transcription.
-        bounds: Bounds of its residuals.
-        thinning: Interval of the thinned grid, see ``select_residuals``.
-    """
+    """Backend in NumPy and DAQP; see ``select_residuals`` for ``thinning``."""
 
     def __init__(self, motion: Transcription, bounds: Bounds, thinning: int) -> None:
         self._motion, self._bounds, self._thinning = motion, bounds, thinning
@@ -118,9 +112,8 @@ class NumpyBackend:
         """Build the subproblem; see ``Backend``."""
         at = self._evaluate(x)
         errors = self._motion.linearization_errors(at, selection.max_log_rate_change)
-        distance = selection.max_distance
         selected = select_residuals(
-            g, self._bounds, thinning=self._thinning, max_distance=distance, linearization_errors=errors
+            g, self._bounds, thinning=self._thinning, max_distance=selection.max_distance, linearization_errors=errors
         )
         selected |= selection.missed
         if selection.multipliers is not None:
@@ -130,16 +123,9 @@ class NumpyBackend:
 
 @dataclass(frozen=True)
 class NumpySubproblem:
-    """Quadratic model of the objective and linear model of the residuals, solved by DAQP.
+    """Quadratic model of the objective and linear model of the selected residuals, solved by DAQP.
 
-    Attributes:
-        motion: The transcription.
-        at: Linearization at the iterate.
-        bounds: Bounds of the residuals.
-        selected: Mask of the residuals in the program, shape (K, m).
-        violation: Largest violation at the iterate.
-        proximal: Weight of the proximal term.
-        penalty: Cost of the largest violation.
+    ``proximal`` is the weight of the proximal term, ``penalty`` that of the largest violation at the iterate.
     """
 
     motion: Transcription
@@ -149,10 +135,6 @@ class NumpySubproblem:
     violation: float
     proximal: float
     penalty: float
-
-    def cost(self, dx: Array) -> float:
-        """Return the predicted change of the objective by a step."""
-        return float(self.at.gradient @ dx + 0.5 * dx @ self.at.curvature @ dx + 0.5 * self.proximal * dx @ dx)
 
     def solve(self, box: Array, *, warm: Array | None = None, relax: bool = False) -> Step | None:
         """Return the best step within the box; see ``Subproblem``."""
@@ -183,7 +165,8 @@ class NumpySubproblem:
             return None
         multipliers = np.zeros(self.at.g.shape)
         multipliers[k, residual] = info["lam"][nx + 1 :]
-        return Step(dx, float(solution[-1]) / ELASTIC_CURVATURE_ROOT, multipliers, -self.cost(dx))
+        cost = float(self.at.gradient @ dx + 0.5 * dx @ self.at.curvature @ dx + 0.5 * self.proximal * dx @ dx)
+        return Step(dx, float(solution[-1]) / ELASTIC_CURVATURE_ROOT, multipliers, gain=-cost)
 
     @cached_property
     def _unwhiten(self) -> Array | None:
@@ -196,12 +179,7 @@ class NumpySubproblem:
         return None if failed else np.asarray(dtrtri(factor, lower=True)[0].T)
 
     def _rows(self, k: Indices, residual: Indices, unwhiten: Array, *, relax: bool) -> tuple[Array, Array, Array]:
-        """Lay out the rows of the program with their bounds.
-
-        Returns:
-            ``(rows, low, high)``: gradients of the box, the elastic variable and m selected residuals, shape
-            (nx + 1 + m, nx + 1), and the largest decrease and increase of the residuals, shape (m,) each.
-        """
+        """Return gradients of box, elastic variable and residuals, (nx + 1 + m, nx + 1), and bounds of their change."""
         g, lower, upper = self.at.g[k, residual], self.bounds.lower[k, residual], self.bounds.upper[k, residual]
         nx = self.motion.nx
         rows = np.zeros((nx + 1 + len(k), nx + 1))
@@ -212,11 +190,8 @@ class NumpySubproblem:
         if relax:
             upper_is_closer = upper - g < g - lower
             elastic[:] = np.where(upper_is_closer, -self.violation, self.violation) / ELASTIC_CURVATURE_ROOT
-            low, high = (
-                np.where(upper_is_closer, -DAQP_INFINITY, lower - g),
-                np.where(upper_is_closer, upper - g, DAQP_INFINITY),
-            )
-            return rows, low, high
+            low = np.where(upper_is_closer, -DAQP_INFINITY, lower - g)
+            return rows, low, np.where(upper_is_closer, upper - g, DAQP_INFINITY)
         above, below = np.maximum(g - upper, 0), np.maximum(lower - g, 0)
         elastic[:] = (below - above) / ELASTIC_CURVATURE_ROOT
         return rows, np.where(above > 0, -DAQP_INFINITY, lower - g), np.where(below > 0, DAQP_INFINITY, upper - g)
@@ -243,12 +218,7 @@ def select_residuals(
 
 
 def local_maxima(violations: Array, *, thinning: int) -> Mask:
-    """Return a mask of local maxima along the motion, their neighbors and the thinned grid, shape (K, m).
-
-    Args:
-        violations: Violations of residuals, shape (K, m).
-        thinning: Interval of the thinned grid in grid points.
-    """
+    """Return a mask of local maxima along the motion, their neighbors and the thinned grid, shape (K, m)."""
     peak = np.zeros(violations.shape, bool, order="F")
     peak[1:-1] = (violations[1:-1] >= violations[:-2]) & (violations[1:-1] >= violations[2:])
     peak[0], peak[-1] = violations[0] >= violations[1], violations[-1] >= violations[-2]

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from cnpgen.refine.solver.bounds import Bounds
 from cnpgen.refine.solver.compiled_backend import CompiledBackend
-from cnpgen.refine.solver.deadline import Deadline
 from cnpgen.refine.solver.qp_subproblem import (
     Backend,
     Mask,
@@ -48,6 +47,7 @@ BOUND_SHRINKAGE, MIN_GAIN_FRACTION = 0.7, 0.1  # of the violation bound; smalles
 LAST_STEPS = 3  # before a deadline restore feasibility
 DEADLINE_PROXIMAL = 30.0  # weight of the proximal term in these
 MAX_MIDPOINT_CORRECTIONS = 2  # tightenings of the bounds for violations between grid points
+STEP_TIME_FACTOR = 1.3  # times the largest duration of a step so far is reserved for the next
 ACCEPTED_RATIO, GOOD_RATIO, POOR_RATIO = 0.05, 0.7, 0.3  # of reduction to prediction: accept, enlarge, shrink
 
 
@@ -86,6 +86,27 @@ class Settings:
 DEFAULT_SETTINGS = Settings()
 
 
+@dataclass
+class Deadline:
+    """Time at which a sequence of steps must have ended: iterations of a solver, or verdicts.
+
+    Attributes:
+        until: Time in the clock of ``time.perf_counter`` [s].
+        max_duration: Time reserved for one step: the largest so far, times ``STEP_TIME_FACTOR`` [s].
+    """
+
+    until: float
+    max_duration: float = 0.0
+
+    def allows(self, steps: int) -> bool:
+        """Return whether there is time for so many steps."""
+        return time.perf_counter() + steps * self.max_duration <= self.until
+
+    def note(self, begun: float) -> None:
+        """Record a step that started at ``begun`` and has just ended."""
+        self.max_duration = max(self.max_duration, STEP_TIME_FACTOR * (time.perf_counter() - begun))
+
+
 @dataclass(frozen=True)
 class Result:
     """Result of an iteration.
@@ -108,15 +129,7 @@ class Result:
 def minimize(
     motion: Transcription, bounds: Bounds, x: Array, settings: Settings, *, deadline: Deadline | None = None
 ) -> Result:
-    """Minimize from x.
-
-    Args:
-        motion: The transcription.
-        bounds: Bounds of its residuals.
-        x: Initial variables, shape (nx,).
-        settings: Settings of the iteration.
-        deadline: Deadline of the iteration; the last steps before it restore feasibility.
-    """
+    """Minimize from variables x, shape (nx,); the last steps before the deadline restore feasibility."""
     iterate = _Iterate(motion, bounds, settings, x)
     feasible: Result | None = None
     iteration = 0
@@ -143,19 +156,10 @@ def make_backend(motion: Transcription, bounds: Bounds, thinning: int) -> Backen
 
 
 class _Iterate:
-    """State of the iteration.
+    """State of the iteration: variables, regularized objective, largest violation."""
 
-    Attributes:
-        x: Variables.
-        cost: Regularized objective.
-        violation: Largest violation.
-        converged: Whether the iteration has ended.
-        restoring: Whether steps only restore feasibility, before a deadline.
-        tightened: Whether the last step tightened the bounds for violations between grid points.
-    """
-
-    restoring = False
-    tightened = False
+    restoring = False  # whether steps only restore feasibility, before a deadline
+    tightened = False  # whether the last step tightened the bounds for violations between grid points
 
     def __init__(self, motion: Transcription, bounds: Bounds, settings: Settings, x: Array) -> None:
         self._backend, self._motion = make_backend(motion, bounds, settings.thinning), motion

@@ -38,7 +38,7 @@ typedef struct {
 
 /* ---- The motion of variables x: control points, states, objective (Transcription) ---- */
 
-/* Control points at an end, from its state, and their derivatives (trajectory/boundary.py, boundary_derivatives.py). */
+/* Control points at an end, from its state, and their derivatives (trajectory/boundary.py). */
 static void end(motion *s, const double *q, const double *dq, const double *ddq, double sign, long last, long step) {
   long inner = last + step, edge = step > 0 ? 0 : s->path - 1;
   double r = s->rates[last], eta = s->eta;

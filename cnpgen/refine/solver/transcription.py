@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.refine.solver.cost_term import CostTerm
 from cnpgen.refine.solver.grid import Bases, Grid
-from cnpgen.trajectory.boundary import Boundary, assemble
-from cnpgen.trajectory.boundary_derivatives import boundary_derivatives
+from cnpgen.trajectory.boundary import Boundary, assemble, boundary_derivatives
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
 Array = NDArray[np.float64]
@@ -149,7 +148,10 @@ class Transcription:
             path: Path control points [rad], shape (C, n).
             rate: Rate control points [1/s], shape (R,).
         """
-        return self.duration(rate) + (0.0 if self.kernels.cost_term is None else self._cost(path, rate))
+        if self.kernels.cost_term is None:
+            return self.duration(rate)
+        e, _, weights = self._cost_residuals(path, rate)
+        return self.duration(rate) + float(weights @ self.kernels.cost_term.rate(e, self.kernels.cost_counts)[0])
 
     def duration(self, rate: Array) -> float:
         """Return the motion time [s] of rate control points [1/s], shape (R,)."""
@@ -197,18 +199,11 @@ class Transcription:
 
     def _evaluate_cost_residuals(self, path: Array, rate: Array) -> tuple[Array, Array, Array]:
         """Return the cost term's residuals (m, Q), their Jacobian (4 n + 3, m, Q) and quadrature weights (Q,)."""
-        assert self.kernels.cost_term is not None
         assert self.kernels.cost_residuals is not None
         w = self.grid.cost_bases.states(path, rate)
         e, jacobian = self.kernels.cost_residuals(w)
         weights = self.grid.cost_weights / w[4 * self.n]
         return e, jacobian.reshape(len(w), *e.shape), weights
-
-    def _cost(self, path: Array, rate: Array) -> float:
-        """Return the value of the cost term."""
-        assert self.kernels.cost_term is not None
-        e, _, weights = self._cost_residuals(path, rate)
-        return float(weights @ self.kernels.cost_term.rate(e, self.kernels.cost_counts)[0])
 
     def _add_cost_term(self, path: Array, rate: Array, gradient: Array, curvature: Array) -> float:
         """Add the cost term's gradient and its Gauss-Newton Hessian; return its value."""
