@@ -8,6 +8,7 @@ between the samples, too. Their jumps at both ends are not counted.
 """
 
 import argparse
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,9 @@ from cnpgen.benchmark.benchmark_planner import Setting
 from cnpgen.benchmark.judging import judge_answer
 from cnpgen.benchmark.planners.rrtconnect import RRTConnect
 from cnpgen.benchmark.suite import load_suite
+from cnpgen.plans.format import OBSTACLE_POSES
 from cnpgen.plans.plans import Plans
+from cnpgen.problems.problem_record import as_problem, record_problem
 from cnpgen.refine.refine_plans import solve_plans
 from cnpgen.trajectory.sampled_trajectory import Trajectory
 
@@ -28,6 +31,15 @@ TIME_LIMIT_S = 600.0
 def slowed(trajectory: Trajectory, factor: float) -> Trajectory:
     assert trajectory.dq is not None
     return Trajectory(trajectory.t * factor, trajectory.q, trajectory.dq / factor)
+
+
+def with_limits_only(problems: Plans) -> Plans:
+    """Return boundary problems without obstacles and without constraints other than limits of the joints."""
+    problem = as_problem(problems.problem)
+    limits = tuple(constraint for constraint in problem.constraint if constraint.reason.startswith("joint"))
+    record = record_problem(replace(problem, constraint=limits, obstacle=()))
+    columns = {name: values for name, values in problems.columns.items() if name != OBSTACLE_POSES}
+    return replace(problems, problem=record, columns=columns)
 
 
 def meets_limits(problem: Plans, trajectory: Trajectory) -> bool:
@@ -53,13 +65,13 @@ def measure(numbers: tuple[int, int], seed: int, simplify_time: float) -> list[d
     """Return the durations of both planners in some problems [s]."""
     suite, (first, last) = load_suite("clutter"), numbers
     problems, _ = suite.problems(last)
-    setting = Setting(problems.problem, suite.model, TIME_LIMIT_S, seed)
+    setting, limits = Setting(problems.problem, suite.model, TIME_LIMIT_S, seed), with_limits_only(problems)
     plan, rows = RRTConnect(simplify_time=simplify_time).prepare(setting), []
     for index in range(first, last):
         problem = problems[index : index + 1]
         baseline, own = plan(problem), solve_plans(problem, workers=1)
         if isinstance(baseline, Trajectory) and own.valid[0]:
-            factor = least_factor(problem, baseline)
+            factor = least_factor(limits[index : index + 1], baseline)
             rows.append({"problem": index, "solve": own.plans.duration[0], "baseline": baseline.duration, "k": factor})
             progress(f"problem {index}: {rows[-1]['solve'] / baseline.duration:.4f}, slowed by {factor:.4f}")
     return rows
