@@ -135,13 +135,8 @@ class CollisionChecker:
         self._set("pairs", self.link_pairs)
         self._set("moving", np.cumsum(parts["frame"] > 0) - 1)
         self._set("moving_frames", parts["frame"][parts["frame"] > 0])
-        for name, count in (
-            ("n", robot.n),
-            ("n_parts", len(parts)),
-            ("n_links", len(capsules)),
-            ("n_link_pairs", len(kept)),
-        ):
-            setattr(self._scene, name, count)
+        self._scene.n, self._scene.n_parts = robot.n, len(parts)
+        self._scene.n_links, self._scene.n_link_pairs = len(capsules), len(kept)
         self.place([], np.empty(0))
 
     def place(self, obstacles: Sequence[Obstacle], numbers: Array) -> None:
@@ -188,18 +183,13 @@ class CollisionChecker:
         """
         states, capacity = np.ascontiguousarray(q.T), MIN_CONTACT_CAPACITY
         while True:
-            close = CloseBodies(
-                np.empty(capacity, np.int64),
-                np.empty(capacity, np.int64),
-                np.empty(capacity),
-                np.empty((capacity, 3)),
-                np.empty((capacity, 2, 3)),
-            )
+            pair, k, distance = np.empty(capacity, np.int64), np.empty(capacity, np.int64), np.empty(capacity)
+            normal, points = np.empty((capacity, 3)), np.empty((capacity, 2, 3))
+            addresses = map(address_of, (pair, k, distance, normal, points))
             count = self.library.find_contacts(
-                self.address, address_of(states), len(states), within, of_obstacles, capacity, *map(address_of, close)
+                self.address, address_of(states), len(states), within, of_obstacles, capacity, *addresses
             )
             if count <= capacity:
-                pair, k, distance, normal, points = close
                 return CloseBodies(pair[:count], k[:count], distance[:count], normal[:count], points[:count])
             capacity = count
 
