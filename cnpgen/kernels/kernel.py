@@ -1,7 +1,7 @@
 """The contract of a kernel: one SX function on a batch, with arrays of shape (width, N)."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +40,26 @@ class Kernel(ABC):
         Raises:
             ValueError: A shape or type does not match the tape.
         """
+
+
+def evaluate_lanes(
+    tape: Tape, arguments: Sequence[Array], evaluate: Callable[[Sequence[Array], int], list[Array]]
+) -> list[Array]:
+    """Evaluate a batch, or step its lanes until they have converged, by a function that evaluates N lanes once."""
+    n = check_arguments(tape, arguments)
+    if tape.loop is None:
+        return evaluate(arguments, n)
+    state, error, active = arguments[0].copy(), np.full((1, n), np.nan), np.arange(n)
+    for _ in range(tape.loop.limit):
+        if len(active) == 0:
+            break
+        inputs = [state, *arguments[1:]]
+        if len(active) < n:
+            inputs = [np.ascontiguousarray(x[:, active]) for x in inputs]
+        next_state, next_error = evaluate(inputs, len(active))
+        state[:, active], error[:, active] = next_state, next_error
+        active = active[~(next_error[0] < tape.loop.tolerance)]
+    return [state, error]
 
 
 def check_arguments(tape: Tape, arguments: Sequence[Array]) -> int:

@@ -15,12 +15,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 
 from cnpgen.errors import MachineError, UsageError
-from cnpgen.kernels.compiled_kernel import (
-    CompiledGridKernel,
-    CompiledKernel,
-    compile_source,
-    compile_tape,
-)
+from cnpgen.kernels.compiled_kernel import CompiledGridKernel, CompiledKernel, compile_source, compile_tape
 from cnpgen.kernels.compiler import require_compiler
 from cnpgen.kernels.grid_kernel import GridKernel
 from cnpgen.kernels.interpreted_kernel import InterpretedGridKernel, InterpretedKernel
@@ -87,11 +82,10 @@ class KernelLibrary:
             loop: The iteration of the function, or None.
             parameters: Further JSON-able keyword arguments of the builder; part of the cache key.
         """
-        objects = self._builder_arguments(builder)
         if self.backend == "casadi":
-            function = builder(**objects, **parameters)
+            function = self._build(builder, parameters)
             return MappedKernel(tape_from_function(function, loop), function)
-        tape = self._tape(builder, objects, parameters, loop=loop)
+        tape = self._tape(builder, parameters, loop=loop)
         if self.backend == "numpy":
             return InterpretedKernel(tape)
         if self._compiler_pool is not None:
@@ -105,12 +99,13 @@ class KernelLibrary:
         Raises:
             MachineError: A compiler failed.
         """
-        with CompilerPool(self.cache_folder) as pool:
-            self._compiler_pool = pool
-            try:
-                yield
-            finally:
-                self._compiler_pool = None
+        pool = self._compiler_pool = CompilerPool(self.cache_folder)
+        try:
+            yield
+            pool.wait()
+        finally:
+            self._compiler_pool = None
+            pool.close()
 
     def load_grid(self, builder: Callable[..., Any], grid: GridSpec, *, dtype: Dtype, **parameters: Any) -> GridKernel:
         """Return the kernel that evaluates an SX function on a grid of nodes and lanes.
@@ -121,11 +116,10 @@ class KernelLibrary:
             dtype: Precision of the arithmetic.
             parameters: Further JSON-able keyword arguments of the builder; part of the cache key.
         """
-        objects = self._builder_arguments(builder)
         if self.backend == "casadi":
-            function = builder(**objects, **parameters)
+            function = self._build(builder, parameters)
             return MappedGridKernel(tape_from_function(function, grid=grid, dtype=dtype), function)
-        tape = self._tape(builder, objects, parameters, grid=grid, dtype=dtype)
+        tape = self._tape(builder, parameters, grid=grid, dtype=dtype)
         if self.backend == "numpy":
             return InterpretedGridKernel(tape)
         return CompiledGridKernel(tape, compile_tape(tape, self.cache_folder))
@@ -147,16 +141,16 @@ class KernelLibrary:
             builder: See ``load``.
             parameters: See ``load``.
         """
-        return self._tape(builder, self._builder_arguments(builder), parameters)
+        return self._tape(builder, parameters)
 
-    def _builder_arguments(self, builder: Callable[..., Any]) -> dict[str, Any]:
+    def _build(self, builder: Callable[..., Any], parameters: Mapping[str, Any]) -> Any:
+        """Return the SX function."""
         expected = inspect.signature(builder).parameters
-        return {name: value for name, value in self.arguments.items() if name in expected}
+        return builder(**{name: value for name, value in self.arguments.items() if name in expected}, **parameters)
 
     def _tape(
         self,
         builder: Callable[..., Any],
-        objects: Mapping[str, Any],
         parameters: Mapping[str, Any],
         *,
         loop: Loop | None = None,
@@ -176,7 +170,7 @@ class KernelLibrary:
         digest = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
         name = f"{builder.__name__}-{digest[:24]}.npy"
         if (tape := self._cached(name)) is None:
-            tape = tape_from_function(builder(**objects, **parameters), loop, grid=grid, dtype=dtype)
+            tape = tape_from_function(self._build(builder, parameters), loop, grid=grid, dtype=dtype)
             self._store(name, tape)
         return tape
 
@@ -263,10 +257,8 @@ def choose_backend(requested: str | None = None) -> tuple[Backend, Path]:
             f"backend {requested!r} does not exist: expected one of {', '.join(BACKENDS)}", concerns="backend"
         )
     folder = usable_cache_folder(default_cache_folder())
-    if requested == "numpy":
-        return "numpy", folder
-    if requested == "casadi":
-        return "casadi", folder
+    if requested in {"numpy", "casadi"}:
+        return requested, folder
     try:
         _try_compiler(folder)
     except MachineError as error:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from cnpgen.kernels.grid_kernel import GridKernel, axis_names, check_grid
-from cnpgen.kernels.kernel import Array, Kernel, check_arguments
+from cnpgen.kernels.kernel import Array, Kernel, evaluate_lanes
 from cnpgen.kernels.tape import Tape
 
 
@@ -19,20 +19,8 @@ class MappedKernel(Kernel):
 
     def __call__(self, *arguments: Array) -> list[Array]:
         """Evaluate the batch; see ``Kernel``."""
-        n = check_arguments(self.tape, arguments)
-        if self.tape.loop is None:
-            return self._evaluate(list(arguments), n)
-        state, error, active = arguments[0].copy(), np.full((1, n), np.nan), np.arange(n)
-        for _ in range(self.tape.loop.limit):
-            if len(active) == 0:
-                break
-            next_state, next_error = self._evaluate([x[:, active] for x in (state, *arguments[1:])], len(active))
-            state[:, active], error[:, active] = next_state, next_error
-            active = active[~(next_error[0] < self.tape.loop.tolerance)]
-        return [state, error]
-
-    def _evaluate(self, arguments: list[Array], n: int) -> list[Array]:
-        return _map(self._function, arguments, n, self.tape.outputs)
+        widths = self.tape.outputs
+        return evaluate_lanes(self.tape, arguments, lambda inputs, n: _map(self._function, inputs, n, widths))
 
 
 class MappedGridKernel(GridKernel):

@@ -3,7 +3,6 @@
 import os
 from functools import cached_property
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING
 
 from cnpgen.kernels.compiled_kernel import CompiledKernel, compile_tape, find_compiled
@@ -40,7 +39,7 @@ class PendingKernel(Kernel):
 
 
 class CompilerPool:
-    """Threads that compile tapes, equal ones once; all are compiled at the end of the ``with`` block."""
+    """Threads that compile tapes, equal ones once; their user closes it."""
 
     def __init__(self, cache_folder: Path) -> None:
         self._folder = cache_folder
@@ -67,26 +66,17 @@ class CompilerPool:
             self._pool = ThreadPoolExecutor(min(os.cpu_count() or 1, MAX_COMPILERS))
         return self._pool
 
-    def __enter__(self) -> "CompilerPool":
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Wait for all compilations; after an error or an interruption, end those that are running or waiting.
+    def wait(self) -> None:
+        """Wait for all compilations.
 
         Raises:
             MachineError: A compiler failed.
         """
-        try:
-            if kind is None:
-                for job in self._jobs.values():
-                    job.result()
-        finally:
-            self._end()
+        for job in self._jobs.values():
+            job.result()
 
-    def _end(self) -> None:
-        """End the threads; jobs that are left are those after an error."""
+    def close(self) -> None:
+        """End the threads; after an error or an interruption, end compilations that are running or waiting."""
         from concurrent.futures import wait
 
         if self._pool is not None:

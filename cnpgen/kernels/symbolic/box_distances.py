@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from functools import reduce
 from typing import Any
 
 from cnpgen.kernels.symbolic.linalg import Scalar, Vec, cross, dot
@@ -144,10 +145,7 @@ def _outside(x: Scalar, bounds: tuple[Any, Any]) -> Scalar:
 
 def _derivative(first: Vec, along: Vec, box: Bounds, t: Scalar) -> Scalar:
     """Return half the derivative of the squared distance at t."""
-    total: Scalar = 0.0
-    for axis in range(3):
-        total = total + _outside(first[axis] + t * along[axis], box[axis]) * along[axis]
-    return total
+    return sum(_outside(first[axis] + t * along[axis], box[axis]) * along[axis] for axis in range(3))
 
 
 def upright_box_separation(center: Vec, rotation: list[Vec], size: tuple[float, float, float], box: Bounds) -> Scalar:
@@ -182,10 +180,7 @@ def upright_box_separation(center: Vec, rotation: list[Vec], size: tuple[float, 
         own = sum(half[j] * ca.fabs(dot(normal, [rotation[0][j], rotation[1][j]])) for j in range(3))
         spread = own + sum(extent[axis] * ca.fabs(normal[axis]) for axis in range(2))
         gaps.append(ca.fabs(shift) - spread)
-    best = gaps[0]
-    for gap in gaps[1:]:
-        best = ca.fmax(best, gap)
-    return best
+    return reduce(ca.fmax, gaps)
 
 
 def cuboid_separation(center: Vec, axes: list[Vec], half: Vec, other: Vec) -> Scalar:

@@ -162,9 +162,7 @@ class SymbolicHull(SymbolicBox):
         gap = ca.fmin(dot(normal, a), dot(normal, b)) - offset if self.planes else best
         return ca.fmax(super().separation(first, second, freeze), gap)
 
-    def distance(self, first: Vec, second: Vec) -> Scalar:
-        """Return the separation."""
-        return self.separation(first, second, lambda value: value)
+    distance = SymbolicSolid.distance
 
     def cuboid_separation(self, center: Vec, rotation: list[Vec], size: Size) -> Scalar:
         """Return the larger one of the separation from the box and the largest one along a plane's normal."""
