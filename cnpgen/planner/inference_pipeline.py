@@ -157,10 +157,7 @@ class InferencePipeline:
     def _with_via_points(
         self, via_points: ViaPoints, model: Model, tasks: Tasks, motion: Motion
     ) -> tuple[Tasks, Motion]:
-        """Fit the rates of motions; replace those that violate static conditions or are slow by better ones.
-
-        Better are motions through via points with a smaller violation, and faster motions nearer to the straight line.
-        """
+        """Fit the rates of motions; replace violating and slow ones by better ones through via points or straighter."""
         path, rate, violation = motion.path.copy(), motion.rate.copy(), via_points.violation(motion, tasks.scene.poses)
         fitted, kept = np.empty_like(rate), np.ones(len(path), bool)
         correction = np.zeros_like(path[:, self._interior(tasks.boundary)])
@@ -191,15 +188,7 @@ class InferencePipeline:
         return replace(tasks, correction=correction), Motion(path, fitted, motion.degree)
 
     def _shorten(self, via_points: ViaPoints, tasks: Tasks, motion: Motion, fitted: Array, violation: Array) -> None:
-        """Move slow motions without violation nearer to the straight line in place, if they become faster.
-
-        Args:
-            via_points: The check of static conditions.
-            tasks: N tasks.
-            motion: N motions; their rates are the network's, shape (N, R).
-            fitted: Their fitted rates, shape (N, R).
-            violation: Their largest violations of static conditions, in tolerances, shape (N,).
-        """
+        """Move slow motions without violation nearer to the straight line in place, if they become faster."""
         bound = replace(motion, rate=fitted).duration_bound()
         slow = np.flatnonzero((violation <= 1) & (bound > SLOW_DURATION * tasks.expected_time))
         if not len(slow):
@@ -241,18 +230,9 @@ def make_inference_pipeline(
     """
     problem, robot, kernels = loaded.problem.for_planning, loaded.robot, loaded.kernels
     with kernels.compile_in_parallel():
+        placed = loaded.problem.sample_obstacles
         prepare = make_task_preprocessor(
-            problem,
-            robot,
-            kernels,
-            line_projection_steps=config.line_projection_steps,
-            expected_time=config.expected_time,
-            fixed_at_goal=fixed_at_goal,
-            within_limits=config.within_limits,
-            via_lines=bool(config.via_points),
-            placed=loaded.problem.sample_obstacles,
-            observed=observed,
-            iterated=config.iterations > 1,
+            problem, robot, kernels, config, fixed_at_goal=fixed_at_goal, placed=placed, observed=observed
         )
         path = kernels.load(
             projected_path,

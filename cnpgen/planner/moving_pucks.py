@@ -121,15 +121,7 @@ def plan_moving_hits(  # noqa: PLR0917 - in the order of plan_hits
 def _touched_early(
     completion: Completion, meeting: Meeting, hits: _Hits, plans: Plans, delay: Array
 ) -> NDArray[np.bool_]:
-    """Return whether moving pucks touch the mallet before the meeting, while it waits or moves.
-
-    Args:
-        completion: The stages, for tip positions.
-        meeting: Rules of the meeting.
-        hits: All hits.
-        plans: M plans; ``plans.sample_id`` is the index of each hit.
-        delay: Waiting times before the plans [s], shape (M,); negative ones belong to hits that are too late.
-    """
+    """Return whether moving pucks touch the mallet before the meeting, while it waits (if not negative) or moves."""
     if not len(plans):
         return np.zeros(0, bool)
     phases, rows, speed = np.linspace(0, 1, EARLY_CONTACT_PHASES), plans.sample_id, plans.columns["hit_speed"]

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from cnpgen.kernels.grid_kernel import GridKernel
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.kernels.tape import GridSpec
-from cnpgen.planner.control_points import along_line
+from cnpgen.planner.control_points import lines_at_rest
 from cnpgen.planner.expressions import static_violation
 from cnpgen.planner.phase_grid import blocks_of_motions
 from cnpgen.planner.tasks import Tasks
@@ -80,10 +80,7 @@ class ViaPoints:
             Rows of lines, shape (N count,).
         """
         assert lines.correction is not None
-        start, goal = lines.boundary.start_q[:, None], lines.boundary.goal_q[:, None]
-        interior = start + (goal - start) * along_line(lines.correction.shape[1]) + lines.correction
-        fixed = self.path.shape[1] - interior.shape[1] - 3
-        path = np.concatenate([np.repeat(start, 3, axis=1), interior, np.repeat(goal, fixed, axis=1)], axis=1)
+        path = lines_at_rest(lines.boundary, lines.correction)
         violation = self._violation_at(self.path[COARSE_PHASES], path, lines.scene.poses)
         order = violation.reshape(-1, len(self.via_points)).argsort(axis=1, kind="stable")[:, :count]
         return np.asarray((order + len(self.via_points) * np.arange(len(order))[:, None]).ravel())
