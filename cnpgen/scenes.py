@@ -5,7 +5,7 @@ from cnpgen.make.solve_scenes import SolvedScenes, solve_scenes
 from cnpgen.pipelines.families.catalog import load_family
 from cnpgen.pipelines.families.family import Grasp, Layout, SceneFamily
 from cnpgen.pipelines.families.scene_generator import make_scenes
-from cnpgen.planner.scene_requests import plan_scenes
+from cnpgen.planner.plan_requests import plan_scenes
 from cnpgen.plans.scene_plans import scene_plans
 from cnpgen.problems.scenes.observe import observe, scene_bodies
 from cnpgen.problems.scenes.point_cloud import obstacles_of_points

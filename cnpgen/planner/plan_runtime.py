@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import CnpgenError, UsageError
-from cnpgen.planner.braking import plan_stop
 from cnpgen.planner.planner import Planner
 from cnpgen.planner.set_points import SampledMotion, SetPoint, at_rest, sample_motion
 from cnpgen.plans.evaluate import evaluate_plans
@@ -29,6 +28,7 @@ PlanFunction = Callable[[SetPoint], Plans | JoinedPlans | None]
 
 MAX_SWITCH_GAPS = (1e-6, 1e-5, 1e-3)  # of q [rad]; of dq and ddq as fractions of the limits
 MAX_END_SPEED = 1e-6  # fraction of the velocity limits: a plan ends at rest
+BRAKING_LOOKAHEADS_S = np.array([0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5])
 
 
 class SwitchOutcome(Enum):
@@ -252,6 +252,36 @@ class PlanRuntime:
             if not (gap <= share * limit).all():
                 return f"{name} jumps by {gap.max():.3g}"
         return ""
+
+
+def plan_stop(
+    planner: Planner, motion: SampledMotion, time: float, *, parameters: ArrayLike | None = None
+) -> Plans | None:
+    """Plan the fastest valid stop from a state on a motion.
+
+    The goals are configurations that the motion passes later, which are on the constraint manifold. The plans are
+    judged in the order of their durations.
+
+    Args:
+        planner: A planner whose model plans from moving states to rest, such as airhockey-online.
+        motion: The motion in execution.
+        time: Time at which the stop begins [s].
+        parameters: Parameters of the problem, if it has any, shape (width,).
+
+    Returns:
+        The stop, or None if no candidate is valid.
+
+    Raises:
+        UsageError: The model does not plan from moving states.
+    """
+    q, dq, ddq = (values[0] for values in motion.at(np.array([time])))
+    goals = motion.at(time + BRAKING_LOOKAHEADS_S).q
+    candidates = planner.plan(q, goals, start_dq=dq, start_ddq=ddq, parameters=parameters)
+    for index in np.argsort(candidates.duration).tolist():
+        plan = candidates[index]
+        if np.isfinite(plan.duration[0]) and evaluate_plans(plan).valid[0]:
+            return plan
+    return None
 
 
 def _checked_parameters(planner: Planner, parameters: ArrayLike | None) -> Array | None:
