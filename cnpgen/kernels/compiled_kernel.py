@@ -205,7 +205,7 @@ def compile_tape(tape: Tape, cache_folder: Path) -> Path:
         MachineError: There is no working compiler, or the cache folder is not writable or writable for other users.
     """
     stem = library_file_stem(tape, require_compiler())
-    return _find(stem, cache_folder) or _compile(stem, lambda: emit(tape), optimization_level(tape), cache_folder)
+    return _compile(stem, lambda: emit(tape), optimization_level(tape), cache_folder)
 
 
 def compile_source(paths: Sequence[Path], cache_folder: Path) -> Path:
@@ -220,11 +220,13 @@ def compile_source(paths: Sequence[Path], cache_folder: Path) -> Path:
     """
     text, level = "".join([prelude("float64"), *(path.read_text(encoding="utf-8") for path in paths)]), "-O3"
     stem = _stem(paths[-1].stem, text.encode(), level, require_compiler())
-    return _find(stem, cache_folder) or _compile(stem, lambda: text, level, cache_folder)
+    return _compile(stem, lambda: text, level, cache_folder)
 
 
 def _compile(stem: str, source: Callable[[], str], level: str, cache_folder: Path) -> Path:
-    """Compile C source into the cache, unless another process did so while this one waited for the lock."""
+    """Compile C source unless its library is cached, also by another process while this one waited for the lock."""
+    if library := _find(stem, cache_folder):
+        return library
     libraries = cache_folder / LIBRARIES
     try:
         make_private_folder(libraries)
@@ -237,7 +239,10 @@ def _compile(stem: str, source: Callable[[], str], level: str, cache_folder: Pat
 
 def _build(stem: str, source: Callable[[], str], level: str, cache_folder: Path) -> Path:
     libraries = cache_folder / LIBRARIES
-    _announce(cache_folder)
+    if linked := read_only_cache(cache_folder):
+        _LOG.info("compiling kernels for this run only: the cache %s lacks them and is not writable", linked)
+    else:
+        _LOG.info("compiling kernels, once per problem and machine")
     with tempfile.TemporaryDirectory(dir=libraries, prefix=".build-") as folder:
         source_file, built = Path(folder) / f"{stem.rpartition('-')[0]}.c", Path(folder) / "kernel.so"
         source_file.write_text(source(), encoding="utf-8")
@@ -248,10 +253,3 @@ def _build(stem: str, source: Callable[[], str], level: str, cache_folder: Path)
 
 def _unusable(cache_folder: Path, error: OSError) -> MachineError:
     return MachineError(f"cannot use the kernel cache {cache_folder / LIBRARIES}: {error.strerror or error}")
-
-
-def _announce(cache_folder: Path) -> None:
-    if linked := read_only_cache(cache_folder):
-        _LOG.info("compiling kernels for this run only: the cache %s lacks them and is not writable", linked)
-    else:
-        _LOG.info("compiling kernels, once per problem and machine")

@@ -32,17 +32,16 @@ Write = Callable[[int, int, Any], None]  # stores a component of a result
 
 
 class _LaneBlock:
-    """The work rows of a block of lanes, with the functions that read and write its present lanes."""
+    """A program bound to the work rows of a block of lanes, with functions that read and write its present lanes."""
 
-    def __init__(self, rows: list[Array]) -> None:
+    def __init__(self, program: "list[Bind]", rows: list[Array]) -> None:
         self.rows = rows
-        self._read: Read
-        self._write: Write
+        self._steps = [bind(self) for bind in program]
 
-    def run(self, steps: "list[Callable[[], Any]]", read: Read, write: Write) -> None:
-        """Run bound steps."""
+    def run(self, read: Read, write: Write) -> None:
+        """Run the program."""
         self._read, self._write = read, write
-        for step in steps:
+        for step in self._steps:
             step()
 
     def load(self, row: int, argument: int, component: int) -> None:
@@ -72,12 +71,12 @@ class InterpretedKernel(Kernel):
     def _evaluate(self, arguments: Sequence[Array], n: int) -> list[Array]:
         results = [np.empty((width, n)) for width in self.tape.outputs]
         work = np.empty((self._slots, min(n, POINTS_PER_BLOCK)))
-        block, steps = _bind_all(self._program, list(work))
+        block = _LaneBlock(self._program, list(work))
         for start in range(0, n, POINTS_PER_BLOCK):
             lanes = slice(start, min(start + POINTS_PER_BLOCK, n))
             if lanes.stop - start < work.shape[1]:
-                block, steps = _bind_all(self._program, list(work[:, : lanes.stop - start]))
-            block.run(steps, *_lanes(arguments, results, lanes))
+                block = _LaneBlock(self._program, list(work[:, : lanes.stop - start]))
+            block.run(*_lanes(arguments, results, lanes))
         return results
 
 
@@ -97,10 +96,8 @@ class InterpretedGridKernel(GridKernel):
             for node in range(0, k, count):
                 for lane in range(0, n, POINTS_PER_BLOCK):
                     nodes, lanes = slice(node, min(node + count, k)), slice(lane, min(lane + POINTS_PER_BLOCK, n))
-                    block, steps = _bind_all(
-                        self._program, [row[: nodes.stop - node, : lanes.stop - lane] for row in work]
-                    )
-                    block.run(steps, *self._points(arguments, out, nodes, lanes))
+                    rows = [row[: nodes.stop - node, : lanes.stop - lane] for row in work]
+                    _LaneBlock(self._program, rows).run(*self._points(arguments, out, nodes, lanes))
 
     def _points(
         self, arguments: Sequence[Array], out: Sequence[Array], nodes: slice, lanes: slice
@@ -119,11 +116,6 @@ class InterpretedGridKernel(GridKernel):
                 out[result][component, lanes] += np.broadcast_to(value, shape).sum(axis=0)
 
         return read, write
-
-
-def _bind_all(program: list[Bind], rows: list[Array]) -> tuple[_LaneBlock, list[Callable[[], Any]]]:
-    block = _LaneBlock(rows)
-    return block, [bind(block) for bind in program]
 
 
 def _lanes(arguments: Sequence[Array], results: list[Array], lanes: slice) -> tuple[Read, Write]:

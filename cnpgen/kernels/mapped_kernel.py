@@ -35,19 +35,14 @@ class MappedGridKernel(GridKernel):
         nodes, lanes = check_grid(self.tape, self.grid, arguments, out)
         points = []
         for argument, axes in zip(arguments, self.grid.arguments, strict=True):
-            shape = (len(argument), nodes, lanes)
-            spread = np.broadcast_to(_with_all_axes(argument, axis_names(axes)), shape)
+            names = axis_names(axes)
+            shape = len(argument), nodes if "nodes" in names else 1, lanes if "lanes" in names else 1
+            spread = np.broadcast_to(argument.reshape(shape), (len(argument), nodes, lanes))
             points.append(spread.reshape(len(argument), nodes * lanes))
         results = _map(self._function, points, nodes * lanes, self.tape.outputs)
         for result, values, axes in zip(out, results, self.grid.results, strict=True):
             grid = values.reshape(len(values), nodes, lanes)
             result[...] = grid if axes == "point" else result + grid.sum(axis=1)
-
-
-def _with_all_axes(array: Array, names: tuple[str, ...]) -> Array:
-    """Insert the axes that an argument lacks, with size 1."""
-    sizes = dict(zip(names, array.shape[1:], strict=True))
-    return array.reshape(len(array), sizes.get("nodes", 1), sizes.get("lanes", 1))
 
 
 def _map(function: Any, arguments: Sequence[Array], n: int, widths: Sequence[int]) -> list[Array]:

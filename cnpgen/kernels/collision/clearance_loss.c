@@ -48,8 +48,14 @@ static double state_loss(const robot_scene *s, memory *m, const double *q, doubl
     double violation = required - list->distance[i], derivative = violation < 1 ? violation : 1.0;
     const double *normal = list->normal + 3 * i, *point = list->points + 6 * i + 3;
     loss += derivative * (violation - 0.5 * derivative);
-    for (long j = 0; j < s->moving_frames[list->pair[i] / s->n_obstacles]; j++)
-      gradient[j] -= derivative * rate(s, m, j, point, normal);
+    for (long j = 0; j < s->moving_frames[list->pair[i] / s->n_obstacles]; j++) {
+      double axis[3], arm[3], speed[3];
+      const pose *f = m->frame + j + 1;
+      turn(f->R, s->axis + 3 * j, axis);
+      less(point, f->p, arm);
+      cross(axis, arm, speed);
+      gradient[j] -= derivative * dot(s->sliding[j] ? axis : speed, normal);
+    }
   }
   return loss;
 }

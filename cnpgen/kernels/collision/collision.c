@@ -227,17 +227,6 @@ static int meet_itself(const robot_scene *s, memory *m, double limit, contact_li
   return 0;
 }
 
-/* Rate of the distance along a normal if joint j moves a point. */
-static double rate(const robot_scene *s, const memory *m, long j, const double *point, const double *normal) {
-  double axis[3], arm[3], speed[3];
-  const pose *f = m->frame + j + 1;
-  turn(f->R, s->axis + 3 * j, axis);
-  if (s->sliding[j]) return dot(axis, normal);
-  less(point, f->p, arm);
-  cross(axis, arm, speed);
-  return dot(speed, normal);
-}
-
 /* Whether a state keeps the distances; a group with a limit of -INFINITY is not checked. */
 static int is_clear(const robot_scene *s, memory *m, const double *q, double obstacle_limit, double self_limit) {
   place_robot(s, q, m);

@@ -28,6 +28,17 @@ void set_row_context(row_context *context) {
   kept = context ? make_memory(context->scene) : 0;
 }
 
+/* Rate of the distance along a normal if joint j moves a point. */
+static double rate(const robot_scene *s, const memory *m, long j, const double *point, const double *normal) {
+  double axis[3], arm[3], speed[3];
+  const pose *f = m->frame + j + 1;
+  turn(f->R, s->axis + 3 * j, axis);
+  if (s->sliding[j]) return dot(axis, normal);
+  less(point, f->p, arm);
+  cross(axis, arm, speed);
+  return dot(speed, normal);
+}
+
 /* Distances of all columns at one state, divided by the scale, and unless null the gradients (columns, n) of those within the
 range. */
 static void measure_columns(const row_context *c, const double *q, double *values, double *gradients) {

@@ -135,16 +135,21 @@ long find_manifold_path(const tree_settings *s, kernel *residuals, const double 
                         double *path, long max_points) {
   long n = s->scene->n, count = 0;
   if (rows > MAX_EQUALITIES) return 0;
-  tree trees[2];
-  search h = begin_search(s, trees);
+  search h = {s, make_memory(s->scene), s->seed * 0x9E3779B97F4A7C15ull + 88172645463325252ull, malloc(n * sizeof(double))};
   double *numbers = malloc(BLOCK * (n + rows + rows * n) * sizeof(double)), *target = malloc(n * sizeof(double));
   manifold m = {residuals, scene, rows, accuracy, numbers, numbers + BLOCK * n, numbers + BLOCK * (n + rows)};
+  tree trees[2];
   int reached;
+  for (int i = 0; i < 10; i++) uniform(&h);
+  for (int i = 0; i < 2; i++) {
+    trees[i] = (tree){0, 256, n, malloc(256 * n * sizeof(double)), malloc(256 * sizeof(long))};
+    add_node(trees + i, i ? s->goal : s->start, -1);
+  }
   long end = follow(&h, &m, trees, 0, s->goal, INFINITY, &reached);
   if (reached) count = join(trees, end, 0, path, max_points);
   for (long trial = 0; trial < s->max_extensions && trees[0].count + trees[1].count < s->max_nodes && !count; trial++) {
     int own = trial % 2;
-    draw_configuration(&h, target);
+    for (long j = 0; j < n; j++) target[j] = s->lower[j] + uniform(&h) * (s->upper[j] - s->lower[j]);
     tree *near = trees + own, *other = trees + !own;
     long node = follow(&h, &m, near, nearest_node(near, target), target, s->extension, &reached);
     if (node < 0) continue;
@@ -155,7 +160,7 @@ long find_manifold_path(const tree_settings *s, kernel *residuals, const double 
   }
   if (count > 2) count = shorten_on_manifold(&h, &m, path, count);
   if (count) memcpy(path + n * (count - 1), s->goal, n * sizeof(double)); /* instead of its projection */
-  end_search(&h, trees);
-  free(target), free(numbers);
+  for (int i = 0; i < 2; i++) free(trees[i].q), free(trees[i].parent);
+  free(target), free(numbers), free(h.q), free_memory(h.m);
   return count;
 }

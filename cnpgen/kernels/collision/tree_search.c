@@ -9,8 +9,8 @@ typedef struct {
   const double *start, *goal, *lower, *upper, *velocity; /* ends, ranges of random configurations, velocity limits */
   double obstacle_distance, self_distance, margin, ramp; /* the margin is complete at a distance `ramp` from the ends */
   double spacing, extension;                             /* of states; largest of a tree */
-  long max_extensions, max_nodes, shortcuts; /* nodes of both trees */
-  double corner_time;                        /* time that a corner costs [s] */
+  long max_extensions, max_nodes, shortcuts;             /* nodes of both trees */
+  double corner_time;                                    /* that a corner costs [s] */
   unsigned long long seed;
 } tree_settings;
 
@@ -158,40 +158,24 @@ static long shorten(search *h, double *path, long count, double *copy, long max_
   return count;
 }
 
-/* Begin a search with a tree at either end. */
-static search begin_search(const tree_settings *s, tree *trees) {
-  long n = s->scene->n;
+/* Search for a path from start to goal; return its number of points, at most max_points, or 0 if there is none. */
+long find_path(const tree_settings *s, double *path, long max_points) {
+  long n = s->scene->n, count = 0;
   search h = {s, make_memory(s->scene), s->seed * 0x9E3779B97F4A7C15ull + 88172645463325252ull, malloc(n * sizeof(double))};
+  double *target = malloc(n * sizeof(double)), *fresh = malloc(n * sizeof(double));
+  tree trees[2];
   for (int i = 0; i < 10; i++) uniform(&h);
   for (int i = 0; i < 2; i++) {
     trees[i] = (tree){0, 256, n, malloc(256 * n * sizeof(double)), malloc(256 * sizeof(long))};
     add_node(trees + i, i ? s->goal : s->start, -1);
   }
-  return h;
-}
-
-static void end_search(search *h, tree *trees) {
-  for (int i = 0; i < 2; i++) free(trees[i].q), free(trees[i].parent);
-  free(h->q), free_memory(h->m);
-}
-
-static void draw_configuration(search *h, double *q) {
-  for (long j = 0; j < h->s->scene->n; j++) q[j] = h->s->lower[j] + uniform(h) * (h->s->upper[j] - h->s->lower[j]);
-}
-
-/* Search for a path from start to goal; return its number of points, at most max_points, or 0 if there is none. */
-long find_path(const tree_settings *s, double *path, long max_points) {
-  long n = s->scene->n, count = 0;
-  tree trees[2];
-  search h = begin_search(s, trees);
-  double *target = malloc(n * sizeof(double)), *fresh = malloc(n * sizeof(double));
   if (line_is_clear(&h, s->start, s->goal, 0)) {
     memcpy(path, s->start, n * sizeof(double)), memcpy(path + n, s->goal, n * sizeof(double));
     count = 2;
   }
   for (long trial = 0; trial < s->max_extensions && trees[0].count + trees[1].count < s->max_nodes && !count; trial++) {
     int own = trees[0].count > trees[1].count, reached;
-    draw_configuration(&h, target);
+    for (long j = 0; j < n; j++) target[j] = s->lower[j] + uniform(&h) * (s->upper[j] - s->lower[j]);
     tree *near = trees + own, *other = trees + !own;
     long node = extend(&h, near, nearest_node(near, target), target, fresh, &reached);
     if (node < 0) continue;
@@ -206,7 +190,7 @@ long find_path(const tree_settings *s, double *path, long max_points) {
     count = shorten(&h, path, count, copy, max_points);
     free(copy);
   }
-  end_search(&h, trees);
-  free(target), free(fresh);
+  for (int i = 0; i < 2; i++) free(trees[i].q), free(trees[i].parent);
+  free(target), free(fresh), free(h.q), free_memory(h.m);
   return count;
 }
