@@ -48,11 +48,12 @@ class KernelLibrary:
     """Loader of kernels for one robot and problem, which builds those that are not cached.
 
     Attributes:
-        structure: Digest of the arguments without the poses and sizes of obstacles, or None; see ``load_by_structure``.
         backend: "compiled", "numpy" (interpreted tape) or "casadi" (CasADi's map; slow, for reference).
         cache_folder: Folder of cached tapes and libraries.
         identity: Digest of all ``arguments``.
         arguments: Objects passed to builders that have a parameter of that name (robot, problem).
+        structure: Digest of the arguments without the poses and sizes of obstacles, or None; see ``load_by_structure``.
+        compiler_pool: Pool that compiles kernels, inside ``compile_in_parallel``.
     """
 
     backend: Backend
@@ -60,18 +61,14 @@ class KernelLibrary:
     identity: str
     arguments: Mapping[str, Any] = field(default_factory=dict)
     structure: str | None = None
-    _compiler_pool: CompilerPool | None = field(default=None, init=False, repr=False)
+    compiler_pool: CompilerPool | None = field(default=None, repr=False)
 
     def load_by_structure(self, builder: Callable[..., Any], **parameters: Any) -> Kernel:
         """Return the kernel of an SX function that reads poses and sizes of obstacles from its arguments only.
 
         Problems that differ only in these numbers share its tape; see ``load``.
         """
-        if self.structure is None:
-            return self.load(builder, **parameters)
-        shared = replace(self, identity=self.structure)
-        shared._compiler_pool = self._compiler_pool
-        return shared.load(builder, **parameters)
+        return replace(self, identity=self.structure or self.identity).load(builder, **parameters)
 
     def load(self, builder: Callable[..., Any], loop: Loop | None = None, **parameters: Any) -> Kernel:
         """Return the kernel of an SX function.
@@ -88,8 +85,8 @@ class KernelLibrary:
         tape = self._tape(builder, parameters, loop=loop)
         if self.backend == "numpy":
             return InterpretedKernel(tape)
-        if self._compiler_pool is not None:
-            return self._compiler_pool.kernel(tape)
+        if self.compiler_pool is not None:
+            return self.compiler_pool.kernel(tape)
         return CompiledKernel(tape, compile_tape(tape, self.cache_folder), self.cache_folder)
 
     @contextmanager
@@ -99,12 +96,12 @@ class KernelLibrary:
         Raises:
             MachineError: A compiler failed.
         """
-        pool = self._compiler_pool = CompilerPool(self.cache_folder)
+        pool = self.compiler_pool = CompilerPool(self.cache_folder)
         try:
             yield
             pool.wait()
         finally:
-            self._compiler_pool = None
+            self.compiler_pool = None
             pool.close()
 
     def load_grid(self, builder: Callable[..., Any], grid: GridSpec, *, dtype: Dtype, **parameters: Any) -> GridKernel:
@@ -125,22 +122,13 @@ class KernelLibrary:
         return CompiledGridKernel(tape, compile_tape(tape, self.cache_folder))
 
     def load_source(self, *paths: Path) -> ctypes.CDLL | None:
-        """Return the library of handwritten C source, or None if the backend is not "compiled".
-
-        Args:
-            paths: Source files that follow ``arrays.h``; see ``compile_source``.
-        """
+        """Return the library of C source that follows ``arrays.h`` (``compile_source``); None if not "compiled"."""
         if self.backend != "compiled":
             return None
         return ctypes.CDLL(str(compile_source([ARRAYS, *paths], self.cache_folder)))
 
     def tape(self, builder: Callable[..., Any], **parameters: Any) -> Tape:
-        """Return the tape of an SX function without compiling it.
-
-        Args:
-            builder: See ``load``.
-            parameters: See ``load``.
-        """
+        """Return the tape of an SX function without compiling it; see ``load``."""
         return self._tape(builder, parameters)
 
     def _build(self, builder: Callable[..., Any], parameters: Mapping[str, Any]) -> Any:

@@ -168,7 +168,9 @@ class PlanRuntime:
             if detail := self._jump(motion, at):
                 return Switch(SwitchOutcome.JUMP, at, detail)
             before = [part for part in self._timeline if part.start < at or part is self._timeline[0]]
-            self._timeline = _without_past((*before, motion), self._now)
+            timeline = (*before, motion)
+            first = max((index for index, part in enumerate(timeline) if part.start <= self._now), default=0)
+            self._timeline = timeline[first:]  # without motions that ended because another one followed
         return Switch(SwitchOutcome.ACCEPTED, at)
 
     @checked_arguments
@@ -320,9 +322,3 @@ def _evaluate(timeline: tuple[SampledMotion, ...], times: Array) -> SetPoint:
         rows = [_part_at(timeline, time).at(np.array([time])) for time in flat.tolist()]
         states = SetPoint(*(np.concatenate(parts) for parts in zip(*rows, strict=True)))
     return states if times.ndim else SetPoint(*(values[0] for values in states))
-
-
-def _without_past(timeline: tuple[SampledMotion, ...], now: float) -> tuple[SampledMotion, ...]:
-    """Omit motions that ended before a time because another one follows."""
-    first = max((index for index, part in enumerate(timeline) if part.start <= now), default=0)
-    return timeline[first:]

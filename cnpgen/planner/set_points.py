@@ -101,12 +101,7 @@ def sample_motion(plan: Plans | JoinedPlans, start: float) -> SampledMotion:
 
 
 def at_rest(q: ArrayLike, start: float) -> SampledMotion:
-    """Return an arm at rest.
-
-    Args:
-        q: Joint positions [rad], shape (n,).
-        start: Time from which on it rests [s].
-    """
+    """Return an arm at rest at joint positions [rad], shape (n,), from a time on [s]."""
     end = np.array(q, np.float64)
     coefficients = np.zeros((1, 6, len(end)))
     coefficients[0, 0] = end

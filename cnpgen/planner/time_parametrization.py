@@ -167,13 +167,7 @@ class TimeParametrization(PhaseGrid):
 def make_time_parametrization(
     problem: Problem, robot: Robot, kernels: KernelLibrary, *, at_rest: bool = False
 ) -> TimeParametrization:
-    """Load the time parametrization of one problem.
-
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        kernels: Library of kernels.
-        at_rest: Whether motions begin and end at rest.
+    """Load the time parametrization of one problem; ``at_rest`` is whether motions begin and end at rest.
 
     Raises:
         UsageError: The problem bounds the jerk, which is no quadratic of the rate.

@@ -102,13 +102,7 @@ class ViaPoints:
 
 
 def make_via_points(problem: Problem, kernels: KernelLibrary, via_points: Array) -> ViaPoints:
-    """Load the check of via points for one problem.
-
-    Args:
-        problem: The problem.
-        kernels: Library of kernels.
-        via_points: Configurations [rad], shape (M, n).
-    """
+    """Load the check of via points [rad], shape (M, n), for one problem."""
     spec = problem.trajectory
     path = basis(chebyshev(STATIC_INTERVALS), spec.path_control_points, spec.degree)
     kernel = kernels.load_grid(static_violation, GridSpec(("point", "lane"), ("point",)), dtype="float32")

@@ -60,12 +60,7 @@ class CloseBodies(NamedTuple):
 
 
 def load_collision_library(kernels: KernelLibrary, sources: Sequence[Path] = SOURCES) -> ctypes.CDLL | None:
-    """Return the library of collision checks, the same for all robots; None where kernels are not compiled.
-
-    Args:
-        kernels: Library of kernels.
-        sources: Source files, convex.c and collision.c first.
-    """
+    """Return the library of collision checks, the same for all robots; None where kernels are not compiled."""
     library = kernels.load_source(*sources)
     if library is not None:
         library.clear_states.restype = library.joint_poses.restype = None
@@ -140,12 +135,7 @@ class CollisionChecker:
         self.place([], np.empty(0))
 
     def place(self, obstacles: Sequence[Obstacle], numbers: Array) -> None:
-        """Set the obstacles.
-
-        Args:
-            obstacles: The obstacles.
-            numbers: Their poses and sizes, shape (width,), see ``cnpgen.robots.solid``.
-        """
+        """Set the obstacles, with their poses and sizes, shape (width,) (``cnpgen.robots.solid``)."""
         bodies, vertices, boxes = obstacle_bodies(obstacles, numbers, len(self.vertices))
         self._set("obstacles", bodies)
         self._set("boxes", boxes)
@@ -194,14 +184,7 @@ class CollisionChecker:
             capacity = count
 
     def joint_poses(self, q: Array) -> Array:
-        """Compute the poses of the joints' frames, that of the base first: rotation by rows and position.
-
-        Args:
-            q: Joint positions [rad], shape (n, K).
-
-        Returns:
-            Shape (K, n + 1, 12).
-        """
+        """Compute the joints' frames at q [rad], shape (n, K), base first: rows and position, shape (K, n + 1, 12)."""
         states = np.ascontiguousarray(q.T)
         poses = np.empty((len(states), self._n + 1, 12))
         self.library.joint_poses(self.address, address_of(states), len(states), address_of(poses))

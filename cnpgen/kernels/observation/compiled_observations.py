@@ -98,10 +98,6 @@ def _view(camera: Camera) -> Array:
 
 
 def observation_backend(backend: str | None = None) -> ObservationBackend:
-    """Return the compiled functions, or their NumPy reference where kernels are not compiled.
-
-    Args:
-        backend: A backend of kernels; by default the fastest that works on this machine.
-    """
+    """Return the functions of a backend of kernels: compiled ones, or their NumPy reference."""
     library = KernelLibrary(*choose_backend(backend), "").load_source(SOURCE)
     return NumpyObservations() if library is None else CompiledObservations(library)

@@ -1,4 +1,8 @@
-"""Exact distances of segments and cuboids from axis-aligned boxes, as SX."""
+"""Exact distances of segments and cuboids from axis-aligned boxes, as SX.
+
+Segments are given by their ends [m], boxes by their bounds along x, y, z [m]. ``freeze`` is a function that makes a
+value constant for differentiation.
+"""
 
 import math
 from collections.abc import Callable
@@ -22,11 +26,6 @@ def segment_box_distance(first: Vec, second: Vec, box: Bounds) -> Scalar:
 
     ``d^2`` of the point ``first + t (second - first)`` is convex in t. Its derivative is piecewise linear with a knot
     where a coordinate meets a face. The knots bracket the minimum; between the two closest the derivative is linear.
-
-    Args:
-        first: First end of the segment [m].
-        second: Second end of the segment [m].
-        box: Bounds along x, y, z [m].
     """
     import casadi as ca
 
@@ -41,11 +40,6 @@ def segment_box_separation(first: Vec, second: Vec, box: Bounds) -> Scalar:
 
     The depth is the length of the smallest translation that separates them. The separating axes are the
     face normals and the common normals of the segment and an edge.
-
-    Args:
-        first: First end of the segment [m].
-        second: Second end of the segment [m].
-        box: Bounds along x, y, z [m].
     """
     import casadi as ca
 
@@ -70,12 +64,6 @@ def signed_segment_box_distance(first: Vec, second: Vec, box: Bounds, *, freeze:
 
     Inside it is minus the depth, below the closest face, of the midpoint of the overlapping part. Outside, the closest
     point of the segment is constant for differentiation (envelope theorem).
-
-    Args:
-        first: First end of the segment [m].
-        second: Second end of the segment [m].
-        box: Bounds along x, y, z [m].
-        freeze: Function that makes a value constant for differentiation.
     """
     import casadi as ca
 

@@ -118,11 +118,6 @@ class SceneFeatures:
 def make_scene_features(robot: Robot, spec: TrajectorySpec, kernels: KernelLibrary) -> SceneFeatures:
     """Load the features of a robot's scenes.
 
-    Args:
-        robot: The robot, with link geometry.
-        spec: Degree and number of control points of paths.
-        kernels: Library of kernels.
-
     Raises:
         UsageError: The robot has no link geometry.
     """
