@@ -15,8 +15,7 @@ import numpy as np
 from cnpgen.errors import MachineError
 from cnpgen.kernels.compiler import compiler_version, flags_of, require_compiler, run_compiler, target
 from cnpgen.kernels.emit import VECTORS, emit, prelude
-from cnpgen.kernels.grid_kernel import GridKernel, check_grid
-from cnpgen.kernels.kernel import Array, Kernel, check_arguments
+from cnpgen.kernels.kernel import Array, GridKernel, Kernel, check_arguments, check_grid
 from cnpgen.kernels.tape import Tape
 from cnpgen.store.files.cache_folder import (
     LIBRARIES,

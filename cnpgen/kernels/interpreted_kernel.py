@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.kernels.grid_kernel import GridKernel, check_grid
-from cnpgen.kernels.kernel import Array, Kernel, evaluate_lanes
+from cnpgen.kernels.kernel import Array, GridKernel, Kernel, check_grid, evaluate_lanes
 from cnpgen.kernels.tape import NAMES, OPERATIONS, Tape
 
 POINTS_PER_BLOCK = 8192  # lanes or points; smaller blocks cost more interpreter time, larger ones exceed the cache

@@ -5,8 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.kernels.grid_kernel import GridKernel, axis_names, check_grid
-from cnpgen.kernels.kernel import Array, Kernel, evaluate_lanes
+from cnpgen.kernels.kernel import Array, GridKernel, Kernel, axis_names, check_grid, evaluate_lanes
 from cnpgen.kernels.tape import Tape
 
 

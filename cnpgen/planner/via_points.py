@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.kernels.grid_kernel import GridKernel
+from cnpgen.kernels.kernel import GridKernel
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.kernels.tape import GridSpec
 from cnpgen.planner.control_points import lines_at_rest
