@@ -210,10 +210,9 @@ class PlanRuntime:
         """Plan and switch; the boundary of the background thread, where errors become results."""
         try:
             return self.switch(make_plan(self.state_at(at)), at)
-        except CnpgenError as error:
-            return Switch(SwitchOutcome.FAILED, at, str(error))
         except Exception as error:  # noqa: BLE001 - errors of the caller's function are results
-            return Switch(SwitchOutcome.FAILED, at, f"{type(error).__name__}: {error}")
+            kind = "" if isinstance(error, CnpgenError) else f"{type(error).__name__}: "
+            return Switch(SwitchOutcome.FAILED, at, f"{kind}{error}")
 
     def _check_plan(self, plan: Plans | JoinedPlans) -> None:
         """Raise an error for several plans and for plans of another robot."""

@@ -77,12 +77,7 @@ class SampledMotion:
 
 
 def sample_motion(plan: Plans | JoinedPlans, start: float) -> SampledMotion:
-    """Sample one plan, or one sequence of plans.
-
-    Args:
-        plan: The plan.
-        start: Time at which it starts [s].
-    """
+    """Sample one plan, or one sequence of plans, that starts at a time [s]."""
     parts = plan.parts if isinstance(plan, JoinedPlans) else (plan,)
     begins = plan.begins[:, 0].tolist() if isinstance(plan, JoinedPlans) else [0.0]
     ends = [*begins[1:], float(plan.duration[0])]

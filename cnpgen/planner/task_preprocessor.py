@@ -117,12 +117,7 @@ class TaskPreprocessor:
         return self._observed(tasks, lines_at_rest(boundary, none if correction is None else correction))
 
     def along(self, tasks: Tasks, path: Array) -> Tasks:
-        """Return tasks whose lines are the paths of other plans for them.
-
-        Args:
-            tasks: N tasks.
-            path: Control points of the plans [rad], shape (N, C, n).
-        """
+        """Return tasks whose lines are the paths of other plans for them: control points [rad], shape (N, C, n)."""
         fixed = tasks.boundary.fixed_at_goal
         first, last, interior = path[:, 2:3], path[:, -fixed, None], path[:, 3:-fixed]
         along = along_line(interior.shape[1], path.dtype.name)
@@ -184,17 +179,7 @@ def make_task_preprocessor(
     placed: tuple[Obstacle, ...],
     observed: bool = False,
 ) -> TaskPreprocessor:
-    """Load the preprocessor of a problem's tasks.
-
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        kernels: Library of kernels.
-        config: Configuration of the model; the line stays straight if there are no equalities.
-        fixed_at_goal: Number of control points that the goal fixes (``Boundary.fixed_at_goal``).
-        placed: Obstacles that samples place.
-        observed: Whether to compute features of them.
-    """
+    """Load the preprocessor of a problem's tasks; ``observed`` is whether it computes features of placed obstacles."""
     steps = effective_steps(kernels, config.line_projection_steps)
     load = partial(kernels.load, steps=steps, fixed_at_goal=fixed_at_goal, within_limits=config.within_limits)
     line = load(line_change, with_offsets=False) if steps else None

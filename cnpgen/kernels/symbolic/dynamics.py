@@ -42,14 +42,7 @@ class BodyMotion:
 
 
 def body_motions(chain: Chain, q: Vec, dq: Vec, ddq: Vec) -> list[BodyMotion]:
-    """Return the motion of every body by the outward recursion of Newton-Euler.
-
-    Args:
-        chain: The chain.
-        q: Joint positions [rad], n scalars.
-        dq: Joint velocities [rad/s].
-        ddq: Joint accelerations [rad/s^2].
-    """
+    """Return the motion of every body by the outward recursion of Newton-Euler; see ``inverse_dynamics``."""
     omega: Vec = [0.0, 0.0, 0.0]
     alpha: Vec = [0.0, 0.0, 0.0]
     acceleration: Vec = constants(-chain.gravity)

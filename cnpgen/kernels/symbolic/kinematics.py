@@ -50,12 +50,7 @@ class Kinematics:
 
 
 def forward_kinematics(chain: Chain, q: Vec) -> Kinematics:
-    """Return positions, axes and the tip Jacobian of a chain.
-
-    Args:
-        chain: The chain.
-        q: Joint positions [rad], n scalars.
-    """
+    """Return positions, axes and the tip Jacobian of a chain at joint positions q [rad], n scalars."""
     rotation: list[Vec] = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     position: Vec = [0.0, 0.0, 0.0]
     axes, origins, frames = [], [], []
