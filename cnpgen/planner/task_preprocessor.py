@@ -102,19 +102,18 @@ class TaskPreprocessor:
         else:
             time = reaching(ends)[0][0]
         correction = None if via_point is None else self._via_offsets(boundary, via_point)
-        joints = boundary.start_q.shape[1]
+        shape = len(boundary), self._interior_points(boundary), boundary.start_q.shape[1]
         kernel, offsets = (self.line, []) if correction is None else (self.via_line, [lanes(correction)])
         if kernel is not None:
             (change,) = kernel(ends, *offsets, 1 / time[None], scene.lanes)
-            correction = rows(change, joints)
+            correction = rows(change, shape[2])
         placed = self._placed_scene(len(boundary), obstacle_poses)
-        none = np.zeros((len(boundary), self._interior_points(boundary), joints))
         if correction is None and self.iterated:
-            correction = none
+            correction = np.zeros(shape)
         tasks = Tasks(boundary, start_xyz, goal_xyz, time, scene, correction, placed)
         if self.scene_features is None:
             return tasks
-        return self._observed(tasks, lines_at_rest(boundary, none if correction is None else correction))
+        return self._observed(tasks, lines_at_rest(boundary, np.zeros(shape) if correction is None else correction))
 
     def along(self, tasks: Tasks, path: Array) -> Tasks:
         """Return tasks whose lines are the paths of other plans for them: control points [rad], shape (N, C, n)."""
