@@ -45,13 +45,7 @@ class _Callee(ctypes.Structure):
 
 
 class CompiledKernel(Kernel):
-    """A tape as machine code.
-
-    Args:
-        tape: The tape.
-        library: The library of the tape.
-        cache_folder: Folder of cached libraries, for the library of call.c.
-    """
+    """A tape as machine code of its library; the cache folder also has the library of call.c."""
 
     def __init__(self, tape: Tape, library: Path, cache_folder: Path) -> None:
         super().__init__(tape)
@@ -210,9 +204,7 @@ def compile_tape(tape: Tape, cache_folder: Path) -> Path:
 def compile_source(paths: Sequence[Path], cache_folder: Path) -> Path:
     """Return the library of handwritten C source that uses the double vectors of kernels.
 
-    Args:
-        paths: Source files, concatenated in this order; the last one names the library.
-        cache_folder: Folder of cached libraries.
+    The files are concatenated in their order; the last one names the library.
 
     Raises:
         MachineError: See ``compile_tape``.

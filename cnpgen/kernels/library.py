@@ -104,14 +104,7 @@ class KernelLibrary:
             pool.close()
 
     def load_grid(self, builder: Callable[..., Any], grid: GridSpec, *, dtype: Dtype, **parameters: Any) -> GridKernel:
-        """Return the kernel that evaluates an SX function on a grid of nodes and lanes.
-
-        Args:
-            builder: See ``load``.
-            grid: Axes of its arguments and results.
-            dtype: Precision of the arithmetic.
-            parameters: Further JSON-able keyword arguments of the builder; part of the cache key.
-        """
+        """Return the kernel that evaluates an SX function on a grid of nodes and lanes, in a type; see ``load``."""
         if self.backend == "casadi":
             function = self._build(builder, parameters)
             return MappedGridKernel(tape_from_function(function, grid=grid, dtype=dtype), function)

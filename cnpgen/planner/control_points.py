@@ -97,12 +97,7 @@ def vjp(
 
 
 def lines_at_rest(boundary: Boundary, correction: Array) -> Array:
-    """Return control points of corrected lines between states at rest, shape (N, C, n).
-
-    Args:
-        boundary: Boundary conditions.
-        correction: Offsets from the straight lines at interior control points [rad], shape (N, m, n).
-    """
+    """Return control points of lines between states at rest, shape (N, C, n), plus corrections [rad], (N, m, n)."""
     start, goal = boundary.start_q[:, None], boundary.goal_q[:, None]
     interior = start + (goal - start) * along_line(correction.shape[1]) + correction
     last = np.repeat(goal, boundary.fixed_at_goal, axis=1)

@@ -52,11 +52,7 @@ class LoadedProblem:
 
 @contextmanager
 def loaded_problem(record: ProblemRecord, backend: str | None = None) -> Iterator[LoadedProblem]:
-    """Load a problem from its record; its URDF file exists until the context is left.
-
-    Args:
-        record: Text of the problem and its URDF.
-        backend: Backend of the kernels; by default the fastest available.
+    """Load a problem from its record, with its URDF file until the context is left, and the fastest backend by default.
 
     Raises:
         CnpgenError: The record does not fit this version of cnpgen, or a dependency is missing.
@@ -219,15 +215,7 @@ def make_inference_pipeline(
     fixed_at_goal: int = 2,
     observed: bool = True,
 ) -> InferencePipeline:
-    """Load the inference pipeline of a problem.
-
-    Args:
-        loaded: The problem.
-        config: Configuration of the model.
-        scale_time: Whether to scale motions in time; only for motions from rest to rest.
-        fixed_at_goal: Number of control points that the goal fixes (``Boundary.fixed_at_goal``).
-        observed: Whether the model has features of obstacles that samples place.
-    """
+    """Load the inference pipeline of a problem; ``scale_time`` is for motions from rest to rest only."""
     problem, robot, kernels = loaded.problem.for_planning, loaded.robot, loaded.kernels
     with kernels.compile_in_parallel():
         placed = loaded.problem.sample_obstacles

@@ -87,14 +87,9 @@ class ViaPoints:
 
     @staticmethod
     def candidates(violation: Array, count: int) -> NDArray[np.intp]:
-        """Return the motions to choose from, given motions along all lines of the first task, then of the next one.
+        """Return rows of motions: for every task those without violation, or else the one with the smallest.
 
-        Args:
-            violation: Largest violations, shape (N count,).
-            count: Number of lines per task.
-
-        Returns:
-            Rows of motions: for every task those without violation, or else the one with the smallest.
+        Violations, shape (N count,), are those along ``count`` lines of the first task, then of the next one.
         """
         of_task = violation.reshape(-1, count)
         least = of_task.min(axis=1, keepdims=True)

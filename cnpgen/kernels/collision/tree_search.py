@@ -115,11 +115,6 @@ def find_tree_path(
 
 
 def estimated_duration(path: Array, velocity_limit: Array) -> float:
-    """Estimate the duration of a motion along a path: velocity limits along its lines, and a time for every corner.
-
-    Args:
-        path: Corners [rad], shape (K, n).
-        velocity_limit: Velocity limits of the joints [rad/s], shape (n,).
-    """
+    """Estimate the duration along a path [rad], shape (K, n): lines at the velocity limits [rad/s], and its corners."""
     lines = (np.abs(np.diff(path, axis=0)) / velocity_limit).max(axis=1)
     return float(lines.sum() + CORNER_TIME_S * max(len(path) - 2, 0))

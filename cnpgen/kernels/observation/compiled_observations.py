@@ -44,11 +44,7 @@ class _SceneArrays(ctypes.Structure):
 
 
 class CompiledObservations:
-    """``ObservationBackend`` in compiled code.
-
-    Args:
-        library: Library of observe.c.
-    """
+    """``ObservationBackend`` in compiled code: the library of observe.c."""
 
     def __init__(self, library: ctypes.CDLL) -> None:
         self._library = library
