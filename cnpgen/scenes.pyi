@@ -6,7 +6,7 @@ from cnpgen.pipelines.families.family import Grasp as Grasp
 from cnpgen.pipelines.families.family import Layout as Layout
 from cnpgen.pipelines.families.family import SceneFamily as SceneFamily
 from cnpgen.pipelines.families.scene_generator import make_scenes as make_scenes
-from cnpgen.planner.scene_requests import plan_scenes as plan_scenes
+from cnpgen.planner.plan_requests import plan_scenes as plan_scenes
 from cnpgen.plans.scene_plans import scene_plans as scene_plans
 from cnpgen.problems.scenes.observe import observe as observe
 from cnpgen.problems.scenes.observe import scene_bodies as scene_bodies

@@ -133,7 +133,7 @@ def _requests(arguments: argparse.Namespace, model: "Model") -> "Requests":
 
 def _scenes(arguments: argparse.Namespace, model: "Model") -> "Requests":
     """Read the problems of scenes."""
-    from cnpgen.planner.scene_requests import scene_requests
+    from cnpgen.planner.plan_requests import scene_requests
     from cnpgen.problems.scenes.scene_files import load_scenes
 
     if arguments.split is not None or arguments.other_rows:

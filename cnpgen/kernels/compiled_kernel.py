@@ -15,8 +15,7 @@ import numpy as np
 from cnpgen.errors import MachineError
 from cnpgen.kernels.compiler import compiler_version, flags_of, require_compiler, run_compiler, target
 from cnpgen.kernels.emit import VECTORS, emit, prelude
-from cnpgen.kernels.grid_kernel import GridKernel, check_grid
-from cnpgen.kernels.kernel import Array, Kernel, check_arguments
+from cnpgen.kernels.kernel import Array, GridKernel, Kernel, check_arguments, check_grid
 from cnpgen.kernels.tape import Tape
 from cnpgen.store.files.cache_folder import (
     LIBRARIES,
@@ -46,13 +45,7 @@ class _Callee(ctypes.Structure):
 
 
 class CompiledKernel(Kernel):
-    """A tape as machine code.
-
-    Args:
-        tape: The tape.
-        library: The library of the tape.
-        cache_folder: Folder of cached libraries, for the library of call.c.
-    """
+    """A tape as machine code of its library; the cache folder also has the library of call.c."""
 
     def __init__(self, tape: Tape, library: Path, cache_folder: Path) -> None:
         super().__init__(tape)
@@ -205,26 +198,26 @@ def compile_tape(tape: Tape, cache_folder: Path) -> Path:
         MachineError: There is no working compiler, or the cache folder is not writable or writable for other users.
     """
     stem = library_file_stem(tape, require_compiler())
-    return _find(stem, cache_folder) or _compile(stem, lambda: emit(tape), optimization_level(tape), cache_folder)
+    return _compile(stem, lambda: emit(tape), optimization_level(tape), cache_folder)
 
 
 def compile_source(paths: Sequence[Path], cache_folder: Path) -> Path:
     """Return the library of handwritten C source that uses the double vectors of kernels.
 
-    Args:
-        paths: Source files, concatenated in this order; the last one names the library.
-        cache_folder: Folder of cached libraries.
+    The files are concatenated in their order; the last one names the library.
 
     Raises:
         MachineError: See ``compile_tape``.
     """
     text, level = "".join([prelude("float64"), *(path.read_text(encoding="utf-8") for path in paths)]), "-O3"
     stem = _stem(paths[-1].stem, text.encode(), level, require_compiler())
-    return _find(stem, cache_folder) or _compile(stem, lambda: text, level, cache_folder)
+    return _compile(stem, lambda: text, level, cache_folder)
 
 
 def _compile(stem: str, source: Callable[[], str], level: str, cache_folder: Path) -> Path:
-    """Compile C source into the cache, unless another process did so while this one waited for the lock."""
+    """Compile C source unless its library is cached, also by another process while this one waited for the lock."""
+    if library := _find(stem, cache_folder):
+        return library
     libraries = cache_folder / LIBRARIES
     try:
         make_private_folder(libraries)
@@ -237,7 +230,10 @@ def _compile(stem: str, source: Callable[[], str], level: str, cache_folder: Pat
 
 def _build(stem: str, source: Callable[[], str], level: str, cache_folder: Path) -> Path:
     libraries = cache_folder / LIBRARIES
-    _announce(cache_folder)
+    if linked := read_only_cache(cache_folder):
+        _LOG.info("compiling kernels for this run only: the cache %s lacks them and is not writable", linked)
+    else:
+        _LOG.info("compiling kernels, once per problem and machine")
     with tempfile.TemporaryDirectory(dir=libraries, prefix=".build-") as folder:
         source_file, built = Path(folder) / f"{stem.rpartition('-')[0]}.c", Path(folder) / "kernel.so"
         source_file.write_text(source(), encoding="utf-8")
@@ -248,10 +244,3 @@ def _build(stem: str, source: Callable[[], str], level: str, cache_folder: Path)
 
 def _unusable(cache_folder: Path, error: OSError) -> MachineError:
     return MachineError(f"cannot use the kernel cache {cache_folder / LIBRARIES}: {error.strerror or error}")
-
-
-def _announce(cache_folder: Path) -> None:
-    if linked := read_only_cache(cache_folder):
-        _LOG.info("compiling kernels for this run only: the cache %s lacks them and is not writable", linked)
-    else:
-        _LOG.info("compiling kernels, once per problem and machine")

@@ -147,9 +147,7 @@ def target() -> str:
 
 def vector_flags() -> tuple[str, ...]:
     """Return the flags for the vector instructions of this machine."""
-    if platform.machine() in ("arm64", "aarch64"):
-        return ("-mcpu=native",)
-    return ("-march=native",)
+    return ("-mcpu=native" if platform.machine() in ("arm64", "aarch64") else "-march=native",)
 
 
 def flags_of(level: str) -> tuple[str, ...]:

@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.kernels.grid_kernel import GridKernel, check_grid
-from cnpgen.kernels.kernel import Array, Kernel, check_arguments
-from cnpgen.kernels.tape import NAMES, OPERATIONS, Loop, Tape
+from cnpgen.kernels.kernel import Array, GridKernel, Kernel, check_grid, evaluate_lanes
+from cnpgen.kernels.tape import NAMES, OPERATIONS, Tape
 
 POINTS_PER_BLOCK = 8192  # lanes or points; smaller blocks cost more interpreter time, larger ones exceed the cache
 
@@ -21,8 +20,7 @@ _APPLY: dict[str, Callable[..., Any]] = {
     "ADD": np.add, "SUB": np.subtract, "MUL": np.multiply, "DIV": np.divide, "NEG": np.negative, "SQ": np.square,
     "TWICE": lambda x, out: np.add(x, x, out=out),
     "INV": np.reciprocal, "SQRT": np.sqrt, "FABS": np.abs, "SIGN": np.sign, "SIN": np.sin,
-    "COS": np.cos,
-    "EXP": np.exp, "FMIN": np.fmin, "FMAX": np.fmax, "LT": np.less, "LE": np.less_equal, "EQ": np.equal,
+    "COS": np.cos, "EXP": np.exp, "FMIN": np.fmin, "FMAX": np.fmax, "LT": np.less, "LE": np.less_equal, "EQ": np.equal,
     "NE": np.not_equal, "NOT": np.logical_not, "AND": np.logical_and, "OR": np.logical_or,
     "IF_ELSE_ZERO": _if_else_zero,
 }  # fmt: skip
@@ -33,17 +31,16 @@ Write = Callable[[int, int, Any], None]  # stores a component of a result
 
 
 class _LaneBlock:
-    """The work rows of a block of lanes, with the functions that read and write its present lanes."""
+    """A program bound to the work rows of a block of lanes, with functions that read and write its present lanes."""
 
-    def __init__(self, rows: list[Array]) -> None:
+    def __init__(self, program: "list[Bind]", rows: list[Array]) -> None:
         self.rows = rows
-        self._read: Read
-        self._write: Write
+        self._steps = [bind(self) for bind in program]
 
-    def run(self, steps: "list[Callable[[], Any]]", read: Read, write: Write) -> None:
-        """Run bound steps."""
+    def run(self, read: Read, write: Write) -> None:
+        """Run the program."""
         self._read, self._write = read, write
-        for step in steps:
+        for step in self._steps:
             step()
 
     def load(self, row: int, argument: int, component: int) -> None:
@@ -67,38 +64,19 @@ class InterpretedKernel(Kernel):
 
     def __call__(self, *arguments: Array) -> list[Array]:
         """Evaluate the batch; see ``Kernel``."""
-        n = check_arguments(self.tape, arguments)
         with np.errstate(all="ignore"):
-            if self.tape.loop is not None:
-                return self._iterate(list(arguments), n, self.tape.loop)
-            return self._evaluate(arguments, n)
+            return evaluate_lanes(self.tape, arguments, self._evaluate)
 
     def _evaluate(self, arguments: Sequence[Array], n: int) -> list[Array]:
         results = [np.empty((width, n)) for width in self.tape.outputs]
         work = np.empty((self._slots, min(n, POINTS_PER_BLOCK)))
-        block, steps = _bind_all(self._program, list(work))
+        block = _LaneBlock(self._program, list(work))
         for start in range(0, n, POINTS_PER_BLOCK):
             lanes = slice(start, min(start + POINTS_PER_BLOCK, n))
             if lanes.stop - start < work.shape[1]:
-                block, steps = _bind_all(self._program, list(work[:, : lanes.stop - start]))
-            block.run(steps, *_lanes(arguments, results, lanes))
+                block = _LaneBlock(self._program, list(work[:, : lanes.stop - start]))
+            block.run(*_lanes(arguments, results, lanes))
         return results
-
-    def _iterate(self, arguments: list[Array], n: int, loop: Loop) -> list[Array]:
-        """Step all lanes until they have converged."""
-        state, parameters = arguments[0].copy(), arguments[1:]
-        error = np.full((1, n), np.nan)
-        active = np.arange(n)
-        for _ in range(loop.limit):
-            if len(active) == 0:
-                break
-            inputs = [state, *parameters]
-            if len(active) < n:
-                inputs = [np.ascontiguousarray(x[:, active]) for x in inputs]
-            next_state, next_error = self._evaluate(inputs, len(active))
-            state[:, active], error[:, active] = next_state, next_error
-            active = active[~(next_error[0] < loop.tolerance)]
-        return [state, error]
 
 
 class InterpretedGridKernel(GridKernel):
@@ -117,10 +95,8 @@ class InterpretedGridKernel(GridKernel):
             for node in range(0, k, count):
                 for lane in range(0, n, POINTS_PER_BLOCK):
                     nodes, lanes = slice(node, min(node + count, k)), slice(lane, min(lane + POINTS_PER_BLOCK, n))
-                    block, steps = _bind_all(
-                        self._program, [row[: nodes.stop - node, : lanes.stop - lane] for row in work]
-                    )
-                    block.run(steps, *self._points(arguments, out, nodes, lanes))
+                    rows = [row[: nodes.stop - node, : lanes.stop - lane] for row in work]
+                    _LaneBlock(self._program, rows).run(*self._points(arguments, out, nodes, lanes))
 
     def _points(
         self, arguments: Sequence[Array], out: Sequence[Array], nodes: slice, lanes: slice
@@ -139,11 +115,6 @@ class InterpretedGridKernel(GridKernel):
                 out[result][component, lanes] += np.broadcast_to(value, shape).sum(axis=0)
 
         return read, write
-
-
-def _bind_all(program: list[Bind], rows: list[Array]) -> tuple[_LaneBlock, list[Callable[[], Any]]]:
-    block = _LaneBlock(rows)
-    return block, [bind(block) for bind in program]
 
 
 def _lanes(arguments: Sequence[Array], results: list[Array], lanes: slice) -> tuple[Read, Write]:
@@ -177,15 +148,13 @@ def _allocate(tape: Tape) -> tuple[int, list[Bind]]:
         dying = {operand for operand in _operands(tape, k, name) if last[operand] == k}
         free.extend(place[operand] for operand in dying if isinstance(place[operand], int))
         if name == "OUTPUT":
-            program.append(_bind_output(operands[0], int(tape.b[k]), int(tape.constant[k])))
+            program.append(_bind_method(_LaneBlock.store, int(tape.b[k]), int(tape.constant[k]), operands[0]))
             continue
-        if free:
-            row = free.pop()
-        else:
-            row, count = count, count + 1
-        place[k] = row
+        place[k] = row = free.pop() if free else count
+        count = max(count, row + 1)
+        load = name == "INPUT"
         program.append(
-            _bind_input(row, int(tape.a[k]), int(tape.b[k])) if name == "INPUT" else _bind(name, operands, row)
+            _bind_method(_LaneBlock.load, row, int(tape.a[k]), int(tape.b[k])) if load else _bind(name, operands, row)
         )
         if last[k] == 0:
             free.append(row)
@@ -196,12 +165,8 @@ def _operands(tape: Tape, k: int, name: str) -> list[int]:
     return [int(tape.a[k]), int(tape.b[k])][: OPERATIONS[name]]
 
 
-def _bind_input(row: int, argument: int, component: int) -> Bind:
-    return lambda block: partial(block.load, row, argument, component)
-
-
-def _bind_output(operand: int | float, result: int, component: int) -> Bind:
-    return lambda block: partial(block.store, result, component, operand)
+def _bind_method(method: Callable[..., None], *arguments: float) -> Bind:
+    return lambda block: partial(method, block, *arguments)
 
 
 def _bind(name: str, operands: list[Any], row: int) -> Bind:

@@ -15,16 +15,10 @@ from typing import Any, Literal, Protocol
 import numpy as np
 
 from cnpgen.errors import MachineError, UsageError
-from cnpgen.kernels.compiled_kernel import (
-    CompiledGridKernel,
-    CompiledKernel,
-    compile_source,
-    compile_tape,
-)
+from cnpgen.kernels.compiled_kernel import CompiledGridKernel, CompiledKernel, compile_source, compile_tape
 from cnpgen.kernels.compiler import require_compiler
-from cnpgen.kernels.grid_kernel import GridKernel
 from cnpgen.kernels.interpreted_kernel import InterpretedGridKernel, InterpretedKernel
-from cnpgen.kernels.kernel import Kernel
+from cnpgen.kernels.kernel import GridKernel, Kernel
 from cnpgen.kernels.mapped_kernel import MappedGridKernel, MappedKernel
 from cnpgen.kernels.parallel_compilation import CompilerPool
 from cnpgen.kernels.tape import CODES, Dtype, GridSpec, Loop, Tape, tape_from_function
@@ -53,11 +47,12 @@ class KernelLibrary:
     """Loader of kernels for one robot and problem, which builds those that are not cached.
 
     Attributes:
-        structure: Digest of the arguments without the poses and sizes of obstacles, or None; see ``load_by_structure``.
         backend: "compiled", "numpy" (interpreted tape) or "casadi" (CasADi's map; slow, for reference).
         cache_folder: Folder of cached tapes and libraries.
         identity: Digest of all ``arguments``.
         arguments: Objects passed to builders that have a parameter of that name (robot, problem).
+        structure: Digest of the arguments without the poses and sizes of obstacles, or None; see ``load_by_structure``.
+        compiler_pool: Pool that compiles kernels, inside ``compile_in_parallel``.
     """
 
     backend: Backend
@@ -65,18 +60,14 @@ class KernelLibrary:
     identity: str
     arguments: Mapping[str, Any] = field(default_factory=dict)
     structure: str | None = None
-    _compiler_pool: CompilerPool | None = field(default=None, init=False, repr=False)
+    compiler_pool: CompilerPool | None = field(default=None, repr=False)
 
     def load_by_structure(self, builder: Callable[..., Any], **parameters: Any) -> Kernel:
         """Return the kernel of an SX function that reads poses and sizes of obstacles from its arguments only.
 
         Problems that differ only in these numbers share its tape; see ``load``.
         """
-        if self.structure is None:
-            return self.load(builder, **parameters)
-        shared = replace(self, identity=self.structure)
-        shared._compiler_pool = self._compiler_pool
-        return shared.load(builder, **parameters)
+        return replace(self, identity=self.structure or self.identity).load(builder, **parameters)
 
     def load(self, builder: Callable[..., Any], loop: Loop | None = None, **parameters: Any) -> Kernel:
         """Return the kernel of an SX function.
@@ -87,15 +78,14 @@ class KernelLibrary:
             loop: The iteration of the function, or None.
             parameters: Further JSON-able keyword arguments of the builder; part of the cache key.
         """
-        objects = self._builder_arguments(builder)
         if self.backend == "casadi":
-            function = builder(**objects, **parameters)
+            function = self._build(builder, parameters)
             return MappedKernel(tape_from_function(function, loop), function)
-        tape = self._tape(builder, objects, parameters, loop=loop)
+        tape = self._tape(builder, parameters, loop=loop)
         if self.backend == "numpy":
             return InterpretedKernel(tape)
-        if self._compiler_pool is not None:
-            return self._compiler_pool.kernel(tape)
+        if self.compiler_pool is not None:
+            return self.compiler_pool.kernel(tape)
         return CompiledKernel(tape, compile_tape(tape, self.cache_folder), self.cache_folder)
 
     @contextmanager
@@ -105,58 +95,42 @@ class KernelLibrary:
         Raises:
             MachineError: A compiler failed.
         """
-        with CompilerPool(self.cache_folder) as pool:
-            self._compiler_pool = pool
-            try:
-                yield
-            finally:
-                self._compiler_pool = None
+        pool = self.compiler_pool = CompilerPool(self.cache_folder)
+        try:
+            yield
+            pool.wait()
+        finally:
+            self.compiler_pool = None
+            pool.close()
 
     def load_grid(self, builder: Callable[..., Any], grid: GridSpec, *, dtype: Dtype, **parameters: Any) -> GridKernel:
-        """Return the kernel that evaluates an SX function on a grid of nodes and lanes.
-
-        Args:
-            builder: See ``load``.
-            grid: Axes of its arguments and results.
-            dtype: Precision of the arithmetic.
-            parameters: Further JSON-able keyword arguments of the builder; part of the cache key.
-        """
-        objects = self._builder_arguments(builder)
+        """Return the kernel that evaluates an SX function on a grid of nodes and lanes, in a type; see ``load``."""
         if self.backend == "casadi":
-            function = builder(**objects, **parameters)
+            function = self._build(builder, parameters)
             return MappedGridKernel(tape_from_function(function, grid=grid, dtype=dtype), function)
-        tape = self._tape(builder, objects, parameters, grid=grid, dtype=dtype)
+        tape = self._tape(builder, parameters, grid=grid, dtype=dtype)
         if self.backend == "numpy":
             return InterpretedGridKernel(tape)
         return CompiledGridKernel(tape, compile_tape(tape, self.cache_folder))
 
     def load_source(self, *paths: Path) -> ctypes.CDLL | None:
-        """Return the library of handwritten C source, or None if the backend is not "compiled".
-
-        Args:
-            paths: Source files that follow ``arrays.h``; see ``compile_source``.
-        """
+        """Return the library of C source that follows ``arrays.h`` (``compile_source``); None if not "compiled"."""
         if self.backend != "compiled":
             return None
         return ctypes.CDLL(str(compile_source([ARRAYS, *paths], self.cache_folder)))
 
     def tape(self, builder: Callable[..., Any], **parameters: Any) -> Tape:
-        """Return the tape of an SX function without compiling it.
+        """Return the tape of an SX function without compiling it; see ``load``."""
+        return self._tape(builder, parameters)
 
-        Args:
-            builder: See ``load``.
-            parameters: See ``load``.
-        """
-        return self._tape(builder, self._builder_arguments(builder), parameters)
-
-    def _builder_arguments(self, builder: Callable[..., Any]) -> dict[str, Any]:
+    def _build(self, builder: Callable[..., Any], parameters: Mapping[str, Any]) -> Any:
+        """Return the SX function."""
         expected = inspect.signature(builder).parameters
-        return {name: value for name, value in self.arguments.items() if name in expected}
+        return builder(**{name: value for name, value in self.arguments.items() if name in expected}, **parameters)
 
     def _tape(
         self,
         builder: Callable[..., Any],
-        objects: Mapping[str, Any],
         parameters: Mapping[str, Any],
         *,
         loop: Loop | None = None,
@@ -176,7 +150,7 @@ class KernelLibrary:
         digest = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
         name = f"{builder.__name__}-{digest[:24]}.npy"
         if (tape := self._cached(name)) is None:
-            tape = tape_from_function(builder(**objects, **parameters), loop, grid=grid, dtype=dtype)
+            tape = tape_from_function(self._build(builder, parameters), loop, grid=grid, dtype=dtype)
             self._store(name, tape)
         return tape
 
@@ -263,10 +237,8 @@ def choose_backend(requested: str | None = None) -> tuple[Backend, Path]:
             f"backend {requested!r} does not exist: expected one of {', '.join(BACKENDS)}", concerns="backend"
         )
     folder = usable_cache_folder(default_cache_folder())
-    if requested == "numpy":
-        return "numpy", folder
-    if requested == "casadi":
-        return "casadi", folder
+    if requested in {"numpy", "casadi"}:
+        return requested, folder
     try:
         _try_compiler(folder)
     except MachineError as error:

@@ -5,8 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from cnpgen.kernels.grid_kernel import GridKernel, axis_names, check_grid
-from cnpgen.kernels.kernel import Array, Kernel, check_arguments
+from cnpgen.kernels.kernel import Array, GridKernel, Kernel, axis_names, check_grid, evaluate_lanes
 from cnpgen.kernels.tape import Tape
 
 
@@ -19,20 +18,8 @@ class MappedKernel(Kernel):
 
     def __call__(self, *arguments: Array) -> list[Array]:
         """Evaluate the batch; see ``Kernel``."""
-        n = check_arguments(self.tape, arguments)
-        if self.tape.loop is None:
-            return self._evaluate(list(arguments), n)
-        state, error, active = arguments[0].copy(), np.full((1, n), np.nan), np.arange(n)
-        for _ in range(self.tape.loop.limit):
-            if len(active) == 0:
-                break
-            next_state, next_error = self._evaluate([x[:, active] for x in (state, *arguments[1:])], len(active))
-            state[:, active], error[:, active] = next_state, next_error
-            active = active[~(next_error[0] < self.tape.loop.tolerance)]
-        return [state, error]
-
-    def _evaluate(self, arguments: list[Array], n: int) -> list[Array]:
-        return _map(self._function, arguments, n, self.tape.outputs)
+        widths = self.tape.outputs
+        return evaluate_lanes(self.tape, arguments, lambda inputs, n: _map(self._function, inputs, n, widths))
 
 
 class MappedGridKernel(GridKernel):
@@ -47,19 +34,14 @@ class MappedGridKernel(GridKernel):
         nodes, lanes = check_grid(self.tape, self.grid, arguments, out)
         points = []
         for argument, axes in zip(arguments, self.grid.arguments, strict=True):
-            shape = (len(argument), nodes, lanes)
-            spread = np.broadcast_to(_with_all_axes(argument, axis_names(axes)), shape)
+            names = axis_names(axes)
+            shape = len(argument), nodes if "nodes" in names else 1, lanes if "lanes" in names else 1
+            spread = np.broadcast_to(argument.reshape(shape), (len(argument), nodes, lanes))
             points.append(spread.reshape(len(argument), nodes * lanes))
         results = _map(self._function, points, nodes * lanes, self.tape.outputs)
         for result, values, axes in zip(out, results, self.grid.results, strict=True):
             grid = values.reshape(len(values), nodes, lanes)
             result[...] = grid if axes == "point" else result + grid.sum(axis=1)
-
-
-def _with_all_axes(array: Array, names: tuple[str, ...]) -> Array:
-    """Insert the axes that an argument lacks, with size 1."""
-    sizes = dict(zip(names, array.shape[1:], strict=True))
-    return array.reshape(len(array), sizes.get("nodes", 1), sizes.get("lanes", 1))
 
 
 def _map(function: Any, arguments: Sequence[Array], n: int, widths: Sequence[int]) -> list[Array]:

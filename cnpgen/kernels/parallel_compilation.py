@@ -3,7 +3,6 @@
 import os
 from functools import cached_property
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING
 
 from cnpgen.kernels.compiled_kernel import CompiledKernel, compile_tape, find_compiled
@@ -12,7 +11,7 @@ from cnpgen.kernels.kernel import Array, Kernel
 from cnpgen.kernels.tape import Tape
 
 if TYPE_CHECKING:
-    from concurrent.futures import Future, ThreadPoolExecutor
+    from concurrent.futures import Future
 
 _KILL_INTERVAL_S = 0.05  # a thread may start its compiler just after the others were killed
 MAX_COMPILERS = 8  # compilers at the same time: each takes some 100 MB
@@ -40,12 +39,13 @@ class PendingKernel(Kernel):
 
 
 class CompilerPool:
-    """Threads that compile tapes, equal ones once; all are compiled at the end of the ``with`` block."""
+    """Threads that compile tapes, equal ones once; their user closes it."""
 
     def __init__(self, cache_folder: Path) -> None:
-        self._folder = cache_folder
-        self._pool: ThreadPoolExecutor | None = None
-        self._jobs: dict[bytes, Future[Path]] = {}
+        from concurrent.futures import ThreadPoolExecutor
+
+        self._folder, self._jobs = cache_folder, dict[bytes, "Future[Path]"]()
+        self._pool = ThreadPoolExecutor(min(os.cpu_count() or 1, MAX_COMPILERS))  # it starts threads on use
 
     def kernel(self, tape: Tape) -> Kernel:
         """Return the kernel of a tape; its compilation may still be pending.
@@ -57,40 +57,23 @@ class CompilerPool:
             return CompiledKernel(tape, library, self._folder)
         key = tape.to_bytes()
         if key not in self._jobs:
-            self._jobs[key] = self._threads().submit(compile_tape, tape, self._folder)
+            self._jobs[key] = self._pool.submit(compile_tape, tape, self._folder)
         return PendingKernel(tape, self._jobs[key], self._folder)
 
-    def _threads(self) -> "ThreadPoolExecutor":
-        from concurrent.futures import ThreadPoolExecutor
-
-        if self._pool is None:  # no thread is started if all kernels are cached
-            self._pool = ThreadPoolExecutor(min(os.cpu_count() or 1, MAX_COMPILERS))
-        return self._pool
-
-    def __enter__(self) -> "CompilerPool":
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Wait for all compilations; after an error or an interruption, end those that are running or waiting.
+    def wait(self) -> None:
+        """Wait for all compilations.
 
         Raises:
             MachineError: A compiler failed.
         """
-        try:
-            if kind is None:
-                for job in self._jobs.values():
-                    job.result()
-        finally:
-            self._end()
+        for job in self._jobs.values():
+            job.result()
 
-    def _end(self) -> None:
-        """End the threads; jobs that are left are those after an error."""
+    def close(self) -> None:
+        """End the threads; after an error or an interruption, end compilations that are running or waiting."""
         from concurrent.futures import wait
 
-        if self._pool is not None:
-            self._pool.shutdown(wait=False, cancel_futures=True)
-            while running := [job for job in self._jobs.values() if not job.done()]:  # canceled jobs are done
-                kill_compilers()
-                wait(running, timeout=_KILL_INTERVAL_S)
+        self._pool.shutdown(wait=False, cancel_futures=True)
+        while running := [job for job in self._jobs.values() if not job.done()]:  # canceled jobs are done
+            kill_compilers()
+            wait(running, timeout=_KILL_INTERVAL_S)

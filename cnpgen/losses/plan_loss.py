@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError, counted, nearest
-from cnpgen.kernels.grid_kernel import GridKernel
+from cnpgen.kernels.kernel import GridKernel
 from cnpgen.kernels.library import Backend, choose_backend, problem_kernels
 from cnpgen.kernels.tape import DTYPES, Dtype
 from cnpgen.losses.hull_loss import HullLoss

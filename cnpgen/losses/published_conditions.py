@@ -72,7 +72,7 @@ def _distance(point: Vec, boxes: list[Any]) -> Any:
     for box in boxes:
         gaps = [ca.fmax(gap, 0) for gap in _gaps(point, box)]
         distances.append(ca.sqrt(sum(gap * gap for gap in gaps) + SMOOTHING_M2))
-    return ca.mmin(ca.vertcat(*distances))
+    return ca.mmin(ca.vertcat(*distances)) if distances else np.inf
 
 
 def _gaps(point: Vec, box: Any) -> list[Any]:

@@ -18,6 +18,7 @@ from cnpgen.kernels.library import Backend, choose_backend, problem_kernels
 from cnpgen.machine.threads import one_thread
 from cnpgen.planner import control_points
 from cnpgen.planner.control_points import ControlPoints
+from cnpgen.planner.model import ModelConfig
 from cnpgen.planner.projection import Projection, make_projection
 from cnpgen.planner.task_preprocessor import TaskPreprocessor, make_task_preprocessor
 from cnpgen.planner.tasks import EXPECTED_TIMES, Tasks
@@ -81,7 +82,7 @@ class BoundaryLayer:
         cache_folder: str | Path | None = None,
     ) -> None:
         self.problem, self.path_scale = as_problem(problem), number("path_scale", path_scale)
-        self._line_projection_steps = integer("line_projection_steps", line_projection_steps, least=0)
+        line_steps = integer("line_projection_steps", line_projection_steps, least=0)
         self.projection_steps = integer("projection_steps", projection_steps, least=0)
         if expected_time not in EXPECTED_TIMES:
             raise UsageError(
@@ -91,7 +92,13 @@ class BoundaryLayer:
             raise UsageError(
                 f"must be one of {', '.join(FIXED_AT_GOAL)}, got {goal_acceleration!r}", argument="goal_acceleration"
             )
-        self._expected_time, self.goal_acceleration = expected_time, goal_acceleration
+        self._config = ModelConfig(
+            path_scale=self.path_scale,
+            line_projection_steps=line_steps,
+            projection_steps=self.projection_steps,
+            expected_time=expected_time,
+        )
+        self.goal_acceleration = goal_acceleration
         self._fixed_at_goal = FIXED_AT_GOAL[goal_acceleration]
         spec = self.problem.trajectory
         self.path_outputs = (spec.path_control_points - 3 - self._fixed_at_goal) * len(self.problem.robot.joints)
@@ -107,19 +114,10 @@ class BoundaryLayer:
     @cached_property
     def _preprocessor_and_projection(self) -> tuple[TaskPreprocessor, Projection | None]:
         robot, problem, kernels = self._kernels.arguments["robot"], self.problem.for_planning, self._kernels
+        fixed, placed = self._fixed_at_goal, self.problem.sample_obstacles
         with kernels.compile_in_parallel():
-            prepare = make_task_preprocessor(
-                problem,
-                robot,
-                kernels,
-                line_projection_steps=self._line_projection_steps,
-                expected_time=self._expected_time,
-                fixed_at_goal=self._fixed_at_goal,
-                placed=self.problem.sample_obstacles,
-            )
-            return prepare, make_projection(
-                problem, kernels, steps=self.projection_steps, fixed_at_goal=self._fixed_at_goal
-            )
+            prepare = make_task_preprocessor(problem, robot, kernels, self._config, fixed_at_goal=fixed, placed=placed)
+            return prepare, make_projection(problem, kernels, steps=self.projection_steps, fixed_at_goal=fixed)
 
     @checked_arguments
     @one_thread()

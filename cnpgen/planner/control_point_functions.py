@@ -64,24 +64,15 @@ def projected_path(robot: Robot, problem: Problem, *, steps: int, fixed_at_goal:
     import casadi as ca
 
     spec, n = problem.trajectory, robot.n
-    (ends_sx, ends), (poses_sx, obstacle_poses) = (
-        symbols("ends", (3 + fixed_at_goal) * n),
-        symbols("obstacle_poses", problem.scene_width),
-    )
+    ends_sx, ends = symbols("ends", (3 + fixed_at_goal) * n)
+    poses_sx, obstacle_poses = symbols("obstacle_poses", problem.scene_width)
     rates_sx, rates = symbols("rates", spec.rate_control_points)
     offsets_sx, offsets = symbols("offsets", (spec.path_control_points - 3 - fixed_at_goal) * n)
     points, interior = _points(_split(ends, n), rates, spec), slice(3, -fixed_at_goal)
     points[interior] = _sums(points[interior], _split(offsets, n))
     if steps:
-        change = projection_change(
-            robot,
-            problem,
-            points,
-            obstacle_poses,
-            steps=steps,
-            fixed_at_goal=fixed_at_goal,
-            within_limits=within_limits,
-        )
+        options: dict[str, Any] = {"steps": steps, "fixed_at_goal": fixed_at_goal, "within_limits": within_limits}
+        change = projection_change(robot, problem, points, obstacle_poses, **options)
         points[interior] = _sums(points[interior], change)
     elif within_limits:
         change = [clipped_to_limits(robot, point, [0.0] * n) for point in points[interior]]
@@ -89,41 +80,28 @@ def projected_path(robot: Robot, problem: Problem, *, steps: int, fixed_at_goal:
     return ca.Function("projected_path", [ends_sx, offsets_sx, rates_sx, poses_sx], [ca.cse(_column(points))])
 
 
-def path_change(robot: Robot, problem: Problem, *, steps: int, fixed_at_goal: int, within_limits: bool) -> Any:
-    """Build ``(path, obstacle_poses) -> change`` of the interior control points."""
+def path_change(robot: Robot, problem: Problem, **options: Any) -> Any:
+    """Build ``(path, obstacle_poses) -> change``: the ``projection_change`` of a path as one column."""
     import casadi as ca
 
-    path, obstacle_poses, change = _path_change(robot, problem, steps, fixed_at_goal, within_limits)
+    path, obstacle_poses, change = _path_change(robot, problem, options)
     return ca.Function("path_change", [path, obstacle_poses], [ca.cse(change)])
 
 
-def path_change_adjoint(robot: Robot, problem: Problem, *, steps: int, fixed_at_goal: int, within_limits: bool) -> Any:
+def path_change_adjoint(robot: Robot, problem: Problem, **options: Any) -> Any:
     """Build ``(path, obstacle_poses, seed) -> gradient`` of ``seed . change`` by the path, in reverse mode."""
     import casadi as ca
 
-    path, obstacle_poses, change = _path_change(robot, problem, steps, fixed_at_goal, within_limits)
+    path, obstacle_poses, change = _path_change(robot, problem, options)
     seed = ca.SX.sym("seed", change.numel())
     gradient = ca.densify(ca.jtimes(change, path, seed, True))
     return ca.Function("path_change_adjoint", [path, obstacle_poses, seed], [ca.cse(gradient)])
 
 
-def _path_change(
-    robot: Robot, problem: Problem, steps: int, fixed_at_goal: int, within_limits: bool
-) -> tuple[Any, Any, Any]:
-    points = problem.trajectory.path_control_points
-    (path_sx, path), (poses_sx, obstacle_poses) = (
-        symbols("path", points * robot.n),
-        symbols("obstacle_poses", problem.scene_width),
-    )
-    change = projection_change(
-        robot,
-        problem,
-        _split(path, robot.n),
-        obstacle_poses,
-        steps=steps,
-        fixed_at_goal=fixed_at_goal,
-        within_limits=within_limits,
-    )
+def _path_change(robot: Robot, problem: Problem, options: dict[str, Any]) -> tuple[Any, Any, Any]:
+    path_sx, path = symbols("path", problem.trajectory.path_control_points * robot.n)
+    poses_sx, obstacle_poses = symbols("obstacle_poses", problem.scene_width)
+    change = projection_change(robot, problem, _split(path, robot.n), obstacle_poses, **options)
     return path_sx, poses_sx, _column(change)
 
 

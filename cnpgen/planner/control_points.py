@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.planner.tasks import Tasks
-from cnpgen.trajectory.boundary import boundary_derivatives, goal_points, start_points
+from cnpgen.trajectory.boundary import Boundary, boundary_derivatives, goal_points, start_points
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
 Array = NDArray[Any]
@@ -93,6 +93,14 @@ def vjp(
         rates[:, partial.variable] += np.einsum("ij,ij->i", total[:, partial.point], partial.derivative)
     rates *= points.rate
     return scale * interior.reshape(len(interior), math.prod(interior.shape[1:])), rates
+
+
+def lines_at_rest(boundary: Boundary, correction: Array) -> Array:
+    """Return control points of lines between states at rest, shape (N, C, n), plus corrections [rad], (N, m, n)."""
+    start, goal = boundary.start_q[:, None], boundary.goal_q[:, None]
+    interior = start + (goal - start) * along_line(correction.shape[1]) + correction
+    last = np.repeat(goal, boundary.fixed_at_goal, axis=1)
+    return np.concatenate([np.repeat(start, 3, axis=1), interior, last], axis=1)
 
 
 @lru_cache(maxsize=16)

@@ -31,7 +31,7 @@ def projection_change(
     *,
     steps: int,
     fixed_at_goal: int,
-    within_limits: bool = False,
+    within_limits: bool,
 ) -> list[Vec]:
     """Return the change of a path's interior control points that projects it onto the equalities.
 
@@ -66,15 +66,7 @@ def clipped_to_limits(robot: Robot, point: Vec, step: Vec) -> Vec:
 
 
 def _gauss_newton(equality: Any, q: list[Vec], obstacle_poses: Vec, inner: Array, response: Array) -> list[Vec]:
-    """Return the change of the interior control points that cancels the residuals at the phases to first order.
-
-    Args:
-        equality: Function of ``equality_residuals``.
-        q: Positions at the K phases.
-        obstacle_poses: Poses and sizes of the obstacles (``Scene.poses``).
-        inner: Basis of the interior control points at the phases, shape (K, interior points).
-        response: Response of the interior control points to a force at the phases, shape (interior points, K).
-    """
+    """Return the change of the interior control points that cancels the residuals at the phases to first order."""
     import casadi as ca
 
     residuals, rows, phases = [], [], []

@@ -66,18 +66,7 @@ def hit_tasks(
     angle: Array | None = None,
     parameters: ArrayLike | None = None,
 ) -> TaskBatch:
-    """Complete the tasks of N hits; see ``plan_hits``.
-
-    Args:
-        completion: The stages.
-        state: State of the arm.
-        puck: Position of the puck at the contact.
-        target: Target of the puck.
-        contact_distance: Distance of the centres at the goal [m].
-        share: Speed as a fraction of the highest possible one.
-        angle: Direction of the hit, shape (N,) [rad]; by default towards the target.
-        parameters: Parameters of the problem, shape (width,) or (N, width); nominal by default.
-    """
+    """Complete the tasks of N hits; see ``plan_hits``. Their angles [rad], shape (N,), are by default to the target."""
     n = completion.context.robot.n
     if len(state) != 3 or np.ndim(state[0]) == 0:
         raise UsageError(

@@ -52,11 +52,7 @@ class LoadedProblem:
 
 @contextmanager
 def loaded_problem(record: ProblemRecord, backend: str | None = None) -> Iterator[LoadedProblem]:
-    """Load a problem from its record; its URDF file exists until the context is left.
-
-    Args:
-        record: Text of the problem and its URDF.
-        backend: Backend of the kernels; by default the fastest available.
+    """Load a problem from its record, with its URDF file until the context is left, and the fastest backend by default.
 
     Raises:
         CnpgenError: The record does not fit this version of cnpgen, or a dependency is missing.
@@ -157,10 +153,7 @@ class InferencePipeline:
     def _with_via_points(
         self, via_points: ViaPoints, model: Model, tasks: Tasks, motion: Motion
     ) -> tuple[Tasks, Motion]:
-        """Fit the rates of motions; replace those that violate static conditions or are slow by better ones.
-
-        Better are motions through via points with a smaller violation, and faster motions nearer to the straight line.
-        """
+        """Fit the rates of motions; replace violating and slow ones by better ones through via points or straighter."""
         path, rate, violation = motion.path.copy(), motion.rate.copy(), via_points.violation(motion, tasks.scene.poses)
         fitted, kept = np.empty_like(rate), np.ones(len(path), bool)
         correction = np.zeros_like(path[:, self._interior(tasks.boundary)])
@@ -191,15 +184,7 @@ class InferencePipeline:
         return replace(tasks, correction=correction), Motion(path, fitted, motion.degree)
 
     def _shorten(self, via_points: ViaPoints, tasks: Tasks, motion: Motion, fitted: Array, violation: Array) -> None:
-        """Move slow motions without violation nearer to the straight line in place, if they become faster.
-
-        Args:
-            via_points: The check of static conditions.
-            tasks: N tasks.
-            motion: N motions; their rates are the network's, shape (N, R).
-            fitted: Their fitted rates, shape (N, R).
-            violation: Their largest violations of static conditions, in tolerances, shape (N,).
-        """
+        """Move slow motions without violation nearer to the straight line in place, if they become faster."""
         bound = replace(motion, rate=fitted).duration_bound()
         slow = np.flatnonzero((violation <= 1) & (bound > SLOW_DURATION * tasks.expected_time))
         if not len(slow):
@@ -230,29 +215,12 @@ def make_inference_pipeline(
     fixed_at_goal: int = 2,
     observed: bool = True,
 ) -> InferencePipeline:
-    """Load the inference pipeline of a problem.
-
-    Args:
-        loaded: The problem.
-        config: Configuration of the model.
-        scale_time: Whether to scale motions in time; only for motions from rest to rest.
-        fixed_at_goal: Number of control points that the goal fixes (``Boundary.fixed_at_goal``).
-        observed: Whether the model has features of obstacles that samples place.
-    """
+    """Load the inference pipeline of a problem; ``scale_time`` is for motions from rest to rest only."""
     problem, robot, kernels = loaded.problem.for_planning, loaded.robot, loaded.kernels
     with kernels.compile_in_parallel():
+        placed = loaded.problem.sample_obstacles
         prepare = make_task_preprocessor(
-            problem,
-            robot,
-            kernels,
-            line_projection_steps=config.line_projection_steps,
-            expected_time=config.expected_time,
-            fixed_at_goal=fixed_at_goal,
-            within_limits=config.within_limits,
-            via_lines=bool(config.via_points),
-            placed=loaded.problem.sample_obstacles,
-            observed=observed,
-            iterated=config.iterations > 1,
+            problem, robot, kernels, config, fixed_at_goal=fixed_at_goal, placed=placed, observed=observed
         )
         path = kernels.load(
             projected_path,

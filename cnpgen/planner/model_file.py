@@ -4,7 +4,7 @@ import json
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -30,23 +30,14 @@ from cnpgen.store.paths import ANY_HDF5, require_file
 
 MODEL_KIND, MODEL_VERSION = "cnpgen-model", 2
 MAX_PROJECTION_STEPS = 20  # Gauss-Newton steps; each makes a kernel larger
-_DEFAULTS = {
-    "expected_time": "distance",
-    "within_limits": False,
-    "time_parametrized": False,
-    "via_points": (),
-    "iterations": 1,
-}  # values that files omit
+_DEFAULTS = {field.name: field.default for field in fields(ModelConfig)}  # values that files omit
 _STRUCTURE = {
-    "architecture": dict.fromkeys(("inputs", "hidden", "layers", "path_outputs", "rate_outputs"), WHOLE),
+    "architecture": {field.name: WHOLE for field in fields(Architecture)},
     "features": [TEXT],
     "config": {"path_scale": NUMBER, "line_projection_steps": WHOLE, "projection_steps": WHOLE},
     "zero_conditions": [TEXT],
 }
-_TRAINING_STRUCTURE = {
-    "dataset": {ANY_KEY: ANYTHING},
-    "stages": [{ANY_KEY: ANYTHING}],
-}  # of the keys that are read; both are optional
+_TRAINING_STRUCTURE = {"dataset": {ANY_KEY: ANYTHING}, "stages": [{ANY_KEY: ANYTHING}]}  # of the optional keys read
 
 
 @checked_arguments
@@ -179,9 +170,8 @@ def _assembled(content: Content) -> Model:
     architecture = Architecture(**description["architecture"])
     features = Features(tuple(description["features"]), content.arrays["feature_mean"], content.arrays["feature_scale"])
     stored = description["config"]
-    config = ModelConfig(
-        **{**stored, "via_points": tuple(tuple(map(float, each)) for each in stored.get("via_points", ()))}
-    )
+    via_points = tuple(tuple(map(float, each)) for each in stored.get("via_points", ()))
+    config = ModelConfig(**{**stored, "via_points": via_points})
     _check_sizes(problem, architecture, features)
     joints = len(problem.joint_names)
     if not all(len(each) == joints and np.isfinite(each).all() for each in config.via_points):
@@ -190,9 +180,8 @@ def _assembled(content: Content) -> Model:
         raise ValueError(f"unknown boundary conditions {', '.join(sorted(unknown))}")
     if positions := {"start_q", "goal_q"} & set(description["zero_conditions"]):
         raise ValueError(f"{', '.join(sorted(positions))}: only velocities and accelerations are zero in every row")
-    if max(config.line_projection_steps, config.projection_steps) > MAX_PROJECTION_STEPS or not math.isfinite(
-        float(config.path_scale)
-    ):
+    steps = max(config.line_projection_steps, config.projection_steps)
+    if steps > MAX_PROJECTION_STEPS or not math.isfinite(float(config.path_scale)):
         raise ValueError(
             f"{config} is invalid: there are at most {MAX_PROJECTION_STEPS} steps, and path_scale is finite"
         )
@@ -219,8 +208,7 @@ def _assembled(content: Content) -> Model:
 
 def _check_sizes(problem: ProblemRecord, architecture: Architecture, features: Features) -> None:
     """Check that the network's inputs and outputs fit its features and its problem."""
-    unknown = set(features.blocks) - set(BLOCKS)
-    if unknown:
+    if unknown := set(features.blocks) - set(BLOCKS):
         raise ValueError(f"unknown features {', '.join(sorted(unknown))}")
     joints, spec = len(problem.joint_names), problem.trajectory
     inputs = count_features(features.blocks, joints, len(problem.parameters), line=architecture.path_outputs)

@@ -73,8 +73,8 @@ def plan_moving_hits(  # noqa: PLR0917 - in the order of plan_hits
         UsageError: As ``plan_hits``.
     """
     hits = _Hits(completion.context.robot.n, state, puck, velocity, target, share, meeting.time)
-    time, speed = hits.meeting_time.copy(), np.full(len(hits), EXPECTED_HIT_SPEED_M_S)
-    reasons, active = [""] * len(hits), np.arange(len(hits))
+    time, speed = hits.meeting_time.copy(), np.full(len(hits.puck), EXPECTED_HIT_SPEED_M_S)
+    reasons, active = [""] * len(hits.puck), np.arange(len(hits.puck))
     for iteration in range(MAX_MEETING_ITERATIONS):
         position, puck_velocity = meeting.model.predict(hits.puck[active], hits.velocity[active], time[active])
         angle = meeting.model.hit_angle(puck_velocity, speed[active], hits.target[active] - position)
@@ -121,15 +121,7 @@ def plan_moving_hits(  # noqa: PLR0917 - in the order of plan_hits
 def _touched_early(
     completion: Completion, meeting: Meeting, hits: _Hits, plans: Plans, delay: Array
 ) -> NDArray[np.bool_]:
-    """Return whether moving pucks touch the mallet before the meeting, while it waits or moves.
-
-    Args:
-        completion: The stages, for tip positions.
-        meeting: Rules of the meeting.
-        hits: All hits.
-        plans: M plans; ``plans.sample_id`` is the index of each hit.
-        delay: Waiting times before the plans [s], shape (M,); negative ones belong to hits that are too late.
-    """
+    """Return whether moving pucks touch the mallet before the meeting, while it waits (if not negative) or moves."""
     if not len(plans):
         return np.zeros(0, bool)
     phases, rows, speed = np.linspace(0, 1, EARLY_CONTACT_PHASES), plans.sample_id, plans.columns["hit_speed"]
@@ -179,20 +171,17 @@ class _Hits:
         parts |= {f"state {index}": lanes("state", values, {n}).T for index, values in enumerate(state)}
         check_range("meeting_time", parts["meeting_time"], 0.0, MAX_MEETING_TIME_S, "s")
         check_range("puck_velocity", parts["puck_velocity"], -MAX_PUCK_SPEED_M_S, MAX_PUCK_SPEED_M_S, "m/s")
-        self._size = max(len(values) for values in parts.values())
+        size = max(len(values) for values in parts.values())
         for name, values in parts.items():
-            if len(values) not in {1, self._size}:
+            if len(values) not in {1, size}:
                 argument = name.partition(" ")[0]
-                raise UsageError(f"has {len(values)} hits, another argument has {self._size}", argument=argument)
-            parts[name] = np.repeat(values, self._size // len(values), axis=0)
+                raise UsageError(f"has {len(values)} hits, another argument has {size}", argument=argument)
+            parts[name] = np.repeat(values, size // len(values), axis=0)
         self.puck, self.velocity, self.target = (parts[name] for name in given)
         self.share, self.meeting_time = parts["speed_share"][:, 0], parts["meeting_time"][:, 0]
         self.state = tuple(parts[f"state {index}"] for index in range(3))
         if meeting_time is not None and (self.state[1].any() or self.state[2].any()):
             raise UsageError("is not at rest: an arm that waits for the puck must be", argument="state")
-
-    def __len__(self) -> int:
-        return self._size
 
     def with_pucks(self, plans: Plans, model: PuckModel, delay: Array) -> Plans:
         """Add the pucks at the starts of the plans: columns ``puck_xy`` [m] and ``puck_velocity`` [m/s]."""

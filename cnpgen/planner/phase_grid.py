@@ -49,13 +49,7 @@ class PhaseGrid:
 
 
 def make_phase_grid(problem: Problem, kernels: KernelLibrary, intervals: int) -> PhaseGrid:
-    """Make the grid of one problem.
-
-    Args:
-        problem: The problem.
-        kernels: Library of kernels.
-        intervals: Number of intervals between phases, K - 1.
-    """
+    """Make the grid of one problem, with K - 1 intervals between its phases."""
     spec, s, orders = problem.trajectory, chebyshev(intervals), problem.path_orders
     path = np.stack([basis(s, spec.path_control_points, spec.degree, order) for order in range(orders)])
     rate = np.stack([basis(s, spec.rate_control_points, spec.degree, order) for order in range(orders - 1)])

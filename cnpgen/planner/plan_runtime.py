@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import CnpgenError, UsageError
-from cnpgen.planner.braking import plan_stop
 from cnpgen.planner.planner import Planner
 from cnpgen.planner.set_points import SampledMotion, SetPoint, at_rest, sample_motion
 from cnpgen.plans.evaluate import evaluate_plans
@@ -29,6 +28,7 @@ PlanFunction = Callable[[SetPoint], Plans | JoinedPlans | None]
 
 MAX_SWITCH_GAPS = (1e-6, 1e-5, 1e-3)  # of q [rad]; of dq and ddq as fractions of the limits
 MAX_END_SPEED = 1e-6  # fraction of the velocity limits: a plan ends at rest
+BRAKING_LOOKAHEADS_S = np.array([0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5])
 
 
 class SwitchOutcome(Enum):
@@ -168,7 +168,9 @@ class PlanRuntime:
             if detail := self._jump(motion, at):
                 return Switch(SwitchOutcome.JUMP, at, detail)
             before = [part for part in self._timeline if part.start < at or part is self._timeline[0]]
-            self._timeline = _without_past((*before, motion), self._now)
+            timeline = (*before, motion)
+            first = max((index for index, part in enumerate(timeline) if part.start <= self._now), default=0)
+            self._timeline = timeline[first:]  # without motions that ended because another one followed
         return Switch(SwitchOutcome.ACCEPTED, at)
 
     @checked_arguments
@@ -208,10 +210,9 @@ class PlanRuntime:
         """Plan and switch; the boundary of the background thread, where errors become results."""
         try:
             return self.switch(make_plan(self.state_at(at)), at)
-        except CnpgenError as error:
-            return Switch(SwitchOutcome.FAILED, at, str(error))
         except Exception as error:  # noqa: BLE001 - errors of the caller's function are results
-            return Switch(SwitchOutcome.FAILED, at, f"{type(error).__name__}: {error}")
+            kind = "" if isinstance(error, CnpgenError) else f"{type(error).__name__}: "
+            return Switch(SwitchOutcome.FAILED, at, f"{kind}{error}")
 
     def _check_plan(self, plan: Plans | JoinedPlans) -> None:
         """Raise an error for several plans and for plans of another robot."""
@@ -254,6 +255,36 @@ class PlanRuntime:
         return ""
 
 
+def plan_stop(
+    planner: Planner, motion: SampledMotion, time: float, *, parameters: ArrayLike | None = None
+) -> Plans | None:
+    """Plan the fastest valid stop from a state on a motion.
+
+    The goals are configurations that the motion passes later, which are on the constraint manifold. The plans are
+    judged in the order of their durations.
+
+    Args:
+        planner: A planner whose model plans from moving states to rest, such as airhockey-online.
+        motion: The motion in execution.
+        time: Time at which the stop begins [s].
+        parameters: Parameters of the problem, if it has any, shape (width,).
+
+    Returns:
+        The stop, or None if no candidate is valid.
+
+    Raises:
+        UsageError: The model does not plan from moving states.
+    """
+    q, dq, ddq = (values[0] for values in motion.at(np.array([time])))
+    goals = motion.at(time + BRAKING_LOOKAHEADS_S).q
+    candidates = planner.plan(q, goals, start_dq=dq, start_ddq=ddq, parameters=parameters)
+    for index in np.argsort(candidates.duration).tolist():
+        plan = candidates[index]
+        if np.isfinite(plan.duration[0]) and evaluate_plans(plan).valid[0]:
+            return plan
+    return None
+
+
 def _checked_parameters(planner: Planner, parameters: ArrayLike | None) -> Array | None:
     """Return the parameters of all plans, shape (width,); None if the problem has none."""
     ranges = planner.model.problem.parameters
@@ -290,9 +321,3 @@ def _evaluate(timeline: tuple[SampledMotion, ...], times: Array) -> SetPoint:
         rows = [_part_at(timeline, time).at(np.array([time])) for time in flat.tolist()]
         states = SetPoint(*(np.concatenate(parts) for parts in zip(*rows, strict=True)))
     return states if times.ndim else SetPoint(*(values[0] for values in states))
-
-
-def _without_past(timeline: tuple[SampledMotion, ...], now: float) -> tuple[SampledMotion, ...]:
-    """Omit motions that ended before a time because another one follows."""
-    first = max((index for index, part in enumerate(timeline) if part.start <= now), default=0)
-    return timeline[first:]

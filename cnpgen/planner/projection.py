@@ -66,15 +66,7 @@ class Projection:
 def make_projection(
     problem: Problem, kernels: KernelLibrary, *, steps: int, fixed_at_goal: int = 2, within_limits: bool = False
 ) -> Projection | None:
-    """Load the projection of a problem; None if there are no steps or no equalities.
-
-    Args:
-        problem: The problem.
-        kernels: Library of kernels.
-        steps: Number of Gauss-Newton steps.
-        fixed_at_goal: Number of control points that the goal fixes (``Boundary.fixed_at_goal``).
-        within_limits: Whether control points are clipped to the joint limits (``ModelConfig``).
-    """
+    """Load the projection of a problem by Gauss-Newton steps; None if there are no steps or no equalities."""
     if not effective_steps(kernels, steps):
         return None
     interior = slice(3, problem.trajectory.path_control_points - fixed_at_goal)

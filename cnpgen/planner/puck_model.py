@@ -64,7 +64,8 @@ class PuckModel:
         Returns:
             Positions and velocities at these times, shape (N, 2) each.
         """
-        left = self._distance_share(time)  # of the path that the velocity still covers
+        # The path over the velocity that a puck still covers [s].
+        left = np.array(time, np.float64) if self.drag == 0 else -np.expm1(-self.drag * time) / self.drag
         position, velocity = position.copy(), velocity.copy()
         low, high = np.array([self.home_edge, -self.half_width]), np.array([np.inf, self.half_width])
         for _ in range(MAX_BOUNCES):
@@ -121,10 +122,3 @@ class PuckModel:
             error = np.arctan2(after[:, 1], after[:, 0]) - wanted
             angle -= (error + np.pi) % (2 * np.pi) - np.pi
         return angle
-
-    def _distance_share(self, time: Array) -> Array:
-        """Return the path that a puck covers in a time over its velocity [s]."""
-        if self.drag == 0:
-            return np.array(time, np.float64)
-        share: Array = -np.expm1(-self.drag * time) / self.drag
-        return share

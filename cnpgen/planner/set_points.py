@@ -77,12 +77,7 @@ class SampledMotion:
 
 
 def sample_motion(plan: Plans | JoinedPlans, start: float) -> SampledMotion:
-    """Sample one plan, or one sequence of plans.
-
-    Args:
-        plan: The plan.
-        start: Time at which it starts [s].
-    """
+    """Sample one plan, or one sequence of plans, that starts at a time [s]."""
     parts = plan.parts if isinstance(plan, JoinedPlans) else (plan,)
     begins = plan.begins[:, 0].tolist() if isinstance(plan, JoinedPlans) else [0.0]
     ends = [*begins[1:], float(plan.duration[0])]
@@ -101,12 +96,7 @@ def sample_motion(plan: Plans | JoinedPlans, start: float) -> SampledMotion:
 
 
 def at_rest(q: ArrayLike, start: float) -> SampledMotion:
-    """Return an arm at rest.
-
-    Args:
-        q: Joint positions [rad], shape (n,).
-        start: Time from which on it rests [s].
-    """
+    """Return an arm at rest at joint positions [rad], shape (n,), from a time on [s]."""
     end = np.array(q, np.float64)
     coefficients = np.zeros((1, 6, len(end)))
     coefficients[0, 0] = end

@@ -12,8 +12,9 @@ from cnpgen.errors import UsageError
 from cnpgen.kernels.kernel import Kernel
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.planner.control_point_functions import line_change, tips_at_ends
-from cnpgen.planner.control_points import along_line
+from cnpgen.planner.control_points import along_line, lines_at_rest
 from cnpgen.planner.expressions import effective_steps
+from cnpgen.planner.model import ModelConfig
 from cnpgen.planner.network.scene_features import SceneFeatures, make_scene_features
 from cnpgen.planner.tasks import MIN_EXPECTED_TIME_S, MIN_TRAVEL_TIME_S, Tasks, expected_time, reaching_time
 from cnpgen.problems.obstacles import scene_of
@@ -101,38 +102,28 @@ class TaskPreprocessor:
         else:
             time = reaching(ends)[0][0]
         correction = None if via_point is None else self._via_offsets(boundary, via_point)
+        shape = len(boundary), self._interior_points(boundary), boundary.start_q.shape[1]
         kernel, offsets = (self.line, []) if correction is None else (self.via_line, [lanes(correction)])
         if kernel is not None:
             (change,) = kernel(ends, *offsets, 1 / time[None], scene.lanes)
-            correction = rows(change, boundary.start_q.shape[1])
+            correction = rows(change, shape[2])
         placed = self._placed_scene(len(boundary), obstacle_poses)
         if correction is None and self.iterated:
-            correction = np.zeros((len(boundary), *self._interior(boundary), boundary.start_q.shape[1]))
+            correction = np.zeros(shape)
         tasks = Tasks(boundary, start_xyz, goal_xyz, time, scene, correction, placed)
-        return tasks if self.scene_features is None else self._observed(tasks, self._line(boundary, correction))
+        if self.scene_features is None:
+            return tasks
+        return self._observed(tasks, lines_at_rest(boundary, np.zeros(shape) if correction is None else correction))
 
     def along(self, tasks: Tasks, path: Array) -> Tasks:
-        """Return tasks whose lines are the paths of other plans for them.
-
-        Args:
-            tasks: N tasks.
-            path: Control points of the plans [rad], shape (N, C, n).
-        """
+        """Return tasks whose lines are the paths of other plans for them: control points [rad], shape (N, C, n)."""
         fixed = tasks.boundary.fixed_at_goal
         first, last, interior = path[:, 2:3], path[:, -fixed, None], path[:, 3:-fixed]
         along = along_line(interior.shape[1], path.dtype.name)
         return self._observed(replace(tasks, correction=interior - first - (last - first) * along), path)
 
-    def _line(self, boundary: Boundary, correction: Array | None) -> Array:
-        """Return control points of the lines between states at rest, shape (N, C, n)."""
-        start, goal, fixed = boundary.start_q[:, None], boundary.goal_q[:, None], boundary.fixed_at_goal
-        interior = start + (goal - start) * along_line(*self._interior(boundary))
-        interior = interior if correction is None else interior + correction
-        return np.concatenate([np.repeat(start, 3, axis=1), interior, np.repeat(goal, fixed, axis=1)], axis=1)
-
-    def _interior(self, boundary: Boundary) -> tuple[int]:
-        """Return the number of interior control points."""
-        return (self.problem.trajectory.path_control_points - 3 - boundary.fixed_at_goal,)
+    def _interior_points(self, boundary: Boundary) -> int:
+        return self.problem.trajectory.path_control_points - 3 - boundary.fixed_at_goal
 
     def _observed(self, tasks: Tasks, path: Array) -> Tasks:
         """Return tasks with features of the placed obstacles along paths, if the model has such features."""
@@ -172,7 +163,7 @@ class TaskPreprocessor:
 
     def _via_offsets(self, boundary: Boundary, via_point: Array) -> Array:
         """Return offsets of lines through via points from straight ones at interior points [rad], shape (N, m, n)."""
-        along = along_line(self.problem.trajectory.path_control_points - 3 - boundary.fixed_at_goal)
+        along = along_line(self._interior_points(boundary))
         offset = via_point - (boundary.start_q + boundary.goal_q) / 2
         return np.asarray((1 - np.abs(2 * along - 1)) * offset[:, None])
 
@@ -181,38 +172,20 @@ def make_task_preprocessor(
     problem: Problem,
     robot: Robot,
     kernels: KernelLibrary,
+    config: ModelConfig,
     *,
-    line_projection_steps: int,
-    expected_time: str = "distance",
-    fixed_at_goal: int = 2,
-    within_limits: bool = False,
-    via_lines: bool = False,
-    placed: tuple[Obstacle, ...] = (),
+    fixed_at_goal: int,
+    placed: tuple[Obstacle, ...],
     observed: bool = False,
-    iterated: bool = False,
 ) -> TaskPreprocessor:
-    """Load the preprocessor of a problem's tasks.
-
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        kernels: Library of kernels.
-        line_projection_steps: Gauss-Newton steps that project the line; it stays straight if there are no equalities.
-        expected_time: One of ``EXPECTED_TIMES``.
-        fixed_at_goal: Number of control points that the goal fixes (``Boundary.fixed_at_goal``).
-        within_limits: Whether control points are clipped to the joint limits (``ModelConfig``).
-        via_lines: Whether to load the kernel of lines through via points.
-        placed: Obstacles that samples place.
-        observed: Whether to compute features of them.
-        iterated: Whether the network corrects its own path.
-    """
-    steps = effective_steps(kernels, line_projection_steps)
-    load = partial(kernels.load, steps=steps, fixed_at_goal=fixed_at_goal, within_limits=within_limits)
+    """Load the preprocessor of a problem's tasks; ``observed`` is whether it computes features of placed obstacles."""
+    steps = effective_steps(kernels, config.line_projection_steps)
+    load = partial(kernels.load, steps=steps, fixed_at_goal=fixed_at_goal, within_limits=config.within_limits)
     line = load(line_change, with_offsets=False) if steps else None
     tips = kernels.load(tips_at_ends, fixed_at_goal=fixed_at_goal)
-    time = kernels.load(reaching_time, fixed_at_goal=fixed_at_goal) if expected_time == "reach" else None
-    via_line = load(line_change, with_offsets=True) if steps and via_lines else None
-    least_time = MIN_TRAVEL_TIME_S if expected_time == "travel" else MIN_EXPECTED_TIME_S
+    time = kernels.load(reaching_time, fixed_at_goal=fixed_at_goal) if config.expected_time == "reach" else None
+    via_line = load(line_change, with_offsets=True) if steps and config.via_points else None
+    least_time = MIN_TRAVEL_TIME_S if config.expected_time == "travel" else MIN_EXPECTED_TIME_S
     features = make_scene_features(robot, problem.trajectory, kernels) if placed and observed else None
-    parts = tips, line, time, via_line, least_time, placed, features, iterated
+    parts = tips, line, time, via_line, least_time, placed, features, config.iterations > 1
     return TaskPreprocessor(problem, robot.velocity_limit, *parts)

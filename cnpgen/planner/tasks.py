@@ -73,13 +73,7 @@ class Tasks:
 def expected_time(boundary: Boundary, velocity_limit: Array, *, least: float = MIN_EXPECTED_TIME_S) -> Array:
     """Return the largest time that a joint needs at its velocity limit (authors' implementation, expected time) [s].
 
-    Args:
-        boundary: Boundary conditions.
-        velocity_limit: Planning limits [rad/s], shape (n,).
-        least: Lower bound [s].
-
-    Returns:
-        Shape (N,).
+    Velocity limits [rad/s] have shape (n,) or (N, n), times shape (N,) and the lower bound ``least`` [s].
     """
     joint_times: Array = np.abs(boundary.goal_q - boundary.start_q) / velocity_limit
     time: Array = joint_times.max(axis=1, initial=least)

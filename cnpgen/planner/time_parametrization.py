@@ -68,7 +68,9 @@ class TimeParametrization(PhaseGrid):
         lower: Lower bounds of its rows, shape (m,).
         upper: Upper bounds of its rows, shape (m,).
         joints: Number of joints.
-        at_rest: Whether motions begin and end at rest, so that all control points of the rate may move.
+        fixed: Number of control points of the rate at either end that stay; 0 from rest to rest.
+        margin: Relative decrease of the rates after the last step.
+        min_increase: Largest increase of a control point in a sweep above which all control points move again.
         library: Library of time_parametrization.c; None if kernels are not compiled.
     """
 
@@ -76,7 +78,9 @@ class TimeParametrization(PhaseGrid):
     lower: Array
     upper: Array
     joints: int
-    at_rest: bool
+    fixed: int
+    margin: float
+    min_increase: float
     library: ctypes.CDLL | None
 
     def parametrize(self, motion: Motion, obstacle_poses: Array) -> tuple[Motion, NDArray[np.bool_]]:
@@ -104,8 +108,7 @@ class TimeParametrization(PhaseGrid):
     def _parametrize_interpreted(self, motion: Motion, obstacle_poses: Array) -> tuple[Array, Array]:
         """Return the rates and the largest violations; inf for motions whose control points moved twice."""
         rate, column = motion.rate.copy(), self.column(motion, obstacle_poses)
-        rates = rate, self.coefficients(column), self._bounds, self.rate
-        twice = parametrize_rates(*rates, fixed=self._fixed, margin=self._margin, min_increase=self._min_increase)
+        twice = self._fit(rate, self.coefficients(column))
         new_column = self.column(Motion(motion.path, rate, motion.degree), obstacle_poses)
         before, after = (
             self.violation(states)[0].reshape(len(motion), -1).max(axis=1) for states in (column, new_column)
@@ -114,20 +117,19 @@ class TimeParametrization(PhaseGrid):
         violation = np.where(twice, np.inf, np.where(better, after, before))
         return np.where(better[:, None], rate, motion.rate), violation
 
-    @property
-    def _fixed(self) -> int:
-        """Number of control points of the rate at either end that stay."""
-        return 0 if self.at_rest else FIXED_RATE_POINTS
-
-    @property
-    def _margin(self) -> float:
-        """Relative decrease of the rates after the last step."""
-        return RATE_MARGIN if self.at_rest else 0.0
-
-    @property
-    def _min_increase(self) -> float:
-        """Largest increase of a control point in a sweep above which all control points move again."""
-        return MIN_INCREASE_TO_REPEAT if self.at_rest else np.inf
+    def _fit(self, rate: Array, coefficients: list[Array]) -> NDArray[np.bool_]:
+        """Fit the rates of N motions in place as time_parametrization.c does; return which of them moved twice."""
+        shaped = [coefficient.reshape(len(coefficient), len(rate), -1) for coefficient in coefficients]
+        table, movable = self.rate, slice(self.fixed, rate.shape[1] - self.fixed)
+        increase = _sweep(rate, shaped, self._bounds, table, self.fixed)
+        again = increase > self.min_increase
+        some = rate[again]
+        _sweep(some, [coefficient[:, again] for coefficient in shaped], self._bounds, table, self.fixed)
+        rate[again] = some
+        along = rate[:, movable] @ table[:, :, movable].swapaxes(1, 2)
+        step = advance(shaped, self._bounds, rate @ table.swapaxes(1, 2), along)
+        rate[:, movable] *= (1 + step[:, None]) * (1 - self.margin)
+        return again
 
     @cached_property
     def _bounds(self) -> tuple[Array, Array]:
@@ -143,14 +145,14 @@ class TimeParametrization(PhaseGrid):
     @cached_property
     def _c_arguments(self) -> tuple[_TimeParametrization, list[NDArray[Any]]]:
         """Arguments of time_parametrization.c for the problem, and the arrays that they point to."""
-        lower, upper, order, fractions = *self._bounds, *moves_of(self.rate.shape[2], self._fixed)
-        tables, spans = [[of(self.path), of(self.rate)] for of in (by_point, span_of)]
+        lower, upper, order, fractions = *self._bounds, *moves_of(self.rate.shape[2], self.fixed)
+        tables, spans = [[of(self.path), of(self.rate)] for of in (_by_point, _span_of)]
         arrays = [*tables, lower, upper, *spans, order, fractions]
         (phases, path_points), points = self.path.shape[1:], self.rate.shape[2]
         counts = self.joints, self.coefficients.tape.inputs[0] - 3 * self.joints - 2, path_points, points
-        moves = phases, len(lower), self._fixed, points - self._fixed, len(order)
+        moves = phases, len(lower), self.fixed, points - self.fixed, len(order)
         addresses = *map(address_of, arrays), self.coefficients.address, self.violation.address
-        bounds = MAX_RATE_INCREASE, MAX_RATE_DECREASE, self._margin, self._min_increase, self._tolerance
+        bounds = MAX_RATE_INCREASE, MAX_RATE_DECREASE, self.margin, self.min_increase, self._tolerance
         return _TimeParametrization(*counts, *moves, *addresses, *bounds), arrays
 
     def _parametrize_compiled(self, path: Array, obstacle_poses: Array, rate: Array, violation: Array) -> None:
@@ -165,13 +167,7 @@ class TimeParametrization(PhaseGrid):
 def make_time_parametrization(
     problem: Problem, robot: Robot, kernels: KernelLibrary, *, at_rest: bool = False
 ) -> TimeParametrization:
-    """Load the time parametrization of one problem.
-
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        kernels: Library of kernels.
-        at_rest: Whether motions begin and end at rest.
+    """Load the time parametrization of one problem; ``at_rest`` is whether motions begin and end at rest.
 
     Raises:
         UsageError: The problem bounds the jerk, which is no quadratic of the rate.
@@ -184,26 +180,18 @@ def make_time_parametrization(
         function = library.parametrize_rates
         function.argtypes, function.restype = (c_void_p, c_long, *[c_void_p] * 5), None
     rows = kernels.load(speed_coefficients), *coefficient_bounds(speed_bounds(robot, problem))
-    return TimeParametrization(
-        speeds.violation, speeds.path, speeds.rate, *rows, joints=robot.n, at_rest=at_rest, library=library
-    )
+    moves = (0, RATE_MARGIN, MIN_INCREASE_TO_REPEAT) if at_rest else (FIXED_RATE_POINTS, 0.0, np.inf)
+    return TimeParametrization(speeds.violation, speeds.path, speeds.rate, *rows, robot.n, *moves, library)
 
 
-def span_of(table: Array) -> NDArray[np.int64]:
-    """Return the range of phases at which each control point has an effect, rounded to whole vectors.
-
-    Args:
-        table: Basis of a spline and its derivatives, shape (orders, K, points).
-
-    Returns:
-        First phase and the one after the last, shape (points, 2).
-    """
+def _span_of(table: Array) -> NDArray[np.int64]:
+    """Return first and last phase, in whole vectors, at which each control point has an effect, shape (points, 2)."""
     nonzero = (table != 0).any(axis=0)
     first, last = nonzero.argmax(axis=0), len(nonzero) - nonzero[::-1].argmax(axis=0)
     return np.stack([first - first % MAX_VECTOR_WIDTH, last + -last % MAX_VECTOR_WIDTH], axis=1).astype(np.int64)
 
 
-def by_point(table: Array) -> Array:
+def _by_point(table: Array) -> Array:
     """Return a basis in the layout of time_parametrization.c, shape (orders, points, K), aligned to vectors."""
     aligned = aligned_array(table.size)
     aligned.reshape(table.swapaxes(1, 2).shape)[:] = table.swapaxes(1, 2)
@@ -215,42 +203,6 @@ def moves_of(points: int, fixed: int) -> tuple[NDArray[np.int64], Array]:
     movable = np.arange(fixed, points - fixed)
     first, second = movable[1::2], movable[::2]
     return np.concatenate([first, second]), np.repeat(STEP_FRACTIONS, [len(first), len(second)])
-
-
-def parametrize_rates(
-    rate: Array,
-    coefficients: list[Array],
-    bounds: tuple[Array, Array],
-    table: Array,
-    *,
-    fixed: int = FIXED_RATE_POINTS,
-    margin: float = 0.0,
-    min_increase: float = np.inf,
-) -> NDArray[np.bool_]:
-    """Fit the rates of N motions as time_parametrization.c does.
-
-    Args:
-        rate: Control points of the rate, shape (N, R), changed in place.
-        coefficients: Constant, square and mixed, shape (m, N K) each.
-        bounds: Lower and upper bounds, shape (m,) each.
-        table: Basis of r and r', shape (2, K, R).
-        fixed: Number of control points at either end that stay.
-        margin: Relative decrease of the others after the last step.
-        min_increase: Relative increase of a control point above which the others move again.
-
-    Returns:
-        Mask of the motions whose control points moved twice, shape (N,).
-    """
-    shaped = [coefficient.reshape(len(coefficient), len(rate), -1) for coefficient in coefficients]
-    movable = slice(fixed, rate.shape[1] - fixed)
-    increase = _sweep(rate, shaped, bounds, table, fixed)
-    again = increase > min_increase
-    some = rate[again]
-    _sweep(some, [coefficient[:, again] for coefficient in shaped], bounds, table, fixed)
-    rate[again] = some
-    along = rate[:, movable] @ table[:, :, movable].swapaxes(1, 2)
-    rate[:, movable] *= (1 + advance(shaped, bounds, rate @ table.swapaxes(1, 2), along)[:, None]) * (1 - margin)
-    return again
 
 
 def _sweep(rate: Array, coefficients: list[Array], bounds: tuple[Array, Array], table: Array, fixed: int) -> Array:

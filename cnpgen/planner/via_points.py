@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.kernels.grid_kernel import GridKernel
+from cnpgen.kernels.kernel import GridKernel
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.kernels.tape import GridSpec
-from cnpgen.planner.control_points import along_line
+from cnpgen.planner.control_points import lines_at_rest
 from cnpgen.planner.expressions import static_violation
 from cnpgen.planner.phase_grid import blocks_of_motions
 from cnpgen.planner.tasks import Tasks
@@ -80,24 +80,16 @@ class ViaPoints:
             Rows of lines, shape (N count,).
         """
         assert lines.correction is not None
-        start, goal = lines.boundary.start_q[:, None], lines.boundary.goal_q[:, None]
-        interior = start + (goal - start) * along_line(lines.correction.shape[1]) + lines.correction
-        fixed = self.path.shape[1] - interior.shape[1] - 3
-        path = np.concatenate([np.repeat(start, 3, axis=1), interior, np.repeat(goal, fixed, axis=1)], axis=1)
+        path = lines_at_rest(lines.boundary, lines.correction)
         violation = self._violation_at(self.path[COARSE_PHASES], path, lines.scene.poses)
         order = violation.reshape(-1, len(self.via_points)).argsort(axis=1, kind="stable")[:, :count]
         return np.asarray((order + len(self.via_points) * np.arange(len(order))[:, None]).ravel())
 
     @staticmethod
     def candidates(violation: Array, count: int) -> NDArray[np.intp]:
-        """Return the motions to choose from, given motions along all lines of the first task, then of the next one.
+        """Return rows of motions: for every task those without violation, or else the one with the smallest.
 
-        Args:
-            violation: Largest violations, shape (N count,).
-            count: Number of lines per task.
-
-        Returns:
-            Rows of motions: for every task those without violation, or else the one with the smallest.
+        Violations, shape (N count,), are those along ``count`` lines of the first task, then of the next one.
         """
         of_task = violation.reshape(-1, count)
         least = of_task.min(axis=1, keepdims=True)
@@ -105,13 +97,7 @@ class ViaPoints:
 
 
 def make_via_points(problem: Problem, kernels: KernelLibrary, via_points: Array) -> ViaPoints:
-    """Load the check of via points for one problem.
-
-    Args:
-        problem: The problem.
-        kernels: Library of kernels.
-        via_points: Configurations [rad], shape (M, n).
-    """
+    """Load the check of via points [rad], shape (M, n), for one problem."""
     spec = problem.trajectory
     path = basis(chebyshev(STATIC_INTERVALS), spec.path_control_points, spec.degree)
     kernel = kernels.load_grid(static_violation, GridSpec(("point", "lane"), ("point",)), dtype="float32")

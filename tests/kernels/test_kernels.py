@@ -9,6 +9,7 @@ import time
 import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -743,7 +744,7 @@ def test_an_interruption_ends_the_compilers_of_all_threads(root, own_cache, monk
         raise KeyboardInterrupt
 
     begun = time.monotonic()
-    with pytest.raises(KeyboardInterrupt), pool:
+    with pytest.raises(KeyboardInterrupt), closing(pool):
         interrupted()
     assert time.monotonic() - begun < HANGING / 10
     assert ended(child)

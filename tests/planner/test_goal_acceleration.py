@@ -16,8 +16,7 @@ from cnpgen.planner.hit_tasks import boundary_of_tasks
 from cnpgen.planner.model import is_rest_to_rest
 from cnpgen.planner.model_file import load_model
 from cnpgen.planner.plan_requests import read_file, read_rows
-from cnpgen.planner.plan_reuse import reuse_previous_plan
-from cnpgen.planner.planner import Planner
+from cnpgen.planner.planner import Planner, reuse_previous_plan
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.training.train import train_model
 from tests.conftest import columns_of, tiny_recipe

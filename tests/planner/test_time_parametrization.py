@@ -7,7 +7,6 @@ import pinocchio as pin
 import pytest
 
 from cnpgen.errors import UsageError
-from cnpgen.planner import time_parametrization as module
 from cnpgen.planner.expressions import coefficient_bounds, speed_bounds
 from cnpgen.planner.planner import Planner
 from cnpgen.planner.time_parametrization import (
@@ -145,7 +144,7 @@ def test_compiled_and_interpreted_time_parametrization_agree(motion, time_parame
 
 @needs_compiler
 @pytest.mark.slow
-def test_compiled_and_interpreted_time_parametrization_agree_from_rest_to_rest(tiny, monkeypatch):
+def test_compiled_and_interpreted_time_parametrization_agree_from_rest_to_rest(tiny):
     """Only with obstacles a state has more values than the motion; compiling its kernels takes some seconds."""
     given, boundary = loaded_problem_of("heavy-object"), boundary_of_columns(columns_of(tiny("heavy-object")), COUNT)
     plans = Planner("heavy-object", backend="numpy").plan_batch(boundary)
@@ -173,8 +172,7 @@ def test_compiled_and_interpreted_time_parametrization_agree_from_rest_to_rest(t
     assert evaluate_plans(timed, workers=1).valid[meets_limits].mean() >= evaluate_plans(plans, workers=1).valid.mean()
     fixed = make_time_parametrization(given.problem, given.robot, kernels).parametrize(motion, obstacle_poses)[0]
     assert twice.duration().mean() < 0.99 * fixed.duration().mean()
-    monkeypatch.setattr(module, "MIN_INCREASE_TO_REPEAT", np.inf)
-    once = interpreted_one.parametrize(motion, obstacle_poses)[0]
+    once = replace(interpreted_one, min_increase=np.inf).parametrize(motion, obstacle_poses)[0]
     assert twice.duration().mean() < once.duration().mean()
 
 

@@ -22,8 +22,8 @@ from cnpgen.planner.network.scene_features import (
     count_scene_features,
     make_scene_features,
 )
+from cnpgen.planner.plan_requests import plan_scenes, scene_requests
 from cnpgen.planner.planner import Planner
-from cnpgen.planner.scene_requests import plan_scenes, scene_requests
 from cnpgen.planner.task_preprocessor import ends_of
 from cnpgen.plans.format import OBSTACLE_POSES
 from cnpgen.plans.plan_file import load_plans

@@ -46,7 +46,9 @@ def obstacle_bodies(obstacles: Sequence[Obstacle], numbers: Array, first: int) -
         ``(bodies, vertices, boxes)``: bodies, shape (O,); vertices of meshes, flat; bounding boxes by rows (center,
         half sizes, rotation, radius), shape (16, O padded).
     """
-    bodies, vertices, boxes = np.zeros(len(obstacles), BODY), list[Array](), _far_boxes(len(obstacles))
+    bodies, vertices = np.zeros(len(obstacles), BODY), list[Array]()
+    boxes = np.zeros((16, len(obstacles) + -len(obstacles) % LANES))
+    boxes[:3] = PADDING_DISTANCE_M
     for index, (obstacle, part) in enumerate(zip(obstacles, number_slices(obstacles), strict=True)):
         body = bodies[index]
         center, half = _fill(body, obstacle, numbers[part])
@@ -57,12 +59,6 @@ def obstacle_bodies(obstacles: Sequence[Obstacle], numbers: Array, first: int) -
         boxes[:3, index], boxes[3:6, index] = center, half
         boxes[6:15, index], boxes[15, index] = body["rotation"], body["radius"]
     return bodies, np.concatenate([*vertices, np.empty(0)]), boxes
-
-
-def _far_boxes(count: int) -> Array:
-    boxes = np.zeros((16, count + -count % LANES))
-    boxes[:3] = PADDING_DISTANCE_M
-    return boxes
 
 
 def _fill(body: Any, obstacle: Obstacle, numbers: Array) -> tuple[Array, Array]:

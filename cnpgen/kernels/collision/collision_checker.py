@@ -60,12 +60,7 @@ class CloseBodies(NamedTuple):
 
 
 def load_collision_library(kernels: KernelLibrary, sources: Sequence[Path] = SOURCES) -> ctypes.CDLL | None:
-    """Return the library of collision checks, the same for all robots; None where kernels are not compiled.
-
-    Args:
-        kernels: Library of kernels.
-        sources: Source files, convex.c and collision.c first.
-    """
+    """Return the library of collision checks, the same for all robots; None where kernels are not compiled."""
     library = kernels.load_source(*sources)
     if library is not None:
         library.clear_states.restype = library.joint_poses.restype = None
@@ -135,22 +130,12 @@ class CollisionChecker:
         self._set("pairs", self.link_pairs)
         self._set("moving", np.cumsum(parts["frame"] > 0) - 1)
         self._set("moving_frames", parts["frame"][parts["frame"] > 0])
-        for name, count in (
-            ("n", robot.n),
-            ("n_parts", len(parts)),
-            ("n_links", len(capsules)),
-            ("n_link_pairs", len(kept)),
-        ):
-            setattr(self._scene, name, count)
+        self._scene.n, self._scene.n_parts = robot.n, len(parts)
+        self._scene.n_links, self._scene.n_link_pairs = len(capsules), len(kept)
         self.place([], np.empty(0))
 
     def place(self, obstacles: Sequence[Obstacle], numbers: Array) -> None:
-        """Set the obstacles.
-
-        Args:
-            obstacles: The obstacles.
-            numbers: Their poses and sizes, shape (width,), see ``cnpgen.robots.solid``.
-        """
+        """Set the obstacles, with their poses and sizes, shape (width,) (``cnpgen.robots.solid``)."""
         bodies, vertices, boxes = obstacle_bodies(obstacles, numbers, len(self.vertices))
         self._set("obstacles", bodies)
         self._set("boxes", boxes)
@@ -188,30 +173,18 @@ class CollisionChecker:
         """
         states, capacity = np.ascontiguousarray(q.T), MIN_CONTACT_CAPACITY
         while True:
-            close = CloseBodies(
-                np.empty(capacity, np.int64),
-                np.empty(capacity, np.int64),
-                np.empty(capacity),
-                np.empty((capacity, 3)),
-                np.empty((capacity, 2, 3)),
-            )
+            pair, k, distance = np.empty(capacity, np.int64), np.empty(capacity, np.int64), np.empty(capacity)
+            normal, points = np.empty((capacity, 3)), np.empty((capacity, 2, 3))
+            addresses = map(address_of, (pair, k, distance, normal, points))
             count = self.library.find_contacts(
-                self.address, address_of(states), len(states), within, of_obstacles, capacity, *map(address_of, close)
+                self.address, address_of(states), len(states), within, of_obstacles, capacity, *addresses
             )
             if count <= capacity:
-                pair, k, distance, normal, points = close
                 return CloseBodies(pair[:count], k[:count], distance[:count], normal[:count], points[:count])
             capacity = count
 
     def joint_poses(self, q: Array) -> Array:
-        """Compute the poses of the joints' frames, that of the base first: rotation by rows and position.
-
-        Args:
-            q: Joint positions [rad], shape (n, K).
-
-        Returns:
-            Shape (K, n + 1, 12).
-        """
+        """Compute the joints' frames at q [rad], shape (n, K), base first: rows and position, shape (K, n + 1, 12)."""
         states = np.ascontiguousarray(q.T)
         poses = np.empty((len(states), self._n + 1, 12))
         self.library.joint_poses(self.address, address_of(states), len(states), address_of(poses))

@@ -7,13 +7,13 @@ before, for each thread. */
 typedef struct {
   kernel *values, *jacobian; /* of the other rows: w, poses -> g, d(g)/d(w) column by column */
   const robot_scene *scene;
+  double *scratch; /* 11 numbers and 2 indices for each contact, then values and gradients of one state, then rows */
   const double *required; /* distances of the columns [m] */
   const long *obstacle_column, *pair_column; /* pair of bodies -> column */
   long rows, columns, width; /* other rows, rows of distances, numbers in w */
+  long capacity, generation; /* contacts of a state; unique number of the context */
   double range, scale;       /* measured distance above the required one [m]; distance of a residual of 1 [m] */
   double obstacle_distance, self_distance; /* -INFINITY without such a constraint */
-  long capacity, generation; /* contacts of a state; unique number of the context */
-  double *scratch; /* 11 numbers and 2 indices for each contact, then values and gradients of one state, then rows */
 } row_context;
 
 static _Thread_local row_context *current;

@@ -24,11 +24,10 @@ class _RowContext(ctypes.Structure):
     """``row_context`` of hull_rows.c."""
 
     _fields_ = (
-        *((name, c_void_p) for name in ("values", "jacobian", "scene", "required", "obstacle_column", "pair_column")),
-        *((name, c_long) for name in ("rows", "columns", "width")),
+        *((name, c_void_p) for name in ("values", "jacobian", "scene", "scratch")),
+        *((name, c_void_p) for name in ("required", "obstacle_column", "pair_column")),
+        *((name, c_long) for name in ("rows", "columns", "width", "capacity", "generation")),
         *((name, c_double) for name in ("range", "scale", "obstacle_distance", "self_distance")),
-        *((name, c_long) for name in ("capacity", "generation")),
-        ("scratch", c_void_p),
     )
 
 
@@ -71,30 +70,14 @@ class RowKernels:
     """
 
     def __init__(self, values: Kernel, jacobian: Kernel, checker: CollisionChecker, columns: DistanceColumns) -> None:
-        rows, m = values.tape.outputs[0], len(columns.required)
-        width = values.tape.inputs[0]
+        rows, m, width = values.tape.outputs[0], len(columns.required), values.tape.inputs[0]
         limits = [-np.inf if x is None else x for x in (columns.obstacle_distance, columns.self_distance)]
         numbers = NUMBERS_PER_CONTACT * MAX_CONTACTS_PER_STATE + m * (1 + width)
-        arrays = (columns.required, columns.of_obstacles, columns.of_links, np.empty(numbers))
+        arrays = (np.empty(numbers), columns.required, columns.of_obstacles, columns.of_links)
         self._keep: tuple[Any, ...] = (values, jacobian, checker, *arrays)
-        required, of_obstacles, of_links, scratch = map(address_of, arrays)
-        self._context = _RowContext(
-            values.address,
-            jacobian.address,
-            checker.address,
-            required,
-            of_obstacles,
-            of_links,
-            rows,
-            m,
-            width,
-            columns.range,
-            columns.scale,
-            *limits,
-            MAX_CONTACTS_PER_STATE,
-            next(_GENERATIONS),
-            scratch,
-        )
+        addresses = *(part.address for part in (values, jacobian, checker)), *map(address_of, arrays)
+        counts = rows, m, width, MAX_CONTACTS_PER_STATE, next(_GENERATIONS)
+        self._context = _RowContext(*addresses, *counts, columns.range, columns.scale, *limits)
         self._library = checker.library
         self._library.set_row_context.argtypes, self._library.set_row_context.restype = (c_void_p,), None
         self.values = _RowKernel(self, values, "row_values", (rows + m,))

@@ -8,8 +8,9 @@ typedef struct {
   const robot_scene *scene;
   const double *start, *goal, *lower, *upper, *velocity; /* ends, ranges of random configurations, velocity limits */
   double obstacle_distance, self_distance, margin, ramp; /* the margin is complete at a distance `ramp` from the ends */
-  double spacing, extension, corner_time;                /* of states; largest of a tree; time that a corner costs [s] */
-  long max_extensions, max_nodes, shortcuts; /* nodes of both trees */
+  double spacing, extension;                             /* of states; largest of a tree */
+  long max_extensions, max_nodes, shortcuts;             /* nodes of both trees */
+  double corner_time;                                    /* that a corner costs [s] */
   unsigned long long seed;
 } tree_settings;
 
@@ -137,8 +138,8 @@ static long shorten(search *h, double *path, long count, double *copy, long max_
     double straight = line_time(s, ends, ends + n) + 2 * s->corner_time;
     if (straight >= section || !line_is_clear(h, ends, ends + n, 1)) continue;
     if (!state_is_clear(h, ends)) continue;
-    long kept = 0;
-    memcpy(copy, path, (index[0] + 1) * n * sizeof(double)), kept = index[0] + 1;
+    long kept = index[0] + 1;
+    memcpy(copy, path, kept * n * sizeof(double));
     memcpy(copy + n * kept, ends, 2 * n * sizeof(double)), kept += 2;
     memcpy(copy + n * kept, path + n * (index[1] + 1), (count - index[1] - 1) * n * sizeof(double));
     count = kept + count - index[1] - 1;

@@ -2,7 +2,7 @@
 
 import ctypes
 from ctypes import c_double, c_long, c_ulonglong, c_void_p
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,9 +25,9 @@ class _TreeSettings(ctypes.Structure):
     _fields_ = (
         *((name, c_void_p) for name in ("scene", "start", "goal", "lower", "upper", "velocity")),
         *((name, c_double) for name in ("obstacle_distance", "self_distance", "margin", "ramp")),
-        *((name, c_double) for name in ("spacing", "extension", "corner_time")),
+        *((name, c_double) for name in ("spacing", "extension")),
         *((name, c_long) for name in ("max_extensions", "max_nodes", "shortcuts")),
-        ("seed", c_ulonglong),
+        *(("corner_time", c_double), ("seed", c_ulonglong)),
     )
 
 
@@ -98,21 +98,8 @@ def find_tree_path(
         Corners of the path [rad], shape (K, n), or None if the trees do not connect.
     """
     arrays = [np.ascontiguousarray(array, np.float64) for array in (*ends, *box, velocity_limit)]
-    limits = [-np.inf if x is None else x for x in (settings.obstacle_distance, settings.self_distance)]
-    native = _TreeSettings(
-        checker.address,
-        *map(address_of, arrays),
-        *limits,
-        settings.margin,
-        settings.margin_ramp,
-        settings.spacing,
-        settings.extension,
-        CORNER_TIME_S,
-        settings.max_extensions,
-        settings.max_nodes,
-        settings.shortcuts,
-        seed + 1,
-    )
+    numbers = [-np.inf if value is None else value for value in astuple(settings)]
+    native = _TreeSettings(checker.address, *map(address_of, arrays), *numbers, CORNER_TIME_S, seed + 1)
     path = np.empty((MAX_PATH_POINTS, len(arrays[0])))
     if manifold is None:
         search = checker.library.find_path
@@ -128,11 +115,6 @@ def find_tree_path(
 
 
 def estimated_duration(path: Array, velocity_limit: Array) -> float:
-    """Estimate the duration of a motion along a path: velocity limits along its lines, and a time for every corner.
-
-    Args:
-        path: Corners [rad], shape (K, n).
-        velocity_limit: Velocity limits of the joints [rad/s], shape (n,).
-    """
+    """Estimate the duration along a path [rad], shape (K, n): lines at the velocity limits [rad/s], and its corners."""
     lines = (np.abs(np.diff(path, axis=0)) / velocity_limit).max(axis=1)
     return float(lines.sum() + CORNER_TIME_S * max(len(path) - 2, 0))

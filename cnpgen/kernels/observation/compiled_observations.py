@@ -22,7 +22,7 @@ SOURCE = Path(__file__).with_name("observe.c")
 
 
 class _SceneArrays(ctypes.Structure):
-    """``scene_arrays`` of observe.c."""
+    """``scene_arrays`` of observe.c, with the arrays that it points to."""
 
     _fields_ = (
         ("scenes", c_long),
@@ -31,13 +31,20 @@ class _SceneArrays(ctypes.Structure):
         *((name, c_void_p) for name in ("first_triangle", "first_plane", "triangles", "planes")),
     )
 
+    def __init__(self, scenes: Primitives) -> None:
+        triangles, planes = ([getattr(mesh, name) for mesh in scenes.meshes] for name in ("triangles", "planes"))
+        types: tuple[Any, ...] = (np.int64, *(np.float64,) * 3, *(np.int64,) * 2, *(np.float32,) * 2)
+        parts = (
+            *(scenes.kinds, scenes.centers, scenes.rotations, scenes.sizes),
+            *(np.cumsum([0, *map(len, rows)]) for rows in (triangles, planes)),
+            *(np.concatenate([*map(np.ravel, rows), np.empty(0)]) for rows in (triangles, planes)),
+        )
+        self._keep = [np.ascontiguousarray(part, dtype) for part, dtype in zip(parts, types, strict=True)]
+        super().__init__(*scenes.kinds.shape, *map(address_of, self._keep))
+
 
 class CompiledObservations:
-    """``ObservationBackend`` in compiled code.
-
-    Args:
-        library: Library of observe.c.
-    """
+    """``ObservationBackend`` in compiled code: the library of observe.c."""
 
     def __init__(self, library: ctypes.CDLL) -> None:
         self._library = library
@@ -51,24 +58,23 @@ class CompiledObservations:
         """See ``ObservationBackend``."""
         coordinates = np.ascontiguousarray(points.swapaxes(-1, -2), np.float32)
         distances = np.empty((len(scenes), points.shape[-2]), np.float32)
-        shared = points.ndim == 2
-        arrays = _Arrays(scenes)
+        shared, arrays = points.ndim == 2, ctypes.byref(_SceneArrays(scenes))
         addresses = address_of(coordinates), address_of(distances)
-        self._library.scene_distances(arrays.address, addresses[0], points.shape[-2], shared, addresses[1])
+        self._library.scene_distances(arrays, addresses[0], points.shape[-2], shared, addresses[1])
         return distances
 
     def surface_points(self, scenes: Primitives, count: int, seeds: Seeds) -> Values:
         """See ``ObservationBackend``."""
         points, seeds = np.empty((len(scenes), count, 3), np.float32), np.ascontiguousarray(seeds)
-        arrays = _Arrays(scenes)
-        self._library.scene_clouds(arrays.address, address_of(seeds), count, address_of(points))
+        arrays = ctypes.byref(_SceneArrays(scenes))
+        self._library.scene_clouds(arrays, address_of(seeds), count, address_of(points))
         return points
 
     def depth_images(self, scenes: Primitives, camera: Camera) -> Values:
         """See ``ObservationBackend``."""
         depth, view = np.empty((len(scenes), camera.height, camera.width), np.float32), _view(camera)
-        arrays = _Arrays(scenes)
-        self._library.scene_depths(arrays.address, address_of(view), camera.width, camera.height, address_of(depth))
+        arrays = ctypes.byref(_SceneArrays(scenes))
+        self._library.scene_depths(arrays, address_of(view), camera.width, camera.height, address_of(depth))
         return depth
 
     def depth_points(self, depth: Values, camera: Camera, count: int, seeds: Seeds) -> Values:
@@ -82,32 +88,12 @@ class CompiledObservations:
         return points
 
 
-class _Arrays:
-    """Arrays of scenes for the library, and the address of their structure."""
-
-    def __init__(self, scenes: Primitives) -> None:
-        triangles, planes = ([getattr(mesh, name) for mesh in scenes.meshes] for name in ("triangles", "planes"))
-        types: tuple[Any, ...] = (np.int64, *(np.float64,) * 3, *(np.int64,) * 2, *(np.float32,) * 2)
-        parts = (
-            *(scenes.kinds, scenes.centers, scenes.rotations, scenes.sizes),
-            *(np.cumsum([0, *map(len, rows)]) for rows in (triangles, planes)),
-            *(np.concatenate([*map(np.ravel, rows), np.empty(0)]) for rows in (triangles, planes)),
-        )
-        self._keep = [np.ascontiguousarray(part, dtype) for part, dtype in zip(parts, types, strict=True)]
-        self._structure = _SceneArrays(*scenes.kinds.shape, *map(address_of, self._keep))
-        self.address = ctypes.addressof(self._structure)
-
-
 def _view(camera: Camera) -> Array:
     """Return the ``view`` of observe.c."""
     return np.concatenate([camera.position, camera.axes.ravel()])
 
 
 def observation_backend(backend: str | None = None) -> ObservationBackend:
-    """Return the compiled functions, or their NumPy reference where kernels are not compiled.
-
-    Args:
-        backend: A backend of kernels; by default the fastest that works on this machine.
-    """
+    """Return the functions of a backend of kernels: compiled ones, or their NumPy reference."""
     library = KernelLibrary(*choose_backend(backend), "").load_source(SOURCE)
     return NumpyObservations() if library is None else CompiledObservations(library)

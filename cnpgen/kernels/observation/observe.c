@@ -69,24 +69,29 @@ static void triangle_distances(const primitive *b, const float *x, const float *
   }
 }
 
-/* Lower the distances of n points, at most BLOCK, to those of a body. */
-static void lower_distances(const primitive *b, const float *x, const float *y, const float *z, long n, float *distance) {
-  float r = b->s[0], h = b->s[1];
 #define LOCAL(i, k) \
   float p##k = b->R[k] * (x[i] - b->c[0]) + b->R[3 + k] * (y[i] - b->c[1]) + b->R[6 + k] * (z[i] - b->c[2]);
-  if (b->kind >= MESH) {
-    float px[BLOCK], py[BLOCK], pz[BLOCK], depth[BLOCK], squared[BLOCK];
-    int outside = 0;
-    EACH(i, 0, n) {
-      LOCAL(i, 0) LOCAL(i, 1) LOCAL(i, 2)
-      px[i] = p0, py[i] = p1, pz[i] = p2, depth[i] = -INFINITY;
-    }
-    for (const float *c = b->plane; c < b->plane + 4 * b->planes; c += 4)
-      EACH(i, 0, n) depth[i] = most(depth[i], c[0] * px[i] + c[1] * py[i] + c[2] * pz[i] + c[3]);
-    EACH(i, 0, n) outside |= depth[i] > 0 && depth[i] < distance[i]; /* planes are never farther than the mesh */
-    if (outside) triangle_distances(b, px, py, pz, n, squared);
-    EACH(i, 0, n) distance[i] = least(distance[i], outside && depth[i] > 0 ? sqrtf(squared[i]) : depth[i]);
-  } else if (b->kind == BOX) {
+
+/* Lower the distances of n points, at most BLOCK, to those of a mesh; its arrays would slow down the loops of other kinds. */
+static __attribute__((noinline)) void lower_mesh_distances(const primitive *b, const float *x, const float *y, const float *z,
+                                                           long n, float *distance) {
+  float px[BLOCK], py[BLOCK], pz[BLOCK], depth[BLOCK], squared[BLOCK];
+  int outside = 0;
+  EACH(i, 0, n) {
+    LOCAL(i, 0) LOCAL(i, 1) LOCAL(i, 2)
+    px[i] = p0, py[i] = p1, pz[i] = p2, depth[i] = -INFINITY;
+  }
+  for (const float *c = b->plane; c < b->plane + 4 * b->planes; c += 4)
+    EACH(i, 0, n) depth[i] = most(depth[i], c[0] * px[i] + c[1] * py[i] + c[2] * pz[i] + c[3]);
+  EACH(i, 0, n) outside |= depth[i] > 0 && depth[i] < distance[i]; /* planes are never farther than the mesh */
+  if (outside) triangle_distances(b, px, py, pz, n, squared);
+  EACH(i, 0, n) distance[i] = least(distance[i], outside && depth[i] > 0 ? sqrtf(squared[i]) : depth[i]);
+}
+
+/* Lower the distances of n points, at most BLOCK, to those of a body that is no mesh. */
+static void lower_distances(const primitive *b, const float *x, const float *y, const float *z, long n, float *distance) {
+  float r = b->s[0], h = b->s[1];
+  if (b->kind == BOX) {
     EACH(i, 0, n) {
       LOCAL(i, 0) LOCAL(i, 1) LOCAL(i, 2)
       float u = fabsf(p0) - b->s[0], v = fabsf(p1) - b->s[1], w = fabsf(p2) - b->s[2];
@@ -121,7 +126,9 @@ void scene_distances(const scene_arrays *a, const float *points, long count, int
       EACH(i, 0, n) out[first + i] = INFINITY;
       EACH(body, 0, a->bodies) {
         primitive b = primitive_of(a, scene * a->bodies + body);
-        if (b.kind >= 0) lower_distances(&b, x + first, x + count + first, x + 2 * count + first, n, out + first);
+        const float *from[3] = {x + first, x + count + first, x + 2 * count + first};
+        if (b.kind >= MESH) lower_mesh_distances(&b, from[0], from[1], from[2], n, out + first);
+        else if (b.kind >= 0) lower_distances(&b, from[0], from[1], from[2], n, out + first);
       }
     }
   }
@@ -298,7 +305,7 @@ static void lower_depths(const primitive *b, const float *o, const float *d, con
       for (long k = 0; k < b->planes; k++) {
         const float *c = b->plane + 4 * k;
         float speed = c[0] * d0 + c[1] * d1 + c[2] * d2, height = c[0] * o[0] + c[1] * o[1] + c[2] * o[2] + c[3];
-        float crossing = -height / (fabsf(speed) < 1e-9f ? 1e-9f : speed);
+        float crossing = -height / (fabsf(speed) < 1e-9f ? (speed < 0 ? -1e-9f : 1e-9f) : speed);
         near = speed < 0 ? most(near, crossing) : near;
         far = speed < 0 ? far : least(far, crossing);
       }

@@ -1,7 +1,12 @@
-"""Exact distances of segments and cuboids from axis-aligned boxes, as SX."""
+"""Exact distances of segments and cuboids from axis-aligned boxes, as SX.
+
+Segments are given by their ends [m], boxes by their bounds along x, y, z [m]. ``freeze`` is a function that makes a
+value constant for differentiation.
+"""
 
 import math
 from collections.abc import Callable
+from functools import reduce
 from typing import Any
 
 from cnpgen.kernels.symbolic.linalg import Scalar, Vec, cross, dot
@@ -21,11 +26,6 @@ def segment_box_distance(first: Vec, second: Vec, box: Bounds) -> Scalar:
 
     ``d^2`` of the point ``first + t (second - first)`` is convex in t. Its derivative is piecewise linear with a knot
     where a coordinate meets a face. The knots bracket the minimum; between the two closest the derivative is linear.
-
-    Args:
-        first: First end of the segment [m].
-        second: Second end of the segment [m].
-        box: Bounds along x, y, z [m].
     """
     import casadi as ca
 
@@ -40,11 +40,6 @@ def segment_box_separation(first: Vec, second: Vec, box: Bounds) -> Scalar:
 
     The depth is the length of the smallest translation that separates them. The separating axes are the
     face normals and the common normals of the segment and an edge.
-
-    Args:
-        first: First end of the segment [m].
-        second: Second end of the segment [m].
-        box: Bounds along x, y, z [m].
     """
     import casadi as ca
 
@@ -69,12 +64,6 @@ def signed_segment_box_distance(first: Vec, second: Vec, box: Bounds, *, freeze:
 
     Inside it is minus the depth, below the closest face, of the midpoint of the overlapping part. Outside, the closest
     point of the segment is constant for differentiation (envelope theorem).
-
-    Args:
-        first: First end of the segment [m].
-        second: Second end of the segment [m].
-        box: Bounds along x, y, z [m].
-        freeze: Function that makes a value constant for differentiation.
     """
     import casadi as ca
 
@@ -144,10 +133,7 @@ def _outside(x: Scalar, bounds: tuple[Any, Any]) -> Scalar:
 
 def _derivative(first: Vec, along: Vec, box: Bounds, t: Scalar) -> Scalar:
     """Return half the derivative of the squared distance at t."""
-    total: Scalar = 0.0
-    for axis in range(3):
-        total = total + _outside(first[axis] + t * along[axis], box[axis]) * along[axis]
-    return total
+    return sum(_outside(first[axis] + t * along[axis], box[axis]) * along[axis] for axis in range(3))
 
 
 def upright_box_separation(center: Vec, rotation: list[Vec], size: tuple[float, float, float], box: Bounds) -> Scalar:
@@ -182,10 +168,7 @@ def upright_box_separation(center: Vec, rotation: list[Vec], size: tuple[float, 
         own = sum(half[j] * ca.fabs(dot(normal, [rotation[0][j], rotation[1][j]])) for j in range(3))
         spread = own + sum(extent[axis] * ca.fabs(normal[axis]) for axis in range(2))
         gaps.append(ca.fabs(shift) - spread)
-    best = gaps[0]
-    for gap in gaps[1:]:
-        best = ca.fmax(best, gap)
-    return best
+    return reduce(ca.fmax, gaps)
 
 
 def cuboid_separation(center: Vec, axes: list[Vec], half: Vec, other: Vec) -> Scalar:

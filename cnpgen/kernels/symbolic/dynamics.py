@@ -19,7 +19,7 @@ from cnpgen.kernels.symbolic.linalg import (
     transposed_times,
 )
 from cnpgen.robots.attached import PayloadBody
-from cnpgen.robots.chain import Chain, Joint
+from cnpgen.robots.chain import Chain
 
 
 @dataclass(frozen=True)
@@ -42,21 +42,16 @@ class BodyMotion:
 
 
 def body_motions(chain: Chain, q: Vec, dq: Vec, ddq: Vec) -> list[BodyMotion]:
-    """Return the motion of every body by the outward recursion of Newton-Euler.
-
-    Args:
-        chain: The chain.
-        q: Joint positions [rad], n scalars.
-        dq: Joint velocities [rad/s].
-        ddq: Joint accelerations [rad/s^2].
-    """
+    """Return the motion of every body by the outward recursion of Newton-Euler; see ``inverse_dynamics``."""
     omega: Vec = [0.0, 0.0, 0.0]
     alpha: Vec = [0.0, 0.0, 0.0]
     acceleration: Vec = constants(-chain.gravity)
     motions = []
     for joint, angle, rate, rate2 in zip(chain.joints, q, dq, ddq, strict=True):
         rotation = product(rows_of(joint.rotation), joint_rotation(joint, angle))
-        offset = _offset(joint, angle)
+        offset = constants(joint.translation)
+        if joint.prismatic:
+            offset = add(offset, scale(constants(joint.rotation @ joint.axis), angle))
         acceleration = acceleration_at(acceleration, omega, alpha, offset)
         acceleration, omega, alpha = (transposed_times(rotation, x) for x in (acceleration, omega, alpha))
         axis = constants(joint.axis)
@@ -141,11 +136,3 @@ def _load_wrench(chain: Chain, payload: PayloadBody, load: Load, motion: BodyMot
     com = add(constants(chain.tip_translation), times(rows_of(turn), load.centre))
     inertia = [scale(row, load.shape) for row in rows_of(turn @ payload.inertia @ turn.T)]
     return _body_wrench(payload.mass, com, inertia, motion)
-
-
-def _offset(joint: Joint, angle: Scalar) -> Vec:
-    """Return the origin of the moved joint frame in the previous frame."""
-    offset = constants(joint.translation)
-    if joint.prismatic:
-        offset = add(offset, scale(constants(joint.rotation @ joint.axis), angle))
-    return offset

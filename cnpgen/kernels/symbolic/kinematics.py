@@ -50,12 +50,7 @@ class Kinematics:
 
 
 def forward_kinematics(chain: Chain, q: Vec) -> Kinematics:
-    """Return positions, axes and the tip Jacobian of a chain.
-
-    Args:
-        chain: The chain.
-        q: Joint positions [rad], n scalars.
-    """
+    """Return positions, axes and the tip Jacobian of a chain at joint positions q [rad], n scalars."""
     rotation: list[Vec] = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     position: Vec = [0.0, 0.0, 0.0]
     axes, origins, frames = [], [], []
@@ -115,16 +110,7 @@ def joint_rotation(joint: Joint, angle: Scalar) -> list[Vec]:
     if joint.prismatic:
         return rows_of(np.eye(3))
     a = joint.axis
-    outer, cosine, sine = np.outer(a, a), ca.cos(angle), ca.sin(angle)
     skew = np.array([[0, -a[2], a[1]], [a[2], 0, -a[0]], [-a[1], a[0], 0]])
-    complement = np.eye(3) - outer
-    return [[_sum3(outer[i, j], complement[i, j], cosine, skew[i, j], sine) for j in range(3)] for i in range(3)]
-
-
-def _sum3(constant: float, a: float, cosine: Scalar, b: float, sine: Scalar) -> Scalar:
-    total: Scalar = float(constant)
-    for factor, value in ((a, cosine), (b, sine)):
-        if factor != 0.0:
-            term = value * float(factor)
-            total = term if isinstance(total, float) and total == 0.0 else total + term
-    return total
+    factors = np.stack([np.outer(a, a), np.eye(3) - np.outer(a, a), skew], axis=2).tolist()
+    terms = [1.0, ca.cos(angle), ca.sin(angle)]
+    return [[dot(terms, entry) for entry in row] for row in factors]

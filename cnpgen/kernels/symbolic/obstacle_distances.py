@@ -162,9 +162,7 @@ class SymbolicHull(SymbolicBox):
         gap = ca.fmin(dot(normal, a), dot(normal, b)) - offset if self.planes else best
         return ca.fmax(super().separation(first, second, freeze), gap)
 
-    def distance(self, first: Vec, second: Vec) -> Scalar:
-        """Return the separation."""
-        return self.separation(first, second, lambda value: value)
+    distance = SymbolicSolid.distance
 
     def cuboid_separation(self, center: Vec, rotation: list[Vec], size: Size) -> Scalar:
         """Return the larger one of the separation from the box and the largest one along a plane's normal."""
@@ -279,10 +277,8 @@ def held_cuboid(state: SymbolicState) -> SymbolicBox:
 
 def symbolic_solids(state: SymbolicState) -> list[SymbolicSolid]:
     """Return the shapes of the obstacles around a robot."""
-    slices = number_slices(state.obstacles)
-    return [
-        _solid(obstacle, state.obstacle_poses[part]) for obstacle, part in zip(state.obstacles, slices, strict=True)
-    ]
+    parts = [state.obstacle_poses[part] for part in number_slices(state.obstacles)]
+    return [_solid(obstacle, values) for obstacle, values in zip(state.obstacles, parts, strict=True)]
 
 
 def _solid(obstacle: Obstacle, values: Vec) -> SymbolicSolid:
@@ -298,14 +294,10 @@ def _solid(obstacle: Obstacle, values: Vec) -> SymbolicSolid:
         return SymbolicCapsule(subtract(position, rest[:3]), add(position, rest[:3]), rest[3])
     if obstacle.kind == "cylinder":
         return SymbolicCylinder(position, rest[:3], rest[3])
-    return _mesh(obstacle, position, rest)
-
-
-def _mesh(obstacle: Obstacle, position: Vec, rotation: Vec) -> SymbolicHull:
     corners = corners_of(obstacle.mesh)
     low, high = corners.min(axis=0), corners.max(axis=0)
     center, half = ((low + high) / 2).tolist(), ((high - low) / 2).tolist()
-    return SymbolicHull(center, half, position, _three_rows(rotation), supporting_planes(corners).tolist())
+    return SymbolicHull(center, half, position, _three_rows(rest), supporting_planes(corners).tolist())
 
 
 def _upright(obstacle: Obstacle, top: Scalar) -> SymbolicUprightBox:

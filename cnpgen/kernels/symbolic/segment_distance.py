@@ -12,12 +12,7 @@ def segment_distance(first: tuple[Vec, Vec], second: tuple[Vec, Vec], *, freeze:
     """Return the distance of two segments [m]; it has a gradient everywhere and is 1e-6 m for crossing segments.
 
     The closest points of the two lines are clamped to their segments (Ericson 2005, section 5.1.9). They are constant
-    for differentiation (envelope theorem).
-
-    Args:
-        first: Ends of the first segment [m].
-        second: Ends of the second segment [m].
-        freeze: Function that makes a value constant for differentiation.
+    for differentiation (envelope theorem), which ``freeze`` makes them. Segments are given by their ends [m].
     """
     import casadi as ca
 

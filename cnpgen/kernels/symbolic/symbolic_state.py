@@ -11,7 +11,6 @@ from cnpgen.kernels.symbolic.linalg import Scalar, Vec, add, constants, cross, d
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.parameter_ranges import PAYLOAD_CENTRE, PAYLOAD_PARAMETERS, UPRIGHT_TURN
 from cnpgen.robots.robot import Robot
-from cnpgen.robots.shape.capsule import Capsule
 from cnpgen.robots.shape.shape import Shape
 from cnpgen.robots.solid import pose_width
 from cnpgen.robots.table_frame import table_axes
@@ -187,14 +186,14 @@ class SymbolicState:
     def _placed_capsules(self, shape: Shape | None) -> dict[str, tuple[Vec, Vec, float]]:
         if shape is None:
             return {}
-        return {capsule.link: self._placed(capsule, shape.joints[capsule.link]) for capsule in shape.capsules}
-
-    def _placed(self, capsule: Capsule, joint: int) -> tuple[Vec, Vec, float]:
-        first, second = constants(capsule.first), constants(capsule.second)
-        if joint == 0:
-            return first, second, capsule.radius
-        rotation, origin = self.kinematics.frames[joint - 1], self.kinematics.origins[joint - 1]
-        return add(origin, times(rotation, first)), add(origin, times(rotation, second)), capsule.radius
+        placed = {}
+        for capsule in shape.capsules:
+            first, second, joint = constants(capsule.first), constants(capsule.second), shape.joints[capsule.link]
+            if joint > 0:
+                rotation, origin = self.kinematics.frames[joint - 1], self.kinematics.origins[joint - 1]
+                first, second = (add(origin, times(rotation, end)) for end in (first, second))
+            placed[capsule.link] = first, second, capsule.radius
+        return placed
 
     def freeze(self, value: Scalar) -> Scalar:
         """Return a value that derivatives may treat as constant; here it is returned unchanged."""

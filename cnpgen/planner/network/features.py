@@ -122,14 +122,7 @@ def raw_features(tasks: Tasks, blocks: tuple[str, ...]) -> Array:
 
 
 def count_features(blocks: tuple[str, ...], joints: int, parameters: int = 0, line: int = 0) -> int:
-    """Return the number of features of some of ``BLOCKS``.
-
-    Args:
-        blocks: The blocks.
-        joints: Number of planned joints.
-        parameters: Number of parameters of the problem.
-        line: Number of coordinates of the interior control points.
-    """
+    """Return the number of features of some of ``BLOCKS``; ``line`` counts coordinates of interior control points."""
     widths = {**dict.fromkeys((*STATES, ARRIVAL), joints), "sin_cos": 4 * joints, "tips": 6}
     widths |= {"expected_time": 1, PARAMETERS: parameters, SCENE: count_scene_features(joints), LINE: line}
     return sum(widths[name] for name in blocks)

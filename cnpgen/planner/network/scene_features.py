@@ -17,6 +17,7 @@ from cnpgen.robots.observation.primitives import Primitives, scene_primitives
 from cnpgen.robots.observation.reference import ObservationBackend
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.scene import Scene
+from cnpgen.robots.shape.capsule import Capsule
 from cnpgen.trajectory.spline import basis
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec
 
@@ -49,14 +50,14 @@ def link_points(robot: Robot) -> Any:
     points = []
     for capsule in robot.shape.moving_capsules:
         first, second, _ = capsules[capsule.link]
-        for share in _shares(np.subtract(capsule.second, capsule.first)):
+        for share in _shares(capsule):
             points += [(1 - share) * a + share * b for a, b in zip(first, second, strict=True)]
     return ca.Function("link_points", [q_sx], [ca.vertcat(*points)])
 
 
-def _shares(axis: Array) -> list[float]:
+def _shares(capsule: Capsule) -> list[float]:
     """Return the places of the points on a capsule's axis, as shares of its length."""
-    length = float(np.linalg.norm(axis))
+    length = float(np.linalg.norm(np.subtract(capsule.second, capsule.first)))
     return np.linspace(0, 1, int(np.ceil(length / POINT_SPACING_M)) + 1).tolist() if length > 0 else [0.5]
 
 
@@ -116,21 +117,12 @@ class SceneFeatures:
 def make_scene_features(robot: Robot, spec: TrajectorySpec, kernels: KernelLibrary) -> SceneFeatures:
     """Load the features of a robot's scenes.
 
-    Args:
-        robot: The robot, with link geometry.
-        spec: Degree and number of control points of paths.
-        kernels: Library of kernels.
-
     Raises:
         UsageError: The robot has no link geometry.
     """
     if robot.shape is None:
         raise UsageError('features of scenes need geometry = "urdf" in [robot]', concerns="problem")
-    radii = [
-        capsule.radius
-        for capsule in robot.shape.moving_capsules
-        for _ in _shares(np.subtract(capsule.second, capsule.first))
-    ]
+    radii = [capsule.radius for capsule in robot.shape.moving_capsules for _ in _shares(capsule)]
     phases = (np.arange(PATH_PHASES) + 1) / (PATH_PHASES + 1)
     path = basis(phases, spec.path_control_points, spec.degree)
     return SceneFeatures(kernels.load(link_points), np.array(radii), observation_backend(kernels.backend), path)

@@ -12,7 +12,8 @@ from cnpgen.robots.shape.inline import corners_of
 
 Array = NDArray[np.float64]
 
-PLANE_DECIMALS = 9  # coplanar triangles have one face
+PLANE_DECIMALS = 9  # to which the planes of triangles of one face agree
+MIN_AREA_M2 = 1e-12  # of a triangle; smaller ones have no normal in single precision
 MAX_KEPT_MESHES = 256
 
 
@@ -69,6 +70,8 @@ class ConvexMesh:
                 crossing = -(plane[:3] @ origin + plane[3]) / speed
             enter = np.where(speed < 0, np.fmax(enter, crossing), enter)
             leave = np.where(speed > 0, np.fmin(leave, crossing), leave)
+            if plane[:3] @ origin + plane[3] > 0:
+                leave = np.where(speed == 0, -np.inf, leave)  # rays along a face, outside of it
         return np.where(enter <= leave, enter, np.nan)
 
 
@@ -93,4 +96,5 @@ def convex_mesh(address: str) -> ConvexMesh:
     first, second, third = (hull.points[index] for index in hull.simplices.T)
     planes = hull.equations[np.sort(np.unique(hull.equations.round(PLANE_DECIMALS), axis=0, return_index=True)[1])]
     triangles = np.stack([first, second - first, third - first], axis=1)
-    return ConvexMesh(center, half, hull.points, triangles, planes)
+    areas = np.linalg.norm(np.cross(triangles[:, 1], triangles[:, 2]), axis=1) / 2
+    return ConvexMesh(center, half, hull.points, triangles[areas > MIN_AREA_M2], planes)
