@@ -13,8 +13,10 @@ from contextlib import suppress
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 from cnpgen.errors import MachineError
+from cnpgen.store.files.cache_folder import default_cache_folder, temporary_folder
 
 _LINKER_FLAGS = ("-Wl,-undefined,dynamic_lookup",) if platform.system() == "Darwin" else ()  # for Python's C API
 COMPILER_FLAGS = (
@@ -38,8 +40,9 @@ def find_compiler() -> str | None:
     """
     if configured := os.environ.get("CC"):
         return _command([configured]) or _command(_words(configured))
-    packaged = shlex.join([sys.executable, "-m", "ziglang", "cc"]) if find_spec("ziglang") else None
-    return next((path for path in map(shutil.which, ["cc", "gcc", "clang"]) if path), packaged)
+    if path := next(filter(None, map(shutil.which, ["cc", "gcc", "clang"])), None):
+        return path
+    return shlex.join([sys.executable, "-m", "ziglang", "cc"]) if sys.executable and find_spec("ziglang") else None
 
 
 def _words(command: str) -> list[str]:
@@ -75,7 +78,7 @@ def compiler_version(compiler: str) -> str:
     Raises:
         MachineError: The compiler does not run.
     """
-    completed = _run([*shlex.split(compiler), "--version"], MAX_VERSION_TIME_S, "to print its version")
+    completed = _run(compiler, ["--version"], MAX_VERSION_TIME_S, "to print its version")
     if completed.returncode != 0:
         raise MachineError(
             f"the C compiler {compiler} does not run: --version ends with exit code {completed.returncode}"
@@ -83,29 +86,40 @@ def compiler_version(compiler: str) -> str:
     return completed.stdout.splitlines()[0].strip() if completed.stdout else "unknown"
 
 
-def _run(command: list[str], seconds: float, purpose: str) -> "subprocess.CompletedProcess[str]":
+def _zig_folder() -> Path:
+    """Return a folder for files of ziglang, which does not end if it cannot write to its own one in the home folder."""
+    folder = default_cache_folder()
+    return folder / "ziglang" if os.access(folder, os.W_OK) else _temporary_folder()
+
+
+@cache
+def _temporary_folder() -> Path:
+    return temporary_folder()
+
+
+def _run(compiler: str, options: list[str], seconds: float, purpose: str) -> "subprocess.CompletedProcess[str]":
     """Run a compiler; at the time limit, or if this process is interrupted, kill it and its child processes.
 
     Raises:
         MachineError: It does not run, or exceeds the time limit.
     """
-    pipe, null = subprocess.PIPE, subprocess.DEVNULL  # a compiler that reads a terminal would be stopped
-    try:
-        process = subprocess.Popen(
-            command, stdin=null, stdout=pipe, stderr=pipe, text=True, errors="replace", process_group=0
-        )
+    command, pipe = [*shlex.split(compiler), *options], subprocess.PIPE
+    environment = {"ZIG_GLOBAL_CACHE_DIR": str(_zig_folder()), **os.environ}
+    texts: dict[str, Any] = {"stdout": pipe, "stderr": pipe, "text": True, "errors": "replace"}
+    try:  # a compiler that reads a terminal would be stopped
+        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, process_group=0, env=environment, **texts)
     except OSError as error:
-        raise MachineError(f"the C compiler {command[0]} does not run: {error}") from error
+        raise MachineError(f"the C compiler {compiler} does not run: {error}") from error
     with process:
         _running.add(process)
         try:
-            out, errors = _outputs(process, command[0], seconds, purpose)
+            out, errors = _outputs(process, compiler, seconds, purpose)
         except BaseException as error:
             _kill(process)
             if isinstance(error, subprocess.TimeoutExpired):
                 hint = "set CC to another compiler, or choose the NumPy backend"
                 raise MachineError(
-                    f"the C compiler {command[0]} took more than {seconds:g} s {purpose}: {hint}"
+                    f"the C compiler {compiler} took more than {seconds:g} s {purpose}: {hint}"
                 ) from error
             raise
         finally:
@@ -161,9 +175,9 @@ def run_compiler(compiler: str, level: str, source: Path, built: Path) -> None:
     Raises:
         MachineError: The compiler fails, or takes too long for the size of the source.
     """
-    command = [*shlex.split(compiler), *flags_of(level), str(source), "-o", str(built), "-lm"]
+    options = [*flags_of(level), str(source), "-o", str(built), "-lm"]
     seconds = min(MIN_COMPILE_LIMIT_S + round(LIMIT_S_PER_BYTE * source.stat().st_size), MAX_COMPILE_TIME_S)
-    completed = _run(command, seconds, f"for {source.name}")
+    completed = _run(compiler, options, seconds, f"for {source.name}")
     if completed.returncode != 0 or not built.exists():
         errors = completed.stderr
         first = next((line for line in errors.splitlines() if "error" in line), errors.strip()[:200])

@@ -85,7 +85,9 @@ class SolvedScenes:
     def _explain(self, index: int) -> Explanation:
         """Explain why a scene is not solved; obstacles have the names of the scene, not those of the plans' problem."""
         problem, robot = open_problem(self.plans.problem)
-        own = (obstacle for obstacle in problem.obstacle if obstacle.position != PARKED_POSITION_M)
+        own = [obstacle for obstacle in problem.obstacle if obstacle.position != PARKED_POSITION_M]
+        names = {obstacle.name for obstacle in self.scenes[index].obstacles}
+        own = [replace(each, name=f"{each.name} of the problem") if each.name in names else each for each in own]
         problem = replace(problem, obstacle=(*own, *self.scenes[index].obstacles))
         scene = Scene(problem.obstacle, place_obstacles(problem.obstacle)[None])
         return explain_failure(problem, robot, self.plans.boundary[index : index + 1], scene)

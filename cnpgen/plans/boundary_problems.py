@@ -99,7 +99,7 @@ def scene_columns(
 
 
 def chosen_rows(folder: Path, spec: DatasetSpec, *, split: str, start: int, n: int | None) -> range:
-    """Return the range of n rows of a split from a first one on; by default all that follow.
+    """Return n rows of a split from ``start`` on as a range; by default all remaining rows.
 
     Raises:
         UsageError: The split or the rows do not exist.

@@ -128,7 +128,7 @@ def _boundary(
 def _snapped(
     snapper: StateSnapper, state: State, end: End, given: Sequence[bool], allowed: float
 ) -> tuple[State, float]:
-    """Snap a state, without its estimated derivatives, those that are not given, if they prevent it.
+    """Snap a state; estimated derivatives that prevent this are omitted, given ones are kept.
 
     Return it with its change [rad]; or as it is, with nan, if a change above the allowed one is necessary.
     """

@@ -302,11 +302,6 @@ class RobotModel:
         return names, lower, upper, tolerance
 
 
-def load_robot_model(problem: Problem | StoredProblem | str | Path, *, backend: str | None = None) -> RobotModel:
-    """Load the robot of a problem; see ``RobotModel`` for arguments and errors."""
-    return RobotModel(problem, backend=backend)
-
-
 def tip_pose(robot: Robot) -> Any:
     """Build ``q -> (p, R, J)``: position, rotation row by row, and geometric Jacobian row by row of the tip."""
     import casadi as ca

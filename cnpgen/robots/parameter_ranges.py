@@ -113,7 +113,7 @@ class ParameterRanges:
         return len(self.names)
 
     def nominal(self, values: Mapping[str, float]) -> Array:
-        """Return the values of a sample without parameters, shape (width,); those of the problem file by name."""
+        """Return the parameters of a sample that gives none, shape (width,); ``values`` are those of the problem."""
         factors = ("velocity_factor", "acceleration_factor", "payload_inertia")
         nominal = dict.fromkeys(self.names, 0.0) | dict.fromkeys(factors, 1.0) | dict(values)
         return np.array([nominal[name] for name in self.names], np.float64)

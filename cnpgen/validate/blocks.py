@@ -23,7 +23,7 @@ MAX_REGENERATION_ERROR_FLOAT32 = 1e-5  # in SI units; accepted difference of row
 
 @dataclass(frozen=True)
 class Regeneration:
-    """Numbers of regenerated blocks, of all, and of bitwise identical ones, and differences above the tolerance."""
+    """Numbers of regenerated, of all and of bitwise identical blocks, and the differences above the tolerance."""
 
     made: int = 0
     blocks: int = 0

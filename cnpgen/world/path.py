@@ -80,7 +80,7 @@ class PathWorld:
         """Move to K states.
 
         Args:
-            q: Joint positions [rad], shape (n, K), K > 0, as of velocities, accelerations and jerks.
+            q: Joint positions [rad], shape (n, K), K > 0; the other arrays of joints have the same shape.
             dq: Joint velocities [rad/s].
             ddq: Joint accelerations [rad/s^2].
             obstacle_poses: Poses and sizes of the obstacles (``cnpgen.robots.solid``), then values for a constraint,

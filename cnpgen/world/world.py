@@ -63,7 +63,16 @@ class World:
         self.set_state(robot.base, zero, zero, place_obstacles(obstacles))
 
     def set_state(self, q: Array, dq: Array, ddq: Array, obstacle_poses: Array, jerk: Array | None = None) -> None:
-        """Move to a state, of shape (n,) each; see ``PathWorld.set_path``. A state without jerk has None."""
+        """Move to a state.
+
+        Args:
+            q: Joint positions [rad], shape (n,).
+            dq: Joint velocities [rad/s], shape (n,).
+            ddq: Joint accelerations [rad/s^2], shape (n,).
+            obstacle_poses: Poses and sizes of the obstacles (``cnpgen.robots.solid``), then values for a constraint,
+                then the parameters of the problem, shape (width,).
+            jerk: Joint jerks [rad/s^3], shape (n,), if the state has any.
+        """
         import pinocchio as pin
 
         self.q, self.dq, self.ddq, self.jerk = q, dq, ddq, jerk

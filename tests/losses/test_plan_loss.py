@@ -411,3 +411,13 @@ def test_threads_change_no_result():
         assert np.array_equal(values, getattr(two, name))
     with pytest.raises(CnpgenError, match="threads"):
         PlanLoss("airhockey", threads=0)
+
+
+@pytest.mark.parametrize("form", ["signed", "paper"])
+def test_a_problem_without_its_obstacles_has_no_loss_of_distances(form):
+    problem = PROBLEMS["heavy-object"].with_obstacles(())
+    loss, spec = PlanLoss(problem, form=form, backend="numpy", nodes=4), problem.trajectory
+    path = np.zeros((1, spec.path_control_points, 7))
+    value = loss(path, np.ones((1, spec.rate_control_points)), weights=loss.weights0)
+    terms = dict(zip(loss.terms, value.terms[0].tolist(), strict=True))
+    assert terms["robot-clearance"] == terms["object-contact"] == 0

@@ -134,15 +134,29 @@ def test_the_compiler_of_a_package_is_used_if_there_is_no_other(monkeypatch, tmp
     (tmp_path / "ziglang" / "__main__.py").write_text(program, encoding="utf-8")
     (tmp_path / "ziglang" / "__init__.py").touch()
     find_compiler.cache_clear()
-    for variable, value in (("PATH", ""), ("PYTHONPATH", str(tmp_path)), ("CNPGEN_CACHE", str(tmp_path / "cache"))):
+    for variable, value in (
+        ("PATH", "/none"),
+        ("PYTHONPATH", str(tmp_path)),
+        ("CNPGEN_CACHE", str(tmp_path / "cache")),
+    ):
         monkeypatch.setenv(variable, value)
     monkeypatch.delenv("CC", raising=False)
-    assert find_compiler() is None
-    find_compiler.cache_clear()
     monkeypatch.syspath_prepend(tmp_path)
     report = check_machine()
     assert report.compiler.startswith(sys.executable)
     assert report.backend == "compiled"
+
+
+@pytest.mark.extended
+def test_the_compiler_of_ziglang_compiles_without_a_home_folder(monkeypatch, tmp_path, fresh_compiler):
+    pytest.importorskip("ziglang")
+    monkeypatch.delenv("CC", raising=False)
+    for variable, value in (("PATH", ""), ("HOME", "/dev/null/none"), ("CNPGEN_CACHE", str(tmp_path / "cache"))):
+        monkeypatch.setenv(variable, value)
+    report = check_machine()
+    assert "ziglang" in report.compiler
+    assert report.backend == "compiled"
+    assert list((tmp_path / "cache" / "ziglang").iterdir())
 
 
 def test_an_unwritable_cache_is_a_note_and_nothing_is_left_behind(monkeypatch, tmp_path):

@@ -164,7 +164,10 @@ def _product(a: Array, b: Array) -> Array:
 
 @cache
 def _products(i: int, j: int) -> Array:
-    """Return the matrix from coefficients to a matrix of multiplication, shape (j + 1, (i + j + 1) (i + 1))."""
+    """Return the matrix that maps coefficients of a factor to the matrix that multiplies by it.
+
+    Its shape is (j + 1, (i + j + 1) (i + 1)).
+    """
     matrix = np.zeros((j + 1, i + j + 1, i + 1))
     for k in range(i + 1):
         for m in range(j + 1):

@@ -40,7 +40,7 @@ MAX_OBJECT_DEPTH_M = 0.02
 def paper_rule(problem: Problem, world: PathWorld, obstacle_poses: Array, goal_xyz: Array) -> PaperRule:
     """Judge one motion by the paper's rules; the world is at its samples.
 
-    Poses and sizes of the obstacles have shape (width,), the tip position of the goal [m] (3,).
+    ``obstacle_poses`` has shape (width,); ``goal_xyz`` is the position of the tip at the goal [m], shape (3,).
     """
     finished = bool(np.linalg.norm(world.tip_position[:, -1] - goal_xyz) < MAX_GOAL_DISTANCE_M)
     broken = tuple(reason for reason, ok in _checks(problem, world, obstacle_poses) if not ok)

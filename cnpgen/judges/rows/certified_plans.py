@@ -18,7 +18,7 @@ from cnpgen.trajectory.spline_motion import Motion
 
 @dataclass(frozen=True)
 class PlanCheck:
-    """Numbers of plans in rows of a certified dataset and of valid ones, and error messages, one line each."""
+    """Number of plans in rows of a certified dataset, number of valid ones, and error messages of one line."""
 
     judged: int = 0
     valid: int = 0

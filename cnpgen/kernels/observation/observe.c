@@ -191,15 +191,17 @@ static int patches_of(const primitive *b, patch *p) {
 /* Write n points of a patch: a Kronecker sequence of two irrational steps from a random start. */
 static void scatter(const patch *p, uint64_t start, long n, float *out) {
   uint32_t first = start >> 32, second = start;
-  float x[BLOCK], y[BLOCK], z[BLOCK];
+  float x[BLOCK], y[BLOCK], z[BLOCK], limit = p->form == 4 ? 1.0f : 3.0f; /* of u + v in a triangle */
+  int flat = p->form == 0 || p->form == 4;
   for (long done = 0; done < n; done += BLOCK) {
     long count = n - done < BLOCK ? n - done : BLOCK;
     EACH(i, 0, count) {
       uint32_t k = done + i;
       float u = (float)(int32_t)((first + k * 3242174889u) >> 8) * UNIT;
       float v = (float)(int32_t)((second + k * 2447445414u) >> 8) * UNIT;
-      if (p->form == 0 || p->form == 4) {
-        if (p->form == 4 && u > 1 - v) u = 1 - u, v = 1 - v; /* the other half of the parallelogram */
+      if (flat) {
+        int far = u > limit - v;
+        u = far ? 1 - u : u, v = far ? 1 - v : v;
         x[i] = p->base[0] + u * p->U[0] + v * p->V[0];
         y[i] = p->base[1] + u * p->U[1] + v * p->V[1];
         z[i] = p->base[2] + u * p->U[2] + v * p->V[2];
@@ -226,8 +228,8 @@ void scene_clouds(const scene_arrays *a, const uint64_t *seed, long count, float
   EACH(scene, 0, a->scenes) {
     long sum = 0;
     EACH(body, 0, a->bodies) {
-      primitive b = primitive_of(a, scene * a->bodies + body);
-      sum += b.kind >= MESH ? b.triangles : MAX_PATCHES;
+      long mesh = a->kind[scene * a->bodies + body] - MESH;
+      sum += mesh >= 0 ? a->first_triangle[mesh + 1] - a->first_triangle[mesh] : MAX_PATCHES;
     }
     most_patches = sum > most_patches ? sum : most_patches;
   }

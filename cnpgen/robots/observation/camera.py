@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 
 MAX_PIXELS = 4096  # of one side of an image
 MIN_VIEW_DISTANCE_M = 1e-6
+MIN_RAY = 1e-9  # of the coordinates of a ray
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,6 +79,7 @@ def depth_image(primitives: Primitives, camera: Camera) -> Array:
         rotation, size = primitives.rotations[index], primitives.sizes[index]
         origin = (np.array(camera.position) - primitives.centers[index]) @ rotation
         mesh, local = primitives.mesh(index), rays @ rotation
+        local[np.abs(local) < MIN_RAY] = MIN_RAY  # rays along a face
         hits = [mesh.entries(origin, local)] if mesh else _hits(KINDS[primitives.kinds[index]], size, origin, local)
         for hit in hits:
             depth = np.where((hit > 0) & (hit < depth), hit, depth)

@@ -69,9 +69,7 @@ class ConvexMesh:
             with np.errstate(all="ignore"):
                 crossing = -(plane[:3] @ origin + plane[3]) / speed
             enter = np.where(speed < 0, np.fmax(enter, crossing), enter)
-            leave = np.where(speed > 0, np.fmin(leave, crossing), leave)
-            if plane[:3] @ origin + plane[3] > 0:
-                leave = np.where(speed == 0, -np.inf, leave)  # rays along a face, outside of it
+            leave = np.where(speed < 0, leave, np.fmin(leave, crossing))  # -inf for rays along a face, outside of it
         return np.where(enter <= leave, enter, np.nan)
 
 

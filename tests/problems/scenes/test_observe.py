@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from cnpgen.errors import UsageError
+from cnpgen.kernels.observation.compiled_observations import observation_backend
 from cnpgen.loader.batch import Batch
 from cnpgen.loader.load import load_dataset
 from cnpgen.problems.obstacles import scene_of
@@ -16,7 +17,7 @@ from cnpgen.robots.observation.primitives import KINDS, bodies_of
 from cnpgen.robots.observation.signed_distance import signed_distances
 from cnpgen.robots.scene import PARKED_POSITION_M, Scene
 from cnpgen.robots.shape.convex_part import turned
-from cnpgen.robots.shape.hull import coal_hull
+from cnpgen.robots.shape.hull import CUBE, coal_hull
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.scenes import (
     BasisPoints,
@@ -138,6 +139,24 @@ def test_a_camera_sees_the_nearest_surface_only() -> None:
         assert signed_distances(bodies, before).min() > 0
     cloud = observe([scenes()[1]], CameraCloud(points=300, camera=CAMERA))["camera_cloud"][0]
     assert np.abs(signed_distances(bodies, cloud.astype(float)).min(axis=0)).max() < 1e-5
+
+
+@pytest.mark.parametrize("backend", [pytest.param("compiled", marks=needs_compiler), "numpy"])
+@pytest.mark.parametrize("shift", [(0.0, 0.3, 0.0), (0.0, 0.0, 0.2), (0.1, 0.1, -0.1)])
+def test_a_mesh_is_seen_as_the_box_of_its_corners_also_along_its_faces(backend: str, shift: tuple[float, ...]) -> None:
+    """The rows and columns of a camera along an axis contain rays that are parallel to faces."""
+    along = Camera(position=(1.5, 0.0, 0.0), target=(0.0, 0.0, 0.0), width=33, height=33, field_of_view=1.0)
+    for turn in ((0.0, 0.0, 0.0), (0.4, 0.0, 0.0), (np.pi / 4, 0.0, 0.0), (2.0, 0.0, 0.0), (0.3, 0.2, 0.1)):
+        box = Obstacle(name="box", kind="box", position=tuple(shift), size=(0.6, 0.5, 0.4), rotation=turn)
+        mesh = make_mesh("mesh", CUBE * box.size @ turned(*turn).T, np.array(shift), np.eye(3), place="")
+        images = [observation_backend(backend).depth_images(scene_bodies([(each,)]), along) for each in (box, mesh)]
+        seen = np.isfinite(images[0]) & np.isfinite(images[1])
+        assert seen.sum() > 40
+        np.testing.assert_allclose(images[1][seen], images[0][seen], atol=1e-5)
+        inner = np.isfinite(images[0][0, 1:-1, 1:-1])
+        around = sum(np.isfinite(images[0][0, 1 + i : 32 + i, 1 + j : 32 + j]) for i in (-1, 0, 1) for j in (-1, 0, 1))
+        assert np.isfinite(images[1][0, 1:-1, 1:-1])[inner & (around == 9)].all()  # no holes
+        assert not np.isfinite(images[1][0, 1:-1, 1:-1])[~inner & (around == 0)].any()
 
 
 def test_a_wall_hides_what_is_behind_it() -> None:
