@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.errors import UsageError
-from cnpgen.kernels.collision.clearance_loss import ClearanceLoss
+from cnpgen.kernels.collision.clearance_loss import load_clearance_loss
 from cnpgen.kernels.library import KernelLibrary
 from cnpgen.losses.plan_batch import PlanBatch
 from cnpgen.losses.quadrature import BasisTable
@@ -35,7 +35,6 @@ class HullLoss:
 
     Raises:
         UsageError: The problem has no constraint ``robot-clearance``, or its robot no link geometry.
-        MachineError: Kernels are not compiled on this machine.
     """
 
     def __init__(self, problem: Problem, robot: Robot, kernels: KernelLibrary, tightening: Array) -> None:
@@ -44,7 +43,7 @@ class HullLoss:
             raise UsageError(f"the problem {problem.name!r} has no constraint robot-clearance", concerns="problem")
         index = problem.constraint.index(constraint)
         inset = float(tightening[len(problem.constraint) + index])
-        self._problem, self._losses = problem, ClearanceLoss(kernels, robot)
+        self._problem, self._losses = problem, load_clearance_loss(kernels, robot)
         self._term = 1 + index  # the task loss is the first one
         self._required = constraint.distance + TRAINING_DISTANCE_M + inset  # m
 

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from cnpgen.kernels.collision.clearance_loss import ClearanceLoss
+from cnpgen.kernels.collision.clearance_loss import load_clearance_loss
+from cnpgen.kernels.collision.clearance_loss_reference import ClearanceLossReference
 from cnpgen.kernels.collision.collision_checker import CollisionChecker, load_collision_library
 from cnpgen.kernels.library import KernelLibrary, choose_backend
 from cnpgen.losses.plan_loss import PlanLoss
@@ -44,7 +45,7 @@ def states(robot, count: int) -> np.ndarray:
 def test_losses_of_states_are_those_of_measured_distances(problem):
     robot, kernels = load_robot(problem), KernelLibrary(*choose_backend("compiled"), "")
     q, bodies = states(robot, 200), scene_primitives([SCENE])
-    losses, gradients = ClearanceLoss(kernels, robot)(q[:, :, None], bodies, REQUIRED)
+    losses, gradients = load_clearance_loss(kernels, robot)(q[:, :, None], bodies, REQUIRED)
     checker = CollisionChecker(load_collision_library(kernels), robot)
     checker.place(SCENE, place_obstacles(SCENE))
     close = checker.close_bodies(q.T, REQUIRED, of_obstacles=True)
@@ -54,9 +55,34 @@ def test_losses_of_states_are_those_of_measured_distances(problem):
         losses[:, 0], expected, rtol=2e-2, atol=1e-5
     )  # cylinders there contain the judges' prism
     step, e = np.random.default_rng(1).normal(size=q.shape), 1e-6
-    above, below = (ClearanceLoss(kernels, robot)((q + s * e * step)[:, :, None], bodies, REQUIRED)[0] for s in (1, -1))
+    above, below = (
+        load_clearance_loss(kernels, robot)((q + s * e * step)[:, :, None], bodies, REQUIRED)[0] for s in (1, -1)
+    )
     numeric, analytic = (above - below)[:, 0] / (2 * e), (gradients[:, :, 0] * step).sum(axis=1)
     assert np.percentile(np.abs(numeric - analytic), 95) < 1e-6  # normals of deep contacts may jump
+
+
+def test_losses_of_states_are_those_of_pinocchio_and_coal(problem):
+    robot, kernels = load_robot(problem), KernelLibrary(*choose_backend("compiled"), "")
+    q, obstacles = states(robot, 120).T.reshape(1, robot.n, 120), scene_primitives([SCENE] * 100 + [SCENE[:2]] * 20)
+    q[0, 0, 7] = np.nan
+    losses, gradients = load_clearance_loss(kernels, robot)(q, obstacles, REQUIRED)
+    expected, slopes = ClearanceLossReference(robot)(q, obstacles, REQUIRED)
+    assert (expected > 0).mean() > 0.1
+    np.testing.assert_allclose(losses, expected, rtol=1e-4, atol=1e-7)
+    error = np.abs(gradients - slopes).max(axis=1)
+    assert np.nanpercentile(error, 95) < 1e-4  # normals of deep contacts may differ
+    assert np.isnan(losses[0, 7]) and np.isnan(expected[0, 7])
+
+
+def test_without_compiled_kernels_the_loss_of_plans_is_the_same(problem):
+    full = with_capacity(problem.with_obstacles(()), dict.fromkeys(map(shape_of, SCENE), 1))
+    poses, (path, rate) = np.stack([scene_poses(full, SCENE)] * 4), plans(full, 4)
+    values = [PlanLoss(full, dtype="float64", nodes=16, backend=backend) for backend in ("compiled", "numpy")]
+    compiled, interpreted = (loss(path, rate, weights=loss.weights0, obstacle_poses=poses) for loss in values)
+    np.testing.assert_allclose(interpreted.terms, compiled.terms, rtol=1e-4, atol=1e-7)
+    difference = np.abs(interpreted.path_gradient - compiled.path_gradient).max()
+    assert difference < 1e-2 * np.abs(compiled.path_gradient).max()
 
 
 def scene_poses(full, obstacles) -> np.ndarray:

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.errors import MachineError, UsageError
+from cnpgen.errors import UsageError
 from cnpgen.kernels.collision.body_arrays import hull_vertices
+from cnpgen.kernels.collision.clearance_loss_reference import ClearanceLossReference
 from cnpgen.kernels.collision.collision_checker import MAX_JOINTS, CollisionChecker, load_collision_library
 from cnpgen.kernels.compiled_kernel import address_of
 from cnpgen.kernels.library import KernelLibrary
@@ -29,23 +30,28 @@ class _SampleObstacles(ctypes.Structure):
     )
 
 
+def load_clearance_loss(kernels: KernelLibrary, robot: Robot) -> "ClearanceLoss | ClearanceLossReference":
+    """Load the losses of a robot, by Pinocchio and Coal where kernels are not compiled.
+
+    Raises:
+        UsageError: The robot has no link geometry, or too many joints.
+    """
+    if robot.shape is None or robot.n > MAX_JOINTS:
+        text = f"losses of the distances of hulls need link geometry and at most {MAX_JOINTS} joints"
+        raise UsageError(text, concerns="problem")
+    library = load_collision_library(kernels, SOURCES)
+    return ClearanceLossReference(robot) if library is None else ClearanceLoss(library, robot)
+
+
 class ClearanceLoss:
     """Losses of states of one robot among obstacles that differ from sample to sample.
 
-    Raises:
-        MachineError: Kernels are not compiled on this machine.
-        UsageError: The robot has no link geometry, or too many joints.
+    Args:
+        library: Library of ``SOURCES``.
+        robot: The robot, with link geometry.
     """
 
-    def __init__(self, kernels: KernelLibrary, robot: Robot) -> None:
-        library = load_collision_library(kernels, SOURCES)
-        if library is None:
-            raise MachineError("losses of the distances of hulls need a C compiler ('cnpgen docs troubleshooting')")
-        if robot.shape is None or robot.n > MAX_JOINTS:
-            raise UsageError(
-                f"losses of the distances of hulls need link geometry and at most {MAX_JOINTS} joints",
-                concerns="problem",
-            )
+    def __init__(self, library: ctypes.CDLL, robot: Robot) -> None:
         library.clearance_losses.restype = None
         library.clearance_losses.argtypes = (
             c_void_p, c_void_p, c_long, c_long, c_void_p, c_double, c_void_p, c_void_p,

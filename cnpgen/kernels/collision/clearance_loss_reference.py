@@ -1,0 +1,94 @@
+"""The losses of ``clearance_loss.c`` by Pinocchio and Coal: their reference, and used without a C compiler."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cnpgen.robots.observation.primitives import KINDS, Primitives, bodies_of
+from cnpgen.robots.observation.signed_distance import smallest_signed_distances
+from cnpgen.robots.robot import Robot
+from cnpgen.robots.shape.convex_part import ConvexPart
+from cnpgen.robots.shape.hull import ball_round, coal_hull
+
+if TYPE_CHECKING:
+    import coal
+
+Array = NDArray[np.float64]
+
+
+class ClearanceLossReference:
+    """Losses of states of one robot with link geometry; see ``ClearanceLoss``, some hundred times faster."""
+
+    def __init__(self, robot: Robot) -> None:
+        assert robot.shape is not None
+        self._robot, self._data = robot, robot.model.createData()
+        self._parts = [_Part(part, robot.shape.joints[part.link]) for part in robot.shape.convex_parts]
+        self._parts = [part for part in self._parts if part.joint]
+
+    def __call__(self, q: Array, obstacles: Primitives, required: float) -> tuple[Array, Array]:
+        """Compute the losses of K states of each of N samples; see ``ClearanceLoss``."""
+        nodes, n, samples = q.shape
+        losses, gradients = np.full((nodes, samples), np.nan), np.full((nodes, n, samples), np.nan)
+        for sample in range(len(obstacles)):
+            bodies = bodies_of(obstacles, sample)
+            shapes = [_shape(bodies, index) for index in range(len(bodies))]
+            for node in np.flatnonzero(np.isfinite(q[:, :, sample]).all(axis=1)).tolist():
+                results = self._loss(q[node, :, sample], bodies, shapes, required)
+                losses[node, sample], gradients[node, :, sample] = results
+        return losses, gradients
+
+    def _loss(
+        self, q: Array, bodies: Primitives, shapes: "list[coal.CollisionGeometry]", required: float
+    ) -> tuple[float, Array]:
+        """Return the loss of one state and its gradient, shape (n,)."""
+        import coal
+        import pinocchio as pin
+
+        model, data = self._robot.model, self._data
+        pin.computeJointJacobians(model, data, q)
+        places = [data.oMi[part.joint] for part in self._parts]
+        centers = np.array([place.act(part.center) for part, place in zip(self._parts, places, strict=True)])
+        clearance = smallest_signed_distances(bodies, centers) - [part.radius for part in self._parts]
+        loss, gradient, request = 0.0, np.zeros(len(q)), coal.DistanceRequest()
+        for index in np.flatnonzero(clearance < required).tolist():
+            part, place = self._parts[index], places[index]
+            jacobian = pin.getJointJacobian(model, data, part.joint, pin.LOCAL_WORLD_ALIGNED)
+            for body, shape in enumerate(shapes):
+                result, there = coal.DistanceResult(), coal.Transform3s(bodies.rotations[body], bodies.centers[body])
+                here = coal.Transform3s(place.rotation, place.translation)
+                distance = coal.distance(shape, there, part.hull, here, request, result) - part.thickness
+                violation = required - distance
+                if violation > 0:
+                    derivative = min(violation, 1.0)
+                    loss += derivative * (violation - 0.5 * derivative)
+                    arm = result.getNearestPoint2() - place.translation
+                    velocity = jacobian[:3] + np.cross(jacobian[3:], arm, axis=0)
+                    gradient -= derivative * result.normal @ velocity
+        return loss, gradient
+
+
+class _Part:
+    """A convex part of a link: its joint, hull, thickness, and a ball around it, in the frame of the joint [m]."""
+
+    def __init__(self, part: ConvexPart, joint: int) -> None:
+        self.joint, self.hull, self.thickness = joint, coal_hull(part.vertices), part.radius
+        self.center, self.radius = ball_round(part.vertices, part.radius)
+
+
+def _shape(bodies: Primitives, index: int) -> "coal.CollisionGeometry":
+    """Return the shape of a body around its center."""
+    import coal
+
+    if mesh := bodies.mesh(index):
+        return coal_hull(mesh.corners)
+    first, second, third = bodies.sizes[index].tolist()
+    match KINDS[bodies.kinds[index]]:
+        case "box":
+            return coal.Box(2 * first, 2 * second, 2 * third)
+        case "sphere":
+            return coal.Sphere(first)
+        case "cylinder":
+            return coal.Cylinder(first, 2 * second)
+        case _:
+            return coal.Capsule(first, 2 * second)
