@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 
 class ClearanceLossReference:
-    """Losses of states of one robot with link geometry; see ``ClearanceLoss``, some hundred times faster."""
+    """Losses of states of one robot with link geometry; ``ClearanceLoss`` computes the same in less time."""
 
     def __init__(self, robot: Robot) -> None:
         assert robot.shape is not None
