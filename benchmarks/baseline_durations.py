@@ -1,7 +1,7 @@
 """Durations of ``solve`` and of RRT-Connect with TOPP-RA in the suite clutter, also once both meet the same limits.
 
 A trajectory of TOPP-RA stands for the cubics through its samples, which exceed limits of acceleration where
-accelerations jump. Slowed down uniformly by the least factor, they meet the limits of velocity, acceleration and torque
+accelerations jump. Scaled in time by the least factor, they meet the limits of velocity, acceleration and torque
 between the samples, too. Their jumps at both ends are not counted.
 
     python benchmarks/baseline_durations.py --problems 0 200
@@ -24,11 +24,11 @@ from cnpgen.problems.problem_record import as_problem, record_problem
 from cnpgen.refine.refine_plans import solve_plans
 from cnpgen.trajectory.sampled_trajectory import Trajectory
 
-MAX_FACTOR, FACTOR_STEPS = 2.0, 12  # of the slowed trajectory; bisections
+MAX_FACTOR, FACTOR_STEPS = 2.0, 12  # of time; bisections
 TIME_LIMIT_S = 600.0
 
 
-def slowed(trajectory: Trajectory, factor: float) -> Trajectory:
+def scaled_in_time(trajectory: Trajectory, factor: float) -> Trajectory:
     assert trajectory.dq is not None
     return Trajectory(trajectory.t * factor, trajectory.q, trajectory.dq / factor)
 
@@ -53,11 +53,11 @@ def least_factor(problem: Plans, trajectory: Trajectory) -> float:
     low, high = 1.0, MAX_FACTOR
     if meets_limits(problem, trajectory):
         return low
-    if not meets_limits(problem, slowed(trajectory, high)):
+    if not meets_limits(problem, scaled_in_time(trajectory, high)):
         return float("nan")
     for _ in range(FACTOR_STEPS):
         factor = (low + high) / 2
-        low, high = (low, factor) if meets_limits(problem, slowed(trajectory, factor)) else (factor, high)
+        low, high = (low, factor) if meets_limits(problem, scaled_in_time(trajectory, factor)) else (factor, high)
     return high
 
 
@@ -73,7 +73,7 @@ def measure(numbers: tuple[int, int], seed: int, simplify_time: float) -> list[d
         if isinstance(baseline, Trajectory) and own.valid[0]:
             factor = least_factor(limits[index : index + 1], baseline)
             rows.append({"problem": index, "solve": own.plans.duration[0], "baseline": baseline.duration, "k": factor})
-            progress(f"problem {index}: {rows[-1]['solve'] / baseline.duration:.4f}, slowed by {factor:.4f}")
+            progress(f"problem {index}: {rows[-1]['solve'] / baseline.duration:.4f}, scaled by {factor:.4f}")
     return rows
 
 
@@ -90,10 +90,10 @@ def main() -> None:
     factors = np.array([row["k"] for row in rows])
     lines = [
         (name, f"{len(ratios)}", f"{np.median(ratios):.3f}", f"{(ratios < 1).sum()}", f"{ratios.max():.4f}")
-        for name, ratios in (("as planned", planned), ("slowed to the limits", planned / factors))
+        for name, ratios in (("as planned", planned), ("scaled to the limits", planned / factors))
     ]
     head = ("baseline", "problems", "median ratio", "solve is shorter", "largest ratio")
-    title = f"Duration of solve relative to the baseline, slowed by {np.median(factors):.3f} in the median"
+    title = f"Duration of solve relative to the baseline, scaled by {np.median(factors):.3f} in the median"
     report({"problems": rows}, [table(title, head, lines)], as_json=options.json)
 
 

@@ -27,7 +27,7 @@ class TensorLoss:
 
     The same operations as those of the compiled loss run in torch, so that results agree to rounding. Gradients are
     those of torch's automatic differentiation, which may be repeated. ``start_tip`` is read on the CPU. Problems whose
-    obstacles samples place (planners of scenes) are refused: their clearance is compiled code only.
+    obstacles samples place (planners of scenes) are refused: their clearance is measured on the CPU.
 
     Args:
         loss: The loss whose problem, nodes, rule, form and margins are used.
