@@ -16,6 +16,7 @@ from cnpgen.problems.scenes.scene_files import save_scenes as save_scenes
 from cnpgen.problems.scenes.scene_problem import GoalPose as GoalPose
 from cnpgen.problems.scenes.scene_problem import SceneError as SceneError
 from cnpgen.problems.scenes.scene_problem import SceneProblem as SceneProblem
+from cnpgen.problems.scenes.scene_problem import make_mesh as make_mesh
 from cnpgen.robots.observation.camera import Camera as Camera
 from cnpgen.robots.observation.observations import BasisPoints as BasisPoints
 from cnpgen.robots.observation.observations import CameraCloud as CameraCloud

@@ -209,7 +209,9 @@ class Planner:
         boundary, columns = boundary_of(self.robot.n, *states, parameters), dict[str, Array]()
         if (poses := plans.columns.get(OBSTACLE_POSES)) is not None:
             columns[OBSTACLE_POSES] = np.broadcast_to(poses, (len(boundary), poses.shape[1]))
-        new = self.plan_batch(boundary, columns=columns)
+        self._check_memory("plans", boundary)
+        check_boundary_units(self.robot, boundary)
+        new = plan_tasks(self, boundary, None, columns)
         times = np.broadcast_to(numbers("time", time), (len(plans),))
         if len(plans) == 1:
             plans, times = plans[np.zeros(len(new), int)], np.repeat(times, len(new))

@@ -22,6 +22,7 @@ from cnpgen.robots.robot import Robot
 from cnpgen.robots.solid import number_slices, place_obstacles, pose_width
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.schema.arguments import numbers
+from cnpgen.schema.units import suggested_unit
 from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]
@@ -126,9 +127,10 @@ def joint_order(scene: SceneProblem, robot: Robot, states: Array, end: str) -> A
     if violation.size and violation.max() > JOINT_TOLERANCE_RAD:
         goal, joint = np.unravel_index(violation.argmax(), violation.shape)
         low, high = robot.position_lower[joint], robot.position_upper[joint]
+        value, unit = float(states[goal, joint]), "m" if robot.sliding[joint] else "rad"
         raise SceneError(
-            f"{scene.place}: {robot.joint_names[joint]} is {states[goal, joint]:.4f} at the {end}, outside of its"
-            f" limits [{low:.4f}, {high:.4f}]"
+            f"{scene.place}: {robot.joint_names[joint]} is {value:.4f} {unit} at the {end}, outside of its limits"
+            f" [{low:.4f}, {high:.4f}] {unit}{suggested_unit(value, unit, low, high)}"
         )
     return np.clip(states, robot.position_lower, robot.position_upper)
 

@@ -150,8 +150,8 @@ class Obstacle:
 
 def invalid_obstacle(obstacles: Iterable[Obstacle]) -> str:
     """Return the first mistake of obstacles, with the name of the obstacle; empty without one."""
-    mistakes = ((each.name, *mistake) for each in obstacles for mistake in each.value_mistakes())
-    return next((f"obstacle {name!r}: {key} {text}" for name, key, text in mistakes), "")
+    mistakes = ((f"obstacle {each.name!r}", *mistake) for each in obstacles for mistake in each.value_mistakes())
+    return next((text if text.startswith(name) else f"{name}: {key} {text}" for name, key, text in mistakes), "")
 
 
 def _listed(keys: Sequence[str]) -> str:

@@ -400,6 +400,7 @@ def _of_scenes(folder: Path) -> list[ValidCall]:
         ValidCall("scene_bodies", scenes.scene_bodies, {"scenes": [scene]}),
         ValidCall("BatchObserver", scenes.BatchObserver, {"kind": "tokens", "scenes": lambda _: [scene]}),
         ValidCall("obstacles_of_points", scenes.obstacles_of_points, {"points": np.eye(3), "radius": 0.01}),
+        ValidCall("make_mesh", scenes.make_mesh, {"name": "rock", "points": np.eye(4, 3)}),
         ValidCall("GoalPose", scenes.GoalPose, {"frame": "", "position": start[:3], "rotation": np.eye(3)}),
         ValidCall("Grasp", scenes.Grasp, _fields(grasp)),
         ValidCall("Layout", scenes.Layout, {"obstacles": (post,), "grasps": (grasp,)}),

@@ -26,6 +26,7 @@ from cnpgen.problems.scenes.scene_problem import (
 from cnpgen.problems.scenes.yaml_document import part, scalar, vector
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.convex_part import turned
+from cnpgen.robots.shape.inline import corners_of
 
 Array = NDArray[np.float64]
 Pose = tuple[Array, Array]  # position [m] and rotation matrix
@@ -227,26 +228,41 @@ def moveit_texts(scene: SceneProblem, joints: Sequence[str]) -> tuple[str, str]:
     """
     lines = [f"name: {_text(scene.name)}", "world:", "  collision_objects:" + ("" if scene.obstacles else " []")]
     for obstacle in scene.obstacles:
-        if obstacle.kind not in _PRIMITIVES.values() or obstacle.position is None:
+        if obstacle.kind not in ("mesh", *_PRIMITIVES.values()) or obstacle.position is None:
             raise SceneError(
                 f"{scene.place}: obstacle {obstacle.name!r} is a {obstacle.kind}, MoveIt has no such shape"
             )
-        dimensions = {
-            "box": list(obstacle.size or ()),
-            "sphere": [obstacle.radius],
-            "cylinder": [obstacle.length, obstacle.radius],
-        }[obstacle.kind]
+        lines += [f"    - id: {_text(obstacle.name)}", *_shape(obstacle)]
         w, x, y, z = quaternion_of(turned(*obstacle.rotation)).tolist()
-        lines += [
-            f"    - id: {_text(obstacle.name)}",
-            "      primitives:",
-            f"        - type: {obstacle.kind}",
-            f"          dimensions: {dimensions}",
-            "      primitive_poses:",
-            f"        - position: {list(obstacle.position)}",
-            f"          orientation: {[x, y, z, w]}",
-        ]
+        lines += [f"        - position: {list(obstacle.position)}", f"          orientation: {[x, y, z, w]}"]
     return "\n".join(lines) + "\n", _request(scene, joints)
+
+
+def _shape(obstacle: Obstacle) -> list[str]:
+    """Return the lines of the shape of an obstacle, up to its pose."""
+    if obstacle.kind == "mesh":
+        corners = corners_of(obstacle.mesh)
+        faces = [f"            - vertex_indices: {triangle}" for triangle in _triangles(corners)]
+        vertices = [f"            - {dict(zip('xyz', corner, strict=True))}" for corner in corners.tolist()]
+        return ["      meshes:", "        - triangles:", *faces, "          vertices:", *vertices, "      mesh_poses:"]
+    dimensions = {
+        "box": list(obstacle.size or ()),
+        "sphere": [obstacle.radius],
+        "cylinder": [obstacle.length, obstacle.radius],
+    }[obstacle.kind]
+    lines = ["      primitives:", f"        - type: {obstacle.kind}", f"          dimensions: {dimensions}"]
+    return [*lines, "      primitive_poses:"]
+
+
+def _triangles(corners: Array) -> list[list[int]]:
+    """Return the triangles of the hull of its corners, counterclockwise seen from outside."""
+    from scipy.spatial import ConvexHull
+
+    hull = ConvexHull(corners)
+    a, b, c = (corners[index] for index in hull.simplices.T)
+    inwards = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(axis=1) < 0
+    triangles: list[list[int]] = np.where(inwards[:, None], hull.simplices[:, ::-1], hull.simplices).tolist()
+    return triangles
 
 
 def _request(scene: SceneProblem, joints: Sequence[str]) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from cnpgen.errors import UsageError
 from cnpgen.problems.scenes.quaternions import quaternion_mistake, roll_pitch_yaw, rotation_matrix
@@ -17,7 +17,8 @@ from cnpgen.robots.obstacle import Obstacle, invalid_obstacle
 from cnpgen.robots.shape.hull import MAX_COORDINATE_M, check_solid, hull_corners
 from cnpgen.robots.shape.inline import address_of, is_inline
 from cnpgen.robots.solid import place_obstacles
-from cnpgen.schema.argument_types import check_fields
+from cnpgen.schema.argument_types import check_fields, checked_arguments
+from cnpgen.schema.arguments import numbers
 from cnpgen.schema.units import PLAUSIBLE_MAX
 
 Array = NDArray[np.float64]
@@ -139,7 +140,15 @@ def make_obstacle(
     return Obstacle(name=name, kind=kind, position=(x, y, z), rotation=turn, radius=radius, length=length)
 
 
-def make_mesh(name: str, points: Array, position: Array, rotation: Array, *, place: str) -> Obstacle:
+@checked_arguments
+def make_mesh(
+    name: str,
+    points: ArrayLike,
+    position: ArrayLike = (0.0, 0.0, 0.0),
+    rotation: ArrayLike = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+    *,
+    place: str = "",
+) -> Obstacle:
     """Build an obstacle from the points of a mesh; it is their convex hull.
 
     Args:
@@ -151,21 +160,33 @@ def make_mesh(name: str, points: Array, position: Array, rotation: Array, *, pla
 
     Raises:
         SceneError: A number is not finite, or the points are not those of a body.
+        UsageError: An argument has another shape.
     """
-    where = f"{place}: obstacle {name!r}"
-    if not len(points):
+    where = f"{place}: obstacle {name!r}" if place else f"obstacle {name!r}"
+    vertices, origin, turn = numbers("points", points), numbers("position", position), numbers("rotation", rotation)
+    if not vertices.size:
         raise SceneError(f"{where} is a mesh without vertices")
-    if not (np.abs([*points.ravel(), *position]) <= MAX_COORDINATE_M).all():
+    shapes = {"points": (vertices, (len(vertices), 3)), "position": (origin, (3,)), "rotation": (turn, (3, 3))}
+    for argument, (values, shape) in shapes.items():
+        if values.shape != shape:
+            raise UsageError(f"must have shape {shape}, got {values.shape}", argument=argument)
+    if not (np.abs([*vertices.ravel(), *origin]) <= MAX_COORDINATE_M).all():
         raise SceneError(f"{where}: points and position must be finite and at most {MAX_COORDINATE_M:g}")
+    if not is_rotation(turn):
+        raise SceneError(f"{where}: its rotation is no rotation matrix: {turn.tolist()}")
     try:
-        corners = hull_corners(points)
+        corners = hull_corners(vertices)
         check_solid(corners)
     except ValueError as error:
         raise SceneError(f"{where}: {error}") from error
-    x, y, z = position.tolist()
-    return Obstacle(
-        name=name, kind="mesh", mesh=address_of(corners), position=(x, y, z), rotation=roll_pitch_yaw(rotation)
-    )
+    x, y, z = origin.tolist()
+    return Obstacle(name=name, kind="mesh", mesh=address_of(corners), position=(x, y, z), rotation=roll_pitch_yaw(turn))
+
+
+def is_rotation(matrix: Array) -> bool:
+    """Return whether a matrix of shape (3, 3) is a rotation up to rounding."""
+    error = np.abs(matrix @ matrix.T - np.eye(3)).max()
+    return bool(error <= MAX_ROTATION_ERROR and np.linalg.det(matrix) > 0)
 
 
 def check_count(count: int, place: str) -> None:
@@ -211,8 +232,7 @@ def checked_scene(scene: SceneProblem) -> SceneProblem:
             raise SceneError(f"{scene.place}: a goal pose has a position, a rotation and tolerances {text}")
         if not (np.abs([*pose.position, *pose.rotation.ravel()]) <= MAX_COORDINATE_M).all():
             raise SceneError(f"{scene.place}: the goal pose has numbers that are not finite or too large")
-        mirrored = float(np.linalg.det(pose.rotation)) < 0
-        if mirrored or np.abs(pose.rotation @ pose.rotation.T - np.eye(3)).max() > MAX_ROTATION_ERROR:
+        if not is_rotation(pose.rotation):
             raise SceneError(
                 f"{scene.place}: the rotation of the goal pose is no rotation matrix: {pose.rotation.tolist()}"
             )

@@ -6,15 +6,17 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+import yaml
 from scipy.spatial.transform import Rotation
 
-from cnpgen.errors import CnpgenError, DatasetError
+from cnpgen.errors import CnpgenError, DatasetError, UsageError
 from cnpgen.problems.scenes.quaternions import quaternion_of, roll_pitch_yaw, rotation_matrix
 from cnpgen.problems.scenes.scene_problem import checked_scene, make_obstacle
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.convex_part import turned
+from cnpgen.robots.shape.hull import CUBE
 from cnpgen.robots.solid import place_obstacles, solids_of
-from cnpgen.scenes import SceneError, SceneProblem, load_scenes, save_scenes
+from cnpgen.scenes import SceneError, SceneProblem, load_scenes, make_mesh, save_scenes
 from tests.examples.scene_files import REQUEST, ROBOMETRICS, SCENE
 
 pytest.importorskip("yaml")
@@ -213,6 +215,35 @@ def test_requests_must_fit_the_joints(tmp_path: Path) -> None:
     (tmp_path / "request0001.yaml").unlink()
     with pytest.raises(SceneError, match="has no request"):
         load_scenes(tmp_path)
+
+
+def test_meshes_are_written_for_moveit_and_read_again(tmp_path: Path) -> None:
+    rock = make_mesh("rock", 0.1 * CUBE[1:] + 0.2, (0.5, 0.1, 0.3), turned(0.1, 0.2, 0.3))
+    joints = tuple(f"joint{index}" for index in range(7))
+    q = np.linspace(-0.5, 0.5, 7)
+    scene = SceneProblem(name="one", obstacles=(rock,), start_q=q, goal_q=q[None] + 0.1, joint_names=joints)
+    save_scenes(tmp_path / "scenes", [scene])
+    (again,) = load_scenes(tmp_path / "scenes")
+    before, after = (solids_of([each], place_obstacles([each]))[0] for each in (rock, again.obstacles[0]))
+    np.testing.assert_allclose(after.low, before.low, atol=1e-12)
+    np.testing.assert_allclose(after.high, before.high, atol=1e-12)
+    document = yaml.safe_load(next((tmp_path / "scenes").glob("scene*")).read_text(encoding="utf-8"))
+    (mesh,) = document["world"]["collision_objects"][0]["meshes"]
+    vertices = np.array([[each[axis] for axis in "xyz"] for each in mesh["vertices"]])
+    a, b, c = (vertices[index] for index in np.array([each["vertex_indices"] for each in mesh["triangles"]]).T)
+    volume = (np.cross(a, b) * c).sum() / 6
+    assert volume == pytest.approx(0.1**3 * (1 - 1 / 6), rel=1e-9)  # positive: all triangles face outwards
+
+
+def test_rotations_of_meshes_are_checked() -> None:
+    for arguments, error, text in (
+        ({"rotation": 2 * np.eye(3)}, SceneError, "no rotation matrix"),
+        ({"position": (0, 0)}, UsageError, r"position must have shape \(3,\)"),
+        ({"points": np.eye(3, 2)}, UsageError, r"points must have shape \(3, 3\), got \(3, 2\)"),
+        ({"points": np.nan * CUBE}, SceneError, "obstacle 'rock': points and position must be finite"),
+    ):
+        with pytest.raises(error, match=text):
+            make_mesh(**{"name": "rock", "points": CUBE} | arguments)
 
 
 def test_meshes_of_moveit_are_hulls_with_composed_poses(tmp_path: Path) -> None:
