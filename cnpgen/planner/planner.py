@@ -165,6 +165,7 @@ class Planner:
         return plan_tasks(self, boundary, sample_id, columns)
 
     @checked_arguments
+    @one_thread()
     def replan(
         self,
         plans: Plans,

@@ -114,6 +114,9 @@ def test_replanning_rejects_plans_of_other_types_and_problems(planner, rows):
         planner.replan(joined, 0.1, **goal)
     with pytest.raises(UsageError, match="the planner is of 'airhockey', the plans are of 'heavy-object'"):
         planner.replan(draw_boundary_problems("heavy-object", 2, seed=1), 0.0, **goal)
+    with pytest.raises(UsageError, match="goal_q must be from") as caught:
+        planner.replan(old, 0.0, goal_q=1e4 * rows.goal_q)
+    assert caught.value.argument == "goal_q"
 
 
 def test_replanning_is_continuous_in_position_velocity_and_acceleration(planner, rows):
