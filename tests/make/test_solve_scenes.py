@@ -86,7 +86,7 @@ def test_joints_are_ordered_by_name_and_checked(crane: Path) -> None:
         scene_plans(problem, [replace(scene, joint_names=(*names[:4], "slew"))])
     with pytest.raises(SceneError, match="scene 'post' has 5 joint positions at the start, the robot has 4"):
         scene_plans(problem, [replace(scene, joint_names=())])
-    with pytest.raises(SceneError, match=r"scene 'post': lift is 2\.7000 at the goal, outside of its limits"):
+    with pytest.raises(SceneError, match=r"scene 'post': lift is 2\.7000 rad at the goal, outside of its limits"):
         scene_plans(problem, [replace(SCENES[0], goal_q=np.array([[0, 2.7, 0, 0]]))])
 
 
