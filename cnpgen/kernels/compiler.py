@@ -104,10 +104,12 @@ def _run(compiler: str, options: list[str], seconds: float, purpose: str) -> "su
         MachineError: It does not run, or exceeds the time limit.
     """
     command, pipe = [*shlex.split(compiler), *options], subprocess.PIPE
-    environment = {"ZIG_GLOBAL_CACHE_DIR": str(_zig_folder()), **os.environ}
+    variables = dict(os.environ)
+    if "ziglang" in command:
+        variables.setdefault("ZIG_GLOBAL_CACHE_DIR", str(_zig_folder()))
     texts: dict[str, Any] = {"stdout": pipe, "stderr": pipe, "text": True, "errors": "replace"}
     try:  # a compiler that reads a terminal would be stopped
-        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, process_group=0, env=environment, **texts)
+        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, process_group=0, env=variables, **texts)
     except OSError as error:
         raise MachineError(f"the C compiler {compiler} does not run: {error}") from error
     with process:

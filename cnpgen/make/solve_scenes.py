@@ -36,7 +36,7 @@ from cnpgen.refine.refine_plans import solve_plans
 from cnpgen.refine.refinement import Refinement
 from cnpgen.refine.task import Attempt
 from cnpgen.robots.robot import Robot
-from cnpgen.robots.scene import PARKED_POSITION_M, Scene
+from cnpgen.robots.scene import Scene
 from cnpgen.robots.solid import place_obstacles
 from cnpgen.schema.argument_types import checked_arguments
 from cnpgen.store.dataset_spec import StoredProblem
@@ -85,10 +85,13 @@ class SolvedScenes:
     def _explain(self, index: int) -> Explanation:
         """Explain why a scene is not solved; obstacles have the names of the scene, not those of the plans' problem."""
         problem, robot = open_problem(self.plans.problem)
-        own = [obstacle for obstacle in problem.obstacle if obstacle.position != PARKED_POSITION_M]
-        names = {obstacle.name for obstacle in self.scenes[index].obstacles}
-        own = [replace(each, name=f"{each.name} of the problem") if each.name in names else each for each in own]
-        problem = replace(problem, obstacle=(*own, *self.scenes[index].obstacles))
+        obstacles = self.scenes[index].obstacles
+        names = {obstacle.name for obstacle in obstacles}
+        own = (
+            replace(each, name=f"{each.name} of the problem") if each.name in names else each
+            for each in problem.own_obstacles
+        )
+        problem = replace(problem, obstacle=(*own, *obstacles))
         scene = Scene(problem.obstacle, place_obstacles(problem.obstacle)[None])
         return explain_failure(problem, robot, self.plans.boundary[index : index + 1], scene)
 

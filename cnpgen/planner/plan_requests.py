@@ -145,10 +145,9 @@ def scene_requests(
             " that was trained on scenes",
             concerns="model",
         )
-    own = tuple(obstacle for obstacle in problem.obstacle if obstacle.position != PARKED_POSITION_M)
     parked = Counter(shape_of(obstacle) for obstacle in problem.obstacle if obstacle.position == PARKED_POSITION_M)
     checked = [checked_scene(scene) for scene in scenes]
-    plans = scene_plans(problem.with_obstacles(own), checked, goals=goals, capacity=parked)
+    plans = scene_plans(problem.with_obstacles(problem.own_obstacles), checked, goals=goals, capacity=parked)
     columns = {OBSTACLE_POSES: plans.columns[OBSTACLE_POSES]}
     return Requests(plans.boundary, plans.sample_id, columns)
 

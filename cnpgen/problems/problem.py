@@ -118,6 +118,11 @@ class Problem:
         return any(obstacle.position == PARKED_POSITION_M for obstacle in self.obstacle)
 
     @property
+    def own_obstacles(self) -> tuple[Obstacle, ...]:
+        """The obstacles that samples do not place."""
+        return tuple(obstacle for obstacle in self.obstacle if obstacle.position != PARKED_POSITION_M)
+
+    @property
     def sample_obstacles(self) -> tuple[Obstacle, ...]:
         """The obstacles, with those that stay in place, if samples place some of them; otherwise none."""
         return self.obstacle if self.has_sample_obstacles else ()

@@ -15,6 +15,7 @@ from cnpgen.problems.problem import Problem
 from cnpgen.robots.chain import frame_of
 from cnpgen.robots.robot import Robot
 from cnpgen.robots.shape.convex_part import convex_part_of, origin_of
+from cnpgen.robots.shape.hull import outward_triangles
 from cnpgen.robots.shape.inline import read_mesh, scale_of, sides_of
 from cnpgen.robots.shape.mesh_files import find_named_file
 from cnpgen.robots.urdf import urdf_tree
@@ -69,15 +70,8 @@ def capsule_bodies(robot: Robot) -> list[Body]:
 
 def wrapped(name: str, joint: int, corners: Array, radius: float) -> Body:
     """Return the hull of points [m], shape (V, 3), inflated by a radius [m], as triangles that face outwards."""
-    from scipy.spatial import ConvexHull
-
     points = (corners[:, None] + radius * _ball()).reshape(-1, 3) if radius else corners
-    hull = ConvexHull(points)
-    triangles = hull.simplices.copy()
-    a, b, c = (points[triangles[:, i]] for i in range(3))
-    inwards = np.einsum("fi,fi->f", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
-    triangles[inwards] = triangles[inwards][:, ::-1]
-    used, numbers = np.unique(triangles, return_inverse=True)
+    used, numbers = np.unique(outward_triangles(points), return_inverse=True)
     return Body(name, joint, points[used], numbers.reshape(-1, 3))
 
 

@@ -14,6 +14,8 @@ from cnpgen.robots.shape.hull import ball_round, coal_hull
 if TYPE_CHECKING:
     import coal
 
+    PlacedShape = tuple[coal.CollisionGeometry, coal.Transform3s]
+
 Array = NDArray[np.float64]
 
 
@@ -23,8 +25,8 @@ class ClearanceLossReference:
     def __init__(self, robot: Robot) -> None:
         assert robot.shape is not None
         self._robot, self._data = robot, robot.model.createData()
-        self._parts = [_Part(part, robot.shape.joints[part.link]) for part in robot.shape.convex_parts]
-        self._parts = [part for part in self._parts if part.joint]
+        joints = robot.shape.joints
+        self._parts = [_Part(each, joints[each.link]) for each in robot.shape.convex_parts if joints[each.link]]
 
     def __call__(self, q: Array, obstacles: Primitives, required: float) -> tuple[Array, Array]:
         """Compute the losses of K states of each of N samples; see ``ClearanceLoss``."""
@@ -32,15 +34,13 @@ class ClearanceLossReference:
         losses, gradients = np.full((nodes, samples), np.nan), np.full((nodes, n, samples), np.nan)
         for sample in range(len(obstacles)):
             bodies = bodies_of(obstacles, sample)
-            shapes = [_shape(bodies, index) for index in range(len(bodies))]
+            placed = [_placed_shape(bodies, index) for index in range(len(bodies))]
             for node in np.flatnonzero(np.isfinite(q[:, :, sample]).all(axis=1)).tolist():
-                results = self._loss(q[node, :, sample], bodies, shapes, required)
+                results = self._loss(q[node, :, sample], bodies, placed, required)
                 losses[node, sample], gradients[node, :, sample] = results
         return losses, gradients
 
-    def _loss(
-        self, q: Array, bodies: Primitives, shapes: "list[coal.CollisionGeometry]", required: float
-    ) -> tuple[float, Array]:
+    def _loss(self, q: Array, bodies: Primitives, placed: "list[PlacedShape]", required: float) -> tuple[float, Array]:
         """Return the loss of one state and its gradient, shape (n,)."""
         import coal
         import pinocchio as pin
@@ -54,9 +54,9 @@ class ClearanceLossReference:
         for index in np.flatnonzero(clearance < required).tolist():
             part, place = self._parts[index], places[index]
             jacobian = pin.getJointJacobian(model, data, part.joint, pin.LOCAL_WORLD_ALIGNED)
-            for body, shape in enumerate(shapes):
-                result, there = coal.DistanceResult(), coal.Transform3s(bodies.rotations[body], bodies.centers[body])
-                here = coal.Transform3s(place.rotation, place.translation)
+            here = coal.Transform3s(place.rotation, place.translation)
+            for shape, there in placed:
+                result = coal.DistanceResult()
                 distance = coal.distance(shape, there, part.hull, here, request, result) - part.thickness
                 violation = required - distance
                 if violation > 0:
@@ -74,6 +74,13 @@ class _Part:
     def __init__(self, part: ConvexPart, joint: int) -> None:
         self.joint, self.hull, self.thickness = joint, coal_hull(part.vertices), part.radius
         self.center, self.radius = ball_round(part.vertices, part.radius)
+
+
+def _placed_shape(bodies: Primitives, index: int) -> "PlacedShape":
+    """Return the shape of a body with its pose."""
+    import coal
+
+    return _shape(bodies, index), coal.Transform3s(bodies.rotations[index], bodies.centers[index])
 
 
 def _shape(bodies: Primitives, index: int) -> "coal.CollisionGeometry":

@@ -33,7 +33,7 @@ class _TreeSettings(ctypes.Structure):
 
 @dataclass(frozen=True)
 class TreeSettings:
-    """Settings of a search.
+    """Settings of a search, in the order of ``tree_settings`` of tree_search.c.
 
     Attributes:
         obstacle_distance: Required distance from obstacles [m]; None for no check.

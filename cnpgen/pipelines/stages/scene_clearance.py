@@ -1,5 +1,6 @@
 """Clearance of states in the scenes of a batch, by compiled collision checks, or by Coal without a compiler."""
 
+from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -15,7 +16,6 @@ from cnpgen.problems.constraints.clearance import RobotClearance
 from cnpgen.problems.constraints.self_clearance import SelfClearance
 from cnpgen.problems.problem import Problem
 from cnpgen.robots.obstacle import Obstacle
-from cnpgen.robots.scene import PARKED_POSITION_M
 from cnpgen.robots.solid import place_obstacles, solids_of
 
 Array = NDArray[np.float64]
@@ -25,7 +25,7 @@ Mask = NDArray[np.bool_]
 class _SceneChecker(CollisionChecker):
     """Compiled checks whose obstacles are replaced by arrays of ``BatchScenes.bodies``."""
 
-    def place_fixed(self, obstacles: list[Obstacle]) -> None:
+    def place_fixed(self, obstacles: Sequence[Obstacle]) -> None:
         """Set the obstacles that all scenes have."""
         numbers = place_obstacles(obstacles)
         self.place(obstacles, numbers)
@@ -80,7 +80,7 @@ class SceneClearance:
             self._states = RestingStates(problem, robot)
             return
         self._checker = _SceneChecker(library, robot)
-        self._checker.place_fixed([each for each in self._obstacles if each.position != PARKED_POSITION_M])
+        self._checker.place_fixed(problem.own_obstacles)
 
     def are_clear(
         self, q: Array, scene: NDArray[np.int64], scenes: BatchScenes, margin: float = 0.0, self_margin: float = 0.0

@@ -26,6 +26,7 @@ from cnpgen.problems.scenes.scene_problem import (
 from cnpgen.problems.scenes.yaml_document import part, scalar, vector
 from cnpgen.robots.obstacle import Obstacle
 from cnpgen.robots.shape.convex_part import turned
+from cnpgen.robots.shape.hull import outward_triangles
 from cnpgen.robots.shape.inline import corners_of
 
 Array = NDArray[np.float64]
@@ -242,7 +243,7 @@ def _shape(obstacle: Obstacle) -> list[str]:
     """Return the lines of the shape of an obstacle, up to its pose."""
     if obstacle.kind == "mesh":
         corners = corners_of(obstacle.mesh)
-        faces = [f"            - vertex_indices: {triangle}" for triangle in _triangles(corners)]
+        faces = [f"            - vertex_indices: {triangle}" for triangle in outward_triangles(corners).tolist()]
         vertices = [f"            - {dict(zip('xyz', corner, strict=True))}" for corner in corners.tolist()]
         return ["      meshes:", "        - triangles:", *faces, "          vertices:", *vertices, "      mesh_poses:"]
     dimensions = {
@@ -252,17 +253,6 @@ def _shape(obstacle: Obstacle) -> list[str]:
     }[obstacle.kind]
     lines = ["      primitives:", f"        - type: {obstacle.kind}", f"          dimensions: {dimensions}"]
     return [*lines, "      primitive_poses:"]
-
-
-def _triangles(corners: Array) -> list[list[int]]:
-    """Return the triangles of the hull of its corners, counterclockwise seen from outside."""
-    from scipy.spatial import ConvexHull
-
-    hull = ConvexHull(corners)
-    a, b, c = (corners[index] for index in hull.simplices.T)
-    inwards = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(axis=1) < 0
-    triangles: list[list[int]] = np.where(inwards[:, None], hull.simplices[:, ::-1], hull.simplices).tolist()
-    return triangles
 
 
 def _request(scene: SceneProblem, joints: Sequence[str]) -> str:

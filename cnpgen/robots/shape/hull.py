@@ -53,6 +53,22 @@ def hull_corners(points: Array) -> Array:
     return corners
 
 
+def outward_triangles(points: Array) -> NDArray[np.int64]:
+    """Return the triangles of the convex hull of points as indices, counterclockwise seen from outside, shape (T, 3).
+
+    Args:
+        points: The points [m], shape (V, 3).
+    """
+    from scipy.spatial import ConvexHull
+
+    hull = ConvexHull(points)
+    triangles: NDArray[np.int64] = hull.simplices.astype(np.int64)
+    a, b, c = (points[triangles[:, i]] for i in range(3))
+    inwards = np.einsum("fi,fi->f", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
+    triangles[inwards] = triangles[inwards][:, ::-1]
+    return triangles
+
+
 def enclosing_hull(corners: Array) -> tuple[Array, float]:
     """Return a body with fewer corners that contains a convex hull, and their maximum distance from it [m].
 
