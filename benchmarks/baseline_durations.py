@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from common import arguments, progress, report, table
 
+from cnpgen.benchmark.answers import judge_answer
 from cnpgen.benchmark.benchmark_planner import Setting
-from cnpgen.benchmark.judging import judge_answer
 from cnpgen.benchmark.planners.rrtconnect import RRTConnect
 from cnpgen.benchmark.suite import load_suite
 from cnpgen.plans.format import OBSTACLE_POSES

@@ -17,8 +17,8 @@ import numpy as np
 from common import arguments, progress, report, table
 from numpy.typing import NDArray
 
+from cnpgen.benchmark.answers import execution_of
 from cnpgen.benchmark.benchmark_planner import Setting
-from cnpgen.benchmark.execution import execution_of
 from cnpgen.benchmark.results_file import answer_to_dict
 from cnpgen.benchmark.simulator.challenge import JOINTS, _environment, challenge_plant
 from cnpgen.benchmark.simulator.plant import Plant

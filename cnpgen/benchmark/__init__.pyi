@@ -2,9 +2,9 @@ from cnpgen.benchmark.benchmark_planner import BenchmarkPlanner as BenchmarkPlan
 from cnpgen.benchmark.benchmark_planner import Setting as Setting
 from cnpgen.benchmark.html_report import save_benchmark_report as save_benchmark_report
 from cnpgen.benchmark.paper_figures import save_benchmark_figures as save_benchmark_figures
+from cnpgen.benchmark.pucks import ExecutedPrefix as ExecutedPrefix
 from cnpgen.benchmark.pucks import Pucks as Pucks
-from cnpgen.benchmark.replanning_scenario import ExecutedPrefix as ExecutedPrefix
-from cnpgen.benchmark.replanning_scenario import ReplanningScenario as ReplanningScenario
+from cnpgen.benchmark.pucks import ReplanningScenario as ReplanningScenario
 from cnpgen.benchmark.result_tables import save_benchmark_tables as save_benchmark_tables
 from cnpgen.benchmark.run_record import RunRecord as RunRecord
 from cnpgen.benchmark.run_suite import Benchmark as Benchmark

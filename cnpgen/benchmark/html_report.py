@@ -7,7 +7,7 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cnpgen.benchmark.execution import Task, execution_of
+from cnpgen.benchmark.answers import Task, execution_of
 from cnpgen.benchmark.paper_figures import benchmark_values, distribution_figure, success_figure
 from cnpgen.benchmark.result_tables import failure_summaries, notes, table_rows
 from cnpgen.benchmark.run_suite import Benchmark

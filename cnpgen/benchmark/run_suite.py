@@ -10,14 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from cnpgen.benchmark.answers import execute_answer, judge_answer
 from cnpgen.benchmark.benchmark_planner import Setting, load_planner
-from cnpgen.benchmark.execution import execute_answer
 from cnpgen.benchmark.hypothesis_tests import summarize_results
-from cnpgen.benchmark.judging import judge_answer
 from cnpgen.benchmark.process import PlannerProcess, PlanningOutcome
-from cnpgen.benchmark.replanning_scenario import ExecutedPrefix
-from cnpgen.benchmark.results_file import Results, answer_from_dict
-from cnpgen.benchmark.results_folder import ResultsFolder
+from cnpgen.benchmark.pucks import ExecutedPrefix
+from cnpgen.benchmark.results_file import Results, ResultsFolder, answer_from_dict
 from cnpgen.benchmark.run_record import RunRecord, describe_run, load_runs, save_runs
 from cnpgen.benchmark.simulator.challenge import challenge_plant, check_challenge
 from cnpgen.benchmark.simulator.execute import load_mujoco

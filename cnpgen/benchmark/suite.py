@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from cnpgen.benchmark.pucks import Pucks, hits_of
-from cnpgen.benchmark.replanning_scenario import ExecutedPrefix, ReplanningScenario, scenario_problems
+from cnpgen.benchmark.pucks import ExecutedPrefix, Pucks, ReplanningScenario, hits_of, scenario_problems
 from cnpgen.errors import CnpgenError, nearest
 from cnpgen.make.draw_boundary_problems import draw_boundary_problems
 from cnpgen.make.recipe_file import load_dataset_recipe

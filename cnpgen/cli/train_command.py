@@ -113,7 +113,7 @@ def _command(arguments: argparse.Namespace) -> str:
 
 def _draw(trained: "Trained") -> None:
     """Draw the learning curve where that is possible."""
-    from cnpgen.training.curve import plot_curve
+    from cnpgen.training.log import plot_curve
 
     try:
         plot_curve(trained.model.log, trained.path.with_suffix(".png"))

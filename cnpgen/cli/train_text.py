@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 from cnpgen.cli.progress import Meter
 
 if TYPE_CHECKING:
+    from cnpgen.training.checkpoint import State
     from cnpgen.training.train import Trained
     from cnpgen.training.training_run import Run
-    from cnpgen.training.training_state import State
 
 
 LINE_WIDTH = 100  # of a line

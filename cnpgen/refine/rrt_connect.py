@@ -4,7 +4,7 @@ Kernels check many states of an edge at once against capsules; Coal's hulls deci
 there are equalities, the states of an edge are first projected onto the manifold by Gauss-Newton steps within the joint
 limits (CBiRRT, Berenson et al. 2009). Where compiled code measures hulls, ``tree_paths`` searches instead. Random
 numbers are the same for every task. The refiner adds velocities and accelerations. The tree of
-``benchmark/planners/tree.py`` has states, costs and pruning (SST) and is separate.
+``benchmark/planners/sst.py`` has states, costs and pruning (SST) and is separate.
 """
 
 from collections.abc import Callable, Iterator

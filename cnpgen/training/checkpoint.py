@@ -1,20 +1,176 @@
-"""Checkpoints: the state of a run and its identity, so that no other run resumes from it."""
+"""State of a training run, and its checkpoints: with the identity of the run, so that no other one resumes from it."""
 
 import json
+import math
 import time
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from cnpgen.errors import DatasetError, UsageError
-from cnpgen.store.files.checksum_file import read_with_checksum, write_with_checksum
+from cnpgen.store.files.checksum_file import Content, read_with_checksum, write_with_checksum
+from cnpgen.store.files.document_structure import ANY_KEY, ANYTHING, NUMBER, WHOLE, check_structure
 from cnpgen.store.files.documents import differences, parse_json
-from cnpgen.training.training_state import State, from_content, to_content
+from cnpgen.training.adam import Adam, Clipping, start_adam
 
 CHECKPOINT_KIND, CHECKPOINT_VERSION = "cnpgen-checkpoint", 2
 MIN_INTERVAL_S, MAX_INTERVAL_S = 20.0, 50.0  # wall time between two checkpoints
 INTERVAL_PER_WRITING_TIME = 20.0
+Array = NDArray[Any]
+_ADAM_ARRAYS = ("parameters", "average", "first", "second")
+
+
+@dataclass
+class Sums:
+    """Sums since the last line of the log.
+
+    Attributes:
+        terms: Sum over steps of the terms' means, shape (1 + m,).
+        steps: Number of steps.
+        lost: Number of plans whose loss was not finite.
+        distance: Sum over imitating steps of the mean distance from demonstrations.
+        imitating: Number of imitating steps, not included in ``steps``.
+    """
+
+    terms: Array
+    steps: int = 0
+    lost: int = 0
+    distance: float = 0.0
+    imitating: int = 0
+
+    def add_distances(self, distances: Array) -> None:
+        """Add the distances of a batch of imitating plans, shape (N, 1)."""
+        self.distance += float(distances.mean(dtype=np.float64))
+        self.imitating += 1
+
+    def add(self, terms: Array) -> None:
+        """Add the terms of a batch, shape (N, 1 + m); plans without a finite loss are counted and omitted."""
+        finite: NDArray[np.bool_] = np.asarray(np.isfinite(terms).all(axis=1))
+        if finite.any():
+            self.terms += terms[finite].mean(axis=0, dtype=np.float64)
+        self.lost += int(len(finite) - finite.sum())
+        self.steps += 1
+
+
+@dataclass
+class Best:
+    """The best model so far.
+
+    Attributes:
+        score: Its score, the larger the better; -inf before the first validation.
+        step: Step at which it was validated.
+        parameters: Its parameters, shape (n_parameters,).
+    """
+
+    score: float
+    step: int
+    parameters: Array
+
+
+@dataclass
+class State:
+    """State of a run.
+
+    Attributes:
+        adam: Parameters and averages.
+        clipping: Running norms of gradients.
+        sums: Sums for the log.
+        best: The best model so far.
+        steps: Number of steps of the run.
+        imitating: Number of imitating steps, at the beginning.
+        metric: State of the metric, JSON-able.
+        seconds: CPU time of all steps [s].
+        checking: CPU time of validation [s].
+        log: Lines of the log so far.
+    """
+
+    adam: Adam
+    clipping: Clipping
+    sums: Sums
+    best: Best
+    steps: int
+    imitating: int = 0
+    metric: Mapping[str, Any] = field(default_factory=dict)
+    seconds: float = 0.0
+    checking: float = 0.0
+    log: list[str] = field(default_factory=list)
+
+    def progress(self, step: int) -> float:
+        """Return the fraction of the run that is done at a step, without imitating steps; in [0, 1]."""
+        return max(step - self.imitating, 0) / (self.steps - self.imitating)
+
+
+def start_state(parameters: Array, *, terms: int, steps: int, imitation: float = 0.0) -> State:
+    """Return the initial state of a run.
+
+    Args:
+        parameters: Initial parameters.
+        terms: Number of the loss's terms.
+        steps: Number of steps of the run.
+        imitation: Fraction of imitating steps.
+    """
+    best = Best(-math.inf, 0, parameters.copy())
+    return State(start_adam(parameters), Clipping(), Sums(np.zeros(terms)), best, steps, int(imitation * steps))
+
+
+def to_content(state: State) -> Content:
+    """Convert a state to arrays and texts."""
+    adam, best = state.adam, state.best
+    arrays = {name: getattr(adam, name) for name in _ADAM_ARRAYS}
+    numbers = {
+        "step": adam.step,
+        "steps": state.steps,
+        "imitating": state.imitating,
+        "clipping": asdict(state.clipping),
+        "metric": dict(state.metric),
+        "sums": {name: value for name, value in vars(state.sums).items() if name != "terms"},
+        "best": {"score": best.score, "step": best.step},
+        "seconds": state.seconds,
+        "checking": state.checking,
+    }
+    texts = {"numbers": json.dumps(numbers, indent=1), "log": "\n".join(state.log)}
+    return Content({**arrays, "best": best.parameters, "terms": state.sums.terms}, texts)
+
+
+_FORM = {
+    **dict.fromkeys(("step", "steps", "imitating"), WHOLE),
+    **dict.fromkeys(("seconds", "checking"), NUMBER),
+    "clipping": {"sample": NUMBER, "batch": NUMBER},
+    "metric": {ANY_KEY: ANYTHING},
+    "sums": {"steps": WHOLE, "lost": WHOLE, "distance": NUMBER, "imitating": WHOLE},
+    "best": {"score": NUMBER, "step": WHOLE},
+}
+
+
+def from_content(content: Content) -> State:
+    """Make a state from arrays and texts.
+
+    Raises:
+        KeyError: A key is missing.
+        TypeError: A key is unknown to this version.
+        ValueError: A value is invalid.
+    """
+    numbers, arrays = parse_json(content.texts["numbers"]), content.arrays
+    check_structure(numbers, _FORM)
+    best, shapes = numbers["best"], {arrays[name].shape for name in (*_ADAM_ARRAYS, "best")}
+    if len(shapes) > 1 or len(shapes.pop()) != 1 or arrays["terms"].ndim != 1:
+        raise ValueError("its arrays do not belong to one network")
+    return State(
+        Adam(**{name: np.array(arrays[name]) for name in _ADAM_ARRAYS}, step=numbers["step"]),
+        Clipping(**numbers["clipping"]),
+        Sums(np.array(arrays["terms"]), **numbers["sums"]),
+        Best(best["score"], best["step"], np.array(arrays["best"])),
+        numbers["steps"],
+        numbers["imitating"],
+        numbers["metric"],
+        numbers["seconds"],
+        numbers["checking"],
+        content.texts["log"].splitlines(),
+    )
 
 
 class Checkpoints:

@@ -1,5 +1,6 @@
-"""Set up a run: rows, kernels, loss and network; determine its number of steps."""
+"""Set up a run: rows, kernels, loss, network and validation; determine its number of steps."""
 
+import math
 import time
 from dataclasses import asdict, replace
 from typing import Any
@@ -17,18 +18,20 @@ from cnpgen.planner.model import Model, ModelConfig, is_rest_to_rest
 from cnpgen.planner.network.architecture import Architecture, initial_parameters
 from cnpgen.planner.network.features import SCENE, Features, count_features, feature_blocks, published_features
 from cnpgen.planner.projection import make_projection
+from cnpgen.plans.evaluate import evaluate_plans
+from cnpgen.plans.format import OBSTACLE_POSES
 from cnpgen.schema.memory import check_memory
 from cnpgen.store.files.documents import plain
+from cnpgen.training.checkpoint import State, start_state
 from cnpgen.training.data import TrainingData
-from cnpgen.training.score import validate
 from cnpgen.training.settings import Length, TrainingSettings
 from cnpgen.training.step import Learner
 from cnpgen.training.training_rows import Rows, TrainingProblems, prepare_rows, zero_conditions
 from cnpgen.training.training_run import Run
-from cnpgen.training.training_state import State, start_state
 from cnpgen.trajectory.boundary import Boundary
 
 WARM_UP_STEPS, TIMED_STEPS = 10, 50  # to measure the time of a step
+MEANS = ("duration_s", "z_error_mm_s", "vertical_error_rad_s")
 
 
 def prepare_run(
@@ -240,3 +243,39 @@ def _step_seconds(run: Run) -> float:
         times.append(time.process_time() - started)
     run.metric.load_state(metric)
     return float(np.median(times[WARM_UP_STEPS:]))
+
+
+def validate(
+    model: Model, inference: InferencePipeline, problems: TrainingProblems, *, workers: int | None = 1
+) -> dict[str, Any]:
+    """Plan for validation rows and judge the plans.
+
+    Args:
+        model: The model.
+        inference: Inference pipeline of its problem.
+        problems: N validation rows.
+        workers: Number of processes that judge.
+
+    Returns:
+        JSON-able: number of ``plans``; fractions ``valid`` and, by the paper's rules, ``paper_valid``; means of some
+        metrics; ``broken``, condition -> number of violating plans; ``score``, which compares models: 1 % of the plans
+        counts as much as 1 % of the motion time.
+    """
+    poses = problems.obstacle_poses
+    columns = None if poses is None else {OBSTACLE_POSES: poses}
+    plans = inference.plan(model, problems.boundary, columns=columns)
+    summary = evaluate_plans(plans, workers=workers).summary()
+    metrics = summary["metrics_of_all"]
+    duration = float(np.mean(plans.duration))
+    return {
+        "plans": summary["plans"],
+        "valid": summary["valid_ratio"],
+        "paper_valid": summary["paper_valid_ratio"],
+        **{name: metrics[name]["mean"] for name in MEANS if name in metrics},
+        "broken": {
+            name: condition["violating_plans"]
+            for name, condition in summary["conditions"].items()
+            if condition["violating_plans"]
+        },
+        "score": summary["valid_ratio"] - math.log(duration),
+    }

@@ -14,8 +14,7 @@ from cnpgen.planner.network.features import Features
 from cnpgen.planner.network.forward import backward, forward
 from cnpgen.planner.projection import Projection
 from cnpgen.planner.tasks import Tasks
-from cnpgen.training.adam import Adam
-from cnpgen.training.clipping import Clipping
+from cnpgen.training.adam import Adam, Clipping
 from cnpgen.training.settings import TrainingSettings
 from cnpgen.training.training_rows import Rows
 from cnpgen.trajectory.trajectory_spec import TrajectorySpec

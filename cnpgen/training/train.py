@@ -20,14 +20,12 @@ from cnpgen.store.files.atomic import check_writable, file_sha256
 from cnpgen.store.files.documents import differences, plain
 from cnpgen.store.files.file_lock import output_lock
 from cnpgen.store.files.leftovers import remove_leftovers_of
-from cnpgen.training.checkpoint import Checkpoints
+from cnpgen.training.checkpoint import Checkpoints, State
 from cnpgen.training.data import open_training_data
 from cnpgen.training.log import TrainingLog, is_log
-from cnpgen.training.prepare import begin_run, identity, prepare_run
-from cnpgen.training.score import validate
+from cnpgen.training.prepare import begin_run, identity, prepare_run, validate
 from cnpgen.training.settings import Length, TrainingSettings
 from cnpgen.training.training_run import Run, Watcher
-from cnpgen.training.training_state import State
 
 DEFAULT_CPU_TIME_S = 120.0
 CHECKPOINT, LOG, PICTURE, LOCK = ".checkpoint", ".jsonl", ".png", ".lock"  # in place of .h5

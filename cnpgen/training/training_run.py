@@ -16,11 +16,10 @@ from cnpgen.planner.model import Model, ModelConfig
 from cnpgen.planner.network.features import Features
 from cnpgen.problems.problem_record import ProblemRecord
 from cnpgen.training.adam import learning_rate
-from cnpgen.training.checkpoint import Checkpoints
+from cnpgen.training.checkpoint import Best, Checkpoints, State, Sums
 from cnpgen.training.log import TrainingLog
 from cnpgen.training.step import Learner
 from cnpgen.training.training_rows import Rows, StepRows
-from cnpgen.training.training_state import Best, State, Sums
 
 Array = NDArray[Any]
 Watcher = Callable[[Mapping[str, Any]], None]

@@ -9,8 +9,8 @@ import pytest
 from scipy.integrate import quad
 from scipy.optimize import LinearConstraint, minimize
 
+from cnpgen.benchmark.answers import judge_answer
 from cnpgen.benchmark.benchmark_planner import BenchmarkPlanner, Setting
-from cnpgen.benchmark.judging import judge_answer
 from cnpgen.benchmark.planners.aqp import (
     AQP,
     MAX_MALLET_XY_M,

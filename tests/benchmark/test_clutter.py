@@ -10,7 +10,7 @@ import pytest
 import cnpgen
 from cnpgen.benchmark import Setting, load_suite
 from cnpgen.benchmark.benchmark_planner import load_planner
-from cnpgen.benchmark.planners.free_search import has_manifold
+from cnpgen.benchmark.planners.rrtconnect import has_manifold
 from cnpgen.benchmark.suite import list_suites
 from cnpgen.errors import RecipeError
 from cnpgen.pipelines.families.catalog import FAMILIES

@@ -6,8 +6,8 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from cnpgen.benchmark.answers import judge_answer
 from cnpgen.benchmark.benchmark_planner import Setting, load_planner
-from cnpgen.benchmark.judging import judge_answer
 from cnpgen.benchmark.planners.cbirrt import MANIFOLD_TOLERANCE, Search
 from cnpgen.benchmark.planners.crocoddyl import ObjectViolation, are_small, cubic_states, load_crocoddyl, min_duration
 from cnpgen.benchmark.planners.drake import model_text

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cnpgen.benchmark.execution import execution_of, joined
+from cnpgen.benchmark.answers import execution_of, joined
 from cnpgen.benchmark.results_file import answer_to_dict
 from cnpgen.benchmark.simulator.plant import PLANTS
 from cnpgen.benchmark.simulator.reference import states_of

@@ -37,7 +37,7 @@ from dataclasses import dataclass
 import numpy as np
 from cnpgen.benchmark import Trajectory
 from cnpgen.benchmark.benchmark_planner import BenchmarkPlanner
-from cnpgen.benchmark.planners.learned import ShippedNetwork
+from cnpgen.benchmark.planners.own_planners import ShippedNetwork
 from cnpgen.benchmark.suite import load_suite
 
 @dataclass(frozen=True)

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from cnpgen.benchmark.execution import execute_answer
-from cnpgen.benchmark.judging import judge_answer
+from cnpgen.benchmark.answers import execute_answer, judge_answer
 from cnpgen.benchmark.results_file import answer_to_dict
 from cnpgen.benchmark.run_suite import verdict_to_dict
 from cnpgen.benchmark.simulator.plant import PLANTS

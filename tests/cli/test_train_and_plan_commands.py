@@ -34,7 +34,7 @@ def trained(tiny, tmp_path_factory) -> Path:
 @pytest.fixture
 def undrawn(monkeypatch) -> None:
     """Learning curves are not drawn: that takes longer than so short a training."""
-    monkeypatch.setattr("cnpgen.training.curve.plot_curve", lambda *_: None)
+    monkeypatch.setattr("cnpgen.training.log.plot_curve", lambda *_: None)
 
 
 def failing(capsys, words: list[str]) -> tuple[int, str]:

@@ -19,8 +19,7 @@ from cnpgen.refine.refinement_journal import open_journal
 from cnpgen.refine.task import Attempt, Outcome
 from cnpgen.schema.catalogue import recipes_root
 from cnpgen.store.shard import read_shard
-from cnpgen.training.checkpoint import Checkpoints
-from cnpgen.training.training_state import start_state
+from cnpgen.training.checkpoint import Checkpoints, start_state
 from cnpgen.trajectory.sampled_trajectory import Trajectory
 from tests.examples.models import boundary_of_columns, untrained_model
 from tests.examples.plan_files import plans_of, remove_checksum

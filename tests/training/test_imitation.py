@@ -14,7 +14,7 @@ from cnpgen.planner.control_points import ControlPoints
 from cnpgen.planner.network.architecture import initial_parameters
 from cnpgen.planner.plan_requests import read_rows
 from cnpgen.planner.planner import Planner
-from cnpgen.training.clipping import Clipping
+from cnpgen.training.adam import Clipping
 from cnpgen.training.data import open_training_data
 from cnpgen.training.step import imitation_loss
 from cnpgen.training.train import train_model

@@ -14,8 +14,7 @@ from cnpgen.losses.metric_settings import MetricSettings
 from cnpgen.planner.network.architecture import Architecture
 from cnpgen.problems.constraints.joint import JointTorque
 from cnpgen.problems.constraints.table import Table
-from cnpgen.training.adam import learning_rate
-from cnpgen.training.clipping import Clipping
+from cnpgen.training.adam import Clipping, learning_rate
 from cnpgen.training.prepare import begin_run
 from cnpgen.training.settings import METRICS, Length, TrainingSettings
 from cnpgen.training.training_rows import StepRows

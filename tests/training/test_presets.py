@@ -156,7 +156,7 @@ def test_a_model_of_the_preset_is_the_last_one_plans_and_round_trips(trained, ti
 
 @pytest.mark.slow
 def test_options_override_the_preset_and_are_in_the_command(tiny, tmp_path, monkeypatch):
-    monkeypatch.setattr("cnpgen.training.curve.plot_curve", lambda *_: None)
+    monkeypatch.setattr("cnpgen.training.log.plot_curve", lambda *_: None)
     out = tmp_path / "p.h5"
     words = ["--preset", "paper", "--hidden", "8", "--layers", "2", "--steps", "2", "--projection-steps", "1"]
     words += ["--path-scale", "0.5", "--features", "states", "--metric", "ramped", "--path-control-points", "12"]
@@ -208,6 +208,6 @@ def _one(tiny):
 
 
 def _clipping():
-    from cnpgen.training.clipping import Clipping
+    from cnpgen.training.adam import Clipping
 
     return Clipping()

@@ -39,7 +39,7 @@ from cnpgen.robots.shape.hull import hull_corners
 from cnpgen.robots.shape.inline import address_of
 from cnpgen.robots.solid import number_slices, place_obstacles
 from cnpgen.scenes import SceneProblem, save_scenes
-from cnpgen.training.clipping import Clipping
+from cnpgen.training.adam import Clipping
 from cnpgen.training.data import make_scene_rows
 from cnpgen.training.prepare import prepare_run
 from cnpgen.training.settings import TrainingSettings

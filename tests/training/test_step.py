@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from cnpgen.planner.network.architecture import initial_parameters
-from cnpgen.training.adam import start_adam
-from cnpgen.training.clipping import Clipping
+from cnpgen.training.adam import Clipping, start_adam
 from cnpgen.training.step import Learner
 from cnpgen.training.training_rows import Rows
 from tests.conftest import columns_of, some

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from cnpgen.benchmark.benchmark_planner import Answer, BenchmarkPlanner, Plan, Setting
 from cnpgen.benchmark.planners.cbirrt import MANIFOLD_TOLERANCE, MAX_PROJECTIONS, SEEDS, Search
-from cnpgen.benchmark.planners.free_search import FreeSearch, has_manifold
+from cnpgen.benchmark.planners.rrtconnect import FreeSearch, has_manifold
 from cnpgen.errors import requires_extra
 from cnpgen.pipelines.families.resting_states import RestingStates
 from cnpgen.plans.plans import Plans

@@ -9,7 +9,7 @@ import pinocchio as pin
 import pytest
 
 from cnpgen.benchmark.simulator import hockey
-from cnpgen.benchmark.simulator.controller import Controller
+from cnpgen.benchmark.simulator.execute import Controller
 from cnpgen.benchmark.simulator.plant import PLANTS, Plant
 from cnpgen.benchmark.simulator.simulator_scene import SimulatorScene, scene_xml
 from cnpgen.problems.load_robot import load_robot

@@ -1,4 +1,4 @@
-"""Verdicts on the results of planners: plans and sampled trajectories as by ``cnpgen evaluate``.
+"""Verdicts on the answers of planners, as by ``cnpgen evaluate``, and their execution in the simulator.
 
 A sampled trajectory stands for the curve of a controller: linear through positions, cubic with velocities, quintic with
 accelerations. A condition that needs a derivative which this curve lacks at its samples counts as violated.
@@ -6,10 +6,19 @@ accelerations. A condition that needs a derivative which this curve lacks at its
 
 from dataclasses import replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cnpgen.benchmark.pucks import ExecutedPrefix
+from cnpgen.benchmark.results_file import answer_from_dict
+from cnpgen.benchmark.simulator.execute import Execution
+from cnpgen.benchmark.simulator.executed import Executed
+from cnpgen.benchmark.simulator.plant import Plant
+from cnpgen.benchmark.simulator.reference import StatesAt, states_of
+from cnpgen.benchmark.simulator.simulate import execute_states
+from cnpgen.errors import UsageError
 from cnpgen.judges.plans.evaluated_trajectory import EvaluatedTrajectory
 from cnpgen.judges.plans.judge import reason_of
 from cnpgen.judges.plans.measure import boundary_margins, by_name
@@ -26,6 +35,8 @@ from cnpgen.trajectory.sampled_trajectory import Trajectory
 from cnpgen.world.path import PathWorld
 
 Array = NDArray[np.float64]
+Task = tuple[Plans, dict[str, Any], ExecutedPrefix | None]
+"""One boundary problem, the stored answer, and the executed prefix of a replanning scenario."""
 
 JUDGING_STEP_S = 1e-3
 MAX_JUDGED_DURATION_S = 60.0
@@ -81,3 +92,58 @@ def _evaluated(entry: ConditionDecision) -> Margin:
 def _judge_and_world(record: ProblemRecord) -> tuple[FamilyJudge, PathWorld]:
     problem, robot = open_problem(record)
     return FamilyJudge(problem, robot, step=JUDGING_STEP_S), PathWorld(robot, problem.obstacle, problem.object_size)
+
+
+def execute_answer(task: Task, *, plant: Plant) -> Executed:
+    """Execute an answer; if this is impossible, ``failure`` has the reason.
+
+    Args:
+        task: The problem and the answer.
+        plant: The robot.
+    """
+    try:
+        return execution_of(task, plant).executed
+    except UsageError as error:
+        return Executed(failure=str(error))
+
+
+def execution_of(task: Task, plant: Plant) -> Execution:
+    """Execute an answer.
+
+    Args:
+        task: The problem and the answer; of a replanning scenario, the first motion is executed up to the switch.
+        plant: The robot.
+
+    Raises:
+        UsageError: The answer is invalid or cannot be executed.
+        RecipeError: MuJoCo cannot simulate the robot.
+        MachineError: MuJoCo is missing.
+    """
+    problem, content, prefix = task
+    states, duration = _timed(answer_from_dict(problem, content))
+    if prefix is None:
+        return execute_states(problem, states, duration, plant, problem.boundary.start_dq[0])
+    return execute_states(problem, joined(prefix, states), float(prefix.until[0]) + duration, plant)
+
+
+def joined(prefix: ExecutedPrefix, states: StatesAt) -> StatesAt:
+    """Join the first part of a motion with its continuation.
+
+    Args:
+        prefix: Prefix of one motion.
+        states: The continuation, from time 0.
+    """
+    first, until = states_of(prefix.motion), float(prefix.until[0])
+
+    def at(t: Array) -> tuple[Array, Array, Array]:
+        before, after = first(np.minimum(t, until)), states(np.maximum(t - until, 0.0))
+        q, dq, ddq = (np.where((t < until)[:, None], a, b) for a, b in zip(before, after, strict=True))
+        return q, dq, ddq
+
+    return at
+
+
+def _timed(answer: Plans | Trajectory) -> tuple[StatesAt, float]:
+    if isinstance(answer, Plans):
+        return states_of(answer.motion), float(answer.duration[0])
+    return answer.states, answer.duration

@@ -1,16 +1,38 @@
-"""Trained models as planners: the shipped model, its refined plan, and the paper's method from a model file."""
+"""Planners of cnpgen: optimization from a straight line, trained models without and with refining."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from cnpgen.benchmark.benchmark_planner import Answer, BenchmarkPlanner, Plan, Setting
-from cnpgen.benchmark.planners.solve import near_base
 from cnpgen.errors import UsageError
 from cnpgen.planner.planner import Planner
+from cnpgen.plans.boundary_problems import plans_of_rows
 from cnpgen.plans.plans import Plans
-from cnpgen.refine.refine_plans import refine_plans
+from cnpgen.problems.problem_record import ProblemRecord, open_problem
+from cnpgen.refine.refine_plans import refine_plans, solve_plans
 from cnpgen.schema.keys import field
+
+
+@dataclass(frozen=True)
+class Solve(BenchmarkPlanner):
+    """Sequential quadratic programming from a straight line, as ``cnpgen solve``."""
+
+    def prepare(self, setting: Setting) -> Plan:
+        """Load the kernels."""
+        solve_plans(near_base(setting.problem), workers=1)
+        return lambda problem: solve_plans(problem, workers=1).plans
+
+
+def near_base(record: ProblemRecord) -> Plans:
+    """Return a boundary problem for warming up: a small rotation of the first joint from the base configuration."""
+    base = open_problem(record)[1].base
+    goal, still = base.copy(), np.zeros((1, len(base)))
+    goal[0] += 0.1
+    ends = {"start_q": base[None], "goal_q": goal[None]}
+    return plans_of_rows(record, {**ends, "start_dq": still, "start_ddq": still, "goal_dq": still})
 
 
 @dataclass(frozen=True)
