@@ -43,12 +43,7 @@ MAX_JUDGED_DURATION_S = 60.0
 
 
 def judge_answer(problem: Plans, answer: Plans | Trajectory) -> Verdict:
-    """Judge the answer of a planner.
-
-    Args:
-        problem: One boundary problem, as a plan without motion.
-        answer: One plan or a trajectory.
-    """
+    """Judge an answer, one plan or a trajectory, for one boundary problem."""
     if isinstance(answer, Plans):
         return evaluate_plans(answer, workers=1).verdicts[0]
     if answer.duration > MAX_JUDGED_DURATION_S:
@@ -95,12 +90,7 @@ def _judge_and_world(record: ProblemRecord) -> tuple[FamilyJudge, PathWorld]:
 
 
 def execute_answer(task: Task, *, plant: Plant) -> Executed:
-    """Execute an answer; if this is impossible, ``failure`` has the reason.
-
-    Args:
-        task: The problem and the answer.
-        plant: The robot.
-    """
+    """Execute an answer on a plant; if this is impossible, ``failure`` has the reason."""
     try:
         return execution_of(task, plant).executed
     except UsageError as error:
@@ -108,11 +98,7 @@ def execute_answer(task: Task, *, plant: Plant) -> Executed:
 
 
 def execution_of(task: Task, plant: Plant) -> Execution:
-    """Execute an answer.
-
-    Args:
-        task: The problem and the answer; of a replanning scenario, the first motion is executed up to the switch.
-        plant: The robot.
+    """Execute an answer; in a replanning scenario, the first motion is executed up to the switch.
 
     Raises:
         UsageError: The answer is invalid or cannot be executed.
@@ -127,12 +113,7 @@ def execution_of(task: Task, plant: Plant) -> Execution:
 
 
 def joined(prefix: ExecutedPrefix, states: StatesAt) -> StatesAt:
-    """Join the first part of a motion with its continuation.
-
-    Args:
-        prefix: Prefix of one motion.
-        states: The continuation, from time 0.
-    """
+    """Join the prefix of one motion with its continuation, whose time starts at 0."""
     first, until = states_of(prefix.motion), float(prefix.until[0])
 
     def at(t: Array) -> tuple[Array, Array, Array]:

@@ -81,11 +81,7 @@ class BenchmarkPlanner(ABC):
 
 
 def load_planner(name: str, parameters: Mapping[str, Any]) -> BenchmarkPlanner:
-    """Load a planner by its name.
-
-    Args:
-        name: Its name.
-        parameters: Values of its fields, as in a recipe.
+    """Load a planner by its name, with values of its fields as in a recipe.
 
     Raises:
         RecipeError: The planner is unknown or cannot be imported.

@@ -58,12 +58,9 @@ Values = dict[str, bool | float]
 
 
 def values_of(row: Mapping[str, Any], plant: str = "", plane_tolerance: float = PLANE_TOLERANCE_M) -> Values:
-    """Return the known flags and figures of one problem; empty if the planner or the plant does not apply.
+    """Return the known flags and figures of a row; empty if the planner or the plant does not apply.
 
-    Args:
-        row: A row of results.
-        plant: Name of the plant; empty for plans only.
-        plane_tolerance: See ``succeeded``.
+    The plant is empty for plans only; ``succeeded`` defines the tolerance.
     """
     has_answer = row["answer"] is not None
     executed = row.get("executed", {}).get(plant)
@@ -99,13 +96,7 @@ def summarize_results(
     reference: str | None = None,
     plane_tolerance: float = PLANE_TOLERANCE_M,
 ) -> dict[str, dict[str, dict[str, dict[str, Any]]]]:
-    """Summarize the results of all planners.
-
-    Args:
-        results: Planner -> rows.
-        plant: Name of the plant; empty for plans only.
-        reference: Planner with which the others are compared, see ``reference_planner``.
-        plane_tolerance: See ``succeeded``.
+    """Summarize the rows of all planners on a plant, or of their plans only if it is empty.
 
     Returns:
         Planner -> ``{"ratios": ..., "figures": ...}``, both empty if the planner does not apply. A ratio has ``count``,
@@ -192,12 +183,7 @@ def _correct(summary: dict[str, dict[str, dict[str, dict[str, Any]]]]) -> None:
 
 
 def wilson(share: float, n: int) -> tuple[float, float]:
-    """Return the 95 % interval of a ratio by Wilson (1927).
-
-    Args:
-        share: Observed ratio.
-        n: Number of independent problems.
-    """
+    """Return the 95 % interval of an observed ratio of n independent problems by Wilson (1927)."""
     if n == 0:
         return 0.0, 1.0
     z2 = NORMAL_QUANTILE_95**2
@@ -216,12 +202,7 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 
 def mcnemar(mine: Any, theirs: Any) -> float:
-    """Return the p-value of McNemar's exact test.
-
-    Args:
-        mine: Whether one planner solved each problem, shape (N,).
-        theirs: Whether the other planner solved it, shape (N,).
-    """
+    """Return the p-value of McNemar's exact test of two masks of solved problems, shape (N,) each."""
     from scipy.stats import binomtest
 
     only_mine, only_theirs = int(np.sum(mine & ~theirs)), int(np.sum(theirs & ~mine))

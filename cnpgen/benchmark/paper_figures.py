@@ -48,12 +48,7 @@ def save_benchmark_figures(benchmark: Benchmark, folder: str | Path) -> tuple[Pa
 
 
 def benchmark_values(benchmark: Benchmark, plant: str) -> dict[str, list[Values]]:
-    """Return planner -> flags and figures of its problems, without planners that do not apply.
-
-    Args:
-        benchmark: Result of ``run_benchmark``.
-        plant: Name of the plant; empty for plans only.
-    """
+    """Return planner -> flags and figures of its problems on a plant, without planners that do not apply."""
     tolerance = benchmark.plane_tolerance
     values = {
         name: [known for row in rows if (known := values_of(row, plant, tolerance))]
@@ -63,23 +58,13 @@ def benchmark_values(benchmark: Benchmark, plant: str) -> dict[str, list[Values]
 
 
 def success_over_time(rows: list[Values], flag: str) -> tuple[Array, Array]:
-    """Return the planning times of solved problems in increasing order [ms], and the ratios solved by then.
-
-    Args:
-        rows: Flags and figures of all problems.
-        flag: Name of the flag of a solved problem.
-    """
+    """Return the planning times of problems with a flag in increasing order [ms], and the ratios solved by then."""
     times = np.sort([float(known["planning_cpu_ms"]) for known in rows if known.get(flag)])
     return times, np.arange(1, len(times) + 1) / max(len(rows), 1)
 
 
 def success_figure(values: dict[str, list[Values]], plant: str) -> "Figure":
-    """Draw the ratio of solved problems over the planning time, with a logarithmic axis of time.
-
-    Args:
-        values: Result of ``benchmark_values``.
-        plant: Name of the plant; empty for plans only.
-    """
+    """Draw the ratio of successful executions, or of valid plans without a plant, over the planning time."""
     figure = new_figure(4.5, 3.2)
     axes, flag = figure.add_subplot(), "success" if plant else "valid"
     times_ms = [float(known.get("planning_cpu_ms", 0.0)) for rows in values.values() for known in rows]
@@ -100,11 +85,7 @@ def success_figure(values: dict[str, list[Values]], plant: str) -> "Figure":
 
 
 def distribution_figure(values: dict[str, list[Values]]) -> "Figure":
-    """Draw a box plot of each known figure.
-
-    Args:
-        values: Result of ``benchmark_values``.
-    """
+    """Draw a box plot of each known figure."""
     keys = [key for key in FIGURES if any(key in known for rows in values.values() for known in rows)]
     columns = max(min(len(keys), PANELS_PER_ROW), 1)
     count = max(-(-len(keys) // columns), 1)

@@ -102,12 +102,7 @@ def _keys_of(planner: str) -> tuple[Key, ...]:
 def random_parameters(
     ranges: Mapping[str, Sequence[float]], seed: Sequence[int], *, whole: Collection[str] = ()
 ) -> dict[str, Any]:
-    """Draw a value for each field.
-
-    Args:
-        ranges: See ``search_parameters``.
-        seed: Seed of the generator.
-        whole: Fields whose values are whole numbers.
+    """Draw a value for each field; see ``search_parameters``.
 
     Raises:
         UsageError: There is no range, or one is not two increasing, finite numbers.
@@ -128,12 +123,7 @@ def random_parameters(
 
 
 def csv_of(trials: Sequence[Trial], keys: Sequence[str]) -> str:
-    """Write trials as CSV, a row each; fields of the default parameters are empty.
-
-    Args:
-        trials: The trials.
-        keys: Names of the fields.
-    """
+    """Write trials as CSV, a row each with the values of these fields, which are empty for the default parameters."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["trial", "solved", "planning_cpu_ms", "duration_s", *keys])

@@ -57,12 +57,7 @@ class PlanningOutcome:
 
 
 class PlannerProcess:
-    """Planner in another process, which is restarted after it died or was stopped.
-
-    Args:
-        name: Name of the planner.
-        setting: Its problem and limits.
-    """
+    """Planner in another process, which is restarted after it died or was stopped."""
 
     def __init__(self, name: str, setting: Setting) -> None:
         self._name, self._setting = name, setting
@@ -71,11 +66,7 @@ class PlannerProcess:
         self._unprepared: PlanningOutcome | None = None
 
     def plan(self, problem: Plans) -> PlanningOutcome:
-        """Plan for one problem.
-
-        Raises:
-            MachineError: This machine lacks a requirement of the planner.
-        """
+        """Plan for one problem; raise MachineError if this machine lacks a requirement of the planner."""
         if self._unprepared is None and self._pipe is None:
             self._unprepared = self._start()
         if self._unprepared is not None:
@@ -139,11 +130,7 @@ class PlannerProcess:
 
 
 def end_processes(root: int) -> None:
-    """End a process that leads its own session, and all processes that it started.
-
-    Args:
-        root: Its number.
-    """
+    """End a process that leads its own session, and all processes that it started."""
     import psutil
 
     with suppress(psutil.NoSuchProcess):
@@ -157,11 +144,7 @@ def end_processes(root: int) -> None:
 
 
 def cpu_time_of(root: int) -> float:
-    """Return the CPU time of a process and all of its child processes [s]; 0 if it has ended.
-
-    Args:
-        root: Its number.
-    """
+    """Return the CPU time of a process and all of its child processes [s]; 0 if it has ended."""
     import psutil
 
     seconds = 0.0
@@ -180,11 +163,7 @@ def _cpu_time() -> float:
 
 
 def serve(descriptor: int) -> None:
-    """Prepare the planner whose name arrives on a pipe, then plan until the pipe is closed.
-
-    Args:
-        descriptor: File descriptor of the pipe.
-    """
+    """Prepare the planner whose name arrives on a pipe, then plan until the pipe is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all processes; the parent decides
     with Connection(descriptor) as pipe, suppress(EOFError, OSError):
         name, setting = pipe.recv()

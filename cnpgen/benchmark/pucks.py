@@ -62,11 +62,7 @@ class Pucks:
 
 
 def hits_of(pucks: Pucks) -> Plans:
-    """Return the boundary problems of hitting every puck of a grid from rest in the base configuration.
-
-    Raises:
-        RecipeError: The problem has no table, or a puck cannot be hit.
-    """
+    """Return the boundary problems of hitting every puck of a grid from rest in the base configuration."""
     puck = pucks.positions()
     start_q = np.tile(load_robot(pucks.problem).base, (puck.shape[1], 1))
     still = np.zeros_like(start_q)
@@ -74,15 +70,10 @@ def hits_of(pucks: Pucks) -> Plans:
 
 
 def hits_from(pucks: Pucks, puck: Array, start: State) -> Plans:
-    """Return the boundary problems of hitting N pucks, each from its own state.
+    """Return the boundary problems of hitting N pucks at positions [m] of shape (2, N), each from its own state.
 
     The goal configuration maximizes the speed of the tip along the hit, near the configuration of the start. The goal
     velocity has the maximum speed ('cnpgen docs references', 2).
-
-    Args:
-        pucks: The problem and the target.
-        puck: Positions of the pucks [m], shape (2, N).
-        start: States of the arm at the start.
 
     Raises:
         RecipeError: The problem has no table, or a puck cannot be hit.

@@ -52,12 +52,7 @@ def save_benchmark_tables(benchmark: Benchmark, folder: str | Path) -> tuple[Pat
 
 
 def table_rows(benchmark: Benchmark, plant: str) -> list[tuple[str, ...]]:
-    """Return the rows of the comparison: a head, then one row per ratio and figure, with the paper's values.
-
-    Args:
-        benchmark: Result of ``run_benchmark``.
-        plant: Name of the plant; empty for plans only.
-    """
+    """Return the comparison on a plant: a head, then one row per ratio and figure, with the paper's values."""
     summary = benchmark.summary(plant)
     printed = PRINTED.get(benchmark.suite.name, {})
     rows: list[tuple[str, ...]] = [(f"{plant} plant" if plant else "planned", *summary)]

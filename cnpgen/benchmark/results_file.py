@@ -64,11 +64,7 @@ class Results:
     rows: dict[int, dict[str, Any]] = field(default_factory=dict)
 
     def append(self, row: dict[str, Any]) -> None:
-        """Append a line to the file and to the rows.
-
-        Raises:
-            MachineError: The disk is full or cannot be written.
-        """
+        """Append a line to the file and to the rows."""
         text = json.dumps(row, allow_nan=False)
         self._merge(json.loads(text))  # equal to the row that a later run reads
         append_line(self.path, text)
@@ -95,11 +91,7 @@ class Results:
 def open_results(path: Path, identity: dict[str, Any], *, overwrite: bool = False, discard: bool = False) -> Results:
     """Open the results of a planner with the rows of earlier runs.
 
-    Args:
-        path: The file.
-        identity: Identity of the run; results of another run are refused.
-        overwrite: Whether to overwrite results of another run.
-        discard: Whether to discard the earlier results of this run.
+    Results of another run, by its identity, are refused or overwritten; those of this run may be discarded.
 
     Raises:
         UsageError: The file belongs to another run.
@@ -125,14 +117,9 @@ def open_results(path: Path, identity: dict[str, Any], *, overwrite: bool = Fals
 
 
 def read_results(path: Path, shared: dict[str, Any]) -> tuple[dict[str, Any], Results] | None:
-    """Read the results of a planner.
+    """Read the head and the results of a planner; ``shared`` is the part of the identity that all planners share.
 
-    Args:
-        path: The file.
-        shared: The part of the identity that all planners of a folder share.
-
-    Returns:
-        The head and the results; None if the file is incomplete or belongs to another suite, version or time limit.
+    Return None if the file is incomplete or belongs to another suite, version or time limit.
 
     Raises:
         DatasetError: The file is damaged.
@@ -219,11 +206,7 @@ def answer_to_dict(answer: Plans | Trajectory) -> dict[str, Any]:
 
 
 def answer_from_dict(problem: Plans, content: dict[str, Any]) -> Plans | Trajectory:
-    """Read an answer for one boundary problem.
-
-    Raises:
-        UsageError: A shape is wrong, or the number of joints differs from the problem.
-    """
+    """Read an answer for one boundary problem; raise UsageError if a shape or the number of joints is wrong."""
     known = _PLAN.keys() - {"degree"} if "degree" in content else _SAMPLES.keys() & content.keys()
     numbers = {name: np.array(content[name], float) for name in known}
     if "degree" not in content:
@@ -251,12 +234,7 @@ def _rows(values: Any) -> list[Any]:
 
 
 class ResultsFolder:
-    """Folder for the results of planners on one suite; created if missing.
-
-    Args:
-        path: The folder.
-        suite: The suite.
-        setting: Time limit and seed.
+    """Folder for the results of planners on one suite with one time limit and seed; created if missing.
 
     Raises:
         UsageError: The path is a file.
@@ -279,14 +257,7 @@ class ResultsFolder:
         }
 
     def planners(self, *, delete_others: bool) -> set[str]:
-        """Return the planners with results.
-
-        Args:
-            delete_others: Whether to delete results of another run.
-
-        Raises:
-            UsageError: There are results of another run, and they are not to be deleted.
-        """
+        """Return the planners with results; delete results of another run, or raise UsageError."""
         names = set()
         for path in sorted(self.path.glob("*.jsonl")):
             require_file(path, "the results of a planner")

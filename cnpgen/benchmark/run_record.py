@@ -55,23 +55,14 @@ class RunRecord:
 
 
 def describe_run(seed: int, planners: Sequence[str]) -> RunRecord:
-    """Describe a run that begins now.
-
-    Args:
-        seed: Seed of random planners.
-        planners: Names of the planners.
-    """
+    """Describe a run of these planners that begins now."""
     libraries = {name: number for name in LIBRARIES if (number := installed_version(name))}
     date = datetime.now(UTC).isoformat(timespec="seconds")
     return RunRecord(date, _processor(), os.cpu_count() or 1, seed, tuple(planners), {**versions(), **libraries})
 
 
 def load_runs(folder: Path) -> tuple[RunRecord, ...]:
-    """Load the records of earlier runs in a folder.
-
-    Raises:
-        DatasetError: The file is damaged.
-    """
+    """Load the records of earlier runs in a folder; raise DatasetError if the file is damaged."""
     path = folder / RUNS_FILE
     if not path.exists():
         return ()
@@ -85,11 +76,7 @@ def load_runs(folder: Path) -> tuple[RunRecord, ...]:
 
 
 def save_runs(folder: Path, runs: Sequence[RunRecord]) -> None:
-    """Write the records of all runs.
-
-    Raises:
-        MachineError: The file cannot be written.
-    """
+    """Write the records of all runs."""
     documents: list[dict[str, Any]] = [asdict(run) for run in runs]
     write_file(folder / RUNS_FILE, json.dumps(documents, indent=1) + "\n")
 

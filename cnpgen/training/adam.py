@@ -38,13 +38,7 @@ class Adam:
     step: int = 0
 
     def update(self, gradient: Array, *, rate: float, memory: float = 0.999) -> None:
-        """Take one step.
-
-        Args:
-            gradient: Gradient of the loss.
-            rate: Learning rate.
-            memory: Decay of the average; smaller during the first steps.
-        """
+        """Take one step at a learning rate; the decay ``memory`` of the average is smaller during the first steps."""
         self.step += 1
         new = 1 - min(memory, (1 + self.step) / (10 + self.step))
         scratch = np.empty(min(PARAMETERS_PER_BLOCK, len(gradient)), gradient.dtype)
@@ -81,15 +75,7 @@ def start_adam(parameters: Array) -> Adam:
 
 
 def learning_rate(step: int, steps: int, *, peak: float, final: float, warm_up: int) -> float:
-    """Return the learning rate: a cosine from ``peak`` to ``final * peak``, after a linear warm-up.
-
-    Args:
-        step: Number of steps taken.
-        steps: Number of steps of the run.
-        peak: Largest learning rate.
-        final: Last learning rate, as a fraction of the peak.
-        warm_up: Number of steps of the warm-up.
-    """
+    """Return the learning rate: a cosine from ``peak`` to ``final * peak``, after a linear warm-up of some steps."""
     falling = 0.5 * (1 + math.cos(math.pi * min(step / steps, 1.0)))
     return peak * (final + (1 - final) * falling) * min(1.0, (step + 1) / max(warm_up, 1))
 
@@ -107,14 +93,10 @@ class Clipping:
     batch: float = 0.0
 
     def sample_factors(self, norms: Array, *, limit: float) -> Array:
-        """Return the factors of the samples' gradients.
+        """Return the factors of the samples' gradients, shape (N,), in (0, 1], from their finite norms.
 
-        Args:
-            norms: Norms of the samples' gradients, finite, shape (N,).
-            limit: Largest norm, in running medians; inf for no clipping.
-
-        Returns:
-            Shape (N,), in (0, 1]; 1 while half of the gradients of every batch are zero.
+        The largest norm is in running medians; inf for no clipping. Factors are 1 while half of the gradients of every
+        batch are zero.
         """
         median = float(np.median(norms))
         self.sample = SAMPLE_MEMORY * self.sample + (1 - SAMPLE_MEMORY) * median if self.sample else median
@@ -123,12 +105,7 @@ class Clipping:
         return np.minimum(1.0, limit * self.sample / np.maximum(norms, 1e-30)).astype(norms.dtype)
 
     def batch_factor(self, norm: float, *, limit: float) -> float:
-        """Return the factor of the batch's gradient.
-
-        Args:
-            norm: Norm of the gradient.
-            limit: Largest norm, in running norms; inf for no clipping.
-        """
+        """Return the factor of the batch's gradient; the largest norm is in running norms, inf for no clipping."""
         self.batch = BATCH_MEMORY * self.batch + (1 - BATCH_MEMORY) * min(norm, MAX_NORM_RATIO * self.batch) or norm
         if not self.batch or np.isinf(limit):
             return 1.0

@@ -105,14 +105,7 @@ class State:
 
 
 def start_state(parameters: Array, *, terms: int, steps: int, imitation: float = 0.0) -> State:
-    """Return the initial state of a run.
-
-    Args:
-        parameters: Initial parameters.
-        terms: Number of the loss's terms.
-        steps: Number of steps of the run.
-        imitation: Fraction of imitating steps.
-    """
+    """Return the initial state of a run, a fraction of which imitates; ``terms`` is the number of loss terms."""
     best = Best(-math.inf, 0, parameters.copy())
     return State(start_adam(parameters), Clipping(), Sums(np.zeros(terms)), best, steps, int(imitation * steps))
 
@@ -150,9 +143,7 @@ def from_content(content: Content) -> State:
     """Make a state from arrays and texts.
 
     Raises:
-        KeyError: A key is missing.
-        TypeError: A key is unknown to this version.
-        ValueError: A value is invalid.
+        KeyError, TypeError, ValueError: A key is missing, unknown to this version, or has an invalid value.
     """
     numbers, arrays = parse_json(content.texts["numbers"]), content.arrays
     check_structure(numbers, _FORM)
@@ -192,8 +183,7 @@ class Checkpoints:
     def load(self, *, discard: bool = False) -> State | None:
         """Return the state of an interrupted run; None if there is none.
 
-        Args:
-            discard: Whether to ignore a checkpoint that is damaged or of another run.
+        With ``discard``, a checkpoint that is damaged or of another run is ignored.
 
         Raises:
             DatasetError: The file is damaged.
@@ -229,11 +219,7 @@ class Checkpoints:
             self.save(state)
 
     def save(self, state: State) -> None:
-        """Save the state.
-
-        Raises:
-            MachineError: The disk is full or read-only.
-        """
+        """Save the state."""
         started, content = time.monotonic(), to_content(state)
         content = replace(content, texts={**content.texts, "identity": json.dumps(self.identity)})
         write_with_checksum(self.path, content, kind=CHECKPOINT_KIND, version=CHECKPOINT_VERSION)

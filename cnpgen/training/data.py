@@ -168,12 +168,7 @@ class SceneRows(TrainingData):
 
 
 def make_scene_rows(problem: Problem, scenes: Sequence[SceneProblem], place: str) -> SceneRows:
-    """Make training rows of scenes.
-
-    Args:
-        problem: The robot's problem.
-        scenes: The scenes; the last ones validate models, so that they should be of other scenes than the others.
-        place: File of the scenes.
+    """Make training rows of scenes; the last ones validate models, so they should be of other scenes.
 
     Raises:
         SceneError: A scene does not fit the robot.
@@ -190,11 +185,7 @@ def make_scene_rows(problem: Problem, scenes: Sequence[SceneProblem], place: str
 
 
 def open_training_data(folder: str | Path, robot: str | Path | None = None) -> TrainingData:
-    """Open a dataset, or the problems of a scene file, for training.
-
-    Args:
-        folder: The dataset; with ``robot`` a scene file, or a folder of scene files.
-        robot: Problem of the robot in these scenes.
+    """Open a dataset for training or, with the problem of a robot, a scene file or a folder of scene files.
 
     Raises:
         DatasetError: It is missing, unfinished or damaged, or has no rows for training or validation.

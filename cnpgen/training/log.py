@@ -21,12 +21,7 @@ MIN_DRAWN_TERM = 1e-12  # smaller terms are drawn here
 class TrainingLog:
     """A log that records are appended to.
 
-    Args:
-        path: The file; its content is replaced by ``lines``.
-        lines: Previous lines of the log; new lines are appended to this list, too.
-
-    Raises:
-        MachineError: The disk is full or read-only.
+    Its file begins with the previous lines; new lines are appended to this list, too.
     """
 
     def __init__(self, path: Path, lines: list[str]) -> None:
@@ -34,11 +29,7 @@ class TrainingLog:
         write_file(path, self.text)
 
     def write(self, record: Mapping[str, Any]) -> None:
-        """Append a record.
-
-        Raises:
-            MachineError: The disk is full or read-only.
-        """
+        """Append a record."""
         line = json.dumps(record, allow_nan=False)
         self.lines.append(line)
         append_line(self.path, line)
@@ -61,11 +52,7 @@ def is_log(path: Path) -> bool:
 
 
 def plot_curve(log: str, path: str | Path) -> None:
-    """Draw a training log.
-
-    Args:
-        log: The log, one JSON object per line.
-        path: Output file, ``.png``, ``.pdf`` or ``.svg``; replaced if it exists.
+    """Draw a training log, one JSON object per line, as ``.png``, ``.pdf`` or ``.svg``; an existing file is replaced.
 
     Raises:
         UsageError: The log contains no step.

@@ -43,18 +43,10 @@ def prepare_run(
     check_rows: int = 200,
     command: str = "",
 ) -> tuple[Run, InferencePipeline]:
-    """Load rows, kernels and loss; set up the network.
+    """Load rows, kernels and loss; set up the network; return the run, and the inference pipeline of its plans.
 
-    Args:
-        source: The dataset.
-        loaded: Its problem.
-        settings: Training settings.
-        initial_model: Model to start from; None for random parameters and features standardized by the rows.
-        check_rows: Number of validation rows that models are compared on.
-        command: Command recorded in the model.
-
-    Returns:
-        The run, and the inference pipeline of its plans.
+    Without an initial model, parameters are random and features are standardized by the rows. Models are compared on
+    ``check_rows`` validation rows. The command is recorded in the model.
 
     Raises:
         UsageError: The dataset has no plans to imitate, or the initial model does not fit.
@@ -248,13 +240,7 @@ def _step_seconds(run: Run) -> float:
 def validate(
     model: Model, inference: InferencePipeline, problems: TrainingProblems, *, workers: int | None = 1
 ) -> dict[str, Any]:
-    """Plan for validation rows and judge the plans.
-
-    Args:
-        model: The model.
-        inference: Inference pipeline of its problem.
-        problems: N validation rows.
-        workers: Number of processes that judge.
+    """Plan for N validation rows and judge the plans in some processes.
 
     Returns:
         JSON-able: number of ``plans``; fractions ``valid`` and, by the paper's rules, ``paper_valid``; means of some

@@ -28,12 +28,7 @@ Loss = Callable[..., LossValue]
 def imitation_loss(points: ControlPoints, target: ControlPoints) -> LossValue:
     """Return half the squared distances of path control points [rad^2] and of logarithms of rate control points.
 
-    Args:
-        points: Control points of N motions.
-        target: Control points of their demonstrations.
-
-    Returns:
-        Distances as ``total``, and as the only column of ``terms``; their gradients.
+    The distances are ``total`` and the only column of ``terms``.
     """
     by_path = points.path - target.path
     logs = np.log(points.rate / target.rate)
@@ -66,18 +61,10 @@ class Learner:
     def gradient(
         self, parameters: Array, rows: Rows, weights: Array, *, shift: float, clipping: Clipping, out: Array
     ) -> Array:
-        """Write the gradient of the mean loss of a batch with respect to all parameters.
+        """Write the gradient of the mean loss of a batch with respect to all parameters, shape (n_parameters,).
 
-        Args:
-            parameters: The parameters.
-            rows: The batch.
-            weights: Weight of every constraint term, shape (m,).
-            shift: Shift of the quadrature nodes, in [0, 1).
-            clipping: Running norms of the gradients.
-            out: Output array, shape (n_parameters,).
-
-        Returns:
-            The terms of every sample, shape (N, 1 + m).
+        The constraint terms have weights of shape (m,); the quadrature nodes have a shift in [0, 1). Return the terms
+        of every sample, shape (N, 1 + m).
         """
 
         def cost(rows: Rows, points: ControlPoints) -> LossValue:
@@ -94,11 +81,7 @@ class Learner:
         return self._gradient(parameters, rows, cost, clipping, out)
 
     def imitation_gradient(self, parameters: Array, rows: Rows, *, clipping: Clipping, out: Array) -> Array:
-        """Write the gradient of the mean distance of a batch from its demonstrations; see ``gradient``.
-
-        Returns:
-            The distance of every sample, shape (N, 1).
-        """
+        """Write the gradient of the mean distance from demonstrations; return the distances, shape (N, 1)."""
         target = rows.target
         assert target is not None
         return self._gradient(parameters, rows, lambda _, points: imitation_loss(points, target), clipping, out)

@@ -184,14 +184,7 @@ def check_out(out: Path) -> None:
 
 
 def check_beside(out: Path) -> None:
-    """Raise an error if a log or a picture of another origin would be replaced.
-
-    Args:
-        out: The model's file.
-
-    Raises:
-        UsageError: There is such a file.
-    """
+    """Raise UsageError if a log or a picture of another origin beside a model's file would be replaced."""
     log, picture = out.with_suffix(LOG), out.with_suffix(PICTURE)
     hint, remedies = "choose another {out}, or replace it with {force}", {"out": None, "force": True}
     if log.exists() and not is_log(log):

@@ -75,17 +75,9 @@ def prepare_rows(
 ) -> tuple[Rows, Features]:
     """Prepare rows in blocks, because temporary arrays take four times the memory of the result.
 
-    Args:
-        boundary: Boundary conditions of N rows.
-        prepare: Preprocessor of the problem's tasks.
-        features: Standardization of the features; by these rows if None.
-        blocks: Blocks of features to standardize by these rows; all if None.
-        lines: Preprocessor of tasks along other lines; ``prepare`` if None.
-        dtype: Float type of the rows.
-        obstacle_poses: Poses and sizes of obstacles that samples place, shape (N, width).
-
-    Returns:
-        The rows, and the standardization of their features.
+    Without ``features``, they are standardized by these rows, with some or all ``blocks``. ``lines`` preprocesses tasks
+    along other lines than ``prepare``. Obstacles that samples place have poses and sizes of shape (N, width). Return
+    the rows, and the standardization of their features.
     """
     parts = [
         slice(first, first + PREPARED_ROWS_PER_BLOCK)
@@ -126,13 +118,7 @@ def zero_conditions(boundary: Boundary) -> tuple[str, ...]:
 
 
 class StepRows:
-    """Batches of shuffled rows; every epoch has another order, and rows that do not fill a batch are omitted.
-
-    Args:
-        rows: Number of rows.
-        batch_size: Rows per batch.
-        seed: Seed.
-    """
+    """Batches of shuffled rows; every epoch has another order, and rows that do not fill a batch are omitted."""
 
     def __init__(self, rows: int, batch_size: int, seed: int) -> None:
         self.batch_size = min(batch_size, rows)

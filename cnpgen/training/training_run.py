@@ -67,13 +67,7 @@ class Run:
         self.order = StepRows(len(self.rows), settings.batch_size, settings.seed)
 
     def train(self, state: State, checkpoints: Checkpoints, log: TrainingLog, watch: Watcher | None = None) -> None:
-        """Train until the last step.
-
-        Args:
-            state: State of the run; changed in place.
-            checkpoints: Checkpoints, written at intervals.
-            log: The log.
-            watch: Called with every line of the log.
+        """Train until the last step; the state is changed in place, and ``watch`` is called with every line of the log.
 
         Raises:
             MachineError: The loss is not finite any more, or the disk is full.

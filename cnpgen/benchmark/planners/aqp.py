@@ -127,14 +127,8 @@ class _Follower:
 def nearest_in_null_space(null: Array, weights: Array, ahead: Array, bounds: tuple[Array, Array]) -> Array | None:
     """Minimize ``a^T N^T W N a / 2 + ahead^T W N a`` with ``low <= N a <= high``, by DAQP.
 
-    Args:
-        null: N, shape (n, k).
-        weights: Diagonal of W, shape (n,).
-        ahead: Velocity without ``a`` minus the desired one [rad/s], shape (n,).
-        bounds: ``(low, high)`` [rad/s], shape (n,) each.
-
-    Returns:
-        a, shape (k,), or None if the bounds are infeasible.
+    N is ``null``, shape (n, k), and W has ``weights`` on its diagonal. ``ahead`` is the velocity without ``a`` minus
+    the desired one [rad/s], shape (n,). Return a, shape (k,), or None if the bounds [rad/s] are infeasible.
     """
     import daqp
 
@@ -218,12 +212,8 @@ class PlanePath:
 def striking_path(start: Array, hit: Array, velocity: Array, speed: float, acceleration: float) -> PlanePath:
     """Plan a path from rest to a hit in a direction: it bends where the line of the hit leaves the box of both ends.
 
-    Args:
-        start: Position at rest [m], shape (2,).
-        hit: Position of the hit [m], shape (2,).
-        velocity: Direction of the hit, of any length, shape (2,).
-        speed: Speed of the hit [m/s], reduced if it needs more than ``acceleration``.
-        acceleration: Largest acceleration along the path [m/s^2].
+    Positions [m] and the direction have shape (2,). The speed [m/s] is reduced if it needs more than the largest
+    acceleration along the path [m/s^2].
     """
     start, hit = np.clip(start, MIN_MALLET_XY_M, MAX_MALLET_XY_M), np.clip(hit, MIN_MALLET_XY_M, MAX_MALLET_XY_M)
     low, high = (

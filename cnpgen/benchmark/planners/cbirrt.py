@@ -64,11 +64,7 @@ class CBiRRT(BenchmarkPlanner):
 
 
 def load_ompl() -> Any:
-    """Import OMPL without its messages.
-
-    Raises:
-        MissingExtraError: OMPL is missing.
-    """
+    """Import OMPL without its messages; raise MissingExtraError if it is missing."""
     with requires_extra("benchmark", "OMPL"):
         import ompl.base
         import ompl.geometric
@@ -93,23 +89,13 @@ def joint_space(base: Any, robot: Robot) -> Any:
 
 
 def timed(path: Array, velocity_limit: Array) -> Trajectory:
-    """Time a path so that one joint is at its velocity limit in every step.
-
-    Args:
-        path: Joint positions [rad], shape (K, n).
-        velocity_limit: Planning limits [rad/s], shape (n,).
-    """
+    """Time a path, shape (K, n), so that one joint is at its velocity limit [rad/s] in every step."""
     steps = np.max(np.abs(np.diff(path, axis=0)) / velocity_limit, axis=1) + STEP_PAUSE_S
     return Trajectory(np.append(0.0, np.cumsum(steps)), path)
 
 
 class PathSearch(ABC):
-    """Search for a path of one boundary problem by OMPL's RRTConnect.
-
-    Args:
-        robot: The robot.
-        task: The boundary problem.
-    """
+    """Search for a path of one boundary problem by OMPL's RRTConnect."""
 
     max_goal_error = float(np.finfo(float).eps)  # rad
 
@@ -127,16 +113,10 @@ class PathSearch(ABC):
     def solve(
         self, ompl: Any, time_limit: float, *, simplify_time: float = 0.0, step_size: float = 0.0
     ) -> Array | None:
-        """Search for a path and simplify it.
+        """Search for a path and simplify it; return joint positions [rad], shape (K, n), or None.
 
-        Args:
-            ompl: The modules of OMPL.
-            time_limit: Time for the search [s].
-            simplify_time: Time for simplifying the path [s]; 0 keeps it as it was found.
-            step_size: Largest step of the trees [rad]; 0 is the automatic value of OMPL.
-
-        Returns:
-            Joint positions [rad], shape (K, n), or None.
+        Times are in seconds; without time for simplifying, the path is kept as it was found. The largest step of the
+        trees is in radians; 0 is the automatic value of OMPL.
         """
         information, ends = self.space(ompl)
         setup, planner = ompl.geometric.SimpleSetup(information), ompl.geometric.RRTConnect(information)
@@ -157,14 +137,7 @@ class PathSearch(ABC):
 
 
 class Search(PathSearch):
-    """Search on the constraint manifold.
-
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        task: The boundary problem.
-        delta: Distance of projected states along an edge [rad].
-    """
+    """Search on the constraint manifold; ``delta`` is the distance of projected states along an edge [rad]."""
 
     max_goal_error = MAX_GOAL_ERROR_RAD
 

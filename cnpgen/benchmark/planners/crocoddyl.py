@@ -107,11 +107,7 @@ def cubic_states(boundary: Boundary, t: Array) -> list[Array]:
 def are_small(robot: Robot, boundary: Boundary, t: Array, states: Array) -> bool:
     """Return whether a motion meets its goal and exceeds its limits of velocity and acceleration by 1 % at most.
 
-    Args:
-        robot: The robot.
-        boundary: Boundary conditions of one motion.
-        t: Times [s], shape (K,).
-        states: Positions and velocities, shape (K, 2 n).
+    States at the times t [s] of shape (K,) are positions and velocities, shape (K, 2 n).
     """
     q, dq = np.split(states, 2, axis=1)
     use = np.abs(dq) / robot.velocity_limit, np.abs(np.diff(dq, axis=0) / t[1]) / robot.acceleration_limit
@@ -159,12 +155,7 @@ class ShootingCosts:
         self._object = None if self._table is not None else ObjectViolation(robot, *boxes_of(problem, task.scene))
 
     def solver(self, period: float, nodes: int) -> Any:
-        """Return BoxFDDP on spans of constant torque.
-
-        Args:
-            period: Duration of a span [s].
-            nodes: Number of spans.
-        """
+        """Return BoxFDDP on spans of constant torque of a duration [s]."""
         package, boundary = self._package, self._boundary
         at_rest = not np.any(boundary.goal_dq)
         first = self._action(period, boundary.start_ddq[0])
@@ -243,13 +234,7 @@ class ShootingCosts:
 
 
 class ObjectViolation:
-    """Missing distance of a held object's centre from the boxes [m], and depths of its corners in them [m].
-
-    Args:
-        robot: The robot.
-        size: Edge lengths of the object [m], shape (3,).
-        boxes: The B obstacles.
-    """
+    """Missing distance of a held object's centre from B boxes [m], and depths of its corners in them [m]."""
 
     def __init__(self, robot: Robot, size: Array, boxes: list[Box]) -> None:
         self._tip, self._corners = Tip(robot), CUBE * size

@@ -101,12 +101,7 @@ class Drake(BenchmarkPlanner):
 
 
 def add_boundary_conditions(program: Any, boundary: Boundary) -> None:
-    """Add positions and velocities of both ends, and the acceleration at the start; a goal at rest has none, too.
-
-    Args:
-        program: A ``KinematicTrajectoryOptimization``.
-        boundary: Boundary conditions of one motion.
-    """
+    """Add positions and velocities of both ends, and the acceleration at the start; a goal at rest has none, too."""
     from pydrake.solvers import Binding, LinearConstraint
     from pydrake.trajectories import BsplineTrajectory
 
@@ -147,24 +142,14 @@ def load_drake() -> Any:
 
 
 def check_robot(problem: Problem, robot: Robot) -> None:
-    """Check that Drake can model a problem from its URDF.
-
-    Raises:
-        UsageError: The problem has neither a table nor a held object among boxes, or a payload or another tip frame.
-    """
+    """Raise UsageError if there is neither a table nor a held object among boxes, or a payload or another tip frame."""
     require_table_or_transport(problem)
     if robot.attached.payload is not None or robot.attached.tip != robot.attached.frame:
         raise UsageError(f"supported are tips of the URDF without payload, {problem.name!r} has another one")
 
 
 class DrakeArm:
-    """A robot in its scene; Drake's objects live as long as this one.
-
-    Args:
-        problem: The problem, see ``check_robot``.
-        robot: Its robot.
-        scene: Obstacles of one boundary problem.
-    """
+    """A robot in the scene of one boundary problem; Drake's objects live as long as this one."""
 
     def __init__(self, problem: Problem, robot: Robot, scene: Scene) -> None:
         from pydrake.multibody.parsing import Parser

@@ -155,15 +155,10 @@ class Steering:
     iterations: int = 30
 
     def __call__(self, state: Array, target: Array) -> tuple[Array, Array] | None:
-        """Steer; a control is cut before its first invalid state.
+        """Steer from a state of shape (2 n,) to a configuration of shape (n,) [rad], with any velocity there.
 
-        Args:
-            state: Positions [rad] and velocities [rad/s], shape (2 n,).
-            target: Target configuration [rad], shape (n,), with any velocity.
-
-        Returns:
-            The states of the best motion, one per ``STEERING_STEP_S``, shape (K, 2 n), and the tip position at its end
-            [m], shape (3,); None if all controls are invalid.
+        A control is cut before its first invalid state. Return the states of the best motion, one per
+        ``STEERING_STEP_S``, shape (K, 2 n), and the tip position at its end [m]; None if all controls are invalid.
         """
         mean = np.append(np.zeros_like(self.limit), self.spread.mean_time)
         deviation = np.append(self.spread.acceleration * self.limit, self.spread.time)
@@ -191,15 +186,10 @@ class Steering:
         return np.clip(controls, low, high)
 
     def integrate(self, state: Array, controls: Array) -> tuple[Array, Array, NDArray[np.int64]]:
-        """Integrate controls from a state.
+        """Integrate controls, accelerations [rad/s^2] and times [s] of shape (N, n + 1), from a state of shape (2 n,).
 
-        Args:
-            state: Shape (2 n,).
-            controls: Accelerations [rad/s^2] and times [s], shape (N, n + 1).
-
-        Returns:
-            States every ``STEERING_STEP_S``, shape (N, K, 2 n), and tip positions [m], shape (N, K, 3). The third array
-            has the numbers of states before the first invalid one, shape (N,).
+        Return states every ``STEERING_STEP_S``, shape (N, K, 2 n), tip positions [m], shape (N, K, 3), and the numbers
+        of states before the first invalid one, shape (N,).
         """
         (q, dq), n = np.split(state, 2), len(self.limit)
         ddq = np.repeat(controls[:, None, :n], round(self.spread.max_duration / STEERING_STEP_S), axis=1)

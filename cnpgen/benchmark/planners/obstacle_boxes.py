@@ -17,22 +17,14 @@ MAX_CORNER_PENETRATION_M = 0.01  # of the object's corners, for samplers
 
 
 def boxes_of(problem: Problem, scene: Scene) -> tuple[Array, list[Box]]:
-    """Return the edge lengths of the held object [m], shape (3,), and the obstacles.
-
-    Raises:
-        UsageError: There is no held object, or an obstacle is not an upright box.
-    """
+    """Return the edge lengths of the held object [m], shape (3,), and the obstacles; see ``require_transport``."""
     size = require_transport(problem)
     boxes = [(np.array([*solid.low[:2], -np.inf]), solid.high) for solid in scene.bodies()]
     return size, boxes
 
 
 def require_table_or_transport(problem: Problem) -> None:
-    """Check that a problem has a table, or a held object among upright boxes.
-
-    Raises:
-        UsageError: It has neither.
-    """
+    """Raise UsageError if a problem has neither a table nor a held object among upright boxes."""
     if problem.first(Table) is None:
         require_transport(problem)
 

@@ -57,14 +57,7 @@ class Proposals:
     training: Mapping[str, str] = field(default_factory=dict)
 
     def propose(self, state: Array, goal_q: Array, obstacle_poses: Array, random: np.random.Generator) -> Array:
-        """Sample a next configuration [rad], shape (n,).
-
-        Args:
-            state: Positions [rad] and velocities [rad/s], shape (2 n,).
-            goal_q: Goal configuration [rad], shape (n,).
-            obstacle_poses: Poses and sizes of the obstacles, shape (width,).
-            random: Random generator.
-        """
+        """Sample a next configuration [rad], shape (n,), from a state of shape (2 n,) towards a goal of shape (n,)."""
         poses = obstacle_poses[None, : len(self.mean) - 2 * len(state)]  # without the puck of a hit
         inputs = standardize(inputs_of(state[None], goal_q[None], poses), self.mean, self.scale)
         prediction = forward(self._weights, inputs)
@@ -100,12 +93,7 @@ def save_proposals(path: str | Path, proposals: Proposals) -> None:
 
 
 def load_proposals(path: str | Path) -> Proposals:
-    """Read a network.
-
-    Raises:
-        DatasetError: The file is damaged or of another kind.
-        MachineError: The file cannot be read.
-    """
+    """Read a network; raise DatasetError if the file is damaged or of another kind."""
     content = read_with_checksum(Path(path), kind=PROPOSALS_KIND, version=PROPOSALS_VERSION)
     arrays = dict(content.arrays)
     try:
@@ -118,11 +106,7 @@ def load_proposals(path: str | Path) -> Proposals:
 
 
 def shipped_proposals(problem: str) -> Path:
-    """Find the network that cnpgen ships for a problem.
-
-    Raises:
-        UsageError: cnpgen ships none for this problem.
-    """
+    """Find the network that cnpgen ships for a problem; raise UsageError if there is none."""
     folder = recipes_root() / "datasets" / "proposals"
     path = folder / f"{problem}.h5"
     if not path.is_file():
@@ -183,16 +167,10 @@ def _fit(network: Proposals, features: Array, targets: Array, steps: int, random
 
 
 def likelihood_gradient(weights: Weights, features: Array, targets: Array, *, out: Weights) -> float:
-    """Write the gradient of the mean negative logarithm of the likelihood.
+    """Write the gradient of the mean negative logarithm of the likelihood; return this mean, up to the constant.
 
-    Args:
-        weights: Weights of the network.
-        features: Standardized inputs, shape (N, F).
-        targets: Changes of the joints as fractions of their reach, shape (N, n).
-        out: Output, like ``weights``.
-
-    Returns:
-        The mean negative logarithm of the likelihood, up to the constant.
+    Features are the standardized inputs, shape (N, F). Targets are the changes of the joints as fractions of their
+    reach, shape (N, n).
     """
     prediction = forward(weights, features)
     deviation = np.exp(prediction.log_rate) + MIN_PROPOSAL_DEVIATION

@@ -44,13 +44,7 @@ def has_manifold(problem: Problem, robot: Robot) -> bool:
 
 
 class FreeSearch(PathSearch):
-    """Search among obstacles.
-
-    Args:
-        states: States of the robot, which has link geometry; the obstacles of the boundary problem are placed.
-        robot: The robot.
-        task: The boundary problem.
-    """
+    """Search among the obstacles of a boundary problem, which are placed around the states of the robot."""
 
     def __init__(self, states: RestingStates, robot: Robot, task: Plans) -> None:
         super().__init__(robot, task)
@@ -118,16 +112,10 @@ def load_toppra() -> Any:
 
 
 def timed_by_toppra(path: Array, robot: Robot, goal_dq: Array, *, torque: bool = False) -> Trajectory | None:
-    """Time a path as fast as possible within the limits of velocity and acceleration.
+    """Time a path from rest as fast as possible within the limits of velocity, acceleration and, optionally, torque.
 
-    Args:
-        path: Joint positions [rad], shape (K, n).
-        robot: The robot with its limits.
-        goal_dq: Joint velocities at the goal [rad/s], shape (n,).
-        torque: Whether torques are limited, too.
-
-    Returns:
-        The trajectory from rest, or None if TOPP-RA finds no timing.
+    The path has shape (K, n) [rad], the velocities at the goal shape (n,) [rad/s]. Return None if TOPP-RA finds no
+    timing.
     """
     toppra = load_toppra()
     steps = np.linalg.norm(np.diff(path, axis=0), axis=1)

@@ -46,10 +46,7 @@ def load_ruckig() -> Any:
 def time_optimal_motion(ruckig: Any, robot: Robot, boundary: Boundary) -> Trajectory | None:
     """Return the time-optimal motion of one boundary problem, or None if there is none within the limits.
 
-    Args:
-        ruckig: The module.
-        robot: The robot with its limits.
-        boundary: Boundary conditions of one motion; the acceleration at the goal is 0.
+    The acceleration at the goal is 0.
     """
     state = ruckig.InputParameter(robot.n)
     for name, values in (

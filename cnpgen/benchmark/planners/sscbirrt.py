@@ -81,11 +81,7 @@ class SSCBiRRT(BenchmarkPlanner):
 
 
 class ManifoldSet:
-    """Set of joint positions near a manifold, in the interface of the package.
-
-    Args:
-        search: Search whose residual is to be small.
-    """
+    """Set of joint positions at which the residual of a search is small, in the interface of the package."""
 
     def __init__(self, search: Search) -> None:
         self._search = search
@@ -117,11 +113,7 @@ def load_sscbirrt() -> Any:
 
 
 def sampled(motion: Any) -> Trajectory | None:
-    """Return a timed path of the package at the breaks of its accelerations, between which cubics are exact.
-
-    Args:
-        motion: A ``sscbirrt.Trajectory``.
-    """
+    """Return a ``sscbirrt.Trajectory`` at the breaks of its accelerations, between which cubics are exact."""
     times = [np.zeros(1)]
     for piece, start in zip(motion.pieces, motion.breaks, strict=False):
         for ramp in piece.ramps:

@@ -60,15 +60,9 @@ def radii_of(problem: Problem, witness: float) -> Radii:
 
 
 class Tree:
-    """Tree of states; each node has the path from its parent.
+    """Tree of states from a start of shape (2 n,); each node has the path from its parent, with a step in seconds.
 
     A state is (q, dq), distances are those of the tip in the workspace, the cost of a node is the time from the start.
-
-    Args:
-        start: The root, shape (2 n,).
-        tip: Tip position of the root [m], shape (3,).
-        radii: The distances.
-        step: Time between two states of a path [s].
     """
 
     def __init__(self, start: Array, tip: Array, radii: Radii, step: float) -> None:
@@ -95,15 +89,9 @@ class Tree:
         return int(close[np.argmin(self._cost.rows[close])]) if len(close) else int(active[np.argmin(distances)])
 
     def add(self, parent: int, path: Array, tip: Array) -> int:
-        """Add a node unless a cheaper one exists near the same witness.
+        """Add a node with states from its parent, shape (K, 2 n), unless a cheaper one exists near the same witness.
 
-        Args:
-            parent: Parent of the node.
-            path: States from the parent, shape (K, 2 n).
-            tip: Tip position of the node [m], shape (3,).
-
-        Returns:
-            The active node near the witness: the new one or the cheaper one.
+        Return the active node near the witness: the new one or the cheaper one.
         """
         node, cost = len(self._paths), self._cost.rows[parent] + self._step * len(path)
         distances = np.linalg.norm(self._witnesses.rows - tip, axis=1)
@@ -134,16 +122,9 @@ class Tree:
     def grow(
         self, extend: Callable[[], int], goal: Array, *, time_limit: float, max_iterations: int
     ) -> Trajectory | None:
-        """Grow until a node is within the goal radius.
+        """Call ``extend``, which returns the active node, until one is within the goal radius or the time [s] is over.
 
-        Args:
-            extend: Function that extends the tree and returns the active node; 0 is the root.
-            goal: Goal position of the tip [m], shape (3,).
-            time_limit: Maximum time [s].
-            max_iterations: Maximum number of extensions.
-
-        Returns:
-            The trajectory to the node nearest to the goal; None if it is the root.
+        Return the trajectory to the node nearest to the goal [m], shape (3,); None if it is the root, node 0.
         """
         deadline = perf_counter() + time_limit
         best, min_distance = 0, float(np.linalg.norm(self.tip(0) - goal))
@@ -203,17 +184,9 @@ class SST(BenchmarkPlanner):
     def extend(
         self, tree: Tree, check: StateCheck, obstacle_poses: Array, goal: Array, random: np.random.Generator
     ) -> int:
-        """Apply a random acceleration for a random time at a node near a random position.
+        """Apply a random acceleration for a random time at a node near a random position or the goal [m], shape (3,).
 
-        Args:
-            tree: The tree, which gets the new node.
-            check: Check of states.
-            obstacle_poses: Poses and sizes of the obstacles, shape (width,).
-            goal: Goal position of the tip [m], shape (3,).
-            random: Random generator.
-
-        Returns:
-            The new node, or 0 if a state is invalid.
+        Return the new node of the tree, or 0 if a state is invalid.
         """
         position = goal if random.random() < self.goal_bias else check.random_position(obstacle_poses, random)
         parent = tree.select(position)

@@ -25,11 +25,7 @@ MAX_TIP_HEIGHT_ERROR_M = 0.01
 
 
 class StateCheck:
-    """Check of states: limits of joints and torques, the manifold, the obstacles.
-
-    Raises:
-        UsageError: There is neither a table nor a held object, or an obstacle is not an upright box.
-    """
+    """Check of states: limits of joints and torques, the manifold, the obstacles."""
 
     def __init__(self, problem: Problem, robot: Robot) -> None:
         require_table_or_transport(problem)
@@ -37,16 +33,9 @@ class StateCheck:
         self._kernel = problem_kernels(problem, robot, *choose_backend(None)).load(tip_and_violation)
 
     def __call__(self, q: Array, dq: Array, ddq: Array, obstacle_poses: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Check N states.
+        """Check N states of shape (N, n) each among obstacles.
 
-        Args:
-            q: Joint positions [rad], shape (N, n).
-            dq: Joint velocities [rad/s], shape (N, n).
-            ddq: Joint accelerations [rad/s^2], shape (N, n).
-            obstacle_poses: Poses and sizes of the obstacles, shape (width,).
-
-        Returns:
-            Positions of the tip [m], shape (N, 3), and a mask of the valid states, shape (N,).
+        Return positions of the tip [m], shape (N, 3), and a mask of the valid states, shape (N,).
         """
         lanes = [np.ascontiguousarray(values.T) for values in (q, dq, ddq)]
         tip, violation = self._kernel(

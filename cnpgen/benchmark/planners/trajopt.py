@@ -63,12 +63,7 @@ class TrajOptTranscription:
 
     Its variables are positions, velocities and accelerations at the knots where these are free, and T, in this order:
     ``x = (q_1 .. q_13, dq_1 .. dq_13, ddq, T)``. Accelerations are free at all knots if the motion must not end at
-    rest; else those at both ends are 0.
-
-    Args:
-        robot: The robot.
-        boundary: Boundary conditions of one motion.
-        at_knots: Constraints at the inner knots.
+    rest; else those at both ends are 0. ``at_knots`` are the constraints at the inner knots.
     """
 
     def __init__(self, robot: Robot, boundary: Boundary, at_knots: KnotConstraints) -> None:
@@ -187,16 +182,7 @@ class TrajOptTranscription:
 
 
 def knot_constraints(problem: Problem, robot: Robot, scene: Scene) -> KnotConstraints:
-    """Return the constraints of a boundary problem: of a hit, or of a transport.
-
-    Args:
-        problem: The problem.
-        robot: Its robot.
-        scene: Obstacles of the boundary problem.
-
-    Raises:
-        UsageError: The problem has neither a table nor a held object.
-    """
+    """Return the constraints of a boundary problem: of a hit, or of a transport; see ``require_table_or_transport``."""
     table = problem.first(Table)
     if table is not None:
         return _on_table(table, robot)

@@ -40,10 +40,7 @@ UNSUPPORTED = (AssertionError, AttributeError, KeyError, IndexError, TypeError, 
 
 
 def challenge_plant(folder: str | Path) -> Plant:
-    """Return the plant of a clone of the environment.
-
-    Args:
-        folder: The clone, which contains the package ``air_hockey_challenge``.
+    """Return the plant of a clone of the environment, which contains the package ``air_hockey_challenge``.
 
     Raises:
         UsageError: The folder is not a clone.
@@ -62,11 +59,7 @@ def challenge_plant(folder: str | Path) -> Plant:
 
 
 def check_challenge(problem: Problem, robot: Robot) -> None:
-    """Check that a problem is for an iiwa at the air-hockey table.
-
-    Raises:
-        UsageError: The problem is another one.
-    """
+    """Raise UsageError if a problem is not for an iiwa at the air-hockey table."""
     table = any(isinstance(constraint, Table) for constraint in problem.constraint)
     if not table or not set(robot.joint_names) <= set(JOINTS):
         needed = f"a table and an arm with {JOINTS[0]} to {JOINTS[-1]}"
@@ -74,12 +67,9 @@ def check_challenge(problem: Problem, robot: Robot) -> None:
 
 
 def execute_in_challenge(scene: SimulatorScene, reference: Reference, start_dq: Array) -> TickRecord:
-    """Execute one plan in the environment.
+    """Execute one plan in the environment, with the puck and the planned joints of the scene.
 
-    Args:
-        scene: The world: its puck and the planned joints are used.
-        reference: Reference of the controller; the robot starts at its first position.
-        start_dq: The robot's velocities at the start [rad/s], shape (n,).
+    The robot starts at the first position of the reference with the velocities ``start_dq`` [rad/s], shape (n,).
 
     Raises:
         UsageError: The environment aborted.

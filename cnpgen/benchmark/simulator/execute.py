@@ -30,15 +30,8 @@ class Controller:
     """Computed torque, within the rated torques: ``M(q) (ddq* + w^2 (q* - q) + 2 w (dq* - dq)) + h(q, dq)``.
 
     w is ``GAIN_RAD_S``. If a torque would exceed its limit, the acceleration is scaled down in its direction, and the
-    holding torque keeps priority. The controller models no friction, no damping and no other deviation of a plant.
-
-    Args:
-        problem: The problem, which defines the rated torques.
-        robot: Nominal robot.
-        plant: The simulated robot, for its delay.
-
-    Attributes:
-        limit: The rated torques [N m], shape (n,).
+    holding torque keeps priority. The robot is nominal: of a plant, only the delay counts. ``limit`` has the rated
+    torques [N m], shape (n,).
     """
 
     def __init__(self, problem: Problem, robot: Robot, plant: Plant) -> None:
@@ -49,13 +42,7 @@ class Controller:
         self._delayed: deque[Array] = deque()
 
     def __call__(self, q: Array, dq: Array, desired: tuple[Array, Array, Array]) -> Array:
-        """Compute the torque that takes effect now [N m], shape (n,).
-
-        Args:
-            q: Measured positions [rad], shape (n,).
-            dq: Measured velocities [rad/s], shape (n,).
-            desired: Positions, velocities and accelerations to follow.
-        """
+        """Compute the torque that takes effect now [N m], shape (n,), from the measured and the desired state."""
         import pinocchio as pin
 
         acceleration = desired[2] + GAIN_RAD_S**2 * (desired[0] - q) + 2 * GAIN_RAD_S * (desired[1] - dq)
@@ -92,11 +79,7 @@ class Execution:
 
 
 def load_mujoco() -> Any:
-    """Import MuJoCo.
-
-    Raises:
-        MissingExtraError: MuJoCo is not installed or broken.
-    """
+    """Import MuJoCo; raise MissingExtraError if it is not installed or broken."""
     if sys.platform == "linux" and not os.environ.get("DISPLAY"):
         os.environ.setdefault("MUJOCO_GL", "egl")  # renders without a screen; read when MuJoCo is imported
     with requires_extra("benchmark", "MuJoCo"):
@@ -105,12 +88,7 @@ def load_mujoco() -> Any:
 
 
 def compile_scene(scene: SimulatorScene) -> Any:
-    """Build MuJoCo's model of a scene.
-
-    Raises:
-        RecipeError: MuJoCo refuses the model, for example impossible inertias.
-        MachineError: MuJoCo is missing.
-    """
+    """Build MuJoCo's model of a scene; raise RecipeError if MuJoCo refuses it, for example impossible inertias."""
     try:
         return _compiled(scene_xml(scene))
     except ValueError as error:
@@ -123,16 +101,10 @@ def _compiled(text: str) -> Any:
 
 
 def execute(scene: SimulatorScene, reference: Reference, goal_xyz: Array, start_dq: Array | None = None) -> Execution:
-    """Execute one plan.
+    """Execute one plan, which ends with the tip at ``goal_xyz`` [m], shape (3,).
 
-    Args:
-        scene: The world.
-        reference: Reference of the controller; the robot starts at its first position.
-        goal_xyz: Tip position at the end of the plan [m], shape (3,).
-        start_dq: Velocities at the start [rad/s], shape (n,); default from the reference.
-
-    Raises:
-        RecipeError, MachineError: As ``compile_scene``.
+    The robot starts at the first position of the reference, with the velocities ``start_dq`` [rad/s], shape (n,), or
+    those of the reference.
     """
     start_dq = reference.dq[0] if start_dq is None else start_dq
     if scene.plant.environment:

@@ -92,15 +92,11 @@ class Executed:
 
 
 def succeeded(executed: Mapping[str, Any], plane_tolerance: float = PLANE_TOLERANCE_M) -> bool:
-    """Return whether an execution succeeded.
+    """Return whether an execution succeeded, from the result of ``Executed.to_dict``.
 
     A hit succeeds if it scores without early contact, and the mallet stays near the plane of the table throughout the
-    plan. The limit holds for the commanded height, too, because the table supports a mallet that is commanded below it.
-    A motion without a puck succeeds if it reaches its goal without collision.
-
-    Args:
-        executed: Result as by ``Executed.to_dict``.
-        plane_tolerance: Maximum distance of the mallet from the plane [m].
+    plan, within a tolerance [m]. The limit holds for the commanded height, too, because the table supports a mallet
+    that is commanded below it. A motion without a puck succeeds if it reaches its goal without collision.
     """
     if "failure" in executed:
         return False

@@ -52,14 +52,9 @@ def bounce(restitution: float = RESTITUTION, contact_time: float = CONTACT_TIME_
 
 
 def puck_of(goal_xyz: Array, tip_velocity: Array) -> Array | None:
-    """Place the puck of a hit: ``PUCK_OFFSET_M`` ahead of the tip, along its velocity at the goal.
+    """Place the puck of a hit: ``PUCK_OFFSET_M`` ahead of the tip [m], along its velocity at the goal [m/s].
 
-    Args:
-        goal_xyz: Tip position at the goal [m], shape (3,).
-        tip_velocity: Tip velocity at the goal [m/s], shape (3,).
-
-    Returns:
-        Its centre over the table [m], shape (2,); None if the motion ends at rest and is not a hit.
+    Return its centre over the table [m], shape (2,); None if the motion ends at rest and is not a hit.
     """
     speed = float(np.linalg.norm(tip_velocity[:2]))
     return goal_xyz[:2] + PUCK_OFFSET_M * tip_velocity[:2] / speed if speed > 1e-3 else None

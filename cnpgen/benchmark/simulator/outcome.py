@@ -58,11 +58,7 @@ class TickRecord:
 def puck_is_done(reference: Reference, tick: int, x: float, speed: float) -> bool:
     """Return whether the result of the puck is final: it has stopped, has left the table, or takes too long.
 
-    Args:
-        reference: Reference of the controller.
-        tick: Current tick.
-        x: Position of the puck along the table [m].
-        speed: Speed of the puck [m/s].
+    x is its position along the table [m].
     """
     stopped = tick > len(reference.q) and speed < MIN_PUCK_SPEED_M_S
     outside = x > hockey.GOAL_LINE_M + hockey.PUCK_RADIUS_M
@@ -70,14 +66,7 @@ def puck_is_done(reference: Reference, tick: int, x: float, speed: float) -> boo
 
 
 def outcome_of(scene: SimulatorScene, reference: Reference, goal_xyz: Array, record: TickRecord) -> Executed:
-    """Compute the result of an execution.
-
-    Args:
-        scene: The simulated world.
-        reference: Reference of the controller.
-        goal_xyz: Tip position at the end of the plan [m], shape (3,).
-        record: Record of all ticks.
-    """
+    """Compute the result of an execution whose plan ends with the tip at ``goal_xyz`` [m], shape (3,)."""
     ticks, height = min(reference.ticks, len(record.q)), scene.height
     during, tip = slice(0, ticks), scene.on_table(record.tip)
     goal_distance = float(np.linalg.norm(record.tip[ticks - 1] - goal_xyz))

@@ -71,11 +71,7 @@ PLANTS = {
 
 
 def as_plant(plant: Plant | str, *, argument: str = "plant") -> Plant:
-    """Return a plant by its name.
-
-    Raises:
-        UsageError: The name is unknown.
-    """
+    """Return a plant by its name; raise UsageError if the name is unknown."""
     if isinstance(plant, Plant):
         return plant
     if not isinstance(plant, str):

@@ -50,12 +50,7 @@ def states_of(motion: Motion) -> StatesAt:
 
 
 def make_reference(states: StatesAt, duration: float, *, acceleration_limit: Array) -> Reference:
-    """Sample a trajectory and add a stop, in which all joints decelerate uniformly in the same time.
-
-    Args:
-        states: The trajectory.
-        duration: Duration of the trajectory [s].
-        acceleration_limit: Deceleration limit of the stop [rad/s^2], shape (n,).
+    """Sample a trajectory of a duration [s] and add a stop, in which all joints decelerate uniformly in the same time.
 
     Raises:
         UsageError: The plan never arrives, or plan or stop exceed ``MAX_EXECUTED_DURATION_S``.

@@ -25,11 +25,7 @@ Image = NDArray[np.uint8]
 
 
 def save_picture(path: Path, execution: Execution) -> None:
-    """Render the world at the end of a plan.
-
-    Args:
-        path: Image file, ``.png``; replaced if it exists.
-        execution: The execution.
+    """Render the world at the end of a plan as ``.png``; an existing file is replaced.
 
     Raises:
         MachineError: This machine cannot render, or the file cannot be written.
@@ -42,12 +38,9 @@ def save_picture(path: Path, execution: Execution) -> None:
 
 
 def save_film(path: Path, execution: Execution, *, max_frames: int | None = None) -> None:
-    """Render a film of a plan and of the second after it, in slow motion.
+    """Render a film of a plan and of the second after it, in slow motion, as ``.mp4`` or ``.gif``.
 
-    Args:
-        path: Film file, ``.mp4`` or ``.gif``; replaced if it exists.
-        execution: The execution.
-        max_frames: Maximum number of frames; longer motions are shown faster. Unlimited by default.
+    An existing file is replaced. Motions with more than ``max_frames`` are shown faster.
 
     Raises:
         MachineError: As ``save_picture``, or ffmpeg is missing.

@@ -133,10 +133,6 @@ def _simulate(plan: Plans, *, plant: Plant) -> Executed:
 def execute_plan(plan: Plans, plant: Plant) -> Execution:
     """Execute one plan.
 
-    Args:
-        plan: One plan.
-        plant: The robot.
-
     Raises:
         UsageError: The plan cannot be executed: it is not finite, never arrives, or takes too long.
         RecipeError, MachineError: As ``simulate_plans``.
@@ -147,18 +143,7 @@ def execute_plan(plan: Plans, plant: Plant) -> Execution:
 def execute_states(
     problem: Plans, states: StatesAt, duration: float, plant: Plant, start_dq: Array | None = None
 ) -> Execution:
-    """Execute a trajectory for one boundary problem.
-
-    Args:
-        problem: One boundary problem, or a plan for it.
-        states: The trajectory.
-        duration: Duration [s].
-        plant: The robot.
-        start_dq: See ``execute``.
-
-    Raises:
-        UsageError, RecipeError, MachineError: As ``execute_plan``.
-    """
+    """Execute a trajectory of a duration [s] for one boundary problem; see ``execute`` and ``execute_plan``."""
     _, robot = open_problem(problem.problem)
     reference = make_reference(states, duration, acceleration_limit=robot.acceleration_limit)
     return execute(simulator_scene(problem, plant), reference, problem.columns["goal_xyz"][0], start_dq)
@@ -169,10 +154,6 @@ def simulator_scene(problem: Plans, plant: Plant) -> SimulatorScene:
 
     Parameters of the problem determine the load, the pose of the table and the upright direction. The columns
     ``puck_xy`` [m] and ``puck_velocity`` [m/s] of hits of moving pucks define the puck at the start.
-
-    Args:
-        problem: One boundary problem, or a plan for it.
-        plant: The robot.
     """
     record, values = problem.problem, problem.boundary.parameters
     loaded, robot = open_problem(record if values is None else with_payload_of(record, values[0]))

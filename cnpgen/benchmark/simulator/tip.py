@@ -16,11 +16,9 @@ class Tip:
         self._frame = robot.tip_frame
 
     def at(self, q: Array) -> tuple[Array, Array, Array]:
-        """Evaluate the tip at joint positions q [rad], shape (n,).
+        """Return position [m], shape (3,), rotation, shape (3, 3), and Jacobian, shape (6, n), at q [rad], shape (n,).
 
-        Returns:
-            Its position [m], shape (3,), its rotation, shape (3, 3), and its Jacobian in world axes, shape (6, n),
-            translation first.
+        The Jacobian is in world axes, translation first.
         """
         import pinocchio as pin
 
