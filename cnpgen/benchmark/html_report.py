@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cnpgen.benchmark.answers import Task, execution_of
-from cnpgen.benchmark.paper_figures import benchmark_values, distribution_figure, success_figure
+from cnpgen.benchmark.paper_figures import benchmark_figures
 from cnpgen.benchmark.result_tables import failure_summaries, notes, table_rows
 from cnpgen.benchmark.run_suite import Benchmark
 from cnpgen.benchmark.simulator.plant import Plant
@@ -45,7 +45,8 @@ def save_benchmark_report(benchmark: Benchmark, path: str | Path, *, video: bool
     parts += [f"<p>{escape(text)}</p>" for text in [*failure_summaries(benchmark), *notes(benchmark)]]
     for plant in benchmark.executions:
         title = f"executed by the {plant} plant" if plant else "planned"
-        parts.append(f"<h2>{title}</h2>{_table(benchmark, plant)}{_drawings(benchmark, plant)}")
+        drawings = "".join(map(_as_svg, benchmark_figures(benchmark, plant).values()))
+        parts.append(f"<h2>{title}</h2>{_table(benchmark, plant)}{drawings}")
     parts += _motions(benchmark, video=video)
     head = f"<!doctype html><meta charset='utf-8'><title>{escape(suite.name)}</title><style>{_STYLE}</style>"
     write_file(place, "\n".join([head, *parts]))
@@ -58,12 +59,6 @@ def _table(benchmark: Benchmark, plant: str) -> str:
     lines = ["<table><tr>" + "".join(f"<th>{escape(cell)}</th>" for cell in head) + "</tr>"]
     lines += ["<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows]
     return "\n".join([*lines, "</table>"])
-
-
-def _drawings(benchmark: Benchmark, plant: str) -> str:
-    """Draw success over planning time and box plots of all figures."""
-    values = benchmark_values(benchmark, plant)
-    return "".join(map(_as_svg, (success_figure(values, plant), distribution_figure(values))))
 
 
 def _as_svg(figure: "Figure") -> str:

@@ -39,12 +39,16 @@ def save_benchmark_figures(benchmark: Benchmark, folder: str | Path) -> tuple[Pa
     """
     paths = []
     for plant in benchmark.executions:
-        values = benchmark_values(benchmark, plant)
-        figures = {"success": success_figure(values, plant), "distributions": distribution_figure(values)}
-        for name, figure in figures.items():
+        for name, figure in benchmark_figures(benchmark, plant).items():
             paths.append(Path(folder) / f"{name}-{plant or 'planned'}.pdf")
             save_figure(figure, paths[-1])
     return tuple(paths)
+
+
+def benchmark_figures(benchmark: Benchmark, plant: str) -> dict[str, "Figure"]:
+    """Draw both figures of a plant; return name -> figure."""
+    values = benchmark_values(benchmark, plant)
+    return {"success": success_figure(values, plant), "distributions": distribution_figure(values)}
 
 
 def benchmark_values(benchmark: Benchmark, plant: str) -> dict[str, list[Values]]:

@@ -29,7 +29,9 @@ PYTHON_LOOPS = ("aqp", "cbirrt", "rrtconnect", "sscbirrt")  # planners whose aut
 TAIL_FIGURES = ("planning_ms", "planning_cpu_ms")  # printed with their tails
 MAX_PRINTED_P = 0.05
 TABLE_FILES = ("results.csv", "tables.md", "tables.tex")
-_LATEX = {"&": r"\&", "%": r"\%", "_": r"\_", "<": r"\textless{}", "#": r"\#", "²": r"\textsuperscript{2}"}
+_LATEX = str.maketrans(
+    {"&": r"\&", "%": r"\%", "_": r"\_", "<": r"\textless{}", "#": r"\#", "²": r"\textsuperscript{2}"}
+)
 _COLUMNS = ("suite", "suite_version", "planner", "repetition", "problem", "plant", "ending", "seed")
 
 
@@ -179,7 +181,7 @@ def latex_text(benchmark: Benchmark) -> str:
     """Write the tables of all plants as LaTeX, for the package booktabs."""
     lines = [f"% {note}" for note in [*notes(benchmark), *failure_summaries(benchmark)]]
     for plant in benchmark.executions:
-        head, *rows = ([_latex(cell) for cell in row] for row in table_rows(benchmark, plant))
+        head, *rows = ([cell.translate(_LATEX) for cell in row] for row in table_rows(benchmark, plant))
         lines += [
             rf"\begin{{tabular}}{{l{'r' * (len(head) - 1)}}}",
             r"\toprule",
@@ -189,7 +191,3 @@ def latex_text(benchmark: Benchmark) -> str:
         lines += [rf"{' & '.join(row)} \\" for row in rows]
         lines += [r"\bottomrule", r"\end{tabular}", ""]
     return "\n".join(lines)
-
-
-def _latex(text: str) -> str:
-    return "".join(_LATEX.get(character, character) for character in text)

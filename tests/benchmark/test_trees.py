@@ -127,7 +127,7 @@ def test_fields_of_mpc_mpnet_are_the_counts_of_the_cross_entropy_method(monkeypa
     integrate = Steering.integrate
 
     def recorded(self: Steering, state: Array, controls: Array) -> tuple[Array, Array, NDArray[np.int64]]:
-        shapes.append((len(controls), self.elites))
+        shapes.append((len(controls), self.settings.elites))
         return integrate(self, state, controls)
 
     monkeypatch.setattr(Steering, "integrate", recorded)
@@ -135,7 +135,7 @@ def test_fields_of_mpc_mpnet_are_the_counts_of_the_cross_entropy_method(monkeypa
     task = one_of("hits-81", 40)
     planner.prepare(Setting(task.problem, time_limit=0.2))(task)
     assert set(shapes) == {(10, 3)}
-    steer = replace(steering_of(task), samples=10, iterations=2)
+    steer = replace(steering_of(task), settings=MPCMPNet(samples=10, iterations=2))
     shapes.clear()
     steer(np.concatenate([task.boundary.start_q[0], task.boundary.start_dq[0]]), task.boundary.goal_q[0])
     assert len(shapes) <= 2
@@ -157,8 +157,7 @@ def test_a_tree_keeps_the_cheapest_node_of_every_witness_and_selects_the_cheapes
 def steering_of(task: Plans, seed: int = 0) -> Steering:
     problem, robot = open_problem(task.problem)
     check = StateCheck(problem, robot)
-    random = np.random.default_rng(seed)
-    return Steering(check, task.scene.poses[0], robot.acceleration_limit, spread_of(problem), random)
+    return Steering(MPCMPNet(), check, task.scene.poses[0], spread_of(problem), np.random.default_rng(seed))
 
 
 def test_controls_are_integrated_as_by_pinocchio_up_to_the_first_invalid_state() -> None:
@@ -286,6 +285,6 @@ def test_mpc_mpnet_continues_from_another_node_after_a_failure() -> None:
     tree = Tree(start, task.columns["start_xyz"][0], RADII, STEERING_STEP_S)
     upwards = np.concatenate([start[:6], [0, -1.0, 0, 0, 0, 0]])  # the tip leaves the table at once
     stuck = tree.add(0, upwards[None], np.array([1.5, 0, 0.16]))
-    extend = ProposedExtension(tree, load_proposals(shipped_proposals("airhockey")), steer, start[:6], 0.05, node=stuck)
+    extend = ProposedExtension(tree, load_proposals(shipped_proposals("airhockey")), steer, start[:6], node=stuck)
     assert extend() == 0
     assert extend.node == 0

@@ -92,14 +92,8 @@ def min_duration(robot: Robot, boundary: Boundary) -> float:
 
 def cubic_states(boundary: Boundary, t: Array) -> list[Array]:
     """Return positions and velocities of the cubic between both ends at K times, a list of arrays of shape (2 n,)."""
-    ends = np.array([t[0], t[-1]])
-    cubic = Trajectory(
-        ends,
-        *(
-            np.vstack(pair)
-            for pair in zip((boundary.start_q, boundary.start_dq), (boundary.goal_q, boundary.goal_dq), strict=True)
-        ),
-    )
+    b = boundary
+    cubic = Trajectory(t[[0, -1]], np.vstack([b.start_q, b.goal_q]), np.vstack([b.start_dq, b.goal_dq]))
     q, dq, _ = cubic.states(t)
     return list(np.hstack([q, dq]))
 

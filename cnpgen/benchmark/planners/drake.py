@@ -130,11 +130,7 @@ def sampled(spline: Any) -> Trajectory:
 
 
 def load_drake() -> Any:
-    """Import Drake.
-
-    Raises:
-        MissingExtraError: Drake is missing.
-    """
+    """Import Drake; raise MissingExtraError if it is missing."""
     with requires_extra("planners", "Drake"):
         import pydrake
         import pydrake.planning

@@ -52,17 +52,14 @@ class MPCMPNet(BenchmarkPlanner):
             raise UsageError(
                 f"the network that proposes configurations for {problem.name!r} is trained for another arm or scene"
             )
-        spread = spread_of(problem)
 
         def plan(task: Plans) -> Answer:
             boundary = task.boundary
             start_xyz, goal_xyz = task.columns["start_xyz"][0], task.columns["goal_xyz"][0]
             start = np.concatenate([boundary.start_q[0], boundary.start_dq[0]])
             tree = Tree(start, start_xyz, radii_of(problem, self.witness_radius), STEERING_STEP_S)
-            poses, random = task.scene.poses[0], setting.random(task)
-            counts = self.samples, self.elites, self.iterations
-            steer = Steering(check, poses, robot.acceleration_limit, spread, random, *counts)
-            extend = ProposedExtension(tree, network, steer, boundary.goal_q[0], self.goal_bias)
+            steer = Steering(self, check, task.scene.poses[0], spread_of(problem), setting.random(task))
+            extend = ProposedExtension(tree, network, steer, boundary.goal_q[0])
             return tree.grow(extend, goal_xyz, time_limit=setting.time_limit, max_iterations=MAX_PROPOSALS)
 
         return plan
@@ -77,7 +74,6 @@ class ProposedExtension:
         network: Network of the proposals.
         steer: Steering.
         goal_q: Goal configuration [rad], shape (n,).
-        goal_bias: Share of targets that are the goal.
         node: Node of the next step.
         steps: Consecutive steps.
     """
@@ -86,14 +82,13 @@ class ProposedExtension:
     network: Proposals
     steer: Steering
     goal_q: Array
-    goal_bias: float
     node: int = 0
     steps: int = 0
 
     def __call__(self) -> int:
         """Take one step; return the new node, or 0 after a failure."""
         state, target, random = self.tree.state(self.node), self.goal_q, self.steer.random
-        if random.random() >= self.goal_bias:
+        if random.random() >= self.steer.settings.goal_bias:
             target = self.network.propose(state, self.goal_q, self.steer.obstacle_poses, random)
         motion = self.steer(state, target)
         node = 0 if motion is None else self.tree.add(self.node, *motion)
@@ -135,24 +130,23 @@ class Steering:
     """Steering from states towards configurations, for one boundary problem.
 
     Attributes:
+        settings: Numbers of controls and iterations of the cross-entropy method.
         check: Check of states.
         obstacle_poses: Poses and sizes of the obstacles, shape (width,).
-        limit: Limits of the accelerations [rad/s^2], shape (n,).
         spread: Initial distribution of controls.
         random: Random generator.
-        samples: Controls per iteration of the cross-entropy method.
-        elites: Best controls, which determine the next distribution.
-        iterations: Largest number of iterations.
     """
 
+    settings: MPCMPNet
     check: StateCheck
     obstacle_poses: Array
-    limit: Array
     spread: Spread
     random: np.random.Generator
-    samples: int = 64
-    elites: int = 4
-    iterations: int = 30
+
+    @property
+    def limit(self) -> Array:
+        """Limits of the accelerations [rad/s^2], shape (n,)."""
+        return self.check.robot.acceleration_limit
 
     def __call__(self, state: Array, target: Array) -> tuple[Array, Array] | None:
         """Steer from a state of shape (2 n,) to a configuration of shape (n,) [rad], with any velocity there.
@@ -163,12 +157,12 @@ class Steering:
         mean = np.append(np.zeros_like(self.limit), self.spread.mean_time)
         deviation = np.append(self.spread.acceleration * self.limit, self.spread.time)
         best, least = None, np.inf
-        for _ in range(self.iterations):
+        for _ in range(self.settings.iterations):
             controls = self._sample_controls(mean, deviation)
             paths, tips, lengths = self.integrate(state, controls)
-            ends = paths[np.arange(self.samples), lengths - 1, : len(target)]
+            ends = paths[np.arange(self.settings.samples), lengths - 1, : len(target)]
             distances = np.where(lengths > 0, np.linalg.norm(ends - target, axis=1), np.inf)
-            order = np.argsort(distances)[: self.elites]
+            order = np.argsort(distances)[: self.settings.elites]
             first, length = int(order[0]), int(lengths[order[0]])
             if distances[first] < least:
                 best, least = (paths[first, :length], tips[first, length - 1]), float(distances[first])
@@ -181,7 +175,7 @@ class Steering:
 
     def _sample_controls(self, mean: Array, deviation: Array) -> Array:
         """Sample controls within their limits: accelerations [rad/s^2] and a time [s], shape (samples, n + 1)."""
-        controls = self.random.normal(mean, deviation, (self.samples, len(mean)))
+        controls = self.random.normal(mean, deviation, (self.settings.samples, len(mean)))
         low, high = np.append(-self.limit, STEERING_STEP_S), np.append(self.limit, self.spread.max_duration)
         return np.clip(controls, low, high)
 

@@ -6,6 +6,7 @@ torque if the problem limits it and there is no manifold. A goal in motion is me
 as this is feasible.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -67,6 +68,14 @@ class FreeSearch(PathSearch):
         return information, ends
 
 
+def path_searches(problem: Problem, robot: Robot) -> Callable[[Plans], PathSearch]:
+    """Return the function that prepares the search of a boundary problem: on the manifold, or among obstacles."""
+    if has_manifold(problem, robot):
+        return lambda task: Search(problem, robot, task)
+    states = RestingStates(problem, robot)
+    return lambda task: FreeSearch(states, robot, task)
+
+
 @dataclass(frozen=True)
 class RRTConnect(BenchmarkPlanner):
     """RRT-Connect on the constraint manifold with simplification (OMPL), timed by TOPP-RA."""
@@ -79,18 +88,18 @@ class RRTConnect(BenchmarkPlanner):
         ompl = load_ompl()
         load_toppra()
         problem, robot = open_problem(setting.problem)
-        states = None if has_manifold(problem, robot) else RestingStates(problem, robot)
+        search_for = path_searches(problem, robot)
         torque_limited = problem.first(JointTorque) is not None
 
         def plan(task: Plans) -> Answer:
             seed_ompl(ompl, setting, task)
             simplify_time = min(self.simplify_time, setting.time_limit / 2)
-            search: PathSearch = Search(problem, robot, task) if states is None else FreeSearch(states, robot, task)
+            search = search_for(task)
             search_time = setting.time_limit - simplify_time
             path = search.solve(ompl, search_time, simplify_time=simplify_time, step_size=self.step_size)
             if path is None:
                 return None
-            if states is None:
+            if isinstance(search, Search):
                 return timed_by_toppra(path, robot, task.boundary.goal_dq[0])
             return timed_by_toppra(path, robot, np.zeros(robot.n), torque=torque_limited)
 
@@ -98,11 +107,7 @@ class RRTConnect(BenchmarkPlanner):
 
 
 def load_toppra() -> Any:
-    """Import TOPP-RA without its messages.
-
-    Raises:
-        MissingExtraError: TOPP-RA is missing.
-    """
+    """Import TOPP-RA without its messages; raise MissingExtraError if it is missing."""
     with requires_extra("benchmark", "TOPP-RA"):
         import toppra
         import toppra.algorithm

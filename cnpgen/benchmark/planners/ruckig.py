@@ -33,11 +33,7 @@ class Ruckig(BenchmarkPlanner):
 
 
 def load_ruckig() -> Any:
-    """Import Ruckig.
-
-    Raises:
-        MissingExtraError: Ruckig is missing.
-    """
+    """Import Ruckig; raise MissingExtraError if it is missing."""
     with requires_extra("benchmark", "Ruckig"):
         import ruckig
     return ruckig

@@ -5,7 +5,6 @@ within the limits of velocity and acceleration by Hauser and Ng-Thow-Hing (2010)
 ends, which are at rest.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
@@ -13,11 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.benchmark.benchmark_planner import Answer, BenchmarkPlanner, Plan, Setting
-from cnpgen.benchmark.planners.cbirrt import MANIFOLD_TOLERANCE, MAX_PROJECTIONS, SEEDS, Search
-from cnpgen.benchmark.planners.rrtconnect import FreeSearch, has_manifold
+from cnpgen.benchmark.benchmark_planner import BenchmarkPlanner, Plan, Setting
+from cnpgen.benchmark.planners.cbirrt import MANIFOLD_TOLERANCE, MAX_PROJECTIONS, SEEDS, PathSearch, Search
+from cnpgen.benchmark.planners.rrtconnect import path_searches
 from cnpgen.errors import requires_extra
-from cnpgen.pipelines.families.resting_states import RestingStates
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem_record import open_problem
 from cnpgen.robots.robot import Robot
@@ -40,30 +38,15 @@ class SSCBiRRT(BenchmarkPlanner):
         """Import the package."""
         load_sscbirrt()
         problem, robot = open_problem(setting.problem)
-        states = None if has_manifold(problem, robot) else RestingStates(problem, robot)
+        search_for = path_searches(problem, robot)
+        return lambda task: self._plan(setting, robot, task, search_for(task))
 
-        def plan(task: Plans) -> Answer:
-            if states is not None:
-                is_valid = FreeSearch(states, robot, task).is_valid
-                return self._plan(setting, robot, task, is_valid=is_valid, manifold=None)
-            search = Search(problem, robot, task)
-            return self._plan(setting, robot, task, is_valid=search.is_valid, manifold=ManifoldSet(search))
-
-        return plan
-
-    def _plan(
-        self,
-        setting: Setting,
-        robot: Robot,
-        task: Plans,
-        *,
-        is_valid: Callable[[Array], bool],
-        manifold: "ManifoldSet | None",
-    ) -> Trajectory | None:
+    def _plan(self, setting: Setting, robot: Robot, task: Plans, search: PathSearch) -> Trajectory | None:
         """Search for a path and time it; return None without a path in time."""
         package = load_sscbirrt()
+        manifold = ManifoldSet(search) if isinstance(search, Search) else None
         joints = SimpleNamespace(dof=robot.n, joint_limits=(robot.position_lower, robot.position_upper))
-        validity = SimpleNamespace(is_valid=is_valid)
+        validity = SimpleNamespace(is_valid=search.is_valid)
         config = package.CBiRRTConfig(timeout=setting.time_limit, step_size=self.step_size)
         planner = package.CBiRRT(joints, collision_checker=validity, config=config)
         start, goal = (
@@ -102,11 +85,7 @@ class ManifoldSet:
 
 
 def load_sscbirrt() -> Any:
-    """Import the package.
-
-    Raises:
-        MissingExtraError: The package is missing.
-    """
+    """Import the package; raise MissingExtraError if it is missing."""
     with requires_extra("planners", "sscbirrt"):
         import sscbirrt
     return sscbirrt

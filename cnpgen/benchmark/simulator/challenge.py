@@ -104,13 +104,9 @@ def _all_joints(scene: SimulatorScene, values: Array) -> Array:
 def _action(scene: SimulatorScene, reference: Reference, tick: int) -> Array:
     """Return the positions, velocities and accelerations at the ends of the next 20 ticks, shape (20, 3, 7).
 
-    The environment's own interpolation begins at the end of the first tick, too. After the reference, the arm is to
-    stand still.
+    The environment's own interpolation begins at the end of the first tick, too.
     """
-    ticks = np.arange(tick + 1, tick + 1 + TICKS_PER_STEP)
-    last = len(reference.q) - 1
-    moving, rows = (ticks <= last)[:, None], np.minimum(ticks, last)
-    parts = (reference.q[rows], reference.dq[rows] * moving, reference.ddq[rows] * moving)
+    parts = reference.at(np.arange(tick + 1, tick + 1 + TICKS_PER_STEP))
     return np.stack([_all_joints(scene, part) for part in parts], axis=1)
 
 
@@ -120,7 +116,7 @@ def _tick_record(scene: SimulatorScene, reference: Reference, environment: Any) 
     q, torque, puck, velocity, touched = (np.array(column) for column in zip(*environment.recorded, strict=True))
     q, evaluated = q[:, planned], Tip(robot)
     tip, rotation, _ = (np.array(part) for part in zip(*map(evaluated.at, q), strict=True))
-    desired = reference.q[np.minimum(np.arange(len(q)), len(reference.q) - 1)]
+    desired = reference.at(np.arange(len(q)))[0]
     torque_use = torque[:, planned] / rated_torque(scene.problem, robot)
     unknown_force = np.full((len(q), 2), np.nan)
     steps = dict(environment.violated_steps)

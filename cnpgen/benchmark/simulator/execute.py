@@ -155,10 +155,8 @@ class _Run:
 
     def _step(self, tick: int) -> None:
         """Record the state, compute the torque, and simulate one tick."""
-        data, n, last = self._data, self._n, len(self._reference.q) - 1
-        reference, k = self._reference, min(tick, last)
-        moving = 0.0 if tick > last else 1.0
-        desired = (reference.q[k], moving * reference.dq[k], moving * reference.ddq[k])
+        data, n = self._data, self._n
+        desired = self._reference.at(tick)
         torque = self._control(data.qpos[:n].copy(), data.qvel[:n].copy(), desired)
         tip, rotation = data.site_xpos[self._tip].copy(), data.site_xmat[self._tip].reshape(3, 3).copy()
         state = data.qpos.copy(), tip, rotation, desired[0], torque, data.qvel.copy()

@@ -5,6 +5,7 @@ arm ('cnpgen docs references'). The friction of other joints is a fraction of th
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,14 +17,8 @@ from cnpgen.robots.robot import Robot
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Friction:
-    """Friction of one joint.
-
-    Attributes:
-        dry: Dry friction [N m].
-        viscous: Viscous friction [N m s/rad].
-    """
+class Friction(NamedTuple):
+    """Dry [N m] and viscous [N m s/rad] friction of one joint."""
 
     dry: float
     viscous: float

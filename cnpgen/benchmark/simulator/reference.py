@@ -38,6 +38,12 @@ class Reference:
         """Number of ticks within the plan, including its end."""
         return int(np.ceil(self.duration / TICK_S)) + 1
 
+    def at(self, ticks: int | NDArray[np.int64]) -> tuple[Array, Array, Array]:
+        """Return positions, velocities and accelerations at a tick, shape (n,) each, or at K ticks, shape (K, n)."""
+        last = len(self.q) - 1
+        rows, moving = np.minimum(ticks, last), np.less_equal(ticks, last)[..., None]
+        return self.q[rows], self.dq[rows] * moving, self.ddq[rows] * moving
+
 
 def states_of(motion: Motion) -> StatesAt:
     """Return the function that evaluates one motion in time."""
