@@ -53,12 +53,7 @@ _VERDICT = {
 
 @dataclass
 class Results:
-    """Results of one planner.
-
-    Attributes:
-        path: The file.
-        rows: Index of the problem -> its row, see ``cnpgen docs benchmark``.
-    """
+    """Results of one planner: the file, and problem -> its row, see ``cnpgen docs benchmark``."""
 
     path: Path
     rows: dict[int, dict[str, Any]] = field(default_factory=dict)

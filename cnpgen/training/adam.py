@@ -82,12 +82,7 @@ def learning_rate(step: int, steps: int, *, peak: float, final: float, warm_up: 
 
 @dataclass
 class Clipping:
-    """Running norms of gradients; 0 before the first batch.
-
-    Attributes:
-        sample: Running median of the norms of the samples' gradients.
-        batch: Running norm of the batch's gradient.
-    """
+    """Running median of the samples' gradient norms, running norm of the batch's; 0 before the first batch."""
 
     sample: float = 0.0
     batch: float = 0.0

@@ -58,13 +58,7 @@ class Sums:
 
 @dataclass
 class Best:
-    """The best model so far.
-
-    Attributes:
-        score: Its score, the larger the better; -inf before the first validation.
-        step: Step at which it was validated.
-        parameters: Its parameters, shape (n_parameters,).
-    """
+    """Best model so far: score, -inf before the first validation, step, and parameters of shape (n_parameters,)."""
 
     score: float
     step: int

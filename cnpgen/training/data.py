@@ -39,11 +39,7 @@ MIN_SCENE_ROWS = 40
 class TrainingData(ABC):
     """Rows to train on and to validate with.
 
-    Attributes:
-        problem: The problem of all rows.
-        place: Folder or file, for messages.
-        stages: Stages of the pipeline that made the rows; empty for other rows.
-        n_validation: Number of validation rows.
+    ``place`` is the folder or file, for messages. ``stages`` are those of the pipeline that made the rows, if any.
     """
 
     problem: StoredProblem
@@ -82,13 +78,7 @@ class TrainingData(ABC):
 
 @dataclass(frozen=True)
 class DatasetRows(TrainingData):
-    """A dataset to train on.
-
-    Attributes:
-        dataset: The dataset.
-        train: Name of the split to train on.
-        validation: Name of the split to validate on.
-    """
+    """A dataset to train on, with the names of the splits for training and validation."""
 
     dataset: Dataset
     train: str
@@ -136,11 +126,8 @@ def _problems(columns: dict[str, Array]) -> TrainingProblems:
 class SceneRows(TrainingData):
     """Problems of scenes to train on; exact symmetries multiply the training rows.
 
-    The training rows are the problems and their reverses, from the goal to the start.
-
-    Attributes:
-        boundary: Boundary conditions of all problems, shape (N, n) each; the last ones are the validation rows.
-        obstacle_poses: Poses and sizes of their obstacles, shape (N, width).
+    The training rows are the problems and their reverses, from the goal to the start. The last problems are the
+    validation rows. Boundary conditions have shape (N, n) each, poses and sizes of the obstacles (N, width).
     """
 
     boundary: Boundary

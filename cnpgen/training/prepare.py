@@ -18,6 +18,7 @@ from cnpgen.planner.model import Model, ModelConfig, is_rest_to_rest
 from cnpgen.planner.network.architecture import Architecture, initial_parameters
 from cnpgen.planner.network.features import SCENE, Features, count_features, feature_blocks, published_features
 from cnpgen.planner.projection import make_projection
+from cnpgen.planner.tasks import Tasks
 from cnpgen.plans.evaluate import evaluate_plans
 from cnpgen.plans.format import OBSTACLE_POSES
 from cnpgen.schema.memory import check_memory
@@ -70,11 +71,21 @@ def prepare_run(
     architecture = _architecture(loaded, settings, blocks, boundary)
     if initial_model is not None:
         _check_initial_model(initial_model, architecture, settings, loaded, zero)
-    rows, features = _rows(problems, inference, features, blocks, initial_model)
+
+    def planned_lines(boundary: Boundary) -> Tasks:
+        assert initial_model is not None
+        return inference.planned(initial_model, boundary)[0]
+
+    lines = None if initial_model is None or inference.via_points is None else planned_lines
+    poses = problems.obstacle_poses
+    rows, features = prepare_rows(
+        boundary, inference.prepare, features=features, blocks=blocks, lines=lines, obstacle_poses=poses
+    )
     if settings.imitation:
         rows = _with_demonstrations(rows, source, loaded)
     loss = _loss(loaded, settings)
     held_out = source.checked(check_rows)
+    training = {"command": command, **identity(source, settings), "stages": source.stages}
     projection = make_projection(
         loaded.problem.for_planning,
         loaded.kernels,
@@ -89,32 +100,20 @@ def prepare_run(
         names=loss.terms,
         budgets=dict(zip(loss.terms[1:], loss.budgets.tolist(), strict=True)),
         rows=rows,
-        features=features,
         metric=_metric(loss, settings),
-        problem=loaded.record,
-        config=config,
+        model=lambda parameters: Model(
+            problem=loaded.record,
+            architecture=architecture,
+            parameters=parameters.astype(np.float32),
+            features=features,
+            config=config,
+            zero_conditions=zero,
+            training=training,
+        ),
         validate=lambda model: validate(model, inference, held_out),
-        zero_conditions=zero,
         initial_parameters=None if initial_model is None else initial_model.parameters,
-        training={"command": command, **identity(source, settings), "stages": source.stages},
     )
     return run, inference
-
-
-def _rows(
-    problems: TrainingProblems,
-    inference: InferencePipeline,
-    features: Features | None,
-    blocks: tuple[str, ...],
-    initial_model: Model | None,
-) -> tuple[Rows, Features]:
-    """Prepare the rows, with the lines of the initial model's plans."""
-    boundary, poses = problems.boundary, problems.obstacle_poses
-    if initial_model is None or inference.via_points is None:
-        return prepare_rows(boundary, inference.prepare, features=features, blocks=blocks, obstacle_poses=poses)
-    return prepare_rows(
-        boundary, inference.prepare, features=features, lines=lambda some: inference.planned(initial_model, some)[0]
-    )
 
 
 def identity(source: TrainingData, settings: TrainingSettings) -> dict[str, Any]:

@@ -10,12 +10,7 @@ from cnpgen.training.settings import Length, TrainingSettings
 
 @dataclass(frozen=True)
 class Preset:
-    """Training settings with a suitable length.
-
-    Attributes:
-        settings: The settings.
-        length: Length of a run.
-    """
+    """Training settings with a suitable length of a run."""
 
     settings: TrainingSettings
     length: Length

@@ -40,14 +40,8 @@ def imitation_loss(points: ControlPoints, target: ControlPoints) -> LossValue:
 class Learner:
     """Constants of a training step.
 
-    Attributes:
-        architecture: The network's architecture.
-        spec: Degree and numbers of control points.
-        loss: The loss.
-        settings: The settings.
-        projection: Projection of the network's paths onto the equalities; None if there is none.
-        along: Function of tasks and paths of plans for them that returns tasks along these paths.
-        features: Definition of the features of such tasks.
+    The projection leads the network's paths onto the equalities, if there are any. ``along`` returns tasks along the
+    paths of plans for them, whose features are defined by ``features``.
     """
 
     architecture: Architecture

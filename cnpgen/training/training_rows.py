@@ -22,13 +22,7 @@ PREPARED_ROWS_PER_BLOCK = 8192
 
 @dataclass(frozen=True)
 class Rows:
-    """N training rows.
-
-    Attributes:
-        tasks: The tasks.
-        features: The network's inputs, shape (N, F).
-        target: Control points of demonstrations; None if there are none.
-    """
+    """N training rows: tasks, inputs of the network, shape (N, F), and control points of demonstrations or None."""
 
     tasks: Tasks
     features: Array
@@ -47,9 +41,7 @@ class Rows:
 class TrainingProblems:
     """N boundary problems to train on or to validate with.
 
-    Attributes:
-        boundary: Boundary conditions, shape (N, n) each.
-        obstacle_poses: Poses and sizes of obstacles that samples place, shape (N, width); None for other problems.
+    Poses and sizes of obstacles that samples place have shape (N, width); they are None for other problems.
     """
 
     boundary: Boundary

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,9 +12,7 @@ from cnpgen.errors import MachineError
 from cnpgen.losses.metric import Metric
 from cnpgen.losses.quadrature import rotating_shift
 from cnpgen.machine.signals import signals_deferred
-from cnpgen.planner.model import Model, ModelConfig
-from cnpgen.planner.network.features import Features
-from cnpgen.problems.problem_record import ProblemRecord
+from cnpgen.planner.model import Model
 from cnpgen.training.adam import learning_rate
 from cnpgen.training.checkpoint import Best, Checkpoints, State, Sums
 from cnpgen.training.log import TrainingLog
@@ -23,7 +21,6 @@ from cnpgen.training.training_rows import Rows, StepRows
 
 Array = NDArray[Any]
 Watcher = Callable[[Mapping[str, Any]], None]
-Validate = Callable[[Model], Mapping[str, Any]]
 
 LOG_LINES = 100  # per run
 SHIFT_STRIDE = 7  # between the shifts of successive steps; coprime to the number of shifts
@@ -38,14 +35,10 @@ class Run:
         names: Names of the loss's terms.
         budgets: Term -> its acceptable value, from the problem file.
         rows: The training rows.
-        features: Definition of the features.
         metric: Weights of the constraint terms.
-        problem: The problem.
-        config: Definition of the network's outputs.
+        model: Function that makes a model of parameters.
         validate: Function that scores a model: a record for the log with a ``score``, the larger the better.
-        zero_conditions: Boundary conditions that are zero in all training rows.
         initial_parameters: Parameters to start from; None for random ones.
-        training: Metadata recorded in the model.
         order: Order of the rows.
     """
 
@@ -53,14 +46,10 @@ class Run:
     names: tuple[str, ...]
     budgets: Mapping[str, float]
     rows: Rows
-    features: Features
     metric: Metric
-    problem: ProblemRecord
-    config: ModelConfig
-    validate: Validate
-    zero_conditions: tuple[str, ...] = ()
+    model: Callable[[Array], Model]
+    validate: Callable[[Model], Mapping[str, Any]]
     initial_parameters: Array | None = None
-    training: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         settings = self.learner.settings
@@ -92,18 +81,6 @@ class Run:
             log.write(record)
             if watch is not None:
                 watch(record)
-
-    def model(self, parameters: Array) -> Model:
-        """Return a model with these parameters."""
-        return Model(
-            problem=self.problem,
-            architecture=self.learner.architecture,
-            parameters=parameters.astype(np.float32),
-            features=self.features,
-            config=self.config,
-            zero_conditions=self.zero_conditions,
-            training=self.training,
-        )
 
     def step(self, state: State, gradient: Array) -> None:
         """Take one step; ``gradient`` is a buffer of shape (n_parameters,)."""

@@ -87,7 +87,7 @@ def test_inputs_are_the_states_divided_by_pi_and_the_limits(tiny):
     b, robot = source.training().boundary, _airhockey().robot
     parts = (b.start_q / np.pi, b.start_dq / robot.velocity_limit, b.start_ddq / robot.acceleration_limit)
     expected = np.concatenate([*parts, b.goal_q / np.pi, b.goal_dq / robot.velocity_limit], axis=1)
-    assert run.features.blocks == STATES
+    assert run.learner.features.blocks == STATES
     np.testing.assert_allclose(run.rows.features, expected, rtol=1e-6, atol=1e-7)
 
 

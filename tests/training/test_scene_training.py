@@ -203,7 +203,7 @@ def test_the_gradient_is_the_sum_of_those_of_all_iterations(problem):
         activations = forward(learner.architecture.split(parameters), batch.features)
         points = control_points(batch.tasks, activations.path, activations.log_rate, scale=0.5, spec=learner.spec)
         tasks = inference.prepare.along(batch.tasks, points.path)
-        batch = replace(batch, tasks=tasks, features=run.features.of(tasks))
+        batch = replace(batch, tasks=tasks, features=learner.features.of(tasks))
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5 * np.abs(expected).max())
 
 

@@ -145,14 +145,9 @@ def nearest_in_null_space(null: Array, weights: Array, ahead: Array, bounds: tup
 
 @dataclass(frozen=True)
 class PlanePath:
-    """A path of the mallet, from rest to a hit or from there to rest.
+    """A path of the mallet, from rest to a hit or, if it stops, from there to rest.
 
-    Attributes:
-        start: First position [m], shape (2,).
-        bend: Intersection of the two lines [m], shape (2,).
-        end: Last position [m], shape (2,).
-        speed: At the hit [m/s].
-        stops: Whether the path begins with the hit.
+    Two lines lead from the start over the bend to the end [m], shape (2,) each; the speed at the hit is in m/s.
     """
 
     start: Array

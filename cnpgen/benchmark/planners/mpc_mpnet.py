@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from cnpgen.benchmark.benchmark_planner import Answer, BenchmarkPlanner, Plan, Setting
 from cnpgen.benchmark.planners.proposals import Proposals, load_proposals, shipped_proposals
-from cnpgen.benchmark.planners.sst import Tree, radii_of
-from cnpgen.benchmark.planners.state_check import StateCheck
+from cnpgen.benchmark.planners.sst import StateCheck, Tree, radii_of
 from cnpgen.errors import UsageError
 from cnpgen.plans.plans import Plans
 from cnpgen.problems.problem import Problem
@@ -67,15 +66,9 @@ class MPCMPNet(BenchmarkPlanner):
 
 @dataclass
 class ProposedExtension:
-    """Extension of a tree towards proposals of a network, from one node to the next.
+    """Extension of a tree towards proposals of a network for a goal [rad], shape (n,), from one node to the next.
 
-    Attributes:
-        tree: The tree.
-        network: Network of the proposals.
-        steer: Steering.
-        goal_q: Goal configuration [rad], shape (n,).
-        node: Node of the next step.
-        steps: Consecutive steps.
+    The next step begins at ``node``, after a number of consecutive steps.
     """
 
     tree: Tree
@@ -103,11 +96,7 @@ class ProposedExtension:
 class Spread:
     """Initial distribution of controls; the mean acceleration is 0.
 
-    Attributes:
-        acceleration: Standard deviation, as a fraction of the limits.
-        mean_time: Mean duration of a control [s].
-        time: Standard deviation of the duration [s].
-        max_duration: Maximum duration [s].
+    The deviation of accelerations is a fraction of the limits. Durations [s] have a mean, a deviation and a maximum.
     """
 
     acceleration: float
@@ -127,15 +116,7 @@ def spread_of(problem: Problem) -> Spread:
 
 @dataclass(frozen=True)
 class Steering:
-    """Steering from states towards configurations, for one boundary problem.
-
-    Attributes:
-        settings: Numbers of controls and iterations of the cross-entropy method.
-        check: Check of states.
-        obstacle_poses: Poses and sizes of the obstacles, shape (width,).
-        spread: Initial distribution of controls.
-        random: Random generator.
-    """
+    """Steering from states towards configurations, for one boundary problem with obstacles, shape (width,)."""
 
     settings: MPCMPNet
     check: StateCheck

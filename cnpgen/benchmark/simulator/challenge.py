@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cnpgen.benchmark.simulator.outcome import TickRecord, puck_is_done
+from cnpgen.benchmark.simulator.executed import TickRecord, puck_is_done
 from cnpgen.benchmark.simulator.plant import Plant, rated_torque
 from cnpgen.benchmark.simulator.reference import Reference
 from cnpgen.benchmark.simulator.simulator_scene import SimulatorScene

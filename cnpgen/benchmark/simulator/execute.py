@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.benchmark.simulator.challenge import execute_in_challenge
-from cnpgen.benchmark.simulator.executed import Executed
-from cnpgen.benchmark.simulator.outcome import TickRecord, outcome_of, puck_is_done
+from cnpgen.benchmark.simulator.executed import Executed, TickRecord, outcome_of, puck_is_done
 from cnpgen.benchmark.simulator.plant import Plant, rated_torque
 from cnpgen.benchmark.simulator.reference import TICK_S, Reference
 from cnpgen.benchmark.simulator.simulator_scene import SIMULATION_STEP_S, SimulatorScene, scene_xml
@@ -61,13 +60,8 @@ class Controller:
 class Execution:
     """Record of an execution and its result.
 
-    Attributes:
-        scene: The simulated world.
-        reference: Reference of the controller.
-        executed: The result.
-        states: Positions of all simulated joints, including the puck, shape (K, nq), for rendering.
-        tip: Positions of the tip [m], shape (K, 3).
-        puck: Positions of the puck over the table [m], shape (K, 2); nan without one.
+    ``states`` are the positions of all simulated joints, including the puck, shape (K, nq), for rendering. The tip [m]
+    has shape (K, 3). The puck over the table [m] has shape (K, 2); it is nan without one.
     """
 
     scene: SimulatorScene

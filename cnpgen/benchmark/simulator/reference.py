@@ -19,13 +19,10 @@ MAX_EXECUTED_DURATION_S = 60.0
 
 @dataclass(frozen=True)
 class Reference:
-    """States to follow at the ticks of the controller; after the last tick, the robot stands still.
+    """States to follow at the K ticks of the controller; after the last tick, the robot stands still.
 
-    Attributes:
-        q: Joint positions [rad], shape (K, n).
-        dq: Joint velocities [rad/s], shape (K, n).
-        ddq: Joint accelerations [rad/s^2], shape (K, n).
-        duration: Duration of the plan [s]; the stop follows.
+    Positions, velocities and accelerations have shape (K, n), in radians. The duration of the plan is in seconds; the
+    stop follows.
     """
 
     q: Array
