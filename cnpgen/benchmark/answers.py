@@ -100,10 +100,8 @@ def execute_answer(task: Task, *, plant: Plant) -> Executed:
 def execution_of(task: Task, plant: Plant) -> Execution:
     """Execute an answer; in a replanning scenario, the first motion is executed up to the switch.
 
-    Raises:
-        UsageError: The answer is invalid or cannot be executed.
-        RecipeError: MuJoCo cannot simulate the robot.
-        MachineError: MuJoCo is missing.
+    Raise UsageError if the answer is invalid or cannot be executed, and RecipeError if MuJoCo cannot simulate the
+    robot.
     """
     problem, content, prefix = task
     states, duration = _timed(answer_from_dict(problem, content))

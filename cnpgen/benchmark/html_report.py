@@ -69,13 +69,18 @@ def _as_svg(figure: "Figure") -> str:
 
 def _motions(benchmark: Benchmark, *, video: bool) -> list[str]:
     """Render one executable plan of each planner, if this machine can render: of the same problem if all have one."""
-    parts, common = [], _common_problem(benchmark)
-    for name, rows in benchmark.results.items() if benchmark.plants else ():
-        plant = benchmark.plants[0]
-        executed = [row for row in rows if _was_executed(row, plant.name)]
-        row = next((row for row in executed if row["problem"] == common), executed[0] if executed else None)
-        if row is None:
+    if not benchmark.plants:
+        return []
+    parts, plant = [], benchmark.plants[0]
+    executed = {
+        name: [row for row in rows if _was_executed(row, plant.name)] for name, rows in benchmark.results.items()
+    }
+    problems = [{row["problem"] for row in rows} for rows in executed.values() if rows]
+    common = min(set.intersection(*problems), default=None) if problems else None
+    for name, rows in executed.items():
+        if not rows:
             continue
+        row = next((row for row in rows if row["problem"] == common), rows[0])
         index = row["problem"]
         task = benchmark.problems[index], row["answer"], benchmark.prefix and benchmark.prefix[index]
         label = f"{escape(name)}, problem {index}"
@@ -88,14 +93,6 @@ def _motions(benchmark: Benchmark, *, video: bool) -> list[str]:
             continue
         parts.append(f"<figure>{element}<figcaption>{label}, {caption}</figcaption></figure>")
     return parts
-
-
-def _common_problem(benchmark: Benchmark) -> int | None:
-    """Return the first problem whose plans of all planners with any execution were executed, or None."""
-    name = benchmark.plants[0].name if benchmark.plants else ""
-    executed = [{row["problem"] for row in rows if _was_executed(row, name)} for rows in benchmark.results.values()]
-    known = [problems for problems in executed if problems]
-    return min(set.intersection(*known), default=None) if known else None
 
 
 def _was_executed(row: dict[str, Any], plant: str) -> bool:

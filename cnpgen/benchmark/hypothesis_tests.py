@@ -48,6 +48,11 @@ FIGURES = {
     "torque_use": "maximum torque / rated, executed",
     "penalty_points": "penalty points of the environment",
 }
+METRICS_OF_FIGURES = {  # figure of the plan -> metric of its verdict
+    "duration_s": "duration_s",
+    "planned_z_error_mm_s": "z_error_mm_s",
+    "planned_vertical_error_rad_s": "vertical_error_rad_s",
+}
 TAILS = {"p99": 0.99, "p999": 0.999, "max": 1.0}
 REFERENCE_PLANNER = "cnpgen+refine"  # default reference of the comparison, if present
 NORMAL_QUANTILE_95 = 1.959963984540054  # two-sided
@@ -78,12 +83,9 @@ def values_of(row: Mapping[str, Any], plant: str = "", plane_tolerance: float = 
     verdict = row.get("verdict")
     if verdict is None:
         return {**values, "valid": False, "paper_valid": False, "paper_finished": False}
-    metrics = verdict["metrics"]
-    values |= {"valid": verdict["valid"], "paper_valid": verdict["paper"]["valid"]}
-    values |= {"paper_finished": verdict["paper"]["finished"]}
-    named = {"duration_s": "duration_s", "planned_z_error_mm_s": "z_error_mm_s"}
-    named["planned_vertical_error_rad_s"] = "vertical_error_rad_s"
-    values |= {name: metrics[key] for name, key in named.items() if key in metrics}
+    metrics, paper = verdict["metrics"], verdict["paper"]
+    values |= {"valid": verdict["valid"], "paper_valid": paper["valid"], "paper_finished": paper["finished"]}
+    values |= {name: metrics[key] for name, key in METRICS_OF_FIGURES.items() if key in metrics}
     if "joint acceleration" in verdict["value_over_bound"]:
         values["acceleration_use"] = verdict["value_over_bound"]["joint acceleration"]
     return values

@@ -24,14 +24,10 @@ MIN_LOGARITHMIC_RANGE = 10.0  # ratio of both ends, from which values are log-un
 
 @dataclass(frozen=True)
 class Trial:
-    """Result of one set of parameters.
+    """Result of one set of parameters; number 0 has the default ones.
 
-    Attributes:
-        number: Its number; 0 has the default parameters.
-        parameters: Values of the fields of the planner.
-        solved: Ratio of successful executions, the mean of all plants, or of valid plans without a plant.
-        planning_cpu_ms: Median planning time [ms], nan if the planner does not apply.
-        duration_s: Median motion time [s], nan without a plan.
+    ``solved`` is the ratio of successful executions, the mean of all plants, or of valid plans without a plant. The
+    times are medians, nan if the planner does not apply or without a plan.
     """
 
     number: int
@@ -53,25 +49,12 @@ def search_parameters(
 ) -> list[Trial]:
     """Try random parameters of a planner on a suite; an interrupted search resumes.
 
-    Values are uniform in their range, or log-uniform if both ends are positive and differ by a factor of 10 or more.
-    Fields of type int get whole numbers. Tune on other problems than those of the comparison: the name of a
-    dataset gives fresh ones.
+    A range maps a field to (low, high), in SI units. Values are uniform, or log-uniform if both ends are positive and
+    differ by a factor of 10 or more. Fields of type int get whole numbers. The default parameters are tried, too. Tune
+    on other problems than those of the comparison: the name of a dataset gives fresh ones. Options are further
+    arguments of ``run_benchmark``. The folder gets one folder per trial, and ``search.csv``.
 
-    Args:
-        suite: A suite, or the name or file of a suite or dataset.
-        folder: Folder for results: one folder per trial, and ``search.csv``.
-        planner: Name of the planner.
-        ranges: Field of the planner -> (low, high), in SI units.
-        trials: Number of random sets of parameters, beside the default ones.
-        seed: Seed of the parameters, and of random planners.
-        options: Further arguments of ``run_benchmark``, for example ``n``, ``plants`` and ``time_limit``.
-
-    Returns:
-        The trials, the best one first: by solved problems, then by motion time, then by planning time.
-
-    Raises:
-        UsageError: A range or a field is invalid.
-        RecipeError, MachineError: As ``run_benchmark``.
+    Return the trials, the best one first: by solved problems, then by motion time, then by planning time.
     """
     trials, seed = integer("trials", trials, least=1, most=MAX_TRIALS), integer("seed", seed, least=0)
     whole = {key.name for key in _keys_of(planner) if key.hint is int}

@@ -38,15 +38,9 @@ class Ending(StrEnum):
 
 @dataclass(frozen=True)
 class PlanningOutcome:
-    """Result of planning for one problem.
+    """Result of planning for one problem: the answer in its stored form, wall and CPU time [s], and an error message.
 
-    Attributes:
-        ending: Outcome.
-        answer: The plan or the trajectory in its stored form, if there is one.
-        seconds: Wall time of planning [s].
-        cpu_seconds: CPU time of planning, with that of ended child processes [s]; of a stopped planner, also with that
-            of its running child processes.
-        error: Error message of the planner, or empty.
+    The CPU time includes that of ended child processes; of a stopped planner, also that of its running child processes.
     """
 
     ending: Ending
@@ -112,17 +106,17 @@ class PlannerProcess:
             self._process = subprocess.Popen(  # output of planners is not data
                 command, pass_fds=[child_end.fileno()], stdin=subprocess.DEVNULL, stdout=STDERR, start_new_session=True
             )
-        refusal, message = None, "its process ended or was not ready in time"
+        refuses, lacks, message = False, False, "its process ended or was not ready in time"
         with suppress(EOFError, OSError):
             self._pipe.send((self._name, self._setting))
             if self._pipe.poll(MAX_PREPARATION_TIME_S):
-                refusal, message = self._pipe.recv()
+                refuses, lacks, message = self._pipe.recv()
         if not message:
             return None
         self.stop()
-        if refusal is MachineError:
+        if lacks:
             raise MachineError(f"planner {self._name!r} cannot plan here: {message}")
-        if refusal is not None:
+        if refuses:
             return PlanningOutcome(Ending.NOT_APPLICABLE, error=message)
         return PlanningOutcome(
             Ending.CRASHED, seconds=time.perf_counter() - start, error=f"before the first problem: {message}"
@@ -170,9 +164,10 @@ def serve(descriptor: int) -> None:
         try:
             plan = load_planner(name, setting.parameters).prepare(setting)
         except Exception as error:  # noqa: BLE001 - a plug-in may raise any exception
-            pipe.send((_refusal(error), _message(error)))
+            refuses, lacks = isinstance(error, CnpgenError), isinstance(error, MachineError)
+            pipe.send((refuses, lacks, _message(error)))
             return
-        pipe.send((None, ""))
+        pipe.send((False, False, ""))
         while True:
             pipe.send(_plan_once(plan, pipe.recv()))
 
@@ -202,13 +197,6 @@ def _content(answer: Any, problem: Plans) -> dict[str, Any] | None:
     content = answer_to_dict(answer)
     answer_from_dict(problem, content)
     return content
-
-
-def _refusal(error: Exception) -> type[CnpgenError] | None:
-    """Return the error class for a planner that refuses the problem; None if it failed."""
-    if not isinstance(error, CnpgenError):
-        return None
-    return MachineError if isinstance(error, MachineError) else UsageError
 
 
 def _message(error: Exception) -> str:

@@ -94,7 +94,6 @@ def open_results(path: Path, identity: dict[str, Any], *, overwrite: bool = Fals
         MachineError: The file cannot be read or written.
     """
     head = json.dumps({**_FORMAT, **identity})
-    results = Results(path)
     lines: list[str] = []
     if path.exists():
         require_file(path, "the results of a planner")
@@ -106,32 +105,9 @@ def open_results(path: Path, identity: dict[str, Any], *, overwrite: bool = Fals
                 remedies={"force": True},
             )
         lines = lines[1:] if lines and lines[0] == head and not discard else []
-    _read_rows(results, lines)
+    results = _read_rows(path, lines)
     write_file(path, "".join(f"{line}\n" for line in (head, *lines)).encode())
     return results
-
-
-def read_results(path: Path, shared: dict[str, Any]) -> tuple[dict[str, Any], Results] | None:
-    """Read the head and the results of a planner; ``shared`` is the part of the identity that all planners share.
-
-    Return None if the file is incomplete or belongs to another suite, version or time limit.
-
-    Raises:
-        DatasetError: The file is damaged.
-        MachineError: The file cannot be read.
-    """
-    lines = _complete_lines(path)
-    head = json.loads(lines[0]) if lines else None
-    if not isinstance(head, dict) or any(head.get(key) != value for key, value in {**_FORMAT, **shared}.items()):
-        return None
-    return head, _read_rows(Results(path), lines[1:])
-
-
-def holds_results(path: Path) -> bool:
-    """Return whether a file begins as the results of a planner, of any run."""
-    lines = _complete_lines(path)
-    head = json.loads(lines[0]) if lines else None
-    return isinstance(head, dict) and head.get("format") == RESULTS_FORMAT
 
 
 def _differences(line: str, head: str) -> str:
@@ -143,13 +119,14 @@ def _differences(line: str, head: str) -> str:
     return f"other {', '.join(keys) or 'problems'}".replace("_", " ")
 
 
-def _read_rows(results: Results, lines: list[str]) -> Results:
+def _read_rows(path: Path, lines: list[str]) -> Results:
+    results = Results(path)
     for number, line in enumerate(lines, start=2):
         row = json.loads(line)
         try:
             _check_row(row)
         except ValueError as error:
-            raise DatasetError(f"{results.path} is damaged: line {number}: {error}; delete that line") from error
+            raise DatasetError(f"{path} is damaged: line {number}: {error}; delete that line") from error
         results._merge(row)
     return results
 
@@ -251,16 +228,22 @@ class ResultsFolder:
             "seed": setting.seed,
         }
 
+    def _results(self) -> Iterator[tuple[Path, dict[str, Any], Results | None]]:
+        """Yield path, head and results of every file; None for results of another suite, version or time limit."""
+        for path in sorted(self.path.glob("*.jsonl")):
+            require_file(path, "the results of a planner")
+            lines = _complete_lines(path)
+            head = json.loads(lines[0]) if lines else None
+            if isinstance(head, dict) and head.get("format") == RESULTS_FORMAT:
+                is_own = all(head.get(key) == value for key, value in {**_FORMAT, **self._shared}.items())
+                yield path, head, _read_rows(path, lines[1:]) if is_own else None
+
     def planners(self, *, delete_others: bool) -> set[str]:
         """Return the planners with results; delete results of another run, or raise UsageError."""
         names = set()
-        for path in sorted(self.path.glob("*.jsonl")):
-            require_file(path, "the results of a planner")
-            results = read_results(path, self._shared)
+        for path, head, results in self._results():
             if results is not None:
-                names.add(str(results[0]["planner"]))
-            elif not holds_results(path):
-                continue
+                names.add(str(head["planner"]))
             elif delete_others:
                 path.unlink()
             else:
@@ -289,11 +272,9 @@ class ResultsFolder:
     def rows(self, first: Sequence[str]) -> dict[str, list[dict[str, Any]]]:
         """Return planner -> rows of all results, the given planners first."""
         parts: dict[str, dict[int, Results]] = {name: {} for name in first}
-        for path in sorted(self.path.glob("*.jsonl")):
-            loaded = read_results(path, self._shared)
-            if loaded is not None:
-                identity, results = loaded
-                parts.setdefault(identity["planner"], {})[identity["repetition"]] = results
+        for _, head, results in self._results():
+            if results is not None:
+                parts.setdefault(head["planner"], {})[head["repetition"]] = results
         return {
             name: [
                 {**row, "repetition": repetition}

@@ -154,7 +154,7 @@ def run_benchmark(
     values = {name: _checked_parameters(name, given[name]) for name in planners}
     limit, seed, repeat = _checked_numbers(time_limit, plane_tolerance, seed, repeat)
     robots = _checked_plants(plants, environment)
-    problems, prefix = loaded.problems(None if n is None else integer("n", n, least=1))
+    problems, prefix = loaded.problems(n)
     if environment is not None:
         check_challenge(*open_problem(problems.problem))
     setting = Setting(problems.problem, loaded.model, limit, seed)

@@ -157,10 +157,9 @@ def _read(path: Path, mistakes: list[str]) -> Suite | None:
         PlannerFields: _read_planners,
     }
     suite = parse(Suite, table, where=RecipeLocation(str(path)), mistakes=mistakes, readers=readers)
-    folder = path.parent
     if suite is not None and suite.scenes is not None:
-        file, robot = str(folder / suite.scenes.file), _beside(folder, suite.scenes.robot)
+        file, robot = str(path.parent / suite.scenes.file), _beside(path.parent, suite.scenes.robot)
         return replace(suite, scenes=SceneFileProblems(file=file, robot=robot))
     if suite is not None and suite.samples is not None:
-        return replace(suite, samples=replace(suite.samples, recipe=_beside(folder, suite.samples.recipe)))
+        return replace(suite, samples=replace(suite.samples, recipe=_beside(path.parent, suite.samples.recipe)))
     return suite

@@ -159,15 +159,7 @@ def from_content(content: Content) -> State:
 
 
 class Checkpoints:
-    """Checkpoints of one run, written at intervals.
-
-    Args:
-        path: The file.
-        identity: Settings, dataset and steps of the run; JSON-able.
-
-    Attributes:
-        identity: The identity after a round trip through JSON.
-    """
+    """Checkpoints of one run in a file, written at intervals, with its JSON-able settings, dataset and steps."""
 
     def __init__(self, path: Path, identity: Mapping[str, Any]) -> None:
         self.path = path

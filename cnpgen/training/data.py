@@ -157,9 +157,7 @@ class SceneRows(TrainingData):
 def make_scene_rows(problem: Problem, scenes: Sequence[SceneProblem], place: str) -> SceneRows:
     """Make training rows of scenes; the last ones validate models, so they should be of other scenes.
 
-    Raises:
-        SceneError: A scene does not fit the robot.
-        UsageError: There are too few scenes, or the problem has no constraint ``robot-clearance``.
+    Raise SceneError if a scene does not fit the robot, and UsageError if there are too few, or no ``robot-clearance``.
     """
     if len(scenes) < MIN_SCENE_ROWS:
         raise UsageError(

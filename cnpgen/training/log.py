@@ -54,9 +54,8 @@ def is_log(path: Path) -> bool:
 def plot_curve(log: str, path: str | Path) -> None:
     """Draw a training log, one JSON object per line, as ``.png``, ``.pdf`` or ``.svg``; an existing file is replaced.
 
-    Raises:
-        UsageError: The log contains no step.
-        MachineError: matplotlib is missing, or the file cannot be written.
+    Raise UsageError if the log contains no step, and MachineError if matplotlib is missing or the file cannot be
+    written.
     """
     records = [json.loads(line) for line in log.splitlines()]
     steps = [record for record in records if "loss" in record]

@@ -58,8 +58,7 @@ class Run:
     def train(self, state: State, checkpoints: Checkpoints, log: TrainingLog, watch: Watcher | None = None) -> None:
         """Train until the last step; the state is changed in place, and ``watch`` is called with every line of the log.
 
-        Raises:
-            MachineError: The loss is not finite any more, or the disk is full.
+        Raise MachineError if the loss is not finite any more, or the disk is full.
         """
         if state.metric:
             self.metric.load_state(state.metric)

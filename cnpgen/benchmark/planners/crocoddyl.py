@@ -113,10 +113,8 @@ def are_small(robot: Robot, boundary: Boundary, t: Array, states: Array) -> bool
 def load_crocoddyl() -> Any:
     """Import Crocoddyl.
 
-    Raises:
-        MissingExtraError: Crocoddyl is missing.
-        MachineError: Its version is unknown, or its wheel is for another version of Pinocchio, with which it would read
-            wrong memory.
+    Raise MachineError if its version is unknown, or its wheel is for another version of Pinocchio, with which it would
+    read wrong memory.
     """
     import pinocchio
 

@@ -80,7 +80,6 @@ class TrajOptTranscription:
         """Minimize T and return the knots; None if they are not finite."""
         from scipy.optimize import Bounds, minimize
 
-        guess = self.start()
         low, high = self.bounds()
         gradient = np.zeros(self._size)
         gradient[-1] = 1.0
@@ -90,7 +89,7 @@ class TrajOptTranscription:
         ]
         solution = minimize(
             lambda x: x[-1],
-            np.clip(guess, low, high),
+            np.clip(self.start(), low, high),
             jac=lambda _: gradient,
             method="SLSQP",
             bounds=Bounds(low, high),

@@ -46,9 +46,8 @@ def challenge_plant(folder: str | Path) -> Plant:
         UsageError: The folder is not a clone.
         MachineError: The environment cannot be imported or is of another version.
     """
-    place = Path(folder).resolve()
-    if not (place / MODULE.replace(".", "/")).with_suffix(".py").is_file():
-        module_file = f"{MODULE.replace('.', '/')}.py"
+    place, module_file = Path(folder).resolve(), f"{MODULE.replace('.', '/')}.py"
+    if not (place / module_file).is_file():
         raise UsageError(
             f"{folder} is no clone of the Air Hockey Challenge's environment: it has no {module_file}",
             concerns="environment",

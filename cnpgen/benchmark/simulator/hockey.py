@@ -24,19 +24,13 @@ RESTITUTION = 0.75  # of mallet and puck, and of puck and bands
 CONTACT_TIME_S = 2.5e-3  # of a bounce; ten steps of the simulation
 
 
-def bounce(restitution: float = RESTITUTION, contact_time: float = CONTACT_TIME_S) -> tuple[float, float]:
-    """Compute stiffness and damping of a contact, per unit of the colliding mass, from restitution and contact time.
+def bounce(restitution: float = RESTITUTION) -> tuple[float, float]:
+    """Compute stiffness [1/s^2] and damping [1/s] of a contact, per unit of the colliding mass, from the restitution.
 
     A contact ``x'' = -k x - b x'`` that can push but not pull ends when its force does. With ``b = 2 zeta sqrt(k)`` and
     ``a = pi - atan2(2 zeta sqrt(1 - zeta^2), 1 - 2 zeta^2)`` this is after ``a / sqrt(k (1 - zeta^2))``. The bodies
-    separate with ``exp(-a zeta / sqrt(1 - zeta^2))`` times the initial speed (Schwager and Poeschel, 2007).
-
-    Args:
-        restitution: Speed after over speed before, from 0.22 to below 1.
-        contact_time: Duration of the contact [s].
-
-    Returns:
-        ``(k, b)`` [1/s^2] and [1/s].
+    separate with ``exp(-a zeta / sqrt(1 - zeta^2))`` times the initial speed (Schwager and Poeschel, 2007). The
+    restitution, speed after over speed before, is from 0.22 to below 1.
     """
     from scipy.optimize import brentq
 
@@ -47,7 +41,7 @@ def bounce(restitution: float = RESTITUTION, contact_time: float = CONTACT_TIME_
         return exp(-angle(zeta) * zeta / sqrt(1 - zeta**2)) - restitution
 
     zeta = float(brentq(residual, 0.0, 0.7, xtol=1e-12))
-    k = (angle(zeta) / contact_time) ** 2 / (1 - zeta**2)
+    k = (angle(zeta) / CONTACT_TIME_S) ** 2 / (1 - zeta**2)
     return k, 2 * zeta * sqrt(k)
 
 

@@ -27,8 +27,7 @@ Image = NDArray[np.uint8]
 def save_picture(path: Path, execution: Execution) -> None:
     """Render the world at the end of a plan as ``.png``; an existing file is replaced.
 
-    Raises:
-        MachineError: This machine cannot render, or the file cannot be written.
+    Raise MachineError if this machine cannot render, or the file cannot be written.
     """
     imageio = _imageio()
     with _renderer(execution) as draw:
@@ -38,12 +37,9 @@ def save_picture(path: Path, execution: Execution) -> None:
 
 
 def save_film(path: Path, execution: Execution, *, max_frames: int | None = None) -> None:
-    """Render a film of a plan and of the second after it, in slow motion, as ``.mp4`` or ``.gif``.
+    """Render a film of a plan and of the second after it, in slow motion, as ``.mp4`` or ``.gif``, as ``save_picture``.
 
-    An existing file is replaced. Motions with more than ``max_frames`` are shown faster.
-
-    Raises:
-        MachineError: As ``save_picture``, or ffmpeg is missing.
+    Motions with more than ``max_frames`` are shown faster. Raise MachineError without ffmpeg, too.
     """
     imageio = _imageio()
     last = min(execution.reference.ticks + round(FILM_TAIL_S / TICK_S), len(execution.states))

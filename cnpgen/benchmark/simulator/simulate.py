@@ -131,12 +131,7 @@ def _simulate(plan: Plans, *, plant: Plant) -> Executed:
 
 
 def execute_plan(plan: Plans, plant: Plant) -> Execution:
-    """Execute one plan.
-
-    Raises:
-        UsageError: The plan cannot be executed: it is not finite, never arrives, or takes too long.
-        RecipeError, MachineError: As ``simulate_plans``.
-    """
+    """Execute one plan; raise UsageError if it is not finite, never arrives, or takes too long."""
     return execute_states(plan, states_of(plan.motion), float(plan.duration[0]), plant)
 
 
