@@ -1,7 +1,7 @@
 from cnpgen.benchmark.benchmark_planner import BenchmarkPlanner as BenchmarkPlanner
 from cnpgen.benchmark.benchmark_planner import Setting as Setting
-from cnpgen.benchmark.html_report import save_benchmark_report as save_benchmark_report
-from cnpgen.benchmark.paper_figures import save_benchmark_figures as save_benchmark_figures
+from cnpgen.benchmark.benchmark_report import save_benchmark_figures as save_benchmark_figures
+from cnpgen.benchmark.benchmark_report import save_benchmark_report as save_benchmark_report
 from cnpgen.benchmark.pucks import ExecutedPrefix as ExecutedPrefix
 from cnpgen.benchmark.pucks import Pucks as Pucks
 from cnpgen.benchmark.pucks import ReplanningScenario as ReplanningScenario

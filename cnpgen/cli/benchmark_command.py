@@ -87,8 +87,7 @@ def parameter_range(text: str) -> tuple[str, str, tuple[float, float]]:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
-    from cnpgen.benchmark.html_report import save_benchmark_report
-    from cnpgen.benchmark.paper_figures import save_benchmark_figures
+    from cnpgen.benchmark.benchmark_report import save_benchmark_figures, save_benchmark_report
     from cnpgen.benchmark.result_tables import save_benchmark_tables
 
     if arguments.list:

@@ -22,6 +22,7 @@ MIN_INTERVAL_S, MAX_INTERVAL_S = 20.0, 50.0  # wall time between two checkpoints
 INTERVAL_PER_WRITING_TIME = 20.0
 Array = NDArray[Any]
 _ADAM_ARRAYS = ("parameters", "average", "first", "second")
+_STATE_NUMBERS = ("steps", "imitating", "metric", "seconds", "checking")
 
 
 @dataclass
@@ -110,14 +111,10 @@ def to_content(state: State) -> Content:
     arrays = {name: getattr(adam, name) for name in _ADAM_ARRAYS}
     numbers = {
         "step": adam.step,
-        "steps": state.steps,
-        "imitating": state.imitating,
+        **{name: getattr(state, name) for name in _STATE_NUMBERS},
         "clipping": asdict(state.clipping),
-        "metric": dict(state.metric),
         "sums": {name: value for name, value in vars(state.sums).items() if name != "terms"},
         "best": {"score": best.score, "step": best.step},
-        "seconds": state.seconds,
-        "checking": state.checking,
     }
     texts = {"numbers": json.dumps(numbers, indent=1), "log": "\n".join(state.log)}
     return Content({**arrays, "best": best.parameters, "terms": state.sums.terms}, texts)
@@ -149,12 +146,8 @@ def from_content(content: Content) -> State:
         Clipping(**numbers["clipping"]),
         Sums(np.array(arrays["terms"]), **numbers["sums"]),
         Best(best["score"], best["step"], np.array(arrays["best"])),
-        numbers["steps"],
-        numbers["imitating"],
-        numbers["metric"],
-        numbers["seconds"],
-        numbers["checking"],
-        content.texts["log"].splitlines(),
+        **{name: numbers[name] for name in _STATE_NUMBERS},
+        log=content.texts["log"].splitlines(),
     )
 
 

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 from cnpgen.benchmark.benchmark_planner import Setting
-from cnpgen.benchmark.html_report import save_benchmark_report
-from cnpgen.benchmark.paper_figures import (
+from cnpgen.benchmark.benchmark_report import (
     benchmark_values,
     distribution_figure,
     save_benchmark_figures,
+    save_benchmark_report,
     success_figure,
     success_over_time,
 )
@@ -173,7 +173,7 @@ def test_a_run_resumes_and_adds_executions_and_problems(tmp_path: Path, monkeypa
     assert all(row["executed"]["nominal"]["scored"] for row in second.results["cnpgen"])
     third = run_benchmark("hits-81", tmp_path, planners=["cnpgen"], n=3, plants=["nominal"], workers=1)
     assert third.results == second.results
-    monkeypatch.setattr("cnpgen.benchmark.html_report.MAX_FILM_FRAMES", 3)
+    monkeypatch.setattr("cnpgen.benchmark.benchmark_report.MAX_FILM_FRAMES", 3)
     report = save_benchmark_report(third, tmp_path / "report.html", video=True).read_text()
     assert ": 100 %, planning time" in report
     assert "<svg" in report

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cnpgen.benchmark.html_report import save_benchmark_report
+from cnpgen.benchmark.benchmark_report import save_benchmark_report
 from cnpgen.benchmark.run_suite import run_benchmark
 from cnpgen.benchmark.simulator.challenge import _ScalarItems, challenge_plant
 from cnpgen.benchmark.simulator.simulate import execute_plan, simulate_plans
