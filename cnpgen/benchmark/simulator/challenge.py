@@ -174,11 +174,6 @@ class _Recorder:
     """Mix-in for the environment's classes: sets the start and records every tick."""
 
     recorded: list[tuple[Array, ...]]
-    constraints: list[Any]
-    violated_steps: dict[str, int]
-    _start: Array
-    _observed: Array
-    _puck_velocity: Array
 
     def begin(self: Any, q: Array, dq: Array, puck: Array, velocity: tuple[float, float] = (0.0, 0.0)) -> None:
         """Reset to positions and velocities of the arm, shape (7,), and of the puck [m] and [m/s], shape (2,)."""
