@@ -16,7 +16,7 @@ from cnpgen.errors import DatasetError, UsageError
 from cnpgen.loader.dataset import Dataset
 from cnpgen.loader.load import load_dataset
 from cnpgen.planner.control_points import ControlPoints
-from cnpgen.plans.format import CONDITIONS, OBSTACLE_POSES
+from cnpgen.plans.format import BOUNDARY, CONDITIONS, OBSTACLE_POSES
 from cnpgen.plans.scene_plans import scene_plans
 from cnpgen.problems.problem import Problem
 from cnpgen.problems.problem_record import as_problem
@@ -24,7 +24,7 @@ from cnpgen.problems.scenes.scene_files import holds_scenes, load_scenes
 from cnpgen.problems.scenes.scene_problem import SceneProblem
 from cnpgen.schema.arguments import concerning
 from cnpgen.store.dataset_spec import StoredProblem
-from cnpgen.training.training_rows import TrainingProblems, boundary_columns
+from cnpgen.training.training_rows import TrainingProblems
 from cnpgen.trajectory.boundary import Boundary
 
 Array = NDArray[np.float64]
@@ -119,7 +119,10 @@ class DatasetRows(TrainingData):
 
 
 def _problems(columns: dict[str, Array]) -> TrainingProblems:
-    return TrainingProblems(boundary_columns(columns), columns.get(OBSTACLE_POSES))
+    """Return the problems in columns of a dataset; missing conditions are zero, goal accelerations free."""
+    zero = np.zeros_like(columns["start_q"])
+    named = {name: columns.get(name, zero) for name in CONDITIONS if name in columns or name in BOUNDARY}
+    return TrainingProblems(Boundary(**named), columns.get(OBSTACLE_POSES))
 
 
 @dataclass(frozen=True)

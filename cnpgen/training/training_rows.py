@@ -12,7 +12,6 @@ from cnpgen.planner.control_points import ControlPoints
 from cnpgen.planner.network.features import Features, feature_blocks, fit_features
 from cnpgen.planner.task_preprocessor import TaskPreprocessor
 from cnpgen.planner.tasks import Tasks
-from cnpgen.plans.format import BOUNDARY, CONDITIONS
 from cnpgen.robots.scene import Scene
 from cnpgen.trajectory.boundary import Boundary
 
@@ -46,13 +45,6 @@ class TrainingProblems:
 
     boundary: Boundary
     obstacle_poses: Array | None = None
-
-
-def boundary_columns(columns: dict[str, Array]) -> Boundary:
-    """Return the boundary conditions among the columns of a dataset; missing ones are zero, goal accelerations free."""
-    zero = np.zeros_like(columns["start_q"], np.float64)
-    named = {name: columns.get(name, zero) for name in CONDITIONS if name in columns or name in BOUNDARY}
-    return Boundary(**{name: np.asarray(values, np.float64) for name, values in named.items()})
 
 
 def prepare_rows(
