@@ -21,14 +21,10 @@ MAX_NORM_RATIO = 3.0  # of a batch's norm to the running norm, in the update of 
 
 @dataclass
 class Adam:
-    """State of the optimizer; all arrays have shape (n_parameters,).
+    """State of the optimizer after a number of steps; all arrays have shape (n_parameters,).
 
-    Attributes:
-        parameters: The parameters.
-        average: Their exponential average, which is validated and kept.
-        first: Average of the gradient.
-        second: Average of the squared gradient.
-        step: Number of steps taken.
+    ``average`` is the exponential average of the parameters, which is validated and kept. ``first`` and ``second`` are
+    the averages of the gradient and of the squared gradient.
     """
 
     parameters: Array

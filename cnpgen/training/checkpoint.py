@@ -29,12 +29,8 @@ _STATE_NUMBERS = ("steps", "imitating", "metric", "seconds", "checking")
 class Sums:
     """Sums since the last line of the log.
 
-    Attributes:
-        terms: Sum over steps of the terms' means, shape (1 + m,).
-        steps: Number of steps.
-        lost: Number of plans whose loss was not finite.
-        distance: Sum over imitating steps of the mean distance from demonstrations.
-        imitating: Number of imitating steps, not included in ``steps``.
+    ``terms`` sums the terms' means over steps, shape (1 + m,). ``lost`` plans had no finite loss. ``distance`` sums the
+    mean distance from demonstrations over imitating steps, which are not included in ``steps``.
     """
 
     terms: Array
@@ -68,19 +64,10 @@ class Best:
 
 @dataclass
 class State:
-    """State of a run.
+    """State of a run of ``steps`` steps, of which the first ones imitate.
 
-    Attributes:
-        adam: Parameters and averages.
-        clipping: Running norms of gradients.
-        sums: Sums for the log.
-        best: The best model so far.
-        steps: Number of steps of the run.
-        imitating: Number of imitating steps, at the beginning.
-        metric: State of the metric, JSON-able.
-        seconds: CPU time of all steps [s].
-        checking: CPU time of validation [s].
-        log: Lines of the log so far.
+    The state of the metric is JSON-able. ``seconds`` is the CPU time of all steps, ``checking`` that of validation [s].
+    ``log`` has the lines of the log so far.
     """
 
     adam: Adam

@@ -30,16 +30,10 @@ SHIFT_STRIDE = 7  # between the shifts of successive steps; coprime to the numbe
 class Run:
     """One run.
 
-    Attributes:
-        learner: Architecture, loss, settings.
-        names: Names of the loss's terms.
-        budgets: Term -> its acceptable value, from the problem file.
-        rows: The training rows.
-        metric: Weights of the constraint terms.
-        model: Function that makes a model of parameters.
-        validate: Function that scores a model: a record for the log with a ``score``, the larger the better.
-        initial_parameters: Parameters to start from; None for random ones.
-        order: Order of the rows.
+    ``budgets`` maps a term of the loss to its acceptable value, from the problem file. ``metric`` has the weights of
+    the constraint terms. ``model`` makes a model of parameters. ``validate`` scores it: a record for the log with a
+    ``score``, the larger the better. Without ``initial_parameters``, they are random. ``order`` is the order of the
+    rows.
     """
 
     learner: Learner
