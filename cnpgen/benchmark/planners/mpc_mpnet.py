@@ -116,7 +116,7 @@ def spread_of(problem: Problem) -> Spread:
 
 @dataclass(frozen=True)
 class Steering:
-    """Steering from states towards configurations, for one boundary problem with obstacles, shape (width,)."""
+    """Steering from states towards configurations, for one boundary problem; its obstacles have shape (width,)."""
 
     settings: MPCMPNet
     check: StateCheck
