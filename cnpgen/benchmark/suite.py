@@ -109,11 +109,6 @@ def load_suite(name_or_path: str | Path) -> Suite:
     return load_recipe(("suite", "dataset", "pipeline"), name_or_path, None, _read)
 
 
-def list_suites() -> dict[str, Path]:
-    """List the shipped suites: name -> file."""
-    return list_recipes("suite")
-
-
 def _beside(folder: Path, name: str) -> str:
     """Return the path of a recipe beside the suite, from any working directory; the name if there is none."""
     return str(folder / name) if (folder / name).is_file() else name

@@ -199,12 +199,13 @@ def _text(found: "Benchmark") -> str:
 def _listing(*, as_json: bool) -> str:
     """List suites, planners with their fields, and plants."""
     from cnpgen.benchmark.simulator.plant import PLANTS
-    from cnpgen.benchmark.suite import list_suites, load_suite
+    from cnpgen.benchmark.suite import load_suite
     from cnpgen.cli.describe import table
+    from cnpgen.schema.catalogue import list_recipes
 
     planners, fields = _planners()
     found = {
-        "suites": {name: load_suite(name).title for name in list_suites()},
+        "suites": {name: load_suite(name).title for name in list_recipes("suite")},
         "planners": planners,
         "fields": fields,
         "plants": {plant.name: plant.title for plant in PLANTS.values()},

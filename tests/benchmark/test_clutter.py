@@ -11,18 +11,18 @@ import cnpgen
 from cnpgen.benchmark import Setting, load_suite
 from cnpgen.benchmark.benchmark_planner import load_planner
 from cnpgen.benchmark.planners.rrtconnect import has_manifold
-from cnpgen.benchmark.suite import list_suites
 from cnpgen.errors import RecipeError
 from cnpgen.pipelines.families.catalog import FAMILIES
 from cnpgen.pipelines.families.resting_states import RestingStates
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.scenes import SceneProblem, load_scenes, save_scenes
+from cnpgen.schema.catalogue import list_recipes
 from cnpgen.trajectory.sampled_trajectory import Trajectory
 from tests.examples.example_robots import needs_robots
 from tests.examples.shaped_robot import SELF, write_problem
 from tests.make.test_solve_scenes import LIMITS, SCENES
 
-CLUTTER = list_suites()["clutter"].with_suffix(".h5")
+CLUTTER = list_recipes("suite")["clutter"].with_suffix(".h5")
 SUITE = """name = "posts"
 version = "1.0.0"
 [scenes]

@@ -9,10 +9,11 @@ from cnpgen.benchmark.answers import execution_of, joined
 from cnpgen.benchmark.results_file import answer_to_dict
 from cnpgen.benchmark.simulator.plant import PLANTS
 from cnpgen.benchmark.simulator.reference import states_of
-from cnpgen.benchmark.suite import list_suites, load_suite
+from cnpgen.benchmark.suite import load_suite
 from cnpgen.errors import RecipeError
 from cnpgen.planner.planner import Planner
 from cnpgen.refine.refine_plans import refine_plans
+from cnpgen.schema.catalogue import list_recipes
 from tests.conftest import some
 
 
@@ -52,14 +53,14 @@ def test_only_the_opposite_puck_is_hit() -> None:
 
 
 def test_a_switch_after_the_end_of_the_first_motion_is_refused(tmp_path: Path) -> None:
-    text = list_suites()["online"].read_text(encoding="utf-8").replace("250 ms", "400 ms")
+    text = list_recipes("suite")["online"].read_text(encoding="utf-8").replace("250 ms", "400 ms")
     (tmp_path / "late.toml").write_text(text, encoding="utf-8")
     with pytest.raises(RecipeError, match=r"a first motion ends after 0\.3\d+ s, the switch is at 0\.4 s"):
         load_suite(tmp_path / "late.toml").problems()
 
 
 def test_a_grid_with_a_puck_in_its_center_is_refused(tmp_path: Path) -> None:
-    text = list_suites()["online"].read_text(encoding="utf-8").replace("rows = 4", "rows = 3")
+    text = list_recipes("suite")["online"].read_text(encoding="utf-8").replace("rows = 4", "rows = 3")
     (tmp_path / "odd.toml").write_text(text, encoding="utf-8")
     with pytest.raises(RecipeError, match="an even number of pucks"):
         load_suite(tmp_path / "odd.toml")

@@ -25,8 +25,9 @@ from cnpgen.benchmark.process import Ending, PlannerProcess, PlanningOutcome, cp
 from cnpgen.benchmark.result_tables import failure_summaries, notes, save_benchmark_tables, table_rows
 from cnpgen.benchmark.results_file import answer_from_dict, answer_to_dict, open_results
 from cnpgen.benchmark.run_suite import Benchmark, run_benchmark
-from cnpgen.benchmark.suite import list_suites, load_suite
+from cnpgen.benchmark.suite import load_suite
 from cnpgen.errors import DatasetError, UsageError
+from cnpgen.schema.catalogue import list_recipes
 from cnpgen.trajectory.sampled_trajectory import Trajectory
 from tests.conftest import some
 from tests.examples.installed import installed_kind
@@ -352,7 +353,7 @@ def test_earlier_answers_are_discarded_on_request(random: str, tmp_path: Path) -
 
 
 def test_fields_of_planners_in_a_suite_are_those_of_its_runs_unless_the_command_sets_others(tmp_path: Path) -> None:
-    suite, text = tmp_path / "hits-81.toml", list_suites()["hits-81"].read_text(encoding="utf-8")
+    suite, text = tmp_path / "hits-81.toml", list_recipes("suite")["hits-81"].read_text(encoding="utf-8")
     suite.write_text(f'{text}[planners.aqp]\nacceleration = "300 cm/s^2"\nanchor_time = "700 ms"\n', encoding="utf-8")
     parameters = {"aqp": {"anchor_time": 0.6}}
     run_benchmark(suite, tmp_path / "out", planners=["aqp"], parameters=parameters, n=1)

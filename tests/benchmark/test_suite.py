@@ -5,14 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cnpgen.benchmark.suite import list_suites, load_suite
+from cnpgen.benchmark.suite import load_suite
 from cnpgen.errors import RecipeError
+from cnpgen.schema.catalogue import list_recipes
 from tests.examples.plans import ROBOTS
 
 
 def test_every_shipped_suite_is_named_after_its_file() -> None:
-    assert {"hits-81", "hits-110", "heavy-100"} <= list_suites().keys()
-    assert all(load_suite(name).name == name for name in list_suites())
+    assert {"hits-81", "hits-110", "heavy-100"} <= list_recipes("suite").keys()
+    assert all(load_suite(name).name == name for name in list_recipes("suite"))
 
 
 def test_hits_81_has_every_puck_of_the_grid_with_a_hit_towards_the_goal() -> None:
@@ -63,22 +64,22 @@ def test_mistakes_in_a_suite_are_named(text: str, tmp_path: Path) -> None:
 
 
 def test_a_suite_has_pucks_or_samples_and_not_both(tmp_path: Path) -> None:
-    text = (list_suites()["hits-81"]).read_text(encoding="utf-8")
+    text = list_recipes("suite")["hits-81"].read_text(encoding="utf-8")
     (tmp_path / "both.toml").write_text(text + '\n[samples]\nrecipe = "heavy-object"\n', encoding="utf-8")
     with pytest.raises(RecipeError, match="expected exactly one"):
         load_suite(tmp_path / "both.toml")
 
 
 def test_a_grid_without_end_is_refused_before_it_is_made(tmp_path: Path) -> None:
-    text = (list_suites()["hits-81"]).read_text(encoding="utf-8")
+    text = list_recipes("suite")["hits-81"].read_text(encoding="utf-8")
     (tmp_path / "large.toml").write_text(text.replace("= 9", "= 9000000000"), encoding="utf-8")
     with pytest.raises(RecipeError, match="a grid of 81,000,000,000,000,000,000 pucks is too large"):
         load_suite(tmp_path / "large.toml")
 
 
 def test_too_many_problems_are_refused_before_sampling(tmp_path: Path) -> None:
-    replanning = list_suites()["replan"].read_text(encoding="utf-8")
-    sampled = list_suites()["heavy-100"].read_text(encoding="utf-8")
+    replanning = list_recipes("suite")["replan"].read_text(encoding="utf-8")
+    sampled = list_recipes("suite")["heavy-100"].read_text(encoding="utf-8")
     for text, message in (
         (sampled.replace("n = 100", f"n = {10**15}"), "is too large, expected at most 100000"),
         (
@@ -92,7 +93,7 @@ def test_too_many_problems_are_refused_before_sampling(tmp_path: Path) -> None:
 
 
 def test_pucks_need_a_table(tmp_path: Path) -> None:
-    text = (list_suites()["hits-81"]).read_text(encoding="utf-8")
+    text = list_recipes("suite")["hits-81"].read_text(encoding="utf-8")
     (tmp_path / "heavy.toml").write_text(text.replace('"airhockey"', '"heavy-object"'), encoding="utf-8")
     with pytest.raises(RecipeError, match="no table to put pucks on"):
         load_suite(tmp_path / "heavy.toml").problems()

@@ -9,7 +9,6 @@ import h5py
 import numpy as np
 
 from cnpgen.benchmark.results_file import answer_to_dict, open_results
-from cnpgen.benchmark.suite import list_suites
 from cnpgen.make.make_dataset import make_dataset
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.make.recipe_file import load_dataset_recipe
@@ -17,7 +16,7 @@ from cnpgen.planner.model_file import save_model
 from cnpgen.plans.save import save_plans
 from cnpgen.refine.refinement_journal import open_journal
 from cnpgen.refine.task import Attempt, Outcome
-from cnpgen.schema.catalogue import recipes_root
+from cnpgen.schema.catalogue import list_recipes, recipes_root
 from cnpgen.store.shard import read_shard
 from cnpgen.training.checkpoint import Checkpoints, start_state
 from cnpgen.trajectory.sampled_trajectory import Trajectory
@@ -67,7 +66,7 @@ def make_good_files(folder: Path) -> None:
 
 def _make_task_files(folder: Path) -> None:
     """Make files of tasks and of a benchmark: a suite, boundary conditions, tables of tasks and results."""
-    suite = list_suites()["hits-81"].read_text(encoding="utf-8")
+    suite = list_recipes("suite")["hits-81"].read_text(encoding="utf-8")
     (folder / "recipes" / "suite.toml").write_text(
         suite.replace('problem = "airhockey"', 'problem = "./problem.toml"').replace("= 9", "= 2"), encoding="utf-8"
     )

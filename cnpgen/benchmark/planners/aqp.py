@@ -211,10 +211,8 @@ def striking_path(start: Array, hit: Array, velocity: Array, speed: float, accel
     acceleration along the path [m/s^2].
     """
     start, hit = np.clip(start, MIN_MALLET_XY_M, MAX_MALLET_XY_M), np.clip(hit, MIN_MALLET_XY_M, MAX_MALLET_XY_M)
-    low, high = (
-        np.array([min(start[0], hit[0]), MIN_MALLET_XY_M[1]]),
-        np.array([max(start[0], hit[0]), MAX_MALLET_XY_M[1]]),
-    )
+    low = np.array([min(start[0], hit[0]), MIN_MALLET_XY_M[1]])
+    high = np.array([max(start[0], hit[0]), MAX_MALLET_XY_M[1]])
     path = PlanePath(start, _exit_point(hit, -velocity, low, high), hit, speed)
     duration = max(2 * path.length / speed, np.sqrt(2 * path.length / acceleration))
     return PlanePath(path.start, path.bend, hit, 2 * path.length / duration)

@@ -59,8 +59,7 @@ def challenge_plant(folder: str | Path) -> Plant:
 
 def check_challenge(problem: Problem, robot: Robot) -> None:
     """Raise UsageError if a problem is not for an iiwa at the air-hockey table."""
-    table = any(isinstance(constraint, Table) for constraint in problem.constraint)
-    if not table or not set(robot.joint_names) <= set(JOINTS):
+    if problem.first(Table) is None or not set(robot.joint_names) <= set(JOINTS):
         needed = f"a table and an arm with {JOINTS[0]} to {JOINTS[-1]}"
         raise UsageError(f"the Air Hockey Challenge has {needed}, {problem.name!r} is another problem")
 
