@@ -53,7 +53,9 @@ class Drake(BenchmarkPlanner):
         """Import Drake and check that it can model the problem."""
         load_drake()
         problem, robot = open_problem(setting.problem)
-        check_robot(problem, robot)
+        require_table_or_transport(problem)
+        if robot.attached.payload is not None or robot.attached.tip != robot.attached.frame:
+            raise UsageError(f"supported are tips of the URDF without payload, {problem.name!r} has another one")
         return lambda task: self._plan(problem, robot, task)
 
     def _plan(self, problem: Problem, robot: Robot, task: Plans) -> Trajectory | None:
@@ -135,13 +137,6 @@ def load_drake() -> Any:
         import pydrake
         import pydrake.planning
     return pydrake
-
-
-def check_robot(problem: Problem, robot: Robot) -> None:
-    """Raise UsageError if there is neither a table nor a held object among boxes, or a payload or another tip frame."""
-    require_table_or_transport(problem)
-    if robot.attached.payload is not None or robot.attached.tip != robot.attached.frame:
-        raise UsageError(f"supported are tips of the URDF without payload, {problem.name!r} has another one")
 
 
 class DrakeArm:
