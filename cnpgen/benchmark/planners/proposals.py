@@ -36,16 +36,11 @@ HIDDEN_WIDTH, HIDDEN_LAYERS, BATCH_ROWS, TRAINING_STEPS, PEAK_LEARNING_RATE = 12
 
 @dataclass(frozen=True, eq=False)
 class Proposals:
-    """A trained network.
+    """A trained network, whose heads have n outputs each; its parameters are float32.
 
-    Attributes:
-        architecture: The network's architecture; both heads have n outputs.
-        parameters: All of its numbers, float32.
-        mean: Mean of every input over the training rows, shape (F,).
-        scale: Reciprocal of its standard deviation; 0 for constant inputs, shape (F,).
-        reach: Maximum change of a joint within the time [rad], shape (n,).
-        ahead: The time [s].
-        training: Data of its training, as text.
+    ``mean`` and ``scale`` have the mean of every input over the training rows and the reciprocal of its standard
+    deviation, 0 for constant inputs, shape (F,). ``reach`` is the maximum change of a joint [rad], shape (n,), within
+    the time ``ahead`` [s]. ``training`` has data of the training, as text.
     """
 
     architecture: Architecture

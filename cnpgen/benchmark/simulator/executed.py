@@ -126,19 +126,11 @@ def succeeded(executed: Mapping[str, Any], plane_tolerance: float = PLANE_TOLERA
 class TickRecord:
     """Record of K ticks.
 
-    Attributes:
-        q: Joint positions [rad], shape (K, n).
-        tip: Positions of the tip [m], shape (K, 3).
-        rotation: Its rotation, shape (K, 3, 3).
-        reference: Reference positions of the joints [rad], shape (K, n).
-        torque_use: Torques as fractions of the rated torques, shape (K, n).
-        puck: Positions of the puck over the table [m], shape (K, 2); nan without one.
-        puck_velocity: Its velocities [m/s], shape (K, 2); nan without one.
-        puck_contact: Whether mallet and puck touch, shape (K,).
-        table_force: Normal and friction force between mallet and table [N], shape (K, 2); nan if not simulated.
-        violated_steps: See ``Executed``.
-        penalty: See ``Executed``.
-        max_penetration: Maximum penetration of an obstacle [m].
+    Joint positions, their reference [rad] and torques as fractions of the rated ones have shape (K, n). The tip [m] has
+    shape (K, 3), its rotation (K, 3, 3). The puck over the table [m] and its velocity [m/s] have shape (K, 2) and are
+    nan without one; ``puck_contact`` is true while the mallet touches it, shape (K,). ``table_force`` has the normal
+    and the friction force of the mallet on the table [N], shape (K, 2), nan if not simulated. ``max_penetration`` is
+    that of an obstacle [m]; see ``Executed`` for the others.
     """
 
     q: Array

@@ -52,18 +52,11 @@ _RIMS = {  # the bands and the four halves of both goals' sides: centre and half
 
 @dataclass(frozen=True)
 class SimulatorScene:
-    """Simulated world.
+    """Simulated world: a problem with its robot, deviations of the plant, and poses of the obstacles, shape (width,).
 
-    Attributes:
-        problem: The problem.
-        robot: Its robot.
-        plant: Deviations from the nominal model.
-        obstacle_poses: Poses and sizes of the obstacles, shape (width,).
-        puck: Position of the puck on the table [m], shape (2,), or None.
-        puck_velocity: Velocity of the puck on the table at the start [m/s].
-        table_rotation: Axes of the table in the world, columns x, y and the normal, shape (3, 3).
-        table_position: Origin of the table's coordinates in the world [m], shape (3,).
-        upright: Axes of which the last is the upright direction, as columns, shape (3, 3).
+    The puck on the table [m], shape (2,), is None without one; its velocity at the start is in m/s. ``table_rotation``
+    has the table's axes in the world as columns: x, y and the normal. ``table_position`` is the origin of its
+    coordinates [m]. The last column of ``upright`` is the upright direction.
     """
 
     problem: Problem
