@@ -1,4 +1,12 @@
-"""``cnpgen benchmark``: compare planners on the problems of a suite."""
+"""Compare planners on the problems of a suite.
+
+Each planner solves one problem after the other, in its own process and on one thread. Pinocchio and Coal judge the
+answers, and with --simulate MuJoCo executes them. Every finished problem is written to DIR at once, one file per
+planner. After an interruption the same command resumes; more --planners or --plant extend the results. If a planner
+crashes, times out or returns an invalid result, only that problem is marked as failed. With --engine several workers
+plan at once, so compare CPU times only. 'cnpgen docs benchmark' describes suites and planners. The exit code is 0 if
+the benchmark is complete, also if planners failed.
+"""
 
 import argparse
 import json
@@ -9,26 +17,16 @@ from typing import TYPE_CHECKING, Any
 
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.interruption import resumable
-from cnpgen.cli.parser import ENGINE, Commands, Parser, add_command, add_engine, add_json, options_of
+from cnpgen.cli.parser import ENGINE, Parser, add_engine, add_json, options_of
 from cnpgen.cli.progress import Meter
 from cnpgen.errors import CnpgenError, UsageError
 
 if TYPE_CHECKING:
     from cnpgen.benchmark.run_suite import Benchmark
 
-_TEXT = """\
-Each planner solves one problem after the other, in its own process and on one thread. Pinocchio and Coal judge the
-answers, and with --simulate MuJoCo executes them. Every finished problem is written to DIR at once, one file per
-planner. After an interruption the same command resumes; more --planners or --plant extend the results. If a planner
-crashes, times out or returns an invalid result, only that problem is marked as failed. With --engine several workers
-plan at once, so compare CPU times only. 'cnpgen docs benchmark' describes suites and planners. The exit code is 0 if
-the benchmark is complete, also if planners failed.
-"""
 
-
-def add(commands: "Commands[Parser]") -> None:
-    """Add the command."""
-    parser = add_command(commands, "benchmark", run, title="compare planners on the problems of a suite", text=_TEXT)
+def add_options(parser: Parser) -> None:
+    """Add the options."""
     option = parser.add_argument
     text = "a suite (see --list), or a dataset for random problems"
     option("suite", metavar="SUITE", nargs="?", type=recipe_names.suite, help=text)

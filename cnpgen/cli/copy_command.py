@@ -1,4 +1,9 @@
-"""``cnpgen copy``: copy a shipped recipe with all files that it refers to, for editing."""
+"""Copy a recipe for editing.
+
+A dataset is copied as DIR/dataset.toml with its DIR/pipeline.toml and DIR/problem.toml, a pipeline with its problem.
+The copies have the name of the folder and refer to each other; the URDF is copied unless it belongs to a package. The
+path of the first file is printed on stdout. Existing files are replaced only with --force.
+"""
 
 import argparse
 import re
@@ -7,17 +12,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names
-from cnpgen.cli.parser import Commands, Parser, add_command
+from cnpgen.cli.parser import Parser
 from cnpgen.errors import UsageError
 
 if TYPE_CHECKING:
     from cnpgen.cli.describe import Recipe
 
-_TEXT = """\
-A dataset is copied as DIR/dataset.toml with its DIR/pipeline.toml and DIR/problem.toml, a pipeline with its problem.
-The copies have the name of the folder and refer to each other; the URDF is copied unless it belongs to a package. The
-path of the first file is printed on stdout. Existing files are replaced only with --force.
-"""
 _NEXT = {
     "dataset": "cnpgen make-dataset {0}",
     "pipeline": "cnpgen make-dataset {0} --n 1000",
@@ -25,9 +25,8 @@ _NEXT = {
 }
 
 
-def add(commands: "Commands[Parser]") -> None:
-    """Add the command."""
-    parser = add_command(commands, "copy", run, title="copy a recipe for editing", text=_TEXT)
+def add_options(parser: Parser) -> None:
+    """Add the options."""
     text = "a shipped dataset, pipeline or problem (see 'cnpgen list')"
     parser.add_argument("recipe", metavar="NAME", type=recipe_names.shipped, help=text)
     parser.add_argument("folder", metavar="DIR", help="folder of the copies; its name becomes theirs")

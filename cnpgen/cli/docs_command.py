@@ -1,4 +1,8 @@
-"""``cnpgen docs``: the documentation of this version, without a network."""
+"""Print a page of the documentation as Markdown.
+
+Without PAGE it lists all pages. --search lists the lines that contain TEXT. Pictures are on the site and in the
+repository only.
+"""
 
 import argparse
 import re
@@ -6,20 +10,14 @@ from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from cnpgen.cli.parser import Commands, Parser, add_command, add_json
+from cnpgen.cli.parser import Parser, add_json
 from cnpgen.errors import CnpgenError, MachineError, UsageError, lacks
 
 KINDS = ("tutorials", "how-to", "concepts", "reference", "benchmarks")
 
-_TEXT = """\
-Without PAGE it lists all pages. --search lists the lines that contain TEXT. Pictures are on the site and in the
-repository only.
-"""
 
-
-def add(commands: "Commands[Parser]") -> None:
-    """Add the command."""
-    parser = add_command(commands, "docs", run, title="print a page of the documentation as Markdown", text=_TEXT)
+def add_options(parser: Parser) -> None:
+    """Add the options."""
     what = parser.add_mutually_exclusive_group()
     what.add_argument("page", metavar="PAGE", nargs="?", help="name of a page, such as hit-a-puck")
     what.add_argument("--search", metavar="TEXT", help="list the lines with TEXT on all pages, in any case")

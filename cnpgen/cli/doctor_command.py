@@ -1,27 +1,24 @@
-"""``cnpgen doctor``: check this machine."""
+"""Check this machine.
+
+Results are printed on stdout, warnings and problems with their remedies on stderr. The exit code is 3 if a required
+library does not work. Without a C compiler cnpgen works 10 to 20 times slower. 'cnpgen docs troubleshooting' has
+more remedies.
+"""
 
 import argparse
 import sys
 from typing import TYPE_CHECKING
 
-from cnpgen.cli.parser import Commands, Parser, add_command, add_json
+from cnpgen.cli.parser import Parser, add_json
 from cnpgen.errors import MachineError, counted
 
 if TYPE_CHECKING:
     from cnpgen.validate.machine import MachineReport
 
 
-_TEXT = """\
-Results are printed on stdout, warnings and problems with their remedies on stderr. The exit code is 3 if a required
-library does not work. Without a C compiler cnpgen works 10 to 20 times slower. 'cnpgen docs troubleshooting' has
-more remedies.
-"""
-
-
-def add(commands: "Commands[Parser]") -> None:
-    """Add the command."""
-    title = "check this machine"
-    add_json(add_command(commands, "doctor", run, title=title, text=_TEXT))
+def add_options(parser: Parser) -> None:
+    """Add the options."""
+    add_json(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:

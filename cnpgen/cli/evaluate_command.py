@@ -1,4 +1,13 @@
-"""``cnpgen evaluate``: judge plans or sampled trajectories of a file with Pinocchio and Coal."""
+"""Judge plans or sampled trajectories.
+
+Every plan is checked on a fine time grid and between its samples ('cnpgen docs verdict'). The exit code is 0 if every
+plan is valid, and 1 if a plan is invalid, if the file holds no plans, or if it is damaged. It is 2 for files of
+another kind. --workers changes only the time.
+
+With --problem, FILE may also hold sampled trajectories: CSV, JSON, YAML, NPZ, HDF5 or Parquet, messages of ROS and
+MoveIt, or a folder of such files ('cnpgen docs trajectories'). Each trajectory and condition is valid, invalid or
+undecided. The exit code is then 0 if all are valid, otherwise 1; 2 for damaged files and files of other kinds.
+"""
 
 import argparse
 import json
@@ -7,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names, values
-from cnpgen.cli.parser import Commands, Parser, add_command, add_json
+from cnpgen.cli.parser import Parser, add_json
 from cnpgen.cli.plan_files import read_plans
 from cnpgen.cli.progress import Meter
 from cnpgen.cli.trajectory_options import (
@@ -25,20 +34,9 @@ if TYPE_CHECKING:
     from cnpgen.plans.evaluate import Evaluation
     from cnpgen.plans.evaluate_trajectories import TrajectoryEvaluation
 
-_TEXT = """\
-Every plan is checked on a fine time grid and between its samples ('cnpgen docs verdict'). The exit code is 0 if every
-plan is valid, and 1 if a plan is invalid, if the file holds no plans, or if it is damaged. It is 2 for files of
-another kind. --workers changes only the time.
 
-With --problem, FILE may also hold sampled trajectories: CSV, JSON, YAML, NPZ, HDF5 or Parquet, messages of ROS and
-MoveIt, or a folder of such files ('cnpgen docs trajectories'). Each trajectory and condition is valid, invalid or
-undecided. The exit code is then 0 if all are valid, otherwise 1; 2 for damaged files and files of other kinds.
-"""
-
-
-def add(commands: "Commands[Parser]") -> None:
-    """Add the command."""
-    parser = add_command(commands, "evaluate", run, title="judge plans or sampled trajectories", text=_TEXT)
+def add_options(parser: Parser) -> None:
+    """Add the options."""
     option = parser.add_argument
     option("file", metavar="FILE", type=Path, help="plan file, .h5, or sampled trajectories")
     text = "the problem of the plans; its tolerances are used"

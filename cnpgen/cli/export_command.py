@@ -1,4 +1,13 @@
-"""``cnpgen export``: plans as sampled trajectories for robots and simulators."""
+"""Write plans as sampled trajectories.
+
+npz, parquet and mpd (B-splines of the paths) are one file. csv, joint-trajectory (a message of ROS 2, as JSON) and
+ros2-control (the goal of a trajectory controller, as YAML) are a folder with one file per plan. lerobot is a
+dataset in a folder (LeRobotDataset v3), with --rate frames per second.
+'cnpgen list exporters' shows all formats, including those of installed packages. 'cnpgen docs plan-format' shows how to
+read them. The path of the output is printed on stdout. Plans that cannot be sampled are left out and listed on
+stderr; the exit code is then 1. With --join, positions, velocities and accelerations must be
+continuous from plan to plan (1e-9 in SI); otherwise nothing is written.
+"""
 
 import argparse
 import sys
@@ -6,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names, values
-from cnpgen.cli.parser import Commands, Parser, add_command
+from cnpgen.cli.parser import Parser
 from cnpgen.cli.plan_files import read_plans
 from cnpgen.errors import UsageError, counted, listed
 
@@ -18,20 +27,9 @@ if TYPE_CHECKING:
 MAX_LISTED_PLANS = 10  # invalid plans that are listed by number
 NO_OBSTACLES = "the output lacks the obstacles of the plans: only a problem with these obstacles judges it among them"
 
-_TEXT = """\
-npz, parquet and mpd (B-splines of the paths) are one file. csv, joint-trajectory (a message of ROS 2, as JSON) and
-ros2-control (the goal of a trajectory controller, as YAML) are a folder with one file per plan. lerobot is a
-dataset in a folder (LeRobotDataset v3), with --rate frames per second.
-'cnpgen list exporters' shows all formats, including those of installed packages. 'cnpgen docs plan-format' shows how to
-read them. The path of the output is printed on stdout. Plans that cannot be sampled are left out and listed on
-stderr; the exit code is then 1. With --join, positions, velocities and accelerations must be
-continuous from plan to plan (1e-9 in SI); otherwise nothing is written.
-"""
 
-
-def add(commands: "Commands[Parser]") -> None:
-    """Add the command."""
-    parser = add_command(commands, "export", run, title="write plans as sampled trajectories", text=_TEXT)
+def add_options(parser: Parser) -> None:
+    """Add the options."""
     option = parser.add_argument
     option("file", metavar="FILE", type=recipe_names.present, help="plan file, .h5")
     text = "format: npz, csv, parquet, lerobot, mpd, ... ('cnpgen list exporters')"

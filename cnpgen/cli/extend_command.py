@@ -1,22 +1,20 @@
-"""``cnpgen extend``: add samples to a dataset."""
+"""Add samples to a dataset.
+
+The samples are those of a dataset that is made at once, every split in the proportion of the recipe. Existing shards
+do not change; statistics, card and manifest are written again. Until it is finished the dataset has no manifest; after
+an interruption the same command resumes ('cnpgen docs dataset-format').
+"""
 
 import argparse
 from functools import partial
 
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.make_command import make_metered
-from cnpgen.cli.parser import ENGINE, Commands, Parser, add_command, add_engine, options_of
-
-_TEXT = """\
-The samples are those of a dataset that is made at once, every split in the proportion of the recipe. Existing shards
-do not change; statistics, card and manifest are written again. Until it is finished the dataset has no manifest; after
-an interruption the same command resumes ('cnpgen docs dataset-format').
-"""
+from cnpgen.cli.parser import ENGINE, Parser, add_engine, options_of
 
 
-def add(commands: "Commands[Parser]") -> None:
-    """Add the command."""
-    parser = add_command(commands, "extend", run, title="add samples to a dataset", text=_TEXT)
+def add_options(parser: Parser) -> None:
+    """Add the options."""
     option = parser.add_argument
     option("folder", metavar="DIR", type=recipe_names.dataset, help="the dataset")
     option("--n", metavar="N", type=values.rows, required=True, help="total number of samples afterwards")

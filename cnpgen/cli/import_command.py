@@ -1,4 +1,9 @@
-"""``cnpgen import``: fit plans to sampled trajectories of any planner."""
+"""Make plans of sampled trajectories.
+
+The plans are initial guesses: 'cnpgen refine' optimizes them and keeps their ends, and 'cnpgen evaluate' judges them.
+Formats and columns are those of 'cnpgen evaluate' ('cnpgen docs trajectories'). The ends are moved onto the
+constraints by a change of positions of at most three times the noise, or 1 mrad. The plan file is printed on stdout.
+"""
 
 import argparse
 import sys
@@ -6,23 +11,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names, values
-from cnpgen.cli.parser import Commands, Parser, add_command
+from cnpgen.cli.parser import Parser
 from cnpgen.cli.trajectory_options import add_trajectory_options, load_file, problem_of
 from cnpgen.errors import UsageError, counted
 
 if TYPE_CHECKING:
     from cnpgen.plans import Plans
 
-_TEXT = """\
-The plans are initial guesses: 'cnpgen refine' optimizes them and keeps their ends, and 'cnpgen evaluate' judges them.
-Formats and columns are those of 'cnpgen evaluate' ('cnpgen docs trajectories'). The ends are moved onto the
-constraints by a change of positions of at most three times the noise, or 1 mrad. The plan file is printed on stdout.
-"""
 
-
-def add(commands: "Commands[Parser]") -> None:
-    """Add the command."""
-    parser = add_command(commands, "import", run, title="make plans of sampled trajectories", text=_TEXT)
+def add_options(parser: Parser) -> None:
+    """Add the options."""
     option = parser.add_argument
     option("file", metavar="FILE", type=recipe_names.present, help="file of trajectories, or a folder of them")
     text = "the problem of the trajectories"

@@ -1,15 +1,5 @@
-"""``cnpgen init``: write a problem, a pipeline and a dataset for an arm, or a package with a planner."""
+"""Write recipes for your own arm, or a planner.
 
-import argparse
-import sys
-import warnings
-from collections.abc import Iterable, Mapping
-from pathlib import Path
-
-from cnpgen.cli.parser import Commands, Parser, add_command
-from cnpgen.errors import UsageError
-
-_TEXT = """\
 The command writes NAME/problem.toml, NAME/pipeline.toml and NAME/dataset.toml: motions from rest to rest between two
 boxes of positions in front of the robot, within its limits and without self-collision. Comments explain every key. The
 head of problem.toml lists findings about the robot: joints, masses, frames, link pairs, the free space that convex
@@ -18,10 +8,18 @@ are decomposed. 'cnpgen docs your-arm' continues from there. With --planner the 
 module with a planner for 'cnpgen benchmark', which uses limits, kinematics and the table through the public interface.
 """
 
+import argparse
+import sys
+import warnings
+from collections.abc import Iterable, Mapping
+from pathlib import Path
 
-def add(commands: "Commands[Parser]") -> None:
-    """Add the command."""
-    parser = add_command(commands, "init", run, title="write recipes for your own arm, or a planner", text=_TEXT)
+from cnpgen.cli.parser import Parser
+from cnpgen.errors import UsageError
+
+
+def add_options(parser: Parser) -> None:
+    """Add the options."""
     option = parser.add_argument
     option("name", metavar="NAME", type=_folder, help="name of the recipes and of their folder")
     kind = parser.add_mutually_exclusive_group(required=True)

@@ -1,10 +1,10 @@
-"""``cnpgen list``: shipped recipes and models, and the kinds of stages, constraints, objectives and exporters."""
+"""List datasets, models, pipelines, problems, stages, constraints, objectives and exporters."""
 
 import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cnpgen.cli.parser import Commands, Parser, add_command, add_json
+from cnpgen.cli.parser import Parser, add_json
 from cnpgen.errors import RecipeError
 
 if TYPE_CHECKING:
@@ -24,9 +24,8 @@ _HOW = {
 }
 
 
-def add(commands: "Commands[Parser]") -> None:
-    """Add the command."""
-    parser = add_command(commands, "list", run, title=f"list {', '.join(WHAT[:-1])} and {WHAT[-1]}")
+def add_options(parser: Parser) -> None:
+    """Add the options."""
     parser.add_argument("what", nargs="?", choices=WHAT, metavar="WHAT", help=f"one of {', '.join(WHAT)}; default all")
     add_json(parser)
 

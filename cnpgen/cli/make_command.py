@@ -1,4 +1,15 @@
-"""``cnpgen make-dataset``: make a dataset, or resume one."""
+"""Make a dataset, or resume one.
+
+The same recipe, seed and backend give the same samples. --workers, --shard-size and --part decide which process makes
+which samples, never their content; a smaller --n gives the first samples of each split. With --certify every sample is
+planned (about 30 ms each). Samples without a valid plan are rejected as "no plan found", and the control points of the
+plans are stored. With --model certification starts from a planner's plans, in half the time, with the same judge.
+The folder of the dataset is printed on stdout.
+
+Shards of the same dataset in the folder are kept: they are compared with their recorded sha256 (at 0.3 to 1 GB/s per
+core), and damaged ones are made again. Another dataset is replaced only with --force, or if it has no shards. After
+Ctrl-C (exit code 130), SIGTERM (143), kill -9 or a full disk the same command resumes.
+"""
 
 import argparse
 import sys
@@ -7,7 +18,7 @@ from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.interruption import raise_if_interrupted
-from cnpgen.cli.parser import ENGINE, Commands, Parser, add_command, add_engine, options_of
+from cnpgen.cli.parser import ENGINE, Parser, add_engine, options_of
 from cnpgen.cli.progress import Meter
 from cnpgen.errors import UsageError, counted
 
@@ -21,22 +32,9 @@ if TYPE_CHECKING:
 _SETTINGS = ("n", "seed", "shard_size", "dtype", "backend", "force")
 INTERRUPTED_TEXT = "finished shards are kept; run the same command again to resume"
 
-_TEXT = """\
-The same recipe, seed and backend give the same samples. --workers, --shard-size and --part decide which process makes
-which samples, never their content; a smaller --n gives the first samples of each split. With --certify every sample is
-planned (about 30 ms each). Samples without a valid plan are rejected as "no plan found", and the control points of the
-plans are stored. With --model certification starts from a planner's plans, in half the time, with the same judge.
-The folder of the dataset is printed on stdout.
 
-Shards of the same dataset in the folder are kept: they are compared with their recorded sha256 (at 0.3 to 1 GB/s per
-core), and damaged ones are made again. Another dataset is replaced only with --force, or if it has no shards. After
-Ctrl-C (exit code 130), SIGTERM (143), kill -9 or a full disk the same command resumes.
-"""
-
-
-def add(commands: "Commands[Parser]") -> None:
-    """Add the command."""
-    parser = add_command(commands, "make-dataset", run, title="make a dataset, or resume one", text=_TEXT)
+def add_options(parser: Parser) -> None:
+    """Add the options."""
     option = parser.add_argument
     option("recipe", metavar="NAME|FILE", help="a shipped dataset or pipeline (see 'cnpgen list'), or a recipe file")
     option("--n", metavar="N", type=values.rows, help="total number of samples; default the recipe's")

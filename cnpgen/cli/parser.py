@@ -1,20 +1,17 @@
 """argparse with errors of one line that suggest the nearest known name.
 
 argparse has no public names for the error of a choice, the width of the command column, the known options and some
-types. Only this module uses the private ones; others import ``Commands`` and ``Options`` from here. Tests of the errors
-detect changes of argparse.
+types. Only this module uses the private ones; others import ``Options`` from here. Tests of the errors detect changes
+of argparse.
 """
 
 import argparse
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from types import ModuleType
 from typing import Any, NoReturn
 
 from cnpgen.errors import UsageError, nearest
-
-Command = Callable[[argparse.Namespace], int]
-"""What a command runs: a function of the parsed arguments that returns the exit code."""
-
 
 _NEGATIVE = re.compile(r"-\.?[0-9]")  # how values begin: -5ms; before Python 3.14 argparse takes it for an option
 
@@ -63,12 +60,14 @@ Commands = argparse._SubParsersAction  # what ``add_subparsers`` returns: comman
 Options = argparse._ActionsContainer  # a parser or a group of its options: options are added to it
 
 
-def add_command(commands: "Commands[Parser]", name: str, run: Command, *, title: str, text: str = "") -> Parser:
-    """Add a command with a title for the list of commands and a text for its help; return the parser of its options."""
-    parser = commands.add_parser(name, help=title, description=f"{title[0].upper()}{title[1:]}.", epilog=text or None)
+def add_command(commands: "Commands[Parser]", name: str, module: ModuleType) -> None:
+    """Add the command of a module: its docstring is the help, ``add_options`` adds arguments, ``run`` runs it."""
+    title, _, text = (module.__doc__ or "").partition("\n\n")
+    summary = f"{title[:1].lower()}{title[1:]}".rstrip(".\n")
+    parser = commands.add_parser(name, help=summary, description=title, epilog=text or None)
     add_debug(parser, default=argparse.SUPPRESS)  # keep an option before the command
-    parser.set_defaults(run=run, parser=parser)
-    return parser
+    module.add_options(parser)
+    parser.set_defaults(run=module.run, parser=parser)
 
 
 def add_debug(parser: Parser, *, default: Any = False) -> None:

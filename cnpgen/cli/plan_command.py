@@ -1,20 +1,5 @@
-"""``cnpgen plan``: plan with a trained model."""
+"""Plan with a trained model.
 
-import argparse
-import sys
-from pathlib import Path
-from typing import TYPE_CHECKING
-
-from cnpgen.cli import recipe_names, values
-from cnpgen.cli.parser import ENGINE, Commands, Parser, add_command, add_engine, add_json, options_of
-from cnpgen.cli.refine_options import LARGE_ANGLES, REFINING, WORKERS, add_refining, check_place, refine_and_save
-from cnpgen.errors import UsageError, counted
-
-if TYPE_CHECKING:
-    from cnpgen.planner.model import Model
-    from cnpgen.planner.plan_requests import Requests
-
-_TEXT = """\
 The problems are samples of a dataset, fresh draws of a recipe as 'cnpgen solve' makes them, scenes ('cnpgen docs
 scene-files') for a model that was trained on scenes, or boundary conditions in an HDF5 file (a shard, a plan file, or
 any other): start_q and goal_q of shape (N, joints), optionally start_dq, start_ddq and goal_dq, and goal_ddq for models
@@ -24,10 +9,23 @@ the end. Finished plans are kept in PLANS.part, and the same command resumes. Th
 existing one is replaced only with --force.
 """
 
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-def add(commands: "Commands[Parser]") -> None:
-    """Add the command."""
-    parser = add_command(commands, "plan", run, title="plan with a trained model", text=_TEXT)
+from cnpgen.cli import recipe_names, values
+from cnpgen.cli.parser import ENGINE, Parser, add_engine, add_json, options_of
+from cnpgen.cli.refine_options import LARGE_ANGLES, REFINING, WORKERS, add_refining, check_place, refine_and_save
+from cnpgen.errors import UsageError, counted
+
+if TYPE_CHECKING:
+    from cnpgen.planner.model import Model
+    from cnpgen.planner.plan_requests import Requests
+
+
+def add_options(parser: Parser) -> None:
+    """Add the options."""
     option = parser.add_argument
     text = "a dataset's folder; a dataset or pipeline by name, or a recipe file; boundary conditions in HDF5; or scenes"
     option("problems", metavar="DIR|NAME|FILE", type=recipe_names.problems, help=text)

@@ -1,23 +1,20 @@
-"""``cnpgen publish``: a dataset as a repository of the Hugging Face Hub."""
+"""Publish a dataset on the Hugging Face Hub (extra: hub).
+
+The repository has a card, a Parquet view and the dataset itself in hdf5/. License, creator and citation are those of
+the recipe's keys; a dataset without a license is refused. The same command continues an interrupted upload. 'hf auth
+login' stores the token of the upload. The path of the folder, or the address of the repository, is printed on stdout.
+"""
 
 import argparse
 import sys
 from pathlib import Path
 
 from cnpgen.cli import recipe_names
-from cnpgen.cli.parser import Commands, Parser, add_command
-
-_TEXT = """\
-The repository has a card, a Parquet view and the dataset itself in hdf5/. License, creator and citation are those of
-the recipe's keys; a dataset without a license is refused. The same command continues an interrupted upload. 'hf auth
-login' stores the token of the upload. The path of the folder, or the address of the repository, is printed on stdout.
-"""
+from cnpgen.cli.parser import Parser
 
 
-def add(commands: "Commands[Parser]") -> None:
-    """Add the command."""
-    title = "publish a dataset on the Hugging Face Hub (extra: hub)"
-    parser = add_command(commands, "publish", run, title=title, text=_TEXT)
+def add_options(parser: Parser) -> None:
+    """Add the options."""
     option = parser.add_argument
     option("folder", metavar="DIR", type=recipe_names.dataset, help="folder of a finished dataset")
     option("--to", metavar="USER/NAME", required=True, help="repository of the Hub; it is created if it does not exist")

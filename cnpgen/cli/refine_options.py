@@ -36,8 +36,9 @@ in either case.
 """
 
 
-def add_options(parser: Parser) -> None:
-    """Add the options of both commands."""
+def add_refine_options(parser: Parser) -> None:
+    """Add the options of both commands, and complete the help."""
+    parser.epilog = f"{parser.epilog}{TEXT}"
     add_refining(parser)
     parser.add_argument("--workers", metavar="W", type=values.positive, help=WORKERS)
     add_engine(parser)

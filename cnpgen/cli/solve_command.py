@@ -1,22 +1,5 @@
-"""``cnpgen solve``: make plans for boundary problems of a dataset, of a file, or fresh draws, from nothing."""
+"""Plan without an initial guess.
 
-import argparse
-import math
-from collections.abc import Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-from cnpgen.cli import recipe_names, values
-from cnpgen.cli.parser import Commands, Parser, add_command
-from cnpgen.cli.refine_options import LARGE_ANGLES, TEXT, add_options, check_place, refine_and_save
-from cnpgen.errors import DatasetError, UsageError
-
-if TYPE_CHECKING:
-    from cnpgen.make.solve_scenes import SolvedScenes
-    from cnpgen.plans import Plans
-
-_TEXT = (
-    """\
 A folder of a dataset gives its rows, a recipe gives fresh draws, which no split of the dataset holds. Rows of a
 certified dataset have plans already: these are refined. An HDF5 file gives boundary conditions: a shard, a file of
 plans, whose plans are not looked at, or any other with start_q and goal_q of shape (N, joints), and start_dq,
@@ -25,15 +8,26 @@ start_ddq and goal_dq where they are not zero. --problem names the problem if th
 With --robot, files of scenes are solved: planning scenes and requests of MoveIt or robometrics in YAML, MPiNets or
 Avoid Everything in HDF5, or a folder of them ('cnpgen docs scene-files'). All plans of one call are written to one
 file; the column obstacle_poses contains the obstacles of each. Unsolved scenes are listed with a reason.
-
 """
-    + TEXT
-)
+
+import argparse
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from cnpgen.cli import recipe_names, values
+from cnpgen.cli.parser import Parser
+from cnpgen.cli.refine_options import LARGE_ANGLES, add_refine_options, check_place, refine_and_save
+from cnpgen.errors import DatasetError, UsageError
+
+if TYPE_CHECKING:
+    from cnpgen.make.solve_scenes import SolvedScenes
+    from cnpgen.plans import Plans
 
 
-def add(commands: "Commands[Parser]") -> None:
-    """Add the command."""
-    parser = add_command(commands, "solve", run, title="plan without an initial guess", text=_TEXT)
+def add_options(parser: Parser) -> None:
+    """Add the options."""
     option = parser.add_argument
     text = "a dataset's folder; a dataset or pipeline by name, or a recipe file; boundary conditions in HDF5;"
     text += " or, with --robot, scenes"
@@ -48,7 +42,8 @@ def add(commands: "Commands[Parser]") -> None:
     option("--robot", metavar="NAME|FILE", type=recipe_names.problem, help=text)
     option("-o", "--out", metavar="OUT", type=Path, help="output file (default: DIR-plans.h5 or NAME-plans.h5)")
     option("--allow-large-angles", action="store_true", help=LARGE_ANGLES)
-    add_options(parser)
+    parser.epilog = f"{parser.epilog}\n"
+    add_refine_options(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:

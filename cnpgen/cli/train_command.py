@@ -1,4 +1,11 @@
-"""``cnpgen train``: train a model on a dataset, or go on with one that was interrupted."""
+"""Train a planner on a dataset.
+
+The loss is the problem's objective and constraints along every motion; no demonstrations are needed. The command also
+writes a log (.jsonl), a picture of it (.png, if matplotlib is installed) and, until the end, a checkpoint. After Ctrl-C
+(exit code 130), SIGTERM (143), kill -9 or a full disk the same command resumes from the checkpoint and gives the same
+parameters. The best of ten models on validation samples is kept; its score is measured on other samples. The model file
+is printed on stdout. 'cnpgen docs training' explains the options.
+"""
 
 import argparse
 import shlex
@@ -7,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names, values
-from cnpgen.cli.parser import Commands, Parser, add_command, options_of
+from cnpgen.cli.parser import Parser, options_of
 from cnpgen.cli.train_options import add_settings, changed_settings, passed_settings
 from cnpgen.cli.train_text import Watch, summary
 from cnpgen.errors import MachineError
@@ -15,13 +22,6 @@ from cnpgen.errors import MachineError
 if TYPE_CHECKING:
     from cnpgen.training.train import Trained
 
-_TEXT = """\
-The loss is the problem's objective and constraints along every motion; no demonstrations are needed. The command also
-writes a log (.jsonl), a picture of it (.png, if matplotlib is installed) and, until the end, a checkpoint. After Ctrl-C
-(exit code 130), SIGTERM (143), kill -9 or a full disk the same command resumes from the checkpoint and gives the same
-parameters. The best of ten models on validation samples is kept; its score is measured on other samples. The model file
-is printed on stdout. 'cnpgen docs training' explains the options.
-"""
 
 _LENGTHS = ("cpu_seconds", "steps", "epochs")
 _CHECK = "validation rows to compare models by, half of all at most (default: 200)"
@@ -32,9 +32,8 @@ _PRESET = (
 )
 
 
-def add(commands: "Commands[Parser]") -> None:
-    """Add the command."""
-    parser = add_command(commands, "train", run, title="train a planner on a dataset", text=_TEXT)
+def add_options(parser: Parser) -> None:
+    """Add the options."""
     option = parser.add_argument
     option("folder", metavar="DIR", type=recipe_names.present, help="the dataset; or, with --robot, scenes")
     option("-o", "--out", metavar="MODEL", type=Path, required=True, help="model file to write, .h5")

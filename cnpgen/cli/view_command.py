@@ -1,4 +1,13 @@
-"""``cnpgen view``: show a robot, a plan or a sample in a browser."""
+"""Show a robot, a plan or a sample in a browser.
+
+The page is one file that needs no network: the arm, obstacles, puck, path and frame of the tip, a time slider and a
+slider for every joint. Curves show the joints relative to their limits and the other conditions with their bounds. The
+verdict lists the smallest margin of every condition; for a rejected plan, a click shows the place and time of a
+violation. A sample without a plan is shown at its start and goal, a problem in its base configuration. --rows puts
+several plans on one page. Sampled trajectories need --problem ('cnpgen docs trajectories'). Plans and datasets contain
+collision geometry only; --problem locates the visual meshes. --serve serves the page locally until Ctrl-C and reloads
+it when a file changes; ?row=I shows another sample. Needs MeshCat's viewer: pip install 'cnpgen[view]'.
+"""
 
 import argparse
 import math
@@ -8,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names, values
-from cnpgen.cli.parser import Commands, Parser, add_command
+from cnpgen.cli.parser import Parser
 from cnpgen.cli.trajectory_options import add_trajectory_options, load_file, problem_of, refuse_trajectory_options
 from cnpgen.errors import DatasetError, UsageError
 
@@ -19,20 +28,9 @@ if TYPE_CHECKING:
 
 MAX_ROWS_OF_PAGE = 50  # each adds about 0.3 MB
 
-_TEXT = """\
-The page is one file that needs no network: the arm, obstacles, puck, path and frame of the tip, a time slider and a
-slider for every joint. Curves show the joints relative to their limits and the other conditions with their bounds. The
-verdict lists the smallest margin of every condition; for a rejected plan, a click shows the place and time of a
-violation. A sample without a plan is shown at its start and goal, a problem in its base configuration. --rows puts
-several plans on one page. Sampled trajectories need --problem ('cnpgen docs trajectories'). Plans and datasets contain
-collision geometry only; --problem locates the visual meshes. --serve serves the page locally until Ctrl-C and reloads
-it when a file changes; ?row=I shows another sample. Needs MeshCat's viewer: pip install 'cnpgen[view]'.
-"""
 
-
-def add(commands: "Commands[Parser]") -> None:
-    """Add the command."""
-    parser = add_command(commands, "view", run, title="show a robot, a plan or a sample in a browser", text=_TEXT)
+def add_options(parser: Parser) -> None:
+    """Add the options."""
     option = parser.add_argument
     text = "a problem by name or file, the folder of a dataset, a plan file, or sampled trajectories"
     option("what", metavar="PROBLEM|DIR|FILE", type=recipe_names.viewed, help=text)

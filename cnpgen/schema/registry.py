@@ -4,9 +4,9 @@ import contextlib
 import dataclasses
 import functools
 import hashlib
-import importlib
 import importlib.metadata
 import inspect
+import pkgutil
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -174,7 +174,7 @@ def name_hint(group: str, name: str) -> str:
 
 def contract(group: str) -> type[Any]:
     """Import the base class of a group."""
-    kind: type[Any] = _named(CONTRACTS[group])
+    kind: type[Any] = pkgutil.resolve_name(CONTRACTS[group])
     return kind
 
 
@@ -252,18 +252,12 @@ def _sources(group: str, name: str) -> dict[str, Callable[[], Any]]:
     """List the packages that define a kind, with import paths."""
     found: dict[str, Callable[[], Any]] = {}
     if name in BUILT_IN[group]:
-        found["cnpgen"] = lambda: _named(BUILT_IN[group][name])
+        found["cnpgen"] = functools.partial(pkgutil.resolve_name, BUILT_IN[group][name])
     for entry in installed(group):
         if entry.name == name:
             package = entry.dist.name if entry.dist else "an installed package"
             found[f"{package} ({entry.value})"] = entry.load
     return found
-
-
-def _named(spec: str) -> Any:
-    """Import the object ``"module:name"``."""
-    module, _, attribute = spec.partition(":")
-    return getattr(importlib.import_module(module), attribute)
 
 
 def _faults(kind: type[Any]) -> Iterator[str]:

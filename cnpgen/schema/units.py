@@ -7,63 +7,36 @@ from typing import Any
 
 from cnpgen.errors import nearest
 
-_SCALES = {
-    "1": {"1": "1", "%": "0.01"},
-    "m": {"m": "1", "km": "1000", "cm": "0.01", "mm": "0.001", "um": "0.000001"},
-    "s": {"s": "1", "ms": "0.001", "us": "0.000001", "min": "60", "h": "3600"},
-    "rad": {"rad": "1", "mrad": "0.001", "deg": "0.0174532925199432957692369"},
-    "rad/s": {"rad/s": "1", "deg/s": "0.0174532925199432957692369", "rpm": "0.1047197551196597746154214"},
-    "rad/s^2": {"rad/s^2": "1", "deg/s^2": "0.0174532925199432957692369"},
-    "rad/s^3": {"rad/s^3": "1", "deg/s^3": "0.0174532925199432957692369"},
-    "m/s": {"m/s": "1", "cm/s": "0.01", "mm/s": "0.001"},
-    "m/s^2": {"m/s^2": "1", "cm/s^2": "0.01", "mm/s^2": "0.001"},
-    "kg": {"kg": "1", "g": "0.001", "t": "1000"},
-    "N": {"N": "1", "kN": "1000"},
-    "N m": {"N m": "1", "Nm": "1", "kN m": "1000"},
-    "1/s": {"1/s": "1", "Hz": "1"},
-    "kg m^2": {"kg m^2": "1"},
+_DEG = "0.0174532925199432957692369"
+
+# SI unit -> dimension, largest plausible absolute value, and units with their conversion factors.
+_QUANTITIES: dict[str, tuple[str, float, dict[str, str]]] = {
+    "1": ("a number", math.inf, {"1": "1", "%": "0.01"}),
+    "m": ("a length", 100.0, {"m": "1", "km": "1000", "cm": "0.01", "mm": "0.001", "um": "0.000001"}),
+    "s": ("a time", 3600.0, {"s": "1", "ms": "0.001", "us": "0.000001", "min": "60", "h": "3600"}),
+    "rad": ("an angle", 8 * math.pi, {"rad": "1", "mrad": "0.001", "deg": _DEG}),
+    "rad/s": ("an angular velocity", 200.0, {"rad/s": "1", "deg/s": _DEG, "rpm": "0.1047197551196597746154214"}),
+    "rad/s^2": ("an angular acceleration", 1e4, {"rad/s^2": "1", "deg/s^2": _DEG}),
+    "rad/s^3": ("an angular jerk", 1e7, {"rad/s^3": "1", "deg/s^3": _DEG}),
+    "m/s": ("a velocity", 100.0, {"m/s": "1", "cm/s": "0.01", "mm/s": "0.001"}),
+    "m/s^2": ("an acceleration", 1e4, {"m/s^2": "1", "cm/s^2": "0.01", "mm/s^2": "0.001"}),
+    "kg": ("a mass", 2500.0, {"kg": "1", "g": "0.001", "t": "1000"}),
+    "N": ("a force", 1e6, {"N": "1", "kN": "1000"}),
+    "N m": ("a torque", 1e5, {"N m": "1", "Nm": "1", "kN m": "1000"}),
+    "1/s": ("a rate", math.inf, {"1/s": "1", "Hz": "1"}),
+    "kg m^2": ("an inertia", 1e4, {"kg m^2": "1"}),
 }
 
 UNITS: dict[str, tuple[str, Decimal]] = {
-    unit: (si, Decimal(factor)) for si, scale in _SCALES.items() for unit, factor in scale.items()
+    unit: (si, Decimal(factor)) for si, (_, _, scale) in _QUANTITIES.items() for unit, factor in scale.items()
 }
 """Unit -> SI unit and conversion factor. Decimal, so that "9 mm" and 0.009 are the same float."""
 
-PLAUSIBLE_MAX = {
-    "m": 100.0,
-    "s": 3600.0,
-    "rad": 8 * math.pi,
-    "rad/s": 200.0,
-    "rad/s^2": 1e4,
-    "rad/s^3": 1e7,
-    "m/s": 100.0,
-    "m/s^2": 1e4,
-    "kg": 2500.0,
-    "N": 1e6,
-    "N m": 1e5,
-    "kg m^2": 1e4,
-}
+PLAUSIBLE_MAX = {si: largest for si, (_, largest, _) in _QUANTITIES.items() if largest < math.inf}
 """SI unit -> largest plausible absolute value of a quantity; larger ones are probably in another unit."""
 
 OTHER_UNITS = {"rad": "deg", "m": "mm", "s": "ms", "kg": "g"}
 """SI unit -> unit in which values are often given by mistake."""
-
-_DIMENSIONS = {
-    "1": "a number",
-    "m": "a length [m]",
-    "s": "a time [s]",
-    "rad": "an angle [rad]",
-    "rad/s": "an angular velocity [rad/s]",
-    "rad/s^2": "an angular acceleration [rad/s^2]",
-    "rad/s^3": "an angular jerk [rad/s^3]",
-    "m/s": "a velocity [m/s]",
-    "m/s^2": "an acceleration [m/s^2]",
-    "kg": "a mass [kg]",
-    "N": "a force [N]",
-    "N m": "a torque [N m]",
-    "1/s": "a rate [1/s]",
-    "kg m^2": "an inertia [kg m^2]",
-}
 
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 _QUANTITY = re.compile(rf"\s*({_NUMBER.pattern})(.*)", re.DOTALL)
@@ -73,7 +46,8 @@ _SPELLINGS = (("**", "^"), ("*", " "), ("·", " "), ("²", "^2"), ("°", "deg"),
 
 def dimension(unit: str) -> str:
     """Return the name of the dimension of an SI unit: ``"a time [s]"``."""
-    return _DIMENSIONS.get(unit, f"a quantity [{unit}]")
+    name = _QUANTITIES[unit][0] if unit in _QUANTITIES else "a quantity"
+    return name if unit == "1" else f"{name} [{unit}]"
 
 
 def suggested_unit(value: float, unit: str, low: float = -math.inf, high: float = math.inf) -> str:
