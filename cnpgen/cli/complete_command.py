@@ -42,7 +42,7 @@ def add_options(parser: Parser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
-    from cnpgen.cli.refine_options import check_place
+    from cnpgen.cli.refine_command import check_place
     from cnpgen.make.complete import complete
     from cnpgen.plans import save_plans
 

@@ -40,7 +40,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     import numpy as np
 
-    from cnpgen.cli.refine_options import check_place
+    from cnpgen.cli.refine_command import check_place
     from cnpgen.plans.import_trajectories import import_trajectories
     from cnpgen.plans.save import save_plans
     from cnpgen.store.files.kind import PLANS

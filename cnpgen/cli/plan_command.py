@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import ENGINE, Parser, add_engine, add_json, options_of
-from cnpgen.cli.refine_options import LARGE_ANGLES, REFINING, WORKERS, add_refining, check_place, refine_and_save
+from cnpgen.cli.refine_command import LARGE_ANGLES, REFINING, WORKERS, add_refining, check_place, refine_and_save
 from cnpgen.errors import UsageError, counted
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Parser
-from cnpgen.cli.refine_options import LARGE_ANGLES, add_refine_options, check_place, refine_and_save
+from cnpgen.cli.refine_command import LARGE_ANGLES, add_refine_options, check_place, refine_and_save
 from cnpgen.errors import DatasetError, UsageError
 
 if TYPE_CHECKING:

@@ -82,7 +82,7 @@ def test_a_run_that_was_killed_before_its_picture_was_drawn_draws_it_when_it_is_
 @pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("often", some([0, 100], 0, "slow"))
 def test_rows_that_are_seen_too_often_are_spoken_of(tiny, tmp_path, capsys, monkeypatch, often):
-    monkeypatch.setattr("cnpgen.cli.train_text.OFTEN", often)
+    monkeypatch.setattr("cnpgen.cli.train_command.OFTEN", often)
     assert main(["train", str(tiny("airhockey-hit")), "-o", str(tmp_path / "m.h5"), *SMALL]) == 0
     assert ("a planner from more rows is better" in capsys.readouterr().err) == (often == 0)
 

@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cnpgen.cli.view.view_bodies import Body, capsule_bodies, robot_bodies, tube, wrapped
-from cnpgen.cli.view.view_verdict import view_verdict
-from cnpgen.judges.plans.condition_curves import ConditionCurve, condition_curves
+from cnpgen.judges.plans.condition_curves import ConditionCurve, condition_curves, plot_unit
 from cnpgen.judges.plans.plan_plot import along, shares_of_limits
-from cnpgen.judges.plans.verdict import Reason, Verdict
+from cnpgen.judges.plans.verdict import Margin, Reason, Verdict
 from cnpgen.judges.trajectories.trajectory_plot import along_trajectory
 from cnpgen.judges.trajectories.trajectory_verdict import TrajectoryVerdict
 from cnpgen.plans.plans import Plans
@@ -180,8 +179,43 @@ def _moving(  # noqa: PLR0917 - all of them are shown
         path=(tube("path of the tip", poses[:, -1, :3, 3], TIP_PATH_RADIUS_M),),
         shares=shares_of_limits(world),
         conditions=tuple(curves),
-        verdict=view_verdict(verdict, curves, times, poses, robot.joint_names),
+        verdict=_verdict(verdict, curves, times, poses, robot.joint_names),
     )
+
+
+def _verdict(
+    verdict: Verdict, curves: Sequence[ConditionCurve], times: Array, poses: Array, joints: Sequence[str]
+) -> dict[str, Any]:
+    """Return a verdict for JSON, its margins located in time and space, the largest violation first.
+
+    The poses of the joints, the universe first and the tip last, have shape (K, joints, 4, 4), the times [s] (K,).
+    """
+    by_name = {curve.name: curve for curve in curves}
+    margins = sorted(verdict.margins.values(), key=lambda margin: -margin.severity)
+    causes = []
+    for margin in margins:
+        frame = int(np.abs(times - margin.time).argmin())
+        point = _point(margin, by_name.get(margin.name), poses[frame], frame, joints).tolist()
+        name, text = f"{margin.name} {margin.part}".strip(), _margin_text(margin)
+        causes.append({"name": name, "text": text, "frame": frame, "ok": margin.ok, "point": point})
+    return {"valid": verdict.valid, "reason": str(verdict.reason), "causes": causes}
+
+
+def _margin_text(margin: Margin) -> str:
+    """Return a margin as text in the units of plots."""
+    factor, unit = plot_unit(margin.unit)
+    side = "outside" if margin.violation > 0 else "inside"
+    amount, tolerance = factor * abs(margin.violation), factor * margin.tolerance
+    return f"{amount:.3g} {unit} {side}, tolerance {tolerance:.3g} {unit}"
+
+
+def _point(margin: Margin, curve: ConditionCurve | None, poses: Array, frame: int, joints: Sequence[str]) -> Array:
+    """Return the place of a margin [m], shape (3,): between the closest points, at the joint, or at the tip."""
+    if curve is not None and curve.points is not None:
+        return np.asarray(curve.points[frame].mean(axis=0))
+    if margin.part in joints:
+        return np.asarray(poses[1 + list(joints).index(margin.part), :3, 3])
+    return np.asarray(poses[-1, :3, 3])
 
 
 def _still(  # noqa: PLR0917 - all of them are shown
