@@ -43,11 +43,7 @@ _LEFT_OUT = {
 
 
 def describe(recipe: Recipe) -> str:
-    """Describe a recipe of any kind, with everything that it refers to.
-
-    Raises:
-        RecipeError: The robot's URDF does not fit the problem.
-    """
+    """Describe a recipe, with everything that it refers to; raise RecipeError if the URDF does not fit the problem."""
     if isinstance(recipe, DatasetRecipe):
         return f"{describe_dataset(recipe)}\n\n{describe(recipe.pipeline)}"
     if isinstance(recipe, Pipeline):
@@ -77,11 +73,7 @@ def describe_pipeline(pipeline: Pipeline) -> str:
 
 
 def describe_problem(problem: Problem) -> str:
-    """Describe a problem: its robot, limits and constraints.
-
-    Raises:
-        RecipeError: The robot's URDF does not fit the problem.
-    """
+    """Describe a problem: its robot, limits and constraints; raise RecipeError if the URDF does not fit."""
     spec = problem.robot
     facts = [("robot", f"{spec.urdf}, {len(spec.joints)} planned joints, tip {spec.tip!r}")]
     facts += [("object", numbers(problem.object))] if problem.object else []
@@ -254,11 +246,7 @@ def kind_name(item: Stage | Constraint) -> str:
 
 
 def recipe_to_dict(recipe: Recipe) -> dict[str, Any]:
-    """Describe a recipe for JSON: everything it refers to resolved, in SI units, with derived values.
-
-    Raises:
-        RecipeError: The robot's URDF does not fit the problem.
-    """
+    """Describe a recipe for JSON: everything it refers to resolved, in SI units, with derived values."""
     pipeline = recipe.pipeline if isinstance(recipe, DatasetRecipe) else recipe
     problem = pipeline.problem if isinstance(pipeline, Pipeline) else pipeline
     robot = load_robot(problem)
@@ -284,17 +272,9 @@ def table(
     one_line: bool = False,
     width: int = LINE_WIDTH,
 ) -> list[str]:
-    """Lay out rows as aligned columns.
+    """Lay out rows of the same length as aligned columns, those in ``right`` to the right; return the lines.
 
-    Args:
-        rows: The cells, in rows of the same length. A path in the last column stays in one piece, for scripts.
-        indent: Put before every line.
-        right: The columns that are aligned to the right.
-        one_line: Whether to cut what does not fit into the last column; it is wrapped by default.
-        width: Maximum length of a line.
-
-    Returns:
-        The lines.
+    The last column is wrapped to the width or, with ``one_line``, cut; a path in it stays in one piece, for scripts.
     """
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]) - 1)]
     hanging = indent + " " * (sum(widths) + 2 * len(widths))

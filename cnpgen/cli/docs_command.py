@@ -50,10 +50,7 @@ def docs_folder() -> Path:
 
 
 def list_pages() -> dict[str, Path]:
-    """List the pages in the order of the index; those of benchmarks are named with their folder.
-
-    Returns:
-        Name -> file; the first is "index".
+    """List the pages, name -> file, in the order of the index, which is the first.
 
     Raises:
         MachineError: The installation lacks the pages.
@@ -71,11 +68,7 @@ def list_pages() -> dict[str, Path]:
 
 
 def page_name(text: str, pages: dict[str, Path]) -> str:
-    """Return the name of a page from its name, its path, or a link to it on another page.
-
-    Raises:
-        UsageError: There is no such page.
-    """
+    """Return the name of a page from its name, its path, or a link to it; raise UsageError for other texts."""
     path = PurePosixPath(text.partition("#")[0].removesuffix(".md"))
     folder = path.parent.name
     name = f"benchmarks/{path.name}" if folder == "benchmarks" else path.name

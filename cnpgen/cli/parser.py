@@ -91,6 +91,12 @@ def options_of(arguments: argparse.Namespace, *names: str) -> dict[str, Any]:
     return {name: getattr(arguments, name) for name in names}
 
 
+def refuse(arguments: argparse.Namespace, names: Sequence[str], why: str) -> None:
+    """Raise UsageError if one of some options was passed."""
+    if any(getattr(arguments, name) is not None for name in names):
+        raise UsageError(why)
+
+
 def add_json(parser: Parser) -> None:
     """Add ``--json``."""
     parser.add_argument("--json", action="store_true", help="write JSON")

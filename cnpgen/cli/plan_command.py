@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names, values
-from cnpgen.cli.parser import ENGINE, Parser, add_engine, add_json, options_of
+from cnpgen.cli.parser import ENGINE, Parser, add_engine, add_json, options_of, refuse
 from cnpgen.cli.refine_command import LARGE_ANGLES, REFINING, WORKERS, add_refining, check_place, refine_and_save
 from cnpgen.errors import UsageError, counted
 
@@ -110,8 +110,7 @@ def _requests(arguments: argparse.Namespace, model: "Model") -> "Requests":
 
     if recipe_names.is_recipe(arguments.problems):
         return _draws(arguments, model)
-    if arguments.seed is not None:
-        raise UsageError(f"--seed is for fresh draws of a recipe, got {arguments.problems}")
+    refuse(arguments, ["seed"], f"--seed is for fresh draws of a recipe, got {arguments.problems}")
     problems = Path(arguments.problems)
     if problems.exists() and holds_scenes(problems):
         return _scenes(arguments, model)
@@ -124,8 +123,7 @@ def _requests(arguments: argparse.Namespace, model: "Model") -> "Requests":
             n=arguments.n,
             other=arguments.other_rows,
         )
-    if arguments.split is not None or arguments.first is not None or arguments.n is not None:
-        raise UsageError("--split, --first and --n need the folder of a dataset, got a file")
+    refuse(arguments, ["split", "first", "n"], "--split, --first and --n need the folder of a dataset, got a file")
     return read_file(problems, model, other=arguments.other_rows, allow_large_angles=arguments.allow_large_angles)
 
 
@@ -149,8 +147,8 @@ def _draws(arguments: argparse.Namespace, model: "Model") -> "Requests":
     from cnpgen.store.files.documents import plain
 
     name = arguments.problems
-    if arguments.split is not None or arguments.first is not None:
-        raise UsageError("--split and --first need the folder of a dataset; samples drawn from a recipe have --seed")
+    of_rows = "--split and --first need the folder of a dataset; samples drawn from a recipe have --seed"
+    refuse(arguments, ["split", "first"], of_rows)
     if arguments.n is None:
         raise UsageError(f"--n is required: the number of fresh problems of the recipe {name}")
     recipe = load_dataset_recipe(name)

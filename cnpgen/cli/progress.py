@@ -12,16 +12,7 @@ if TYPE_CHECKING:
 
 
 class Meter:
-    """Counts samples and sampling statistics.
-
-    Args:
-        quiet: Whether to print nothing.
-        noun: Name of the counted items.
-
-    Attributes:
-        rows: Samples counted since the last ``begin``, without ``initial``.
-        sampling: Sampling statistics of these samples.
-    """
+    """Counts items, named by a noun, and their sampling statistics since the last ``begin``; prints unless quiet."""
 
     def __init__(self, *, quiet: bool = False, noun: str = "row") -> None:
         self.rows = 0

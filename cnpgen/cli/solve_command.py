@@ -12,12 +12,11 @@ file; the column obstacle_poses contains the obstacles of each. Unsolved scenes 
 
 import argparse
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cnpgen.cli import recipe_names, values
-from cnpgen.cli.parser import Parser
+from cnpgen.cli.parser import Parser, refuse
 from cnpgen.cli.refine_command import LARGE_ANGLES, add_refine_options, check_place, refine_and_save
 from cnpgen.errors import DatasetError, UsageError
 
@@ -65,7 +64,7 @@ def _solve_scenes(arguments: argparse.Namespace, out: Path) -> int:
     from cnpgen.problems.problem_record import as_problem
     from cnpgen.problems.scenes.scene_files import load_scenes
 
-    _refuse(arguments, ["split", "seed", "problem"], "--robot is for scenes, which have --first and --n")
+    refuse(arguments, ["split", "seed", "problem"], "--robot is for scenes, which have --first and --n")
     scenes = load_scenes(arguments.what, start=arguments.first or 0, n=arguments.n)
     problem = as_problem(arguments.robot)
 
@@ -94,8 +93,8 @@ def _problems(arguments: argparse.Namespace) -> "Plans":
 def _rows(arguments: argparse.Namespace) -> "Plans":
     from cnpgen.plans.boundary_problems import load_boundary_problems
 
-    _refuse(arguments, ["seed"], "--seed is for fresh draws of a recipe; rows of a folder have --split and --first")
-    _refuse(arguments, ["problem"], "--problem is for boundary conditions in HDF5; a dataset contains its problem")
+    refuse(arguments, ["seed"], "--seed is for fresh draws of a recipe; rows of a folder have --split and --first")
+    refuse(arguments, ["problem"], "--problem is for boundary conditions in HDF5; a dataset contains its problem")
     split = arguments.split or "validation"
     return load_boundary_problems(arguments.what, split=split, start=arguments.first, n=arguments.n)
 
@@ -103,8 +102,8 @@ def _rows(arguments: argparse.Namespace) -> "Plans":
 def _conditions(arguments: argparse.Namespace) -> "Plans":
     from cnpgen.plans.boundary_problems import load_boundary_problems
 
-    _refuse(arguments, ["split", "first", "n"], "--split, --first and --n need the folder of a dataset, got a file")
-    _refuse(arguments, ["seed"], "--seed is for fresh draws of a recipe, got a file of boundary conditions")
+    refuse(arguments, ["split", "first", "n"], "--split, --first and --n need the folder of a dataset, got a file")
+    refuse(arguments, ["seed"], "--seed is for fresh draws of a recipe, got a file of boundary conditions")
     problems = load_boundary_problems(
         arguments.what, problem=arguments.problem, allow_large_angles=arguments.allow_large_angles
     )
@@ -120,14 +119,8 @@ def _draws(arguments: argparse.Namespace) -> "Plans":
     recipe_names.check_recipe(arguments.what)
     recipe = load_dataset_recipe(arguments.what)
     of_rows = "--split and --first need the folder of a dataset; samples drawn from a recipe have --seed"
-    _refuse(arguments, ["split", "first"], of_rows)
-    _refuse(arguments, ["problem"], "--problem is for boundary conditions in HDF5; a recipe contains its problem")
+    refuse(arguments, ["split", "first"], of_rows)
+    refuse(arguments, ["problem"], "--problem is for boundary conditions in HDF5; a recipe contains its problem")
     if arguments.n is None:
         raise UsageError(f"--n is required: the number of fresh problems of the recipe {arguments.what}")
     return draw_boundary_problems(recipe, arguments.n, seed=arguments.seed)
-
-
-def _refuse(arguments: argparse.Namespace, options: Sequence[str], why: str) -> None:
-    """Refuse options that mean nothing here."""
-    if any(getattr(arguments, name) is not None for name in options):
-        raise UsageError(why)

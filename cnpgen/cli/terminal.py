@@ -1,8 +1,7 @@
 r"""The output stream of every command: untrusted text must not control the terminal that shows it.
 
-Titles of recipes, names of fields and joints, texts in files of plans: any of them may hold the control characters by
-which a terminal is told to move, to colour, to rename its window, or the marks that turn the direction of writing. They
-are printed as ``\u001b``, as JSON has them, so that output which is JSON stays the same JSON.
+Titles, names and texts of files may hold control characters of terminals, or marks that turn the direction of writing.
+They are printed as ``\u001b``, as JSON has them, so that output which is JSON stays the same JSON.
 """
 
 import re
@@ -21,14 +20,7 @@ def printable(text: str) -> str:
 
 
 class Printable:
-    """A stream that prints what is printable.
-
-    Args:
-        stream: Where it goes.
-
-    Attributes:
-        terminal: The stream itself, for bars of progress, which move on a line.
-    """
+    """A stream that prints what is printable; bars of progress, which move on a line, write to its ``terminal``."""
 
     def __init__(self, stream: TextIO) -> None:
         self.terminal = stream

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names, values
-from cnpgen.cli.parser import Parser
+from cnpgen.cli.parser import Parser, refuse
 from cnpgen.cli.trajectory_options import add_trajectory_options, load_file, problem_of, refuse_trajectory_options
 from cnpgen.errors import DatasetError, UsageError
 
@@ -128,8 +128,7 @@ def _scene_of_trajectories(arguments: argparse.Namespace, rows: Sequence[int]) -
     from cnpgen.problems.load_robot import load_robot
     from cnpgen.problems.problem_record import as_problem
 
-    if arguments.split:
-        raise UsageError(f"--split is for the folder of a dataset, got {arguments.what}")
+    refuse(arguments, ["split"], f"--split is for the folder of a dataset, got {arguments.what}")
     problem = as_problem(problem_of(arguments))
     loaded = load_file(argparse.Namespace(**vars(arguments) | {"file": Path(arguments.what)}), problem)
     count = len(loaded.trajectories)
@@ -164,8 +163,7 @@ def _plans(arguments: argparse.Namespace, rows: Sequence[int]) -> "tuple[Plans, 
     """Read plans, and count those of the file."""
     from cnpgen.cli.plan_files import read_plans
 
-    if arguments.split:
-        raise UsageError(f"--split is for the folder of a dataset, got {arguments.what}")
+    refuse(arguments, ["split"], f"--split is for the folder of a dataset, got {arguments.what}")
     plans, option = read_plans(Path(arguments.what), problem=arguments.problem), "--rows" if arguments.rows else "--row"
     if (row := max(rows)) >= len(plans):
         raise UsageError(f"{option}: {arguments.what} has no plan {row}: {len(plans)} plans are numbered from 0")

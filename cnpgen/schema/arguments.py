@@ -101,8 +101,8 @@ def check_range(name: str, values: ArrayLike, low: float, high: float, unit: str
         raise UsageError(text + suggested_unit(value, unit, low, high), argument=name)
 
 
-def reject_masked(name: str, values: Any) -> None:
-    """Reject masked arrays, whose masks NumPy's functions drop without notice.
+def reject_masked(name: str, values: Any) -> Any:
+    """Return an argument; reject masked arrays, whose masks NumPy's functions drop without notice.
 
     Raises:
         UsageError: The argument is a masked array, or a list of them.
@@ -110,6 +110,7 @@ def reject_masked(name: str, values: Any) -> None:
     parts = values if isinstance(values, list | tuple) else [values]
     if any(isinstance(part, np.ma.MaskedArray) for part in parts):
         raise UsageError("must not be a masked array: pass filled values, such as values.filled(0.0)", argument=name)
+    return values
 
 
 @contextmanager

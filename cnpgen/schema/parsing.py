@@ -96,7 +96,7 @@ class _Parser:
         values = {key.name: self.value(key.hint, table[key.name], key, where / key.name) for key in given}
         if len(self.mistakes) == before:
             made = cls(**values)
-            self.check(_mistakes_of(made), where)
+            self.check(getattr(made, "find_mistakes", tuple)(), where)
             return made
         self.check(_first_mistakes_of(_partly(cls, known, values)), where)
         return None
@@ -158,16 +158,11 @@ def _partly(cls: type[T], known: Mapping[str, Key], values: Mapping[str, Any]) -
     return made
 
 
-def _mistakes_of(made: object) -> Iterable[tuple[str, str]]:
-    found: Iterable[tuple[str, str]] = getattr(made, "find_mistakes", tuple)()
-    return found
-
-
 def _first_mistakes_of(made: object) -> list[tuple[str, str]]:
     """List the mistakes of an object up to the first check that uses a value with a mistake."""
     found: list[tuple[str, str]] = []
     with suppress(TypeError, AttributeError):
-        for mistake in _mistakes_of(made):
+        for mistake in getattr(made, "find_mistakes", tuple)():
             found.append(mistake)  # noqa: PERF402 - keeps the mistakes before an error
     return found
 

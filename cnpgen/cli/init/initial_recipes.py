@@ -42,18 +42,11 @@ TORQUE_STATES = 1000  # random states that determine placeholders of missing tor
 
 @dataclass(frozen=True)
 class InitialProblem:
-    """Problem of an arm, with findings about its input.
-
-    Attributes:
-        problem: The problem.
-        arm: The arm, with placeholders of missing limits.
-        overlaps: Convex parts and ignored pairs of its links; None without link geometry.
-        notes: Sentences about the input.
-    """
+    """Problem of an arm, with findings about its input."""
 
     problem: Problem
-    arm: Arm
-    overlaps: LinkOverlaps | None
+    arm: Arm  # with placeholders of missing limits
+    overlaps: LinkOverlaps | None  # None without link geometry
     notes: tuple[str, ...]
 
 

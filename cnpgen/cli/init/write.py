@@ -142,13 +142,7 @@ def _joint_rows(arm: Arm) -> Iterator[tuple[str, ...]]:
 
 
 def recipe_text(recipe: Any, values: Mapping[str, Any], notes: Mapping[str, str]) -> str:
-    """Write a problem, pipeline or dataset.
-
-    Args:
-        recipe: The recipe.
-        values: Key -> what to write in the place of what the recipe has: "robot.urdf" -> a path.
-        notes: Key -> what to say of it besides.
-    """
+    """Write a problem, pipeline or dataset, with other values of keys, such as "robot.urdf", and notes on keys."""
     return "\n".join(_Writer(values, notes).table(type(recipe), recipe, "")) + "\n"
 
 
