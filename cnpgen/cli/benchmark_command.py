@@ -83,7 +83,7 @@ def parameter_range(text: str) -> tuple[str, str, tuple[float, float]]:
     return name, key, (low, high)
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> None:
     """Run the command."""
     from cnpgen.benchmark.html_report import save_benchmark_report
     from cnpgen.benchmark.paper_figures import save_benchmark_figures
@@ -91,14 +91,15 @@ def run(arguments: argparse.Namespace) -> int:
 
     if arguments.list:
         print(_listing(as_json=arguments.json))
-        return 0
+        return
     if arguments.suite is None:
         raise UsageError("the argument SUITE is missing; 'cnpgen benchmark --list' lists suites")
     for name in ("plant", "environment", "video"):
         if getattr(arguments, name) and not arguments.simulate:
             raise UsageError(f"--{name} needs --simulate")
     if arguments.search:
-        return _search(arguments)
+        _search(arguments)
+        return
     folder = arguments.out or Path(f"{Path(arguments.suite).stem}-results")
     found = _run(arguments, folder)
     save_benchmark_tables(found, folder)
@@ -106,10 +107,9 @@ def run(arguments: argparse.Namespace) -> int:
     report = save_benchmark_report(found, folder / "report.html", video=arguments.video)
     print(json.dumps(_facts(found, folder), indent=2) if arguments.json else _text(found))
     print(f"report: {report}", file=sys.stderr)
-    return 0
 
 
-def _search(arguments: argparse.Namespace) -> int:
+def _search(arguments: argparse.Namespace) -> None:
     """Search for parameters of one planner and print the trials, the best one first."""
     from cnpgen.benchmark.parameter_search import SEARCH_FILE, csv_of, search_parameters
 
@@ -123,7 +123,6 @@ def _search(arguments: argparse.Namespace) -> int:
     documents = json.dumps([asdict(trial) for trial in trials], indent=2) + "\n"
     sys.stdout.write(documents if arguments.json else csv_of(trials, list(ranges)))
     print(f"trials: {folder / SEARCH_FILE}", file=sys.stderr)
-    return 0
 
 
 def _run(arguments: argparse.Namespace, folder: Path) -> "Benchmark":

@@ -34,7 +34,7 @@ def add_options(parser: Parser) -> None:
     parser.add_argument("--force", action="store_true", help="replace existing files")
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> None:
     """Run the command."""
     from cnpgen.cli.show_command import load_any
     from cnpgen.store.files.atomic import check_writable, write_file
@@ -51,7 +51,6 @@ def run(arguments: argparse.Namespace) -> int:
     first = folder / next(iter(texts))
     print(first)
     print(f"next: edit the files in {folder}, then: {_NEXT[first.stem].format(first)}", file=sys.stderr)
-    return 0
 
 
 def _name(folder: Path) -> str:

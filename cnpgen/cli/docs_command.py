@@ -77,11 +77,6 @@ def page_name(text: str, pages: dict[str, Path]) -> str:
     return name
 
 
-def page_title(page: Path) -> str:
-    """Return the heading of a page."""
-    return _text(page).partition("\n")[0].removeprefix("# ")
-
-
 def page_url(page: Path) -> str:
     """Return the address of a page on the site."""
     from cnpgen.machine.versions import DOCUMENTATION_URL
@@ -104,7 +99,8 @@ def _text(page: Path) -> str:
 
 def _list(pages: dict[str, Path], *, as_json: bool) -> None:
     listed = {name: file for name, file in pages.items() if name != "index"}
-    rows = [{"page": name, "kind": file.parent.name, "title": page_title(file)} for name, file in listed.items()]
+    titles = {name: _text(file).partition("\n")[0].removeprefix("# ") for name, file in listed.items()}
+    rows = [{"page": name, "kind": file.parent.name, "title": titles[name]} for name, file in listed.items()]
     if as_json:
         _print_json(rows)
         return

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Parser, add_json
-from cnpgen.cli.plan_files import read_plans
 from cnpgen.cli.progress import Meter
 from cnpgen.cli.trajectory_options import (
     add_trajectory_options,
@@ -123,7 +122,7 @@ def _run_trajectories(arguments: argparse.Namespace) -> int:
 def _evaluate(arguments: argparse.Namespace) -> "Evaluation":
     from cnpgen.plans.evaluate import evaluate_plans
 
-    plans = read_plans(arguments.file, problem=arguments.problem)
+    plans = recipe_names.read_plans(arguments.file, problem=arguments.problem)
     if arguments.plan is not None and arguments.plan >= len(plans):
         raise UsageError(f"{arguments.file} has no plan {arguments.plan}: {len(plans)} plans are numbered from 0")
     with Meter(quiet=not sys.stderr.isatty(), noun="plan") as meter:

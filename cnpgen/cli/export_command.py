@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Parser
-from cnpgen.cli.plan_files import read_plans
 from cnpgen.errors import UsageError, counted, listed
 
 if TYPE_CHECKING:
@@ -73,13 +72,13 @@ def _plans(arguments: argparse.Namespace) -> "Plans | JoinedPlans":
     """Read the plans, and join them with the following ones."""
     from cnpgen.plans.join import join_plans
 
-    plans: Plans | JoinedPlans = read_plans(arguments.file)
+    plans: Plans | JoinedPlans = recipe_names.read_plans(arguments.file)
     following, times = arguments.join or [], arguments.at or []
     if times and len(times) != len(following):
         given = f"--at is given {counted(len(times), 'time')}, --join {counted(len(following), 'time')}"
         raise UsageError(f"{given}: expected one for each")
     for file, time in zip(following, times or [None] * len(following), strict=True):
-        plans = join_plans(plans, read_plans(file), at=time)
+        plans = join_plans(plans, recipe_names.read_plans(file), at=time)
     return plans
 
 

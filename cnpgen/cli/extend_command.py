@@ -23,10 +23,9 @@ def add_options(parser: Parser) -> None:
     option("--quiet", action="store_true", help="no progress and no summary")
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> None:
     """Run the command."""
     from cnpgen.make.extend import extend_dataset
 
     extend = partial(extend_dataset, arguments.folder, arguments.n, **options_of(arguments, *ENGINE))
     make_metered(extend, quiet=arguments.quiet)
-    return 0

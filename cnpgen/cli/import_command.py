@@ -36,7 +36,7 @@ def add_options(parser: Parser) -> None:
     option("--stay-within", metavar="E", type=values.angle, help=text)
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> None:
     """Run the command."""
     import numpy as np
 
@@ -72,7 +72,6 @@ def run(arguments: argparse.Namespace) -> int:
     largest = float(np.nanmax(imported.snapped)) if len(failed) < len(imported.plans) else 0.0
     print(f"ends moved by at most {largest:.2g} rad to meet the constraints", file=sys.stderr)
     print(arguments.out)
-    return 0
 
 
 def _refined(plans: "Plans", distance: float) -> "Plans":

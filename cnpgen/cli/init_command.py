@@ -34,7 +34,7 @@ def add_options(parser: Parser) -> None:
     option("--force", action="store_true", help="overwrite existing files")
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> None:
     """Run the command."""
     from cnpgen.cli.init.arm import read_arm
     from cnpgen.cli.init.initial_recipes import dataset_of, problem_of
@@ -43,7 +43,8 @@ def run(arguments: argparse.Namespace) -> int:
 
     folder = arguments.name
     if arguments.planner:
-        return _write_planner(folder, force=arguments.force)
+        _write_planner(folder, force=arguments.force)
+        return
     _check_place(folder, FILES, force=arguments.force)
     arm = read_arm(arguments.urdf, arguments.tip)
     packages = (*arguments.packages, *packages_of_environment(arm.meshes, arm.urdf, arguments.packages))
@@ -60,10 +61,9 @@ def run(arguments: argparse.Namespace) -> int:
         f"cnpgen solve {folder}/pipeline.toml --n 10 -o {folder.name}-plans.h5",
         f"cnpgen view {folder}/problem.toml -o {folder.name}.html",
     )
-    return 0
 
 
-def _write_planner(folder: Path, *, force: bool) -> int:
+def _write_planner(folder: Path, *, force: bool) -> None:
     from cnpgen.cli.init.planner_package import planner_texts
 
     texts = planner_texts(folder.name)
@@ -71,7 +71,6 @@ def _write_planner(folder: Path, *, force: bool) -> int:
     _write(folder, texts)
     test = f"cnpgen benchmark hits-81 --planners {folder.name} cnpgen --n 2"
     _print_next(f"pip install -e {folder}", test, "cnpgen docs benchmark")
-    return 0
 
 
 def _write(folder: Path, texts: Mapping[str, str]) -> None:

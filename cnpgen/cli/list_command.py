@@ -30,13 +30,12 @@ def add_options(parser: Parser) -> None:
     add_json(parser)
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> None:
     """Run the command."""
     from cnpgen.store.files.documents import plain, render
 
     found = {what: list_all(what) for what in ([arguments.what] if arguments.what else WHAT)}
     print(render(plain(found)) if arguments.json else "\n\n".join(_section(*item) for item in found.items()))
-    return 0
 
 
 def list_all(what: str) -> list[dict[str, Any]]:

@@ -167,7 +167,7 @@ def _run(words: list[str], given: argparse.Namespace) -> int:
         parser.print_help(sys.stderr)
         return 2
     with notices(quiet=getattr(arguments, "quiet", False)):
-        code: int = arguments.run(arguments)
+        code: int = arguments.run(arguments) or 0  # most commands return nothing
     return code
 
 

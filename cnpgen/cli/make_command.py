@@ -55,7 +55,7 @@ def add_options(parser: Parser) -> None:
     option("--quiet", action="store_true", help="no progress and no summary")
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> None:
     """Run the command."""
     from cnpgen.make.recipe_file import load_dataset_recipe
 
@@ -73,12 +73,11 @@ def run(arguments: argparse.Namespace) -> int:
         from cnpgen.cli.dry_run import spec_text
 
         print(spec_text(recipe, arguments.out, **options_of(arguments, *_SETTINGS)))
-        return 0
+        return
     from cnpgen.make.make_dataset import make_dataset
 
     options = options_of(arguments, *_SETTINGS, *ENGINE, "part")
     make_metered(partial(make_dataset, recipe, arguments.out, **options), quiet=arguments.quiet, part=arguments.part)
-    return 0
 
 
 def make_metered(

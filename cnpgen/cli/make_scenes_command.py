@@ -46,14 +46,14 @@ def family_parameter(text: str) -> tuple[str, Any]:
     return key, values.toml_value(value)
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> None:
     """Run the command."""
     from cnpgen.pipelines.families.scene_generator import make_scenes
     from cnpgen.problems.scenes.scene_files import save_scenes
 
     if arguments.list:
         print(_listing(as_json=arguments.json))
-        return 0
+        return
     needed = {"FAMILY": arguments.family, "--robot": arguments.robot, "--n": arguments.n}
     missing = [name for name, value in needed.items() if value is None]
     if missing:
@@ -78,7 +78,6 @@ def run(arguments: argparse.Namespace) -> int:
         text = f"{len(scenes)} problems in {facts['scenes']} scenes with {min(obstacles)} to {max(obstacles)} obstacles"
         print(text, file=sys.stderr)
     print(json.dumps(facts, indent=2) if arguments.json else out)
-    return 0
 
 
 def _check_place(out: Path, *, force: bool) -> None:

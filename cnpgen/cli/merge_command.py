@@ -21,10 +21,9 @@ def add_options(parser: Parser) -> None:
     option("--quiet", action="store_true", help="no progress and no summary")
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> None:
     """Run the command."""
     from cnpgen.make.merge import merge_datasets
 
     merge = partial(merge_datasets, arguments.parts, arguments.out)
     make_metered(merge, quiet=arguments.quiet, verb="merged")
-    return 0

@@ -23,7 +23,7 @@ def add_options(parser: Parser) -> None:
     option("--dry-run", action="store_true", help="write the folder, but upload nothing")
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> None:
     """Run the command."""
     from cnpgen.make.publish import publish_dataset
 
@@ -34,4 +34,3 @@ def run(arguments: argparse.Namespace) -> int:
     if published.url:
         print(f"cnpgen: uploaded {published.folder}", file=sys.stderr)
     print(published.url or published.folder)
-    return 0

@@ -5,9 +5,10 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cnpgen.errors import UsageError, either
+from cnpgen.errors import DatasetError, UsageError, either
 
 if TYPE_CHECKING:
+    from cnpgen.plans import Plans
     from cnpgen.schema.toml import Kind
 
 _TEXTS = {".toml", ".yaml", ".yml"}  # suffixes of recipes, and of scenes
@@ -144,6 +145,16 @@ def present(text: str) -> Path:
     _refuse_shipped(text)
     require_path(Path(text), "a file or a folder")
     return Path(text)
+
+
+def read_plans(path: Path, *, problem: str | None = None) -> "Plans":
+    """Read the plans of a file, as ``cnpgen.load_plans`` does; refuse files without plans."""
+    from cnpgen.plans import load_plans
+
+    plans = load_plans(path, problem=problem)
+    if not len(plans):
+        raise DatasetError(f"no plans in {path}")
+    return plans
 
 
 def _refuse_shipped(text: str) -> None:

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.interruption import resumable
 from cnpgen.cli.parser import ENGINE, Options, Parser, add_engine, add_json, options_of
-from cnpgen.cli.plan_files import checksum_text, read_plans
 from cnpgen.cli.progress import Meter
 from cnpgen.errors import UsageError, counted
 
@@ -54,7 +53,9 @@ def add_options(parser: Parser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
-    plans = read_plans(arguments.file, problem=arguments.problem)
+    from cnpgen.cli.verdict_text import checksum_text
+
+    plans = recipe_names.read_plans(arguments.file, problem=arguments.problem)
     out = arguments.out or arguments.file.with_name(f"{arguments.file.stem}-refined.h5")
     if not arguments.quiet:
         print(f"{arguments.file}: {checksum_text(plans)}", file=sys.stderr)

@@ -31,7 +31,7 @@ def add_options(parser: Parser) -> None:
     add_json(parser)
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> None:
     """Run the command."""
     from cnpgen.cli import describe
     from cnpgen.store.files.documents import plain, render
@@ -40,11 +40,10 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.kind:
             raise UsageError("--kind needs NAME or FILE")
         print(_about_kinds(arguments))
-        return 0
+        return
     check_recipe(arguments.recipe)
     recipe = load_any(arguments.recipe, arguments.kind)
     print(render(plain(describe.recipe_to_dict(recipe))) if arguments.json else describe.describe(recipe))
-    return 0
 
 
 def _about_kinds(arguments: argparse.Namespace) -> str:

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Parser, add_json
-from cnpgen.cli.plan_files import read_plans
 from cnpgen.cli.progress import Meter
 from cnpgen.errors import UsageError, counted
 
@@ -64,7 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the command."""
     from cnpgen.benchmark.simulator.simulate import simulate_plans
 
-    plans = read_plans(arguments.file, problem=arguments.problem)
+    plans = recipe_names.read_plans(arguments.file, problem=arguments.problem)
     if arguments.plan >= len(plans):
         raise UsageError(f"{arguments.file} has no plan {arguments.plan}: {len(plans)} plans are numbered from 0")
     with Meter(quiet=not sys.stderr.isatty(), noun="plan") as meter:

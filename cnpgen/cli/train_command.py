@@ -101,7 +101,7 @@ class Watch:
         self._meter.close()
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> None:
     """Run the command."""
     watch = Watch(quiet=arguments.quiet)
     try:
@@ -117,7 +117,6 @@ def run(arguments: argparse.Namespace) -> int:
     if not arguments.quiet:
         print(summary(trained), file=sys.stderr)
     print(trained.path)
-    return 0
 
 
 def _train(arguments: argparse.Namespace, watch: Watch) -> "Trained":

@@ -50,22 +50,22 @@ def add_options(parser: Parser) -> None:
     add_trajectory_options(parser.add_argument_group("sampled trajectories"))
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> None:
     """Run the command."""
     from cnpgen.cli.view.page import page_of
     from cnpgen.store.files.atomic import check_writable, write_file
 
     what = Path(arguments.what)
     if arguments.serve is not None:
-        return _serve(arguments)
+        _serve(arguments)
+        return
     out = Path(arguments.out or f"{what.resolve().name if what.is_dir() else what.stem}.html")
     check_writable(out)
     write_file(out, page_of(_scene(arguments)))
     print(out)
-    return 0
 
 
-def _serve(arguments: argparse.Namespace) -> int:
+def _serve(arguments: argparse.Namespace) -> None:
     """Serve the page until an interruption."""
     from cnpgen.cli.view.page import page_of
     from cnpgen.cli.view.serve import serve
@@ -73,13 +73,13 @@ def _serve(arguments: argparse.Namespace) -> int:
 
     def page(row: int | None, stamp: str) -> str:
         chosen = arguments if row is None else argparse.Namespace(**(vars(arguments) | {"row": row, "rows": None}))
-        return page_of(_scene(chosen), stamp=stamp)
+        page_of(_scene(chosen), stamp=stamp)
+        return
 
     _scene(arguments)  # report errors before serving
     files = [Path(file) for file in (arguments.what, arguments.problem) if file and Path(file).exists()]
     watched = [path / SPECIFICATION if path.is_dir() else path for path in files]
     serve(page, watched, port=arguments.serve, ready=lambda address: print(address, flush=True))
-    return 0
 
 
 def _scene(arguments: argparse.Namespace) -> "ViewScene":
@@ -161,10 +161,9 @@ def _samples(arguments: argparse.Namespace, rows: Sequence[int]) -> "tuple[Plans
 
 def _plans(arguments: argparse.Namespace, rows: Sequence[int]) -> "tuple[Plans, int]":
     """Read plans, and count those of the file."""
-    from cnpgen.cli.plan_files import read_plans
-
     refuse(arguments, ["split"], f"--split is for the folder of a dataset, got {arguments.what}")
-    plans, option = read_plans(Path(arguments.what), problem=arguments.problem), "--rows" if arguments.rows else "--row"
+    plans = recipe_names.read_plans(Path(arguments.what), problem=arguments.problem)
+    option = "--rows" if arguments.rows else "--row"
     if (row := max(rows)) >= len(plans):
         raise UsageError(f"{option}: {arguments.what} has no plan {row}: {len(plans)} plans are numbered from 0")
     return plans[list(rows)], len(plans)
