@@ -17,7 +17,7 @@ from cnpgen.planner.model import Model, ModelConfig, is_rest_to_rest
 from cnpgen.planner.network.architecture import Architecture, initial_parameters
 from cnpgen.planner.network.features import SCENE, Features, count_features, feature_blocks, published_features
 from cnpgen.planner.projection import make_projection
-from cnpgen.schema.memory import check_memory
+from cnpgen.schema.arguments import check_memory
 from cnpgen.store.files.documents import plain
 from cnpgen.training.data import TrainingData
 from cnpgen.training.score import validate
