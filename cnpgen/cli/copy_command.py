@@ -37,30 +37,24 @@ def add_options(parser: Parser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Run the command."""
     from cnpgen.cli.show_command import load_any
+    from cnpgen.schema.keys import NAME
     from cnpgen.store.files.atomic import check_writable, write_file
 
     folder = Path(arguments.folder)
-    texts = copied_texts(load_any(arguments.recipe, arguments.kind), _name(folder))
-    existing = [str(folder / name) for name in texts if (folder / name).exists()]
+    recipe, name = load_any(arguments.recipe, arguments.kind), folder.resolve().name
+    if not re.match(NAME, name):
+        raise UsageError(f"DIR must be lower-case letters, digits and hyphens, such as my-hits; got {name!r}")
+    texts = copied_texts(recipe, name)
+    existing = [str(folder / file) for file in texts if (folder / file).exists()]
     if existing and not arguments.force:
         raise UsageError(f"{', '.join(existing)} exists already: --force writes over it")
     check_writable(folder)
-    for name, text in texts.items():
+    for file, text in texts.items():
         folder.mkdir(parents=True, exist_ok=True)
-        write_file(folder / name, text)
+        write_file(folder / file, text)
     first = folder / next(iter(texts))
     print(first)
     print(f"next: edit the files in {folder}, then: {_NEXT[first.stem].format(first)}", file=sys.stderr)
-
-
-def _name(folder: Path) -> str:
-    """Return the name of recipes in a folder."""
-    from cnpgen.schema.keys import NAME
-
-    name = folder.resolve().name
-    if not re.match(NAME, name):
-        raise UsageError(f"DIR must be lower-case letters, digits and hyphens, such as my-hits; got {name!r}")
-    return name
 
 
 def copied_texts(recipe: "Recipe", name: str) -> dict[str, str]:

@@ -55,11 +55,14 @@ def run(arguments: argparse.Namespace) -> None:
         sys.stderr.writelines(f"note: {note}\n" for note in initial.notes)
         recipe, share = dataset_of(initial, folder)
     _write(folder, sampling_texts(recipe, share))
-    _print_next(
+    print(
+        "next:",
         f"cnpgen show {folder}/dataset.toml               what is in them",
         f"cnpgen make-dataset {folder}/dataset.toml --n 1000",
         f"cnpgen solve {folder}/pipeline.toml --n 10 -o {folder.name}-plans.h5",
         f"cnpgen view {folder}/problem.toml -o {folder.name}.html",
+        sep="\n  ",
+        file=sys.stderr,
     )
 
 
@@ -70,7 +73,7 @@ def _write_planner(folder: Path, *, force: bool) -> None:
     _check_place(folder, texts, force=force)
     _write(folder, texts)
     test = f"cnpgen benchmark hits-81 --planners {folder.name} cnpgen --n 2"
-    _print_next(f"pip install -e {folder}", test, "cnpgen docs benchmark")
+    print("next:", f"pip install -e {folder}", test, "cnpgen docs benchmark", sep="\n  ", file=sys.stderr)
 
 
 def _write(folder: Path, texts: Mapping[str, str]) -> None:
@@ -100,7 +103,3 @@ def _check_place(folder: Path, names: Iterable[str], *, force: bool) -> None:
     there = [str(folder / name) for name in names if (folder / name).exists()]
     if there and not force:
         raise UsageError(f"{', '.join(there)} exist{'s' if len(there) == 1 else ''} already: --force writes over it")
-
-
-def _print_next(*lines: str) -> None:
-    print("next:", *lines, sep="\n  ", file=sys.stderr)

@@ -2,13 +2,11 @@
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from cnpgen.cli.parser import Parser, add_json
 from cnpgen.errors import RecipeError
-
-if TYPE_CHECKING:
-    from cnpgen.schema.toml import Kind
+from cnpgen.schema.toml import Kind
 
 WHAT = ("datasets", "models", "pipelines", "problems", "stages", "constraints", "objectives", "exporters")
 

@@ -67,8 +67,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _serve(arguments: argparse.Namespace) -> None:
     """Serve the page until an interruption."""
-    from cnpgen.cli.view.page import page_of
-    from cnpgen.cli.view.serve import serve
+    from cnpgen.cli.view.page import page_of, serve
     from cnpgen.store.layout import SPECIFICATION
 
     def page(row: int | None, stamp: str) -> str:
