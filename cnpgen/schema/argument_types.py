@@ -97,11 +97,7 @@ def _evaluated(function: Callable[..., Any], annotation: Any) -> Any:
 
 
 def check_fields(options: Any) -> None:
-    """Check the fields of a frozen dataclass by their annotations; convert NumPy's scalars.
-
-    Raises:
-        UsageError: A field has the wrong type.
-    """
+    """Check the fields of a frozen dataclass by their annotations; convert NumPy's scalars."""
     for name, check in _field_checks(type(options)):  # type: ignore[arg-type]
         object.__setattr__(options, name, check(name, getattr(options, name)))
 

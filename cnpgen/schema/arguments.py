@@ -19,11 +19,7 @@ MIN_CHECKED_SIZE = 10_000_000  # floats from which on the available memory is me
 
 
 def integer(name: str, value: Any, *, least: int | None = None, most: int | None = None) -> int:
-    """Return an argument as an integer; accept NumPy integers, reject bool.
-
-    Raises:
-        UsageError: The value is not an integer, or out of range.
-    """
+    """Return an argument as an integer; accept NumPy integers, raise UsageError for bool and values out of range."""
     try:
         found = None if isinstance(value, bool) else operator.index(value)
     except TypeError:
@@ -35,10 +31,10 @@ def integer(name: str, value: Any, *, least: int | None = None, most: int | None
 
 
 def number(name: str, value: Any) -> float:
-    """Return an argument as a float; accept real scalars of all libraries, reject texts, bool, arrays and nan.
+    """Return an argument as a float; accept real scalars of all libraries.
 
     Raises:
-        UsageError: The value is not a finite number.
+        UsageError: The value is a text, a bool, an array, or not finite.
     """
     try:
         real = not isinstance(value, str | bytes | bool | np.bool_ | np.complexfloating) and np.ndim(value) == 0
@@ -51,16 +47,12 @@ def number(name: str, value: Any) -> float:
 
 
 def numbers(name: str, values: ArrayLike, dtype: str = "float64", *, differentiable: bool = False) -> Array:
-    """Return an argument as an array of floats; accept nan and inf, reject texts, dates and complex numbers.
+    """Return an argument as an array of "float64" or "float32"; accept nan and inf, and tensors on the CPU.
 
-    Args:
-        name: Name of the argument.
-        values: Numbers, lists of numbers, arrays, or tensors on the CPU.
-        dtype: "float64" or "float32".
-        differentiable: Whether tensors with gradients raise an error; otherwise they are detached.
+    Tensors with gradients are detached or, with ``differentiable``, raise an error.
 
     Raises:
-        UsageError: The values are not real numbers, have rows of different lengths, or are not in CPU memory.
+        UsageError: The values are texts, dates or complex numbers, have uneven rows, or are not in CPU memory.
     """
     if type(values) is np.ndarray and values.dtype == dtype:  # the usual case
         return _fitting(name, values)
@@ -90,11 +82,7 @@ def _fitting(name: str, array: Array) -> Array:
 
 
 def check_range(name: str, values: ArrayLike, low: float, high: float, unit: str) -> None:
-    """Raise an error for values [unit] outside of their range, with the unit that was probably meant.
-
-    Raises:
-        UsageError: A value is outside of the range, or nan.
-    """
+    """Raise UsageError for values [unit] outside of their range or nan, with the unit that was probably meant."""
     array = np.asarray(values, np.float64)
     outside = ~((low <= array) & (array <= high))
     if outside.any():
@@ -104,11 +92,7 @@ def check_range(name: str, values: ArrayLike, low: float, high: float, unit: str
 
 
 def reject_masked(name: str, values: Any) -> Any:
-    """Return an argument; reject masked arrays, whose masks NumPy's functions drop without notice.
-
-    Raises:
-        UsageError: The argument is a masked array, or a list of them.
-    """
+    """Return an argument; raise UsageError for masked arrays and lists of them, whose masks NumPy's functions drop."""
     parts = values if isinstance(values, list | tuple) else [values]
     if any(isinstance(part, np.ma.MaskedArray) for part in parts):
         raise UsageError("must not be a masked array: pass filled values, such as values.filled(0.0)", argument=name)
@@ -129,26 +113,19 @@ def concerning(argument: str) -> Iterator[None]:
 
 
 def flag(name: str, value: Any) -> bool:
-    """Return an argument as a bool; accept NumPy's bool, reject other types such as 1 and "no".
-
-    Raises:
-        UsageError: The value is not a bool.
-    """
+    """Return an argument as a bool; accept NumPy's bool, raise UsageError for other types such as 1 and "no"."""
     if not isinstance(value, bool | np.bool_):
         raise UsageError(f"must be True or False, got {value!r:.100}", argument=name)
     return bool(value)
 
 
 def check_memory(argument: str, value: int, n_floats: int) -> None:
-    """Refuse a request whose arrays do not fit into the available memory.
+    """Refuse a request whose arrays need more than the available memory.
 
     Args:
         argument: Name of the argument that determines the size.
         value: Its value, for the error.
         n_floats: Lower bound of the number of floats in memory at a time.
-
-    Raises:
-        UsageError: The arrays need more than the available memory.
     """
     needed = n_floats * BYTES_PER_FLOAT
     if n_floats > MIN_CHECKED_SIZE and needed > (available := available_bytes()):
@@ -157,15 +134,7 @@ def check_memory(argument: str, value: int, n_floats: int) -> None:
 
 
 def check_memory_of_rows(counts: Mapping[str, int], n_floats: int) -> None:
-    """Refuse arguments with too many rows, by the name of the one with the most.
-
-    Args:
-        counts: Argument -> its number of rows.
-        n_floats: Lower bound of the number of floats in memory for a row.
-
-    Raises:
-        UsageError: The rows need more than the available memory.
-    """
+    """Refuse arguments, name -> number of rows, with at least so many floats per row, by the name of the longest."""
     argument = max(counts, key=lambda name: counts[name])
     check_memory(argument, counts[argument], counts[argument] * n_floats)
 

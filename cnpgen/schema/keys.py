@@ -150,9 +150,7 @@ class RecipeLocation:
 def to_dict(obj: Any, *, label: Callable[[Any], Mapping[str, Any]] = lambda _: {}) -> dict[str, Any]:
     """Turn an object declared with ``field`` into plain dicts, lists, numbers and strings, all in SI.
 
-    Args:
-        obj: Object; fields that are not keys are omitted.
-        label: Function that returns further entries of an object, such as its registered name.
+    Fields that are not keys are omitted; ``label`` returns further entries of an object, such as its registered name.
     """
     values = ((key, getattr(obj, key.name)) for key in keys(type(obj)))
     return {

@@ -42,21 +42,12 @@ def parse(
     mistakes: list[str],
     readers: Mapping[type, Reader] | None = None,
 ) -> T | None:
-    """Build a dataclass declared with ``field`` from a TOML table.
+    """Build a dataclass declared with ``field`` from the table at a location; all values are in SI.
 
-    Further conditions are checked by the dataclass, with a ValueError in ``__post_init__`` or a method
-    ``find_mistakes()`` that yields (key, mistake) pairs. The method also runs if other keys have mistakes, and then
-    stops at the first use of such a key.
-
-    Args:
-        cls: Dataclass to build.
-        table: Result of the TOML parser.
-        where: Location of the table.
-        mistakes: List to which mistakes are appended, one line each.
-        readers: Readers of field types that are not tables of their own keys.
-
-    Returns:
-        The object with all values in SI, or None if there was a mistake.
+    Returns None after a mistake, and appends one line per mistake to ``mistakes``. Field types that are not tables of
+    their own keys have ``readers``. Further conditions are checked by the dataclass: by a ValueError in
+    ``__post_init__``, or by a method ``find_mistakes()`` that yields (key, mistake) pairs. The method also runs if
+    other keys have mistakes, and then stops at the first use of such a key.
     """
     before = len(mistakes)
     parser = _Parser(mistakes, readers or {})

@@ -134,14 +134,7 @@ def names(group: str) -> tuple[str, ...]:
 
 
 def load(group: str, name: str) -> type[Any]:
-    """Import the class of a kind.
-
-    Args:
-        group: ``STAGES``, ``CONSTRAINTS``, ``OBJECTIVES``, ``PLANNERS``, ``EXPORTERS`` or ``FAMILIES``.
-        name: Name of the kind, as ``use`` has it in a recipe.
-
-    Returns:
-        A concrete subclass of the contract of the group.
+    """Import the class of a kind by its name in recipes, a concrete subclass of the contract of the group.
 
     Raises:
         RecipeError: The kind is unknown, defined twice, or cannot be imported.

@@ -51,13 +51,9 @@ def dimension(unit: str) -> str:
 
 
 def suggested_unit(value: float, unit: str, low: float = -math.inf, high: float = math.inf) -> str:
-    """Return a hint for a value outside of its plausible range: ``"; did you mean 15 deg = 0.262 rad?"``.
+    """Return a hint for a value [unit] outside of its plausible range: ``"; did you mean 15 deg = 0.262 rad?"``.
 
-    Args:
-        value: The value, read in ``unit``.
-        unit: SI unit, such as "rad" or "rad/s"; the hint is empty for units without a common mistake.
-        low: Minimum value; the hint is empty if the converted value is below it.
-        high: Maximum value.
+    The hint is empty for units without a common mistake, and if the converted value is outside of ``low`` to ``high``.
     """
     base, slash, per = unit.partition("/")
     factor = float(UNITS[OTHER_UNITS[base]][1]) if base in OTHER_UNITS else 0.0
@@ -75,14 +71,7 @@ def show(value: object) -> str:
 
 
 def parse_number(value: Any, unit: str) -> float:
-    """Read one number or quantity.
-
-    Args:
-        value: An int or a float, in ``unit``; or a text such as ``"50 ms"`` or ``"0.05"``.
-        unit: SI unit of the result.
-
-    Returns:
-        The value [unit].
+    """Read a number in ``unit``, or a text such as ``"50 ms"`` or ``"0.05"``; return the value [unit], an SI unit.
 
     Raises:
         ValueError: The value is not a finite number, or its unit is unknown or of another dimension.
@@ -97,18 +86,10 @@ def parse_number(value: Any, unit: str) -> float:
 
 
 def parse_numbers(value: Any, unit: str, *, count: int | None = None) -> tuple[float, ...]:
-    """Read a list of numbers or quantities.
-
-    Args:
-        value: A list of values for ``parse_number``, or a text such as ``"[0.6, 1.3] m"``.
-        unit: SI unit of the result.
-        count: Required number of values; None for one or more.
-
-    Returns:
-        The values [unit].
+    """Read a list of values for ``parse_number``, or a text such as ``"[0.6, 1.3] m"``; return the values [unit].
 
     Raises:
-        ValueError: The value is not a list, has the wrong length, or an invalid entry.
+        ValueError: The value is not a list, has an invalid entry, or not ``count`` entries (None for one or more).
     """
     match = _LIST.fullmatch(value) if isinstance(value, str) else None
     if match:
@@ -124,14 +105,7 @@ def parse_numbers(value: Any, unit: str, *, count: int | None = None) -> tuple[f
 
 
 def parse_range(value: Any, unit: str) -> tuple[float, float]:
-    """Read a closed interval.
-
-    Args:
-        value: A list of two, ``"[0.6, 1.3] m"``, or a value for ``parse_number``, a single point.
-        unit: SI unit of the result.
-
-    Returns:
-        Low and high end [unit].
+    """Read a list of two, ``"[0.6, 1.3] m"``, or a value for ``parse_number``, a single point; return both ends [unit].
 
     Raises:
         ValueError: An end is invalid, or the low end is above the high end.

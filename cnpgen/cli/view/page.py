@@ -62,11 +62,8 @@ def serve(page: Page, watched: Sequence[Path], *, port: int, ready: Callable[[st
     Args:
         page: (row or None, stamp of the files) -> the page as HTML. Its errors are shown in place of the page.
         watched: The files that the page depends on; for a recipe also the other files in its folder.
-        port: Port on the loopback address; 0 for any free port.
+        port: Port on the loopback address; 0 for any free port. MachineError if it is taken.
         ready: Called with the address once it is served.
-
-    Raises:
-        MachineError: The port is taken.
     """
 
     class Handler(BaseHTTPRequestHandler):
