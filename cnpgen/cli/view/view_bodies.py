@@ -30,21 +30,13 @@ BALL = 12  # directions per quarter of a circle in which round bodies have corne
 
 @dataclass(frozen=True)
 class Body:
-    """Triangles that a joint moves.
-
-    Attributes:
-        name: Name of the body.
-        joint: Index of the joint, from 1; 0 for a fixed body.
-        corners: Corners in the joint's frame [m], shape (V, 3).
-        triangles: Numbers of their corners, shape (F, 3).
-        smooth: Whether the surface is drawn without edges.
-    """
+    """Triangles that a joint moves."""
 
     name: str
-    joint: int
-    corners: Array
-    triangles: NDArray[np.integer[Any]]
-    smooth: bool = False
+    joint: int  # index from 1; 0 for a fixed body
+    corners: Array  # in the frame of the joint [m], shape (V, 3)
+    triangles: NDArray[np.integer[Any]]  # numbers of their corners, shape (F, 3)
+    smooth: bool = False  # whether the surface is drawn without edges
 
 
 def robot_bodies(problem: Problem, robot: Robot, *, with_meshes: bool = True) -> tuple[list[Body], str]:

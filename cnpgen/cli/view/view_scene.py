@@ -46,68 +46,38 @@ _NOTES = {  # kind of the robot's bodies -> remark
 
 @dataclass(frozen=True)
 class View:
-    """A plan, a sample or a configuration of the robot, with the names that the script of the page has.
-
-    Attributes:
-        title: Title.
-        labels: Label of each of the K frames: its time, "start" or "goal".
-        times: Times of the frames [s]; 0, 1, ... without a motion.
-        q: Joint positions [rad], shape (K, n).
-        poses: Transposed poses of the joints, the universe first and the tip last, shape (K, joints, 4, 4).
-        world: Obstacles, the table and the puck.
-        path: Path of the tip, of a motion.
-        curves: Quantities with their shares of the limits; empty without a motion.
-        conditions: Curves of the other conditions; empty without a motion.
-        verdict: The verdict; None without a motion.
-    """
+    """A plan, a sample or a configuration of the robot, with the names that the script of the page has."""
 
     title: str
-    labels: Sequence[str]
-    times: Sequence[float]
-    q: Array
-    poses: Array
-    world: Sequence[Body]
-    path: Sequence[Body] = ()
-    curves: Sequence[dict[str, Any]] = ()
-    conditions: Sequence[dict[str, Any]] = ()
-    verdict: dict[str, Any] | None = None
+    labels: Sequence[str]  # of each of the K frames: its time, "start" or "goal"
+    times: Sequence[float]  # times of the frames [s]; 0, 1, ... without a motion
+    q: Array  # joint positions [rad], shape (K, n)
+    poses: Array  # transposed poses of the joints, the universe first and the tip last, shape (K, joints, 4, 4)
+    world: Sequence[Body]  # obstacles, the table and the puck
+    path: Sequence[Body] = ()  # path of the tip, of a motion
+    curves: Sequence[dict[str, Any]] = ()  # quantities with their shares of the limits; empty without a motion
+    conditions: Sequence[dict[str, Any]] = ()  # curves of the other conditions; empty without a motion
+    verdict: dict[str, Any] | None = None  # None without a motion
 
 
 @dataclass(frozen=True)
 class ViewScene:
-    """The content of a page, with the names that its script has.
+    """The content of a page, with the names that its script has."""
 
-    Attributes:
-        note: Remark about the bodies of the robot.
-        joints: Placements, axes and limits of the planned joints.
-        tip: Pose of the tip in the frame of the last joint, by columns.
-        joints_and_tip: Number of poses of a frame.
-        robot: Bodies of the robot.
-        capsules: Capsules around its links.
-        held: The held object, in the tip's frame.
-        mallet: The mallet, relative to the position of the tip.
-        triad: Axes of a frame, in the tip's frame.
-        centre: Centre of the box around the robot [m].
-        size: Diagonal of the box [m].
-        views: The views, one or more.
-        first_row: Row of the first view.
-        n_rows: Number of rows that the source has.
-    """
-
-    note: str
-    joints: Sequence[dict[str, Any]]
-    tip: Sequence[float]
-    joints_and_tip: int
+    note: str  # remark about the bodies of the robot
+    joints: Sequence[dict[str, Any]]  # placements, axes and limits of the planned joints
+    tip: Sequence[float]  # pose of the tip in the frame of the last joint, by columns
+    joints_and_tip: int  # number of poses of a frame
     robot: Sequence[Body]
-    capsules: Sequence[Body]
-    held: Sequence[Body]
-    mallet: Sequence[Body]
-    triad: Sequence[Body]
-    centre: Sequence[float]
-    size: float
-    views: Sequence[View]
-    first_row: int = 0
-    n_rows: int = 1
+    capsules: Sequence[Body]  # around the links of the robot
+    held: Sequence[Body]  # the held object, in the tip's frame
+    mallet: Sequence[Body]  # the mallet, relative to the position of the tip
+    triad: Sequence[Body]  # axes of a frame, in the tip's frame
+    centre: Sequence[float]  # centre of the box around the robot [m]
+    size: float  # diagonal of the box [m]
+    views: Sequence[View]  # one or more
+    first_row: int = 0  # row of the first view
+    n_rows: int = 1  # number of rows that the source has
 
 
 def scene_of_problem(problem: Problem, robot: Robot) -> ViewScene:
