@@ -2,8 +2,6 @@
 
 import math
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -59,11 +57,12 @@ def problem_of(arm: Arm, name: str, folder: Path, packages: tuple[Path, ...], sr
         RecipeError: The arm cannot be planned for.
     """
     problem = _problem(with_torques(arm, [1.0] * len(arm.planned)), name, folder, packages, srdf)
-    with _warnings_as_notes() as notes:
+    with warnings.catch_warnings(record=True) as caught:  # such as those about simplified meshes
+        warnings.simplefilter("always")
         overlaps = resolve_overlaps(problem) if arm.has_shape else None
         problem = overlaps.problem if overlaps else problem
         robot = load_robot(problem)
-    notes += overlaps.notes if overlaps else ()
+    notes = [*dict.fromkeys(str(each.message) for each in caught), *(overlaps.notes if overlaps else ())]
     arm, overloaded = _with_torque_limits(arm, robot)
     limits = replace(problem.limits, **_replaced_limits(arm))
     problem = _with_jerk_limits(replace(problem, limits=limits), robot)
@@ -115,16 +114,6 @@ def _problem(arm: Arm, name: str, folder: Path, packages: tuple[Path, ...], srdf
         constraints = (*constraints, *clearances)  # obstacles may follow
     path, title = folder / "problem.toml", f"Move {arm.urdf.stem} within its limits"
     return Problem(name=name, title=title, robot=robot, limits=limits, constraint=constraints, path=path.absolute())
-
-
-@contextmanager
-def _warnings_as_notes() -> Iterator[list[str]]:
-    """Collect the warnings of the block, such as those about simplified meshes, in a list without repetitions."""
-    notes: list[str] = []
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        yield notes
-    notes += dict.fromkeys(str(each.message) for each in caught)
 
 
 def _replaced_limits(arm: Arm) -> dict[str, Any]:
