@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Parser, add_json
-from cnpgen.cli.progress import Meter
+from cnpgen.cli.terminal import Meter
 from cnpgen.cli.trajectory_options import (
     add_trajectory_options,
     listing_text,

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.interruption import raise_if_interrupted
 from cnpgen.cli.parser import ENGINE, Parser, add_engine, options_of
-from cnpgen.cli.progress import Meter
+from cnpgen.cli.terminal import Meter
 from cnpgen.errors import UsageError, counted
 
 if TYPE_CHECKING:

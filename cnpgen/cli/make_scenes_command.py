@@ -15,7 +15,7 @@ from typing import Any
 
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Parser, add_json
-from cnpgen.cli.progress import Meter
+from cnpgen.cli.terminal import Meter
 from cnpgen.errors import UsageError
 
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.interruption import resumable
 from cnpgen.cli.parser import ENGINE, Options, Parser, add_engine, add_json, options_of
-from cnpgen.cli.progress import Meter
+from cnpgen.cli.terminal import Meter
 from cnpgen.errors import UsageError, counted
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Parser, add_json
-from cnpgen.cli.progress import Meter
+from cnpgen.cli.terminal import Meter
 from cnpgen.errors import UsageError, counted
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Parser, options_of
-from cnpgen.cli.progress import Meter
+from cnpgen.cli.terminal import Meter
 from cnpgen.cli.train_options import add_settings, changed_settings, passed_settings
 from cnpgen.errors import MachineError
 

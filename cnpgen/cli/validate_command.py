@@ -18,7 +18,7 @@ from pathlib import Path
 
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import ENGINE, Parser, add_engine, add_json, options_of
-from cnpgen.cli.progress import Meter
+from cnpgen.cli.terminal import Meter
 from cnpgen.errors import DatasetError
 
 

@@ -268,7 +268,7 @@ def test_refining_goes_on_where_it_was_interrupted(trained, tiny, tmp_path, caps
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("cnpgen.cli.progress.Meter.__call__", interrupted)
+        patch.setattr("cnpgen.cli.terminal.Meter.__call__", interrupted)
         code, text = failing(capsys, [*words, "--refine", "--workers", "1"])
     assert code == 130
     assert "p.h5.part keeps all finished problems; run the same command again to resume" in text
