@@ -7,6 +7,7 @@ more remedies.
 
 import argparse
 import sys
+from textwrap import TextWrapper
 from typing import TYPE_CHECKING
 
 from cnpgen.cli.parser import Parser, add_json
@@ -55,7 +56,12 @@ def machine_text(report: "MachineReport") -> str:
         "free disk": f"{report.free_bytes / 1e9:,.1f} GB here",
         "verdict": _verdict(report),
     }
-    return "\n".join(f"{name:<10} {_folded(value)}" for name, value in facts.items())
+    wrapper = TextWrapper(100, subsequent_indent=" " * 11, break_long_words=False, break_on_hyphens=False)
+    lines = []
+    for name, value in facts.items():
+        wrapper.initial_indent = f"{name:<10} "
+        lines += wrapper.wrap(value)
+    return "\n".join(lines)
 
 
 def _cache(report: "MachineReport") -> str:
@@ -69,9 +75,3 @@ def _verdict(report: "MachineReport") -> str:
         return f"cnpgen does not work here: {counted(len(report.problems), 'problem')}, below"
     text = "all requirements are met"
     return f"{text}; {counted(len(report.notes), 'warning')}, below" if report.notes else text
-
-
-def _folded(text: str) -> str:
-    import textwrap
-
-    return ("\n" + " " * 11).join(textwrap.wrap(text, 89, break_long_words=False, break_on_hyphens=False))

@@ -64,7 +64,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def add_refine_options(parser: Parser) -> None:
     """Add the options of both commands, and complete the help."""
-    parser.epilog = f"{parser.epilog}{TEXT}"
+    parser.epilog = f"{parser.epilog or ''}{TEXT}"
     add_refining(parser)
     parser.add_argument("--workers", metavar="W", type=values.positive, help=WORKERS)
     add_engine(parser)

@@ -41,7 +41,7 @@ def add_options(parser: Parser) -> None:
     option("--robot", metavar="NAME|FILE", type=recipe_names.problem, help=text)
     option("-o", "--out", metavar="OUT", type=Path, help="output file (default: DIR-plans.h5 or NAME-plans.h5)")
     option("--allow-large-angles", action="store_true", help=LARGE_ANGLES)
-    parser.epilog = f"{parser.epilog}\n"
+    parser.epilog = f"{parser.epilog or ''}\n"
     add_refine_options(parser)
 
 
