@@ -129,6 +129,8 @@ def _run(arguments: argparse.Namespace, folder: Path) -> "Benchmark":
     from cnpgen.benchmark.run_suite import FASTEST, run_benchmark
 
     meter, doing = Meter(noun="problem"), [""]
+    planners = {name for name, _, _ in arguments.set}
+    parameters = {each: {key: value for name, key, value in arguments.set if name == each} for each in planners}
 
     def progress(what: str, total: int, done: int) -> None:
         if what != doing[0]:
@@ -143,7 +145,7 @@ def _run(arguments: argparse.Namespace, folder: Path) -> "Benchmark":
             planners=arguments.planners or FASTEST,
             repeat=arguments.repeat,
             reference=arguments.reference,
-            parameters=_parameters(arguments.set),
+            parameters=parameters,
             progress=progress,
             **_options(arguments),
         )
@@ -154,14 +156,6 @@ def _options(arguments: argparse.Namespace) -> dict[str, Any]:
     names = ("n", "environment", "time_limit", "seed", "plane_tolerance", *ENGINE, "replan", "force")
     plants = (arguments.plant or ("nominal",)) if arguments.simulate else ()
     return {"plants": plants, **options_of(arguments, *names)}
-
-
-def _parameters(fields: list[tuple[str, str, Any]]) -> dict[str, dict[str, Any]]:
-    """Group fields by planner."""
-    grouped: dict[str, dict[str, Any]] = {}
-    for name, key, value in fields:
-        grouped.setdefault(name, {})[key] = value
-    return grouped
 
 
 def _facts(found: "Benchmark", folder: Path) -> dict[str, Any]:

@@ -47,15 +47,11 @@ def sampling_texts(recipe: DatasetRecipe, share: float) -> dict[str, str]:
         "stage.0.start": f"Found by sampling: of the draws {100 * share:.0f} % become samples.",
         "stage.1.guess": "About the base configuration of the problem.",
     }
-    heads = {
-        FILES[1]: _head("How starts and goals are drawn: positions, and joint angles that reach them."),
-        FILES[2]: _head("How many samples there are, from which seed, split how."),
-    }
-    texts = (
-        recipe_text(recipe.pipeline, {"problem": FILES[0]}, comments),
-        recipe_text(recipe, {"pipeline": FILES[1]}, {}),
-    )
-    return {name: "\n".join([*head, "", text]) for (name, head), text in zip(heads.items(), texts, strict=True)}
+    pipeline = _head("How starts and goals are drawn: positions, and joint angles that reach them.")
+    pipeline += ["", recipe_text(recipe.pipeline, {"problem": FILES[0]}, comments)]
+    dataset = _head("How many samples there are, from which seed, split how.")
+    dataset += ["", recipe_text(recipe, {"pipeline": FILES[1]}, {})]
+    return {FILES[1]: "\n".join(pipeline), FILES[2]: "\n".join(dataset)}
 
 
 def _from(folder: Path, path: str) -> str:
