@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
 
 def add_options(parser: Parser) -> None:
-    """Add the options."""
     option = parser.add_argument
     text = "a suite (see --list), or a dataset for random problems"
     option("suite", metavar="SUITE", nargs="?", type=recipe_names.suite, help=text)
@@ -84,7 +83,6 @@ def parameter_range(text: str) -> tuple[str, str, tuple[float, float]]:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Run the command."""
     from cnpgen.benchmark.html_report import save_benchmark_report
     from cnpgen.benchmark.paper_figures import save_benchmark_figures
     from cnpgen.benchmark.result_tables import save_benchmark_tables

@@ -29,7 +29,6 @@ MAX_LISTED_TASKS = 10  # tasks without an answer that are listed by number
 
 
 def add_options(parser: Parser) -> None:
-    """Add the options."""
     option = parser.add_argument
     text = "a pipeline, dataset or problem by name, or a recipe file"
     option("pipeline", metavar="NAME|FILE", type=recipe_names.tasks_of, help=text)
@@ -41,7 +40,6 @@ def add_options(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the command."""
     from cnpgen.cli.refine_command import check_place
     from cnpgen.make.complete import complete
     from cnpgen.plans import save_plans

@@ -26,7 +26,6 @@ _NEXT = {
 
 
 def add_options(parser: Parser) -> None:
-    """Add the options."""
     text = "a shipped dataset, pipeline or problem (see 'cnpgen list')"
     parser.add_argument("recipe", metavar="NAME", type=recipe_names.shipped, help=text)
     parser.add_argument("folder", metavar="DIR", help="folder of the copies; its name becomes theirs")
@@ -35,7 +34,6 @@ def add_options(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Run the command."""
     from cnpgen.cli.show_command import load_any
     from cnpgen.schema.keys import NAME
     from cnpgen.store.files.atomic import check_writable, write_file

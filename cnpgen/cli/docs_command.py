@@ -17,7 +17,6 @@ KINDS = ("tutorials", "how-to", "concepts", "reference", "benchmarks")
 
 
 def add_options(parser: Parser) -> None:
-    """Add the options."""
     what = parser.add_mutually_exclusive_group()
     what.add_argument("page", metavar="PAGE", nargs="?", help="name of a page, such as hit-a-puck")
     what.add_argument("--search", metavar="TEXT", help="list the lines with TEXT on all pages, in any case")
@@ -26,7 +25,6 @@ def add_options(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the command."""
     pages = list_pages()
     name = None if arguments.page is None else page_name(arguments.page, pages)
     if arguments.search is not None:

@@ -18,12 +18,10 @@ if TYPE_CHECKING:
 
 
 def add_options(parser: Parser) -> None:
-    """Add the options."""
     add_json(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the command."""
     import json
 
     from cnpgen.validate.machine import check_machine

@@ -35,7 +35,6 @@ if TYPE_CHECKING:
 
 
 def add_options(parser: Parser) -> None:
-    """Add the options."""
     option = parser.add_argument
     option("file", metavar="FILE", type=Path, help="plan file, .h5, or sampled trajectories")
     text = "the problem of the plans; its tolerances are used"
@@ -63,7 +62,6 @@ def add_options(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the command."""
     from cnpgen.plans.trajectory_tables import holds_trajectories
 
     if arguments.plan is not None and not arguments.plot:

@@ -28,7 +28,6 @@ NO_OBSTACLES = "the output lacks the obstacles of the plans: only a problem with
 
 
 def add_options(parser: Parser) -> None:
-    """Add the options."""
     option = parser.add_argument
     option("file", metavar="FILE", type=recipe_names.present, help="plan file, .h5")
     text = "format: npz, csv, parquet, lerobot, mpd, ... ('cnpgen list exporters')"
@@ -46,7 +45,6 @@ def add_options(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the command."""
     from cnpgen.plans.export import export_plans, load_exporter
     from cnpgen.problems.problem_record import open_problem
 

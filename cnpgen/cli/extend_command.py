@@ -14,7 +14,6 @@ from cnpgen.cli.parser import ENGINE, Parser, add_engine, options_of
 
 
 def add_options(parser: Parser) -> None:
-    """Add the options."""
     option = parser.add_argument
     option("folder", metavar="DIR", type=recipe_names.dataset, help="the dataset")
     option("--n", metavar="N", type=values.rows, required=True, help="total number of samples afterwards")
@@ -24,7 +23,6 @@ def add_options(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Run the command."""
     from cnpgen.make.extend import extend_dataset
 
     extend = partial(extend_dataset, arguments.folder, arguments.n, **options_of(arguments, *ENGINE))

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
 
 def add_options(parser: Parser) -> None:
-    """Add the options."""
     option = parser.add_argument
     option("file", metavar="FILE", type=recipe_names.present, help="file of trajectories, or a folder of them")
     text = "the problem of the trajectories"
@@ -37,7 +36,6 @@ def add_options(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Run the command."""
     import numpy as np
 
     from cnpgen.cli.refine_command import check_place

@@ -19,7 +19,6 @@ from cnpgen.errors import UsageError
 
 
 def add_options(parser: Parser) -> None:
-    """Add the options."""
     option = parser.add_argument
     option("name", metavar="NAME", type=_folder, help="name of the recipes and of their folder")
     kind = parser.add_mutually_exclusive_group(required=True)
@@ -35,7 +34,6 @@ def add_options(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Run the command."""
     from cnpgen.cli.init.arm import read_arm
     from cnpgen.cli.init.initial_recipes import dataset_of, problem_of
     from cnpgen.cli.init.write import FILES, problem_text, sampling_texts

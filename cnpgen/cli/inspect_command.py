@@ -20,14 +20,12 @@ if TYPE_CHECKING:
 
 
 def add_options(parser: Parser) -> None:
-    """Add the options."""
     parser.add_argument("folder", metavar="DIR", type=recipe_names.dataset, help="folder of a dataset, finished or not")
     parser.add_argument("--plot", metavar="FILE", type=values.plot_file, help="also draw it: .png, .pdf or .svg")
     add_json(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the command."""
     from cnpgen.store.files.documents import render
     from cnpgen.store.inspection import inspect_dataset
 

@@ -23,13 +23,11 @@ _HOW = {
 
 
 def add_options(parser: Parser) -> None:
-    """Add the options."""
     parser.add_argument("what", nargs="?", choices=WHAT, metavar="WHAT", help=f"one of {', '.join(WHAT)}; default all")
     add_json(parser)
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Run the command."""
     from cnpgen.store.files.documents import plain, render
 
     found = {what: list_all(what) for what in ([arguments.what] if arguments.what else WHAT)}

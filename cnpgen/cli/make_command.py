@@ -34,7 +34,6 @@ INTERRUPTED_TEXT = "finished shards are kept; run the same command again to resu
 
 
 def add_options(parser: Parser) -> None:
-    """Add the options."""
     option = parser.add_argument
     option("recipe", metavar="NAME|FILE", help="a shipped dataset or pipeline (see 'cnpgen list'), or a recipe file")
     option("--n", metavar="N", type=values.rows, help="total number of samples; default the recipe's")
@@ -56,7 +55,6 @@ def add_options(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Run the command."""
     from cnpgen.make.recipe_file import load_dataset_recipe
 
     recipe_names.check_recipe(arguments.recipe, of_dataset="'cnpgen make-dataset NAME --out {0}' resumes it")

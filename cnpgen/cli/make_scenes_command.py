@@ -20,7 +20,6 @@ from cnpgen.errors import UsageError
 
 
 def add_options(parser: Parser) -> None:
-    """Add the options."""
     option = parser.add_argument
     text = "family of scenes, such as tabletop (see --list)"
     option("family", metavar="FAMILY", nargs="?", type=recipe_names.family, help=text)
@@ -47,7 +46,6 @@ def family_parameter(text: str) -> tuple[str, Any]:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Run the command."""
     from cnpgen.pipelines.families.scene_generator import make_scenes
     from cnpgen.problems.scenes.scene_files import save_scenes
 

@@ -14,7 +14,6 @@ from cnpgen.cli.parser import Parser
 
 
 def add_options(parser: Parser) -> None:
-    """Add the options."""
     option = parser.add_argument
     option("parts", metavar="PART", nargs="+", type=recipe_names.dataset, help="folders of parts")
     option("-o", "--out", metavar="DIR", required=True, help="folder of the dataset; may be one of the parts")
@@ -22,7 +21,6 @@ def add_options(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Run the command."""
     from cnpgen.make.merge import merge_datasets
 
     merge = partial(merge_datasets, arguments.parts, arguments.out)

@@ -61,7 +61,11 @@ Options = argparse._ActionsContainer  # a parser or a group of its options: opti
 
 
 def add_command(commands: "Commands[Parser]", name: str, module: ModuleType) -> None:
-    """Add the command of a module: its docstring is the help, ``add_options`` adds arguments, ``run`` runs it."""
+    """Add the command of a module, whose docstring is the help.
+
+    Its function ``add_options`` adds arguments and options to a parser. ``run`` runs the command with the parsed
+    arguments, and returns the exit code if it can be another one than 0.
+    """
     title, _, text = (module.__doc__ or "").partition("\n\n")
     summary = f"{title[:1].lower()}{title[1:]}".rstrip(".\n")
     parser = commands.add_parser(name, help=summary, description=title, epilog=text or None)

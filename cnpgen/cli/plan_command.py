@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
 
 def add_options(parser: Parser) -> None:
-    """Add the options."""
     option = parser.add_argument
     text = "a dataset's folder; a dataset or pipeline by name, or a recipe file; boundary conditions in HDF5; or scenes"
     option("problems", metavar="DIR|NAME|FILE", type=recipe_names.problems, help=text)
@@ -51,7 +50,6 @@ def add_options(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the command."""
     import json
     import time
 

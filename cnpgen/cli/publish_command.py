@@ -14,7 +14,6 @@ from cnpgen.cli.parser import Parser
 
 
 def add_options(parser: Parser) -> None:
-    """Add the options."""
     option = parser.add_argument
     option("folder", metavar="DIR", type=recipe_names.dataset, help="folder of a finished dataset")
     option("--to", metavar="USER/NAME", required=True, help="repository of the Hub; it is created if it does not exist")
@@ -24,7 +23,6 @@ def add_options(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Run the command."""
     from cnpgen.make.publish import publish_dataset
 
     folder = arguments.folder

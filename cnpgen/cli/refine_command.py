@@ -42,7 +42,6 @@ in either case.
 
 
 def add_options(parser: Parser) -> None:
-    """Add the options."""
     parser.add_argument("file", metavar="FILE", type=Path, help="plan file, .h5")
     text = "output file (default: FILE-refined.h5 beside it)"
     parser.add_argument("-o", "--out", metavar="OUT", type=Path, help=text)
@@ -52,7 +51,6 @@ def add_options(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the command."""
     from cnpgen.cli.verdict_text import checksum_text
 
     plans = recipe_names.read_plans(arguments.file, problem=arguments.problem)

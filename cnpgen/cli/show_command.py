@@ -19,7 +19,6 @@ KINDS: tuple[Kind, ...] = ("dataset", "pipeline", "problem")  # a dataset includ
 
 
 def add_options(parser: Parser) -> None:
-    """Add the options."""
     what = parser.add_mutually_exclusive_group(required=True)
     text = "a shipped dataset, pipeline or problem (see 'cnpgen list'), or a recipe file"
     what.add_argument("recipe", metavar="NAME|FILE", nargs="?", help=text)
@@ -32,7 +31,6 @@ def add_options(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Run the command."""
     from cnpgen.cli import describe
     from cnpgen.store.files.documents import plain, render
 

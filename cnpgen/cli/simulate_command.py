@@ -43,7 +43,6 @@ _FIGURES = {
 
 
 def add_options(parser: Parser) -> None:
-    """Add the options."""
     option = parser.add_argument
     option("file", metavar="FILE", type=Path, help="plan file, .h5")
     option("--problem", metavar="NAME|FILE", type=recipe_names.problem, help="the problem of the plans")
@@ -60,7 +59,6 @@ def add_options(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the command."""
     from cnpgen.benchmark.simulator.simulate import simulate_plans
 
     plans = recipe_names.read_plans(arguments.file, problem=arguments.problem)

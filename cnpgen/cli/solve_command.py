@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
 
 def add_options(parser: Parser) -> None:
-    """Add the options."""
     option = parser.add_argument
     text = "a dataset's folder; a dataset or pipeline by name, or a recipe file; boundary conditions in HDF5;"
     text += " or, with --robot, scenes"
@@ -46,7 +45,6 @@ def add_options(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the command."""
     from cnpgen.refine.refine_plans import refine_plans, solve_plans
 
     what = Path(arguments.what)

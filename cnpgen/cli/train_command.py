@@ -40,7 +40,6 @@ _PRESET = (
 
 
 def add_options(parser: Parser) -> None:
-    """Add the options."""
     option = parser.add_argument
     option("folder", metavar="DIR", type=recipe_names.present, help="the dataset; or, with --robot, scenes")
     option("-o", "--out", metavar="MODEL", type=Path, required=True, help="model file to write, .h5")
@@ -102,7 +101,6 @@ class Watch:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Run the command."""
     watch = Watch(quiet=arguments.quiet)
     try:
         trained = _train(arguments, watch)

@@ -23,7 +23,6 @@ from cnpgen.errors import DatasetError
 
 
 def add_options(parser: Parser) -> None:
-    """Add the options."""
     option = parser.add_argument
     option("folder", metavar="DIR", type=recipe_names.dataset, help="folder of a dataset")
     option("--deep", action="store_true", help="check every row, its constraints with Pinocchio and Coal")
@@ -36,7 +35,6 @@ def add_options(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the command."""
     from cnpgen.store.files.documents import plain, render
     from cnpgen.validate.validate_dataset import validate_dataset
 

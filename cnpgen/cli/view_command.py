@@ -30,7 +30,6 @@ MAX_ROWS_OF_PAGE = 50  # each adds about 0.3 MB
 
 
 def add_options(parser: Parser) -> None:
-    """Add the options."""
     option = parser.add_argument
     text = "a problem by name or file, the folder of a dataset, a plan file, or sampled trajectories"
     option("what", metavar="PROBLEM|DIR|FILE", type=recipe_names.viewed, help=text)
@@ -51,7 +50,6 @@ def add_options(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Run the command."""
     from cnpgen.cli.view.page import page_of
     from cnpgen.store.files.atomic import check_writable, write_file
 
