@@ -76,17 +76,11 @@ def field(
 
 @dataclass(frozen=True, kw_only=True)
 class Key:
-    """Key of a recipe table, declared by ``field``.
-
-    Attributes:
-        name: Name of the key.
-        hint: Type of the dataclass field, without ``| None``.
-        default: Value of an absent key, ``dataclasses.MISSING`` for required keys.
-    """
+    """Key of a recipe table, declared by ``field``."""
 
     name: str
-    hint: Any
-    default: Any
+    hint: Any  # type of the dataclass field, without ``| None``
+    default: Any  # of an absent key; ``dataclasses.MISSING`` for required keys
     doc: str
     unit: str
     low: float | None

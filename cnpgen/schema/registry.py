@@ -218,8 +218,7 @@ def package_digest(package: str) -> str:
 def package_of(group: str, kind: type) -> str:
     """Return the name of the installed package that registers a class; empty for built-in and unregistered ones."""
     name = name_of(group, kind)
-    found = [entry.dist.name for entry in installed(group) if entry.name == name and entry.dist]
-    return found[0] if found else ""
+    return next((entry.dist.name for entry in installed(group) if entry.name == name and entry.dist), "")
 
 
 def why_missing(group: str, use: str, package: str) -> str:

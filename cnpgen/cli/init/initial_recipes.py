@@ -49,12 +49,9 @@ class InitialProblem:
 
 
 def problem_of(arm: Arm, name: str, folder: Path, packages: tuple[Path, ...], srdf: Path | None) -> InitialProblem:
-    """Make the problem of an arm.
+    """Make the problem of an arm, or raise RecipeError if it cannot be planned for.
 
     ``packages`` are folders that are searched for packages of the URDF, the SRDF disables pairs of links.
-
-    Raises:
-        RecipeError: The arm cannot be planned for.
     """
     problem = _problem(with_torques(arm, [1.0] * len(arm.planned)), name, folder, packages, srdf)
     with warnings.catch_warnings(record=True) as caught:  # such as those about simplified meshes
@@ -77,11 +74,7 @@ def problem_of(arm: Arm, name: str, folder: Path, packages: tuple[Path, ...], sr
 
 
 def dataset_of(initial: InitialProblem, folder: Path) -> tuple[DatasetRecipe, float]:
-    """Return the dataset of a problem, with its pipeline and the problem, and the share of accepted candidates.
-
-    Raises:
-        RecipeError: No positions were found that the arm reaches.
-    """
+    """Return the dataset of a problem and the share of accepted candidates; raise RecipeError if none are found."""
     problem, name = initial.problem, initial.problem.name
     title, path = f"From rest to rest: {name}", folder / "pipeline.toml"
     stages = _stages(initial.arm, problem)

@@ -34,11 +34,7 @@ class LinkOverlaps:
 
 
 def resolve_overlaps(problem: Problem) -> LinkOverlaps:
-    """Decompose the links whose hulls reject much free space, and ignore pairs in contact if no state is free.
-
-    Raises:
-        RecipeError: A mesh is missing or cannot be read.
-    """
+    """Decompose the links whose hulls reject much free space, and ignore pairs in contact if no state is free."""
     hulls = _gap(problem)
     problem, parts = _decompose(problem, hulls)
     problem, parts, contacts = _ignore_contacts(problem, parts)
