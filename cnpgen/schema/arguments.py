@@ -134,7 +134,7 @@ def check_memory(argument: str, value: int, n_floats: int) -> None:
 
 
 def check_memory_of_rows(counts: Mapping[str, int], n_floats: int) -> None:
-    """Refuse arguments, name -> number of rows, with at least so many floats per row, by the name of the longest."""
+    """Refuse arguments, name -> number of rows, of at least so many floats; name the one with most rows."""
     argument = max(counts, key=lambda name: counts[name])
     check_memory(argument, counts[argument], counts[argument] * n_floats)
 
