@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.interruption import resumable
 from cnpgen.cli.parser import ENGINE, Parser, add_engine, add_json, options_of
-from cnpgen.cli.terminal import Meter
+from cnpgen.cli.terminal import Meter, table
 from cnpgen.errors import CnpgenError, UsageError
 
 if TYPE_CHECKING:
@@ -178,7 +178,6 @@ def _facts(found: "Benchmark", folder: Path) -> dict[str, Any]:
 def _text(found: "Benchmark") -> str:
     """Format one table per plant with a column per planner."""
     from cnpgen.benchmark.result_tables import failure_summaries, notes, table_rows
-    from cnpgen.cli.describe import table
 
     head = f"{found.suite.name} {found.suite.version}: {len(found.problems)} problems"
     tables = [table([(*row, "") for row in table_rows(found, plant)], indent="  ") for plant in found.executions]
@@ -190,7 +189,6 @@ def _listing(*, as_json: bool) -> str:
     """List suites, planners with their fields, and plants."""
     from cnpgen.benchmark.simulator.plant import PLANTS
     from cnpgen.benchmark.suite import list_suites, load_suite
-    from cnpgen.cli.describe import table
 
     planners, fields = _planners()
     found = {

@@ -2,10 +2,10 @@
 
 import math
 from collections.abc import Sequence
-from pathlib import Path
-from textwrap import TextWrapper, wrap
+from textwrap import wrap
 from typing import Any
 
+from cnpgen.cli.terminal import LINE_WIDTH, table
 from cnpgen.make.recipe import DatasetRecipe, recipe_digest
 from cnpgen.pipelines.pipeline import Pipeline
 from cnpgen.pipelines.stages.stage import Stage
@@ -20,8 +20,6 @@ from cnpgen.robots.shape.shape import Shape
 from cnpgen.schema import registry
 from cnpgen.schema.keys import PerJoint, Range, keys
 from cnpgen.store.joint_units import unit_of
-
-LINE_WIDTH = 100
 
 Recipe = Problem | Pipeline | DatasetRecipe
 
@@ -262,28 +260,3 @@ def recipe_to_dict(recipe: Recipe) -> dict[str, Any]:
         name: {"unit": robot.units(unit), "values": list(getattr(robot, name))} for name, unit in LIMITS.items()
     }
     return content
-
-
-def table(
-    rows: Sequence[Sequence[Any]],
-    *,
-    indent: str = "",
-    right: Sequence[int] = (),
-    one_line: bool = False,
-    width: int = LINE_WIDTH,
-) -> list[str]:
-    """Lay out rows of the same length as aligned columns, those in ``right`` to the right; return the lines.
-
-    The last column is wrapped to the width or, with ``one_line``, cut; a path in it stays in one piece, for scripts.
-    """
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]) - 1)]
-    hanging = indent + " " * (sum(widths) + 2 * len(widths))
-    space, count = max(width - len(hanging), 30), 1 if one_line else None
-    wrapper = TextWrapper(space, break_on_hyphens=False, break_long_words=one_line, max_lines=count, placeholder=" ...")
-    lines = []
-    for *cells, last in rows:
-        pairs = enumerate(zip(cells, widths, strict=True))
-        head = indent + "".join(f"{text.rjust(w) if i in right else text.ljust(w)}  " for i, (text, w) in pairs)
-        parts = [str(last)] if isinstance(last, Path) else wrapper.wrap(last)
-        lines += [(head + (parts[0] if parts else "")).rstrip(), *(hanging + part for part in parts[1:])]
-    return lines

@@ -7,10 +7,10 @@ more remedies.
 
 import argparse
 import sys
-from textwrap import TextWrapper
 from typing import TYPE_CHECKING
 
 from cnpgen.cli.parser import Parser, add_json
+from cnpgen.cli.terminal import table
 from cnpgen.errors import MachineError, counted
 
 if TYPE_CHECKING:
@@ -54,12 +54,7 @@ def machine_text(report: "MachineReport") -> str:
         "free disk": f"{report.free_bytes / 1e9:,.1f} GB here",
         "verdict": _verdict(report),
     }
-    wrapper = TextWrapper(100, subsequent_indent=" " * 11, break_long_words=False, break_on_hyphens=False)
-    lines = []
-    for name, value in facts.items():
-        wrapper.initial_indent = f"{name:<10} "
-        lines += wrapper.wrap(value)
-    return "\n".join(lines)
+    return "\n".join(table(list(facts.items())))
 
 
 def _cache(report: "MachineReport") -> str:

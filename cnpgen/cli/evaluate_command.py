@@ -15,7 +15,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cnpgen.cli import recipe_names, values
+from cnpgen.cli import recipe_names, values, verdict_text
 from cnpgen.cli.parser import Parser, add_json
 from cnpgen.cli.terminal import Meter
 from cnpgen.cli.trajectory_options import (
@@ -73,11 +73,9 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         _write_json(arguments.file, found)
     else:
-        from cnpgen.cli.verdict_text import listing_text, summary_text
-
-        print(summary_text(arguments.file, found))
+        print(verdict_text.summary_text(arguments.file, found))
         if arguments.list:
-            print(f"\n{listing_text(found)}")
+            print(f"\n{verdict_text.listing_text(found)}")
     if arguments.plot:
         _draw(found, arguments.plot, arguments.plan)
     return 0 if found.valid.all() else 1

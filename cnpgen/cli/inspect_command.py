@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Parser, add_json
+from cnpgen.cli.terminal import table
 
 if TYPE_CHECKING:
     from cnpgen.store.field import Field
@@ -41,8 +42,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 def inspection_text(found: "Inspection") -> str:
     """Lay out an inspection for people."""
-    from cnpgen.cli.describe import table
-
     spec = found.spec
     sections = [[f"{spec.name} {spec.version}  {spec.title}".rstrip(), *table(_facts(found), indent="  ")]]
     if found.sampling.tried:
@@ -77,8 +76,6 @@ def _facts(found: "Inspection") -> list[tuple[str, str]]:
 
 def _yield_lines(sampling: "SamplingStatistics") -> list[str]:
     """Lay out the sampling statistics of the draws, in pipeline order."""
-    from cnpgen.cli.describe import table
-
     rows = [("stage", "rejects because", "draws", "accepts", "left"), ("", "", f"{sampling.tried:,}", "", "100.00 %")]
     left, before = sampling.tried, ""
     for reason, count in sampling.rejections.items():

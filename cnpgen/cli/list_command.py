@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from cnpgen.cli.parser import Parser, add_json
+from cnpgen.cli.terminal import table
 from cnpgen.errors import RecipeError
 from cnpgen.schema.toml import Kind
 
@@ -94,7 +95,5 @@ def _summary(group: str, name: str) -> str:
 
 
 def _section(what: str, entries: list[dict[str, Any]]) -> str:
-    from cnpgen.cli.describe import table
-
     rows = [(entry["name"], *([entry["size"]] if "size" in entry else []), entry["title"]) for entry in entries]
     return "\n".join([f"{what}  ({_HOW[what]})", *(table(rows, indent="  ", one_line=True) if rows else ["  none"])])

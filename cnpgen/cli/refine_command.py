@@ -16,6 +16,7 @@ from cnpgen.cli import recipe_names, values
 from cnpgen.cli.interruption import resumable
 from cnpgen.cli.parser import ENGINE, Options, Parser, add_engine, add_json, options_of
 from cnpgen.cli.terminal import Meter
+from cnpgen.cli.verdict_text import checksum_text
 from cnpgen.errors import UsageError, counted
 
 if TYPE_CHECKING:
@@ -51,8 +52,6 @@ def add_options(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from cnpgen.cli.verdict_text import checksum_text
-
     plans = recipe_names.read_plans(arguments.file, problem=arguments.problem)
     out = arguments.out or arguments.file.with_name(f"{arguments.file.stem}-refined.h5")
     if not arguments.quiet:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Parser, add_json
-from cnpgen.cli.terminal import Meter
+from cnpgen.cli.terminal import Meter, table
 from cnpgen.errors import UsageError, counted
 
 if TYPE_CHECKING:
@@ -82,8 +82,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _text(file: Path, found: "Simulation") -> str:
     """Lay out what came of all plans together."""
-    from cnpgen.cli.describe import table
-
     summary, count = found.summary(), len(found.executed)
     head = f"{file}: {counted(count, 'plan')} of {found.plans.problem.name}, executed by the {found.plant.name} plant"
     counts = {text: summary[name] for name, text in _NAMES.items() if name in summary}

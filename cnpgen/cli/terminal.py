@@ -1,4 +1,4 @@
-r"""The output streams of every command, and progress on stderr: untrusted text must not control a terminal.
+r"""The output streams of every command, progress and tables: untrusted text must not control a terminal.
 
 Titles, names and texts of files may hold control characters of terminals, or marks that turn the direction of writing.
 They are printed as ``\u001b``, as JSON has them, so that output which is JSON stays the same JSON.
@@ -7,14 +7,18 @@ They are printed as ``\u001b``, as JSON has them, so that output which is JSON s
 import re
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from pathlib import Path
+from textwrap import TextWrapper
 from typing import TYPE_CHECKING, Any, TextIO
 
 from cnpgen.errors import counted
 
 if TYPE_CHECKING:
     from cnpgen.store.sampling_statistics import SamplingStatistics
+
+LINE_WIDTH = 100  # of tables and wrapped lines
 
 # What is not printed: control characters but newline and tab, and marks of direction (Unicode, bidirectional controls).
 _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]")
@@ -139,3 +143,28 @@ class Meter:
             with suppress(OSError):
                 self._bar.close()
             self._bar = None
+
+
+def table(
+    rows: Sequence[Sequence[Any]],
+    *,
+    indent: str = "",
+    right: Sequence[int] = (),
+    one_line: bool = False,
+    width: int = LINE_WIDTH,
+) -> list[str]:
+    """Lay out rows of the same length as aligned columns, those in ``right`` to the right; return the lines.
+
+    The last column is wrapped to the width or, with ``one_line``, cut; a path in it stays in one piece, for scripts.
+    """
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]) - 1)]
+    hanging = indent + " " * (sum(widths) + 2 * len(widths))
+    space, count = max(width - len(hanging), 30), 1 if one_line else None
+    wrapper = TextWrapper(space, break_on_hyphens=False, break_long_words=one_line, max_lines=count, placeholder=" ...")
+    lines = []
+    for *cells, last in rows:
+        pairs = enumerate(zip(cells, widths, strict=True))
+        head = indent + "".join(f"{text.rjust(w) if i in right else text.ljust(w)}  " for i, (text, w) in pairs)
+        parts = [str(last)] if isinstance(last, Path) else wrapper.wrap(last)
+        lines += [(head + (parts[0] if parts else "")).rstrip(), *(hanging + part for part in parts[1:])]
+    return lines

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from cnpgen.cli import recipe_names, values
 from cnpgen.cli.parser import Parser, options_of
-from cnpgen.cli.terminal import Meter
+from cnpgen.cli.terminal import LINE_WIDTH, Meter
 from cnpgen.cli.train_options import add_settings, changed_settings, passed_settings
 from cnpgen.errors import MachineError
 
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from cnpgen.training.training_state import State
 
 
-LINE_WIDTH = 100  # of a line
 OFTEN = 100  # passes over the same rows after which more rows help more
 
 _LENGTHS = ("cpu_seconds", "steps", "epochs")

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cnpgen.cli.describe import table
+from cnpgen.cli.terminal import table
 from cnpgen.errors import counted
 
 if TYPE_CHECKING:

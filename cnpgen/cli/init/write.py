@@ -8,11 +8,12 @@ from pathlib import Path
 from textwrap import wrap
 from typing import Any
 
-from cnpgen.cli.describe import link_rows, pair_rows, table, with_units
+from cnpgen.cli.describe import link_rows, pair_rows, with_units
 from cnpgen.cli.describe_keys import GROUPS, is_array, kind_summary, part_of
 from cnpgen.cli.init.arm import DEFAULT_RANGE_M, DEFAULT_RANGE_RAD, DEFAULT_SPEED, Arm
 from cnpgen.cli.init.initial_recipes import INITIAL_JERK_RATE, TORQUE_STATES, InitialProblem
 from cnpgen.cli.init.link_overlaps import MAX_PAIR_GAP, LinkOverlaps
+from cnpgen.cli.terminal import table
 from cnpgen.make.recipe import DatasetRecipe
 from cnpgen.problems.load_robot import load_robot
 from cnpgen.robots.robot import Robot
