@@ -60,7 +60,7 @@ Commands = argparse._SubParsersAction  # what ``add_subparsers`` returns: comman
 Options = argparse._ActionsContainer  # a parser or a group of its options: options are added to it
 
 
-def add_command(commands: "Commands[Parser]", name: str, module: ModuleType) -> None:
+def add_command(commands: "Commands[Any]", name: str, module: ModuleType) -> None:
     """Add the command of a module, whose docstring is the help.
 
     Its function ``add_options`` adds arguments and options to a parser. ``run`` runs the command with the parsed

@@ -70,8 +70,7 @@ def _serve(arguments: argparse.Namespace) -> None:
 
     def page(row: int | None, stamp: str) -> str:
         chosen = arguments if row is None else argparse.Namespace(**(vars(arguments) | {"row": row, "rows": None}))
-        page_of(_scene(chosen), stamp=stamp)
-        return
+        return page_of(_scene(chosen), stamp=stamp)
 
     _scene(arguments)  # report errors before serving
     files = [Path(file) for file in (arguments.what, arguments.problem) if file and Path(file).exists()]
