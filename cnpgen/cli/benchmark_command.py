@@ -39,9 +39,7 @@ def add_options(parser: Parser) -> None:
     option("--environment", metavar="PATH", type=Path, help=text)
     option("--video", action="store_true", help="film the first plan of every planner for the report")
     option("--time-limit", metavar="S", type=values.seconds, default=60.0, help="time limit per problem (default: 60s)")
-    text = "processes for execution, and with --engine for planning; default one per available core"
-    option("--workers", metavar="W", type=values.positive, help=text)
-    add_engine(parser)
+    add_engine(parser, "processes for execution, and with --engine for planning; default one per available core")
     option("--seed", metavar="SEED", type=values.seed, default=0, help="seed of random planners (default: 0)")
     option("--repeat", metavar="K", type=values.positive, default=1, help="repetitions of every problem (default: 1)")
     text = "largest distance of the mallet of a successful hit from the table plane (default: 20mm)"

@@ -17,7 +17,6 @@ def add_options(parser: Parser) -> None:
     option = parser.add_argument
     option("folder", metavar="DIR", type=recipe_names.dataset, help="the dataset")
     option("--n", metavar="N", type=values.rows, required=True, help="total number of samples afterwards")
-    option("--workers", metavar="W", type=values.positive, help="processes; default one per available core")
     add_engine(parser)
     option("--quiet", action="store_true", help="no progress and no summary")
 

@@ -39,7 +39,6 @@ def add_options(parser: Parser) -> None:
     option("--n", metavar="N", type=values.rows, help="total number of samples; default the recipe's")
     option("--seed", metavar="S", type=values.seed, help="root seed; default the recipe's")
     option("-o", "--out", metavar="DIR", help="folder of the dataset; default NAME-vMAJOR here")
-    option("--workers", metavar="W", type=values.positive, help="processes; default one per available core")
     add_engine(parser)
     text = "rows per file; default 8192 to 65536, with --certify 64 to 1024"
     option("--shard-size", metavar="R", type=values.positive, help=text)

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from types import ModuleType
 from typing import Any, NoReturn
 
+from cnpgen.cli import values
 from cnpgen.errors import UsageError, nearest
 
 _NEGATIVE = re.compile(r"-\.?[0-9]")  # how values begin: -5ms; before Python 3.14 argparse takes it for an option
@@ -82,8 +83,9 @@ def add_debug(parser: Parser, *, default: Any = False) -> None:
 ENGINE = ("workers", "engine", "address")
 
 
-def add_engine(parser: Options) -> None:
-    """Add ``--engine`` and ``--address``."""
+def add_engine(parser: Options, workers: str = "processes; default one per available core") -> None:
+    """Add the options of ``ENGINE``, with a help for ``--workers``."""
+    parser.add_argument("--workers", metavar="W", type=values.positive, help=workers)
     text = "engine of the workers: local processes (loky, default), or a cluster ('cnpgen docs scale')"
     parser.add_argument("--engine", choices=("loky", "dask", "ray"), help=text)
     text = "address of the cluster, such as tcp://host:8786; without it a local cluster is started"

@@ -44,8 +44,7 @@ def add_options(parser: Parser) -> None:
     add_json(parser)
     option("--refine", action="store_true", help="optimize the plans")
     refining = parser.add_argument_group("with --refine")
-    refining.add_argument("--workers", metavar="W", type=values.positive, help=WORKERS)
-    add_engine(refining)
+    add_engine(refining, WORKERS)
     add_refining(refining)
 
 

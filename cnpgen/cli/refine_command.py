@@ -63,8 +63,7 @@ def add_refine_options(parser: Parser) -> None:
     """Add the options of both commands, and complete the help."""
     parser.epilog = f"{parser.epilog or ''}{TEXT}"
     add_refining(parser)
-    parser.add_argument("--workers", metavar="W", type=values.positive, help=WORKERS)
-    add_engine(parser)
+    add_engine(parser, WORKERS)
     parser.add_argument("--force", action="store_true", help="replace OUT, and discard another run's OUT.part")
     parser.add_argument("--quiet", action="store_true", help="no progress and no summary")
     add_json(parser)

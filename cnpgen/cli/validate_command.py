@@ -28,8 +28,7 @@ def add_options(parser: Parser) -> None:
     option("--deep", action="store_true", help="check every row, its constraints with Pinocchio and Coal")
     text = "make K random blocks again from the seed and compare them"
     option("--regenerate", metavar="K", type=values.natural, default=0, help=text)
-    option("--workers", metavar="W", type=values.positive, help="processes for --deep; default one per available core")
-    add_engine(parser)
+    add_engine(parser, "processes for --deep; default one per available core")
     option("--quiet", action="store_true", help="print findings only")
     add_json(parser)
 
