@@ -9,8 +9,6 @@ from cnpgen.cli.terminal import table
 from cnpgen.errors import RecipeError
 from cnpgen.schema.toml import Kind
 
-WHAT = ("datasets", "models", "pipelines", "problems", "stages", "constraints", "objectives", "exporters")
-
 _HOW = {
     "datasets": "cnpgen make-dataset NAME",
     "models": "cnpgen plan DIR --model NAME -o PLANS",
@@ -21,6 +19,7 @@ _HOW = {
     "objectives": "cnpgen train DIR -o MODEL --objective NAME=WEIGHT",
     "exporters": "cnpgen export PLANS --to NAME",
 }
+WHAT = tuple(_HOW)
 
 
 def add_options(parser: Parser) -> None:
